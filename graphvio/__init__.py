@@ -1,0 +1,68 @@
+"""graphvio: visual-inertial odometry for rigs of several stereo pairs.
+
+The names below are loaded when they are first used, so that ``import graphvio`` stays fast.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from graphvio.config import Config
+    from graphvio.errors import ConfigError, GraphvioError, MissingExtraError, RigError, SourceError
+    from graphvio.events import Estimate, FrameSet, ImuSample, Status
+    from graphvio.odometry import Odometry
+    from graphvio.rig import Camera, Imu, Rig, StereoPair
+    from graphvio.sources import open_source
+
+_HOME_OF = {
+    "Camera": "rig",
+    "Config": "config",
+    "ConfigError": "errors",
+    "Estimate": "events",
+    "FrameSet": "events",
+    "GraphvioError": "errors",
+    "Imu": "rig",
+    "ImuSample": "events",
+    "MissingExtraError": "errors",
+    "Odometry": "odometry",
+    "Rig": "rig",
+    "RigError": "errors",
+    "SourceError": "errors",
+    "Status": "events",
+    "StereoPair": "rig",
+    "open_source": "sources",
+}
+
+__all__ = [
+    "Camera",
+    "Config",
+    "ConfigError",
+    "Estimate",
+    "FrameSet",
+    "GraphvioError",
+    "Imu",
+    "ImuSample",
+    "MissingExtraError",
+    "Odometry",
+    "Rig",
+    "RigError",
+    "SourceError",
+    "Status",
+    "StereoPair",
+    "__version__",
+    "open_source",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'graphvio' has no attribute {name!r}")
+    value = getattr(import_module(f"graphvio.{_HOME_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,28 @@
+"""Typed errors: every message says what is wrong, where, and what to do about it."""
+
+
+class GraphvioError(Exception):
+    """Base of every error that a user's input can cause."""
+
+
+class RigError(GraphvioError):
+    """A rig file, or the rig that it describes, cannot be used."""
+
+
+class SourceError(GraphvioError):
+    """A recording cannot be read, or holds nothing to work on."""
+
+
+class ConfigError(GraphvioError):
+    """A configuration file, profile or value is not valid."""
+
+
+class TrajectoryError(GraphvioError):
+    """A trajectory file cannot be read, or two trajectories cannot be compared."""
+
+
+class MissingExtraError(GraphvioError):
+    """An optional part of graphvio is used that is not installed."""
+
+    def __init__(self, package: str, extra: str, purpose: str) -> None:
+        super().__init__(f"{purpose} needs {package}: install it with  pip install 'graphvio[{extra}]'")

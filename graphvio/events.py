@@ -1,0 +1,122 @@
+"""What flows through the system: IMU samples and framesets in, estimates out.
+
+Stamps are int64 nanoseconds of one clock. A sample's time is the IMU's; a frameset's is the cameras', and the two
+differ by the rig's ``time_offset_s``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from graphvio.arrays import Float, Image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSample:
+    """One reading of the IMU.
+
+    Attributes:
+        stamp_ns: IMU clock, nanoseconds.
+        angular_velocity: (3,) rad/s, frame body.
+        linear_acceleration: (3,) m/s^2, frame body: specific force, so at rest it points up with 9.81.
+    """
+
+    stamp_ns: int
+    angular_velocity: Float
+    linear_acceleration: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSet:
+    """Images of one instant from any subset of the rig's pairs.
+
+    Attributes:
+        stamp_ns: camera clock, nanoseconds.
+        images: pair index -> (left, right), each (height, width) uint8. A pair that delivered nothing is absent.
+    """
+
+    stamp_ns: int
+    images: Mapping[int, tuple[Image, Image]]
+
+
+Event = ImuSample | FrameSet
+
+
+class Status(StrEnum):
+    """What an estimate rests on."""
+
+    INITIALISING = "initialising"
+    """Vision moves the pose; gravity, velocity or biases are not yet known well."""
+    TRACKING = "tracking"
+    """Vision constrains this frameset."""
+    COASTING = "coasting"
+    """Vision failed or was rejected; the pose is predicted and its covariance grows."""
+    LOST = "lost"
+    """There is no honest pose; the next one starts a new epoch."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairReport:
+    """What one stereo pair contributed to a frameset.
+
+    Attributes:
+        points: points offered to the estimation.
+        inliers: points that the accepted motion explains.
+        pixels: (N, 2) left-image pixels of the tracked corners, for display.
+        is_inlier: (N,) whether each of them is explained.
+    """
+
+    points: int
+    inliers: int
+    pixels: Float
+    is_inlier: np.ndarray[tuple[int], np.dtype[np.bool_]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The state of the rig at a frameset's time, as known when that frameset arrived (causal).
+
+    Attributes:
+        stamp_ns: the frameset's stamp.
+        status: what the pose rests on.
+        nav_T_body: (4, 4) pose, or None when there is nothing honest to say.
+        covariance: (6, 6) of the pose, tangent ``[rotation, translation]`` in frame body, or None with the pose.
+        epoch: counts declared breaks; poses of different epochs do not share a nav frame.
+        velocity_nav: (3,) m/s in nav, or None when not estimated.
+        gyro_bias: (3,) rad/s, or None without an IMU.
+        accel_bias: (3,) m/s^2, or None without an IMU.
+        rates: angular rate of body (3,) rad/s by ``gyro``, ``vision`` and ``fused``, as far as known.
+        pairs: pair index -> what it contributed.
+        stage_ms: processing time by stage, milliseconds.
+    """
+
+    stamp_ns: int
+    status: Status
+    nav_T_body: Float | None
+    covariance: Float | None
+    epoch: int = 0
+    velocity_nav: Float | None = None
+    gyro_bias: Float | None = None
+    accel_bias: Float | None = None
+    rates: Mapping[str, Float] = field(default_factory=dict)
+    pairs: Mapping[int, PairReport] = field(default_factory=dict)
+    stage_ms: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Incident:
+    """Something that a person would want to know of: a gate, a reset, a fault of the input.
+
+    Attributes:
+        stamp_ns: when, on the clock of the data concerned.
+        kind: short name that can be counted, such as ``vision_gated`` or ``imu_gap``.
+        detail: one line for people, with the figures.
+    """
+
+    stamp_ns: int
+    kind: str
+    detail: str

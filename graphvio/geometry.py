@@ -1,0 +1,217 @@
+"""SO(3) and SE(3): exponential, logarithm, adjoint, Jacobians, quaternions.
+
+A transform ``a_T_b`` is a 4x4 float64 array that maps coordinates, ``X_a = a_T_b X_b``; chains are products,
+``a_T_c = a_T_b @ b_T_c``. The tangent is ordered ``[rotation(3), translation(3)]`` and perturbs on the right
+(in frame b): ``a_T_b @ se3_exp(xi)``. Both are GTSAM's conventions, and so is every 6x6 covariance.
+All functions are numba kernels: they may be called from Python and from other kernels.
+
+Reference: J. Sola, J. Deray, D. Atchuthan, *A micro Lie theory for state estimation in robotics*, 2018.
+"""
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.kernels import kernel
+
+_SMALL_ANGLE = 1e-5
+
+
+@kernel
+def skew(v: Float) -> Float:
+    """Matrix (3, 3) of the cross product: ``skew(v) @ w == cross(v, w)``."""
+    m = np.zeros((3, 3))
+    m[0, 1], m[0, 2] = -v[2], v[1]
+    m[1, 0], m[1, 2] = v[2], -v[0]
+    m[2, 0], m[2, 1] = -v[1], v[0]
+    return m
+
+
+@kernel
+def so3_exp(phi: Float) -> Float:
+    """Rotation matrix (3, 3) of a rotation vector (3,) in radians."""
+    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    angle = np.sqrt(angle2)
+    if angle < _SMALL_ANGLE:
+        a = 1.0 - angle2 / 6.0
+        b = 0.5 - angle2 / 24.0
+    else:
+        a = np.sin(angle) / angle
+        b = (1.0 - np.cos(angle)) / angle2
+    k = skew(phi)
+    return np.eye(3) + a * k + b * (k @ k)
+
+
+@kernel
+def so3_log(rotation: Float) -> Float:
+    """Rotation vector (3,) in radians, of norm at most pi, of a rotation matrix (3, 3)."""
+    q = quat_wxyz_from_rotation(rotation)
+    sine = np.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    if sine < _SMALL_ANGLE:
+        scale = 2.0 / q[0] - 2.0 * sine * sine / (3.0 * q[0] * q[0] * q[0])
+    else:
+        scale = 2.0 * np.arctan2(sine, q[0]) / sine
+    return scale * q[1:]
+
+
+@kernel
+def so3_right_jacobian(phi: Float) -> Float:
+    """``J`` (3, 3) with ``exp(phi + d) = exp(phi) exp(J d)`` to first order in d."""
+    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    angle = np.sqrt(angle2)
+    if angle < _SMALL_ANGLE:
+        b = 0.5 - angle2 / 24.0
+        c = 1.0 / 6.0 - angle2 / 120.0
+    else:
+        b = (1.0 - np.cos(angle)) / angle2
+        c = (angle - np.sin(angle)) / (angle2 * angle)
+    k = skew(phi)
+    return np.eye(3) - b * k + c * (k @ k)
+
+
+@kernel
+def so3_right_jacobian_inverse(phi: Float) -> Float:
+    """Inverse (3, 3) of `so3_right_jacobian`: ``log(exp(phi) exp(d)) = phi + J^-1 d`` to first order."""
+    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    angle = np.sqrt(angle2)
+    if angle < 1e-3:  # the closed form below subtracts two large, nearly equal numbers
+        c = 1.0 / 12.0 + angle2 / 720.0
+    else:
+        c = 1.0 / angle2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
+    k = skew(phi)
+    return np.eye(3) + 0.5 * k + c * (k @ k)
+
+
+@kernel
+def quat_wxyz_from_rotation(rotation: Float) -> Float:
+    """Unit Hamilton quaternion (4,) ``[w, x, y, z]`` with ``w >= 0`` of a rotation matrix (3, 3)."""
+    r = rotation
+    q = np.empty(4)
+    trace = r[0, 0] + r[1, 1] + r[2, 2]
+    if trace > 0.0:
+        s = 2.0 * np.sqrt(trace + 1.0)
+        q[0] = 0.25 * s
+        q[1] = (r[2, 1] - r[1, 2]) / s
+        q[2] = (r[0, 2] - r[2, 0]) / s
+        q[3] = (r[1, 0] - r[0, 1]) / s
+    else:
+        i = 0
+        if r[1, 1] > r[0, 0]:
+            i = 1
+        if r[2, 2] > r[i, i]:
+            i = 2
+        j = (i + 1) % 3
+        k = (i + 2) % 3
+        s = 2.0 * np.sqrt(1.0 + r[i, i] - r[j, j] - r[k, k])
+        q[0] = (r[k, j] - r[j, k]) / s
+        q[1 + i] = 0.25 * s
+        q[1 + j] = (r[j, i] + r[i, j]) / s
+        q[1 + k] = (r[k, i] + r[i, k]) / s
+    q /= np.sqrt(np.sum(q * q))
+    if q[0] < 0.0:
+        q = -q
+    return q
+
+
+@kernel
+def rotation_from_quat_wxyz(quat_wxyz: Float) -> Float:
+    """Rotation matrix (3, 3) of a Hamilton quaternion (4,) ``[w, x, y, z]`` of any norm but zero."""
+    w, x, y, z = quat_wxyz / np.sqrt(np.sum(quat_wxyz * quat_wxyz))
+    r = np.empty((3, 3))
+    r[0, 0], r[0, 1], r[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    r[1, 0], r[1, 1], r[1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    r[2, 0], r[2, 1], r[2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    return r
+
+
+@kernel
+def se3(rotation: Float, translation: Float) -> Float:
+    """Transform (4, 4) from its rotation (3, 3) and translation (3,)."""
+    t = np.eye(4)
+    t[:3, :3] = rotation
+    t[:3, 3] = translation
+    return t
+
+
+@kernel
+def se3_inverse(a_T_b: Float) -> Float:
+    """``b_T_a`` (4, 4)."""
+    inverse = np.eye(4)
+    for i in range(3):
+        for j in range(3):
+            inverse[i, j] = a_T_b[j, i]
+    for i in range(3):
+        inverse[i, 3] = -(
+            a_T_b[0, i] * a_T_b[0, 3] + a_T_b[1, i] * a_T_b[1, 3] + a_T_b[2, i] * a_T_b[2, 3]
+        )
+    return inverse
+
+
+@kernel
+def se3_exp(xi: Float) -> Float:
+    """Transform (4, 4) of a tangent vector (6,) ``[rotation, translation]``."""
+    phi = xi[:3]
+    left_jacobian = so3_right_jacobian(-phi)
+    return se3(so3_exp(phi), left_jacobian @ xi[3:])
+
+
+@kernel
+def se3_log(a_T_b: Float) -> Float:
+    """Tangent vector (6,) ``[rotation, translation]`` of a transform (4, 4)."""
+    phi = so3_log(np.ascontiguousarray(a_T_b[:3, :3]))
+    xi = np.empty(6)
+    xi[:3] = phi
+    xi[3:] = so3_right_jacobian_inverse(-phi) @ np.ascontiguousarray(a_T_b[:3, 3])
+    return xi
+
+
+@kernel
+def se3_adjoint(a_T_b: Float) -> Float:
+    """Adjoint (6, 6): ``a_T_b exp(xi_b) = exp(Ad xi_b) a_T_b``."""
+    rotation = np.ascontiguousarray(a_T_b[:3, :3])
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = rotation
+    adjoint[3:, 3:] = rotation
+    adjoint[3:, :3] = skew(a_T_b[:3, 3]) @ rotation
+    return adjoint
+
+
+@kernel
+def se3_right_jacobian_inverse(xi: Float) -> Float:
+    """``J`` (6, 6) with ``log(exp(xi) exp(d)) = xi + J d`` to first order in d."""
+    phi = xi[:3]
+    rho = xi[3:]
+    diagonal = so3_right_jacobian_inverse(phi)
+    coupling = -_left_coupling(-phi, -rho)  # Q of the right Jacobian is Q of the left one at -xi
+    inverse = np.zeros((6, 6))
+    inverse[:3, :3] = diagonal
+    inverse[3:, 3:] = diagonal
+    inverse[3:, :3] = diagonal @ coupling @ diagonal
+    return inverse
+
+
+@kernel
+def _left_coupling(phi: Float, rho: Float) -> Float:
+    """Block Q (3, 3) of SE(3)'s left Jacobian (Barfoot, *State Estimation for Robotics*, eq. 7.86)."""
+    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    angle = np.sqrt(angle2)
+    if angle < 1e-2:  # series: the closed form loses all digits in angle^5
+        c1 = 1.0 / 6.0 - angle2 / 120.0
+        c2 = 1.0 / 24.0 - angle2 / 720.0
+        c3 = 1.0 / 120.0 - angle2 / 2520.0
+    else:
+        sine, cosine = np.sin(angle), np.cos(angle)
+        c1 = (angle - sine) / angle**3
+        c2 = (angle2 + 2.0 * cosine - 2.0) / (2.0 * angle**4)
+        c3 = (2.0 * angle - 3.0 * sine + angle * cosine) / (2.0 * angle**5)
+    p = skew(phi)
+    r = skew(rho)
+    pr = p @ r
+    rp = r @ p
+    prp = pr @ p
+    return 0.5 * r + c1 * (pr + rp + prp) + c2 * (p @ pr + rp @ p - 3.0 * prp) + c3 * (prp @ p + p @ prp)
+
+
+def interpolate(a_T_b0: Float, a_T_b1: Float, fraction: float) -> Float:
+    """Pose (4, 4) between two poses: position on the chord, rotation by constant rate; fraction 0 to 1."""
+    rotation = so3_exp(fraction * so3_log(a_T_b0[:3, :3].T @ a_T_b1[:3, :3]))
+    return se3(a_T_b0[:3, :3] @ rotation, (1.0 - fraction) * a_T_b0[:3, 3] + fraction * a_T_b1[:3, 3])

@@ -1,0 +1,86 @@
+"""The one way in which numba compiles our kernels, and what is known of their cache.
+
+numba notices an edit to a kernel's own file but not to a file whose kernels it calls. The cache folder
+of a module is therefore named after a digest of its source and of all that it imports from this package:
+outdated machine code is never run by mistake.
+"""
+
+import functools
+import hashlib
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar, cast
+
+import numba
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_PACKAGE = Path(__file__).parent
+_IMPORT = re.compile(r"^from (graphvio[\w.]*) import", re.MULTILINE)
+_registered: list[Any] = []
+
+
+@functools.cache
+def cache_root() -> Path:
+    """Folder of all compiled kernels: ``GRAPHVIO_CACHE_DIR``, or graphvio's folder in the user's cache."""
+    chosen = os.environ.get("GRAPHVIO_CACHE_DIR")
+    user_cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache")
+    try:
+        root = (Path(chosen) if chosen else user_cache / "graphvio" / "kernels").expanduser()
+        root.mkdir(parents=True, exist_ok=True)
+        if os.access(root, os.W_OK):
+            return root
+    except (OSError, RuntimeError):
+        pass  # a home that is read-only or unknown: compiled code then lives as long as /tmp does
+    root = Path(tempfile.gettempdir()) / f"graphvio-{os.getuid()}-kernels"
+    root.mkdir(parents=True, exist_ok=True)
+    return root
+
+
+def kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a function with numba: no GIL, cached on disk, IEEE division (no exception on 1/0)."""
+    callers_choice = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(cache_root() / _digest(function.__module__))  # read when the cache is attached
+    try:
+        compiled = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    finally:
+        numba.config.CACHE_DIR = callers_choice
+    _registered.append(compiled)
+    return cast(Callable[P, R], compiled)
+
+
+def any_compiled_before(module: str) -> bool:
+    """Whether the cache holds code of a module's kernels, so that their first call need not wait for a compiler."""
+    return any((cache_root() / _digest(module)).rglob("*.nbc"))
+
+
+def compile_counts() -> tuple[int, int]:
+    """(loaded from the cache, compiled now) over all kernels of this process."""
+    stats = [compiled.stats for compiled in _registered if hasattr(compiled, "stats")]
+    return (
+        sum(sum(s.cache_hits.values()) for s in stats),
+        sum(sum(s.cache_misses.values()) for s in stats),
+    )
+
+
+@functools.cache
+def _digest(module: str) -> str:
+    sources: dict[str, bytes] = {}
+    pending = [module]
+    while pending:
+        name = pending.pop()
+        if name in sources:
+            continue
+        path = _PACKAGE.parent.joinpath(*name.split("."))
+        file = path.with_suffix(".py") if not path.is_dir() else path / "__init__.py"
+        sources[name] = file.read_bytes() if file.is_file() else b""
+        pending += _IMPORT.findall(sources[name].decode())
+    digest = hashlib.sha256(f"{numba.__version__} {sys.version}".encode())
+    for name in sorted(sources):
+        digest.update(name.encode() + sources[name])
+    return f"{module}-{digest.hexdigest()[:16]}"

@@ -1,0 +1,281 @@
+"""The rig: stereo pairs and an IMU, rigidly joined, with everything that calibration knows of them.
+
+All extrinsics are ``body_T_cam``. Body is the IMU's frame; a rig without an IMU may choose any. The objects check
+themselves when they are made and are never changed afterwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float
+from graphvio.cameras import MODEL_NAMES, project_points, unproject_pixels
+from graphvio.errors import RigError
+from graphvio.geometry import se3_inverse
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_ROTATION_TOLERANCE = 1e-3
+_MIN_BASELINE_M = 1e-3
+_MAX_AXES_ANGLE_DEG = 45.0
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One camera.
+
+    Attributes:
+        name: unique in the rig, such as ``cam0``.
+        model: ``radial-tangential`` (pinhole with Brown distortion) or ``equidistant`` (Kannala-Brandt fisheye).
+        size_px: (width, height).
+        intrinsics: (4,) ``[fx, fy, cx, cy]``, pixels.
+        distortion: (5,), see `graphvio.cameras`; shorter input is filled with zeros.
+        body_T_cam: (4, 4), metres.
+        mask: image file whose black pixels are never used (the person's own body or the rig), or None.
+
+    Raises:
+        RigError: if a value is missing, not finite, or impossible.
+    """
+
+    name: str
+    model: str
+    size_px: tuple[int, int]
+    intrinsics: Float
+    distortion: Float
+    body_T_cam: Float
+    mask: Path | None = None
+
+    def __post_init__(self) -> None:
+        where = f"camera {self.name}"
+        if self.model not in MODEL_NAMES:
+            raise RigError(f"{where}: unknown model {self.model!r}; use one of {', '.join(MODEL_NAMES)}")
+        width, height = self.size_px
+        if width < 16 or height < 16:
+            raise RigError(f"{where}: image size {width}x{height} is too small; give size_px as [width, height]")
+        intrinsics = _finite(self.intrinsics, (4,), f"{where}: intrinsics [fx, fy, cx, cy]")
+        if intrinsics[0] <= 0 or intrinsics[1] <= 0:
+            raise RigError(f"{where}: focal lengths {intrinsics[:2].tolist()} must be positive, in pixels")
+        given = np.asarray(self.distortion, dtype=np.float64).ravel()
+        if len(given) > 5:
+            raise RigError(f"{where}: {len(given)} distortion coefficients; at most 5 [k1, k2, p1, p2, k3] are known")
+        distortion = _finite(np.pad(given, (0, 5 - len(given))), (5,), f"{where}: distortion")
+        _set(self, "size_px", (int(width), int(height)))
+        _set(self, "intrinsics", intrinsics)
+        _set(self, "distortion", distortion)
+        _set(self, "body_T_cam", checked_transform(self.body_T_cam, f"{where}: body_T_cam"))
+
+    @property
+    def focal_px(self) -> float:
+        """Mean focal length, pixels: what one normalised image unit is worth in the middle of the image."""
+        return float(0.5 * (self.intrinsics[0] + self.intrinsics[1]))
+
+    @cached_property
+    def cam_T_body(self) -> Float:
+        """Inverse (4, 4) of ``body_T_cam``."""
+        return se3_inverse(self.body_T_cam)
+
+    @property
+    def model_number(self) -> int:
+        """The model as the kernels of `graphvio.cameras` take it."""
+        return MODEL_NAMES[self.model]
+
+    def project(self, points: Float) -> tuple[Float, Bool]:
+        """Pixels (N, 2) of points (N, 3) in the camera frame, and whether each is inside the image (N,)."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        pixels, valid = project_points(self.model_number, self.intrinsics, self.distortion, points)
+        return pixels, valid & self.contains(pixels)
+
+    def unproject(self, pixels: Float) -> tuple[Float, Bool]:
+        """Normalised coordinates (N, 2) of pixels (N, 2), and whether each has a ray (N,)."""
+        pixels = np.ascontiguousarray(pixels, dtype=np.float64)
+        return unproject_pixels(self.model_number, self.intrinsics, self.distortion, pixels)
+
+    def contains(self, pixels: Float, border_px: float = 0.0) -> Bool:
+        """Whether pixels (N, 2) lie inside the image, at least ``border_px`` from its edge (N,)."""
+        width, height = self.size_px
+        x, y = pixels[:, 0], pixels[:, 1]
+        inside_x = (x >= border_px) & (x <= width - 1 - border_px)
+        return np.asarray(inside_x & (y >= border_px) & (y <= height - 1 - border_px))
+
+
+@dataclass(frozen=True, eq=False)
+class StereoPair:
+    """Two cameras that see the same scene.
+
+    Raises:
+        RigError: if there is no baseline, or the optical axes disagree by more than 45 degrees.
+    """
+
+    name: str
+    left: Camera
+    right: Camera
+
+    def __post_init__(self) -> None:
+        where = f"pair {self.name} ({self.left.name}, {self.right.name})"
+        if self.baseline_m < _MIN_BASELINE_M:
+            raise RigError(
+                f"{where}: baseline is {1e3 * self.baseline_m:.3f} mm; a stereo pair needs two cameras at "
+                "different places: check body_T_cam of both"
+            )
+        axes_deg = np.rad2deg(np.arccos(np.clip(self.right_T_left[2, 2], -1.0, 1.0)))
+        if axes_deg > _MAX_AXES_ANGLE_DEG:
+            raise RigError(
+                f"{where}: optical axes are {axes_deg:.0f} degrees apart (at most {_MAX_AXES_ANGLE_DEG:.0f}); "
+                "check which cameras form a pair and the direction of body_T_cam"
+            )
+
+    @cached_property
+    def right_T_left(self) -> Float:
+        """``P^s`` of the paper's eq. (2): (4, 4), maps points of the left camera to the right one."""
+        return self.right.cam_T_body @ self.left.body_T_cam
+
+    @property
+    def baseline_m(self) -> float:
+        """Distance between the two optical centres."""
+        return float(np.linalg.norm(self.right_T_left[:3, 3]))
+
+
+@dataclass(frozen=True)
+class Imu:
+    """The inertial sensor, whose frame is the body's.
+
+    Attributes:
+        rate_hz: nominal rate.
+        gyro_noise_density: white noise, rad/s/sqrt(Hz).
+        gyro_random_walk: bias diffusion, rad/s^2/sqrt(Hz).
+        accel_noise_density: white noise, m/s^2/sqrt(Hz).
+        accel_random_walk: bias diffusion, m/s^3/sqrt(Hz).
+        time_offset_s: add it to a camera's stamp to get the IMU's stamp of the same instant
+            (``t_imu = t_cam + time_offset``, Kalibr's ``timeshift_cam_imu``).
+
+    Raises:
+        RigError: if a density is not positive or a value is not finite.
+    """
+
+    rate_hz: float = 200.0
+    gyro_noise_density: float = 1.7e-4
+    gyro_random_walk: float = 2.0e-5
+    accel_noise_density: float = 2.0e-3
+    accel_random_walk: float = 3.0e-3
+    time_offset_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not np.isfinite(value):
+                raise RigError(f"imu: {name} is {value}; it must be a finite number")
+            if name != "time_offset_s" and value <= 0:
+                raise RigError(f"imu: {name} is {value}; it must be positive")
+        if abs(self.time_offset_s) > 1.0:
+            raise RigError(f"imu: time_offset_s is {self.time_offset_s}; more than a second is surely in other units")
+
+    @property
+    def time_offset_ns(self) -> int:
+        """`time_offset_s` in nanoseconds."""
+        return round(self.time_offset_s * 1e9)
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Any number of stereo pairs, and an IMU or None.
+
+    Raises:
+        RigError: if there is no pair, or two cameras or pairs share a name.
+    """
+
+    pairs: tuple[StereoPair, ...]
+    imu: Imu | None = None
+    name: str = field(default="rig")
+
+    def __post_init__(self) -> None:
+        _set(self, "pairs", tuple(self.pairs))
+        if not self.pairs:
+            raise RigError(f"{self.name}: has no stereo pair; graphvio needs at least one")
+        names = [camera.name for camera in self.cameras]
+        for kind, all_names in (("camera", names), ("pair", [pair.name for pair in self.pairs])):
+            twice = {n for n in all_names if all_names.count(n) > 1}
+            if twice:
+                raise RigError(f"{self.name}: {kind} {sorted(twice)[0]!r} appears twice; names must differ")
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """All cameras: left and right of the first pair, then of the next."""
+        return tuple(camera for pair in self.pairs for camera in (pair.left, pair.right))
+
+    def left2_T_left1(self, first: int = 0, second: int = 1) -> Float:
+        """``P_12`` of the paper's eq. (1): (4, 4), maps points of the first pair's left camera to the second's."""
+        return self.pairs[second].left.cam_T_body @ self.pairs[first].left.body_T_cam
+
+    def with_pairs(self, indices: Sequence[int]) -> Rig:
+        """The same rig with only some of its pairs, in the order given.
+
+        Raises:
+            RigError: if an index does not exist.
+        """
+        for index in indices:
+            if not 0 <= index < len(self.pairs):
+                raise RigError(f"{self.name}: there is no pair {index}; its pairs are 0 to {len(self.pairs) - 1}")
+        return replace(self, pairs=tuple(self.pairs[i] for i in indices))
+
+    def without_imu(self) -> Rig:
+        """The same rig, cameras only."""
+        return replace(self, imu=None)
+
+    @staticmethod
+    def load(path: str | Path) -> Rig:
+        """Read a rig from graphvio's ``rig.yaml``, a Kalibr, EuRoC/ASL or KITTI calibration: see `graphvio.rig_files`.
+
+        Raises:
+            RigError: if the file cannot be read or describes no usable rig.
+        """
+        from graphvio.rig_files import load_rig
+
+        return load_rig(Path(path))
+
+    def save(self, path: str | Path) -> None:
+        """Write graphvio's own ``rig.yaml``."""
+        from graphvio.rig_files import save_rig
+
+        save_rig(self, Path(path))
+
+
+def checked_transform(matrix: object, where: str) -> Float:
+    """A 4x4 array that is surely a rigid transform; its rotation is made orthonormal to the last digit.
+
+    Raises:
+        RigError: if the shape is wrong, a value is not finite, or the rotation is none.
+    """
+    transform = _finite(matrix, (4, 4), where)
+    rotation = transform[:3, :3]
+    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise RigError(
+            f"{where}: the upper left 3x3 block is no rotation (R R^T differs from 1 by {off:.2g}, determinant "
+            f"{np.linalg.det(rotation):.3g}); check that the matrix is complete and row-major"
+        )
+    if np.abs(transform[3] - [0, 0, 0, 1]).max() > 1e-9:
+        raise RigError(f"{where}: the last row is {transform[3].tolist()}; it must be [0, 0, 0, 1]")
+    u, _, vt = np.linalg.svd(rotation)
+    transform[:3, :3] = u @ vt
+    return transform
+
+
+def _finite(values: object, shape: tuple[int, ...], where: str) -> Float:
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise RigError(f"{where}: is not numeric ({error})") from None
+    if array.shape != shape:
+        raise RigError(f"{where}: has shape {array.shape}; it must be {shape}")
+    if not np.isfinite(array).all():
+        raise RigError(f"{where}: holds NaN or infinity")
+    return array
+
+
+def _set(frozen: object, name: str, value: object) -> None:
+    object.__setattr__(frozen, name, value)
