@@ -1,0 +1,226 @@
+"""Configuration: one dataclass per stage, with defaults that need no tuning.
+
+A profile is a YAML file in ``configs/`` that overrides some of the values; so is a user's own file.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args, get_type_hints
+
+from graphvio.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class CornerConfig:
+    """Harris corners, one in each cell of the left image that has no track (section 3)."""
+
+    cell_px: int = 40
+    """Side of a cell: at most one new corner in each."""
+    min_response: float = 4.0
+    """Least Harris response of a corner, as the corner's grey-level step: smaller eigenvalue's square root."""
+    border_px: int = 8
+    """Corners and tracks nearer to the image's edge are dropped."""
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Temporal 2D-2D matching by pyramidal Lucas-Kanade (section 3)."""
+
+    window_px: int = 15
+    levels: int = 4
+    max_forward_backward_px: float = 0.7
+    """Largest distance between a corner and its image tracked forth and back again."""
+
+
+@dataclass(frozen=True)
+class StereoConfig:
+    """Left-right matching under the epipolar and disparity constraints, and triangulation (section 3)."""
+
+    min_depth_m: float = 0.3
+    max_epipolar_px: float = 1.0
+    """Largest distance of a right corner from the epipolar line of its left one."""
+    min_correlation: float = 0.8
+    """Least normalised cross-correlation of the two patches."""
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Robust resection and refinement, and the choice between pairs (section 3, 3.1)."""
+
+    selection: Literal["best_pair", "joint"] = "joint"
+    """``best_pair``: each pair alone, the least global cost wins, eq. (4). ``joint``: all pairs together, 3.1."""
+    reference: Literal["previous", "keyframe"] = "keyframe"
+    """Motion is measured from the previous frameset, or from one that stays while enough of it is in view."""
+    keyframe_overlap: float = 0.7
+    """Share of a keyframe's points that must still be tracked for it to stay."""
+    hypotheses: int = 500
+    """3-point hypotheses of each pair."""
+    chunk_points: int = 100
+    """Points of each pair on which the hypotheses are scored before half of them are dropped."""
+    cauchy_scale_px: float = 1.5
+    """Scale ``a`` of the robust cost, eq. (2), in pixels."""
+    pixel_sigma_px: float = 0.3
+    """Standard deviation of a tracked corner's position in one image."""
+    max_error_px: float = 3.0
+    """Reprojection error beyond which a point is no inlier."""
+    min_inliers: int = 12
+    min_inlier_share: float = 0.3
+    """Motions that explain fewer points, or a smaller share of them, are refused."""
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class InitialisationConfig:
+    """The first pose: tilt from the accelerometer, at rest or in motion."""
+
+    window_s: float = 1.0
+    """IMU samples before the first frameset that are used, if there are as many."""
+    static_gyro_rad_s: float = 0.02
+    """Largest standard deviation of the angular rate that counts as rest."""
+    static_accel_m_s2: float = 0.15
+    """Largest standard deviation of the specific force that counts as rest."""
+    settle_s: float = 1.0
+    """After a start in motion, estimates are ``initialising`` for this long."""
+
+
+@dataclass(frozen=True)
+class SmootherConfig:
+    """The fixed-lag window, its gate and its limits (section 5)."""
+
+    lag_s: float = 2.0
+    gate_probability: float = 0.9999
+    """Vision is refused where its innovation lies outside this share of the chi-square distribution."""
+    max_gated_s: float = 1.0
+    """When the gate has refused for longer, the prediction is at fault and is started anew."""
+    imu_noise_scale: float = 2.0
+    """Factor on the rig's IMU noise densities, which data sheets state for a sensor that does not vibrate."""
+    motion_accel_sigma_m_s2: float = 5.0
+    """Without an IMU: standard deviation of the acceleration, eq. (11)."""
+    motion_angular_accel_sigma_rad_s2: float = 10.0
+    """Without an IMU: standard deviation of the angular acceleration, eq. (11)."""
+    lost_position_sigma_m: float = 1.0
+    """Coasting ends in ``lost`` when the position has become less certain than this since vision was last used."""
+
+
+@dataclass(frozen=True)
+class TimingConfig:
+    """How long things are waited for."""
+
+    max_imu_wait_ms: float = 100.0
+    """A frameset whose IMU samples have not come is held until one arrives that is newer by this much."""
+    max_imu_gap_ms: float = 50.0
+    """A longer gap between IMU samples is not integrated over."""
+    max_imu_start_wait_s: float = 2.0
+    """When no IMU sample has come for this long, the odometry starts without."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """All stages."""
+
+    corners: CornerConfig = field(default_factory=CornerConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    stereo: StereoConfig = field(default_factory=StereoConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    initialisation: InitialisationConfig = field(default_factory=InitialisationConfig)
+    smoother: SmootherConfig = field(default_factory=SmootherConfig)
+    timing: TimingConfig = field(default_factory=TimingConfig)
+
+    @staticmethod
+    def load(name_or_path: str | Path) -> Config:
+        """Read a profile by its name, or a YAML file.
+
+        Raises:
+            ConfigError: if there is no such profile or file, or a key or value in it is not valid.
+        """
+        path = Path(name_or_path)
+        if path.suffix not in (".yaml", ".yml"):
+            known = profiles()
+            if str(name_or_path) not in known:
+                raise ConfigError(
+                    f"no profile {str(name_or_path)!r}{_nearest(str(name_or_path), known)}; profiles are "
+                    f"{', '.join(sorted(known))}, and a file ends in .yaml"
+                )
+            path = known[str(name_or_path)]
+        try:
+            text = path.read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{path}: cannot be read ({error}); give a YAML file or a profile's name") from None
+        return Config.from_yaml(text, str(path))
+
+    @staticmethod
+    def from_yaml(text: str, where: str = "configuration") -> Config:
+        """Parse YAML; what it does not mention keeps its default.
+
+        Raises:
+            ConfigError: if it is no YAML mapping, or a key or value is not valid.
+        """
+        import yaml
+
+        try:
+            data = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{where}: is not valid YAML: {' '.join(str(error).split())}") from None
+        return _build(Config, {} if data is None else data, where)
+
+    def to_yaml(self) -> str:
+        """All values as YAML, in the order of the dataclasses."""
+        import yaml
+
+        text: str = yaml.safe_dump(asdict(self), sort_keys=False)
+        return text
+
+    def sha256(self) -> str:
+        """Digest of all values: equal for configurations that do the same."""
+        return hashlib.sha256(self.to_yaml().encode()).hexdigest()
+
+
+def profiles() -> dict[str, Path]:
+    """Name -> file of the configurations that come with graphvio."""
+    here = Path(__file__).parent
+    for folder in (here / "configs", here.parent / "configs"):  # as installed, as checked out
+        if folder.is_dir():
+            return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return {}
+
+
+def _build(kind: type[Any], data: object, where: str) -> Any:
+    if not isinstance(data, Mapping):
+        raise ConfigError(f"{where}: must be a mapping of names to values, not {type(data).__name__}")
+    hints = get_type_hints(kind)
+    names = [f.name for f in fields(kind)]
+    values = {}
+    for key, value in data.items():
+        if key not in names:
+            raise ConfigError(f"{where}: unknown key {key!r}{_nearest(str(key), names)}")
+        values[key] = _checked(hints[key], value, f"{where}: {key}")
+    return kind(**values)
+
+
+def _checked(hint: Any, value: object, where: str) -> object:
+    if is_dataclass(hint):
+        return _build(hint, {} if value is None else value, where)  # type: ignore[arg-type]
+    choices = get_args(hint)
+    if choices:
+        if value not in choices:
+            raise ConfigError(f"{where}: is {value!r}; choose one of {', '.join(map(str, choices))}")
+        return value
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is float and number:
+        as_float = float(value)  # type: ignore[arg-type]
+        if not 0.0 <= as_float < float("inf"):
+            raise ConfigError(f"{where}: is {value!r}; it must be finite and not negative")
+        return as_float
+    if hint is int and number and value == int(value) and value >= 0:  # type: ignore[call-overload, operator]
+        return int(value)  # type: ignore[call-overload]
+    raise ConfigError(f"{where}: is {value!r}; it must be {'a number' if hint is float else 'a whole number from 0'}")
+
+
+def _nearest(key: str, names: object) -> str:
+    close = difflib.get_close_matches(key, list(names), n=1, cutoff=0.3)  # type: ignore[call-overload]
+    return f"; did you mean {close[0]!r}?" if close else ""

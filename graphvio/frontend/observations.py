@@ -1,0 +1,118 @@
+"""What the motion between two framesets is estimated from: the tracks of all pairs, side by side in arrays.
+
+All pairs are expressed in one frame, body: a motion hypothesis is ``cur_T_ref``, which maps points of the rig's body
+frame from the reference instant to the current one. Pair j's own motion, the paper's ``P_j``, is
+``left_T_body cur_T_ref body_T_left``: the transfer between pairs, eq. (1), is thereby part of every evaluation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float, Int
+from graphvio.frontend.tracker import PairFrame
+from graphvio.rig import Rig
+
+
+class RigArrays(NamedTuple):
+    """The rig as kernels take it, for P pairs; side 0 is left, 1 right.
+
+    Attributes:
+        cam_T_body: (P, 2, 4, 4).
+        body_T_left: (P, 4, 4).
+        focal_px: (P, 2), what a normalised image unit is worth.
+    """
+
+    cam_T_body: Float
+    body_T_left: Float
+    focal_px: Float
+
+    @staticmethod
+    def of(rig: Rig) -> RigArrays:
+        """Collect the arrays of a rig."""
+        return RigArrays(
+            np.array([[pair.left.cam_T_body, pair.right.cam_T_body] for pair in rig.pairs]),
+            np.array([pair.left.body_T_cam for pair in rig.pairs]),
+            np.array([[pair.left.focal_px, pair.right.focal_px] for pair in rig.pairs]),
+        )
+
+
+class Observations(NamedTuple):
+    """N points known at the reference instant and seen at the current one, sorted by pair.
+
+    Attributes:
+        pair: (N,) index of the pair.
+        points: (N, 3) ``[x, y, 1/Z]`` in the pair's left camera at the reference instant.
+        covariances: (N, 3, 3) of ``points``, for a pixel noise of 1 px.
+        left: (N, 2) normalised coordinates in the current left image.
+        right: (N, 2) the same in the current right image; meaningful where ``has_right``.
+        has_right: (N,).
+    """
+
+    pair: Int
+    points: Float
+    covariances: Float
+    left: Float
+    right: Float
+    has_right: Bool
+
+    def of_pair(self, pair: int) -> Observations:
+        """Only one pair's points."""
+        rows = self.pair == pair
+        return Observations(*(column[rows] for column in self))
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Observations, and which tracks they came from.
+
+    Attributes:
+        observations: of all pairs.
+        rows: pair -> (M,) rows of the current `PairFrame` that take part, in order.
+        offered: number of points that the reference had, over the pairs that take part.
+    """
+
+    observations: Observations
+    rows: Mapping[int, Int]
+    offered: int
+
+
+def correspond(reference: Mapping[int, PairFrame], current: Mapping[int, PairFrame]) -> Correspondences:
+    """Join the tracks of two instants by their identities; points without depth at the reference stay out."""
+    columns: list[list[np.ndarray]] = [[] for _ in range(6)]
+    rows: dict[int, Int] = {}
+    offered = 0
+    for pair in sorted(reference.keys() & current.keys()):
+        then, now = reference[pair], current[pair]
+        offered += int(then.has_depth.sum())
+        _, at_then, at_now = np.intersect1d(then.ids, now.ids, assume_unique=True, return_indices=True)
+        known = then.has_depth[at_then]
+        at_then, at_now = at_then[known], at_now[known]
+        rows[pair] = at_now
+        parts = (
+            np.full(len(at_now), pair, dtype=np.int64),
+            then.points[at_then],
+            then.covariances[at_then],
+            now.left[at_now],
+            now.right[at_now],
+            now.has_depth[at_now],
+        )
+        for column, part in zip(columns, parts, strict=True):
+            column.append(part)
+    if not rows:
+        return Correspondences(_NOTHING, rows, offered)
+    return Correspondences(Observations(*(np.ascontiguousarray(np.concatenate(c)) for c in columns)), rows, offered)
+
+
+_NOTHING = Observations(
+    np.zeros(0, dtype=np.int64),
+    np.zeros((0, 3)),
+    np.zeros((0, 3, 3)),
+    np.zeros((0, 2)),
+    np.zeros((0, 2)),
+    np.zeros(0, dtype=bool),
+)

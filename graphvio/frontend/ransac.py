@@ -1,0 +1,154 @@
+"""Preemptive RANSAC over one or many pairs (section 3.1)."""
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float, Int
+from graphvio.frontend.cost import robust_cost, squared_error_px
+from graphvio.frontend.observations import Observations, RigArrays
+from graphvio.frontend.resection import resect
+from graphvio.geometry import se3_inverse
+from graphvio.kernels import kernel
+
+_MIN_INVERSE_DEPTH = 0.005
+_MAX_RELATIVE_DEPTH_SIGMA = 0.3
+
+
+def hypothesise(
+    rig: RigArrays, observations: Observations, pair: int, count: int, pixel_sigma_px: float, rng: np.random.Generator
+) -> Float:
+    """Motions ``cur_T_ref`` (H, 4, 4) of body, by 3-point resection of one pair's random triples, H <= count."""
+    sigma_w = pixel_sigma_px * np.sqrt(observations.covariances[:, 2, 2])
+    w = observations.points[:, 2]
+    usable = (observations.pair == pair) & (w > _MIN_INVERSE_DEPTH) & (sigma_w < _MAX_RELATIVE_DEPTH_SIGMA * w)
+    rows = np.flatnonzero(usable)
+    if len(rows) < 3 or count == 0:
+        return np.zeros((0, 4, 4))
+    triples = rows[rng.integers(0, len(rows), size=(count, 3))]
+    distinct = (
+        (triples[:, 0] != triples[:, 1]) & (triples[:, 0] != triples[:, 2]) & (triples[:, 1] != triples[:, 2])
+    )
+    poses, found = _resect_triples(
+        triples[distinct],
+        observations.points,
+        observations.left,
+        observations.right,
+        observations.has_right,
+        rig.cam_T_body[pair, 1] @ rig.body_T_left[pair],
+        rig.focal_px[pair, 1],
+    )
+    body_T_left = rig.body_T_left[pair]
+    return np.ascontiguousarray(body_T_left @ poses[found] @ se3_inverse(body_T_left))
+
+
+def preempt(
+    rig: RigArrays,
+    observations: Observations,
+    hypotheses: Float,
+    chunk_points: int,
+    cauchy_scale_px: float,
+    rng: np.random.Generator,
+) -> Float:
+    """The hypothesis (4, 4) that survives when, chunk by chunk, the worse half is dropped.
+
+    Every hypothesis is scored on a chunk of points of *each* pair; the scores cumulate. When the points are used up,
+    the best score wins.
+    """
+    order: list[Int] = [rng.permutation(np.flatnonzero(observations.pair == j)) for j in range(len(rig.body_T_left))]
+    alive = np.arange(len(hypotheses))
+    scores = np.zeros(len(hypotheses))
+    start = 0
+    while len(alive) > 1:
+        chunk = np.concatenate([rows[start : start + chunk_points] for rows in order])
+        if len(chunk) == 0:
+            break
+        scores[alive] += score_all(
+            hypotheses[alive],
+            rig.cam_T_body,
+            rig.body_T_left,
+            rig.focal_px,
+            observations.pair,
+            observations.points,
+            observations.left,
+            observations.right,
+            observations.has_right,
+            chunk,
+            cauchy_scale_px,
+        )
+        ranked = alive[np.argsort(scores[alive], kind="stable")]
+        alive = ranked[: (len(ranked) + 1) // 2]
+        start += chunk_points
+    best = alive[np.argmin(scores[alive])]
+    return np.asarray(hypotheses[best])
+
+
+@kernel
+def score_all(
+    hypotheses: Float,
+    cam_T_body: Float,
+    body_T_left: Float,
+    focal_px: Float,
+    pair: Int,
+    points: Float,
+    left: Float,
+    right: Float,
+    has_right: Bool,
+    rows: Int,
+    cauchy_scale_px: float,
+) -> Float:
+    """Robust cost (H,) of each hypothesis (H, 4, 4) on the given rows."""
+    scores = np.empty(len(hypotheses))
+    for h in range(len(hypotheses)):
+        scores[h] = robust_cost(
+            hypotheses[h],
+            cam_T_body,
+            body_T_left,
+            focal_px,
+            pair,
+            points,
+            left,
+            right,
+            has_right,
+            rows,
+            cauchy_scale_px,
+        )
+    return scores
+
+
+@kernel
+def _resect_triples(
+    triples: Int,
+    points: Float,
+    left: Float,
+    right: Float,
+    has_right: Bool,
+    right_T_left: Float,
+    focal_px: float,
+) -> tuple[Float, Bool]:
+    """For each triple the solution that the right image of its points likes best."""
+    n = len(triples)
+    best = np.zeros((n, 4, 4))
+    found = np.zeros(n, dtype=np.bool_)
+    corners = np.empty((3, 3))
+    rays = np.empty((3, 3))
+    for i in range(n):
+        for k in range(3):
+            row = triples[i, k]
+            w = points[row, 2]
+            corners[k, 0], corners[k, 1], corners[k, 2] = points[row, 0] / w, points[row, 1] / w, 1.0 / w
+            x, y = left[row, 0], left[row, 1]
+            norm = np.sqrt(x * x + y * y + 1.0)
+            rays[k, 0], rays[k, 1], rays[k, 2] = x / norm, y / norm, 1.0 / norm
+        poses, count = resect(corners, rays)
+        least = np.inf
+        for c in range(count):
+            motion = right_T_left @ poses[c]
+            error = 0.0
+            for k in range(3):
+                row = triples[i, k]
+                if has_right[row]:
+                    error += min(squared_error_px(motion, points[row], right[row], focal_px), 1e6)
+            if error < least:
+                least = error
+                best[i] = poses[c]
+                found[i] = True
+    return best, found

@@ -1,0 +1,60 @@
+"""One motion from all pairs: the best pair's (section 3, eq. 3 and 4), or all pairs jointly (section 3.1)."""
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.config import MotionConfig
+from graphvio.frontend.cost import robust_cost
+from graphvio.frontend.observations import Observations, RigArrays
+from graphvio.frontend.ransac import hypothesise, preempt
+from graphvio.frontend.refinement import Refined, explained, refine
+
+
+def joint_motion(
+    rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
+) -> Refined:
+    """Hypotheses of every pair, scored on every pair, and the winner refined on all points (section 3.1).
+
+    Args:
+        rig: of P pairs.
+        observations: of any subset of them.
+        predicted: ``cur_T_ref`` (4, 4), one more hypothesis.
+        config: of this stage.
+        rng: source of the random triples.
+    """
+    hypotheses = [predicted[None]]
+    for pair in np.unique(observations.pair):
+        hypotheses.append(
+            hypothesise(rig, observations, int(pair), config.hypotheses, config.pixel_sigma_px, rng)
+        )
+    winner = preempt(rig, observations, np.concatenate(hypotheses), config.chunk_points, config.cauchy_scale_px, rng)
+    return refine(rig, observations, winner, config)
+
+
+def best_pair_motion(
+    rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
+) -> Refined:
+    """Each pair estimates alone; the pose of least global cost wins, eq. (4). For arguments see `joint_motion`."""
+    candidates = [
+        joint_motion(rig, observations.of_pair(int(pair)), predicted, config, rng)
+        for pair in np.unique(observations.pair)
+    ]
+    costs = [global_cost(rig, observations, candidate.cur_T_ref, config.cauchy_scale_px) for candidate in candidates]
+    winner = candidates[int(np.argmin(costs))]
+    inlier = explained(rig, observations, winner.cur_T_ref, config)
+    return Refined(winner.cur_T_ref, winner.covariance, inlier, winner.cost)
+
+
+def global_cost(rig: RigArrays, observations: Observations, cur_T_ref: Float, cauchy_scale_px: float) -> float:
+    """The cost of a motion (4, 4) on the points of all pairs, eq. (3)."""
+    return robust_cost(
+        cur_T_ref,
+        *rig,
+        observations.pair,
+        observations.points,
+        observations.left,
+        observations.right,
+        observations.has_right,
+        np.arange(len(observations.pair)),
+        cauchy_scale_px,
+    )

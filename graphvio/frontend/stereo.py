@@ -1,0 +1,184 @@
+"""Left-right matching along the epipolar curve, and triangulation with covariance (section 3).
+
+A point is held in the left camera's frame by its inverse depth, ``(x, y, w)`` with ``w = 1 / Z``: homogeneous
+coordinates ``[x, y, 1, w]``. Points so far away that their depth is unknown are then as regular as any other, and
+keep what they say about rotation.
+"""
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float, Image
+from graphvio.cameras import distort
+from graphvio.kernels import kernel
+
+_HALF_PATCH = 5
+_AMBIGUOUS = 0.97
+_GAUSS_NEWTON_STEPS = 4
+
+
+@kernel
+def epipolar_search(
+    left: Image,
+    right: Image,
+    pixels: Float,
+    rays: Float,
+    inverse_depths: Float,
+    right_T_left: Float,
+    model: int,
+    intrinsics: Float,
+    distortion: Float,
+    min_correlation: float,
+) -> tuple[Float, Bool]:
+    """The best place of each corner on its epipolar curve in the right image, to the pixel.
+
+    Args:
+        left: image (height, width).
+        right: image (height, width).
+        pixels: (N, 2) corners in the left image.
+        rays: (N, 2) their normalised coordinates.
+        inverse_depths: (N, 2) range that is searched, 1/m.
+        right_T_left: (4, 4).
+        model: of the right camera, with its ``intrinsics`` (4,) and ``distortion`` (5,).
+        min_correlation: least normalised cross-correlation.
+
+    Returns:
+        Pixels (N, 2) in the right image, and whether there is one clear best place (N,).
+    """
+    n = len(pixels)
+    matches = np.zeros((n, 2))
+    found = np.zeros(n, dtype=np.bool_)
+    height, width = right.shape
+    patch = np.empty((2 * _HALF_PATCH + 1, 2 * _HALF_PATCH + 1))
+    for i in range(n):
+        if not _normalised_patch(left, pixels[i, 0], pixels[i, 1], patch):
+            continue
+        u0, v0, ok0 = _on_curve(rays[i], inverse_depths[i, 0], right_T_left, model, intrinsics, distortion)
+        u1, v1, ok1 = _on_curve(rays[i], inverse_depths[i, 1], right_T_left, model, intrinsics, distortion)
+        if not (ok0 and ok1):
+            continue
+        steps = min(max(int(np.hypot(u1 - u0, v1 - v0)) + 1, 2), 400)
+        scores = np.full(steps + 1, -1.0)
+        best, best_step = -1.0, -1
+        for k in range(steps + 1):
+            w = inverse_depths[i, 0] + (inverse_depths[i, 1] - inverse_depths[i, 0]) * k / steps
+            u, v, ok = _on_curve(rays[i], w, right_T_left, model, intrinsics, distortion)
+            x, y = round(u), round(v)
+            if not ok or x < _HALF_PATCH or y < _HALF_PATCH or x >= width - _HALF_PATCH or y >= height - _HALF_PATCH:
+                continue
+            scores[k] = _correlation(right, int(x), int(y), patch)
+            if scores[k] > best:
+                best, best_step = scores[k], k
+                matches[i, 0], matches[i, 1] = u, v
+        if best < min_correlation:
+            continue
+        found[i] = True
+        for k in range(steps + 1):
+            if abs(k - best_step) > 3 and scores[k] > _AMBIGUOUS * best:
+                found[i] = False  # a repeating texture: another place is as good
+    return matches, found
+
+
+@kernel
+def triangulate(
+    left: Float, right: Float, right_T_left: Float, focal_left: float, focal_right: float
+) -> tuple[Float, Float, Float]:
+    """Points of least squared reprojection error in both images, with covariance for a pixel noise of 1 px.
+
+    Args:
+        left: (N, 2) normalised coordinates.
+        right: (N, 2) normalised coordinates.
+        right_T_left: (4, 4).
+        focal_left: pixels, which weigh the two images.
+        focal_right: pixels.
+
+    Returns:
+        Points (N, 3) ``[x, y, 1/Z]`` in the left camera's frame, their covariances (N, 3, 3) per px^2, and the
+        reprojection errors (N,) in pixels, which measure the distance from the epipolar line.
+    """
+    n = len(left)
+    points = np.zeros((n, 3))
+    covariances = np.zeros((n, 3, 3))
+    errors = np.full(n, np.inf)
+    r = right_T_left
+    jacobian = np.zeros((4, 3))
+    residual = np.empty(4)
+    for i in range(n):
+        a, b, w = left[i, 0], left[i, 1], 0.0
+        hessian = np.zeros((3, 3))
+        regular = True
+        for _ in range(_GAUSS_NEWTON_STEPS):
+            y0 = r[0, 0] * a + r[0, 1] * b + r[0, 2] + w * r[0, 3]
+            y1 = r[1, 0] * a + r[1, 1] * b + r[1, 2] + w * r[1, 3]
+            y2 = r[2, 0] * a + r[2, 1] * b + r[2, 2] + w * r[2, 3]
+            if y2 < 1e-3:
+                regular = False
+                break
+            u, v = y0 / y2, y1 / y2
+            residual[0], residual[1] = focal_left * (left[i, 0] - a), focal_left * (left[i, 1] - b)
+            residual[2], residual[3] = focal_right * (right[i, 0] - u), focal_right * (right[i, 1] - v)
+            jacobian[0, 0], jacobian[1, 1] = focal_left, focal_left
+            for c in range(3):
+                column = c if c < 2 else 3
+                jacobian[2, c] = focal_right * (r[0, column] - u * r[2, column]) / y2
+                jacobian[3, c] = focal_right * (r[1, column] - v * r[2, column]) / y2
+            hessian = jacobian.T @ jacobian
+            step = np.linalg.solve(hessian, jacobian.T @ residual)
+            a, b, w = a + step[0], b + step[1], w + step[2]
+        if not regular:
+            continue
+        points[i, 0], points[i, 1], points[i, 2] = a, b, w
+        covariances[i] = np.linalg.inv(hessian)
+        errors[i] = np.sqrt(np.sum((residual - jacobian @ step) ** 2))
+    return points, covariances, errors
+
+
+@kernel
+def _on_curve(
+    ray: Float, w: float, right_T_left: Float, model: int, intrinsics: Float, distortion: Float
+) -> tuple[float, float, bool]:
+    r = right_T_left
+    z = r[2, 0] * ray[0] + r[2, 1] * ray[1] + r[2, 2] + w * r[2, 3]
+    if z < 1e-3:
+        return 0.0, 0.0, False
+    x = (r[0, 0] * ray[0] + r[0, 1] * ray[1] + r[0, 2] + w * r[0, 3]) / z
+    y = (r[1, 0] * ray[0] + r[1, 1] * ray[1] + r[1, 2] + w * r[1, 3]) / z
+    if x * x + y * y > 9.0:
+        return 0.0, 0.0, False
+    xd, yd, _, _, _, _ = distort(model, distortion, x, y)
+    return intrinsics[0] * xd + intrinsics[2], intrinsics[1] * yd + intrinsics[3], True
+
+
+@kernel
+def _normalised_patch(image: Image, x: float, y: float, patch: Float) -> bool:
+    """Fill the patch around (x, y) with zero mean and unit norm; False at the edge or without contrast."""
+    cx, cy = round(x), round(y)
+    height, width = image.shape
+    if cx < _HALF_PATCH or cy < _HALF_PATCH or cx >= width - _HALF_PATCH or cy >= height - _HALF_PATCH:
+        return False
+    mean = 0.0
+    for j in range(patch.shape[0]):
+        for i in range(patch.shape[1]):
+            value = float(image[int(cy) + j - _HALF_PATCH, int(cx) + i - _HALF_PATCH])
+            patch[j, i] = value
+            mean += value
+    patch -= mean / patch.size
+    norm = np.sqrt(np.sum(patch * patch))
+    if norm < 1e-6:
+        return False
+    patch /= norm
+    return True
+
+
+@kernel
+def _correlation(image: Image, cx: int, cy: int, patch: Float) -> float:
+    total = square = product = 0.0
+    for j in range(patch.shape[0]):
+        for i in range(patch.shape[1]):
+            value = float(image[cy + j - _HALF_PATCH, cx + i - _HALF_PATCH])
+            total += value
+            square += value * value
+            product += value * patch[j, i]
+    variance = square - total * total / patch.size
+    if variance < 1e-6:
+        return -1.0
+    return product / np.sqrt(variance)
