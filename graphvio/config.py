@@ -44,7 +44,7 @@ class StereoConfig:
     min_depth_m: float = 0.3
     max_epipolar_px: float = 1.0
     """Largest distance of a right corner from the epipolar line of its left one."""
-    min_correlation: float = 0.8
+    min_correlation: float = 0.7
     """Least normalised cross-correlation of the two patches."""
 
 

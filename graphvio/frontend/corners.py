@@ -23,14 +23,21 @@ def occupied_cells(pixels: Float, cell_px: int, rows: int, columns: int) -> Bool
 
 @kernel
 def find_corners(
-    image: Image, allowed: Bool, tracked: Float, cell_px: int, border_px: int, min_response: float
+    image: Image,
+    allowed: Bool,
+    tracked: Float,
+    settled: Bool,
+    cell_px: int,
+    border_px: int,
+    min_response: float,
 ) -> Float:
-    """The strongest Harris corner of each cell without a tracked pixel, to sub-pixel precision.
+    """The strongest Harris corner of each cell without a settled track, to sub-pixel precision.
 
     Args:
         image: (height, width).
         allowed: (height, width), False where the image must not be used.
         tracked: (N, 2) pixels that are tracked already; a new corner keeps half a cell of distance to them.
+        settled: (N,) which of them are good enough for their cell to need no other.
         cell_px: side of a cell.
         border_px: width of the margin without corners.
         min_response: least rms gradient, in grey levels per pixel, along a corner's weaker direction.
@@ -40,7 +47,7 @@ def find_corners(
     """
     height, width = image.shape
     rows, columns = (height + cell_px - 1) // cell_px, (width + cell_px - 1) // cell_px
-    occupied = occupied_cells(tracked, cell_px, rows, columns)
+    occupied = occupied_cells(tracked[settled], cell_px, rows, columns)
     margin = max(border_px, _RADIUS + 2)
     found = np.empty((rows * columns + len(tracked), 2))
     found[: len(tracked)] = tracked
@@ -59,22 +66,27 @@ def find_corners(
             for y in range(1, y1 - y0 + 1):
                 for x in range(1, x1 - x0 + 1):
                     r = response[y, x]
-                    if r > best and weaker[y, x] > min_response and allowed[y0 - 1 + y, x0 - 1 + x]:
+                    if r <= best or weaker[y, x] <= min_response or not allowed[y0 - 1 + y, x0 - 1 + x]:
+                        continue
+                    if _distance2(found[:count], x0 - 1.0 + x, y0 - 1.0 + y) >= least_distance2:
                         best, bx, by = r, x, y
             if bx < 0 or not _is_peak(response, bx, by):
                 continue
             px = x0 - 1 + bx + _peak_offset(response[by, bx - 1], best, response[by, bx + 1])
             py = y0 - 1 + by + _peak_offset(response[by - 1, bx], best, response[by + 1, bx])
-            free = True
-            for i in range(count):
-                dx, dy = found[i, 0] - px, found[i, 1] - py
-                if dx * dx + dy * dy < least_distance2:
-                    free = False
-                    break
-            if free:
-                found[count, 0], found[count, 1] = px, py
-                count += 1
+            found[count, 0], found[count, 1] = px, py
+            count += 1
     return found[len(tracked) : count]
+
+
+@kernel
+def _distance2(pixels: Float, x: float, y: float) -> float:
+    """Squared distance from (x, y) to the nearest of pixels (N, 2)."""
+    least = np.inf
+    for i in range(len(pixels)):
+        dx, dy = pixels[i, 0] - x, pixels[i, 1] - y
+        least = min(least, dx * dx + dy * dy)
+    return least
 
 
 @kernel

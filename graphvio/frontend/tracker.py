@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from graphvio.frontend.stereo import epipolar_search, triangulate
 from graphvio.rig import Camera, StereoPair
 
 _MAX_TRACKS_PER_CELL = 2
+_MAX_FLAT_FRAMES = 3  # then another corner of the cell gets its chance
 _REFINEMENT_LEVELS = 2
 _MAX_REFINEMENT_PX = 3.0
 _SEARCH_MARGIN_PX = 6.0
@@ -35,6 +36,7 @@ class PairFrame:
         points: (N, 3) ``[x, y, 1/Z]`` in the left camera's frame, see `graphvio.frontend.stereo`.
         covariances: (N, 3, 3) of ``points``, for a pixel noise of 1 px.
         has_depth: (N,) whether the stereo match passed all its tests.
+        flat_for: (N,) number of frames, up to this one, without depth.
         rejected: what each test of tracking and stereo matching threw out.
     """
 
@@ -46,7 +48,13 @@ class PairFrame:
     points: Float
     covariances: Float
     has_depth: Bool
+    flat_for: Int
     rejected: Mapping[str, int]
+
+    def keep(self, rows: Bool) -> PairFrame:
+        """The same with only some of its tracks."""
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        return PairFrame(**{k: v[rows] if isinstance(v, np.ndarray) else v for k, v in columns.items()})
 
 
 class PairTracker:
@@ -70,24 +78,25 @@ class PairTracker:
             left_T_left_prev: (4, 4) predicted motion of points since the images before, or None if unknown.
         """
         rejected: dict[str, int] = {}
-        ids, pixels, inverse_depth = self._follow(left, left_T_left_prev, rejected)
-        corners = self._config.corners
-        new = find_corners(left, self._allowed, pixels, corners.cell_px, corners.border_px, corners.min_response)
-        ids = np.concatenate([ids, self._next_id + np.arange(len(new))])
+        kept, pixels, inverse_depth = self._follow(left, left_T_left_prev, rejected)
+        new = self._renew(left, pixels, np.isfinite(inverse_depth))
+        ids = np.concatenate([kept.ids, self._next_id + np.arange(len(new))])
+        flat_for = np.concatenate([kept.flat_for, np.zeros(len(new), dtype=np.int64)])
         self._next_id += len(new)
         pixels = np.concatenate([pixels, new])
         inverse_depth = np.concatenate([inverse_depth, np.full(len(new), np.nan)])
         rays, has_ray = self._pair.left.unproject(pixels)
-        ids, pixels, rays, inverse_depth = ids[has_ray], pixels[has_ray], rays[has_ray], inverse_depth[has_ray]
         normalised_right, matched = self._match(left, right, pixels, rays, inverse_depth, rejected)
         points, covariances, errors = triangulate(
             rays, normalised_right, self._pair.right_T_left, self._pair.left.focal_px, self._pair.right.focal_px
         )
+        matched &= has_ray
         on_line = errors <= self._config.stereo.max_epipolar_px
         near = points[:, 2] > 1.0 / self._config.stereo.min_depth_m
         behind = points[:, 2] < -3.0 * np.sqrt(covariances[:, 2, 2]) * self._config.motion.pixel_sigma_px
         rejected["epipolar"] = int((matched & ~on_line).sum())
         rejected["depth_range"] = int((matched & on_line & (near | behind)).sum())
+        has_depth = matched & on_line & ~near & ~behind
         frame = PairFrame(
             stamp_ns=stamp_ns,
             ids=ids,
@@ -96,34 +105,28 @@ class PairTracker:
             right=normalised_right,
             points=points,
             covariances=covariances,
-            has_depth=matched & on_line & ~near & ~behind,
+            has_depth=has_depth,
+            flat_for=np.where(has_depth, 0, flat_for + 1),
             rejected=rejected,
-        )
+        ).keep(has_ray)
         self._last, self._last_image = frame, left
         return frame
 
     def drop(self, ids: Int) -> None:
         """Forget tracks, so that fresh corners may take their place."""
         if self._last is not None and len(ids):
-            keep = ~np.isin(self._last.ids, ids)
-            self._last = PairFrame(
-                self._last.stamp_ns,
-                *(
-                    getattr(self._last, name)[keep]
-                    for name in ("ids", "pixels", "left", "right", "points", "covariances", "has_depth")
-                ),
-                self._last.rejected,
-            )
+            self._last = self._last.keep(~np.isin(self._last.ids, ids))
 
     def _follow(
         self, image: Image, left_T_left_prev: Float | None, rejected: dict[str, int]
-    ) -> tuple[Int, Float, Float]:
-        """Ids, pixels and predicted inverse depths (NaN: unknown) of the tracks that are still there."""
+    ) -> tuple[PairFrame, Float, Float]:
+        """The tracks that are still there, as they were, with their pixels and predicted inverse depths (NaN: unknown)."""
         last = self._last
-        if last is None or self._last_image is None or len(last.ids) == 0:
-            return np.zeros(0, dtype=np.int64), np.zeros((0, 2)), np.zeros(0)
+        if last is None or self._last_image is None:
+            return _NOTHING, np.zeros((0, 2)), np.zeros(0)
         if self._last_image.shape != image.shape:
             raise RigError(f"pair {self._pair.name}: image size changed to {image.shape[::-1]}; one rig has one size")
+        last = last.keep(last.flat_for <= _MAX_FLAT_FRAMES)
         guess, inverse_depth = last.pixels, np.where(last.has_depth, last.points[:, 2], np.nan)
         if left_T_left_prev is not None:
             guess, inverse_depth = self._predict(last, left_T_left_prev)
@@ -143,7 +146,14 @@ class PairTracker:
         whole = np.where(found[:, None], pixels, 0).round().astype(np.int64)
         found &= self._allowed[whole[:, 1], whole[:, 0]]
         found &= _thinned(pixels, found, self._config.corners.cell_px)
-        return last.ids[found], pixels[found], inverse_depth[found]
+        return last.keep(found), pixels[found], inverse_depth[found]
+
+    def _renew(self, image: Image, pixels: Float, has_depth: Bool) -> Float:
+        """New corners (M, 2) where no track gives geometry."""
+        settings = self._config.corners
+        return find_corners(
+            image, self._allowed, pixels, has_depth, settings.cell_px, settings.border_px, settings.min_response
+        )
 
     def _predict(self, last: PairFrame, left_T_left_prev: Float) -> tuple[Float, Float]:
         """Pixels (N, 2) and inverse depths (N,) of the tracks after a motion."""
@@ -221,3 +231,17 @@ def _allowed(camera: Camera) -> Bool:
     if mask is None or mask.shape != (height, width):
         raise RigError(f"camera {camera.name}: mask {camera.mask} is no image of {width}x{height} pixels")
     return np.asarray(mask > 0)
+
+
+_NOTHING = PairFrame(
+    stamp_ns=0,
+    ids=np.zeros(0, dtype=np.int64),
+    pixels=np.zeros((0, 2)),
+    left=np.zeros((0, 2)),
+    right=np.zeros((0, 2)),
+    points=np.zeros((0, 3)),
+    covariances=np.zeros((0, 3, 3)),
+    has_depth=np.zeros(0, dtype=bool),
+    flat_for=np.zeros(0, dtype=np.int64),
+    rejected={},
+)
