@@ -68,6 +68,8 @@ class MotionConfig:
     """Standard deviation of a tracked corner's position in one image."""
     max_error_px: float = 3.0
     """Reprojection error beyond which a point is no inlier."""
+    sigma_inflation: float = 2.5
+    """Factor on a motion's standard deviations: motions from one keyframe share the errors of its points."""
     min_inliers: int = 12
     min_inlier_share: float = 0.3
     """Motions that explain fewer points, or a smaller share of them, are refused."""

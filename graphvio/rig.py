@@ -1,7 +1,7 @@
 """The rig: stereo pairs and an IMU, rigidly joined, with everything that calibration knows of them.
 
-All extrinsics are ``body_T_cam``. Body is the IMU's frame; a rig without an IMU may choose any. The objects check
-themselves when they are made and are never changed afterwards.
+All extrinsics are ``body_T_cam``. Body is the IMU's frame; a rig without an IMU may choose any. The objects
+check themselves when they are made and are never changed afterwards.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Camera:
 
     Attributes:
         name: unique in the rig, such as ``cam0``.
-        model: ``radial-tangential`` (pinhole with Brown distortion) or ``equidistant`` (Kannala-Brandt fisheye).
+        model: ``radial-tangential`` (pinhole, Brown distortion) or ``equidistant`` (Kannala-Brandt fisheye).
         size_px: (width, height).
         intrinsics: (4,) ``[fx, fy, cx, cy]``, pixels.
         distortion: (5,), see `graphvio.cameras`; shorter input is filled with zeros.
@@ -57,13 +57,15 @@ class Camera:
             raise RigError(f"{where}: unknown model {self.model!r}; use one of {', '.join(MODEL_NAMES)}")
         width, height = self.size_px
         if width < 16 or height < 16:
-            raise RigError(f"{where}: image size {width}x{height} is too small; give size_px as [width, height]")
+            raise RigError(f"{where}: image size {width}x{height} is too small; size_px is [width, height]")
         intrinsics = _finite(self.intrinsics, (4,), f"{where}: intrinsics [fx, fy, cx, cy]")
         if intrinsics[0] <= 0 or intrinsics[1] <= 0:
             raise RigError(f"{where}: focal lengths {intrinsics[:2].tolist()} must be positive, in pixels")
         given = np.asarray(self.distortion, dtype=np.float64).ravel()
         if len(given) > 5:
-            raise RigError(f"{where}: {len(given)} distortion coefficients; at most 5 [k1, k2, p1, p2, k3] are known")
+            raise RigError(
+                f"{where}: {len(given)} distortion coefficients; give at most 5 [k1, k2, p1, p2, k3]"
+            )
         distortion = _finite(np.pad(given, (0, 5 - len(given))), (5,), f"{where}: distortion")
         _set(self, "size_px", (int(width), int(height)))
         _set(self, "intrinsics", intrinsics)
@@ -126,8 +128,8 @@ class StereoPair:
         axes_deg = np.rad2deg(np.arccos(np.clip(self.right_T_left[2, 2], -1.0, 1.0)))
         if axes_deg > _MAX_AXES_ANGLE_DEG:
             raise RigError(
-                f"{where}: optical axes are {axes_deg:.0f} degrees apart (at most {_MAX_AXES_ANGLE_DEG:.0f}); "
-                "check which cameras form a pair and the direction of body_T_cam"
+                f"{where}: optical axes are {axes_deg:.0f} degrees apart (at most "
+                f"{_MAX_AXES_ANGLE_DEG:.0f}); check which cameras form a pair and the direction of body_T_cam"
             )
 
     @cached_property
@@ -172,7 +174,9 @@ class Imu:
             if name != "time_offset_s" and value <= 0:
                 raise RigError(f"imu: {name} is {value}; it must be positive")
         if abs(self.time_offset_s) > 1.0:
-            raise RigError(f"imu: time_offset_s is {self.time_offset_s}; more than a second is surely in other units")
+            raise RigError(
+                f"imu: time_offset_s is {self.time_offset_s}; it must be in seconds, less than one"
+            )
 
     @property
     def time_offset_ns(self) -> int:
@@ -208,7 +212,7 @@ class Rig:
         return tuple(camera for pair in self.pairs for camera in (pair.left, pair.right))
 
     def left2_T_left1(self, first: int = 0, second: int = 1) -> Float:
-        """``P_12`` of the paper's eq. (1): (4, 4), maps points of the first pair's left camera to the second's."""
+        """``P_12`` of the paper's eq. (1): (4, 4), maps points of the first left camera to the second's."""
         return self.pairs[second].left.cam_T_body @ self.pairs[first].left.body_T_cam
 
     def with_pairs(self, indices: Sequence[int]) -> Rig:
@@ -219,7 +223,9 @@ class Rig:
         """
         for index in indices:
             if not 0 <= index < len(self.pairs):
-                raise RigError(f"{self.name}: there is no pair {index}; its pairs are 0 to {len(self.pairs) - 1}")
+                raise RigError(
+                    f"{self.name}: there is no pair {index}; choose from 0 to {len(self.pairs) - 1}"
+                )
         return replace(self, pairs=tuple(self.pairs[i] for i in indices))
 
     def without_imu(self) -> Rig:
@@ -228,7 +234,7 @@ class Rig:
 
     @staticmethod
     def load(path: str | Path) -> Rig:
-        """Read a rig from graphvio's ``rig.yaml``, a Kalibr, EuRoC/ASL or KITTI calibration: see `graphvio.rig_files`.
+        """Read a rig from ``rig.yaml``, or Kalibr's, EuRoC's or KITTI's files: see `graphvio.rig_files`.
 
         Raises:
             RigError: if the file cannot be read or describes no usable rig.
@@ -255,8 +261,8 @@ def checked_transform(matrix: object, where: str) -> Float:
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if off > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         raise RigError(
-            f"{where}: the upper left 3x3 block is no rotation (R R^T differs from 1 by {off:.2g}, determinant "
-            f"{np.linalg.det(rotation):.3g}); check that the matrix is complete and row-major"
+            f"{where}: the upper left 3x3 block is no rotation (R R^T differs from 1 by {off:.2g}, "
+            f"determinant {np.linalg.det(rotation):.3g}); check that the matrix is complete and row-major"
         )
     if np.abs(transform[3] - [0, 0, 0, 1]).max() > 1e-9:
         raise RigError(f"{where}: the last row is {transform[3].tolist()}; it must be [0, 0, 0, 1]")

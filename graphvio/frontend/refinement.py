@@ -19,7 +19,7 @@ from graphvio.kernels import kernel
 _ROUNDS = 3
 _STEPS_PER_ROUND = 6
 _CONVERGED = 1e-7
-_MIN_VARIANCE_FACTOR = 0.25
+_MIN_VARIANCE_FACTOR = 0.5
 _WEAK_DIRECTION_SIGMA = 10.0
 
 
@@ -49,7 +49,7 @@ def refine(rig: RigArrays, observations: Observations, cur_T_ref: Float, config:
     # Backward propagation of the reprojection covariance: the inverse of the robustly weighted normal matrix,
     # scaled by what the residuals say of the noise. The small prior keeps unconstrained directions finite.
     covariance = np.linalg.inv(hessian + np.eye(6) / _WEAK_DIRECTION_SIGMA**2)
-    covariance *= _variance_factor(errors2[inlier], scale, observations.has_right[inlier])
+    covariance *= config.sigma_inflation**2 * _variance_factor(errors2[inlier], scale, observations.has_right[inlier])
     return Refined(pose, 0.5 * (covariance + covariance.T), inlier, cost)
 
 

@@ -1,0 +1,45 @@
+"""The chi-square test of a measured motion against its prediction (section 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphvio.arrays import Float
+from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
+
+_DEGREES_OF_FREEDOM = 6
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Outcome of a gate.
+
+    Attributes:
+        accepted: whether the measurement may be used.
+        statistic: squared Mahalanobis distance of the innovation.
+        threshold: the largest that is accepted.
+    """
+
+    accepted: bool
+    statistic: float
+    threshold: float
+
+
+def relative_covariance(a_T_b: Float, joint: Float) -> Float:
+    """Covariance (6, 6) of ``a_T_b``, in frame b, from the joint covariance (12, 12) of the poses of a and b."""
+    jacobian = np.hstack([-se3_adjoint(se3_inverse(a_T_b)), np.eye(6)])
+    return np.asarray(jacobian @ joint @ jacobian.T)
+
+
+def gate(
+    measured: Float, measured_covariance: Float, predicted: Float, predicted_covariance: Float, probability: float
+) -> Verdict:
+    """Test a motion (4, 4) against a predicted one; covariances (6, 6) in the frame that it ends in."""
+    innovation = se3_log(se3_inverse(measured) @ predicted)
+    covariance = measured_covariance + predicted_covariance
+    statistic = float(innovation @ np.linalg.solve(covariance, innovation))
+    threshold = float(chi2.ppf(probability, _DEGREES_OF_FREEDOM))
+    return Verdict(statistic <= threshold, statistic, threshold)

@@ -1,0 +1,87 @@
+"""The first attitude and gyro bias, from the accelerometer's and gyro's samples before the first frameset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.inertial import GRAVITY_M_S2, ImuSpan
+from graphvio.config import InitialisationConfig
+from graphvio.geometry import so3_exp
+
+_MIN_REST_S = 0.3
+_SPEED_CHANGE_SIGMA_M_S = 0.7
+_ACCEL_BIAS_SIGMA_M_S2 = 0.15
+_UNKNOWN_GYRO_BIAS_SIGMA = 0.1
+_STEEP = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class InitialAttitude:
+    """What is known before vision has said anything.
+
+    Attributes:
+        nav_R_body: (3, 3), gravity down, heading zero.
+        tilt_sigma_rad: of roll and pitch.
+        gyro_bias: (3,) rad/s.
+        gyro_bias_sigma: rad/s.
+        at_rest: whether the rig stood still.
+    """
+
+    nav_R_body: Float
+    tilt_sigma_rad: float
+    gyro_bias: Float
+    gyro_bias_sigma: float
+    at_rest: bool
+
+
+def initial_attitude(span: ImuSpan | None, config: InitialisationConfig) -> InitialAttitude | None:
+    """Attitude at the end of a span of the IMU.
+
+    At rest the mean specific force is gravity and the mean rate is the gyro's bias. In motion, the specific force,
+    turned by the gyro into the last instant's frame, still averages to gravity but for the change of speed, whose
+    share falls with the duration; the bias is then left to the smoother.
+    """
+    if span is None:
+        return None
+    duration = float(span.steps_s.sum())
+    rate_spread = float(np.sqrt(span.angular_velocity.var(axis=0).max()))
+    force_spread = float(np.sqrt(span.linear_acceleration.var(axis=0).max()))
+    mean_force = span.linear_acceleration.mean(axis=0)
+    at_rest = (
+        duration >= _MIN_REST_S
+        and rate_spread < config.static_gyro_rad_s
+        and force_spread < config.static_accel_m_s2
+        and abs(float(np.linalg.norm(mean_force)) - GRAVITY_M_S2) < 0.5
+        and float(np.linalg.norm(span.mean_rate)) < 0.2  # beyond any gyro's bias
+    )
+    tilt_sigma = _ACCEL_BIAS_SIGMA_M_S2 / GRAVITY_M_S2
+    if at_rest:
+        samples = len(span.steps_s)
+        bias_sigma = max(3.0 * rate_spread / np.sqrt(samples), 1e-4)
+        return InitialAttitude(level(mean_force), tilt_sigma, span.mean_rate, float(bias_sigma), True)
+    force = np.zeros(3)
+    last_R_body = np.eye(3)  # from the frame of each step to that of the last instant
+    for step, rate, specific in zip(
+        span.steps_s[::-1], span.angular_velocity[::-1], span.linear_acceleration[::-1], strict=True
+    ):
+        last_R_body = last_R_body @ so3_exp(-step * rate)
+        force += step * (last_R_body @ specific)
+    motion_sigma = _SPEED_CHANGE_SIGMA_M_S / (GRAVITY_M_S2 * duration)
+    return InitialAttitude(
+        level(force), min(tilt_sigma + motion_sigma, 0.5), np.zeros(3), _UNKNOWN_GYRO_BIAS_SIGMA, False
+    )
+
+
+def level(up: Float) -> Float:
+    """``nav_R_body`` (3, 3) that turns a direction (3,) of body upright, with heading zero.
+
+    Heading is that of body's x axis, or where x is steep, of its z axis.
+    """
+    up = up / np.linalg.norm(up)
+    forward = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < _STEEP else np.array([0.0, 0.0, 1.0])
+    x = forward - (forward @ up) * up
+    x /= np.linalg.norm(x)
+    return np.array([x, np.cross(up, x), up])

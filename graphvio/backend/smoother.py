@@ -1,0 +1,265 @@
+"""The estimator: a fixed-lag smoother over poses, velocities and IMU biases at frameset times (section 5).
+
+It has the semantics of the paper's filter. `extend` predicts, from the IMU or by constant velocity (eq. 11); `test`
+is the chi-square test of a vision measurement's innovation; `accept` and `settle` update; `start` resets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.gating import Verdict, gate, relative_covariance
+from graphvio.backend.inertial import ImuSpan, preintegrate, preintegration_params
+from graphvio.backend.window import Window
+from graphvio.config import SmootherConfig
+from graphvio.frontend.visual import RelativeMotion
+from graphvio.geometry import se3_exp, se3_inverse, se3_log
+from graphvio.rig import Imu
+
+_POSITION_SIGMA_M = 1e-3
+_HEADING_SIGMA_RAD = 1e-3
+_ACCEL_BIAS_SIGMA = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class RigState:
+    """The rig at one instant.
+
+    Attributes:
+        nav_T_body: (4, 4).
+        velocity_nav: (3,) m/s.
+        gyro_bias: (3,) rad/s.
+        accel_bias: (3,) m/s^2.
+    """
+
+    nav_T_body: Float
+    velocity_nav: Float
+    gyro_bias: Float
+    accel_bias: Float
+
+
+@dataclass(frozen=True)
+class StartUncertainty:
+    """Standard deviations of a start; position and heading are the frame's origin and known."""
+
+    tilt_rad: float
+    velocity_m_s: float
+    gyro_bias_rad_s: float
+
+
+class Smoother:
+    """Poses, and with an IMU velocities and biases, over the last seconds."""
+
+    def __init__(self, config: SmootherConfig, imu: Imu | None) -> None:
+        self._config = config
+        self._imu = imu
+        self._params = None if imu is None else preintegration_params(imu, config.imu_noise_scale)
+        self._window = Window()
+        self._stamps: list[int] = []
+        self._index = 0
+        self._index_of: dict[int, int] = {}
+        self._previous_motion = np.zeros(6)  # tangent per second
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether velocities and biases are estimated."""
+        return self._imu is not None
+
+    @property
+    def latest_ns(self) -> int:
+        """Stamp of the newest state."""
+        return self._stamps[-1]
+
+    def start(self, stamp_ns: int, state: RigState, uncertainty: StartUncertainty) -> None:
+        """Begin, or begin anew, with one state."""
+        self._window = Window()
+        self._stamps, self._index_of = [], {}
+        self._previous_motion = np.zeros(6)
+        k = self._append(stamp_ns, state)
+        rotation = state.nav_T_body[:3, :3]
+        tilt = np.diag([uncertainty.tilt_rad, uncertainty.tilt_rad, _HEADING_SIGMA_RAD]) ** 2  # about nav's axes
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = rotation.T @ tilt @ rotation
+        covariance[3:, 3:] = np.eye(3) * _POSITION_SIGMA_M**2
+        pose_noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        self._window.add(gtsam.PriorFactorPose3(_x(k), gtsam.Pose3(state.nav_T_body), pose_noise))
+        if self.has_imu:
+            self._window.add(
+                gtsam.PriorFactorVector(_v(k), state.velocity_nav, _isotropic(3, uncertainty.velocity_m_s))
+            )
+            sigmas = np.repeat([_ACCEL_BIAS_SIGMA, uncertainty.gyro_bias_rad_s], 3)
+            bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
+            self._window.add(
+                gtsam.PriorFactorConstantBias(_b(k), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+            )
+
+    def extend(self, stamp_ns: int, span: ImuSpan | None) -> RigState:
+        """Predict the next state and append it; without a span of the IMU, by constant velocity."""
+        i = self._index_of[self.latest_ns]
+        dt = (stamp_ns - self.latest_ns) * 1e-9
+        before = self.state()
+        if span is None or self._params is None:
+            motion = se3_exp(self._previous_motion * dt)
+            state = RigState(before.nav_T_body @ motion, before.velocity_nav, before.gyro_bias, before.accel_bias)
+            j = self._append(stamp_ns, state)
+            self._link_by_constant_velocity(i, j, motion, dt)
+            return state
+        bias = gtsam.imuBias.ConstantBias(before.accel_bias, before.gyro_bias)
+        measurements = preintegrate(span, self._params, bias)
+        predicted = measurements.predict(gtsam.NavState(gtsam.Pose3(before.nav_T_body), before.velocity_nav), bias)
+        state = RigState(
+            predicted.pose().matrix(), np.asarray(predicted.velocity()), before.gyro_bias, before.accel_bias
+        )
+        j = self._append(stamp_ns, state)
+        self._window.add(gtsam.CombinedImuFactor(_x(i), _v(i), _x(j), _v(j), _b(i), _b(j), measurements))
+        return state
+
+    def knows(self, stamp_ns: int) -> bool:
+        """Whether there is a state of this stamp in the window."""
+        return stamp_ns in self._index_of
+
+    def pose(self, stamp_ns: int) -> Float:
+        """``nav_T_body`` (4, 4) of a state in the window."""
+        return np.asarray(self._window.values.atPose3(_x(self._index_of[stamp_ns])).matrix())
+
+    def state(self) -> RigState:
+        """The newest state."""
+        k = self._index_of[self.latest_ns]
+        values = self._window.values
+        pose = np.asarray(values.atPose3(_x(k)).matrix())
+        if not self.has_imu:
+            return RigState(pose, pose[:3, :3] @ self._previous_motion[3:], np.zeros(3), np.zeros(3))
+        bias = values.atConstantBias(_b(k))
+        return RigState(
+            pose, np.asarray(values.atVector(_v(k))), np.asarray(bias.gyroscope()), np.asarray(bias.accelerometer())
+        )
+
+    def latest_rate(self) -> Float | None:
+        """Mean angular rate (3,) rad/s of body between the two newest states, or None when there is one."""
+        return self._previous_motion[:3] if len(self._stamps) > 1 else None
+
+    def covariance(self) -> Float:
+        """Covariance (6, 6) of the newest pose, tangent ``[rotation, translation]`` in body."""
+        return self._window.joint_covariance([_x(self._index_of[self.latest_ns])])
+
+    def covariance_since(self, stamp_ns: int) -> Float:
+        """Covariance (6, 6) of the motion from a state in the window to the newest one, in the newest body frame."""
+        i, j = self._index_of[stamp_ns], self._index_of[self.latest_ns]
+        if i == j:
+            return np.zeros((6, 6))
+        relative = se3_inverse(self.pose(stamp_ns)) @ self.pose(self.latest_ns)
+        return relative_covariance(relative, self._window.joint_covariance([_x(i), _x(j)]))
+
+    def test(self, motion: RelativeMotion) -> Verdict:
+        """Chi-square test of a motion that ends in the newest state, against the window's prediction."""
+        predicted = se3_inverse(self.pose(motion.reference_stamp_ns)) @ self.pose(motion.stamp_ns)
+        return gate(
+            motion.reference_T_current,
+            motion.covariance,
+            predicted,
+            self.covariance_since(motion.reference_stamp_ns),
+            self._config.gate_probability,
+        )
+
+    def accept(self, motion: RelativeMotion) -> None:
+        """Insert a motion that ends in the newest state."""
+        self._window.add(
+            gtsam.BetweenFactorPose3(
+                _x(self._index_of[motion.reference_stamp_ns]),
+                _x(self._index_of[motion.stamp_ns]),
+                gtsam.Pose3(motion.reference_T_current),
+                gtsam.noiseModel.Gaussian.Covariance(motion.covariance),
+            )
+        )
+
+    def settle(self, keep: Iterable[int]) -> list[tuple[int, Float]]:
+        """Optimise, then marginalise what is older than the lag, but for the stamps to keep.
+
+        Returns:
+            Stamps and final poses ``nav_T_body`` of the states that left the window, in time order.
+
+        Raises:
+            WindowError: if the window cannot be solved; it is left as it was.
+        """
+        self._window.optimise()
+        if len(self._stamps) > 1:
+            dt = (self._stamps[-1] - self._stamps[-2]) * 1e-9
+            step = se3_inverse(self.pose(self._stamps[-2])) @ self.pose(self._stamps[-1])
+            self._previous_motion = se3_log(step) / dt
+        return self._forget(self.latest_ns - round(self._config.lag_s * 1e9), frozenset(keep))
+
+    def all_poses(self) -> list[tuple[int, Float]]:
+        """Stamps and poses of the window, in time order."""
+        return [(stamp, self.pose(stamp)) for stamp in self._stamps]
+
+    def _append(self, stamp_ns: int, state: RigState) -> int:
+        k = self._index
+        self._index += 1
+        self._stamps.append(stamp_ns)
+        self._index_of[stamp_ns] = k
+        values = self._window.values
+        values.insert(_x(k), gtsam.Pose3(state.nav_T_body))
+        if self.has_imu:
+            values.insert(_v(k), state.velocity_nav)
+            values.insert(_b(k), gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias))
+        return k
+
+    def _link_by_constant_velocity(self, i: int, j: int, motion: Float, dt: float) -> None:
+        """Eq. (11): velocity and rate go on, but for white accelerations."""
+        config = self._config
+        sigmas = np.repeat(
+            [
+                config.motion_angular_accel_sigma_rad_s2 * dt * dt,
+                config.motion_accel_sigma_m_s2 * dt * dt,
+            ],
+            3,
+        )
+        self._window.add(
+            gtsam.BetweenFactorPose3(_x(i), _x(j), gtsam.Pose3(motion), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+        )
+        if self._imu is None:
+            return
+        still = np.zeros(3)
+        self._window.add(
+            gtsam.BetweenFactorVector(_v(i), _v(j), still, _isotropic(3, config.motion_accel_sigma_m_s2 * dt))
+        )
+        walk = config.imu_noise_scale * np.sqrt(dt)
+        bias_sigmas = np.repeat([walk * self._imu.accel_random_walk, walk * self._imu.gyro_random_walk], 3)
+        self._window.add(
+            gtsam.BetweenFactorConstantBias(
+                _b(i), _b(j), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(bias_sigmas)
+            )
+        )
+
+    def _forget(self, oldest_ns: int, keep: frozenset[int]) -> list[tuple[int, Float]]:
+        leaving = [s for s in self._stamps[:-1] if s < oldest_ns and s not in keep]
+        finished = [(stamp, self.pose(stamp)) for stamp in leaving]
+        keys: list[int] = []
+        for stamp in leaving:
+            k = self._index_of.pop(stamp)
+            keys += [_x(k), _v(k), _b(k)] if self.has_imu else [_x(k)]
+        self._window.marginalise(keys)
+        gone = set(leaving)
+        self._stamps = [s for s in self._stamps if s not in gone]
+        return finished
+
+
+def _x(k: int) -> int:
+    return int(gtsam.symbol("x", k))
+
+
+def _v(k: int) -> int:
+    return int(gtsam.symbol("v", k))
+
+
+def _b(k: int) -> int:
+    return int(gtsam.symbol("b", k))
+
+
+def _isotropic(dimension: int, sigma: float) -> gtsam.noiseModel.Isotropic:
+    return gtsam.noiseModel.Isotropic.Sigma(dimension, sigma)

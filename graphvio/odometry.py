@@ -1,0 +1,322 @@
+"""The odometry: IMU samples and framesets in, estimates out. The algorithm of the paper, and no I/O."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.inertial import ImuBuffer, ImuSpan
+from graphvio.backend.initialisation import InitialAttitude, initial_attitude, level
+from graphvio.backend.smoother import RigState, Smoother, StartUncertainty
+from graphvio.backend.window import WindowError
+from graphvio.config import Config
+from graphvio.events import Estimate, Event, FrameSet, ImuSample, Incident, Status
+from graphvio.frontend.visual import RelativeMotion, VisualFrontend, VisualResult
+from graphvio.geometry import se3, se3_inverse, so3_log
+from graphvio.rig import Rig
+
+_MOVING_START_SPEED_SIGMA = 2.0
+_RESTING_START_SPEED_SIGMA = 0.02
+_RESTART_SPEED_SIGMA = 0.5
+_RESTART_TILT_SIGMA = 0.05
+_RESTART_GYRO_BIAS_SIGMA = 0.01
+
+
+class Odometry:
+    """Visual-inertial odometry of a rig of stereo pairs.
+
+    Feed it events in time order with `process`. It holds a frameset until the IMU samples that cover it have come.
+
+    Args:
+        rig: cameras and IMU; without an IMU, vision alone is used.
+        config: of all stages.
+    """
+
+    def __init__(self, rig: Rig, config: Config | None = None) -> None:
+        self.rig = rig
+        self.config = config or Config()
+        self._frontend = VisualFrontend(rig, self.config)
+        self._imu_buffer = ImuBuffer(self.config.timing.max_imu_gap_ms)
+        self._smoother: Smoother | None = None
+        self._held: deque[FrameSet] = deque()
+        self._newest_frameset_ns: int | None = None
+        self._first_frameset_ns: int | None = None
+        self._settled_ns = 0  # from this stamp on, a start in motion is over
+        self._tracked_ns = 0  # stamp of the last state that vision constrains
+        self._gated_since_ns: int | None = None
+        self._lost = False
+        self._epoch = 0
+        self._last_motion: RelativeMotion | None = None
+        self._incidents: list[Incident] = []
+        self._smoothed: list[tuple[int, Float]] = []
+
+    def process(self, event: Event) -> Estimate | None:
+        """Take one event.
+
+        Returns:
+            The estimate of the oldest frameset that is due, or None while there is none. At most one frameset is
+            worked on in a call; what is still held comes with later events or with `finish`.
+        """
+        if isinstance(event, ImuSample):
+            fault = self._imu_buffer.add(event)
+            if fault:
+                self._report(event.stamp_ns, fault, "sample left out")
+        else:
+            self._hold(event)
+        return self._estimate(self._held.popleft()) if self._held and self._is_due(self._held[0]) else None
+
+    def finish(self) -> Iterator[Estimate]:
+        """Estimates of the framesets still held when the input has ended; the window's poses are final then."""
+        while self._held:
+            yield self._estimate(self._held.popleft())
+        if self._smoother is not None:
+            self._smoothed += self._smoother.all_poses()
+        self._frontend.close()
+
+    def take_incidents(self) -> list[Incident]:
+        """What happened since the last call that a person would want to know of."""
+        taken, self._incidents = self._incidents, []
+        return taken
+
+    def take_smoothed(self) -> list[tuple[int, Float]]:
+        """Stamps and poses ``nav_T_body`` that became final since the last call; not always in time order."""
+        taken, self._smoothed = self._smoothed, []
+        return taken
+
+    # ------------------------------------------------------------------ when a frameset is due
+
+    def _hold(self, frameset: FrameSet) -> None:
+        if self._newest_frameset_ns is not None and frameset.stamp_ns <= self._newest_frameset_ns:
+            self._report(frameset.stamp_ns, "frameset_backward_stamp", "frameset left out: time never goes back")
+            return
+        unknown = [j for j in frameset.images if not 0 <= j < len(self.rig.pairs)]
+        if unknown:
+            self._report(frameset.stamp_ns, "unknown_pair", f"pair {unknown[0]} is not in the rig: left out")
+            frameset = replace(frameset, images={j: v for j, v in frameset.images.items() if j not in unknown})
+        self._newest_frameset_ns = frameset.stamp_ns
+        self._held.append(frameset)
+
+    def _is_due(self, frameset: FrameSet) -> bool:
+        if self.rig.imu is None or self._imu_buffer.covers(self._imu_time(frameset.stamp_ns)):
+            return True
+        assert self._newest_frameset_ns is not None
+        return self._newest_frameset_ns - frameset.stamp_ns > self.config.timing.max_imu_wait_ms * 1e6
+
+    def _imu_time(self, stamp_ns: int) -> int:
+        return stamp_ns + (self.rig.imu.time_offset_ns if self.rig.imu else 0)
+
+    # ------------------------------------------------------------------ one frameset
+
+    def _estimate(self, frameset: FrameSet) -> Estimate:
+        start = perf_counter()
+        stamp_ns = frameset.stamp_ns
+        if self._smoother is None and not self._start(stamp_ns):
+            visual = self._frontend.process(frameset, lambda _: None)
+            return self._nothing_yet(stamp_ns, visual, start)
+        smoother = self._smoother
+        assert smoother is not None
+        span = None
+        if smoother.latest_ns < stamp_ns:  # the first frameset is where the smoother started
+            span = self._span(smoother.latest_ns, stamp_ns)
+            smoother.extend(stamp_ns, span)
+        predicted = perf_counter()
+        visual = self._frontend.process(frameset, self._predicted_motion)
+        measured = perf_counter()
+        used = visual.motion is not None and self._use(visual.motion)
+        if not self._update(visual, used):
+            used = False
+        status = self._status(stamp_ns, used, first=visual.reason == "first images")
+        stage_ms = {
+            "predict": 1e3 * (predicted - start),
+            **visual.stage_ms,
+            "update": 1e3 * (perf_counter() - measured),
+            "frameset": 1e3 * (perf_counter() - start),
+        }
+        return self._assemble(stamp_ns, status, visual, span, stage_ms)
+
+    def _predicted_motion(self, then_ns: int) -> Float | None:
+        """``now_T_then`` of body between a state in the window and the newest one."""
+        smoother = self._smoother
+        if smoother is None or not smoother.knows(then_ns):
+            return None
+        return se3_inverse(smoother.pose(smoother.latest_ns)) @ smoother.pose(then_ns)
+
+    def _use(self, motion: RelativeMotion) -> bool:
+        """Gate a measured motion and insert it; a gate that refuses for too long is itself at fault."""
+        smoother = self._smoother
+        assert smoother is not None
+        if not smoother.knows(motion.reference_stamp_ns):
+            return False
+        if self._lost:
+            self._recover(motion)
+            return True
+        verdict = smoother.test(motion)
+        if verdict.accepted:
+            smoother.accept(motion)
+            self._gated_since_ns = None
+            return True
+        self._report(
+            motion.stamp_ns,
+            "vision_gated",
+            f"innovation {verdict.statistic:.1f} beyond chi-square {verdict.threshold:.1f}, {motion.inliers} inliers",
+        )
+        if self._gated_since_ns is None:
+            self._gated_since_ns = motion.stamp_ns
+        if motion.stamp_ns - self._gated_since_ns > self.config.smoother.max_gated_s * 1e9:
+            self._restart(motion, "gate_reset", "vision was refused for too long: velocity is taken from vision")
+            return True
+        return False
+
+    def _update(self, visual: VisualResult, used: bool) -> bool:
+        """Optimise and marginalise; a window without a solution is rebuilt around the prediction."""
+        smoother = self._smoother
+        assert smoother is not None
+        if used:
+            self._tracked_ns = smoother.latest_ns
+        try:
+            self._smoothed += smoother.settle(self._frontend.reference_stamps_ns | {self._tracked_ns})
+        except WindowError as error:
+            state = smoother.state()
+            self._smoothed += smoother.all_poses()
+            self._report(smoother.latest_ns, "window_rebuilt", str(error))
+            smoother.start(smoother.latest_ns, state, _RESTART)
+            self._tracked_ns = smoother.latest_ns
+            return False
+        self._imu_buffer.discard_before(self._imu_time(smoother.latest_ns) - self._history_ns())
+        return True
+
+    def _status(self, stamp_ns: int, used: bool, *, first: bool) -> Status:
+        smoother = self._smoother
+        assert smoother is not None
+        if used or first:
+            self._tracked_ns = stamp_ns
+            return Status.INITIALISING if stamp_ns < self._settled_ns else Status.TRACKING
+        sigma = float(np.sqrt(np.linalg.eigvalsh(smoother.covariance_since(self._tracked_ns)[3:, 3:])[-1]))
+        if not self._lost and sigma > self.config.smoother.lost_position_sigma_m:
+            self._lost = True
+            self._report(stamp_ns, "lost", f"position uncertain by {sigma:.2f} m since vision was last used")
+        return Status.LOST if self._lost else Status.COASTING
+
+    # ------------------------------------------------------------------ starts and breaks
+
+    def _start(self, stamp_ns: int) -> bool:
+        """Begin at a frameset; False while the IMU is still awaited."""
+        if self._first_frameset_ns is None:
+            self._first_frameset_ns = stamp_ns
+        config = self.config.initialisation
+        imu = self.rig.imu
+        at = None
+        if imu is not None:
+            at = initial_attitude(self._imu_buffer.before(self._imu_time(stamp_ns), config.window_s), config)
+            if at is None:
+                if stamp_ns - self._first_frameset_ns < self.config.timing.max_imu_start_wait_s * 1e9:
+                    return False
+                self._report(stamp_ns, "started_without_imu", "no IMU sample came: vision alone from here")
+        self._smoother = Smoother(self.config.smoother, imu if at is not None else None)
+        if at is None:
+            at = InitialAttitude(self._upright_camera(), 0.0, np.zeros(3), 1.0, False)
+        elif not at.at_rest:
+            self._settled_ns = stamp_ns + round(config.settle_s * 1e9)
+        speed_sigma = _RESTING_START_SPEED_SIGMA if at.at_rest else _MOVING_START_SPEED_SIGMA
+        self._smoother.start(
+            stamp_ns,
+            RigState(se3(at.nav_R_body, np.zeros(3)), np.zeros(3), at.gyro_bias, np.zeros(3)),
+            StartUncertainty(max(at.tilt_sigma_rad, 1e-3), speed_sigma, at.gyro_bias_sigma),
+        )
+        self._tracked_ns = stamp_ns
+        return True
+
+    def _upright_camera(self) -> Float:
+        """``nav_R_body`` without an IMU: the first pair's left camera is taken to be upright."""
+        return level(-self.rig.pairs[0].left.body_T_cam[:3, 1])
+
+    def _recover(self, motion: RelativeMotion) -> None:
+        """After lost: a new epoch that starts at the best guess."""
+        self._epoch += 1
+        self._lost = False
+        self._restart(motion, "new_epoch", f"vision is back: epoch {self._epoch} starts at the best guess")
+
+    def _restart(self, motion: RelativeMotion, kind: str, why: str) -> None:
+        """Start the smoother anew at its newest pose, with the velocity that vision sees."""
+        smoother = self._smoother
+        assert smoother is not None
+        self._smoothed += smoother.all_poses()
+        state = smoother.state()
+        dt = (motion.stamp_ns - motion.reference_stamp_ns) * 1e-9
+        velocity_body = motion.reference_T_current[:3, :3].T @ motion.reference_T_current[:3, 3] / dt
+        velocity_nav = state.nav_T_body[:3, :3] @ velocity_body
+        smoother.start(motion.stamp_ns, replace(state, velocity_nav=velocity_nav), _RESTART)
+        self._frontend.forget_references_before(motion.stamp_ns)
+        self._gated_since_ns = None
+        self._tracked_ns = motion.stamp_ns
+        self._report(motion.stamp_ns, kind, why)
+
+    # ------------------------------------------------------------------ what is told
+
+    def _span(self, start_ns: int, end_ns: int) -> ImuSpan | None:
+        if self._smoother is None or not self._smoother.has_imu:
+            return None
+        span = self._imu_buffer.span(self._imu_time(start_ns), self._imu_time(end_ns))
+        if span is None:
+            self._report(end_ns, "imu_not_covering", "no IMU for this interval: constant velocity instead")
+        return span
+
+    def _history_ns(self) -> int:
+        return round(self.config.initialisation.window_s * 1e9)
+
+    def _assemble(
+        self, stamp_ns: int, status: Status, visual: VisualResult, span: ImuSpan | None, stage_ms: dict[str, float]
+    ) -> Estimate:
+        smoother = self._smoother
+        assert smoother is not None
+        state = smoother.state()
+        honest = status is not Status.LOST
+        inertial = smoother.has_imu
+        return Estimate(
+            stamp_ns=stamp_ns,
+            status=status,
+            nav_T_body=state.nav_T_body if honest else None,
+            covariance=smoother.covariance() if honest else None,
+            epoch=self._epoch,
+            velocity_nav=state.velocity_nav if honest else None,
+            gyro_bias=state.gyro_bias if inertial else None,
+            accel_bias=state.accel_bias if inertial else None,
+            rates=self._rates(visual, span, state),
+            pairs=visual.pairs,
+            stage_ms=stage_ms,
+        )
+
+    def _rates(self, visual: VisualResult, span: ImuSpan | None, state: RigState) -> dict[str, Float]:
+        """Angular rates of body over the last interval by gyro, vision and both (the paper's figure 5)."""
+        rates: dict[str, Float] = {}
+        if span is not None:
+            rates["gyro"] = span.mean_rate - state.gyro_bias
+        before, now = self._last_motion, visual.motion
+        self._last_motion = now
+        if now is not None:
+            earlier = now.reference_T_current
+            since_ns = now.reference_stamp_ns
+            if before is not None and before.reference_stamp_ns == since_ns:
+                earlier = se3_inverse(before.reference_T_current) @ earlier
+                since_ns = before.stamp_ns
+            rates["vision"] = so3_log(earlier[:3, :3].copy()) / ((now.stamp_ns - since_ns) * 1e-9)
+        assert self._smoother is not None
+        fused = self._smoother.latest_rate()
+        if fused is not None:
+            rates["fused"] = fused
+        return rates
+
+    def _nothing_yet(self, stamp_ns: int, visual: VisualResult, start: float) -> Estimate:
+        stage_ms = {**visual.stage_ms, "frameset": 1e3 * (perf_counter() - start)}
+        return Estimate(stamp_ns, Status.INITIALISING, None, None, pairs=visual.pairs, stage_ms=stage_ms)
+
+    def _report(self, stamp_ns: int, kind: str, detail: str) -> None:
+        self._incidents.append(Incident(stamp_ns, kind, detail))
+
+
+_RESTART = StartUncertainty(_RESTART_TILT_SIGMA, _RESTART_SPEED_SIGMA, _RESTART_GYRO_BIAS_SIGMA)

@@ -1,0 +1,119 @@
+"""Calibration of an EuRoC/ASL folder: ``cam0/sensor.yaml``, ``cam1/sensor.yaml`` ..., ``imu0/sensor.yaml``.
+
+``T_BS`` is the pose of the sensor in the body's frame. Where the IMU's is not the identity, everything is
+moved into the IMU's frame, which is graphvio's body. TUM-VI's export has the same folders but may leave the
+calibration to ``dso/camchain.yaml`` and ``dso/imu_config.yaml`` next to ``mav0``.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.errors import RigError
+from graphvio.geometry import se3_inverse
+from graphvio.rig import Camera, Imu, Rig, checked_transform
+from graphvio.rig_files import kalibr
+from graphvio.rig_files.reading import Section, consecutive_pairs, named, read_yaml
+
+_CAMERA_KEYS = ("T_BS", "resolution", "intrinsics", "distortion_model", "distortion_coefficients")
+
+
+def load(path: Path) -> Rig:
+    """Read the calibration of a folder that is ``mav0``, or holds it.
+
+    Cameras 0 and 1 form the first pair, 2 and 3 the next. Without a folder ``imu0`` the rig has no IMU.
+
+    Raises:
+        RigError: if a file or value is missing or describes no usable rig.
+    """
+    root = sensors_folder(path)
+    if root is None:
+        raise RigError(f"{path}: holds no cam0, cam1, ...; give the folder mav0 of an EuRoC/ASL recording")
+    folders = camera_folders(root)
+    sections = {folder.name: _sensor(folder) for folder in folders}
+    imu_folder = root / "imu0"
+    chain = root.parent / "dso" / "camchain.yaml"
+    if chain.is_file() and any(not _is_complete(section) for section in sections.values()):
+        return _from_chain(
+            chain, [folder.name for folder in folders], has_imu=imu_folder.is_dir(), name=_name(root)
+        )
+    imu_T_body = np.eye(4)
+    imu = None
+    if imu_folder.is_dir():
+        section = _sensor(imu_folder)
+        with named(section.file):
+            imu = Imu(**section.noise("rate_hz", kalibr.IMU_KEYS))
+            if section.values.get("T_BS") is not None:
+                body_T_imu = checked_transform(section.matrix("T_BS"), section.where("T_BS"))
+                imu_T_body = se3_inverse(body_T_imu)
+    cameras = [_camera(name, section, imu_T_body) for name, section in sections.items()]
+    with named(root):
+        return Rig(consecutive_pairs(cameras, root), imu, _name(root))
+
+
+def sensors_folder(path: Path) -> Path | None:
+    """The folder with ``cam0``: the given one or its ``mav0``; None where neither is."""
+    for folder in (path / "mav0", path):
+        if camera_folders(folder):
+            return folder
+    return None
+
+
+def camera_folders(root: Path) -> list[Path]:
+    """``cam0``, ``cam1`` ... by number."""
+    if not root.is_dir():
+        return []
+    folders = [p for p in root.iterdir() if re.fullmatch(r"cam\d+", p.name) and p.is_dir()]
+    return sorted(folders, key=lambda p: int(p.name[3:]))
+
+
+def _camera(name: str, section: Section, imu_T_body: Float) -> Camera:
+    if section.values.get("camera_model", "pinhole") != "pinhole":
+        raise RigError(
+            f"{section.where('camera_model')}: is {section.text('camera_model')!r}; graphvio knows pinhole, "
+            "with distortion_model radial-tangential or equidistant"
+        )
+    with named(section.file):
+        body_T_cam = checked_transform(section.matrix("T_BS"), section.where("T_BS"))
+        return Camera(
+            name=name,
+            model=kalibr.model_name(section, "distortion_model"),
+            size_px=section.size("resolution"),
+            intrinsics=section.array("intrinsics", (4,)),
+            distortion=section.array("distortion_coefficients"),
+            body_T_cam=imu_T_body @ body_T_cam,
+        )
+
+
+def _from_chain(chain: Path, names: list[str], has_imu: bool, name: str) -> Rig:
+    document = read_yaml(chain)
+    with named(chain):
+        cameras = {camera.name: camera for camera in kalibr.cameras_of(document)}
+        for camera in names:
+            if camera not in cameras:
+                raise RigError(f"{camera} is missing; the recording has it: add its calibration")
+        pairs = consecutive_pairs([cameras[camera] for camera in names], chain)
+        imu = None
+        if has_imu:
+            imu = kalibr.imu_of(kalibr.find_imu_file(chain), kalibr.time_offset_of(document))
+        return Rig(pairs, imu, name)
+
+
+def _sensor(folder: Path) -> Section:
+    file = folder / "sensor.yaml"
+    if not file.is_file():  # every value is then missing, and the first that is asked for says so
+        return Section({}, file)
+    return read_yaml(file)
+
+
+def _is_complete(section: Section) -> bool:
+    return all(section.values.get(key) not in (None, [], "") for key in _CAMERA_KEYS)
+
+
+def _name(root: Path) -> str:
+    folder = root.resolve()
+    return folder.parent.name if folder.name == "mav0" else folder.name

@@ -1,0 +1,180 @@
+"""Kalibr's ``camchain-imucam.yaml`` with the ``imu.yaml`` next to it, and a camera-only ``camchain.yaml``.
+
+Kalibr writes ``T_cam_imu``, which maps points of the IMU's frame to the camera's, so ``body_T_cam`` is its
+inverse; and ``timeshift_cam_imu`` with ``t_imu = t_cam + timeshift``, graphvio's own sign.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.errors import RigError
+from graphvio.geometry import se3_inverse
+from graphvio.rig import Camera, Imu, Rig, checked_transform
+from graphvio.rig_files.reading import NOISE_KEYS, Section, consecutive_pairs, named, read_yaml
+
+MODELS = {
+    "radtan": "radial-tangential",
+    "radial-tangential": "radial-tangential",
+    "plumb_bob": "radial-tangential",
+    "none": "radial-tangential",
+    "equidistant": "equidistant",
+    "equi": "equidistant",
+}
+"""Name of a distortion model in others' files -> graphvio's."""
+IMU_KEYS = dict(
+    zip(
+        NOISE_KEYS,
+        (
+            "gyroscope_noise_density",
+            "gyroscope_random_walk",
+            "accelerometer_noise_density",
+            "accelerometer_random_walk",
+        ),
+        strict=True,
+    )
+)
+"""graphvio's name of a noise density -> Kalibr's and EuRoC's."""
+_MAX_SPREAD_S = 5e-3
+
+
+def load(path: Path) -> Rig:
+    """Read a camera chain; with ``T_cam_imu`` in it, also the IMU's file from the same folder.
+
+    Cameras 0 and 1 form the first pair, 2 and 3 the next. Without ``T_cam_imu`` the rig has no
+    IMU, and body is cam0.
+
+    Raises:
+        RigError: if a file cannot be read, lacks a value or describes no usable rig.
+    """
+    document = read_yaml(path)
+    names = camera_names(document)
+    has_imu = "T_cam_imu" in document.section(names[0]).values if names else False
+    with named(path):
+        cameras = cameras_of(document)
+        pairs = consecutive_pairs(cameras, path)
+        imu = imu_of(find_imu_file(path), time_offset_of(document)) if has_imu else None
+        return Rig(pairs, imu, path.stem)
+
+
+def camera_names(document: Section) -> list[str]:
+    """``cam0``, ``cam1`` ... of a chain, by number."""
+    names = [key for key in document.values if re.fullmatch(r"cam\d+", str(key))]
+    return sorted(names, key=lambda name: int(name[3:]))
+
+
+def cameras_of(document: Section) -> list[Camera]:
+    """All cameras of a chain."""
+    cameras: list[Camera] = []
+    previous_T_body = np.eye(4)
+    for index, name in enumerate(camera_names(document)):
+        section = document.section(name)
+        cam_T_body = _cam_T_body(section, previous_T_body, first=index == 0)
+        cameras.append(
+            Camera(
+                name=name,
+                model=_model(section),
+                size_px=section.size("resolution"),
+                intrinsics=section.array("intrinsics", (4,)),
+                distortion=_distortion(section),
+                body_T_cam=se3_inverse(cam_T_body),
+            )
+        )
+        previous_T_body = cam_T_body
+    return cameras
+
+
+def imu_of(path: Path, time_offset_s: float) -> Imu:
+    """The IMU of Kalibr's ``imu.yaml``, flat or under ``imu0``.
+
+    Raises:
+        RigError: if a noise value is missing, or the file sets body apart from the IMU.
+    """
+    section = read_yaml(path)
+    if isinstance(section.values.get("imu0"), dict):
+        section = section.section("imu0")
+    if section.values.get("T_i_b") is not None and np.abs(section.matrix("T_i_b") - np.eye(4)).max() > 1e-9:
+        raise RigError(
+            f"{section.where('T_i_b')}: is not the identity; calibrate with this IMU as the only one"
+        )
+    with named(path):
+        return Imu(**section.noise("update_rate", IMU_KEYS), time_offset_s=time_offset_s)
+
+
+def time_offset_of(document: Section) -> float:
+    """Mean of the cameras' ``timeshift_cam_imu``: seconds to add to a camera's stamp; 0 where none is given.
+
+    Raises:
+        RigError: if the cameras disagree by more than 5 ms.
+    """
+    sections = [document.section(name) for name in camera_names(document)]
+    shifts = [section.number("timeshift_cam_imu", 0.0) for section in sections]
+    spread = max(shifts, default=0.0) - min(shifts, default=0.0)
+    if spread > _MAX_SPREAD_S:
+        raise RigError(
+            f"{document.file}: timeshift_cam_imu differs by {1e3 * spread:.1f} ms between "
+            "cameras; graphvio needs cameras that are triggered together: synchronise them or correct "
+            "their stamps"
+        )
+    return float(np.mean(shifts)) if shifts else 0.0
+
+
+def find_imu_file(camchain: Path) -> Path:
+    """The IMU's file next to a camera chain.
+
+    Raises:
+        RigError: if there is none, or no telling which.
+    """
+    stem = camchain.name
+    likely = [stem.replace("camchain-imucam", "imu"), stem.replace("camchain", "imu")]
+    for name in [*likely, "imu.yaml", "imu_config.yaml", "imu0.yaml"]:
+        if name != stem and (camchain.parent / name).is_file():
+            return camchain.parent / name
+    others = sorted(p for p in camchain.parent.glob("*imu*.y*ml") if "camchain" not in p.name)
+    if len(others) == 1:
+        return others[0]
+    defaults = ", ".join(f"{IMU_KEYS[name]}: {getattr(Imu(), name)}" for name in NOISE_KEYS)
+    found = f"more than one IMU file ({', '.join(p.name for p in others)})" if others else "no imu.yaml"
+    raise RigError(
+        f"{camchain.parent}: {found} next to {camchain.name}, which has T_cam_imu; put the IMU's noise into "
+        f"imu.yaml there (graphvio's defaults:  {defaults}, update_rate: {Imu().rate_hz})"
+    )
+
+
+def _cam_T_body(section: Section, previous_T_body: Float, first: bool) -> Float:
+    if section.values.get("T_cam_imu") is not None:
+        return checked_transform(section.matrix("T_cam_imu"), section.where("T_cam_imu"))
+    if first:
+        return np.eye(4)
+    return checked_transform(section.matrix("T_cn_cnm1"), section.where("T_cn_cnm1")) @ previous_T_body
+
+
+def _model(section: Section) -> str:
+    if section.values.get("camera_model", "pinhole") != "pinhole":
+        raise RigError(
+            f"{section.where('camera_model')}: is {section.text('camera_model')!r}; calibrate with "
+            "pinhole-radtan or pinhole-equi"
+        )
+    return model_name(section, "distortion_model")
+
+
+def model_name(section: Section, key: str) -> str:
+    """graphvio's name of the distortion model under a key.
+
+    Raises:
+        RigError: if it is missing or not known.
+    """
+    name = section.text(key)
+    if name not in MODELS:
+        raise RigError(f"{section.where(key)}: unknown model {name!r}; use one of {', '.join(MODELS)}")
+    return MODELS[name]
+
+
+def _distortion(section: Section) -> Float:
+    if section.text("distortion_model") == "none":
+        return np.zeros(5)
+    return section.array("distortion_coeffs")

@@ -1,0 +1,144 @@
+"""graphvio's own ``rig.yaml``, version 1: any number of pairs and at most one IMU.
+
+The format is documented with a full example in ``docs/data-contract.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from graphvio.errors import RigError
+from graphvio.rig import Camera, Imu, Rig, StereoPair
+from graphvio.rig_files.reading import NOISE_KEYS, Section, named, read_yaml
+
+VERSION = 1
+VERSION_KEY = "graphvio_rig"
+FILE_NAME = "rig.yaml"
+
+_RIG_KEYS = (VERSION_KEY, "name", "imu", "pairs")
+_IMU_KEYS = ("rate_hz", *NOISE_KEYS, "time_offset_s")
+_PAIR_KEYS = ("name", "left", "right")
+_CAMERA_KEYS = ("name", "model", "size_px", "intrinsics", "distortion", "body_T_cam", "mask")
+
+
+def load(path: Path) -> Rig:
+    """Read a ``rig.yaml``.
+
+    Raises:
+        RigError: if it cannot be read, holds an unknown key or an impossible value, or lacks one.
+    """
+    document = read_yaml(path)
+    version = document.values.get(VERSION_KEY)
+    if version is None:
+        raise RigError(f"{path}: {VERSION_KEY} is missing; begin the file with  {VERSION_KEY}: {VERSION}")
+    if version != VERSION:
+        raise RigError(
+            f"{path}: {VERSION_KEY} is {version!r}; this graphvio reads version {VERSION}: "
+            "update graphvio or the file"
+        )
+    document.only(_RIG_KEYS)
+    given = document.get("pairs")
+    if not isinstance(given, list) or not given:
+        raise RigError(f"{path}: pairs must be a list of at least one pair, each with left and right")
+    with named(path):
+        pairs = tuple(_pair(document.nested(value, f"pairs[{i}]"), i) for i, value in enumerate(given))
+        imu = _imu(document.section("imu")) if document.values.get("imu") is not None else None
+        name = document.text("name") if document.values.get("name") is not None else path.stem
+        return Rig(pairs, imu, name)
+
+
+def save(rig: Rig, path: Path) -> None:
+    """Write a ``rig.yaml`` that `load` reads back to the last digit.
+
+    Raises:
+        RigError: if the file cannot be written.
+    """
+    lines = [
+        "# A rig of stereo pairs. Metres, radians, seconds, pixels; body is the frame of the IMU.",
+        f"{VERSION_KEY}: {VERSION}",
+        f"name: {_quoted(rig.name)}",
+    ]
+    if rig.imu is not None:
+        lines += [
+            "imu:",
+            f"  rate_hz: {_number(rig.imu.rate_hz)}",
+            f"  gyro_noise_density: {_number(rig.imu.gyro_noise_density)}  # rad/s/sqrt(Hz)",
+            f"  gyro_random_walk: {_number(rig.imu.gyro_random_walk)}  # rad/s^2/sqrt(Hz)",
+            f"  accel_noise_density: {_number(rig.imu.accel_noise_density)}  # m/s^2/sqrt(Hz)",
+            f"  accel_random_walk: {_number(rig.imu.accel_random_walk)}  # m/s^3/sqrt(Hz)",
+            f"  time_offset_s: {_number(rig.imu.time_offset_s)}  # t_imu = t_cam + time_offset_s",
+        ]
+    lines.append("pairs:")
+    for pair in rig.pairs:
+        lines.append(f"  - name: {_quoted(pair.name)}")
+        for side, camera in (("left", pair.left), ("right", pair.right)):
+            lines.append(f"    {side}:")
+            lines += [f"      {line}" for line in _camera_lines(camera, path.parent)]
+    try:
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise RigError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+
+
+def _pair(section: Section, index: int) -> StereoPair:
+    section.only(_PAIR_KEYS)
+    name = section.text("name") if section.values.get("name") is not None else f"pair{index}"
+    return StereoPair(name, _camera(section.section("left")), _camera(section.section("right")))
+
+
+def _camera(section: Section) -> Camera:
+    section.only(_CAMERA_KEYS)
+    mask = None
+    if section.values.get("mask") is not None:
+        mask = (section.file.parent / section.text("mask")).resolve()
+        if not mask.is_file():
+            raise RigError(
+                f"{section.where('mask')}: there is no image {mask}; correct the path or remove the key"
+            )
+    return Camera(
+        name=section.text("name"),
+        model=section.text("model"),
+        size_px=section.size("size_px"),
+        intrinsics=section.array("intrinsics", (4,)),
+        distortion=section.array("distortion"),
+        body_T_cam=section.matrix("body_T_cam"),
+        mask=mask,
+    )
+
+
+def _imu(section: Section) -> Imu:
+    section.only(_IMU_KEYS)
+    noise = section.noise("rate_hz", {key: key for key in NOISE_KEYS})
+    return Imu(**noise, time_offset_s=section.number("time_offset_s", 0.0))
+
+
+def _camera_lines(camera: Camera, folder: Path) -> Iterable[str]:
+    yield f"name: {_quoted(camera.name)}"
+    yield f"model: {camera.model}"
+    yield f"size_px: [{camera.size_px[0]}, {camera.size_px[1]}]"
+    yield f"intrinsics: {_numbers(camera.intrinsics)}  # fx, fy, cx, cy"
+    yield f"distortion: {_numbers(camera.distortion)}"
+    yield "body_T_cam:"
+    for row in camera.body_T_cam:
+        yield f"  - {_numbers(row)}"
+    if camera.mask is not None:
+        mask, home = camera.mask.resolve(), folder.resolve()
+        yield f"mask: {_quoted(str(mask.relative_to(home) if mask.is_relative_to(home) else mask))}"
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return "[" + ", ".join(_number(value) for value in values) + "]"
+
+
+def _number(value: float) -> str:
+    text = repr(float(value))  # the shortest text that reads back exactly
+    if "e" in text and "." not in text:
+        text = text.replace("e", ".0e")  # YAML 1.1 reads 1e-05 as a text
+    return text
+
+
+def _quoted(text: str) -> str:
+    """A YAML text in double quotes; what no editor would show is escaped."""
+    shown = [c if c.isprintable() and c not in '"\\' else f"\\U{ord(c):08x}" for c in text]
+    return f'"{"".join(shown)}"'

@@ -1,0 +1,208 @@
+"""Reading calibration files: YAML in which every value knows its file and key, so that errors say where."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from graphvio.arrays import Float
+from graphvio.errors import RigError
+from graphvio.rig import Camera, Imu, StereoPair
+
+NOISE_KEYS = ("gyro_noise_density", "gyro_random_walk", "accel_noise_density", "accel_random_walk")
+_DEFAULTS = {f.name: f.default for f in fields(Imu)}
+
+
+@dataclass(frozen=True)
+class Section:
+    """A mapping inside a YAML file.
+
+    Attributes:
+        values: what the mapping holds.
+        file: the file.
+        key: the mapping's own key inside the file, empty at the top.
+    """
+
+    values: Mapping[str, Any]
+    file: Path
+    key: str = ""
+
+    def where(self, key: str) -> str:
+        """File and full key, for messages."""
+        return f"{self.file}: {self.key}.{key}" if self.key else f"{self.file}: {key}"
+
+    def only(self, known: Iterable[str]) -> None:
+        """Refuse keys that are not known; the error names the nearest known one."""
+        known = list(known)
+        for key in self.values:
+            if key not in known:
+                nearest = difflib.get_close_matches(str(key), known, n=1, cutoff=0.0)[0]
+                raise RigError(
+                    f"{self.where(str(key))}: unknown key; did you mean {nearest!r}? "
+                    f"(known here: {', '.join(known)})"
+                )
+
+    def get(self, key: str) -> Any:
+        """A value that must be there."""
+        if self.values.get(key) is None:
+            raise RigError(f"{self.where(key)} is missing; add it")
+        return self.values[key]
+
+    def section(self, key: str) -> Section:
+        """A mapping that must be there."""
+        return self.nested(self.get(key), key)
+
+    def nested(self, value: object, key: str) -> Section:
+        """A value of this mapping, known under ``key``, as a mapping of its own."""
+        if not isinstance(value, dict):
+            raise RigError(f"{self.where(key)}: is {_shown(value)}; it must be a mapping of keys to values")
+        return Section(value, self.file, f"{self.key}.{key}" if self.key else key)
+
+    def text(self, key: str) -> str:
+        """A text that must be there."""
+        value = self.get(key)
+        if isinstance(value, dict | list):
+            raise RigError(f"{self.where(key)}: is {_shown(value)}; it must be a text")
+        return str(value)
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """A number; without a default it must be there."""
+        if default is not None and self.values.get(key) is None:
+            return default
+        return float(self.array(key, ()))
+
+    def array(self, key: str, shape: tuple[int, ...] | None = None) -> Float:
+        """An array of finite numbers that must be there; ``shape`` None takes any one-dimensional one."""
+        value = self.get(key)
+        try:
+            array = np.array(value, dtype=np.float64)  # also takes '1e-5', which YAML 1.1 reads as a text
+        except (TypeError, ValueError):
+            raise RigError(f"{self.where(key)}: is {_shown(value)}; it must hold numbers only") from None
+        if array.ndim != 1 if shape is None else array.shape != shape:
+            wanted = "a list" if shape is None else f"of shape {shape}" if shape else "one number"
+            raise RigError(f"{self.where(key)}: has shape {array.shape}; it must be {wanted}")
+        if not np.isfinite(array).all():
+            raise RigError(f"{self.where(key)}: holds NaN or infinity; write the calibrated value")
+        return array
+
+    def size(self, key: str) -> tuple[int, int]:
+        """An image size (width, height) in pixels that must be there."""
+        width, height = self.array(key, (2,))
+        if width != int(width) or height != int(height):
+            raise RigError(f"{self.where(key)}: is {_shown(self.get(key))}; it must be two whole numbers")
+        return int(width), int(height)
+
+    def matrix(self, key: str) -> Float:
+        """A 4x4 matrix that must be there: four rows, 16 numbers by rows, or ``data`` of an OpenCV matrix."""
+        value = self.get(key)
+        if isinstance(value, dict):
+            return self.section(key).matrix("data")
+        if isinstance(value, list) and len(value) == 16:
+            return self.array(key, (16,)).reshape(4, 4)
+        return self.array(key, (4, 4))
+
+    def noise(self, rate_key: str, keys: Mapping[str, str]) -> dict[str, float]:
+        """Rate and noise of an IMU, by the names of `graphvio.rig.Imu`.
+
+        Args:
+            rate_key: key of the rate.
+            keys: name in `graphvio.rig.Imu` -> key in this file, for all four densities.
+
+        Raises:
+            RigError: if any is missing; the message offers the defaults, ready to be pasted.
+        """
+        names = {"rate_hz": rate_key, **keys}
+        missing = [name for name, key in names.items() if self.values.get(key) is None]
+        if missing:
+            lines = ", ".join(f"{names[name]}: {_DEFAULTS[name]}" for name in missing)
+            raise RigError(
+                f"{self.where(names[missing[0]])} is missing"
+                + (f" (and {len(missing) - 1} more)" if len(missing) > 1 else "")
+                + f"; take it from the IMU's data sheet or calibration, or write graphvio's default:  {lines}"
+            )
+        return {name: self.number(key) for name, key in names.items()}
+
+
+def read_yaml(path: Path) -> Section:
+    """The mapping in a YAML file, as written by people, Kalibr or OpenCV; an empty file is an empty mapping.
+
+    Raises:
+        RigError: if the file cannot be read or holds no mapping.
+    """
+    text = read_text(path)
+    text = re.sub(r"^%.*$", "", text, flags=re.MULTILINE)  # OpenCV's `%YAML:1.0` is no valid directive
+    text = text.replace("!!opencv-matrix", "")
+    try:
+        values = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f" line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or str(error).split("\n")[0]
+        raise RigError(f"{path}:{line} is not valid YAML ({problem}); correct it there") from None
+    if values is None:
+        values = {}
+    if not isinstance(values, dict):
+        raise RigError(
+            f"{path}: holds {_shown(values)}; a calibration file must be a mapping of keys to values"
+        )
+    return Section(values, path)
+
+
+def read_text(path: Path) -> str:
+    """Text of a calibration file.
+
+    Raises:
+        RigError: if it cannot be read as text.
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise RigError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+    except UnicodeDecodeError:
+        raise RigError(
+            f"{path}: is no text file; give a calibration file (rig.yaml, Kalibr, EuRoC, KITTI)"
+        ) from None
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Put the file's path in front of what a rig object says about itself."""
+    try:
+        yield
+    except RigError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise RigError(f"{path}: {error}") from None
+
+
+def consecutive_pairs(cameras: list[Camera], path: Path) -> tuple[StereoPair, ...]:
+    """Pairs (0, 1), (2, 3) and so on, of cameras in the order of their numbers.
+
+    Raises:
+        RigError: if there is no camera, or one is left over.
+    """
+    if not cameras:
+        raise RigError(
+            f"{path}: describes no camera; give a rig.yaml, or a calibration of at least two cameras"
+        )
+    if len(cameras) % 2:
+        names = ", ".join(camera.name for camera in cameras)
+        raise RigError(
+            f"{path}: has {len(cameras)} cameras ({names}), so {cameras[-1].name} is left without a partner; "
+            "write a rig.yaml that says which cameras form pairs"
+        )
+    couples = zip(cameras[::2], cameras[1::2], strict=True)
+    return tuple(StereoPair(f"pair{i}", left, right) for i, (left, right) in enumerate(couples))
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

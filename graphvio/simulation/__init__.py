@@ -1,0 +1,20 @@
+"""An image-level simulator: textured worlds, walked through with the paper's four cameras and an IMU.
+
+`simulate` writes a recording; `make_simulator` gives the same images, readings and truth in memory.
+"""
+
+from graphvio.simulation.default_rig import default_rig
+from graphvio.simulation.recording import SimulatedRecording, simulate, write_recording
+from graphvio.simulation.scenes import SCENE_NAMES, build_scene
+from graphvio.simulation.simulator import Simulator, make_simulator
+
+__all__ = [
+    "SCENE_NAMES",
+    "SimulatedRecording",
+    "Simulator",
+    "build_scene",
+    "default_rig",
+    "make_simulator",
+    "simulate",
+    "write_recording",
+]

@@ -1,0 +1,215 @@
+"""Writes a simulated recording in the EuRoC/ASL layout, with graphvio's ``rig.yaml`` next to ``mav0``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from graphvio.arrays import Float, Image
+from graphvio.errors import SourceError
+from graphvio.geometry import quat_wxyz_from_rotation
+from graphvio.rig import Camera, Imu
+from graphvio.simulation.simulator import Simulator, make_simulator
+
+Progress = Callable[[int, int], None]
+"""Called with (framesets written, framesets in all)."""
+
+_PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # noise hardly shrinks any further
+_IMU_HEADER = (
+    "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+    "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
+)
+_TRUTH_HEADER = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
+    "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], "
+    "b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]"
+)
+
+
+@dataclass(frozen=True)
+class SimulatedRecording:
+    """What was written.
+
+    Attributes:
+        path: folder that holds ``mav0`` and ``rig.yaml``.
+        scene: its name.
+        framesets: number of instants at which all cameras took an image.
+        images: number of image files.
+        imu_samples: number of IMU samples.
+        duration_s: length of the walk.
+        path_length_m: length of the body's true path, at the stamps of the IMU.
+        events: name -> (start, end) in seconds since the first frameset of what makes the scene hard.
+    """
+
+    path: Path
+    scene: str
+    framesets: int
+    images: int
+    imu_samples: int
+    duration_s: float
+    path_length_m: float
+    events: dict[str, tuple[float, float]]
+
+
+def simulate(
+    name: str,
+    out: Path,
+    *,
+    duration_s: float | None = None,
+    seed: int = 0,
+    rate_hz: float = 20.0,
+    rest_s: float = 1.0,
+    progress: Progress | None = None,
+) -> SimulatedRecording:
+    """Simulate a scene and write it as a recording.
+
+    Args:
+        name: scene, one of `graphvio.simulation.SCENE_NAMES`.
+        out: folder to write; it must be empty or not exist.
+        duration_s: only so much of the walk; None for all of it.
+        seed: of all noise; the same seed gives the same bytes.
+        rate_hz: framesets per second.
+        rest_s: how long the rig stands still at first; 0 starts at walking speed.
+        progress: called as the framesets are written.
+
+    Raises:
+        SourceError: if there is no such scene, a value is impossible, or the folder is not empty.
+    """
+    out = Path(out)
+    _require_empty(out)
+    simulator = make_simulator(name, duration_s=duration_s, seed=seed, rate_hz=rate_hz, rest_s=rest_s)
+    return write_recording(simulator, out, progress)
+
+
+def write_recording(simulator: Simulator, out: Path, progress: Progress | None = None) -> SimulatedRecording:
+    """Write what a simulator gives, on all cores.
+
+    Raises:
+        SourceError: if the folder is not empty or an image cannot be written.
+    """
+    _require_empty(out)
+    mav0 = out / "mav0"
+    cameras = simulator.rig.cameras
+    for camera in cameras:
+        (mav0 / camera.name / "data").mkdir(parents=True)
+    stamps = simulator.stamps_ns
+    _write_sensors(simulator, mav0)
+    _write_inertial(simulator, mav0)
+    simulator.rig.save(out / "rig.yaml")
+
+    def write(index: int) -> None:
+        surfaces = simulator.surfaces(index)
+        for number, camera in enumerate(cameras):
+            image = simulator.image(index, number, surfaces=surfaces)
+            _write_image(mav0 / camera.name / "data" / f"{stamps[index]}.png", image)
+
+    workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    write(0)  # compiles the kernels once, before threads would wait for each other
+    with ThreadPoolExecutor(workers) as pool:
+        for done, _ in enumerate(_in_order(pool, write, range(1, len(stamps)), 2 * workers), start=2):
+            if progress is not None:
+                progress(done, len(stamps))
+    positions = simulator.imu_track.states.world_T_body[:, :3, 3]
+    return SimulatedRecording(
+        path=out,
+        scene=simulator.scene.name,
+        framesets=len(stamps),
+        images=len(stamps) * len(cameras),
+        imu_samples=len(simulator.imu_track.stamps_ns),
+        duration_s=simulator.scene.motion.duration_s,
+        path_length_m=float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
+        events=dict(simulator.scene.events),
+    )
+
+
+def _require_empty(out: Path) -> None:
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise SourceError(f"{out}: is there already and not empty; give a new folder, or remove it first")
+
+
+def _in_order(
+    pool: ThreadPoolExecutor, work: Callable[[int], None], indices: Sequence[int], ahead: int
+) -> Iterator[None]:
+    """Results in order with a bounded number under way, so that an error or an interrupt stops soon."""
+    remaining = iter(indices)
+    pending: list[Future[None]] = [pool.submit(work, i) for i in islice(remaining, ahead)]
+    try:
+        while pending:
+            yield pending.pop(0).result()
+            pending += [pool.submit(work, i) for i in islice(remaining, 1)]
+    finally:
+        for future in pending:
+            future.cancel()
+
+
+def _write_image(path: Path, image: Image) -> None:
+    if not cv2.imwrite(str(path), image, _PNG_OPTIONS):
+        raise SourceError(f"{path}: cannot be written; is the disk full?")
+
+
+def _write_sensors(simulator: Simulator, mav0: Path) -> None:
+    for camera in simulator.rig.cameras:
+        folder = mav0 / camera.name
+        (folder / "sensor.yaml").write_text(_camera_yaml(camera, simulator.rate_hz))
+        rows = [f"{stamp},{stamp}.png" for stamp in simulator.stamps_ns]
+        (folder / "data.csv").write_text("\n".join(["#timestamp [ns],filename", *rows, ""]))
+    for name in ("imu0", "state_groundtruth_estimate0"):
+        (mav0 / name).mkdir()
+    (mav0 / "imu0" / "sensor.yaml").write_text(_imu_yaml(simulator.imu))
+    truth = f"sensor_type: visual-inertial\ncomment: exact truth of the simulation\n{_matrix_yaml(np.eye(4))}"
+    (mav0 / "state_groundtruth_estimate0" / "sensor.yaml").write_text(truth)
+    (mav0 / "body.yaml").write_text(f"comment: simulated walk, scene {simulator.scene.name}\n")
+
+
+def _write_inertial(simulator: Simulator, mav0: Path) -> None:
+    track = simulator.imu_track
+    readings = np.hstack([track.angular_velocity, track.linear_acceleration])
+    _write_table(mav0 / "imu0" / "data.csv", _IMU_HEADER, track.stamps_ns.tolist(), readings)
+    poses = track.states.world_T_body
+    quaternions = np.array([quat_wxyz_from_rotation(np.ascontiguousarray(pose[:3, :3])) for pose in poses])
+    truth = np.hstack(
+        [poses[:, :3, 3], quaternions, track.states.velocity, track.gyro_bias, track.accel_bias]
+    )
+    path = mav0 / "state_groundtruth_estimate0" / "data.csv"
+    _write_table(path, _TRUTH_HEADER, track.stamps_ns.tolist(), truth)
+
+
+def _write_table(path: Path, header: str, stamps: Sequence[int], values: Float) -> None:
+    with path.open("w") as file:
+        file.write(header + "\n")
+        for stamp, row in zip(stamps, values, strict=True):
+            file.write(f"{stamp}," + ",".join(f"{value:.12g}" for value in row) + "\n")
+
+
+def _matrix_yaml(body_T_sensor: Float) -> str:
+    rows = ",\n         ".join(", ".join(f"{value:.15g}" for value in row) for row in body_T_sensor)
+    return f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{rows}]\n"
+
+
+def _camera_yaml(camera: Camera, rate_hz: float) -> str:
+    coefficients = camera.distortion if camera.distortion[4] != 0.0 else camera.distortion[:4]
+    return (
+        f"sensor_type: camera\ncomment: simulated {camera.name}\n{_matrix_yaml(camera.body_T_cam)}"
+        f"rate_hz: {rate_hz:g}\nresolution: [{camera.size_px[0]}, {camera.size_px[1]}]\n"
+        "camera_model: pinhole\n"
+        f"intrinsics: [{', '.join(f'{value:.12g}' for value in camera.intrinsics)}]\n"
+        f"distortion_model: {camera.model}\n"
+        f"distortion_coefficients: [{', '.join(f'{value:.12g}' for value in coefficients)}]\n"
+    )
+
+
+def _imu_yaml(imu: Imu) -> str:
+    return (
+        f"sensor_type: imu\ncomment: simulated\n{_matrix_yaml(np.eye(4))}rate_hz: {imu.rate_hz:g}\n"
+        f"gyroscope_noise_density: {imu.gyro_noise_density:.12g}\n"
+        f"gyroscope_random_walk: {imu.gyro_random_walk:.12g}\n"
+        f"accelerometer_noise_density: {imu.accel_noise_density:.12g}\n"
+        f"accelerometer_random_walk: {imu.accel_random_walk:.12g}\n"
+    )

@@ -1,0 +1,39 @@
+"""The scenes by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from graphvio.errors import SourceError
+from graphvio.simulation.scenes import calibration, corridor, room, stairs
+from graphvio.simulation.scenes.scene import Scene
+
+_BUILDERS: dict[str, tuple[Callable[[float, float], Scene], float]] = {
+    "calibration": (calibration.build, 40.0),
+    "corridor": (corridor.build, 60.0),
+    "room": (room.build, 40.0),
+    "stairs": (stairs.build, 30.0),
+}
+
+SCENE_NAMES = tuple(_BUILDERS)
+
+
+def build_scene(name: str, duration_s: float | None = None, rest_s: float = 1.0) -> Scene:
+    """A scene by its name.
+
+    Args:
+        name: one of `SCENE_NAMES`.
+        duration_s: only so much of its walk; None for all. Beyond its end, the body stands still.
+        rest_s: how long the body stands still at first; 0 starts at walking speed.
+
+    Raises:
+        SourceError: if there is no such scene, or the duration is not positive.
+    """
+    if name not in _BUILDERS:
+        raise SourceError(f"there is no scene {name!r}; choose one of {', '.join(SCENE_NAMES)}")
+    build, whole_s = _BUILDERS[name]
+    if duration_s is not None and not 0.0 < duration_s < 3600.0:
+        raise SourceError(
+            f"a duration of {duration_s} s cannot be simulated; give seconds between 0 and 3600"
+        )
+    return build(whole_s if duration_s is None else duration_s, rest_s)

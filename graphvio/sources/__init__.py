@@ -1,0 +1,67 @@
+"""Recordings as streams of IMU samples and framesets: EuRoC/ASL, TUM-VI, KITTI odometry and KITTI raw."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from graphvio.errors import RigError, SourceError
+from graphvio.rig import Rig
+from graphvio.rig_files import find_rig
+from graphvio.sources import euroc, kitti_odometry, kitti_raw
+from graphvio.sources.base import Source
+from graphvio.sources.faults import FaultLog
+from graphvio.sources.recording import Recording
+
+__all__ = ["FaultLog", "Source", "open_source"]
+
+_FORMATS = (euroc, kitti_odometry, kitti_raw)
+
+
+def open_source(
+    path: str | Path, rig: Rig | None = None, *, from_s: float | None = None, to_s: float | None = None
+) -> Source:
+    """Open a recording, whatever its layout.
+
+    Args:
+        path: folder of the recording.
+        rig: decides which pairs are read, and whether the IMU is; None takes the recording's own.
+        from_s: where to begin, seconds after the recording's first frameset.
+        to_s: where to end (inclusive), on the same scale.
+
+    Raises:
+        SourceError: if the folder cannot be read, has no known layout, or holds nothing in the given time.
+        RigError: if no rig is given and the recording carries none that is usable.
+    """
+    for name, value in (("from_s", from_s), ("to_s", to_s)):
+        if value is not None and not math.isfinite(value):
+            raise SourceError(f"{name} is {value}; give seconds after the first frameset")
+    try:
+        return _open(Path(path), rig, from_s, to_s)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+
+
+def _open(folder: Path, rig: Rig | None, from_s: float | None, to_s: float | None) -> Recording:
+    if not folder.exists():
+        raise SourceError(f"{folder}: does not exist; give the folder of a recording")
+    if not folder.is_dir():
+        raise SourceError(f"{folder}: is no folder; give the folder of a recording ({_known()})")
+    if next(folder.iterdir(), None) is None:
+        raise SourceError(f"{folder}: is empty; looked for {_known()}")
+    layout = next((known for known in _FORMATS if known.matches(folder)), None)
+    if layout is None:
+        raise SourceError(f"{folder}: has none of the known layouts; looked for {_known()}")
+    if rig is None:
+        rig = find_rig(folder)
+    if rig is None:
+        raise RigError(
+            f"{folder}: carries no calibration; write a rig.yaml into it, or give a rig of your own"
+        )
+    resolved = folder.resolve()
+    faults = FaultLog(resolved.parent.name if resolved.name == "mav0" else resolved.name)
+    return Recording(layout.read_index(folder, rig, faults), rig, faults, from_s, to_s)
+
+
+def _known() -> str:
+    return "; ".join(known.LAYOUT for known in _FORMATS)

@@ -1,0 +1,101 @@
+"""Which images belong together: left to right of a pair, and pairs to one frameset, by their stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from graphvio.arrays import Int
+
+TOLERANCE_NS = 2_000_000
+"""Images whose stamps differ by no more than this are of the same instant."""
+
+Rows = NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class PairIndex:
+    """Images of one pair.
+
+    Attributes:
+        stamps_ns: (N,) of the left images, increasing.
+        rows: (N, 2) rows of the left and the right image in their cameras' tables.
+        left_alone: (L,) stamps of left images without a right one.
+        right_alone: (R,) stamps of right images without a left one.
+    """
+
+    stamps_ns: Int
+    rows: Rows
+    left_alone: Int
+    right_alone: Int
+
+
+@dataclass(frozen=True, eq=False)
+class FramesetIndex:
+    """Framesets of a recording.
+
+    Attributes:
+        stamps_ns: (F,) increasing, camera clock.
+        rows: (F, P, 2) rows of the left and right image of each pair, -1 where the pair has none.
+    """
+
+    stamps_ns: Int
+    rows: Rows
+
+    def slice(self, first: int, last: int) -> FramesetIndex:
+        """Framesets ``first`` to ``last - 1``."""
+        return FramesetIndex(self.stamps_ns[first:last], self.rows[first:last])
+
+
+def match_sides(left_ns: Int, right_ns: Int) -> PairIndex:
+    """Match left (N,) and right (M,) images of a pair by stamp; both increase."""
+    if np.array_equal(left_ns, right_ns):
+        rows = np.repeat(np.arange(len(left_ns), dtype=np.int32)[:, None], 2, axis=1)
+        nothing = np.zeros(0, dtype=np.int64)
+        return PairIndex(left_ns, rows, nothing, nothing)
+    matched: list[tuple[int, int]] = []
+    i = j = 0
+    lefts, rights = left_ns.tolist(), right_ns.tolist()
+    while i < len(lefts) and j < len(rights):
+        ahead = rights[j] - lefts[i]
+        if abs(ahead) <= TOLERANCE_NS:
+            matched.append((i, j))
+            i += 1
+            j += 1
+        elif ahead > 0:
+            i += 1
+        else:
+            j += 1
+    rows = np.array(matched, dtype=np.int32).reshape(-1, 2)
+    return PairIndex(
+        left_ns[rows[:, 0]], rows, np.delete(left_ns, rows[:, 0]), np.delete(right_ns, rows[:, 1])
+    )
+
+
+def group_pairs(pairs: Sequence[PairIndex]) -> FramesetIndex:
+    """Join pairs of the same instant to framesets, stamped by the first pair in each."""
+    count = len(pairs)
+    first = pairs[0].stamps_ns
+    if all(np.array_equal(pair.stamps_ns, first) for pair in pairs[1:]):
+        return FramesetIndex(first, np.stack([pair.rows for pair in pairs], axis=1))
+    entries = sorted(
+        (stamp, number, row)
+        for number, pair in enumerate(pairs)
+        for row, stamp in enumerate(pair.stamps_ns.tolist())
+    )
+    groups: list[dict[int, tuple[int, int]]] = []  # pair -> (stamp, row)
+    begun_ns = 0
+    for stamp, number, row in entries:
+        if not groups or stamp - begun_ns > TOLERANCE_NS or number in groups[-1]:
+            groups.append({})
+            begun_ns = stamp
+        groups[-1][number] = (stamp, row)
+    stamps = np.array([group[min(group)][0] for group in groups], dtype=np.int64)
+    rows = np.full((len(groups), count, 2), -1, dtype=np.int32)
+    for at, group in enumerate(groups):
+        for number, (_, row) in group.items():
+            rows[at, number] = pairs[number].rows[row]
+    return FramesetIndex(stamps, rows)

@@ -1,0 +1,35 @@
+"""Work done ahead of its use in threads: bounded, in order, and ended with its consumer."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
+from typing import TypeVar
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def read_ahead(
+    work: Callable[[T], R], items: Iterable[T], depth: int = 8, threads: int = 2
+) -> Generator[R, None, None]:
+    """``map(work, items)``, where up to ``depth`` results are prepared ahead in ``threads`` threads.
+
+    An exception of ``work`` is raised where its result is due. The threads end when the iterator is
+    exhausted, closed or collected.
+    """
+    waiting: deque[Future[R]] = deque()
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="graphvio-read")
+    try:
+        source = iter(items)
+        for item in islice(source, depth):
+            waiting.append(pool.submit(work, item))
+        while waiting:
+            result = waiting.popleft().result()
+            for item in islice(source, 1):  # refill first, so that the threads work while the consumer does
+                waiting.append(pool.submit(work, item))
+            yield result
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,41 @@
+"""Merging of IMU samples and framesets in the order in which an estimator wants them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from graphvio.events import Event, FrameSet, ImuSample
+
+COVER_NS = 50_000_000
+"""A sample further past a frameset than this does not cover it: the IMU has a gap there."""
+
+
+def merge(
+    imu: Iterable[ImuSample], framesets: Iterable[FrameSet], time_offset_ns: int = 0
+) -> Iterator[Event]:
+    """All samples and framesets in time order, where each frameset follows the sample that covers it.
+
+    The covering sample is the first at or after the frameset's instant on the IMU's clock. In a gap of the
+    IMU and after its end there is none, and the frameset comes without it. Nothing is lost: samples after the
+    last frameset follow it.
+
+    Args:
+        imu: in time order, IMU clock.
+        framesets: in time order, camera clock.
+        time_offset_ns: add it to a frameset's stamp to get the IMU's stamp of the same instant.
+    """
+    samples = iter(imu)
+    pending = next(samples, None)
+    latest_ns: int | None = None
+    for frameset in framesets:
+        instant_ns = frameset.stamp_ns + time_offset_ns
+        while pending is not None and (latest_ns is None or latest_ns < instant_ns):
+            if pending.stamp_ns > instant_ns + COVER_NS:
+                break
+            latest_ns = pending.stamp_ns
+            yield pending
+            pending = next(samples, None)
+        yield frameset
+    while pending is not None:
+        yield pending
+        pending = next(samples, None)

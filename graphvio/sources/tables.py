@@ -1,0 +1,220 @@
+"""Tables of stamped rows: tolerant reading, and cleaning of stamps. Stamps never pass through a float."""
+
+from __future__ import annotations
+
+import warnings
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float, Int
+from graphvio.errors import SourceError
+from graphvio.sources.faults import FaultLog
+
+_MAX_STAMP_NS = 2**62  # the year 2116; far enough from the end of int64 to add offsets to
+_HOUR_NS = 3_600_000_000_000
+_MAX_OUTLIERS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class ImuTable:
+    """Samples of an IMU.
+
+    Attributes:
+        stamps_ns: (N,) increasing, IMU clock.
+        values: (N, 6) angular velocity, rad/s, then specific force, m/s^2; frame body.
+    """
+
+    stamps_ns: Int
+    values: Float
+
+    def slice(self, first: int, last: int) -> ImuTable:
+        """Rows ``first`` to ``last - 1``."""
+        return ImuTable(self.stamps_ns[first:last], self.values[first:last])
+
+
+def read_imu_csv(path: Path, faults: FaultLog) -> ImuTable:
+    """Read EuRoC's ``imu0/data.csv``; rows that are no samples, repeated or out of order are dropped."""
+    table = _read_fast(path)
+    if table is None:
+        table = _read_tolerant(path, faults)
+    finite = (
+        np.isfinite(table.values).all(axis=1) & (table.stamps_ns >= 0) & (table.stamps_ns < _MAX_STAMP_NS)
+    )
+    if not finite.all():
+        bad = int(np.argmin(finite))
+        faults.add(
+            "imu_garbage",
+            int(table.stamps_ns[bad]),
+            f"{path}: the row of stamp {table.stamps_ns[bad]} holds NaN, infinity or an impossible stamp",
+            int(np.sum(~finite)),
+        )
+    kept = finite.copy()
+    kept[finite] = clean_stamps(table.stamps_ns[finite], "imu", path, faults)
+    return ImuTable(table.stamps_ns[kept], table.values[kept])
+
+
+def read_frame_csv(path: Path, faults: FaultLog) -> tuple[Int, list[str]]:
+    """Read EuRoC's ``cam0/data.csv``: stamps (N,), increasing, and file names."""
+    stamps: list[int] = []
+    names: list[str] = []
+    for number, cells in _rows(path):
+        stamp = parse_stamp(cells[0])
+        if stamp is None:
+            _count_garbage("frame_garbage", path, number, stamps, faults)
+            continue
+        stamps.append(stamp)
+        names.append(cells[1] if len(cells) > 1 and cells[1] else f"{stamp}.png")
+    all_stamps = np.array(stamps, dtype=np.int64)
+    kept = clean_stamps(all_stamps, "frame", path, faults)
+    return all_stamps[kept], [name for name, keep in zip(names, kept, strict=True) if keep]
+
+
+def parse_stamp(text: str) -> int | None:
+    """Whole nanoseconds, exactly, also of ``1.4e18``; None if the text is no stamp."""
+    try:
+        stamp = int(text)
+    except ValueError:
+        return decimal_ns(text, 1)
+    return stamp if 0 <= stamp < _MAX_STAMP_NS else None
+
+
+def decimal_ns(text: str, unit_ns: int) -> int | None:
+    """Whole nanoseconds of a decimal number in units of ``unit_ns``; None if the text is no such number."""
+    try:
+        value = Decimal(text.strip()) * unit_ns
+    except InvalidOperation:
+        return None
+    if not value.is_finite() or not 0 <= value < _MAX_STAMP_NS:
+        return None
+    return int(value.to_integral_value())
+
+
+def clean_stamps(stamps_ns: Int, what: str, path: Path, faults: FaultLog) -> Bool:
+    """Which rows (N,) to keep so that stamps increase and the fewest rows are dropped.
+
+    The longest increasing subsequence is kept. So one stamp far in the future costs one row, not all that
+    follow it; of equal stamps the first is kept. Then go one or two rows that lie hours from all others, such
+    as the stamp 0 of a driver that has no time yet. Dropped rows are counted as ``{what}_duplicate``,
+    ``{what}_backward`` and ``{what}_outlier``.
+    """
+    increasing = np.ones(len(stamps_ns), dtype=np.bool_)
+    if (np.diff(stamps_ns) <= 0).any():
+        increasing[:] = False
+        increasing[_longest_increasing(stamps_ns.tolist())] = True
+    kept = increasing.copy()
+    kept[increasing] = ~_far_from_all(stamps_ns[increasing])
+    dropped = ~increasing
+    duplicate = dropped & np.isin(stamps_ns, stamps_ns[increasing])
+    for kind, rows, says in (
+        ("duplicate", duplicate, "repeats an earlier row's; the first is kept"),
+        ("backward", dropped & ~duplicate, "is out of order; the row is dropped"),
+        ("outlier", increasing & ~kept, "lies hours from all others; the row is dropped"),
+    ):
+        if rows.any():
+            row = int(np.argmax(rows))
+            detail = f"{path}: stamp {stamps_ns[row]} of data row {row + 1} {says}"
+            faults.add(f"{what}_{kind}", int(stamps_ns[row]), detail, int(np.sum(rows)))
+    return kept
+
+
+def _far_from_all(stamps_ns: Int) -> Bool:
+    """Which increasing stamps (N,) are too few, and too far from all others, to be part of the recording."""
+    runs = np.split(np.arange(len(stamps_ns)), np.flatnonzero(np.diff(stamps_ns) > _HOUR_NS) + 1)
+    far = np.zeros(len(stamps_ns), dtype=np.bool_)
+    if max(len(run) for run in runs) > _MAX_OUTLIERS:
+        for run in runs:
+            far[run] = len(run) <= _MAX_OUTLIERS
+    return far
+
+
+def _longest_increasing(values: list[int]) -> list[int]:
+    tails: list[int] = []  # the smallest value that ends an increasing run of each length
+    tail_rows: list[int] = []
+    before: list[int] = []
+    for row, value in enumerate(values):
+        at = bisect_left(tails, value)
+        before.append(tail_rows[at - 1] if at else -1)
+        if at == len(tails):
+            tails.append(value)
+            tail_rows.append(row)
+        elif value < tails[at]:
+            tails[at] = value
+            tail_rows[at] = row
+    chosen = []
+    row = tail_rows[-1] if tail_rows else -1
+    while row >= 0:
+        chosen.append(row)
+        row = before[row]
+    return chosen[::-1]
+
+
+def _read_fast(path: Path) -> ImuTable | None:
+    row = np.dtype([("stamp", np.int64), ("values", np.float64, (6,))])
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # numpy only warns when it cuts a stamp that is written as a float
+            table = np.loadtxt(path, dtype=row, delimiter=",", comments="#", ndmin=1, encoding="utf-8")
+    except (ValueError, OverflowError, OSError, Warning):  # the tolerant reader says where
+        return None
+    return ImuTable(np.ascontiguousarray(table["stamp"]), np.ascontiguousarray(table["values"]))
+
+
+def _read_tolerant(path: Path, faults: FaultLog) -> ImuTable:
+    stamps: list[int] = []
+    values: list[list[float]] = []
+    for number, cells in _rows(path):
+        stamp = parse_stamp(cells[0])
+        try:
+            sample = [float(cell) for cell in cells[1:7]]
+        except ValueError:
+            sample = []
+        if stamp is None or len(sample) != 6:
+            _count_garbage("imu_garbage", path, number, stamps, faults)
+            continue
+        stamps.append(stamp)
+        values.append(sample)
+    return ImuTable(np.array(stamps, dtype=np.int64), np.array(values, dtype=np.float64).reshape(-1, 6))
+
+
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Line number and cells of each row that is neither blank, comment nor a header in words."""
+    is_first = True
+    for number, line in enumerate(read_lines(path), start=1):
+        line = line.strip()
+        if not line or line.startswith("#"):
+            continue
+        cells = [cell.strip() for cell in (line.split(",") if "," in line else line.split())]
+        if not (is_first and not any(_is_number(cell) for cell in cells)):
+            yield number, cells
+        is_first = False
+
+
+def read_lines(path: Path) -> list[str]:
+    """Lines of a text file with any line ends; bytes that are no text become garbage in their line only.
+
+    Raises:
+        SourceError: if the file cannot be read.
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig", errors="replace").split("\n")
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read ({error.strerror}); check the recording") from None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _count_garbage(kind: str, path: Path, number: int, stamps: list[int], faults: FaultLog) -> None:
+    faults.add(
+        kind, stamps[-1] if stamps else 0, f"{path}: line {number} is no row of this table; it is dropped"
+    )

@@ -1,0 +1,452 @@
+"""Rig files: what is read, what is written, and what is refused with which words."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from recordings import (
+    KITTI_P,
+    REAL_DATA,
+    small_rig,
+    write_euroc,
+    write_image,
+    write_imu_yaml,
+    write_kitti_odometry,
+    write_kitti_raw,
+)
+
+from graphvio.errors import RigError
+from graphvio.geometry import se3, se3_exp, se3_inverse
+from graphvio.rig import Camera, Imu, Rig, StereoPair
+from graphvio.rig_files import find_rig, load_rig
+
+
+def assert_same(a: Rig, b: Rig) -> None:
+    assert a.imu == b.imu
+    assert [pair.name for pair in a.pairs] == [pair.name for pair in b.pairs]
+    for one, other in zip(a.cameras, b.cameras, strict=True):
+        assert (one.name, one.model, one.size_px, one.mask) == (
+            other.name,
+            other.model,
+            other.size_px,
+            other.mask,
+        )
+        np.testing.assert_array_equal(one.intrinsics, other.intrinsics)
+        np.testing.assert_array_equal(one.distortion, other.distortion)
+        np.testing.assert_allclose(one.body_T_cam, other.body_T_cam, atol=1e-12, rtol=0)
+
+
+def edited(tmp_path: Path, edit: Callable[[dict], None], pairs: int = 1) -> Path:  # type: ignore[type-arg]
+    """A rig.yaml of a small rig after a change."""
+    path = tmp_path / "rig.yaml"
+    small_rig(pairs).save(path)
+    document = yaml.safe_load(path.read_text())
+    edit(document)
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+@pytest.mark.parametrize("pairs", [1, 2, 3])
+@pytest.mark.parametrize("imu", [True, False])
+def test_round_trip(tmp_path: Path, pairs: int, imu: bool) -> None:
+    rig = small_rig(pairs, imu)
+    rig.save(tmp_path / "rig.yaml")
+    loaded = Rig.load(tmp_path / "rig.yaml")
+    assert loaded.name == rig.name
+    assert_same(rig, loaded)
+
+
+@given(
+    numbers=st.lists(st.floats(1e-9, 1e3), min_size=5, max_size=5),
+    offset_s=st.floats(-1, 1),
+    xi=st.lists(st.floats(-2, 2), min_size=6, max_size=6),
+    name=st.text(min_size=1, max_size=12),
+)
+def test_round_trip_of_any_values(
+    tmp_path_factory: pytest.TempPathFactory,
+    numbers: list[float],
+    offset_s: float,
+    xi: list[float],
+    name: str,
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
+    body_T_left = se3_exp(np.array(xi))
+    body_T_right = body_T_left @ se3(np.eye(3), np.array([0.1, 0.0, 0.0]))
+    left, right = (
+        Camera(
+            f"{side}{name}",
+            "equidistant",
+            (640, 480),
+            np.array([300.1, 299.7, 320.3, 240.9]),
+            np.zeros(4),
+            pose,
+        )
+        for side, pose in (("l", body_T_left), ("r", body_T_right))
+    )
+    rig = Rig((StereoPair(name, left, right),), Imu(*[*numbers, offset_s]), name)
+    rig.save(path)
+    assert_same(rig, load_rig(path))
+
+
+def test_mask_is_kept_relative_to_the_file(tmp_path: Path) -> None:
+    write_image(tmp_path / "masks" / "cam0.png", np.zeros((48, 64), dtype=np.uint8))
+    path = edited(tmp_path, lambda d: d["pairs"][0]["left"].update(mask="masks/cam0.png"))
+    rig = load_rig(path)
+    assert rig.pairs[0].left.mask == tmp_path.resolve() / "masks" / "cam0.png"
+    rig.save(tmp_path / "again.yaml")
+    assert 'mask: "masks/cam0.png"' in (tmp_path / "again.yaml").read_text()
+    assert_same(rig, load_rig(tmp_path / "again.yaml"))
+
+
+def test_plain_numbers_without_a_point_are_read(tmp_path: Path) -> None:
+    path = edited(tmp_path, lambda d: d["imu"].update(gyro_random_walk="2e-5"))
+    imu = load_rig(path).imu
+    assert imu is not None
+    assert imu.gyro_random_walk == 2e-5
+
+
+def _set(keys: str, value: object) -> Callable[[dict], None]:  # type: ignore[type-arg]
+    def edit(document: dict) -> None:  # type: ignore[type-arg]
+        *path, last = [int(key) if key.isdigit() else key for key in keys.split(".")]
+        for key in path:
+            document = document[key]
+        document[last] = value
+
+    return edit
+
+
+REFUSED = {
+    "unknown key": (
+        _set("imu.gyro_noise", 1.0),
+        r"rig\.yaml: imu\.gyro_noise: unknown key.*'gyro_noise_density'",
+    ),
+    "unknown top key": (_set("piars", []), r"piars: unknown key; did you mean 'pairs'"),
+    "unknown camera key": (_set("pairs.0.left.intrinsic", 1), r"pairs\[0\]\.left\.intrinsic.*'intrinsics'"),
+    "version missing": (lambda d: d.pop("graphvio_rig"), r"begin the file with  graphvio_rig: 1"),
+    "version unknown": (_set("graphvio_rig", 2), r"reads version 1"),
+    "noise missing": (
+        lambda d: d["imu"].pop("accel_random_walk"),
+        r"imu\.accel_random_walk is missing.*graphvio's default:  accel_random_walk: 0\.003",
+    ),
+    "rate missing": (lambda d: d["imu"].pop("rate_hz"), r"imu\.rate_hz is missing.*rate_hz: 200\.0"),
+    "NaN": (_set("pairs.0.left.intrinsics", [float("nan"), 1, 1, 1]), r"left\.intrinsics: holds NaN"),
+    "NaN in noise": (_set("imu.gyro_noise_density", float("nan")), r"imu\.gyro_noise_density: holds NaN"),
+    "text": (_set("pairs.0.left.intrinsics", ["a", 1, 1, 1]), r"left\.intrinsics: .* numbers only"),
+    "shape": (_set("pairs.0.left.intrinsics", [1, 1, 1]), r"left\.intrinsics: has shape \(3,\)"),
+    "no rotation": (
+        _set("pairs.0.left.body_T_cam", [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+        r"rig\.yaml: camera cam0: body_T_cam: .* no rotation",
+    ),
+    "last row": (
+        _set("pairs.0.left.body_T_cam", [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 2]]),
+        r"last row",
+    ),
+    "no pair": (_set("pairs", []), r"pairs must be a list of at least one pair"),
+    "side missing": (lambda d: d["pairs"][0].pop("right"), r"pairs\[0\]\.right is missing"),
+    "size": (_set("pairs.0.left.size_px", [64.5, 48]), r"size_px.* two whole numbers"),
+    "model": (_set("pairs.0.left.model", "fisheye"), r"unknown model 'fisheye'; use one of"),
+    "mask": (_set("pairs.0.left.mask", "none.png"), r"left\.mask: there is no image"),
+    "same name": (_set("pairs.0.right.name", "cam0"), r"camera 'cam0' appears twice"),
+    "imu is no mapping": (_set("imu", 200), r"imu: is 200; it must be a mapping"),
+    "offset in ms": (_set("imu.time_offset_s", 12.5), r"time_offset_s is 12\.5"),
+    "negative noise": (_set("imu.gyro_noise_density", -1.0), r"must be positive"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refused(tmp_path: Path, name: str) -> None:
+    edit, message = REFUSED[name]
+    path = edited(tmp_path, edit)
+    with pytest.raises(RigError, match=message) as caught:
+        load_rig(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_pair_without_baseline_or_with_diverging_axes_is_refused(tmp_path: Path) -> None:
+    document = edited(
+        tmp_path, lambda d: d["pairs"][0]["right"].update(body_T_cam=d["pairs"][0]["left"]["body_T_cam"])
+    )
+    with pytest.raises(RigError, match=r"baseline is 0\.000 mm"):
+        load_rig(document)
+    other = edited(tmp_path, lambda d: d["pairs"][0].update(right=d["pairs"][1]["left"]), pairs=2)
+    with pytest.raises(RigError, match="optical axes are 180 degrees apart"):
+        load_rig(other)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("rig.yaml", b"graphvio_rig: 1\npairs: [", "line 2 is not valid YAML"),
+        ("rig.yaml", b"- 1\n- 2\n", "must be a mapping"),
+        ("rig.yaml", b"", "graphvio_rig is missing"),
+        ("rig.yaml", b"\xff\xfe\x00", "no text file"),
+        ("rig.bin", b"", "no calibration file"),
+    ],
+)
+def test_unreadable_files(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(RigError, match=message):
+        load_rig(tmp_path / name)
+
+
+def test_example_of_the_documentation_is_valid(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[1] / "docs" / "data-contract.md").read_text()
+    (example,) = re.findall(r"```yaml\n(graphvio_rig.*?)```", text, re.DOTALL)
+    (tmp_path / "rig.yaml").write_text(example)
+    rig = load_rig(tmp_path / "rig.yaml")
+    assert [pair.name for pair in rig.pairs] == ["front", "back"]
+    assert rig.imu == Imu()  # the defaults that errors offer
+
+
+def test_missing_paths(tmp_path: Path) -> None:
+    with pytest.raises(RigError, match="does not exist"):
+        load_rig(tmp_path / "none.yaml")
+    with pytest.raises(RigError, match="cannot be read"):
+        load_rig(tmp_path / ("x" * 300))
+    with pytest.raises(RigError, match="holds no calibration"):
+        load_rig(tmp_path)
+    with pytest.raises(RigError, match="cannot be written"):
+        small_rig().save(tmp_path / "none" / "rig.yaml")
+
+
+def test_euroc_folder(tmp_path: Path) -> None:
+    rig = small_rig(2)
+    write_euroc(tmp_path / "walk", frames=1)
+    for path in (
+        tmp_path / "walk",
+        tmp_path / "walk" / "mav0",
+        tmp_path / "walk" / "mav0" / "cam0" / "sensor.yaml",
+    ):
+        loaded = load_rig(path)
+        assert_same(rig, loaded)
+        assert loaded.name == "walk"
+
+
+def test_rig_yaml_in_the_folder_takes_precedence(tmp_path: Path) -> None:
+    write_euroc(tmp_path, frames=1)
+    small_rig(1).save(tmp_path / "rig.yaml")
+    assert len(load_rig(tmp_path).pairs) == 1
+    assert len(load_rig(tmp_path / "mav0").pairs) == 1
+
+
+def test_euroc_body_becomes_the_imu(tmp_path: Path) -> None:
+    rig = small_rig(1)
+    write_euroc(tmp_path, pairs=1, frames=1)
+    B_T_imu = se3_exp(np.array([0.3, -0.2, 0.5, 0.1, 0.2, -0.3]))
+    write_imu_yaml(tmp_path / "mav0" / "imu0" / "sensor.yaml", Imu(), B_T_imu)
+    loaded = load_rig(tmp_path)
+    for got, camera in zip(loaded.cameras, rig.cameras, strict=True):
+        np.testing.assert_allclose(B_T_imu @ got.body_T_cam, camera.body_T_cam, atol=1e-12)
+
+
+def test_euroc_odd_camera(tmp_path: Path) -> None:
+    write_euroc(tmp_path, frames=1)
+    (tmp_path / "mav0" / "cam4").mkdir()
+    sensor = (tmp_path / "mav0" / "cam0" / "sensor.yaml").read_text()
+    (tmp_path / "mav0" / "cam4" / "sensor.yaml").write_text(sensor)
+    with pytest.raises(RigError, match=r"5 cameras.*cam4 is left without a partner; write a rig.yaml"):
+        load_rig(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "pattern", "replacement", "message"),
+    [
+        (
+            "imu0",
+            r"gyroscope_noise_density.*\n",
+            "",
+            r"gyroscope_noise_density is missing.*default:  gyroscope_noise",
+        ),
+        ("cam1", r"intrinsics.*\n", "", r"cam1/sensor\.yaml: intrinsics is missing"),
+        ("cam1", r"radial-tangential", "fov", r"distortion_model: unknown model 'fov'"),
+        ("cam1", r"pinhole", "omni", r"camera_model: is 'omni'"),
+        ("cam1", r"resolution.*\n", "resolution: 752\n", r"resolution: has shape"),
+        ("cam1", r"data: \[[^,]*", "data: [nan", r"T_BS\.data: holds NaN"),
+    ],
+)
+def test_euroc_refusals(tmp_path: Path, sensor: str, pattern: str, replacement: str, message: str) -> None:
+    write_euroc(tmp_path, pairs=1, frames=1)
+    file = tmp_path / "mav0" / sensor / "sensor.yaml"
+    file.write_text(re.sub(pattern, replacement, file.read_text()))
+    with pytest.raises(RigError, match=message):
+        load_rig(tmp_path)
+
+
+def kalibr_chain(rig: Rig, shift_s: float = 0.0, model: str = "radtan") -> str:
+    chain = {}
+    for i, camera in enumerate(rig.cameras):
+        chain[f"cam{i}"] = {
+            "T_cam_imu": camera.cam_T_body.tolist(),
+            "cam_overlaps": [],
+            "camera_model": "pinhole",
+            "distortion_coeffs": camera.distortion[:4].tolist(),
+            "distortion_model": model,
+            "intrinsics": camera.intrinsics.tolist(),
+            "resolution": list(camera.size_px),
+            "rostopic": f"/cam{i}/image_raw",
+            "timeshift_cam_imu": shift_s,
+        }
+    return yaml.safe_dump(chain)
+
+
+KALIBR_IMU = """
+accelerometer_noise_density: 2.0e-3
+accelerometer_random_walk: 3.0e-3
+gyroscope_noise_density: 1.7e-4
+gyroscope_random_walk: 2.0e-5
+rostopic: /imu0
+update_rate: 200.0
+"""
+
+
+@pytest.mark.parametrize(
+    ("chain", "imu"),
+    [
+        ("camchain-imucam.yaml", "imu.yaml"),
+        ("walk-camchain-imucam.yaml", "walk-imu.yaml"),
+        ("camchain.yaml", "imu_config.yaml"),
+    ],
+)
+@pytest.mark.parametrize("nested", [False, True])
+def test_kalibr(tmp_path: Path, chain: str, imu: str, nested: bool) -> None:
+    rig = small_rig(2)
+    (tmp_path / chain).write_text(kalibr_chain(rig, shift_s=-0.0125))
+    text = "imu0:\n" + KALIBR_IMU.replace("\n", "\n  ") if nested else KALIBR_IMU
+    (tmp_path / imu).write_text(text)
+    loaded = load_rig(tmp_path / chain)
+    assert loaded.imu == Imu(time_offset_s=-0.0125)
+    assert_same(rig.without_imu(), loaded.without_imu())
+    assert_same(loaded, load_rig(tmp_path))
+
+
+def test_kalibr_without_imu_chains_the_cameras(tmp_path: Path) -> None:
+    rig = small_rig(1, imu=False)
+    chain = yaml.safe_load(kalibr_chain(rig))
+    for camera in chain.values():
+        del camera["T_cam_imu"]
+    chain["cam1"]["T_cn_cnm1"] = rig.pairs[0].right_T_left.tolist()
+    (tmp_path / "camchain.yaml").write_text(yaml.safe_dump(chain))
+    loaded = load_rig(tmp_path / "camchain.yaml")
+    assert loaded.imu is None
+    np.testing.assert_allclose(loaded.pairs[0].right_T_left, rig.pairs[0].right_T_left, atol=1e-12)
+    np.testing.assert_allclose(loaded.pairs[0].left.body_T_cam, np.eye(4), atol=1e-12)
+
+
+def test_kalibr_refusals(tmp_path: Path) -> None:
+    path = tmp_path / "camchain-imucam.yaml"
+    path.write_text(kalibr_chain(small_rig(1)))
+    with pytest.raises(RigError, match=r"no imu.yaml next to.*gyroscope_noise_density: 0.00017"):
+        load_rig(path)
+    (tmp_path / "imu.yaml").write_text(KALIBR_IMU.replace("update_rate: 200.0", ""))
+    with pytest.raises(RigError, match=r"imu.yaml: update_rate is missing.*update_rate: 200.0"):
+        load_rig(path)
+    (tmp_path / "imu.yaml").write_text(KALIBR_IMU)
+    path.write_text(kalibr_chain(small_rig(1), model="fov"))
+    with pytest.raises(RigError, match=r"cam0\.distortion_model: unknown model 'fov'"):
+        load_rig(path)
+    chain = yaml.safe_load(kalibr_chain(small_rig(1)))
+    chain["cam1"]["timeshift_cam_imu"] = 0.02
+    path.write_text(yaml.safe_dump(chain))
+    with pytest.raises(RigError, match=r"timeshift_cam_imu differs by 20.0 ms"):
+        load_rig(path)
+
+
+@pytest.mark.parametrize("sensor_yaml", ["", "missing", "sensor_type: camera\ncomment: TUM\n"])
+def test_tum_vi_takes_the_chain_of_dso(tmp_path: Path, sensor_yaml: str) -> None:
+    rig = small_rig(1)
+    write_euroc(tmp_path, pairs=1, frames=1)
+    for camera in ("cam0", "cam1"):
+        file = tmp_path / "mav0" / camera / "sensor.yaml"
+        file.unlink() if sensor_yaml == "missing" else file.write_text(sensor_yaml)
+    (tmp_path / "mav0" / "imu0" / "sensor.yaml").unlink()
+    (tmp_path / "dso").mkdir()
+    (tmp_path / "dso" / "camchain.yaml").write_text(kalibr_chain(rig, model="equidistant"))
+    (tmp_path / "dso" / "imu_config.yaml").write_text(KALIBR_IMU)
+    loaded = load_rig(tmp_path)
+    assert {camera.model for camera in loaded.cameras} == {"equidistant"}
+    np.testing.assert_allclose(loaded.pairs[0].right_T_left, rig.pairs[0].right_T_left, atol=1e-12)
+    assert loaded.imu == Imu()
+
+
+def test_kitti_odometry(tmp_path: Path) -> None:
+    write_kitti_odometry(tmp_path / "07", frames=1)
+    rig = load_rig(tmp_path / "07" / "calib.txt")
+    assert rig.imu is None
+    assert [camera.name for camera in rig.cameras] == ["image_0", "image_1"]
+    assert rig.pairs[0].left.size_px == (64, 48)
+    np.testing.assert_allclose(rig.pairs[0].left.intrinsics, [70, 70, 31.5, 23.5])
+    # P1's 4th column is -f b: the right camera sits b = 0.5 m to the right of the left one
+    np.testing.assert_allclose(rig.pairs[0].right.body_T_cam[:3, 3], [0.5, 0, 0], atol=1e-12)
+    assert_same(rig, load_rig(tmp_path / "07"))
+
+
+def test_kitti_colour_pair_where_there_is_no_grey(tmp_path: Path) -> None:
+    write_kitti_odometry(tmp_path, frames=1, cameras=(2, 3))
+    rig = load_rig(tmp_path)
+    assert [camera.name for camera in rig.cameras] == ["image_2", "image_3"]
+    left = rig.pairs[0].left
+    P = np.array(KITTI_P[2].split(), dtype=float).reshape(3, 4)
+    point = np.array([0.3, -0.2, 4.0])  # in the frame of the rectified grey left camera, which is body
+    u, v, w = P @ [*point, 1.0]
+    pixels, valid = left.project((se3_inverse(left.body_T_cam) @ [*point, 1.0])[None, :3])
+    assert valid.all()
+    np.testing.assert_allclose(pixels[0], [u / w, v / w], atol=1e-9)
+
+
+def test_kitti_raw(tmp_path: Path) -> None:
+    drive = write_kitti_raw(tmp_path / "2011_09_26", frames=1)
+    for path in (drive, tmp_path / "2011_09_26" / "calib_cam_to_cam.txt"):
+        rig = load_rig(path)
+        assert [camera.name for camera in rig.cameras] == ["image_00", "image_01"]
+        assert rig.pairs[0].baseline_m == pytest.approx(0.5)
+        assert rig.pairs[0].left.size_px == (64, 48)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("P1:", "Q1:", "P1 is missing"),
+        (KITTI_P[1], "1 2 3", "P1: holds 3 numbers"),
+        (KITTI_P[1], KITTI_P[1].replace("-3.5e+01", "x"), "P1: is not numeric"),
+        (KITTI_P[1], KITTI_P[0], "baseline is 0.000 mm"),
+        (KITTI_P[1], KITTI_P[1].replace("-3.5e+01", "nan"), "finite"),
+    ],
+)
+def test_kitti_refusals(tmp_path: Path, old: str, new: str, message: str) -> None:
+    write_kitti_odometry(tmp_path, frames=1)
+    file = tmp_path / "calib.txt"
+    file.write_text(file.read_text().replace(old, new))
+    with pytest.raises(RigError, match=message):
+        load_rig(tmp_path)
+
+
+def test_kitti_without_images(tmp_path: Path) -> None:
+    (tmp_path / "calib.txt").write_text("P0: 1")
+    with pytest.raises(RigError, match="says nothing of the image size"):
+        load_rig(tmp_path / "calib.txt")
+
+
+def test_several_chains_in_a_folder(tmp_path: Path) -> None:
+    for name in ("a-camchain.yaml", "b-camchain.yaml"):
+        (tmp_path / name).write_text(kalibr_chain(small_rig(1)))
+    with pytest.raises(RigError, match="several camera chains"):
+        find_rig(tmp_path)
+
+
+@pytest.mark.skipif(not (REAL_DATA / "euroc_mh01_clip").is_dir(), reason="the real EuRoC clip is not here")
+def test_real_euroc_calibration() -> None:
+    rig = load_rig(REAL_DATA / "euroc_mh01_clip")
+    assert rig.pairs[0].baseline_m == pytest.approx(0.110078, abs=1e-5)
+    assert rig.imu is not None
+    assert rig.imu.gyro_noise_density == 1.6968e-4
+    np.testing.assert_allclose(
+        rig.pairs[0].left.body_T_cam[:3, 3], [-0.0216401454975, -0.064676986768, 0.00981073058949]
+    )

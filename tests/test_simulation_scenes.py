@@ -1,0 +1,88 @@
+import cv2
+import numpy as np
+import pytest
+
+from graphvio.arrays import Image
+from graphvio.errors import SourceError
+from graphvio.simulation import SCENE_NAMES, Simulator, build_scene, make_simulator
+
+STRENGTH = 1e-3  # smallest eigenvalue of a corner that stands out from the noise
+
+
+@pytest.fixture(scope="module")
+def corridor() -> Simulator:
+    return make_simulator("corridor", duration_s=42.0)
+
+
+def corners(image: Image) -> int:
+    """Number of corners that stand out, at least 10 pixels apart."""
+    strength = cv2.cornerMinEigenVal(image, 5, ksize=3)
+    peaks = strength == cv2.dilate(strength, np.ones((21, 21)))
+    return int(np.count_nonzero(peaks & (strength > STRENGTH)))
+
+
+def at(simulator: Simulator, time_s: float) -> int:
+    return round(time_s * simulator.rate_hz)
+
+
+def test_unknown_scene_and_durations_are_refused() -> None:
+    with pytest.raises(SourceError, match="room"):
+        build_scene("kitchen")
+    for duration in (0.0, -1.0, float("nan")):
+        with pytest.raises(SourceError, match="duration"):
+            build_scene("room", duration)
+    with pytest.raises(SourceError, match="rate"):
+        make_simulator("room", rate_hz=0.0)
+    with pytest.raises(SourceError, match="seed"):
+        make_simulator("room", seed=-1)
+
+
+@pytest.mark.parametrize("name", SCENE_NAMES)
+def test_every_camera_sees_texture_and_no_hole(name: str) -> None:
+    simulator = make_simulator(name)
+    last = len(simulator.stamps_ns) - 1
+    for index in (0, last // 5, last):
+        for camera in range(4):
+            view = simulator.view(index, camera)
+            assert np.isfinite(view.depth).all()  # the world is closed
+            assert view.depth.min() > 0.15  # nobody walks through a wall
+            image = simulator.image(index, camera)
+            assert 25 < image.mean() < 170
+            assert corners(image) > 80
+
+
+def test_both_pairs_go_blind_at_the_bend(corridor: Simulator) -> None:
+    start, end = corridor.scene.events["blank"]
+    assert end < 40.0
+    assert 0.8 <= end - start <= 1.5
+    for time_s in np.linspace(start, end, 6):
+        assert max(corners(corridor.image(at(corridor, time_s), camera)) for camera in range(4)) < 12
+    for time_s in (start - 1.5, end + 1.5):  # a moment before and after, one of them sees again
+        assert max(corners(corridor.image(at(corridor, time_s), camera)) for camera in (0, 2)) > 40
+
+
+def test_door_fills_the_front_view(corridor: Simulator) -> None:
+    start, end = corridor.scene.events["door"]
+    seen = [corridor.view(at(corridor, t), 0).is_moving.mean() for t in np.linspace(start, end, 6)]
+    assert max(seen) > 0.2
+    first, second = (corridor.surfaces(at(corridor, t)).corners for t in (start + 0.5, start + 0.8))
+    assert np.abs(first - second).max() > 0.05
+
+
+def test_people_pass_both_pairs(corridor: Simulator) -> None:
+    start, end = corridor.scene.events["people"]
+    for camera in (0, 2):
+        seen = [
+            corridor.view(at(corridor, t), camera).is_moving.mean()
+            for t in np.arange(start + 2, end - 2, 0.5)
+        ]
+        assert max(seen) > 0.1
+
+
+def test_lamps_fail_and_come_back(corridor: Simulator) -> None:
+    start, end = corridor.scene.events["dim"]
+    assert end < 42.0
+    dark = corridor.image(at(corridor, 0.5 * (start + end)), 0)
+    bright = corridor.image(at(corridor, end + 1.0), 0)
+    assert dark.mean() < 0.5 * bright.mean()
+    assert corners(dark) > 40

@@ -1,0 +1,656 @@
+"""Sources: what they yield, each fault of a recording by itself, and their threads."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from recordings import (
+    FRAME_PERIOD_NS,
+    IMU_PERIOD_NS,
+    REAL_DATA,
+    START_NS,
+    frame_stamps,
+    imu_row,
+    noise_image,
+    read_rows,
+    small_rig,
+    write_euroc,
+    write_image,
+    write_imu,
+    write_kitti_odometry,
+    write_kitti_raw,
+    write_rows,
+)
+
+from graphvio import FrameSet, ImuSample, RigError, SourceError, open_source
+from graphvio.sources import Source
+from graphvio.sources.read_ahead import read_ahead
+
+S = 10**9
+
+
+def framesets(source: Source) -> list[FrameSet]:
+    return [event for event in source if isinstance(event, FrameSet)]
+
+
+def samples(source: Source) -> list[ImuSample]:
+    return [event for event in source if isinstance(event, ImuSample)]
+
+
+@pytest.fixture
+def walk(tmp_path: Path) -> Path:
+    return write_euroc(tmp_path / "walk")
+
+
+def image_file(walk: Path, camera: int, frame: int) -> Path:
+    return walk / "mav0" / f"cam{camera}" / "data" / f"{START_NS + frame * FRAME_PERIOD_NS}.png"
+
+
+@pytest.mark.parametrize("inner", [False, True])
+def test_euroc_whole(walk: Path, inner: bool) -> None:
+    source = open_source(walk / "mav0" if inner else str(walk))
+    assert (source.name, source.frameset_count) == ("walk", 10)
+    assert (source.start_ns, source.end_ns) == (START_NS, START_NS + 9 * FRAME_PERIOD_NS)
+    assert source.truth is None
+    events = list(source)
+    sets = [event for event in events if isinstance(event, FrameSet)]
+    assert [s.stamp_ns for s in sets] == frame_stamps(10)
+    for i, frameset in enumerate(sets):
+        assert sorted(frameset.images) == [0, 1]
+        for pair, images in frameset.images.items():
+            for side, image in enumerate(images):
+                np.testing.assert_array_equal(image, noise_image(100 * (2 * pair + side) + i))
+    imu = [event for event in events if isinstance(event, ImuSample)]
+    assert [s.stamp_ns for s in imu] == list(range(START_NS - S, source.end_ns + 10**8 + 1, IMU_PERIOD_NS))
+    np.testing.assert_array_equal(imu[3].angular_velocity, [0.01, -0.02, 0.03])
+    np.testing.assert_array_equal(imu[3].linear_acceleration, [0.1, 0.2, 9.81])
+    assert source.faults.counts == {}
+    assert len(source.decode_ms) == 10
+    assert min(source.decode_ms) > 0
+
+
+def test_the_sample_that_covers_a_frameset_comes_first(walk: Path) -> None:
+    latest = 0
+    for event in open_source(walk):
+        if isinstance(event, FrameSet):
+            assert event.stamp_ns <= latest < event.stamp_ns + IMU_PERIOD_NS
+        else:
+            latest = event.stamp_ns
+
+
+def test_rig_decides_what_is_read(walk: Path) -> None:
+    rig = small_rig(2)
+    only_second = open_source(walk, rig.with_pairs([1]).without_imu())
+    assert samples(only_second) == []
+    first = framesets(only_second)[0]
+    assert list(first.images) == [0]
+    np.testing.assert_array_equal(first.images[0][1], noise_image(300))
+
+
+def test_truth_is_found(walk: Path) -> None:
+    write_rows(walk / "mav0" / "mocap0" / "data.csv", ["#"])
+    assert open_source(walk).truth == walk / "mav0" / "mocap0" / "data.csv"
+    write_rows(walk / "mav0" / "state_groundtruth_estimate0" / "data.csv", ["#"])
+    assert open_source(walk).truth == walk / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+
+
+@pytest.mark.parametrize(
+    ("from_s", "to_s", "frames"),
+    [(0.1, None, range(2, 10)), (None, 0.2, range(5)), (0.07, 0.21, range(2, 5))],
+)
+def test_from_to(walk: Path, from_s: float | None, to_s: float | None, frames: range) -> None:
+    source = open_source(walk, from_s=from_s, to_s=to_s)
+    assert [s.stamp_ns for s in framesets(source)] == [START_NS + i * FRAME_PERIOD_NS for i in frames]
+    assert source.frameset_count == len(frames)
+    imu = samples(source)
+    assert imu[0].stamp_ns == START_NS - S
+    if to_s is not None:
+        assert imu[-1].stamp_ns == source.end_ns
+    assert source.faults.counts == {}
+
+
+def test_imu_lead_is_bounded(tmp_path: Path) -> None:
+    write_euroc(tmp_path, pairs=1, frames=3)
+    write_imu(tmp_path / "mav0", list(range(START_NS - 8 * S, START_NS + S, IMU_PERIOD_NS)))
+    assert samples(open_source(tmp_path))[0].stamp_ns == START_NS - 5 * S
+
+
+@pytest.mark.parametrize(
+    ("from_s", "to_s", "message"),
+    [
+        (5.0, None, r"no frameset lies from 5\.0 s to the end; the recording lasts 0\.450 s"),
+        (0.3, 0.1, r"from 0\.3 s to 0\.1"),
+        (float("nan"), None, "from_s is nan"),
+        (None, float("inf"), "to_s is inf"),
+    ],
+)
+def test_from_to_outside(walk: Path, from_s: float | None, to_s: float | None, message: str) -> None:
+    with pytest.raises(SourceError, match=message):
+        open_source(walk, from_s=from_s, to_s=to_s)
+
+
+def test_wrong_paths(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="does not exist"):
+        open_source(tmp_path / "none")
+    with pytest.raises(SourceError, match="cannot be read"):
+        open_source(tmp_path / ("x" * 300))
+    with pytest.raises(SourceError, match="is empty; looked for EuRoC/ASL"):
+        open_source(tmp_path)
+    file = tmp_path / "file.bag"
+    file.write_bytes(b"x")
+    with pytest.raises(SourceError, match="is no folder"):
+        open_source(file)
+    with pytest.raises(SourceError, match=r"none of the known layouts.*KITTI odometry.*KITTI raw") as caught:
+        open_source(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_calibration(tmp_path: Path) -> None:
+    write_kitti_odometry(tmp_path)
+    (tmp_path / "calib.txt").unlink()
+    with pytest.raises(RigError, match=r"carries no calibration; write a rig\.yaml"):
+        open_source(tmp_path)
+
+
+def test_camera_of_the_rig_is_not_in_the_recording(tmp_path: Path) -> None:
+    write_euroc(tmp_path, pairs=1)
+    with pytest.raises(SourceError, match="no camera cam2, which the rig names; it has cam0, cam1"):
+        open_source(tmp_path, small_rig(2))
+
+
+# Each fault by itself: what is done to a recording of 10 frames; what is counted; framesets; samples.
+ALL_SAMPLES = (S + 9 * FRAME_PERIOD_NS + 10**8) // IMU_PERIOD_NS + 1
+
+
+def cut_image(keep: float) -> Callable[[Path], None]:
+    def damage(walk: Path) -> None:
+        file = image_file(walk, 2, 4)
+        data = file.read_bytes()
+        file.write_bytes(data[: int(keep * len(data))])
+
+    return damage
+
+
+def unlink_all(walk: Path) -> None:
+    for camera in range(4):
+        image_file(walk, camera, 4).unlink()
+
+
+def flip_byte(walk: Path) -> None:
+    file = image_file(walk, 2, 4)
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    file.write_bytes(data)
+
+
+def jpeg(keep: float) -> Callable[[Path], None]:
+    def damage(walk: Path) -> None:
+        encoded = cv2.imencode(".jpg", noise_image(1))[1].tobytes()
+        image_file(walk, 2, 4).write_bytes(encoded[: int(keep * len(encoded))])
+
+    return damage
+
+
+def csv_edit(sensor: str, edit: Callable[[list[str]], None], end: str = "\n") -> Callable[[Path], None]:
+    def damage(walk: Path) -> None:
+        file = walk / "mav0" / sensor / "data.csv"
+        rows = read_rows(file)
+        edit(rows)
+        write_rows(file, rows, end)
+
+    return damage
+
+
+def swap(i: int, j: int) -> Callable[[list[str]], None]:
+    def edit(rows: list[str]) -> None:
+        rows[i], rows[j] = rows[j], rows[i]
+
+    return edit
+
+
+def put(i: int, *rows_put: str) -> Callable[[list[str]], None]:
+    def edit(rows: list[str]) -> None:
+        rows[i:i] = rows_put
+
+    return edit
+
+
+def drop(*which: slice) -> Callable[[list[str]], None]:
+    def edit(rows: list[str]) -> None:
+        for part in which:
+            del rows[part]
+
+    return edit
+
+
+def replace(i: int, row: str) -> Callable[[list[str]], None]:
+    def edit(rows: list[str]) -> None:
+        rows[i] = row
+
+    return edit
+
+
+def both(sensors: tuple[str, ...], edit: Callable[[list[str]], None]) -> Callable[[Path], None]:
+    def damage(walk: Path) -> None:
+        for sensor in sensors:
+            csv_edit(sensor, edit)(walk)
+
+    return damage
+
+
+CAMERAS = ("cam0", "cam1", "cam2", "cam3")
+IMU_T0 = START_NS - S
+FAULTS: dict[str, tuple[Callable[[Path], object], dict[str, int], int, int]] = {
+    "image missing": (lambda w: image_file(w, 2, 4).unlink(), {"image_missing": 1}, 10, ALL_SAMPLES),
+    "both images missing": (
+        unlink_all,
+        {"image_missing": 4, "frameset_empty": 1},
+        9,
+        ALL_SAMPLES,
+    ),
+    "image empty": (cut_image(0), {"image_undecodable": 1}, 10, ALL_SAMPLES),
+    "image cut in half": (cut_image(0.5), {"image_undecodable": 1}, 10, ALL_SAMPLES),
+    "image lacks its end": (cut_image(0.99), {"image_undecodable": 1}, 10, ALL_SAMPLES),
+    "image damaged": (flip_byte, {"image_undecodable": 1}, 10, ALL_SAMPLES),
+    "image is text": (
+        lambda w: write_rows(image_file(w, 2, 4), ["no image"]),
+        {"image_undecodable": 1},
+        10,
+        ALL_SAMPLES,
+    ),
+    "JPEG": (jpeg(1), {}, 10, ALL_SAMPLES),
+    "JPEG cut": (jpeg(0.7), {"image_undecodable": 1}, 10, ALL_SAMPLES),
+    "image size": (
+        lambda w: write_image(image_file(w, 2, 4), noise_image(0, (32, 32))),
+        {"image_wrong_size": 1},
+        10,
+        ALL_SAMPLES,
+    ),
+    "left without right": (
+        csv_edit("cam1", drop(slice(5, 6))),
+        {"unpaired_image": 1, "frame_gap": 1, "frameset_incomplete": 1},
+        10,
+        ALL_SAMPLES,
+    ),
+    "pairs of different lengths": (
+        both(("cam2", "cam3"), drop(slice(8, None))),
+        {"frameset_incomplete": 3},
+        10,
+        ALL_SAMPLES,
+    ),
+    "frame gap": (both(CAMERAS, drop(slice(4, 7))), {"frame_gap": 1}, 7, ALL_SAMPLES),
+    "duplicate frame": (
+        both(CAMERAS, put(3, f"{START_NS},x.png")),
+        {"frame_backward": 0, "frame_duplicate": 4},
+        10,
+        ALL_SAMPLES,
+    ),
+    "frames swapped": (both(CAMERAS, swap(4, 5)), {"frame_backward": 4, "frame_gap": 1}, 9, ALL_SAMPLES),
+    "frame stamp far ahead": (
+        both(CAMERAS, put(3, f"{START_NS + 900 * S},x.png")),
+        {"frame_backward": 4},
+        10,
+        ALL_SAMPLES,
+    ),
+    "frame stamp zero": (
+        both(CAMERAS, put(1, "0,x.png")),
+        {"frame_outlier": 4},
+        10,
+        ALL_SAMPLES,
+    ),
+    "frame garbage": (both(CAMERAS, put(3, "what?,x.png")), {"frame_garbage": 4}, 10, ALL_SAMPLES),
+    "no frame csv": (lambda w: (w / "mav0/cam0/data.csv").unlink(), {"csv_missing": 1}, 10, ALL_SAMPLES),
+    "frame CRLF": (csv_edit("cam0", lambda rows: None, "\r\n"), {}, 10, ALL_SAMPLES),
+    "frame without header": (csv_edit("cam0", drop(slice(0, 1))), {}, 10, ALL_SAMPLES),
+    "frame without names": (
+        csv_edit("cam0", lambda rows: rows.__setitem__(slice(None), [r.split(",")[0] for r in rows])),
+        {},
+        10,
+        ALL_SAMPLES,
+    ),
+    "IMU CRLF": (csv_edit("imu0", lambda rows: None, "\r\n"), {}, 10, ALL_SAMPLES),
+    "IMU CR": (csv_edit("imu0", lambda rows: None, "\r"), {}, 10, ALL_SAMPLES),
+    "IMU without header": (csv_edit("imu0", drop(slice(0, 1))), {}, 10, ALL_SAMPLES),
+    "IMU header in words": (csv_edit("imu0", replace(0, "timestamp,wx,wy,wz,ax,ay,az")), {}, 10, ALL_SAMPLES),
+    "IMU blank lines": (csv_edit("imu0", put(9, "", "# a remark", "  ")), {}, 10, ALL_SAMPLES),
+    "IMU extra column": (
+        csv_edit("imu0", replace(9, imu_row(IMU_T0 + 8 * IMU_PERIOD_NS) + ",25.0")),
+        {},
+        10,
+        ALL_SAMPLES,
+    ),
+    "IMU stamp as float": (csv_edit("imu0", replace(1, f"{IMU_T0}.0,0,0,0,0,0,9.81")), {}, 10, ALL_SAMPLES),
+    "IMU NaN": (
+        csv_edit("imu0", replace(9, f"{IMU_T0 + 8 * IMU_PERIOD_NS},nan,0,0,0,0,0")),
+        {"imu_garbage": 1},
+        10,
+        ALL_SAMPLES - 1,
+    ),
+    "IMU row cut": (csv_edit("imu0", replace(9, f"{IMU_T0},0,0")), {"imu_garbage": 1}, 10, ALL_SAMPLES - 1),
+    "IMU negative stamp": (
+        csv_edit("imu0", replace(9, imu_row(-5))),
+        {"imu_garbage": 1},
+        10,
+        ALL_SAMPLES - 1,
+    ),
+    "IMU stamp too large": (
+        csv_edit("imu0", replace(9, imu_row(10**30))),
+        {"imu_garbage": 1},
+        10,
+        ALL_SAMPLES - 1,
+    ),
+    "IMU garbage": (csv_edit("imu0", put(9, "\x00\x00", "a,b,c")), {"imu_garbage": 2}, 10, ALL_SAMPLES),
+    "IMU duplicate": (
+        csv_edit("imu0", put(9, imu_row(IMU_T0 + 2 * IMU_PERIOD_NS))),
+        {"imu_duplicate": 1},
+        10,
+        ALL_SAMPLES,
+    ),
+    "IMU backward": (csv_edit("imu0", swap(9, 10)), {"imu_backward": 1}, 10, ALL_SAMPLES - 1),
+    "IMU far ahead": (
+        csv_edit("imu0", put(9, imu_row(START_NS + 10**6 * S))),
+        {"imu_backward": 1},
+        10,
+        ALL_SAMPLES,
+    ),
+    "IMU zero": (csv_edit("imu0", put(1, imu_row(0), imu_row(1))), {"imu_outlier": 2}, 10, ALL_SAMPLES),
+    "IMU ends far ahead": (
+        csv_edit("imu0", lambda rows: rows.append(imu_row(START_NS + 10**6 * S))),
+        {"imu_outlier": 1},
+        10,
+        ALL_SAMPLES,
+    ),
+    "IMU gap": (csv_edit("imu0", drop(slice(220, 250))), {"imu_gap": 1}, 10, ALL_SAMPLES - 30),
+    "IMU small gap": (csv_edit("imu0", drop(slice(220, 224))), {}, 10, ALL_SAMPLES - 4),
+    "IMU starts late": (csv_edit("imu0", drop(slice(1, 221))), {"imu_starts_late": 1}, 10, ALL_SAMPLES - 220),
+    "IMU stops early": (csv_edit("imu0", drop(slice(251, None))), {"imu_stops_early": 1}, 10, 250),
+    "IMU csv missing": (lambda w: (w / "mav0/imu0/data.csv").unlink(), {"imu_missing": 1}, 10, 0),
+    "IMU csv empty": (
+        lambda w: (w / "mav0/imu0/data.csv").write_text(""),
+        {"imu_missing": 1},
+        10,
+        0,
+    ),
+    "IMU of another day": (
+        csv_edit(
+            "imu0",
+            lambda rows: rows.__setitem__(slice(1, None), [imu_row(i * IMU_PERIOD_NS) for i in range(50)]),
+        ),
+        {"imu_missing": 1},
+        10,
+        0,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_fault(walk: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
+    damage, counts, frames, imu = FAULTS[name]
+    damage(walk)
+    with caplog.at_level(logging.WARNING, logger="graphvio"):
+        source = open_source(walk)
+        events = list(source)
+    assert source.faults.counts == {kind: count for kind, count in counts.items() if count}
+    assert sum(isinstance(event, FrameSet) for event in events) == frames
+    assert sum(isinstance(event, ImuSample) for event in events) == imu
+    assert [incident.kind for incident in source.faults.incidents] == list(source.faults.counts)
+    assert len(caplog.records) == len(source.faults.counts)
+    stamps = [event.stamp_ns for event in events if isinstance(event, FrameSet)]
+    assert stamps == sorted(set(stamps))
+    assert set(stamps) <= set(frame_stamps(10))
+
+
+def test_a_broken_image_takes_only_its_pair(walk: Path) -> None:
+    image_file(walk, 2, 4).unlink()
+    assert [list(s.images) for s in framesets(open_source(walk))] == [[0, 1]] * 4 + [[0]] + [[0, 1]] * 5
+
+
+def test_iterating_again_yields_and_counts_the_same(walk: Path, caplog: pytest.LogCaptureFixture) -> None:
+    image_file(walk, 2, 4).unlink()
+    csv_edit("imu0", drop(slice(220, 250)))(walk)
+    source = open_source(walk)
+    first = [event.stamp_ns for event in source]
+    counts = dict(source.faults.counts)
+    assert counts == {"imu_gap": 1, "image_missing": 1}
+    assert [event.stamp_ns for event in source] == first
+    assert source.faults.counts == counts
+    assert len(source.decode_ms) == 10
+    assert len(caplog.records) == 2
+
+
+def test_places_of_faults(walk: Path) -> None:
+    csv_edit("imu0", drop(slice(221, 251)))(walk)
+    image_file(walk, 1, 3).unlink()
+    source = open_source(walk)
+    list(source)
+    gap, image = source.faults.incidents
+    assert gap.stamp_ns == IMU_T0 + 219 * IMU_PERIOD_NS
+    assert gap.detail == f"no samples for 155 ms after {gap.stamp_ns}"
+    assert image.stamp_ns == START_NS + 3 * FRAME_PERIOD_NS
+    assert str(image_file(walk, 1, 3)) in image.detail
+
+
+def test_frameset_in_an_imu_gap_does_not_wait(walk: Path) -> None:
+    csv_edit("imu0", drop(slice(221, 271)))(walk)  # 250 ms from 100 ms after the first frameset
+    order = [type(event).__name__[0] for event in open_source(walk) if event.stamp_ns > START_NS + 90_000_000]
+    assert "".join(order).startswith("IF" + "FFF")
+
+
+def test_image_size_that_the_rig_does_not_have(tmp_path: Path) -> None:
+    write_euroc(tmp_path, pairs=1, frames=2)
+    for i in range(2):
+        write_image(image_file(tmp_path, 1, i), noise_image(0, (32, 40)))
+    with pytest.raises(RigError, match="cam1: image is 32x40, the rig says 64x48; calibrate"):
+        list(open_source(tmp_path))
+
+
+def test_nothing_left(tmp_path: Path) -> None:
+    write_euroc(tmp_path, pairs=1, frames=3)
+    for i in range(3):
+        image_file(tmp_path, 1, i).unlink()
+    with pytest.raises(
+        SourceError, match=r"none of its 3 framesets could be read \(frameset_empty 3, image_missing 3\)"
+    ):
+        list(open_source(tmp_path))
+    write_rows(tmp_path / "mav0" / "cam1" / "data.csv", ["#timestamp"])
+    with pytest.raises(SourceError, match="lists no image"):
+        open_source(tmp_path)
+    write_rows(tmp_path / "mav0" / "cam1" / "data.csv", ["12345"])
+    with pytest.raises(SourceError, match="no left image has a right one"):
+        open_source(tmp_path)
+
+
+def test_pairs_that_are_not_triggered_together(walk: Path) -> None:
+    for camera in ("cam2", "cam3"):
+        rows = [f"{s + 20_000_000},{s}.png" for s in frame_stamps(10)]
+        write_rows(walk / "mav0" / camera / "data.csv", rows)
+    source = open_source(walk)
+    assert source.frameset_count == 20
+    assert [list(s.images) for s in framesets(source)] == [[0], [1]] * 10
+    assert source.faults.counts == {"frameset_incomplete": 20}
+
+
+def test_stamps_within_tolerance_belong_together(walk: Path) -> None:
+    for number, camera in enumerate(CAMERAS):
+        rows = [f"{s - 500_000 * number},{s}.png" for s in frame_stamps(10)]
+        write_rows(walk / "mav0" / camera / "data.csv", rows)
+    source = open_source(walk)
+    assert [s.stamp_ns for s in framesets(source)] == frame_stamps(10)
+    assert source.faults.counts == {}
+
+
+def test_time_offset_moves_the_frames(tmp_path: Path) -> None:
+    write_euroc(tmp_path, pairs=1)
+    rig_file = tmp_path / "rig.yaml"
+    small_rig(1).save(rig_file)
+    rig_file.write_text(rig_file.read_text().replace("time_offset_s: 0.0", "time_offset_s: 0.02"))
+    latest = 0
+    for event in open_source(tmp_path):
+        if isinstance(event, FrameSet):
+            assert latest == event.stamp_ns + 20_000_000
+        else:
+            latest = event.stamp_ns
+
+
+@pytest.mark.parametrize("kind", ["16 bit", "colour", "colour with alpha"])
+def test_pixel_formats(tmp_path: Path, kind: str) -> None:
+    write_euroc(tmp_path, pairs=1, frames=1)
+    grey = noise_image(7)
+    images: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.uint8 | np.uint16]]] = {
+        "16 bit": grey.astype(np.uint16) * 256 + 99,
+        "colour": np.stack([grey] * 3, axis=2),
+        "colour with alpha": np.stack([grey] * 4, axis=2),
+    }
+    write_image(image_file(tmp_path, 0, 0), images[kind])
+    got = framesets(open_source(tmp_path))[0].images[0][0]
+    assert got.dtype == np.uint8
+    assert got.flags.c_contiguous
+    np.testing.assert_array_equal(got, grey)
+
+
+def test_kitti_odometry(tmp_path: Path) -> None:
+    path = write_kitti_odometry(tmp_path / "dataset" / "sequences" / "07")
+    write_rows(tmp_path / "dataset" / "poses" / "07.txt", ["1 0 0 0 0 1 0 0 0 0 1 0"])
+    (path / "image_1" / "000002.png").unlink()
+    source = open_source(path)
+    assert (source.name, source.frameset_count, source.end_ns) == ("07", 5, 400_000_000)
+    assert source.truth == tmp_path / "dataset" / "poses" / "07.txt"
+    sets = framesets(source)
+    assert [s.stamp_ns for s in sets] == [0, 100_000_000, 300_000_000, 400_000_000]
+    np.testing.assert_array_equal(sets[2].images[0][1], noise_image(103))
+    assert source.faults.counts == {"image_missing": 1, "frameset_empty": 1}
+
+
+def test_kitti_odometry_times(tmp_path: Path) -> None:
+    write_kitti_odometry(tmp_path)
+    write_rows(tmp_path / "times.txt", ["0", "1.036224e-01", "?", "3.0e-01", "3.0e-01", "5e-01", ""], "\r\n")
+    source = open_source(tmp_path)
+    sets = framesets(source)
+    assert [s.stamp_ns for s in sets] == [0, 103_622_400, 300_000_000]
+    np.testing.assert_array_equal(sets[2].images[0][0], noise_image(3))  # the rows keep their images
+    expected = {"frame_garbage": 1, "frame_duplicate": 1, "image_missing": 2, "frameset_empty": 1}
+    assert source.faults.counts == expected
+    (tmp_path / "times.txt").unlink()
+    with pytest.raises(SourceError, match=r"times\.txt: is missing"):
+        open_source(tmp_path)
+
+
+def test_kitti_raw(tmp_path: Path) -> None:
+    source = open_source(write_kitti_raw(tmp_path / "2011_09_26"))
+    assert source.name == "2011_09_26_drive_0001_sync"
+    begin = 1_317_042_145_000_000_007
+    assert [s.stamp_ns for s in framesets(source)] == [begin + i * 100_000_000 for i in range(5)]
+    assert source.faults.counts == {}
+    assert source.truth is None
+
+
+def readers() -> int:
+    return sum(thread.name.startswith("graphvio-read") for thread in threading.enumerate())
+
+
+def ended(seconds: float = 5.0) -> bool:
+    limit = time.monotonic() + seconds
+    while readers() and time.monotonic() < limit:
+        time.sleep(0.01)
+    return readers() == 0
+
+
+def first_frameset(events: Iterator[object]) -> None:
+    while not isinstance(next(events), FrameSet):
+        pass
+
+
+@pytest.mark.parametrize("how", ["exhausted", "closed", "collected", "broken out of", "raised"])
+def test_threads_end(walk: Path, how: str) -> None:
+    source = open_source(walk)
+    events = iter(source)
+    first_frameset(events)
+    assert readers() > 0
+    if how == "exhausted":
+        list(events)
+    elif how == "closed":
+        events.close()  # type: ignore[attr-defined]
+    elif how == "collected":
+        del events
+        gc.collect()
+    elif how == "broken out of":
+        del events
+        for event in source:
+            if isinstance(event, FrameSet):
+                break
+        del event
+    else:
+        del events
+        image_file(walk, 0, 0).write_bytes(cv2.imencode(".png", noise_image(0, (32, 32)))[1].tobytes())
+        with pytest.raises(RigError):
+            list(open_source(walk))
+    assert ended()
+
+
+def test_read_ahead_is_bounded_and_in_order() -> None:
+    begun: list[int] = []
+
+    def work(item: int) -> int:
+        begun.append(item)
+        time.sleep(0.001 * (item % 3))
+        return item
+
+    results = read_ahead(work, range(100), depth=4)
+    for expected in range(20):
+        assert next(results) == expected
+        time.sleep(0.002)
+        assert len(begun) <= expected + 1 + 4
+    assert list(results) == list(range(20, 100))
+    assert ended()
+
+
+def test_read_ahead_works_while_its_consumer_does() -> None:
+    results = read_ahead(lambda item: time.sleep(0.02), range(10), depth=4, threads=2)
+    next(results)
+    begun = time.perf_counter()
+    for _ in results:
+        time.sleep(0.02)  # an estimation that is slower than two threads' decoding
+    assert time.perf_counter() - begun < 9 * 0.02 + 0.15
+
+
+def test_errors_in_threads_surface() -> None:
+    def work(item: int) -> int:
+        if item == 3:
+            raise RuntimeError("in a thread")
+        return item
+
+    results = read_ahead(work, range(10))
+    assert [next(results) for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(RuntimeError, match="in a thread"):
+        next(results)
+    assert ended()
+
+
+@pytest.mark.skipif(not (REAL_DATA / "euroc_mh01_clip").is_dir(), reason="the real EuRoC clip is not here")
+def test_real_euroc_clip() -> None:
+    root = REAL_DATA / "euroc_mh01_clip"
+    source = open_source(root)
+    events = list(source)
+    sets = [event for event in events if isinstance(event, FrameSet)]
+    assert source.frameset_count == len(sets) == 340
+    rows = read_rows(root / "mav0" / "cam0" / "data.csv")[1:]
+    assert [s.stamp_ns for s in sets] == [int(row.split(",")[0]) for row in rows if row]
+    assert all(image.shape == (480, 752) for s in sets for image in s.images[0])
+    imu_rows = [row for row in read_rows(root / "mav0" / "imu0" / "data.csv")[1:] if row]
+    imu = [event for event in events if isinstance(event, ImuSample)]
+    assert [s.stamp_ns for s in imu] == [int(row.split(",")[0]) for row in imu_rows]
+    assert source.faults.counts == {"frame_gap": 1}
+    (gap,) = source.faults.incidents
+    assert (gap.stamp_ns, gap.detail) == (
+        1403636592863555584,
+        "pair0 has no images for 100 ms after 1403636592863555584",
+    )
+    assert source.truth == root / "mav0" / "state_groundtruth_estimate0" / "data.csv"

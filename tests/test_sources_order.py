@@ -1,0 +1,185 @@
+"""Properties of the sequencer, the matching of images, the cleaning of stamps and the tables' readers."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from recordings import noise_image, small_rig, write_image
+
+from graphvio.events import FrameSet, ImuSample
+from graphvio.rig import Rig
+from graphvio.sources.faults import FaultLog
+from graphvio.sources.images import damage_of
+from graphvio.sources.matching import TOLERANCE_NS, group_pairs, match_sides
+from graphvio.sources.recording import Index, Recording, Track
+from graphvio.sources.sequencer import COVER_NS, merge
+from graphvio.sources.tables import ImuTable, clean_stamps, decimal_ns, parse_stamp, read_imu_csv
+
+MS = 1_000_000
+increasing = st.lists(st.integers(1, 200), max_size=60).map(lambda steps: (np.cumsum(steps) * MS).tolist())
+
+
+def imu_at(stamps: list[int]) -> list[ImuSample]:
+    return [ImuSample(stamp, np.zeros(3), np.zeros(3)) for stamp in stamps]
+
+
+@given(imu=increasing, frames=increasing, offset_ns=st.integers(-300 * MS, 300 * MS))
+def test_merge(imu: list[int], frames: list[int], offset_ns: int) -> None:
+    events = list(merge(imu_at(imu), [FrameSet(stamp, {}) for stamp in frames], offset_ns))
+    assert [e.stamp_ns for e in events if isinstance(e, ImuSample)] == imu  # nothing lost, nothing moved
+    assert [e.stamp_ns for e in events if isinstance(e, FrameSet)] == frames
+    seen: list[int] = []
+    for event in events:
+        if isinstance(event, ImuSample):
+            seen.append(event.stamp_ns)
+            continue
+        instant = event.stamp_ns + offset_ns
+        covering = next((stamp for stamp in imu if stamp >= instant), None)
+        if covering is not None and covering <= instant + COVER_NS:
+            assert covering in seen
+        assert all(stamp in seen for stamp in imu if stamp < instant)
+        assert all(stamp <= instant + COVER_NS for stamp in seen)
+
+
+def test_merge_reads_no_further_than_it_must() -> None:
+    taken: list[int] = []
+
+    def samples() -> Iterator[ImuSample]:
+        for sample in imu_at([0, 10, 20, 30, 40]):
+            taken.append(sample.stamp_ns)
+            yield sample
+
+    for event in merge(samples(), [FrameSet(15, {})]):
+        if isinstance(event, FrameSet):
+            break
+    assert taken == [0, 10, 20, 30]  # the one that covers, and the one that is next
+
+
+@given(st.lists(st.integers(0, 30), max_size=40))
+def test_clean_stamps_keeps_the_most(values: list[int]) -> None:
+    stamps = np.array(values, dtype=np.int64)
+    faults = FaultLog("any")
+    kept = clean_stamps(stamps, "x", Path("x.csv"), faults)
+    chosen = stamps[kept]
+    assert (np.diff(chosen) > 0).all()
+    assert sum(faults.counts.values()) == len(values) - len(chosen)
+    longest: list[int] = []  # the textbook's quadratic solution
+    for i, value in enumerate(values):
+        longest.append(1 + max((longest[j] for j in range(i) if values[j] < value), default=0))
+    assert len(chosen) == max(longest, default=0)
+
+
+def test_of_equal_stamps_the_first_is_kept() -> None:
+    kept = clean_stamps(np.array([1, 2, 2, 2, 3]), "x", Path("x.csv"), FaultLog("any"))
+    assert kept.tolist() == [True, True, False, False, True]
+
+
+@given(
+    steps=st.lists(st.integers(8, 60), min_size=1, max_size=30),
+    jitter=st.lists(st.integers(-TOLERANCE_NS // 2, TOLERANCE_NS // 2), min_size=30, max_size=30),
+    lost_left=st.sets(st.integers(0, 29)),
+    lost_right=st.sets(st.integers(0, 29)),
+)
+def test_match_sides(steps: list[int], jitter: list[int], lost_left: set[int], lost_right: set[int]) -> None:
+    truth = np.cumsum(steps) * MS
+    left = [i for i in range(len(steps)) if i not in lost_left]
+    right = [i for i in range(len(steps)) if i not in lost_right]
+    left_ns = truth[left]
+    right_ns = np.array([truth[i] + jitter[i] for i in right], dtype=np.int64)
+    index = match_sides(left_ns, right_ns)
+    common = sorted(set(left) & set(right))
+    assert index.stamps_ns.tolist() == truth[common].tolist()
+    assert [left[row] for row in index.rows[:, 0]] == common
+    assert [right[row] for row in index.rows[:, 1]] == common
+    assert len(index.left_alone) == len(left) - len(common)
+    assert len(index.right_alone) == len(right) - len(common)
+
+
+@given(
+    steps=st.lists(st.integers(8, 60), min_size=1, max_size=30),
+    lost=st.lists(st.sets(st.integers(0, 29)), min_size=3, max_size=3),
+    delay_ns=st.lists(st.integers(0, TOLERANCE_NS), min_size=3, max_size=3),
+)
+def test_group_pairs(steps: list[int], lost: list[set[int]], delay_ns: list[int]) -> None:
+    truth = np.cumsum(steps) * MS
+    present = [[i for i in range(len(steps)) if i not in gone] for gone in lost]
+    pairs = [
+        match_sides(truth[i] + delay, truth[i] + delay) for i, delay in zip(present, delay_ns, strict=True)
+    ]
+    index = group_pairs(pairs)
+    instants = sorted(set().union(*present))
+    assert len(index.stamps_ns) == len(instants)
+    assert (np.diff(index.stamps_ns) > 0).all()
+    for at, instant in enumerate(instants):
+        having = [number for number in range(3) if instant in present[number]]
+        assert [number for number in range(3) if index.rows[at, number, 0] >= 0] == having
+        assert index.stamps_ns[at] == truth[instant] + delay_ns[having[0]]
+
+
+def test_decimal_stamps_are_exact() -> None:
+    assert parse_stamp("1403636580838555649") == 1403636580838555649
+    assert parse_stamp("1403636580838555649.0") == 1403636580838555649
+    assert decimal_ns("1403636580.838555649", 10**9) == 1403636580838555649
+    for text in ("", "x", "nan", "-1", "inf", "1e400", "9" * 30):
+        assert parse_stamp(text) is None
+
+
+@given(
+    stamps=st.lists(st.integers(0, 2**61), min_size=1, max_size=20, unique=True).map(sorted),
+    end=st.sampled_from(["\n", "\r\n", "\r"]),
+    header=st.sampled_from(["", "#t,x", "t,x", "# a, remark"]),
+)
+def test_imu_csv_is_read_exactly(
+    tmp_path_factory: pytest.TempPathFactory, stamps: list[int], end: str, header: str
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "imu.csv"
+    rows = [header] * bool(header) + [f"{stamp},{i}.25,1e-3,0,-0.5,0,9.81" for i, stamp in enumerate(stamps)]
+    path.write_bytes(end.join(rows).encode())
+    faults = FaultLog("any")
+    table = read_imu_csv(path, faults)
+    assert len(table.stamps_ns) + sum(faults.counts.values()) == len(stamps)
+    assert set(table.stamps_ns.tolist()) <= set(stamps)
+    if not faults.counts:
+        assert table.stamps_ns.tolist() == stamps
+        assert table.values[:, 0].tolist() == [i + 0.25 for i in range(len(stamps))]
+
+
+@given(st.binary(max_size=200))
+def test_damage_of_any_bytes_never_raises(data: bytes) -> None:
+    damage_of(data)
+    damage_of(b"\x89PNG\r\n\x1a\n" + data)
+    damage_of(b"\xff\xd8" + data)
+
+
+def test_memory_does_not_grow_with_length(tmp_path: Path) -> None:
+    size_px = (320, 240)
+    file = tmp_path / "image.png"
+    write_image(file, noise_image(0, size_px))
+    rig = small_rig(1)
+
+    frames = 200
+    stamps = np.arange(frames, dtype=np.int64) * 50 * MS
+    track = Track(tmp_path, stamps, ["image.png"] * frames)
+    imu = ImuTable(np.arange(0, frames * 50 * MS, 5 * MS), np.zeros((10 * frames, 6)))
+    index = Index("long", {"cam0": track, "cam1": track}, imu)
+    source = Recording(index, _resized(rig, size_px), FaultLog("long"))
+    tracemalloc.start()
+    count = sum(isinstance(event, FrameSet) for event in source)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert count == frames
+    # 8 framesets ahead, the files of those being decoded, and the one in use: a tenth of the recording
+    assert peak < 20 * 2 * size_px[0] * size_px[1]
+
+
+def _resized(rig: Rig, size_px: tuple[int, int]) -> Rig:
+    pair = rig.pairs[0]
+    left, right = (replace(camera, size_px=size_px) for camera in (pair.left, pair.right))
+    return replace(rig, pairs=(replace(pair, left=left, right=right),))
