@@ -6,11 +6,12 @@ from numpy.typing import NDArray
 from graphvio.arrays import AnyArray, Float, Image
 from graphvio.geometry import se3, se3_inverse
 from graphvio.simulation import Simulator, make_simulator
+from graphvio.simulation.atlas import pack
 from graphvio.simulation.default_rig import default_rig, paper_left2_T_left1
 from graphvio.simulation.film import Exposure
 from graphvio.simulation.renderer import CameraRays
 from graphvio.simulation.surfaces import Stage
-from graphvio.simulation.textures import checkerboard, pack
+from graphvio.simulation.textures import checkerboard
 from graphvio.simulation.world import Rectangle, World
 
 SQUARES = 8
@@ -71,7 +72,7 @@ def test_rig_is_the_papers() -> None:
 
 
 def tracked(first: Image, second: Image, points: Float, guess: Float) -> tuple[Float, Float]:
-    """Points of the second image by optical flow, and how far they end from the start when flowed back."""
+    """Points of the second image by optical flow, and how far from the start they flow back."""
     there = guess.astype(np.float32).reshape(-1, 1, 2)
     start = points.astype(np.float32).reshape(-1, 1, 2)
     use_guess = cv2.OPTFLOW_USE_INITIAL_FLOW
@@ -90,7 +91,7 @@ def tracked(first: Image, second: Image, points: Float, guess: Float) -> tuple[F
 
 
 def flow_errors(simulator: Simulator, a: tuple[int, int], b: tuple[int, int]) -> Float:
-    """Errors in pixels of optical flow between two images (index, camera) against truth, for static points."""
+    """Errors in pixels of optical flow between two images (index, camera), where nothing moves."""
     first, second = simulator.image(*a), simulator.image(*b)
     corners = cv2.goodFeaturesToTrack(first, 300, 0.02, 10)
     assert corners is not None

@@ -86,3 +86,10 @@ def test_lamps_fail_and_come_back(corridor: Simulator) -> None:
     bright = corridor.image(at(corridor, end + 1.0), 0)
     assert dark.mean() < 0.5 * bright.mean()
     assert corners(dark) > 40
+
+
+def test_a_cut_walk_is_the_beginning_of_the_whole(corridor: Simulator) -> None:
+    cut = make_simulator("corridor", duration_s=6.0)
+    assert np.array_equal(cut.world_T_body, corridor.world_T_body[: len(cut.stamps_ns)])
+    assert cut.scene.events == corridor.scene.events
+    assert np.array_equal(cut.image(119, 0), corridor.image(119, 0))

@@ -9,7 +9,8 @@ Definitions, so that a figure means the same to everybody:
 - *RPE* over 1 s, or over so many metres along the truth: error of the motion from each pose to the pose that
   is nearest to that distance (within a tenth of it). Over 100 to 800 m these are KITTI's segments.
 - *Drift*: the estimate is aligned over its beginning (the first 5 % of the path and at least 2 s, by position
-  and rotation); the position error of the last pose, in percent of the path. ``ate_percent`` is ATE rmse by path.
+  and rotation); the position error of the last pose, in percent of the path. ``ate_percent`` is ATE rmse,
+  likewise.
 - *Loop closure*, where truth walks at least 4 m and ends within 1 m of its start: estimated minus true
   displacement from start to end.
 

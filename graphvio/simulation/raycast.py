@@ -272,17 +272,18 @@ def shade(
             x_i, x_j = slopes[row, column, 0, 0], slopes[row, column, 0, 1]
             y_i, y_j = slopes[row, column, 1, 0], slopes[row, column, 1, 1]
             total = 0.0
-            for n in range(rays_each * rays_each):
-                right = (n % rays_each + 0.5) / rays_each - 0.5
-                down = (n // rays_each + 0.5) / rays_each - 0.5
-                x = rays[row, column, 0] + x_i * right + x_j * down
-                y = rays[row, column, 1] + y_i * right + y_j * down
-                if border:
-                    i, _ = _first_hit(coefficients, items, bounds, starts[tile], starts[tile + 1], x, y)
-                if i >= 0:
-                    total += tint[i] * _seen(
-                        coefficients, i, x, y, x_i, x_j, y_i, y_j,
-                        texture, mapping, texels, level_starts, sides, values, grid,
-                    )  # fmt: skip
+            for m in range(rays_each):
+                down = (m + 0.5) / rays_each - 0.5
+                for n in range(rays_each):
+                    right = (n + 0.5) / rays_each - 0.5
+                    x = rays[row, column, 0] + x_i * right + x_j * down
+                    y = rays[row, column, 1] + y_i * right + y_j * down
+                    if border:
+                        i, _ = _first_hit(coefficients, items, bounds, starts[tile], starts[tile + 1], x, y)
+                    if i >= 0:
+                        total += tint[i] * _seen(
+                            coefficients, i, x, y, x_i, x_j, y_i, y_j,
+                            texture, mapping, texels, level_starts, sides, values, grid,
+                        )  # fmt: skip
             radiance[row, column] = total / (rays_each * rays_each)
     return radiance

@@ -12,9 +12,9 @@ from graphvio.cameras import distort
 from graphvio.geometry import se3_inverse
 from graphvio.kernels import kernel
 from graphvio.rig import Camera
+from graphvio.simulation.atlas import Atlas
 from graphvio.simulation.raycast import TILE_PX, first_hits, ray_coefficients, shade, tile_lists
 from graphvio.simulation.surfaces import Surfaces
-from graphvio.simulation.textures import Atlas
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,12 +41,12 @@ class Walk:
         self.gait = gait if gait is not None else Gait()
         lengths = np.linalg.norm(np.diff(self.path, axis=0), axis=1)
         self._corner_at = np.concatenate([[0.0], np.cumsum(lengths)])
-        self._times = np.arange(-2.0, duration_s + 3.0, _STEP_S)
         # Smoothing spreads the start over half its window on each side: begin later, to rest truly.
-        start_s = rest_s + 0.5 * max(_CORNER_S, _HEADING_S) if rest_s > 0.0 else -10.0
+        start_s = rest_s + 0.5 * max(_CORNER_S, _HEADING_S) if rest_s > 0.0 else -2.0
+        # The whole path, however little of it is wanted: a cut recording is the beginning of the whole one.
+        end_s = max(duration_s, start_s + self._corner_at[-1] / speed_mps)
+        self._times = np.arange(-2.0, end_s + 3.0, _STEP_S)
         walked = np.clip(speed_mps * (self._times - start_s), 0.0, None)
-        if rest_s <= 0.0:
-            walked = speed_mps * (self._times - self._times[0])
         self._walked = np.minimum(walked, self._corner_at[-1])
         self.motion = Motion(self._course, duration_s)
 

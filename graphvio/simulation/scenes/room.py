@@ -1,4 +1,4 @@
-"""A furnished room of 10 x 8 x 3 metres, walked in rounds that end where they began."""
+"""A furnished room of 10 x 8 x 3 metres, walked in two rounds that end where they began."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ _SPEED_MPS = 1.05  # so that two rounds and a moment of rest fill 40 s
 
 
 def build(duration_s: float, rest_s: float) -> Scene:
-    """Two rounds about the table in the middle, once the other way along each long side."""
+    """Two rounds about the table in the middle."""
     world = World(ambient=0.42)
     outline = [(-5.0, -4.0), (-5.0, 4.0), (5.0, 4.0), (5.0, -4.0)]
     world.outline(outline, 0.0, _HEIGHT_M, ("brick", "plaster", "plaster", "concrete"))

@@ -75,8 +75,8 @@ def _shell(world: World, x_top: float, x_far: float, y_far: float) -> None:
     world.box((-3.0, -0.9, 0.0), (0.9, 0.3, 0.45), "wood")
     world.box((-6.5, 0.9, 0.0), (1.2, 0.3, 1.8), "lockers")
     for x in (-6.0, -2.5):
-        world.lamps.append(Lamp(np.array([x, 0.0, 3.6]), 2.6))
-    world.lamps.append(Lamp(np.array([x_top - 1.0, 0.0, 4.6]), 2.6))
-    world.lamps.append(Lamp(np.array([0.5 * (x_top + x_far), 1.6, 5.7]), 2.4))
+        world.lamps.append(Lamp(np.array([x, 0.0, 3.6]), 1.9))
+    world.lamps.append(Lamp(np.array([x_top - 1.0, 0.0, 4.6]), 1.9))
+    world.lamps.append(Lamp(np.array([0.5 * (x_top + x_far), 1.6, 5.7]), 1.6))
     for y in (5.0, 8.0, 11.0):
-        world.lamps.append(Lamp(np.array([0.5 * (x_top + x_far), y, 5.7]), 2.2))
+        world.lamps.append(Lamp(np.array([0.5 * (x_top + x_far), y, 5.7]), 1.3))

@@ -1,0 +1,97 @@
+"""The figures of a run that ``summary.json`` holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from graphvio.arrays import Int
+from graphvio.trajectory import Trajectory, travelled
+
+
+@dataclass(frozen=True)
+class Percentiles:
+    """Spread of a time, milliseconds."""
+
+    median: float
+    p95: float
+    p99: float
+
+    @staticmethod
+    def of(values_ms: Sequence[float]) -> Percentiles | None:
+        """Of any number of values; None of none."""
+        if not len(values_ms):
+            return None
+        return Percentiles(
+            *(round(float(v), 4) for v in np.percentile(np.asarray(values_ms), [50.0, 95.0, 99.0]))
+        )
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What ``summary.json`` holds.
+
+    Attributes:
+        framesets: framesets read.
+        estimated: estimates with a pose.
+        completion: share of the framesets awaited (those after initialisation may begin) that have a pose.
+        duration_s: from the first to the last estimate, pose or not.
+        path_length_m: along the estimated positions, within epochs.
+        wall_s: processing time of the whole run.
+        realtime_factor: ``duration_s / wall_s``; above 1 is faster than the sensors.
+        stage_ms: stage -> time per frameset.
+        frameset_ms: time per frameset of all stages, without decoding images.
+        input_faults: kind -> count.
+        resets: times the estimation was started anew.
+        incidents: kind -> count, of everything in ``events.jsonl``.
+        status: status -> number of estimates.
+        epochs: for each epoch its number, first and last stamp in nanoseconds, and number of poses.
+        graphvio_version: that made the run.
+        config_sha256: of ``config.yaml``.
+        evaluation: figures against truth, or None.
+        evaluation_error: why truth that was given could not be used, or None.
+    """
+
+    framesets: int
+    estimated: int
+    completion: float
+    duration_s: float
+    path_length_m: float
+    wall_s: float
+    realtime_factor: float
+    stage_ms: Mapping[str, Percentiles | None]
+    frameset_ms: Percentiles | None
+    input_faults: Mapping[str, int]
+    resets: int
+    incidents: Mapping[str, int]
+    status: Mapping[str, int]
+    epochs: Sequence[Mapping[str, int]]
+    graphvio_version: str
+    config_sha256: str
+    evaluation: Mapping[str, Any] | None = None
+    evaluation_error: str | None = None
+
+
+def path_length(trajectory: Trajectory, epochs: Int) -> float:
+    """Metres along poses whose epoch numbers (N,) are given; the step into a new epoch is none."""
+    parts = (trajectory.positions[epochs == epoch] for epoch in np.unique(epochs))
+    return float(sum(travelled(part)[-1] for part in parts))
+
+
+def epoch_spans(trajectory: Trajectory, epochs: Int) -> list[dict[str, int]]:
+    """Number, first and last stamp (nanoseconds) and number of poses of each epoch (N,)."""
+    spans = []
+    for epoch in np.unique(epochs):
+        stamps = trajectory.stamps_ns[epochs == epoch]
+        spans.append(
+            {
+                "epoch": int(epoch),
+                "first_stamp_ns": int(stamps[0]),
+                "last_stamp_ns": int(stamps[-1]),
+                "poses": len(stamps),
+            }
+        )
+    return spans

@@ -1,0 +1,260 @@
+"""Writes a result folder while the run goes on.
+
+All files but the summary, the smoothed trajectory and the picture grow line by line and are flushed at once, so
+that a run which is broken off leaves what it had. Equal input gives an equal ``trajectory.txt``, byte by byte.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from array import array
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from itertools import combinations_with_replacement
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+import numpy as np
+
+from graphvio import __version__
+from graphvio.arrays import Float
+from graphvio.errors import GraphvioError, TrajectoryError
+from graphvio.evaluation import Evaluation, evaluate
+from graphvio.events import Estimate, Incident
+from graphvio.plotting import draw_run
+from graphvio.results.summary import Percentiles, Summary, epoch_spans, path_length
+from graphvio.rig import Rig
+from graphvio.trajectory import Trajectory, tum_line
+
+_TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
+_COVARIANCE_HEADER = ",".join(
+    ["stamp_ns", *(f"{a}_{b}" for a, b in combinations_with_replacement(_TANGENT, 2))]
+)
+_BIAS_HEADER = "stamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
+_UPPER = np.triu_indices(6)
+_NS_PER_S = 1e9
+
+
+class ResultWriter:
+    """Writes one result folder; a context manager that closes its files.
+
+    Args:
+        folder: made if absent.
+        rig: written to ``rig.yaml``.
+        config_yaml: written to ``config.yaml`` as it is.
+
+    Raises:
+        GraphvioError: if the folder holds something already, or cannot be written.
+    """
+
+    @staticmethod
+    def new_folder(base: Path, name: str) -> Path:
+        """Make ``base/name-1``, or the next number that is free; two runs at once never get the same.
+
+        Raises:
+            GraphvioError: if it cannot be made.
+        """
+        try:
+            base.mkdir(parents=True, exist_ok=True)
+            number = 1
+            while True:
+                folder = base / f"{name}-{number}"
+                try:
+                    folder.mkdir()
+                    return folder
+                except FileExistsError:
+                    number += 1
+        except OSError as error:
+            raise _cannot_write(base, error) from None
+
+    def __init__(self, folder: Path, rig: Rig, config_yaml: str) -> None:
+        self.folder = Path(folder)
+        self._files: dict[str, IO[str]] = {}
+        self._config_sha256 = hashlib.sha256(config_yaml.encode()).hexdigest()
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._stage_ms: dict[str, array[float]] = {}
+        self._status: Counter[str] = Counter()
+        self._incidents: Counter[str] = Counter()
+        self._stamps, self._epochs, self._lost = array("q"), array("q"), array("q")
+        self._poses = array("d")
+        self._pose_status: list[str] = []
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if any(self.folder.iterdir()):
+                raise GraphvioError(
+                    f"{self.folder}: is not empty, and results are never overwritten; name another folder"
+                )
+            (self.folder / "config.yaml").write_text(config_yaml, encoding="utf-8")
+            rig.save(self.folder / "rig.yaml")
+            for name, header in (
+                ("trajectory.txt", ""),
+                ("covariance.csv", _COVARIANCE_HEADER),
+                ("imu_bias.csv", _BIAS_HEADER),
+                ("events.jsonl", ""),
+            ):
+                self._files[name] = (self.folder / name).open("x", encoding="utf-8", newline="\n")
+                if header:
+                    self._write(name, header)
+        except OSError as error:
+            self.close()
+            raise _cannot_write(self.folder, error) from None
+
+    def __enter__(self) -> ResultWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files; what was added stays."""
+        for file in self._files.values():
+            file.close()
+
+    def add(self, estimate: Estimate) -> None:
+        """Append one estimate; stamps must increase.
+
+        Raises:
+            GraphvioError: if the disk is full or the folder gone.
+        """
+        stamp = int(estimate.stamp_ns)
+        self._first_ns = stamp if self._first_ns is None else self._first_ns
+        self._last_ns = stamp
+        self._status[str(estimate.status)] += 1
+        for stage, spent_ms in estimate.stage_ms.items():
+            self._stage_ms.setdefault(stage, array("d")).append(spent_ms)
+        if estimate.gyro_bias is not None and estimate.accel_bias is not None:
+            self._write("imu_bias.csv", _csv(stamp, [*estimate.gyro_bias, *estimate.accel_bias]))
+        if estimate.nav_T_body is None:
+            self._lost.append(stamp)
+            return
+        self._write("trajectory.txt", tum_line(stamp, estimate.nav_T_body))
+        if estimate.covariance is not None:
+            self._write("covariance.csv", _csv(stamp, np.asarray(estimate.covariance)[_UPPER]))
+        self._stamps.append(stamp)
+        self._epochs.append(estimate.epoch)
+        self._pose_status.append(str(estimate.status))
+        self._poses.extend(np.asarray(estimate.nav_T_body, dtype=np.float64).ravel())
+
+    def add_incident(self, incident: Incident) -> None:
+        """Append one line to ``events.jsonl``.
+
+        Raises:
+            GraphvioError: if the disk is full or the folder gone.
+        """
+        self._incidents[incident.kind] += 1
+        self._write("events.jsonl", json.dumps(asdict(incident), ensure_ascii=False))
+
+    def finish(
+        self,
+        *,
+        wall_s: float,
+        frameset_ms: Sequence[float],
+        smoothed: Sequence[tuple[int, Float]],
+        input_faults: Mapping[str, int],
+        framesets: int,
+        awaited: int,
+        resets: int,
+        truth: Trajectory | None = None,
+    ) -> Summary:
+        """Write what is known only at the end: the smoothed trajectory, the summary and the picture.
+
+        Args:
+            wall_s: processing time of the whole run.
+            frameset_ms: time per frameset, without decoding, milliseconds.
+            smoothed: (stamp_ns, nav_T_body (4, 4)) with everything that came later taken into account.
+            input_faults: kind -> count.
+            framesets: framesets read.
+            awaited: framesets that could have had a pose: those after initialisation may begin.
+            resets: times the estimation was started anew.
+            truth: to measure the run against; if that fails, the summary says why.
+
+        Raises:
+            GraphvioError: if a file cannot be written.
+        """
+        self.close()
+        trajectory = Trajectory(
+            np.array(self._stamps, dtype=np.int64), np.array(self._poses, dtype=np.float64).reshape(-1, 4, 4)
+        )
+        evaluation, evaluation_error = _evaluate_if_possible(trajectory, truth)
+        duration_s = (
+            (self._last_ns - (self._first_ns or 0)) / _NS_PER_S if self._first_ns is not None else 0.0
+        )
+        epochs = np.array(self._epochs, dtype=np.int64)
+        summary = Summary(
+            framesets=framesets,
+            estimated=len(trajectory),
+            completion=min(1.0, len(trajectory) / awaited) if awaited > 0 else 0.0,
+            duration_s=duration_s,
+            path_length_m=path_length(trajectory, epochs),
+            wall_s=wall_s,
+            realtime_factor=duration_s / wall_s if wall_s > 0 else 0.0,
+            stage_ms={stage: Percentiles.of(spent) for stage, spent in self._stage_ms.items()},
+            frameset_ms=Percentiles.of(frameset_ms),
+            input_faults=dict(input_faults),
+            resets=resets,
+            incidents=dict(self._incidents),
+            status=dict(self._status),
+            epochs=epoch_spans(trajectory, epochs),
+            graphvio_version=__version__,
+            config_sha256=self._config_sha256,
+            evaluation=evaluation.as_dict() if evaluation else None,
+            evaluation_error=evaluation_error,
+        )
+        lines = (f"{tum_line(int(stamp), np.asarray(pose))}\n" for stamp, pose in smoothed)
+        self._write_at_once("trajectory_smoothed.txt", "".join(lines))
+        self._write_at_once("summary.json", json.dumps(asdict(summary), indent=2, allow_nan=False) + "\n")
+        draw_run(
+            self.folder / "trajectory.png",
+            trajectory,
+            status=self._pose_status,
+            epochs=self._epochs,
+            lost_ns=self._lost if len(trajectory) else (),
+            truth=truth,
+            evaluation=evaluation,
+            name=self.folder.name,
+        )
+        return summary
+
+    def _write(self, name: str, line: str) -> None:
+        file = self._files[name]
+        try:
+            file.write(line + "\n")
+            file.flush()
+        except OSError as error:
+            raise _cannot_write(self.folder / name, error) from None
+
+    def _write_at_once(self, name: str, text: str) -> None:
+        """Write a file that is either whole or absent."""
+        unfinished = self.folder / f".{name}.tmp"
+        try:
+            unfinished.write_text(text, encoding="utf-8", newline="\n")
+            unfinished.replace(self.folder / name)
+        except OSError as error:
+            raise _cannot_write(self.folder / name, error) from None
+
+
+def _csv(stamp_ns: int, values: Iterable[float]) -> str:
+    return ",".join([str(stamp_ns), *(f"{float(value):.9e}" for value in values)])
+
+
+def _cannot_write(where: Path, error: OSError) -> GraphvioError:
+    return GraphvioError(
+        f"{where}: cannot be written ({error.strerror or error}); choose another place for results"
+    )
+
+
+def _evaluate_if_possible(
+    trajectory: Trajectory, truth: Trajectory | None
+) -> tuple[Evaluation | None, str | None]:
+    if truth is None:
+        return None, None
+    try:
+        return evaluate(trajectory, truth), None
+    except TrajectoryError as error:
+        return None, str(error)
