@@ -81,7 +81,9 @@ class InitialisationConfig:
     """The first pose: tilt from the accelerometer, at rest or in motion."""
 
     window_s: float = 1.0
-    """IMU samples before the first frameset that are used, if there are as many."""
+    """IMU samples before the first frameset that are used, as far as there are."""
+    min_window_s: float = 0.5
+    """Where there are fewer before it, the first frameset is held until samples after it make up for them."""
     static_gyro_rad_s: float = 0.02
     """Largest standard deviation of the angular rate that counts as rest."""
     static_accel_m_s2: float = 0.15

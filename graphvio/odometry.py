@@ -45,7 +45,6 @@ class Odometry:
         self._smoother: Smoother | None = None
         self._held: deque[FrameSet] = deque()
         self._newest_frameset_ns: int | None = None
-        self._first_frameset_ns: int | None = None
         self._settled_ns = 0  # from this stamp on, a start in motion is over
         self._tracked_ns = 0  # stamp of the last state that vision constrains
         self._gated_since_ns: int | None = None
@@ -102,10 +101,27 @@ class Odometry:
         self._held.append(frameset)
 
     def _is_due(self, frameset: FrameSet) -> bool:
-        if self.rig.imu is None or self._imu_buffer.covers(self._imu_time(frameset.stamp_ns)):
+        imu, timing = self.rig.imu, self.config.timing
+        if imu is None:
             return True
         assert self._newest_frameset_ns is not None
-        return self._newest_frameset_ns - frameset.stamp_ns > self.config.timing.max_imu_wait_ms * 1e6
+        waited_ns = self._newest_frameset_ns - frameset.stamp_ns
+        if self._smoother is None:
+            return self._initial_span(frameset.stamp_ns) is not None or waited_ns > timing.max_imu_start_wait_s * 1e9
+        covered = self._imu_buffer.covers(self._imu_time(frameset.stamp_ns))
+        return covered or waited_ns > timing.max_imu_wait_ms * 1e6
+
+    def _initial_span(self, stamp_ns: int) -> tuple[ImuSpan, float] | None:
+        """The IMU around an instant, and the instant's place in it in seconds, once it is long enough."""
+        config, at_ns = self.config.initialisation, self._imu_time(stamp_ns)
+        before_ns, least_ns = round(config.window_s * 1e9), round(config.min_window_s * 1e9)
+        if not self._imu_buffer.covers(at_ns):
+            return None
+        for end_ns in (at_ns, at_ns + least_ns):
+            found = self._imu_buffer.stretch(at_ns - before_ns, end_ns)
+            if found is not None and found[0].steps_s.sum() >= 0.95e-9 * least_ns:
+                return found[0], (at_ns - found[1]) * 1e-9
+        return None
 
     def _imu_time(self, stamp_ns: int) -> int:
         return stamp_ns + (self.rig.imu.time_offset_ns if self.rig.imu else 0)
@@ -115,22 +131,24 @@ class Odometry:
     def _estimate(self, frameset: FrameSet) -> Estimate:
         start = perf_counter()
         stamp_ns = frameset.stamp_ns
-        if self._smoother is None and not self._start(stamp_ns):
-            visual = self._frontend.process(frameset, lambda _: None)
-            return self._nothing_yet(stamp_ns, visual, start)
+        starting = self._must_start(stamp_ns)
+        span = None
+        if starting:
+            self._start(stamp_ns)
         smoother = self._smoother
         assert smoother is not None
-        span = None
-        if smoother.latest_ns < stamp_ns:  # the first frameset is where the smoother started
+        if not starting:
             span = self._span(smoother.latest_ns, stamp_ns)
             smoother.extend(stamp_ns, span)
         predicted = perf_counter()
         visual = self._frontend.process(frameset, self._predicted_motion)
         measured = perf_counter()
+        if starting:
+            self._frontend.rekey()
         used = visual.motion is not None and self._use(visual.motion)
         if not self._update(visual, used):
             used = False
-        status = self._status(stamp_ns, used, first=visual.reason == "first images")
+        status = self._status(stamp_ns, used, starting)
         stage_ms = {
             "predict": 1e3 * (predicted - start),
             **visual.stage_ms,
@@ -190,10 +208,10 @@ class Odometry:
         self._imu_buffer.discard_before(self._imu_time(smoother.latest_ns) - self._history_ns())
         return True
 
-    def _status(self, stamp_ns: int, used: bool, *, first: bool) -> Status:
+    def _status(self, stamp_ns: int, used: bool, starting: bool) -> Status:
         smoother = self._smoother
         assert smoother is not None
-        if used or first:
+        if used or starting:
             self._tracked_ns = stamp_ns
             return Status.INITIALISING if stamp_ns < self._settled_ns else Status.TRACKING
         sigma = float(np.sqrt(np.linalg.eigvalsh(smoother.covariance_since(self._tracked_ns)[3:, 3:])[-1]))
@@ -204,32 +222,37 @@ class Odometry:
 
     # ------------------------------------------------------------------ starts and breaks
 
-    def _start(self, stamp_ns: int) -> bool:
-        """Begin at a frameset; False while the IMU is still awaited."""
-        if self._first_frameset_ns is None:
-            self._first_frameset_ns = stamp_ns
+    def _must_start(self, stamp_ns: int) -> bool:
+        """True at the first frameset, and where an IMU comes after a start without."""
+        if self._smoother is None:
+            return True
+        if self.rig.imu is None or self._smoother.has_imu or self._initial_span(stamp_ns) is None:
+            return False
+        self._epoch += 1
+        self._report(stamp_ns, "imu_came", f"the IMU has come: epoch {self._epoch} starts upright")
+        return True
+
+    def _start(self, stamp_ns: int) -> None:
+        """Begin at a frameset, where the rig is thought to be, with what the IMU says of its attitude."""
         config = self.config.initialisation
-        imu = self.rig.imu
-        at = None
-        if imu is not None:
-            at = initial_attitude(self._imu_buffer.before(self._imu_time(stamp_ns), config.window_s), config)
-            if at is None:
-                if stamp_ns - self._first_frameset_ns < self.config.timing.max_imu_start_wait_s * 1e9:
-                    return False
-                self._report(stamp_ns, "started_without_imu", "no IMU sample came: vision alone from here")
-        self._smoother = Smoother(self.config.smoother, imu if at is not None else None)
-        if at is None:
-            at = InitialAttitude(self._upright_camera(), 0.0, np.zeros(3), 1.0, False)
-        elif not at.at_rest:
+        position = np.zeros(3) if self._smoother is None else self._smoother.state().nav_T_body[:3, 3]
+        found = self._initial_span(stamp_ns) if self.rig.imu is not None else None
+        if self.rig.imu is not None and found is None:
+            self._report(stamp_ns, "started_without_imu", "no IMU samples came: vision alone from here")
+        self._smoother = Smoother(self.config.smoother, self.rig.imu if found else None)
+        if found is None:
+            at = InitialAttitude(self._upright_camera(), 1e-3, np.zeros(3), 1.0, True)
+        else:
+            at = initial_attitude(*found, config)
+        if not at.at_rest:
             self._settled_ns = stamp_ns + round(config.settle_s * 1e9)
         speed_sigma = _RESTING_START_SPEED_SIGMA if at.at_rest else _MOVING_START_SPEED_SIGMA
         self._smoother.start(
             stamp_ns,
-            RigState(se3(at.nav_R_body, np.zeros(3)), np.zeros(3), at.gyro_bias, np.zeros(3)),
-            StartUncertainty(max(at.tilt_sigma_rad, 1e-3), speed_sigma, at.gyro_bias_sigma),
+            RigState(se3(at.nav_R_body, position), np.zeros(3), at.gyro_bias, np.zeros(3)),
+            StartUncertainty(at.tilt_sigma_rad, speed_sigma, at.gyro_bias_sigma),
         )
         self._tracked_ns = stamp_ns
-        return True
 
     def _upright_camera(self) -> Float:
         """``nav_R_body`` without an IMU: the first pair's left camera is taken to be upright."""
@@ -245,13 +268,13 @@ class Odometry:
         """Start the smoother anew at its newest pose, with the velocity that vision sees."""
         smoother = self._smoother
         assert smoother is not None
-        self._smoothed += smoother.all_poses()
+        self._smoothed += [(ns, pose) for ns, pose in smoother.all_poses() if ns <= self._tracked_ns]
         state = smoother.state()
         dt = (motion.stamp_ns - motion.reference_stamp_ns) * 1e-9
         velocity_body = motion.reference_T_current[:3, :3].T @ motion.reference_T_current[:3, 3] / dt
         velocity_nav = state.nav_T_body[:3, :3] @ velocity_body
         smoother.start(motion.stamp_ns, replace(state, velocity_nav=velocity_nav), _RESTART)
-        self._frontend.forget_references_before(motion.stamp_ns)
+        self._frontend.rekey()
         self._gated_since_ns = None
         self._tracked_ns = motion.stamp_ns
         self._report(motion.stamp_ns, kind, why)
@@ -310,10 +333,6 @@ class Odometry:
         if fused is not None:
             rates["fused"] = fused
         return rates
-
-    def _nothing_yet(self, stamp_ns: int, visual: VisualResult, start: float) -> Estimate:
-        stage_ms = {**visual.stage_ms, "frameset": 1e3 * (perf_counter() - start)}
-        return Estimate(stamp_ns, Status.INITIALISING, None, None, pairs=visual.pairs, stage_ms=stage_ms)
 
     def _report(self, stamp_ns: int, kind: str, detail: str) -> None:
         self._incidents.append(Incident(stamp_ns, kind, detail))

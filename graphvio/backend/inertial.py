@@ -81,17 +81,22 @@ class ImuBuffer:
         forces = _interpolate(knots, at, np.array(self._forces[first : last + 1]))
         return ImuSpan(np.diff(knots), 0.5 * (rates[1:] + rates[:-1]), 0.5 * (forces[1:] + forces[:-1]))
 
-    def before(self, stamp_ns: int, duration_s: float) -> ImuSpan | None:
-        """The IMU in up to ``duration_s`` before an instant, as far back as there is no gap."""
-        end = bisect_right(self._stamps, stamp_ns) - 1
+    def stretch(self, start_ns: int, end_ns: int) -> tuple[ImuSpan, int] | None:
+        """The longest gapless piece of the IMU that ends at the newest sample within two instants.
+
+        Returns:
+            The span and the stamp at which it starts, or None where there are not two samples.
+        """
+        end = bisect_right(self._stamps, end_ns) - 1
         first = end
         while (
             first > 0
-            and self._stamps[end] - self._stamps[first - 1] <= duration_s * 1e9
+            and self._stamps[first - 1] >= start_ns
             and self._stamps[first] - self._stamps[first - 1] <= self._max_gap_ns
         ):
             first -= 1
-        return self.span(self._stamps[first], self._stamps[end]) if end > first else None
+        span = self.span(self._stamps[first], self._stamps[end]) if end > first else None
+        return None if span is None else (span, self._stamps[first])
 
     def discard_before(self, stamp_ns: int) -> None:
         """Forget samples that no later span can need."""

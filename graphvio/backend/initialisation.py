@@ -1,4 +1,4 @@
-"""The first attitude and gyro bias, from the accelerometer's and gyro's samples before the first frameset."""
+"""The first attitude and gyro bias, from the accelerometer's and gyro's samples around the first frameset."""
 
 from __future__ import annotations
 
@@ -37,15 +37,13 @@ class InitialAttitude:
     at_rest: bool
 
 
-def initial_attitude(span: ImuSpan | None, config: InitialisationConfig) -> InitialAttitude | None:
-    """Attitude at the end of a span of the IMU.
+def initial_attitude(span: ImuSpan, at_s: float, config: InitialisationConfig) -> InitialAttitude:
+    """Attitude at an instant of a span of the IMU, ``at_s`` seconds after the span's start.
 
     At rest the mean specific force is gravity and the mean rate is the gyro's bias. In motion, the specific force,
-    turned by the gyro into the last instant's frame, still averages to gravity but for the change of speed, whose
+    turned by the gyro into the instant's frame, still averages to gravity but for the change of speed, whose
     share falls with the duration; the bias is then left to the smoother.
     """
-    if span is None:
-        return None
     duration = float(span.steps_s.sum())
     rate_spread = float(np.sqrt(span.angular_velocity.var(axis=0).max()))
     force_spread = float(np.sqrt(span.linear_acceleration.var(axis=0).max()))
@@ -63,12 +61,16 @@ def initial_attitude(span: ImuSpan | None, config: InitialisationConfig) -> Init
         bias_sigma = max(3.0 * rate_spread / np.sqrt(samples), 1e-4)
         return InitialAttitude(level(mean_force), tilt_sigma, span.mean_rate, float(bias_sigma), True)
     force = np.zeros(3)
-    last_R_body = np.eye(3)  # from the frame of each step to that of the last instant
-    for step, rate, specific in zip(
-        span.steps_s[::-1], span.angular_velocity[::-1], span.linear_acceleration[::-1], strict=True
-    ):
-        last_R_body = last_R_body @ so3_exp(-step * rate)
-        force += step * (last_R_body @ specific)
+    start_R_body = np.eye(3)
+    start_R_at = np.eye(3)
+    elapsed = 0.0
+    for step, rate, specific in zip(span.steps_s, span.angular_velocity, span.linear_acceleration, strict=True):
+        force += step * (start_R_body @ specific)
+        start_R_body = start_R_body @ so3_exp(step * rate)
+        elapsed += step
+        if elapsed <= at_s:
+            start_R_at = start_R_body
+    force = start_R_at.T @ force
     motion_sigma = _SPEED_CHANGE_SIGMA_M_S / (GRAVITY_M_S2 * duration)
     return InitialAttitude(
         level(force), min(tilt_sigma + motion_sigma, 0.5), np.zeros(3), _UNKNOWN_GYRO_BIAS_SIGMA, False

@@ -64,6 +64,7 @@ class Smoother:
         self._index = 0
         self._index_of: dict[int, int] = {}
         self._previous_motion = np.zeros(6)  # tangent per second
+        self._constrained_ns = 0  # stamp of the newest state whose motion was measured
 
     @property
     def has_imu(self) -> bool:
@@ -81,6 +82,7 @@ class Smoother:
         self._stamps, self._index_of = [], {}
         self._previous_motion = np.zeros(6)
         k = self._append(stamp_ns, state)
+        self._constrained_ns = stamp_ns
         rotation = state.nav_T_body[:3, :3]
         tilt = np.diag([uncertainty.tilt_rad, uncertainty.tilt_rad, _HEADING_SIGMA_RAD]) ** 2  # about nav's axes
         covariance = np.zeros((6, 6))
@@ -116,6 +118,7 @@ class Smoother:
             predicted.pose().matrix(), np.asarray(predicted.velocity()), before.gyro_bias, before.accel_bias
         )
         j = self._append(stamp_ns, state)
+        self._constrained_ns = stamp_ns
         self._window.add(gtsam.CombinedImuFactor(_x(i), _v(i), _x(j), _v(j), _b(i), _b(j), measurements))
         return state
 
@@ -168,6 +171,7 @@ class Smoother:
 
     def accept(self, motion: RelativeMotion) -> None:
         """Insert a motion that ends in the newest state."""
+        self._constrained_ns = motion.stamp_ns
         self._window.add(
             gtsam.BetweenFactorPose3(
                 _x(self._index_of[motion.reference_stamp_ns]),
@@ -212,13 +216,11 @@ class Smoother:
     def _link_by_constant_velocity(self, i: int, j: int, motion: Float, dt: float) -> None:
         """Eq. (11): velocity and rate go on, but for white accelerations."""
         config = self._config
-        sigmas = np.repeat(
-            [
-                config.motion_angular_accel_sigma_rad_s2 * dt * dt,
-                config.motion_accel_sigma_m_s2 * dt * dt,
-            ],
-            3,
-        )
+        # An unknown constant acceleration moves by a t^2 / 2: the variance grows by steps of a^2 t^4 / 4.
+        after = (self.latest_ns - self._constrained_ns) * 1e-9
+        growth = 0.5 * np.sqrt(after**4 - (after - dt) ** 4)
+        accelerations = [config.motion_angular_accel_sigma_rad_s2, config.motion_accel_sigma_m_s2]
+        sigmas = np.repeat(np.array(accelerations) * growth, 3)
         self._window.add(
             gtsam.BetweenFactorPose3(_x(i), _x(j), gtsam.Pose3(motion), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
         )

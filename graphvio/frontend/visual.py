@@ -92,14 +92,14 @@ class VisualFrontend:
         tracked = perf_counter()
         reference = self._shared_reference(frames)
         if not reference:
-            self._rekey(frames)
+            self._references.update(frames)
             reports = {j: _report(frame, None, None) for j, frame in frames.items()}
             return VisualResult(None, "first images", reports, {"track": 1e3 * (tracked - start)})
         reference_stamp_ns = next(iter(reference.values())).stamp_ns
         correspondences = correspond(reference, frames)
         refined, reason = self._estimate(correspondences, predict(reference_stamp_ns), frameset.stamp_ns)
         if refined is None or self._reference_is_spent(frames, correspondences, refined):
-            self._rekey(frames)
+            self._references.update(frames)
         if refined is not None:
             self._drop_outliers(frames, correspondences, refined)
         reports = {j: _report(frame, correspondences, refined, j) for j, frame in frames.items()}
@@ -115,9 +115,10 @@ class VisualFrontend:
         )
         return VisualResult(motion, "", reports, stage_ms)
 
-    def forget_references_before(self, stamp_ns: int) -> None:
-        """Measure no more motions from framesets older than this."""
-        self._references = {j: frame for j, frame in self._references.items() if frame.stamp_ns >= stamp_ns}
+    def rekey(self) -> None:
+        """Measure the next motions from the newest frames."""
+        newest_ns = max(frame.stamp_ns for frame in self._latest.values())
+        self._references = {j: frame for j, frame in self._latest.items() if frame.stamp_ns == newest_ns}
 
     def close(self) -> None:
         """End the threads."""
@@ -177,9 +178,6 @@ class VisualFrontend:
             if np.sum(refined.inlier[pair == j]) < 0.5 * overlap * frame.has_depth.sum():
                 return True
         return False
-
-    def _rekey(self, frames: Mapping[int, PairFrame]) -> None:
-        self._references.update(frames)
 
     def _drop_outliers(
         self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined

@@ -1,0 +1,57 @@
+"""How rerun's window is laid out, and the colours of what is in it. Needs the optional part ``viewer``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import rerun.blueprint as rrb
+
+from graphvio.events import Status
+from graphvio.rig import Rig
+
+AXES = ("x", "y", "z")
+RATE_COLOURS = {"gyro": (230, 150, 40), "vision": (60, 150, 230), "fused": (40, 190, 90)}
+STATUS_COLOURS = {
+    Status.INITIALISING: (23, 163, 152),
+    Status.TRACKING: (70, 130, 230),
+    Status.COASTING: (242, 142, 28),
+    Status.LOST: (214, 39, 40),
+}
+
+
+def blueprint(rig: Rig) -> Any:
+    """World on the left; on the right the left camera of every pair, above the curves and the messages."""
+    cameras = [
+        rrb.Spatial2DView(origin=f"world/rig/{pair.left.name}", name=f"{pair.name}: {pair.left.name}")
+        for pair in rig.pairs
+    ]
+    rates = rrb.Vertical(
+        *(rrb.TimeSeriesView(origin=f"rates/{axis}", name=f"rate {axis}, rad/s") for axis in AXES),
+        name="rates",
+    )
+    biases = rrb.Vertical(
+        rrb.TimeSeriesView(origin="biases/gyro", name="gyro bias, rad/s"),
+        rrb.TimeSeriesView(origin="biases/accel", name="accelerometer bias, m/s^2"),
+        name="biases",
+    )
+    curves = rrb.Tabs(
+        rates,
+        biases,
+        rrb.TimeSeriesView(origin="timing", name="milliseconds"),
+        rrb.TimeSeriesView(origin="points", name="points"),
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Spatial3DView(origin="world", name="world"),
+            rrb.Vertical(
+                rrb.Grid(*cameras, name="cameras"),
+                curves,
+                rrb.TextLogView(origin="events", name="events"),
+                row_shares=[3.0, 4.0, 1.5],
+            ),
+            column_shares=[3.0, 2.0],
+        ),
+        rrb.TimePanel(timeline="time", state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+    )

@@ -1,0 +1,262 @@
+"""What is logged to rerun, and under which names. Needs the optional part ``viewer``.
+
+| entity | holds |
+|---|---|
+| ``world/rig`` | pose of body in nav |
+| ``world/rig/<camera>`` | pinhole; below it ``image`` and ``corners`` (left cameras) |
+| ``world/rig/uncertainty`` | ellipsoid of three standard deviations of the position |
+| ``world/trajectory/<epoch>/<n>`` | the n-th piece of the path, coloured by status |
+| ``rates/<axis>/<source>`` | angular rate of body by gyro, vision and fused, rad/s (figure 5 of the paper) |
+| ``biases/gyro``, ``biases/accel`` | rad/s, m/s^2 |
+| ``points/<pair>/offered``, ``inliers`` | number of points |
+| ``timing/<stage>`` | milliseconds |
+| ``events`` | changes of status, gates, resets, faults |
+
+The timeline ``time`` begins with the first stamp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from graphvio.arrays import Float
+from graphvio.events import Estimate, FrameSet, Incident, Status
+from graphvio.geometry import quat_wxyz_from_rotation
+from graphvio.rig import Rig
+from graphvio.trajectory import Trajectory
+from graphvio.viewer.layout import AXES, RATE_COLOURS, STATUS_COLOURS, blueprint
+
+_PIECE_POSES = 100
+_SIGMAS = 3.0
+_JPEG_QUALITY = 80
+_FRUSTUM_M = 0.25
+_INLIER, _OUTLIER = (60, 220, 90), (235, 60, 50)
+_XYZ_COLOURS = [(220, 70, 60), (60, 170, 75), (70, 110, 230)]
+
+
+class Recording:
+    """A stream to rerun's window, a file or both. All but construction belongs to one thread.
+
+    Args:
+        rig: drawn once, and its cameras get images.
+        spawn: open a window.
+        save: file to write.
+
+    Raises:
+        OSError, RuntimeError: whatever rerun raises when the file or the window cannot be opened.
+    """
+
+    def __init__(self, rig: Rig, *, spawn: bool, save: Path | None) -> None:
+        self._rig = rig
+        self._stream = rr.RecordingStream("graphvio", recording_id=None, make_default=False)
+        layout = blueprint(rig)
+        sinks: list[Any] = []
+        if save is not None:
+            sinks.append(rr.FileSink(str(save)))
+        if spawn:
+            rr.spawn(connect=False, recording=self._stream)
+            sinks.append(rr.GrpcSink())
+        self._stream.set_sinks(*sinks, default_blueprint=layout)
+        self._start_ns: int | None = None
+        self._count = 0
+        self._status: Status | None = None
+        self._piece: list[tuple[Float, Status]] = []
+        self._piece_number = 0
+        self._epoch = 0
+        self._log_static()
+
+    def close(self) -> None:
+        """Flush and end."""
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def add_estimates(self, estimates: Sequence[Estimate]) -> None:
+        """Poses, scalars and changes of status; a batch costs hardly more than one."""
+        if not estimates:
+            return
+        if self._start_ns is None:
+            self._start_ns = estimates[0].stamp_ns
+        numbers = {id(estimate): self._count + k for k, estimate in enumerate(estimates)}
+        self._count += len(estimates)
+        columns = _Columns(self._stream, self._start_ns, numbers)
+        posed = [e for e in estimates if e.nav_T_body is not None]
+        self._send_poses(columns, posed)
+        self._extend_path(posed)
+        self._send_scalars(columns, estimates)
+        for estimate in estimates:
+            if estimate.status is not self._status:
+                self._at(estimate.stamp_ns)
+                self._log_text(str(estimate.status), "status", STATUS_COLOURS[estimate.status])
+                self._status = estimate.status
+
+    def add_incidents(self, incidents: Iterable[Incident]) -> None:
+        """Messages at the time of their data."""
+        for incident in incidents:
+            self._at(incident.stamp_ns)
+            self._log_text(incident.detail, incident.kind, (200, 200, 200))
+
+    def add_images(self, frameset: FrameSet, estimate: Estimate) -> None:
+        """Left images with the corners tracked in them, green where the motion explains them."""
+        self._at(frameset.stamp_ns)
+        for index, (left, _) in frameset.images.items():
+            camera = f"world/rig/{self._rig.pairs[index].left.name}"
+            done, jpeg = cv2.imencode(".jpg", left, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+            if done:
+                image = rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg")
+                self._stream.log(f"{camera}/image", image)
+            report = estimate.pairs.get(index)
+            pixels = np.empty((0, 2)) if report is None else report.pixels
+            colours = (
+                []
+                if report is None
+                else np.where(report.is_inlier[:, None], _INLIER, _OUTLIER).astype(np.uint8)
+            )
+            self._stream.log(
+                f"{camera}/corners", rr.Points2D(pixels, colors=colours, radii=rr.Radius.ui_points(2.5))
+            )
+
+    def add_path(self, name: str, trajectory: Trajectory, colour: tuple[int, int, int]) -> None:
+        """A whole other path, such as the smoothed one, seen at all times."""
+        strip = rr.LineStrips3D([trajectory.positions], colors=[colour], radii=rr.Radius.ui_points(1.0))
+        self._stream.log(f"world/{name}", strip, static=True)
+
+    def _log_static(self) -> None:
+        log = self._stream.log
+        log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for camera in self._rig.cameras:
+            fx, fy, cx, cy = camera.intrinsics
+            pose = rr.Transform3D(translation=camera.body_T_cam[:3, 3], mat3x3=camera.body_T_cam[:3, :3])
+            pinhole = rr.Pinhole(
+                image_from_camera=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
+                resolution=list(camera.size_px),
+                camera_xyz=rr.ViewCoordinates.RDF,
+                image_plane_distance=_FRUSTUM_M,
+            )
+            log(f"world/rig/{camera.name}", pose, pinhole, static=True)
+        for axis in AXES:
+            for source, colour in RATE_COLOURS.items():
+                log(f"rates/{axis}/{source}", rr.SeriesLines(names=source, colors=[colour]), static=True)
+        for sensor in ("gyro", "accel"):
+            log(f"biases/{sensor}", rr.SeriesLines(names=[*AXES], colors=_XYZ_COLOURS), static=True)
+
+    def _send_poses(self, columns: _Columns, posed: Sequence[Estimate]) -> None:
+        poses = [np.asarray(e.nav_T_body) for e in posed]
+        if not poses:
+            return
+        quats = np.array([_quat_xyzw(pose[:3, :3]) for pose in poses])
+        translations = np.array([pose[:3, 3] for pose in poses])
+        columns.send("world/rig", posed, rr.Transform3D.columns(translation=translations, quaternion=quats))
+        with_covariance = [e for e in posed if e.covariance is not None]
+        if with_covariance:
+            axes = [ellipsoid(np.asarray(e.covariance)[3:, 3:]) for e in with_covariance]
+            spheres = rr.Ellipsoids3D.columns(
+                half_sizes=np.array([half for half, _ in axes]),
+                quaternions=np.array([quat for _, quat in axes]),
+            )
+            columns.send("world/rig/uncertainty", with_covariance, spheres)
+
+    def _send_scalars(self, columns: _Columns, estimates: Sequence[Estimate]) -> None:
+        for source in RATE_COLOURS:
+            for k, axis in enumerate(AXES):
+                columns.scalars(f"rates/{axis}/{source}", estimates, _rate_of(source, k))
+        columns.scalars("biases/gyro", estimates, lambda e: e.gyro_bias)
+        columns.scalars("biases/accel", estimates, lambda e: e.accel_bias)
+        for stage in sorted({stage for e in estimates for stage in e.stage_ms}):
+            columns.scalars(f"timing/{stage}", estimates, _stage_of(stage))
+        for index in sorted({index for e in estimates for index in e.pairs}):
+            name = self._rig.pairs[index].name
+            columns.scalars(f"points/{name}/offered", estimates, _points_of(index, inliers=False))
+            columns.scalars(f"points/{name}/inliers", estimates, _points_of(index, inliers=True))
+
+    def _extend_path(self, posed: Sequence[Estimate]) -> None:
+        """Log the path in pieces of bounded length, so that a long run costs no more per pose than a short one."""
+        for estimate in posed:
+            position = np.asarray(estimate.nav_T_body)[:3, 3]
+            if estimate.epoch != self._epoch:
+                self._piece, self._epoch, self._piece_number = [], estimate.epoch, 0
+            self._piece.append((position, estimate.status))
+            if len(self._piece) > _PIECE_POSES:
+                self._log_piece(estimate.stamp_ns)
+                self._piece, self._piece_number = self._piece[-1:], self._piece_number + 1
+        if posed:
+            self._log_piece(posed[-1].stamp_ns)
+
+    def _log_piece(self, stamp_ns: int) -> None:
+        strips: list[list[Float]] = []
+        colours: list[tuple[int, int, int]] = []
+        for (before, _), (position, status) in zip(self._piece, self._piece[1:], strict=False):
+            if not colours or colours[-1] != STATUS_COLOURS[status]:
+                strips.append([before])
+                colours.append(STATUS_COLOURS[status])
+            strips[-1].append(position)
+        if strips:
+            self._at(stamp_ns)
+            entity = f"world/trajectory/{self._epoch}/{self._piece_number}"
+            self._stream.log(entity, rr.LineStrips3D(strips, colors=colours, radii=rr.Radius.ui_points(1.5)))
+
+    def _log_text(self, text: str, kind: str, colour: tuple[int, int, int]) -> None:
+        self._stream.log("events", rr.TextLog(f"{kind}: {text}", level="INFO", color=[*colour, 255]))
+
+    def _at(self, stamp_ns: int) -> None:
+        if self._start_ns is None:
+            self._start_ns = stamp_ns
+        self._stream.set_time("time", duration=np.timedelta64(int(stamp_ns) - self._start_ns, "ns"))
+
+
+class _Columns:
+    """Sends a value of each of many estimates in one message."""
+
+    def __init__(self, stream: Any, start_ns: int, numbers: dict[int, int]) -> None:
+        self._stream, self._start_ns, self._numbers = stream, start_ns, numbers
+
+    def send(self, entity: str, estimates: Sequence[Estimate], columns: Any) -> None:
+        since = np.array([e.stamp_ns - self._start_ns for e in estimates], dtype="timedelta64[ns]")
+        numbers = np.array([self._numbers[id(e)] for e in estimates], dtype=np.int64)
+        indexes = [rr.TimeColumn("time", duration=since), rr.TimeColumn("frameset", sequence=numbers)]
+        self._stream.send_columns(entity, indexes, columns)
+
+    def scalars(self, entity: str, estimates: Sequence[Estimate], value: Callable[[Estimate], Any]) -> None:
+        """Of those estimates that have the value: a number or a vector (3,)."""
+        known = [(e, v) for e in estimates if (v := value(e)) is not None]
+        if not known:
+            return
+        values = np.array([v for _, v in known], dtype=np.float64)
+        columns = rr.Scalars.columns(scalars=values.ravel())
+        if values.ndim > 1:
+            columns = columns.partition(np.full(len(values), values.shape[1]))
+        self.send(entity, [e for e, _ in known], columns)
+
+
+def ellipsoid(covariance: Float) -> tuple[Float, Float]:
+    """Half axes (3,) of three standard deviations, metres, and their rotation as a quaternion (4,) x y z w."""
+    variances, axes = np.linalg.eigh(covariance)
+    if np.linalg.det(axes) < 0.0:
+        axes[:, 0] = -axes[:, 0]
+    return _SIGMAS * np.sqrt(np.maximum(variances, 0.0)), _quat_xyzw(axes)
+
+
+def _quat_xyzw(rotation: Float) -> Float:
+    w, x, y, z = quat_wxyz_from_rotation(np.ascontiguousarray(rotation))
+    return np.array([x, y, z, w])
+
+
+def _rate_of(source: str, axis: int) -> Callable[[Estimate], Any]:
+    return lambda e: e.rates[source][axis] if source in e.rates else None
+
+
+def _stage_of(stage: str) -> Callable[[Estimate], Any]:
+    return lambda e: e.stage_ms.get(stage)
+
+
+def _points_of(index: int, inliers: bool) -> Callable[[Estimate], Any]:
+    def count(estimate: Estimate) -> int | None:
+        report = estimate.pairs.get(index)
+        return None if report is None else report.inliers if inliers else report.points
+
+    return count
