@@ -170,7 +170,8 @@ class Config:
             data = yaml.safe_load(text)
         except yaml.YAMLError as error:
             raise ConfigError(f"{where}: is not valid YAML: {' '.join(str(error).split())}") from None
-        return _build(Config, {} if data is None else data, where)
+        config: Config = _build(Config, {} if data is None else data, where)
+        return config
 
     def to_yaml(self) -> str:
         """All values as YAML, in the order of the dataclasses."""

@@ -140,9 +140,7 @@ def se3_inverse(a_T_b: Float) -> Float:
         for j in range(3):
             inverse[i, j] = a_T_b[j, i]
     for i in range(3):
-        inverse[i, 3] = -(
-            a_T_b[0, i] * a_T_b[0, 3] + a_T_b[1, i] * a_T_b[1, 3] + a_T_b[2, i] * a_T_b[2, 3]
-        )
+        inverse[i, 3] = -(a_T_b[0, i] * a_T_b[0, 3] + a_T_b[1, i] * a_T_b[1, 3] + a_T_b[2, i] * a_T_b[2, 3])
     return inverse
 
 

@@ -293,7 +293,12 @@ class Odometry:
         return round(self.config.initialisation.window_s * 1e9)
 
     def _assemble(
-        self, stamp_ns: int, status: Status, visual: VisualResult, span: ImuSpan | None, stage_ms: dict[str, float]
+        self,
+        stamp_ns: int,
+        status: Status,
+        visual: VisualResult,
+        span: ImuSpan | None,
+        stage_ms: dict[str, float],
     ) -> Estimate:
         smoother = self._smoother
         assert smoother is not None

@@ -61,12 +61,8 @@ def draw_run(
         GraphvioError: if the picture cannot be written.
     """
     positions = trajectory.positions
-    true_positions = (
-        _truth_in_nav(truth, evaluation) if truth is not None and evaluation is not None else None
-    )
-    breaks = (
-        np.flatnonzero(np.diff(np.asarray(epochs, dtype=np.int64))) + 1 if len(epochs) else np.empty(0, int)
-    )
+    true_positions = _truth_in_nav(truth, evaluation) if truth is not None and evaluation is not None else None
+    breaks = np.flatnonzero(np.diff(np.asarray(epochs, dtype=np.int64))) + 1 if len(epochs) else np.empty(0, int)
     figure, plan, side = _maps(positions, true_positions, series=False)
     for axes, z in ((plan, 1), (side, 2)):
         if true_positions is not None:
@@ -254,6 +250,4 @@ def _save(figure: Figure, path: Path) -> None:
     except OSError as error:
         raise GraphvioError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
     except ValueError as error:
-        raise GraphvioError(
-            f"{path}: cannot be drawn ({error}); end its name in .png, .pdf or .svg"
-        ) from None
+        raise GraphvioError(f"{path}: cannot be drawn ({error}); end its name in .png, .pdf or .svg") from None

@@ -63,9 +63,7 @@ class Camera:
             raise RigError(f"{where}: focal lengths {intrinsics[:2].tolist()} must be positive, in pixels")
         given = np.asarray(self.distortion, dtype=np.float64).ravel()
         if len(given) > 5:
-            raise RigError(
-                f"{where}: {len(given)} distortion coefficients; give at most 5 [k1, k2, p1, p2, k3]"
-            )
+            raise RigError(f"{where}: {len(given)} distortion coefficients; give at most 5 [k1, k2, p1, p2, k3]")
         distortion = _finite(np.pad(given, (0, 5 - len(given))), (5,), f"{where}: distortion")
         _set(self, "size_px", (int(width), int(height)))
         _set(self, "intrinsics", intrinsics)
@@ -174,9 +172,7 @@ class Imu:
             if name != "time_offset_s" and value <= 0:
                 raise RigError(f"imu: {name} is {value}; it must be positive")
         if abs(self.time_offset_s) > 1.0:
-            raise RigError(
-                f"imu: time_offset_s is {self.time_offset_s}; it must be in seconds, less than one"
-            )
+            raise RigError(f"imu: time_offset_s is {self.time_offset_s}; it must be in seconds, less than one")
 
     @property
     def time_offset_ns(self) -> int:
@@ -223,9 +219,7 @@ class Rig:
         """
         for index in indices:
             if not 0 <= index < len(self.pairs):
-                raise RigError(
-                    f"{self.name}: there is no pair {index}; choose from 0 to {len(self.pairs) - 1}"
-                )
+                raise RigError(f"{self.name}: there is no pair {index}; choose from 0 to {len(self.pairs) - 1}")
         return replace(self, pairs=tuple(self.pairs[i] for i in indices))
 
     def without_imu(self) -> Rig:

@@ -42,9 +42,7 @@ class Trajectory:
         stamps = np.array(self.stamps_ns, dtype=np.int64).reshape(-1)
         poses = np.ascontiguousarray(self.nav_T_body, dtype=np.float64).reshape(-1, 4, 4)
         if len(stamps) != len(poses):
-            raise TrajectoryError(
-                f"trajectory: {len(stamps)} stamps but {len(poses)} poses; give one stamp a pose"
-            )
+            raise TrajectoryError(f"trajectory: {len(stamps)} stamps but {len(poses)} poses; give one stamp a pose")
         bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
         if len(bad):
             raise TrajectoryError(f"trajectory: pose {bad[0]} holds NaN or infinity; leave such poses out")
@@ -134,15 +132,11 @@ class Trajectory:
         Raises:
             TrajectoryError: if the file cannot be written.
         """
-        text = "".join(
-            f"{tum_line(int(s), p)}\n" for s, p in zip(self.stamps_ns, self.nav_T_body, strict=True)
-        )
+        text = "".join(f"{tum_line(int(s), p)}\n" for s, p in zip(self.stamps_ns, self.nav_T_body, strict=True))
         try:
             Path(path).write_text(text, encoding="ascii")
         except OSError as error:
-            raise TrajectoryError(
-                f"{path}: cannot be written ({error.strerror}); choose another place"
-            ) from None
+            raise TrajectoryError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
 
 
 def tum_line(stamp_ns: int, nav_T_body: Float) -> str:
@@ -196,15 +190,11 @@ def _read(path: Path) -> Trajectory:
         where = f"{path}, line {number}"
         stamp, pose = _pose(fields, is_euroc, where)
         if stamps and stamp <= stamps[-1]:
-            raise TrajectoryError(
-                f"{where}: its stamp does not come after the one before it; sort the file by time"
-            )
+            raise TrajectoryError(f"{where}: its stamp does not come after the one before it; sort the file by time")
         stamps.append(stamp)
         poses.append(pose)
     if not poses:
-        raise TrajectoryError(
-            f"{path}: holds no pose; the run that wrote it estimated nothing, or it is another file"
-        )
+        raise TrajectoryError(f"{path}: holds no pose; the run that wrote it estimated nothing, or it is another file")
     return Trajectory(np.array(stamps, dtype=np.int64), np.array(poses))
 
 
@@ -235,13 +225,9 @@ def _pose(fields: Sequence[str], is_euroc: bool, where: str) -> tuple[int, Float
     if not np.isfinite(values).all():
         raise TrajectoryError(f"{where}: holds NaN or infinity; remove the line")
     if abs(stamp) > _STAMP_MAX_NS:
-        raise TrajectoryError(
-            f"{where}: stamp {fields[0]} is no time in nanoseconds; correct or remove the line"
-        )
+        raise TrajectoryError(f"{where}: stamp {fields[0]} is no time in nanoseconds; correct or remove the line")
     quat_wxyz = values[3:] if is_euroc else np.array([values[6], values[3], values[4], values[5]])
     norm = float(np.linalg.norm(quat_wxyz))
     if abs(norm - 1.0) > _NORM_TOLERANCE:
-        raise TrajectoryError(
-            f"{where}: its quaternion has norm {norm:.3g}, not 1; check the order of the columns"
-        )
+        raise TrajectoryError(f"{where}: its quaternion has norm {norm:.3g}, not 1; check the order of the columns")
     return stamp, se3(rotation_from_quat_wxyz(quat_wxyz), values[:3])

@@ -35,7 +35,11 @@ def relative_covariance(a_T_b: Float, joint: Float) -> Float:
 
 
 def gate(
-    measured: Float, measured_covariance: Float, predicted: Float, predicted_covariance: Float, probability: float
+    measured: Float,
+    measured_covariance: Float,
+    predicted: Float,
+    predicted_covariance: Float,
+    probability: float,
 ) -> Verdict:
     """Test a motion (4, 4) against a predicted one; covariances (6, 6) in the frame that it ends in."""
     innovation = se3_log(se3_inverse(measured) @ predicted)

@@ -96,9 +96,7 @@ class Smoother:
             )
             sigmas = np.repeat([_ACCEL_BIAS_SIGMA, uncertainty.gyro_bias_rad_s], 3)
             bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-            self._window.add(
-                gtsam.PriorFactorConstantBias(_b(k), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
-            )
+            self._window.add(gtsam.PriorFactorConstantBias(_b(k), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
 
     def extend(self, stamp_ns: int, span: ImuSpan | None) -> RigState:
         """Predict the next state and append it; without a span of the IMU, by constant velocity."""
@@ -139,7 +137,10 @@ class Smoother:
             return RigState(pose, pose[:3, :3] @ self._previous_motion[3:], np.zeros(3), np.zeros(3))
         bias = values.atConstantBias(_b(k))
         return RigState(
-            pose, np.asarray(values.atVector(_v(k))), np.asarray(bias.gyroscope()), np.asarray(bias.accelerometer())
+            pose,
+            np.asarray(values.atVector(_v(k))),
+            np.asarray(bias.gyroscope()),
+            np.asarray(bias.accelerometer()),
         )
 
     def latest_rate(self) -> Float | None:

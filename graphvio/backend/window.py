@@ -84,10 +84,10 @@ class Window:
         except RuntimeError as error:
             raise WindowError(f"a state cannot be marginalised: {_first_line(error)}") from None
         for i in range(remaining.size()):
-            factor = remaining.at(i)
-            if factor is not None and len(factor.keys()):
-                container = gtsam.LinearContainerFactor(factor, self.values)
-                staying.append((frozenset(factor.keys()), container))
+            marginal = remaining.at(i)
+            if marginal is not None and len(marginal.keys()):
+                container = gtsam.LinearContainerFactor(marginal, self.values)
+                staying.append((frozenset(marginal.keys()), container))
         for key in leaving:
             self.values.erase(key)
         self._factors = staying
@@ -99,7 +99,9 @@ class Window:
             for _, factor in self._factors:
                 graph.push_back(factor)
             try:
-                self._solution = graph.linearize(self.values).eliminateMultifrontal(gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR)
+                self._solution = graph.linearize(self.values).eliminateMultifrontal(
+                    gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR
+                )
             except RuntimeError as error:
                 raise WindowError(f"the window has no unique solution: {_first_line(error)}") from None
         return self._solution

@@ -118,9 +118,7 @@ def relative_errors(estimate: Trajectory, truth: Trajectory) -> tuple[dict[str, 
     for length in RPE_SECONDS:
         position, rotation = _motion_errors(estimate, truth, _pairs(seconds, length))
         if len(position):
-            errors[f"{length:g} s"] = RelativeError(
-                len(position), Stats.of(position), Stats.of(rotation), None, None
-            )
+            errors[f"{length:g} s"] = RelativeError(len(position), Stats.of(position), Stats.of(rotation), None, None)
     for length in RPE_METRES + KITTI_METRES:
         position, rotation = _motion_errors(estimate, truth, _pairs(distances, length))
         if not len(position):

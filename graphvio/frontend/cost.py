@@ -3,21 +3,22 @@
 import numpy as np
 
 from graphvio.arrays import Float, Int
+from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.kernels import kernel
 
 
 @kernel
-def left_motions(cur_T_ref: Float, cam_T_body: Float, body_T_left: Float) -> Float:
+def left_motions(cur_T_ref: Float, rig: RigArrays) -> Float:
     """``cam_T_left`` (P, 2, 4, 4): from each left camera at the reference instant to its pair's cameras now.
 
     Side 0 is the transfer of the motion to the pair, eq. (1); side 1 has the paper's ``P^s`` in front.
     """
-    n_pairs = len(body_T_left)
+    n_pairs = len(rig.body_T_left)
     motions = np.empty((n_pairs, 2, 4, 4))
     for j in range(n_pairs):
-        body_T_left_ref = cur_T_ref @ body_T_left[j]
+        body_T_left_ref = cur_T_ref @ rig.body_T_left[j]
         for side in range(2):
-            motions[j, side] = np.ascontiguousarray(cam_T_body[j, side]) @ body_T_left_ref
+            motions[j, side] = np.ascontiguousarray(rig.cam_T_body[j, side]) @ body_T_left_ref
     return motions
 
 
@@ -36,30 +37,21 @@ def squared_error_px(motion: Float, point: Float, seen: Float, focal_px: float) 
 
 @kernel
 def robust_cost(
-    cur_T_ref: Float,
-    cam_T_body: Float,
-    body_T_left: Float,
-    focal_px: Float,
-    pair: Int,
-    points: Float,
-    left: Float,
-    right: Float,
-    has_right: Float,
-    rows: Int,
-    cauchy_scale_px: float,
+    cur_T_ref: Float, rig: RigArrays, observations: Observations, rows: Int, cauchy_scale_px: float
 ) -> float:
     """Sum of ``rho(y) = log(1 + |y|^2 / a^2)`` over both images of the given rows: eq. (3), or eq. (2) for one pair.
 
     A point that falls behind a camera counts as one with an error of a thousand scales.
     """
-    motions = left_motions(cur_T_ref, cam_T_body, body_T_left)
+    motions = left_motions(cur_T_ref, rig)
     inverse_a2 = 1.0 / (cauchy_scale_px * cauchy_scale_px)
     total = 0.0
     for i in rows:
-        j = pair[i]
-        e2 = squared_error_px(motions[j, 0], points[i], left[i], focal_px[j, 0])
+        j = observations.pair[i]
+        point = observations.points[i]
+        e2 = squared_error_px(motions[j, 0], point, observations.left[i], rig.focal_px[j, 0])
         total += np.log1p(min(e2 * inverse_a2, 1e6))
-        if has_right[i]:
-            e2 = squared_error_px(motions[j, 1], points[i], right[i], focal_px[j, 1])
+        if observations.has_right[i]:
+            e2 = squared_error_px(motions[j, 1], point, observations.right[i], rig.focal_px[j, 1])
             total += np.log1p(min(e2 * inverse_a2, 1e6))
     return total

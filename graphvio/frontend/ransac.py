@@ -14,7 +14,12 @@ _MAX_RELATIVE_DEPTH_SIGMA = 0.3
 
 
 def hypothesise(
-    rig: RigArrays, observations: Observations, pair: int, count: int, pixel_sigma_px: float, rng: np.random.Generator
+    rig: RigArrays,
+    observations: Observations,
+    pair: int,
+    count: int,
+    pixel_sigma_px: float,
+    rng: np.random.Generator,
 ) -> Float:
     """Motions ``cur_T_ref`` (H, 4, 4) of body, by 3-point resection of one pair's random triples, H <= count."""
     sigma_w = pixel_sigma_px * np.sqrt(observations.covariances[:, 2, 2])
@@ -24,18 +29,8 @@ def hypothesise(
     if len(rows) < 3 or count == 0:
         return np.zeros((0, 4, 4))
     triples = rows[rng.integers(0, len(rows), size=(count, 3))]
-    distinct = (
-        (triples[:, 0] != triples[:, 1]) & (triples[:, 0] != triples[:, 2]) & (triples[:, 1] != triples[:, 2])
-    )
-    poses, found = _resect_triples(
-        triples[distinct],
-        observations.points,
-        observations.left,
-        observations.right,
-        observations.has_right,
-        rig.cam_T_body[pair, 1] @ rig.body_T_left[pair],
-        rig.focal_px[pair, 1],
-    )
+    distinct = (triples[:, 0] != triples[:, 1]) & (triples[:, 0] != triples[:, 2]) & (triples[:, 1] != triples[:, 2])
+    poses, found = _resect_triples(triples[distinct], rig, observations, pair)
     body_T_left = rig.body_T_left[pair]
     return np.ascontiguousarray(body_T_left @ poses[found] @ se3_inverse(body_T_left))
 
@@ -61,19 +56,7 @@ def preempt(
         chunk = np.concatenate([rows[start : start + chunk_points] for rows in order])
         if len(chunk) == 0:
             break
-        scores[alive] += score_all(
-            hypotheses[alive],
-            rig.cam_T_body,
-            rig.body_T_left,
-            rig.focal_px,
-            observations.pair,
-            observations.points,
-            observations.left,
-            observations.right,
-            observations.has_right,
-            chunk,
-            cauchy_scale_px,
-        )
+        scores[alive] += score_all(hypotheses[alive], rig, observations, chunk, cauchy_scale_px)
         ranked = alive[np.argsort(scores[alive], kind="stable")]
         alive = ranked[: (len(ranked) + 1) // 2]
         start += chunk_points
@@ -83,53 +66,25 @@ def preempt(
 
 @kernel
 def score_all(
-    hypotheses: Float,
-    cam_T_body: Float,
-    body_T_left: Float,
-    focal_px: Float,
-    pair: Int,
-    points: Float,
-    left: Float,
-    right: Float,
-    has_right: Bool,
-    rows: Int,
-    cauchy_scale_px: float,
+    hypotheses: Float, rig: RigArrays, observations: Observations, rows: Int, cauchy_scale_px: float
 ) -> Float:
     """Robust cost (H,) of each hypothesis (H, 4, 4) on the given rows."""
     scores = np.empty(len(hypotheses))
     for h in range(len(hypotheses)):
-        scores[h] = robust_cost(
-            hypotheses[h],
-            cam_T_body,
-            body_T_left,
-            focal_px,
-            pair,
-            points,
-            left,
-            right,
-            has_right,
-            rows,
-            cauchy_scale_px,
-        )
+        scores[h] = robust_cost(hypotheses[h], rig, observations, rows, cauchy_scale_px)
     return scores
 
 
 @kernel
-def _resect_triples(
-    triples: Int,
-    points: Float,
-    left: Float,
-    right: Float,
-    has_right: Bool,
-    right_T_left: Float,
-    focal_px: float,
-) -> tuple[Float, Bool]:
-    """For each triple the solution that the right image of its points likes best."""
+def _resect_triples(triples: Int, rig: RigArrays, observations: Observations, pair: int) -> tuple[Float, Bool]:
+    """For each triple of one pair's points the solution that the right image of the points likes best."""
     n = len(triples)
     best = np.zeros((n, 4, 4))
     found = np.zeros(n, dtype=np.bool_)
     corners = np.empty((3, 3))
     rays = np.empty((3, 3))
+    points, left, right = observations.points, observations.left, observations.right
+    right_T_left = np.ascontiguousarray(rig.cam_T_body[pair, 1]) @ np.ascontiguousarray(rig.body_T_left[pair])
     for i in range(n):
         for k in range(3):
             row = triples[i, k]
@@ -145,8 +100,9 @@ def _resect_triples(
             error = 0.0
             for k in range(3):
                 row = triples[i, k]
-                if has_right[row]:
-                    error += min(squared_error_px(motion, points[row], right[row], focal_px), 1e6)
+                if observations.has_right[row]:
+                    e2 = squared_error_px(motion, points[row], right[row], rig.focal_px[pair, 1])
+                    error += min(e2, 1e6)
             if error < least:
                 least = error
                 best[i] = poses[c]

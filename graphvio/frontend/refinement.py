@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Int
+from graphvio.arrays import Bool, Float
 from graphvio.config import MotionConfig
 from graphvio.frontend.cost import left_motions
 from graphvio.frontend.observations import Observations, RigArrays
@@ -44,7 +44,7 @@ def refine(rig: RigArrays, observations: Observations, cur_T_ref: Float, config:
     """Minimise the robust cost from a start (4, 4); directions that no point constrains get a large variance."""
     sigma = config.pixel_sigma_px
     scale = config.cauchy_scale_px / sigma
-    pose, hessian, errors2, cost = _levenberg_marquardt(cur_T_ref, *rig, *observations, sigma, scale)
+    pose, hessian, errors2, cost = _levenberg_marquardt(cur_T_ref, rig, observations, sigma, scale)
     inlier = errors2 < (config.max_error_px / sigma) ** 2
     # Backward propagation of the reprojection covariance: the inverse of the robustly weighted normal matrix,
     # scaled by what the residuals say of the noise. The small prior keeps unconstrained directions finite.
@@ -55,7 +55,7 @@ def refine(rig: RigArrays, observations: Observations, cur_T_ref: Float, config:
 
 def explained(rig: RigArrays, observations: Observations, cur_T_ref: Float, config: MotionConfig) -> Bool:
     """The points (N,) that a motion (4, 4) explains to within ``max_error_px``, their own uncertainty allowed for."""
-    errors2 = _squared_errors(cur_T_ref, *rig, *observations, config.pixel_sigma_px)
+    errors2 = _squared_errors(cur_T_ref, rig, observations, config.pixel_sigma_px)
     return np.asarray(errors2 < (config.max_error_px / config.pixel_sigma_px) ** 2)
 
 
@@ -69,27 +69,12 @@ def _variance_factor(errors2: Float, scale: float, has_right: Bool) -> float:
 
 
 @kernel
-def _squared_errors(
-    cur_T_ref: Float,
-    cam_T_body: Float,
-    body_T_left: Float,
-    focal_px: Float,
-    pair: Int,
-    points: Float,
-    covariances: Float,
-    left: Float,
-    right: Float,
-    has_right: Bool,
-    sigma: float,
-) -> Float:
+def _squared_errors(cur_T_ref: Float, rig: RigArrays, observations: Observations, sigma: float) -> Float:
     """Whitened squared errors (N,)."""
-    motions = left_motions(cur_T_ref, cam_T_body, body_T_left)
-    whiteners = np.empty((len(pair), 4, 4))
-    for i in range(len(pair)):
-        _whitener(motions[pair[i]], points[i], covariances[i], focal_px[pair[i]], sigma, whiteners[i])
-    errors2 = np.empty(len(pair))
+    motions = left_motions(cur_T_ref, rig)
+    errors2 = np.empty(len(observations.pair))
     _linearise(
-        cur_T_ref, cam_T_body, motions, focal_px, pair, points, left, right, has_right, whiteners, 1.0,
+        motions, rig, observations, _whiteners(motions, rig, observations, sigma), 1.0,
         np.empty((6, 6)), np.empty(6), errors2,
     )  # fmt: skip
     return errors2
@@ -97,49 +82,29 @@ def _squared_errors(
 
 @kernel
 def _levenberg_marquardt(
-    cur_T_ref: Float,
-    cam_T_body: Float,
-    body_T_left: Float,
-    focal_px: Float,
-    pair: Int,
-    points: Float,
-    covariances: Float,
-    left: Float,
-    right: Float,
-    has_right: Bool,
-    sigma: float,
-    scale: float,
+    cur_T_ref: Float, rig: RigArrays, observations: Observations, sigma: float, scale: float
 ) -> tuple[Float, Float, Float, float]:
     """Pose, normal matrix (6, 6), whitened squared errors (N,) and cost at the minimum."""
     pose = cur_T_ref.copy()
-    n = len(pair)
-    whiteners = np.empty((n, 4, 4))
-    hessian = np.zeros((6, 6))
-    gradient = np.zeros(6)
-    errors2 = np.empty(n)
+    n = len(observations.pair)
+    hessian, gradient, errors2 = np.zeros((6, 6)), np.zeros(6), np.empty(n)
     cost = 0.0
     for _ in range(_ROUNDS):
-        motions = left_motions(pose, cam_T_body, body_T_left)
-        for i in range(n):
-            _whitener(motions[pair[i]], points[i], covariances[i], focal_px[pair[i]], sigma, whiteners[i])
+        motions = left_motions(pose, rig)
+        whiteners = _whiteners(motions, rig, observations, sigma)
+        cost = _linearise(motions, rig, observations, whiteners, scale, hessian, gradient, errors2)
         damping = 1e-6
-        cost = _linearise(
-            pose, cam_T_body, motions, focal_px, pair, points, left, right, has_right, whiteners, scale,
-            hessian, gradient, errors2,
-        )  # fmt: skip
         moved = 0.0
         for _ in range(_STEPS_PER_ROUND):
             damped = hessian.copy()
             for k in range(6):
                 damped[k, k] += damping * hessian[k, k] + 1e-9
-            step = np.linalg.solve(damped, gradient)
+            step: Float = np.linalg.solve(damped, gradient)
             candidate = se3_exp(step) @ pose
-            new_hessian = np.zeros((6, 6))
-            new_gradient = np.zeros(6)
-            new_errors2 = np.empty(n)
+            new_hessian, new_gradient, new_errors2 = np.zeros((6, 6)), np.zeros(6), np.empty(n)
             new_cost = _linearise(
-                candidate, cam_T_body, left_motions(candidate, cam_T_body, body_T_left), focal_px, pair, points,
-                left, right, has_right, whiteners, scale, new_hessian, new_gradient, new_errors2,
+                left_motions(candidate, rig), rig, observations, whiteners, scale,
+                new_hessian, new_gradient, new_errors2,
             )  # fmt: skip
             size = np.max(np.abs(step))
             if new_cost <= cost:
@@ -157,8 +122,18 @@ def _levenberg_marquardt(
 
 
 @kernel
+def _whiteners(motions: Float, rig: RigArrays, observations: Observations, sigma: float) -> Float:
+    """Inverse Cholesky factors (N, 4, 4) of the covariances S of the points' errors in both images, pixels."""
+    whiteners = np.empty((len(observations.pair), 4, 4))
+    for i in range(len(observations.pair)):
+        j = observations.pair[i]
+        _whitener(motions[j], observations.points[i], observations.covariances[i], rig.focal_px[j], sigma, whiteners[i])
+    return whiteners
+
+
+@kernel
 def _whitener(motions: Float, point: Float, covariance: Float, focal_px: Float, sigma: float, inverse_l: Float) -> None:
-    """Fill the inverse Cholesky factor (4, 4) of the covariance S of a point's errors in both images, pixels."""
+    """Fill one point's inverse Cholesky factor (4, 4)."""
     jacobian = np.zeros((4, 3))
     for side in range(2):
         m = motions[side]
@@ -197,15 +172,9 @@ def _whitener(motions: Float, point: Float, covariance: Float, focal_px: Float, 
 
 @kernel
 def _linearise(
-    cur_T_ref: Float,
-    cam_T_body: Float,
     motions: Float,
-    focal_px: Float,
-    pair: Int,
-    points: Float,
-    left: Float,
-    right: Float,
-    has_right: Bool,
+    rig: RigArrays,
+    observations: Observations,
     whiteners: Float,
     scale: float,
     hessian: Float,
@@ -221,11 +190,12 @@ def _linearise(
     white = np.empty(4)
     white_jacobian = np.empty((4, 6))
     inverse_scale2 = 1.0 / (scale * scale)
-    for i in range(len(pair)):
-        j = pair[i]
-        a, b, w = points[i, 0], points[i, 1], points[i, 2]
+    focal_px = rig.focal_px
+    for i in range(len(observations.pair)):
+        j = observations.pair[i]
+        a, b, w = observations.points[i]
         behind = False
-        rows = 4 if has_right[i] else 2
+        rows = 4 if observations.has_right[i] else 2
         for side in range(rows // 2):
             m = motions[j, side]
             x = m[0, 0] * a + m[0, 1] * b + m[0, 2] + w * m[0, 3]
@@ -235,11 +205,11 @@ def _linearise(
                 behind = True
                 break
             u, v = x / z, y / z
-            seen = left[i] if side == 0 else right[i]
+            seen = observations.left[i] if side == 0 else observations.right[i]
             residual[2 * side] = focal_px[j, side] * (seen[0] - u)
             residual[2 * side + 1] = focal_px[j, side] * (seen[1] - v)
             # d cam point = R_cam_body (-[p]x d_rotation + w d_translation), p the homogeneous point in body now
-            r = cam_T_body[j, side]
+            r = rig.cam_T_body[j, side]
             qx, qy, qz = x - w * r[0, 3], y - w * r[1, 3], z - w * r[2, 3]
             px = r[0, 0] * qx + r[1, 0] * qy + r[2, 0] * qz
             py = r[0, 1] * qx + r[1, 1] * qy + r[2, 1] * qz

@@ -11,7 +11,11 @@ from graphvio.frontend.refinement import Refined, explained, refine
 
 
 def joint_motion(
-    rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
+    rig: RigArrays,
+    observations: Observations,
+    predicted: Float,
+    config: MotionConfig,
+    rng: np.random.Generator,
 ) -> Refined:
     """Hypotheses of every pair, scored on every pair, and the winner refined on all points (section 3.1).
 
@@ -24,15 +28,17 @@ def joint_motion(
     """
     hypotheses = [predicted[None]]
     for pair in np.unique(observations.pair):
-        hypotheses.append(
-            hypothesise(rig, observations, int(pair), config.hypotheses, config.pixel_sigma_px, rng)
-        )
+        hypotheses.append(hypothesise(rig, observations, int(pair), config.hypotheses, config.pixel_sigma_px, rng))
     winner = preempt(rig, observations, np.concatenate(hypotheses), config.chunk_points, config.cauchy_scale_px, rng)
     return refine(rig, observations, winner, config)
 
 
 def best_pair_motion(
-    rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
+    rig: RigArrays,
+    observations: Observations,
+    predicted: Float,
+    config: MotionConfig,
+    rng: np.random.Generator,
 ) -> Refined:
     """Each pair estimates alone; the pose of least global cost wins, eq. (4). For arguments see `joint_motion`."""
     candidates = [
@@ -47,14 +53,5 @@ def best_pair_motion(
 
 def global_cost(rig: RigArrays, observations: Observations, cur_T_ref: Float, cauchy_scale_px: float) -> float:
     """The cost of a motion (4, 4) on the points of all pairs, eq. (3)."""
-    return robust_cost(
-        cur_T_ref,
-        *rig,
-        observations.pair,
-        observations.points,
-        observations.left,
-        observations.right,
-        observations.has_right,
-        np.arange(len(observations.pair)),
-        cauchy_scale_px,
-    )
+    rows = np.arange(len(observations.pair))
+    return robust_cost(cur_T_ref, rig, observations, rows, cauchy_scale_px)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -53,8 +53,8 @@ class PairFrame:
 
     def keep(self, rows: Bool) -> PairFrame:
         """The same with only some of its tracks."""
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        return PairFrame(**{k: v[rows] if isinstance(v, np.ndarray) else v for k, v in columns.items()})
+        columns = ("ids", "pixels", "left", "right", "points", "covariances", "has_depth", "flat_for")
+        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
 
 class PairTracker:
@@ -88,7 +88,11 @@ class PairTracker:
         rays, has_ray = self._pair.left.unproject(pixels)
         normalised_right, matched = self._match(left, right, pixels, rays, inverse_depth, rejected)
         points, covariances, errors = triangulate(
-            rays, normalised_right, self._pair.right_T_left, self._pair.left.focal_px, self._pair.right.focal_px
+            rays,
+            normalised_right,
+            self._pair.right_T_left,
+            self._pair.left.focal_px,
+            self._pair.right.focal_px,
         )
         matched &= has_ray
         on_line = errors <= self._config.stereo.max_epipolar_px
@@ -120,7 +124,7 @@ class PairTracker:
     def _follow(
         self, image: Image, left_T_left_prev: Float | None, rejected: dict[str, int]
     ) -> tuple[PairFrame, Float, Float]:
-        """The tracks that are still there, as they were, with their pixels and predicted inverse depths (NaN: unknown)."""
+        """The tracks that are still there, as they were, with their pixels and predicted inverse depths (or NaN)."""
         last = self._last
         if last is None or self._last_image is None:
             return _NOTHING, np.zeros((0, 2)), np.zeros(0)
@@ -152,7 +156,13 @@ class PairTracker:
         """New corners (M, 2) where no track gives geometry."""
         settings = self._config.corners
         return find_corners(
-            image, self._allowed, pixels, has_depth, settings.cell_px, settings.border_px, settings.min_response
+            image,
+            self._allowed,
+            pixels,
+            has_depth,
+            settings.cell_px,
+            settings.border_px,
+            settings.min_response,
         )
 
     def _predict(self, last: PairFrame, left_T_left_prev: Float) -> tuple[Float, Float]:
@@ -166,7 +176,13 @@ class PairTracker:
         return np.where(valid[:, None], pixels, last.pixels), inverse_depth
 
     def _match(
-        self, left: Image, right: Image, pixels: Float, rays: Float, inverse_depth: Float, rejected: dict[str, int]
+        self,
+        left: Image,
+        right: Image,
+        pixels: Float,
+        rays: Float,
+        inverse_depth: Float,
+        rejected: dict[str, int],
     ) -> tuple[Float, Bool]:
         """Normalised coordinates (N, 2) in the right image, and whether the match passed its tests (N,)."""
         pair, settings = self._pair, self._config.stereo

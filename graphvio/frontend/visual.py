@@ -174,7 +174,10 @@ class VisualFrontend:
         explained = int(refined.inlier.sum())
         if explained < overlap * correspondences.offered or explained < _MIN_KEYFRAME_POINTS:
             return True
-        for j, frame in frames.items():  # one pair's keyframe may be spent long before all points together are few
+        for (
+            j,
+            frame,
+        ) in frames.items():  # one pair's keyframe may be spent long before all points together are few
             if np.sum(refined.inlier[pair == j]) < 0.5 * overlap * frame.has_depth.sum():
                 return True
         return False

@@ -25,9 +25,7 @@ class Percentiles:
         """Of any number of values; None of none."""
         if not len(values_ms):
             return None
-        return Percentiles(
-            *(round(float(v), 4) for v in np.percentile(np.asarray(values_ms), [50.0, 95.0, 99.0]))
-        )
+        return Percentiles(*(round(float(v), 4) for v in np.percentile(np.asarray(values_ms), [50.0, 95.0, 99.0])))
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """Writes a result folder while the run goes on.
 
-All files but the summary, the smoothed trajectory and the picture grow line by line and are flushed at once, so
-that a run which is broken off leaves what it had. Equal input gives an equal ``trajectory.txt``, byte by byte.
+All files but the summary, the smoothed trajectory and the picture grow line by line and are flushed at once,
+so that a run which is broken off leaves what it had. Equal input gives an equal ``trajectory.txt``, byte by
+byte.
 """
 
 from __future__ import annotations
@@ -30,9 +31,7 @@ from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory, tum_line
 
 _TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
-_COVARIANCE_HEADER = ",".join(
-    ["stamp_ns", *(f"{a}_{b}" for a, b in combinations_with_replacement(_TANGENT, 2))]
-)
+_COVARIANCE_HEADER = ",".join(["stamp_ns", *(f"{a}_{b}" for a, b in combinations_with_replacement(_TANGENT, 2))])
 _BIAS_HEADER = "stamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
 _UPPER = np.triu_indices(6)
 _NS_PER_S = 1e9
@@ -182,9 +181,7 @@ class ResultWriter:
             np.array(self._stamps, dtype=np.int64), np.array(self._poses, dtype=np.float64).reshape(-1, 4, 4)
         )
         evaluation, evaluation_error = _evaluate_if_possible(trajectory, truth)
-        duration_s = (
-            (self._last_ns - (self._first_ns or 0)) / _NS_PER_S if self._first_ns is not None else 0.0
-        )
+        duration_s = (self._last_ns - (self._first_ns or 0)) / _NS_PER_S if self._first_ns is not None else 0.0
         epochs = np.array(self._epochs, dtype=np.int64)
         summary = Summary(
             framesets=framesets,
@@ -244,14 +241,10 @@ def _csv(stamp_ns: int, values: Iterable[float]) -> str:
 
 
 def _cannot_write(where: Path, error: OSError) -> GraphvioError:
-    return GraphvioError(
-        f"{where}: cannot be written ({error.strerror or error}); choose another place for results"
-    )
+    return GraphvioError(f"{where}: cannot be written ({error.strerror or error}); choose another place for results")
 
 
-def _evaluate_if_possible(
-    trajectory: Trajectory, truth: Trajectory | None
-) -> tuple[Evaluation | None, str | None]:
+def _evaluate_if_possible(trajectory: Trajectory, truth: Trajectory | None) -> tuple[Evaluation | None, str | None]:
     if truth is None:
         return None, None
     try:

@@ -1,7 +1,8 @@
 """Live view and recording of a run, by way of rerun (the optional part ``viewer``).
 
 The odometry hands over and goes on: a thread of its own does the drawing. When that thread cannot keep pace,
-images are left out (there is room for one waiting frameset, and the latest wins), but no pose, scalar or message.
+images are left out (there is room for one waiting frameset, and the latest wins), but no pose, scalar or
+message.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import os
 import sys
 import threading
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -44,12 +46,11 @@ class Viewer:
         recording = _open_recording(rig, spawn, save)
         self._changed = threading.Condition()
         self._estimates: deque[Estimate] = deque()
-        self._incidents: deque[Incident] = deque()
+        self._extras: deque[Callable[[Recording], None]] = deque()
         self._frameset: tuple[FrameSet, Estimate] | None = None
         self._closing = False
         self._dropped = 0
         self._error: Exception | None = None
-        self._closed = threading.Event()
         self._worker = threading.Thread(target=self._work, args=(recording,), name="viewer", daemon=True)
         self._worker.start()
 
@@ -83,10 +84,17 @@ class Viewer:
 
     def show_incident(self, incident: Incident) -> None:
         """Hand over a message; returns at once."""
+        self._add_extra(lambda recording: recording.add_incident(incident))
+
+    def show_path(self, name: str, path: Trajectory, colour: tuple[int, int, int] = (150, 150, 150)) -> None:
+        """Hand over a whole other path in nav, such as the smoothed one or truth; returns at once."""
+        self._add_extra(lambda recording: recording.add_path(name, path, colour))
+
+    def _add_extra(self, extra: Callable[[Recording], None]) -> None:
         with self._changed:
             if self._closing or self._error is not None:
                 return
-            self._incidents.append(incident)
+            self._extras.append(extra)
             self._changed.notify()
 
     def close(self) -> None:
@@ -106,12 +114,13 @@ class Viewer:
     def _work(self, recording: Recording) -> None:
         try:
             while self._draw_waiting(recording):
-                # Many small rounds would take the interpreter from the odometry; one carries many poses as cheaply.
-                self._closed.wait(_ROUND_S)
+                # Many small rounds would hold up the odometry; one carries many poses as cheaply as one pose.
+                with self._changed:
+                    self._changed.wait_for(lambda: self._closing, _ROUND_S)
         except Exception as error:
             self._error = error
             self._estimates.clear()
-            self._incidents.clear()
+            self._extras.clear()
             self._frameset = None
         finally:
             recording.close()
@@ -119,13 +128,14 @@ class Viewer:
     def _draw_waiting(self, recording: Recording) -> bool:
         """Wait for work and do it; False when all is done and there will be no more."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closing or self._estimates or self._incidents)
+            self._changed.wait_for(lambda: self._closing or self._estimates or self._extras)
             estimates, self._estimates = self._estimates, deque()
-            incidents, self._incidents = self._incidents, deque()
+            extras, self._extras = self._extras, deque()
             frameset, self._frameset = self._frameset, None
             closing = self._closing
         recording.add_estimates(list(estimates))
-        recording.add_incidents(list(incidents))
+        for extra in extras:
+            extra(recording)
         if frameset is not None:
             recording.add_images(*frameset)
         return not closing
@@ -137,12 +147,10 @@ def check_display() -> None:
     Raises:
         GraphvioError: on Linux without an X or Wayland display.
     """
-    if sys.platform.startswith("linux") and not (
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    ):
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise GraphvioError(
-            "viewer: there is no display to open a window on; save a recording with --save-rrd FILE and open it "
-            "with  rerun FILE  where there is one"
+            "viewer: there is no display to open a window on; save a recording with --save-rrd FILE and open "
+            "it with  rerun FILE  where there is one"
         )
 
 
@@ -156,9 +164,7 @@ def _open_recording(rig: Rig, spawn: bool, save: Path | None) -> Recording:
     if spawn:
         check_display()
     if save is not None and not Path(save).parent.is_dir():
-        raise GraphvioError(
-            f"{save}: cannot be written (there is no folder {Path(save).parent}); make it first"
-        )
+        raise GraphvioError(f"{save}: cannot be written (there is no folder {Path(save).parent}); make it first")
     try:
         return Recording(rig, spawn=spawn, save=save)
     except (OSError, RuntimeError, ValueError) as error:

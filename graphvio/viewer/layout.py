@@ -9,6 +9,7 @@ import rerun.blueprint as rrb
 from graphvio.events import Status
 from graphvio.rig import Rig
 
+TIMELINE = "time"
 AXES = ("x", "y", "z")
 RATE_COLOURS = {"gyro": (230, 150, 40), "vision": (60, 150, 230), "fused": (40, 190, 90)}
 STATUS_COLOURS = {
@@ -51,7 +52,7 @@ def blueprint(rig: Rig) -> Any:
             ),
             column_shares=[3.0, 2.0],
         ),
-        rrb.TimePanel(timeline="time", state="collapsed"),
+        rrb.TimePanel(timeline=TIMELINE, state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
     )

@@ -17,7 +17,7 @@ The timeline ``time`` begins with the first stamp.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +30,12 @@ from graphvio.events import Estimate, FrameSet, Incident, Status
 from graphvio.geometry import quat_wxyz_from_rotation
 from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
-from graphvio.viewer.layout import AXES, RATE_COLOURS, STATUS_COLOURS, blueprint
+from graphvio.viewer.layout import AXES, RATE_COLOURS, STATUS_COLOURS, TIMELINE, blueprint
 
 _PIECE_POSES = 100
 _SIGMAS = 3.0
 _JPEG_QUALITY = 80
+_CURVES_NS = 500_000_000
 _FRUSTUM_M = 0.25
 _INLIER, _OUTLIER = (60, 220, 90), (235, 60, 50)
 _XYZ_COLOURS = [(220, 70, 60), (60, 170, 75), (70, 110, 230)]
@@ -64,7 +65,7 @@ class Recording:
             sinks.append(rr.GrpcSink())
         self._stream.set_sinks(*sinks, default_blueprint=layout)
         self._start_ns: int | None = None
-        self._count = 0
+        self._unsent: list[Estimate] = []
         self._status: Status | None = None
         self._piece: list[tuple[Float, Status]] = []
         self._piece_number = 0
@@ -72,7 +73,8 @@ class Recording:
         self._log_static()
 
     def close(self) -> None:
-        """Flush and end."""
+        """Log what is left, flush and end."""
+        self._send_curves()
         self._stream.flush()
         self._stream.disconnect()
 
@@ -82,24 +84,22 @@ class Recording:
             return
         if self._start_ns is None:
             self._start_ns = estimates[0].stamp_ns
-        numbers = {id(estimate): self._count + k for k, estimate in enumerate(estimates)}
-        self._count += len(estimates)
-        columns = _Columns(self._stream, self._start_ns, numbers)
         posed = [e for e in estimates if e.nav_T_body is not None]
-        self._send_poses(columns, posed)
+        self._send_poses(posed)
         self._extend_path(posed)
-        self._send_scalars(columns, estimates)
+        self._unsent += estimates
+        if self._unsent[-1].stamp_ns - self._unsent[0].stamp_ns >= _CURVES_NS:
+            self._send_curves()
         for estimate in estimates:
             if estimate.status is not self._status:
                 self._at(estimate.stamp_ns)
                 self._log_text(str(estimate.status), "status", STATUS_COLOURS[estimate.status])
                 self._status = estimate.status
 
-    def add_incidents(self, incidents: Iterable[Incident]) -> None:
-        """Messages at the time of their data."""
-        for incident in incidents:
-            self._at(incident.stamp_ns)
-            self._log_text(incident.detail, incident.kind, (200, 200, 200))
+    def add_incident(self, incident: Incident) -> None:
+        """A message at the time of its data."""
+        self._at(incident.stamp_ns)
+        self._log_text(incident.detail, incident.kind, (200, 200, 200))
 
     def add_images(self, frameset: FrameSet, estimate: Estimate) -> None:
         """Left images with the corners tracked in them, green where the motion explains them."""
@@ -111,15 +111,10 @@ class Recording:
                 image = rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg")
                 self._stream.log(f"{camera}/image", image)
             report = estimate.pairs.get(index)
-            pixels = np.empty((0, 2)) if report is None else report.pixels
-            colours = (
-                []
-                if report is None
-                else np.where(report.is_inlier[:, None], _INLIER, _OUTLIER).astype(np.uint8)
-            )
-            self._stream.log(
-                f"{camera}/corners", rr.Points2D(pixels, colors=colours, radii=rr.Radius.ui_points(2.5))
-            )
+            if report is not None:
+                colours = np.where(np.asarray(report.is_inlier)[:, None], _INLIER, _OUTLIER).astype(np.uint8)
+                corners = rr.Points2D(report.pixels, colors=colours, radii=rr.Radius.ui_points(2.5))
+                self._stream.log(f"{camera}/corners", corners)
 
     def add_path(self, name: str, trajectory: Trajectory, colour: tuple[int, int, int]) -> None:
         """A whole other path, such as the smoothed one, seen at all times."""
@@ -145,13 +140,13 @@ class Recording:
         for sensor in ("gyro", "accel"):
             log(f"biases/{sensor}", rr.SeriesLines(names=[*AXES], colors=_XYZ_COLOURS), static=True)
 
-    def _send_poses(self, columns: _Columns, posed: Sequence[Estimate]) -> None:
+    def _send_poses(self, posed: Sequence[Estimate]) -> None:
         poses = [np.asarray(e.nav_T_body) for e in posed]
         if not poses:
             return
         quats = np.array([_quat_xyzw(pose[:3, :3]) for pose in poses])
         translations = np.array([pose[:3, 3] for pose in poses])
-        columns.send("world/rig", posed, rr.Transform3D.columns(translation=translations, quaternion=quats))
+        self._send("world/rig", posed, rr.Transform3D.columns(translation=translations, quaternion=quats))
         with_covariance = [e for e in posed if e.covariance is not None]
         if with_covariance:
             axes = [ellipsoid(np.asarray(e.covariance)[3:, 3:]) for e in with_covariance]
@@ -159,23 +154,40 @@ class Recording:
                 half_sizes=np.array([half for half, _ in axes]),
                 quaternions=np.array([quat for _, quat in axes]),
             )
-            columns.send("world/rig/uncertainty", with_covariance, spheres)
+            self._send("world/rig/uncertainty", with_covariance, spheres)
 
-    def _send_scalars(self, columns: _Columns, estimates: Sequence[Estimate]) -> None:
+    def _send_curves(self) -> None:
+        """Everything that is drawn over time: one message a curve for any number of estimates."""
+        estimates, self._unsent = self._unsent, []
         for source in RATE_COLOURS:
             for k, axis in enumerate(AXES):
-                columns.scalars(f"rates/{axis}/{source}", estimates, _rate_of(source, k))
-        columns.scalars("biases/gyro", estimates, lambda e: e.gyro_bias)
-        columns.scalars("biases/accel", estimates, lambda e: e.accel_bias)
+                self._send_scalars(f"rates/{axis}/{source}", estimates, _rate_of(source, k))
+        self._send_scalars("biases/gyro", estimates, lambda e: e.gyro_bias)
+        self._send_scalars("biases/accel", estimates, lambda e: e.accel_bias)
         for stage in sorted({stage for e in estimates for stage in e.stage_ms}):
-            columns.scalars(f"timing/{stage}", estimates, _stage_of(stage))
+            self._send_scalars(f"timing/{stage}", estimates, _stage_of(stage))
         for index in sorted({index for e in estimates for index in e.pairs}):
             name = self._rig.pairs[index].name
-            columns.scalars(f"points/{name}/offered", estimates, _points_of(index, inliers=False))
-            columns.scalars(f"points/{name}/inliers", estimates, _points_of(index, inliers=True))
+            self._send_scalars(f"points/{name}/offered", estimates, _points_of(index, inliers=False))
+            self._send_scalars(f"points/{name}/inliers", estimates, _points_of(index, inliers=True))
+
+    def _send_scalars(self, entity: str, estimates: Sequence[Estimate], value: Callable[[Estimate], Any]) -> None:
+        """The values, numbers or vectors (3,), of those estimates that have one."""
+        known = [(e, v) for e in estimates if (v := value(e)) is not None]
+        if not known:
+            return
+        values = np.array([v for _, v in known], dtype=np.float64)
+        columns = rr.Scalars.columns(scalars=values.ravel())
+        if values.ndim > 1:
+            columns = columns.partition(np.full(len(values), values.shape[1]))
+        self._send(entity, [e for e, _ in known], columns)
+
+    def _send(self, entity: str, estimates: Sequence[Estimate], columns: Any) -> None:
+        since = np.array([e.stamp_ns - (self._start_ns or 0) for e in estimates], dtype="timedelta64[ns]")
+        self._stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=since)], columns)
 
     def _extend_path(self, posed: Sequence[Estimate]) -> None:
-        """Log the path in pieces of bounded length, so that a long run costs no more per pose than a short one."""
+        """Log the path in pieces of bounded length, so that a long run costs no more per pose."""
         for estimate in posed:
             position = np.asarray(estimate.nav_T_body)[:3, 3]
             if estimate.epoch != self._epoch:
@@ -206,35 +218,11 @@ class Recording:
     def _at(self, stamp_ns: int) -> None:
         if self._start_ns is None:
             self._start_ns = stamp_ns
-        self._stream.set_time("time", duration=np.timedelta64(int(stamp_ns) - self._start_ns, "ns"))
-
-
-class _Columns:
-    """Sends a value of each of many estimates in one message."""
-
-    def __init__(self, stream: Any, start_ns: int, numbers: dict[int, int]) -> None:
-        self._stream, self._start_ns, self._numbers = stream, start_ns, numbers
-
-    def send(self, entity: str, estimates: Sequence[Estimate], columns: Any) -> None:
-        since = np.array([e.stamp_ns - self._start_ns for e in estimates], dtype="timedelta64[ns]")
-        numbers = np.array([self._numbers[id(e)] for e in estimates], dtype=np.int64)
-        indexes = [rr.TimeColumn("time", duration=since), rr.TimeColumn("frameset", sequence=numbers)]
-        self._stream.send_columns(entity, indexes, columns)
-
-    def scalars(self, entity: str, estimates: Sequence[Estimate], value: Callable[[Estimate], Any]) -> None:
-        """Of those estimates that have the value: a number or a vector (3,)."""
-        known = [(e, v) for e in estimates if (v := value(e)) is not None]
-        if not known:
-            return
-        values = np.array([v for _, v in known], dtype=np.float64)
-        columns = rr.Scalars.columns(scalars=values.ravel())
-        if values.ndim > 1:
-            columns = columns.partition(np.full(len(values), values.shape[1]))
-        self.send(entity, [e for e, _ in known], columns)
+        self._stream.set_time(TIMELINE, duration=np.timedelta64(int(stamp_ns) - self._start_ns, "ns"))
 
 
 def ellipsoid(covariance: Float) -> tuple[Float, Float]:
-    """Half axes (3,) of three standard deviations, metres, and their rotation as a quaternion (4,) x y z w."""
+    """Half axes (3,) of three standard deviations, metres, and their frame: quaternion ``x y z w``."""
     variances, axes = np.linalg.eigh(covariance)
     if np.linalg.det(axes) < 0.0:
         axes[:, 0] = -axes[:, 0]

@@ -1,0 +1,109 @@
+"""``graphvio doctor``."""
+
+import os
+import platform
+import sys
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+_REQUIRED = {"gtsam": "gtsam", "numpy": "numpy", "numba": "numba", "matplotlib": "matplotlib"}
+_OPENCV = ("opencv-python-headless", "opencv-contrib-python-headless", "opencv-python", "opencv-contrib-python")
+_OPTIONAL = {"viewer": ("rerun", "rerun-sdk", "live view and recordings"), "maps": ("pycolmap", "pycolmap", "maps")}
+
+
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+) -> None:
+    """Tell what graphvio finds on this machine: versions, cores, optional parts, compiled kernels.
+
+    Examples:
+
+        graphvio doctor
+
+        graphvio doctor --json
+    """
+    import json
+
+    findings = examine()
+    if as_json:
+        typer.echo(json.dumps(findings, indent=2))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(show_header=False)
+    for name, version in findings["versions"].items():
+        table.add_row(name, version or "[red]missing[/red]: pip install graphvio")
+    table.add_section()
+    table.add_row("cores", f"{findings['cores']['usable']} of {findings['cores']['present']} usable")
+    table.add_section()
+    for name, part in findings["optional"].items():
+        table.add_row(f"optional: {name}", part["version"] or f"absent ({part['purpose']}): {part['install']}")
+    table.add_section()
+    cache = findings["kernel_cache"]
+    size = f"{cache['files']} kernels, {cache['megabytes']:.1f} MB"
+    table.add_row("compiled kernels", f"{size} in {cache['folder']}")
+    compiled = "no: the first run compiles for a minute or so"
+    table.add_row("compiled for this version", "yes" if cache["compiled"] else compiled)
+    Console(soft_wrap=True).print(table)
+
+
+def examine() -> dict[str, Any]:
+    """All findings, as JSON can hold them."""
+    from graphvio import __version__
+    from graphvio.kernels import any_compiled_before, cache_root
+
+    folder = cache_root()
+    kernels = [file.stat().st_size for file in folder.rglob("*.nbc")]
+    versions: dict[str, str | None] = {"graphvio": __version__, "python": platform.python_version()}
+    versions |= {name: _version(package) for name, package in _REQUIRED.items()}
+    versions["opencv"] = next((version for name in _OPENCV if (version := _version(name))), None)
+    return {
+        "versions": versions,
+        "platform": platform.platform(),
+        "executable": sys.executable,
+        "cores": {"present": os.cpu_count() or 1, "usable": _usable_cores()},
+        "optional": {
+            name: {
+                "version": _version(package) if find_spec(module) else None,
+                "purpose": purpose,
+                "install": f"pip install 'graphvio[{name}]'",
+            }
+            for name, (module, package, purpose) in _OPTIONAL.items()
+        },
+        "kernel_cache": {
+            "folder": str(folder),
+            "files": len(kernels),
+            "megabytes": sum(kernels) / 1e6,
+            "compiled": all(any_compiled_before(module) for module in kernel_modules()),
+        },
+    }
+
+
+def kernel_modules() -> list[str]:
+    """Names of graphvio's modules that hold kernels, found in their text: importing them would compile some."""
+    import graphvio
+
+    package = Path(graphvio.__file__).parent
+    found = []
+    for file in sorted(package.rglob("*.py")):
+        if "\n@kernel\n" in file.read_text(encoding="utf-8"):
+            parts = file.relative_to(package.parent).with_suffix("").parts
+            found.append(".".join(parts[:-1] if parts[-1] == "__init__" else parts))
+    return found
+
+
+def _usable_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
