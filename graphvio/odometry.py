@@ -153,7 +153,6 @@ class Odometry:
             "predict": 1e3 * (predicted - start),
             **visual.stage_ms,
             "update": 1e3 * (perf_counter() - measured),
-            "frameset": 1e3 * (perf_counter() - start),
         }
         return self._assemble(stamp_ns, status, visual, span, stage_ms)
 

@@ -34,6 +34,12 @@ def doctor(
         typer.echo(json.dumps(findings, indent=2))
         return
     from rich.console import Console
+
+    Console(soft_wrap=True).print(_table(findings))
+
+
+def _table(findings: dict[str, Any]) -> Any:
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(show_header=False)
@@ -43,14 +49,15 @@ def doctor(
     table.add_row("cores", f"{findings['cores']['usable']} of {findings['cores']['present']} usable")
     table.add_section()
     for name, part in findings["optional"].items():
-        table.add_row(f"optional: {name}", part["version"] or f"absent ({part['purpose']}): {part['install']}")
+        absent = escape(f"absent ({part['purpose']}): {part['install']}")
+        table.add_row(f"optional: {name}", part["version"] or absent)
     table.add_section()
     cache = findings["kernel_cache"]
-    size = f"{cache['files']} kernels, {cache['megabytes']:.1f} MB"
-    table.add_row("compiled kernels", f"{size} in {cache['folder']}")
-    compiled = "no: the first run compiles for a minute or so"
-    table.add_row("compiled for this version", "yes" if cache["compiled"] else compiled)
-    Console(soft_wrap=True).print(table)
+    table.add_row("kernel cache", f"{escape(cache['folder'])}, {cache['files']} files, {cache['megabytes']:.1f} MB")
+    modules = cache["compiled_modules"]
+    rest = "" if all(modules.values()) else "; the rest compiles when first used, which may take a minute"
+    table.add_row("modules compiled", f"{sum(modules.values())} of {len(modules)}{rest}")
+    return table
 
 
 def examine() -> dict[str, Any]:
@@ -80,7 +87,7 @@ def examine() -> dict[str, Any]:
             "folder": str(folder),
             "files": len(kernels),
             "megabytes": sum(kernels) / 1e6,
-            "compiled": all(any_compiled_before(module) for module in kernel_modules()),
+            "compiled_modules": {module: any_compiled_before(module) for module in kernel_modules()},
         },
     }
 

@@ -47,8 +47,8 @@ class RelativeError:
         pairs: number of motions compared.
         position_m: metres.
         rotation_deg: degrees.
-        percent: mean position error in percent of the distance; None for a distance in time.
-        deg_per_m: mean rotation error by distance; None for a distance in time.
+        percent: mean position error in percent of the distance walked; None for a distance in time.
+        deg_per_m: mean rotation error by distance walked; None for a distance in time.
     """
 
     pairs: int
@@ -116,20 +116,20 @@ def relative_errors(estimate: Trajectory, truth: Trajectory) -> tuple[dict[str, 
     errors: dict[str, RelativeError] = {}
     kitti = [np.empty((0, 2))]
     for length in RPE_SECONDS:
-        position, rotation = _motion_errors(estimate, truth, _pairs(seconds, length))
+        pairs = _pairs(seconds, length)
+        pairs = pairs[seconds[pairs[:, 0]] + length <= seconds[-1] + 1e-6]
+        position, rotation = _motion_errors(estimate, truth, pairs)
         if len(position):
             errors[f"{length:g} s"] = RelativeError(len(position), Stats.of(position), Stats.of(rotation), None, None)
-    for length in RPE_METRES + KITTI_METRES:
-        position, rotation = _motion_errors(estimate, truth, _pairs(distances, length))
+    for length in (m for m in RPE_METRES + KITTI_METRES if m <= distances[-1]):
+        pairs = _pairs(distances, length)
+        position, rotation = _motion_errors(estimate, truth, pairs)
         if not len(position):
             continue
-        percent, deg_per_m = 100.0 * position / length, rotation / length
+        walked = distances[pairs[:, 1]] - distances[pairs[:, 0]]
+        percent, deg_per_m = 100.0 * position / walked, rotation / walked
         errors[f"{length:g} m"] = RelativeError(
-            len(position),
-            Stats.of(position),
-            Stats.of(rotation),
-            float(percent.mean()),
-            float(deg_per_m.mean()),
+            len(position), Stats.of(position), Stats.of(rotation), float(percent.mean()), float(deg_per_m.mean())
         )
         if length in KITTI_METRES:
             kitti.append(np.column_stack([percent, deg_per_m]))

@@ -99,8 +99,8 @@ def _levenberg_marquardt(
             damped = hessian.copy()
             for k in range(6):
                 damped[k, k] += damping * hessian[k, k] + 1e-9
-            step: Float = np.linalg.solve(damped, gradient)
-            candidate = se3_exp(step) @ pose
+            step = np.linalg.solve(damped, gradient)
+            candidate = se3_exp(step) @ pose  # type: ignore[arg-type]
             new_hessian, new_gradient, new_errors2 = np.zeros((6, 6)), np.zeros(6), np.empty(n)
             new_cost = _linearise(
                 left_motions(candidate, rig), rig, observations, whiteners, scale,

@@ -1,0 +1,24 @@
+"""``graphvio dump-config``: the values of a profile, to start a file of one's own."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+
+def dump_config(
+    profile: Annotated[str, typer.Argument(help="Profile or YAML file.")] = "default",
+    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+) -> None:
+    """Print all values of a configuration as YAML.
+
+    Examples:
+
+        graphvio dump-config > mine.yaml
+
+        graphvio dump-config best_pair
+    """
+    from graphvio.config import Config
+
+    typer.echo(Config.load(profile).to_yaml(), nl=False)

@@ -1,0 +1,157 @@
+"""``graphvio run``: a recording in, a folder of results out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from graphvio.pipeline import Progress
+    from graphvio.results import Summary
+    from graphvio.rig import Rig
+
+EXIT_INCOMPLETE = 3
+_LEAST_COMPLETION = 0.9
+
+
+def run(
+    source: Annotated[Path, typer.Argument(help="Folder of a recording: EuRoC/ASL, TUM-VI, KITTI odometry or raw.")],
+    rig: Annotated[
+        Path | None, typer.Option("--rig", help="Rig or calibration file.  [default: what the recording carries]")
+    ] = None,
+    config: Annotated[
+        str, typer.Option("--config", help="Profile, or a YAML file with the values to change.")
+    ] = "default",
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the results, new or empty.  [default: results/NAME-N]")
+    ] = None,
+    pairs: Annotated[
+        str | None, typer.Option("--pairs", help="Use only these stereo pairs, such as 0 or 0,1.  [default: all]")
+    ] = None,
+    no_imu: Annotated[bool, typer.Option("--no-imu", help="Use the cameras alone.")] = False,
+    from_s: Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.")] = None,
+    to_s: Annotated[float | None, typer.Option("--to", help="End at this second of the recording.")] = None,
+    view: Annotated[bool, typer.Option("--view", help="Watch it in the rerun viewer.")] = False,
+    save_rrd: Annotated[
+        Path | None, typer.Option("--save-rrd", help="Save what the viewer would show; needs no display.")
+    ] = None,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+) -> None:
+    """Estimate the trajectory of a recording.
+
+    Ends with exit code 0; with 2 where the input cannot be used; with 3 where less than 90 % of the framesets
+    have a pose (the results are written all the same).
+
+    Examples:
+
+        graphvio run MH_01_easy
+
+        graphvio run walk --pairs 0 --no-imu --out front-only
+
+        graphvio run walk --from 10 --to 40 --save-rrd walk.rrd
+    """
+    from contextlib import ExitStack
+
+    from graphvio.config import Config
+    from graphvio.pipeline import run as run_pipeline
+    from graphvio.results import ResultWriter
+    from graphvio.rig import Rig
+    from graphvio.sources import open_source
+    from graphvio.viewer import Viewer
+    from graphvio.warmup import is_first_use, warm_up
+
+    settings = Config.load(config)
+    opened = open_source(source, None if rig is None else Rig.load(rig), from_s=from_s, to_s=to_s)
+    chosen = _choose(opened.rig, pairs, no_imu)
+    if chosen is not opened.rig:
+        opened = open_source(source, chosen, from_s=from_s, to_s=to_s)
+    if is_first_use():
+        typer.echo("compiling numerical kernels for this machine, once: about a minute", err=True)
+    warm_up(opened.rig, settings)
+    with ExitStack() as stack:
+        viewer = stack.enter_context(Viewer(opened.rig, spawn=view, save=save_rrd)) if view or save_rrd else None
+        folder = out if out is not None else ResultWriter.new_folder(Path("results"), opened.name)
+        line = stack.enter_context(_ProgressLine())
+        summary = run_pipeline(opened, settings, folder, viewer=viewer, on_progress=line.show)
+    _tell(summary, folder)
+    if summary.completion < _LEAST_COMPLETION:
+        typer.echo(
+            f"graphvio: only {100 * summary.completion:.0f} % of the framesets have a pose; "
+            f"{folder / 'events.jsonl'} tells when and why",
+            err=True,
+        )
+        raise typer.Exit(EXIT_INCOMPLETE)
+
+
+def _choose(rig: Rig, pairs: str | None, no_imu: bool) -> Rig:
+    from graphvio.errors import RigError
+
+    if pairs is not None:
+        try:
+            indices = [int(text) for text in pairs.split(",")]
+        except ValueError:
+            raise RigError(f"--pairs {pairs}: give numbers separated by commas, such as 0,1") from None
+        rig = rig.with_pairs(indices)
+    return rig.without_imu() if no_imu else rig
+
+
+class _ProgressLine:
+    """One line that is drawn over on a terminal, and every few seconds a line of its own elsewhere."""
+
+    _REFRESH_S = 0.1
+    _PLAIN_S = 5.0
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.live import Live
+
+        self._console = Console(stderr=True)
+        self._live = Live(console=self._console, auto_refresh=False, transient=True)
+        self._period_s = self._REFRESH_S if self._console.is_terminal else self._PLAIN_S
+        self._next_s = 0.0
+
+    def __enter__(self) -> _ProgressLine:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+
+    def show(self, progress: Progress) -> None:
+        """Draw the line, if it is time to."""
+        if progress.wall_s < self._next_s and progress.framesets < progress.total:
+            return
+        self._next_s = progress.wall_s + self._period_s
+        latest = progress.latest
+        rate = progress.framesets / max(progress.wall_s, 1e-9)
+        realtime = progress.recorded_s / max(progress.wall_s, 1e-9)
+        features = " ".join(f"{report.inliers}/{report.points}" for _, report in sorted(latest.pairs.items()))
+        text = (
+            f"{progress.framesets}/{progress.total}  {progress.recorded_s:6.1f} s  {progress.distance_m:7.2f} m  "
+            f"{rate:5.1f} framesets/s ({realtime:.2f} x real time)  {latest.status:<12}  points {features}"
+        )
+        if self._console.is_terminal:
+            self._live.update(text, refresh=True)
+        else:
+            self._console.print(text, soft_wrap=True, highlight=False)
+
+
+def _tell(summary: Summary, folder: Path) -> None:
+    evaluation = summary.evaluation
+    typer.echo(
+        f"{summary.estimated} of {summary.framesets} framesets estimated, {summary.path_length_m:.2f} m in "
+        f"{summary.duration_s:.1f} s, {summary.realtime_factor:.2f} x real time"
+    )
+    if evaluation is not None:
+        typer.echo(f"against the recording's truth: ATE rmse {1e3 * evaluation['ate_position_m']['rmse']:.1f} mm, "
+            f"drift {evaluation['drift_percent']:.2f} % of the path")
+    faults = ", ".join(f"{kind} {count}" for kind, count in sorted(summary.input_faults.items()))
+    if faults:
+        typer.echo(f"faults of the recording: {faults}")
+    if summary.resets:
+        typer.echo(f"started anew {summary.resets} times: see {folder / 'events.jsonl'}")
+    typer.echo(f"results: {folder}")

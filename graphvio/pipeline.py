@@ -1,0 +1,163 @@
+"""A whole run: source -> odometry -> results and viewer."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.config import Config
+from graphvio.events import Estimate, Event, FrameSet
+from graphvio.odometry import Odometry
+from graphvio.results import ResultWriter, Summary
+from graphvio.sources import Source
+from graphvio.trajectory import Trajectory
+from graphvio.viewer import Viewer
+
+RESETS = ("gate_reset", "new_epoch", "window_rebuilt", "imu_came")
+"""Kinds of incidents after which the estimation started anew."""
+
+_KEPT_FRAMESETS = 100  # held by the odometry for lack of IMU samples, at the most
+
+
+@dataclass
+class Progress:
+    """How far a run has come.
+
+    Attributes:
+        framesets: estimated so far.
+        total: framesets that the source will yield at most.
+        recorded_s: time covered, by the recording's clock.
+        wall_s: time spent.
+        distance_m: path length so far.
+        latest: newest estimate.
+    """
+
+    framesets: int
+    total: int
+    recorded_s: float
+    wall_s: float
+    distance_m: float
+    latest: Estimate
+
+
+def run(
+    source: Source,
+    config: Config,
+    folder: Path,
+    *,
+    viewer: Viewer | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> Summary:
+    """Run the odometry over a source and write the results.
+
+    Args:
+        source: of the events; its rig is used.
+        config: of the odometry.
+        folder: for the results, new or empty.
+        viewer: shows or saves what happens, or None.
+        on_progress: called after each frameset.
+
+    Raises:
+        GraphvioError: if the source cannot be read or the folder not written.
+    """
+    odometry = Odometry(source.rig, config)
+    with ResultWriter(folder, source.rig, config.to_yaml()) as writer:
+        return _Run(source, odometry, writer, viewer, on_progress).go()
+
+
+class _Run:
+    def __init__(
+        self,
+        source: Source,
+        odometry: Odometry,
+        writer: ResultWriter,
+        viewer: Viewer | None,
+        on_progress: Callable[[Progress], None] | None,
+    ) -> None:
+        self._source = source
+        self._odometry = odometry
+        self._writer = writer
+        self._viewer = viewer
+        self._on_progress = on_progress
+        self._waiting: OrderedDict[int, FrameSet] = OrderedDict()  # for the viewer, until they are estimated
+        self._smoothed: list[tuple[int, Float]] = []
+        self._frameset_ms: list[float] = []
+        self._delivered = 0
+        self._resets = 0
+        self._distance_m = 0.0
+        self._last: Estimate | None = None
+        self._start = perf_counter()
+
+    def go(self) -> Summary:
+        for event in self._source:
+            self._remember(event)
+            begin = perf_counter()
+            estimate = self._odometry.process(event)
+            if estimate is not None:
+                self._frameset_ms.append(1e3 * (perf_counter() - begin))
+                self._take(estimate)
+        for estimate in self._odometry.finish():
+            self._take(estimate)
+        wall_s = perf_counter() - self._start
+        self._collect()
+        for incident in self._source.faults.incidents:
+            self._writer.add_incident(incident)
+        truth = None if self._source.truth is None else Trajectory.read(self._source.truth)
+        return self._writer.finish(
+            wall_s=wall_s,
+            frameset_ms=self._frameset_ms,
+            smoothed=sorted(self._smoothed, key=lambda stamped: stamped[0]),
+            input_faults=self._source.faults.counts,
+            framesets=self._delivered,
+            awaited=self._delivered,
+            resets=self._resets,
+            truth=truth,
+        )
+
+    def _remember(self, event: Event) -> None:
+        if isinstance(event, FrameSet):
+            self._delivered += 1
+            if self._viewer is not None:
+                self._waiting[event.stamp_ns] = event
+                if len(self._waiting) > _KEPT_FRAMESETS:
+                    self._waiting.popitem(last=False)
+
+    def _take(self, estimate: Estimate) -> None:
+        self._writer.add(estimate)
+        self._collect()
+        if self._viewer is not None:
+            self._viewer.show(self._waiting.pop(estimate.stamp_ns, None), estimate)
+        before, self._last = self._last, estimate
+        if before is not None and before.epoch == estimate.epoch:
+            self._distance_m += _distance(before, estimate)
+        if self._on_progress is not None:
+            self._on_progress(
+                Progress(
+                    framesets=len(self._frameset_ms),
+                    total=self._source.frameset_count,
+                    recorded_s=(estimate.stamp_ns - self._source.start_ns) * 1e-9,
+                    wall_s=perf_counter() - self._start,
+                    distance_m=self._distance_m,
+                    latest=estimate,
+                )
+            )
+
+    def _collect(self) -> None:
+        self._smoothed += self._odometry.take_smoothed()
+        for incident in self._odometry.take_incidents():
+            self._resets += incident.kind in RESETS
+            self._writer.add_incident(incident)
+            if self._viewer is not None:
+                self._viewer.show_incident(incident)
+
+
+def _distance(before: Estimate, now: Estimate) -> float:
+    if before.nav_T_body is None or now.nav_T_body is None:
+        return 0.0
+    return float(np.linalg.norm(now.nav_T_body[:3, 3] - before.nav_T_body[:3, 3]))

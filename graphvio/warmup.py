@@ -1,0 +1,41 @@
+"""Compiling, or loading from the cache, every kernel that the odometry uses, before the first image arrives."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphvio.config import Config
+from graphvio.frontend.observations import Observations, RigArrays
+from graphvio.frontend.selection import best_pair_motion, joint_motion
+from graphvio.frontend.tracker import PairTracker
+from graphvio.kernels import any_compiled_before
+from graphvio.rig import Rig
+
+_POINTS = 20
+
+
+def is_first_use() -> bool:
+    """Whether this machine has no compiled kernels of this version yet, so that `warm_up` will take long."""
+    return not any_compiled_before("graphvio.frontend.refinement")
+
+
+def warm_up(rig: Rig, config: Config) -> None:
+    """Call every kernel once on noise, with the array types of the real work."""
+    rng = np.random.default_rng(0)
+    pair = rig.pairs[0]
+    width, height = pair.left.size_px
+    tracker = PairTracker(pair, config)
+    noise = rng.integers(0, 256, size=(height, width), dtype=np.uint8)
+    for stamp_ns in range(2):
+        tracker.observe(stamp_ns, noise, noise, np.eye(4))
+    points = np.column_stack([rng.uniform(-0.3, 0.3, (_POINTS, 2)), rng.uniform(0.1, 1.0, _POINTS)])
+    observations = Observations(
+        np.zeros(_POINTS, dtype=np.int64),
+        points,
+        np.tile(1e-6 * np.eye(3), (_POINTS, 1, 1)),
+        np.ascontiguousarray(points[:, :2]),
+        np.ascontiguousarray(points[:, :2]),
+        np.ones(_POINTS, dtype=bool),
+    )
+    for solve in (joint_motion, best_pair_motion):
+        solve(RigArrays.of(rig), observations, np.eye(4), config.motion, rng)
