@@ -20,6 +20,7 @@ from graphvio.frontend.visual import RelativeMotion, VisualFrontend, VisualResul
 from graphvio.geometry import se3, se3_inverse, so3_log
 from graphvio.rig import Rig
 
+_MAX_UNBRIDGED_S = 3.0
 _MOVING_START_SPEED_SIGMA = 2.0
 _RESTING_START_SPEED_SIGMA = 0.02
 _RESTART_SPEED_SIGMA = 0.5
@@ -139,12 +140,13 @@ class Odometry:
         assert smoother is not None
         if not starting:
             span = self._span(smoother.latest_ns, stamp_ns)
-            smoother.extend(stamp_ns, span)
+            if span is None and stamp_ns - smoother.latest_ns > _MAX_UNBRIDGED_S * 1e9:
+                self._jump(stamp_ns)
+            else:
+                smoother.extend(stamp_ns, span)
         predicted = perf_counter()
         visual = self._frontend.process(frameset, self._predicted_motion)
         measured = perf_counter()
-        if starting:
-            self._frontend.rekey()
         used = visual.motion is not None and self._use(visual.motion)
         if not self._update(visual, used):
             used = False
@@ -167,12 +169,16 @@ class Odometry:
         """Gate a measured motion and insert it; a gate that refuses for too long is itself at fault."""
         smoother = self._smoother
         assert smoother is not None
-        if not smoother.knows(motion.reference_stamp_ns):
+        if not smoother.knows(motion.reference_stamp_ns):  # it started anew since then
+            self._frontend.rekey()
             return False
         if self._lost:
             self._recover(motion)
             return True
-        verdict = smoother.test(motion)
+        try:
+            verdict = smoother.test(motion)
+        except WindowError:
+            return False  # `_update` meets the same error, and rebuilds
         if verdict.accepted:
             smoother.accept(motion)
             self._gated_since_ns = None
@@ -256,6 +262,19 @@ class Odometry:
     def _upright_camera(self) -> Float:
         """``nav_R_body`` without an IMU: the first pair's left camera is taken to be upright."""
         return level(-self.rig.pairs[0].left.body_T_cam[:3, 1])
+
+    def _jump(self, stamp_ns: int) -> None:
+        """After a gap that nothing bridges, be it a pause or a jump of the clock: a new epoch at the last pose."""
+        smoother = self._smoother
+        assert smoother is not None
+        gap_s = (stamp_ns - smoother.latest_ns) * 1e-9
+        self._smoothed += smoother.all_poses()
+        smoother.start(stamp_ns, smoother.state(), _AFTER_JUMP)
+        self._epoch += 1
+        self._lost = False
+        self._gated_since_ns = None
+        self._tracked_ns = stamp_ns
+        self._report(stamp_ns, "time_jump", f"{gap_s:.1f} s without data: epoch {self._epoch} starts at the last pose")
 
     def _recover(self, motion: RelativeMotion) -> None:
         """After lost: a new epoch that starts at the best guess."""
@@ -342,4 +361,5 @@ class Odometry:
         self._incidents.append(Incident(stamp_ns, kind, detail))
 
 
+_AFTER_JUMP = StartUncertainty(0.2, _MOVING_START_SPEED_SIGMA, _RESTART_GYRO_BIAS_SIGMA)
 _RESTART = StartUncertainty(_RESTART_TILT_SIGMA, _RESTART_SPEED_SIGMA, _RESTART_GYRO_BIAS_SIGMA)

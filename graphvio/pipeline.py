@@ -19,7 +19,7 @@ from graphvio.sources import Source
 from graphvio.trajectory import Trajectory
 from graphvio.viewer import Viewer
 
-RESETS = ("gate_reset", "new_epoch", "window_rebuilt", "imu_came")
+RESETS = ("gate_reset", "new_epoch", "window_rebuilt", "imu_came", "time_jump")
 """Kinds of incidents after which the estimation started anew."""
 
 _KEPT_FRAMESETS = 100  # held by the odometry for lack of IMU samples, at the most

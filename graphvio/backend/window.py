@@ -58,7 +58,7 @@ class Window:
                 return np.asarray(self._solve().marginalCovariance(keys[0]))
             joint = self._solve().jointMarginalCovariance(gtsam.KeyVector(list(keys)))
         except RuntimeError as error:
-            raise WindowError(f"the window has no covariance: {_first_line(error)}") from None
+            raise WindowError(f"the window has no covariance: {_one_line(error)}") from None
         blocks = [[joint.at(a, b) for b in keys] for a in keys]
         return np.block(blocks)
 
@@ -82,7 +82,7 @@ class Window:
         try:
             _, remaining = graph.linearize(self.values).eliminatePartialMultifrontal(ordering, gtsam.EliminateQR)
         except RuntimeError as error:
-            raise WindowError(f"a state cannot be marginalised: {_first_line(error)}") from None
+            raise WindowError(f"a state cannot be marginalised: {_one_line(error)}") from None
         for i in range(remaining.size()):
             marginal = remaining.at(i)
             if marginal is not None and len(marginal.keys()):
@@ -103,9 +103,9 @@ class Window:
                     gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR
                 )
             except RuntimeError as error:
-                raise WindowError(f"the window has no unique solution: {_first_line(error)}") from None
+                raise WindowError(f"the window has no unique solution: {_one_line(error)}") from None
         return self._solution
 
 
-def _first_line(error: Exception) -> str:
+def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())

@@ -147,8 +147,11 @@ def _tell(summary: Summary, folder: Path) -> None:
         f"{summary.duration_s:.1f} s, {summary.realtime_factor:.2f} x real time"
     )
     if evaluation is not None:
-        typer.echo(f"against the recording's truth: ATE rmse {1e3 * evaluation['ate_position_m']['rmse']:.1f} mm, "
-            f"drift {evaluation['drift_percent']:.2f} % of the path")
+        drift = evaluation["drift_percent"]
+        typer.echo(
+            f"against the recording's truth: ATE rmse {1e3 * evaluation['ate_position_m']['rmse']:.1f} mm"
+            + (f", drift {drift:.2f} % of the path" if drift is not None else "")
+        )
     faults = ", ".join(f"{kind} {count}" for kind, count in sorted(summary.input_faults.items()))
     if faults:
         typer.echo(f"faults of the recording: {faults}")

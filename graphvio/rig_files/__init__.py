@@ -12,8 +12,7 @@ from graphvio.rig_files.reading import read_yaml
 __all__ = ["find_rig", "load_rig", "save_rig"]
 
 _KNOWN = (
-    "rig.yaml, Kalibr's camchain-imucam.yaml, an EuRoC/ASL folder (mav0), "
-    "KITTI's calib.txt or calib_cam_to_cam.txt"
+    "rig.yaml, Kalibr's camchain-imucam.yaml, an EuRoC/ASL folder (mav0), KITTI's calib.txt or calib_cam_to_cam.txt"
 )
 
 

@@ -38,9 +38,7 @@ def load(path: Path) -> Rig:
     imu_folder = root / "imu0"
     chain = root.parent / "dso" / "camchain.yaml"
     if chain.is_file() and any(not _is_complete(section) for section in sections.values()):
-        return _from_chain(
-            chain, [folder.name for folder in folders], has_imu=imu_folder.is_dir(), name=_name(root)
-        )
+        return _from_chain(chain, [folder.name for folder in folders], has_imu=imu_folder.is_dir(), name=_name(root))
     imu_T_body = np.eye(4)
     imu = None
     if imu_folder.is_dir():

@@ -98,9 +98,7 @@ def imu_of(path: Path, time_offset_s: float) -> Imu:
     if isinstance(section.values.get("imu0"), dict):
         section = section.section("imu0")
     if section.values.get("T_i_b") is not None and np.abs(section.matrix("T_i_b") - np.eye(4)).max() > 1e-9:
-        raise RigError(
-            f"{section.where('T_i_b')}: is not the identity; calibrate with this IMU as the only one"
-        )
+        raise RigError(f"{section.where('T_i_b')}: is not the identity; calibrate with this IMU as the only one")
     with named(path):
         return Imu(**section.noise("update_rate", IMU_KEYS), time_offset_s=time_offset_s)
 

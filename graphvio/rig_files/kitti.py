@@ -29,9 +29,7 @@ def load_odometry(file: Path) -> Rig:
         RigError: if a projection or the images are missing, or they describe no usable rig.
     """
     folder = file.parent
-    name, left, right = pair_of(
-        [p.name for p in folder.iterdir() if p.is_dir()] if folder.is_dir() else [], "image_{}"
-    )
+    name, left, right = pair_of([p.name for p in folder.iterdir() if p.is_dir()] if folder.is_dir() else [], "image_{}")
     size = _png_size(folder / f"image_{left}")
     if size is None:
         raise RigError(

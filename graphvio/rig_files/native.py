@@ -34,8 +34,7 @@ def load(path: Path) -> Rig:
         raise RigError(f"{path}: {VERSION_KEY} is missing; begin the file with  {VERSION_KEY}: {VERSION}")
     if version != VERSION:
         raise RigError(
-            f"{path}: {VERSION_KEY} is {version!r}; this graphvio reads version {VERSION}: "
-            "update graphvio or the file"
+            f"{path}: {VERSION_KEY} is {version!r}; this graphvio reads version {VERSION}: update graphvio or the file"
         )
     document.only(_RIG_KEYS)
     given = document.get("pairs")
@@ -93,9 +92,7 @@ def _camera(section: Section) -> Camera:
     if section.values.get("mask") is not None:
         mask = (section.file.parent / section.text("mask")).resolve()
         if not mask.is_file():
-            raise RigError(
-                f"{section.where('mask')}: there is no image {mask}; correct the path or remove the key"
-            )
+            raise RigError(f"{section.where('mask')}: there is no image {mask}; correct the path or remove the key")
     return Camera(
         name=section.text("name"),
         model=section.text("model"),

@@ -46,8 +46,7 @@ class Section:
             if key not in known:
                 nearest = difflib.get_close_matches(str(key), known, n=1, cutoff=0.0)[0]
                 raise RigError(
-                    f"{self.where(str(key))}: unknown key; did you mean {nearest!r}? "
-                    f"(known here: {', '.join(known)})"
+                    f"{self.where(str(key))}: unknown key; did you mean {nearest!r}? (known here: {', '.join(known)})"
                 )
 
     def get(self, key: str) -> Any:
@@ -150,9 +149,7 @@ def read_yaml(path: Path) -> Section:
     if values is None:
         values = {}
     if not isinstance(values, dict):
-        raise RigError(
-            f"{path}: holds {_shown(values)}; a calibration file must be a mapping of keys to values"
-        )
+        raise RigError(f"{path}: holds {_shown(values)}; a calibration file must be a mapping of keys to values")
     return Section(values, path)
 
 
@@ -167,9 +164,7 @@ def read_text(path: Path) -> str:
     except OSError as error:
         raise RigError(f"{path}: cannot be read ({error.strerror}); check the path") from None
     except UnicodeDecodeError:
-        raise RigError(
-            f"{path}: is no text file; give a calibration file (rig.yaml, Kalibr, EuRoC, KITTI)"
-        ) from None
+        raise RigError(f"{path}: is no text file; give a calibration file (rig.yaml, Kalibr, EuRoC, KITTI)") from None
 
 
 @contextmanager
@@ -190,9 +185,7 @@ def consecutive_pairs(cameras: list[Camera], path: Path) -> tuple[StereoPair, ..
         RigError: if there is no camera, or one is left over.
     """
     if not cameras:
-        raise RigError(
-            f"{path}: describes no camera; give a rig.yaml, or a calibration of at least two cameras"
-        )
+        raise RigError(f"{path}: describes no camera; give a rig.yaml, or a calibration of at least two cameras")
     if len(cameras) % 2:
         names = ", ".join(camera.name for camera in cameras)
         raise RigError(

@@ -44,9 +44,7 @@ class Film:
 
 
 @kernel
-def _expose(
-    radiance: AnyArray, response: AnyArray, light: float, gain: float, normal: AnyArray, noisy: bool
-) -> Image:
+def _expose(radiance: AnyArray, response: AnyArray, light: float, gain: float, normal: AnyArray, noisy: bool) -> Image:
     image = np.empty(radiance.shape, dtype=np.uint8)
     read = gain * _READ_NOISE if noisy else 0.0
     shot = gain * _SHOT_VARIANCE if noisy else 0.0

@@ -68,16 +68,12 @@ class Motion:
         """
         times_s = np.atleast_1d(np.asarray(times_s, dtype=np.float64))
         if times_s.min() < 0.0 or times_s.max() > self.duration_s + 1e-6:
-            raise ValueError(
-                f"times {times_s.min()} to {times_s.max()} s; the motion lasts {self.duration_s} s"
-            )
+            raise ValueError(f"times {times_s.min()} to {times_s.max()} s; the motion lasts {self.duration_s} s")
         place = times_s / KNOT_S
         first = np.minimum(place.astype(np.int64), len(self._control) - 6)
         u = (place - first)[:, None]
         control = self._control[first[:, None] + np.arange(6)]
-        values, rates, second = (
-            np.einsum("ni,nic->nc", weights, control) for weights in _weights_and_derivatives(u)
-        )
+        values, rates, second = (np.einsum("ni,nic->nc", weights, control) for weights in _weights_and_derivatives(u))
         yaw, pitch, roll = values[:, 3], values[:, 4], values[:, 5]
         world_T_body = np.zeros((len(times_s), 4, 4))
         world_T_body[:, :3, :3] = _rotations(yaw, pitch, roll)

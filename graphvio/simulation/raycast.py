@@ -69,9 +69,7 @@ def tile_lists(coefficients: Float, tile_boxes: Float) -> tuple[Int, Int, Float]
     everywhere = np.array(
         [[tile_boxes[:, 0].min(), tile_boxes[:, 1].max(), tile_boxes[:, 2].min(), tile_boxes[:, 3].max()]]
     )
-    in_view = np.array(
-        [i for i in range(len(coefficients)) if _nearest_in(coefficients, i, everywhere, 0) > 0.0]
-    )
+    in_view = np.array([i for i in range(len(coefficients)) if _nearest_in(coefficients, i, everywhere, 0) > 0.0])
     n_tiles = len(tile_boxes)
     starts = np.zeros(n_tiles + 1, dtype=np.int64)
     items = np.empty(max(1, n_tiles * len(in_view)), dtype=np.int64)
@@ -160,9 +158,7 @@ def _light(values: AnyArray, grid: Int, i: int, u: float, v: float) -> float:
     fx, fy = x - left, y - top
     right, bottom = min(left + 1, columns - 1), min(top + 1, rows - 1)
     upper = values[start + top * columns + left] * (1.0 - fx) + values[start + top * columns + right] * fx
-    lower = (
-        values[start + bottom * columns + left] * (1.0 - fx) + values[start + bottom * columns + right] * fx
-    )
+    lower = values[start + bottom * columns + left] * (1.0 - fx) + values[start + bottom * columns + right] * fx
     value: float = upper * (1.0 - fy) + lower * fy
     return value
 

@@ -174,9 +174,7 @@ def _write_inertial(simulator: Simulator, mav0: Path) -> None:
     _write_table(mav0 / "imu0" / "data.csv", _IMU_HEADER, track.stamps_ns.tolist(), readings)
     poses = track.states.world_T_body
     quaternions = np.array([quat_wxyz_from_rotation(np.ascontiguousarray(pose[:3, :3])) for pose in poses])
-    truth = np.hstack(
-        [poses[:, :3, 3], quaternions, track.states.velocity, track.gyro_bias, track.accel_bias]
-    )
+    truth = np.hstack([poses[:, :3, 3], quaternions, track.states.velocity, track.gyro_bias, track.accel_bias])
     path = mav0 / "state_groundtruth_estimate0" / "data.csv"
     _write_table(path, _TRUTH_HEADER, track.stamps_ns.tolist(), truth)
 

@@ -47,9 +47,7 @@ class Simulator:
         atlas: Atlas | None = None,
     ) -> None:
         if not 0.1 <= rate_hz <= 200.0:
-            raise SourceError(
-                f"a rate of {rate_hz} Hz cannot be simulated; give 0.1 to 200 framesets per second"
-            )
+            raise SourceError(f"a rate of {rate_hz} Hz cannot be simulated; give 0.1 to 200 framesets per second")
         if seed < 0:
             raise SourceError(f"the seed {seed} is negative; give 0 or more")
         self.scene = scene

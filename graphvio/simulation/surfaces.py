@@ -47,13 +47,9 @@ class Stage:
         self._mapping = np.array([_mapping(r, atlas) for r in everything])
         self._tint = np.array([r.tint for r in everything])
         self._is_moving = np.arange(len(everything)) >= len(world.rectangles)
-        self._part_of = np.repeat(
-            np.arange(len(world.moving)), [len(part.rectangles) for part in world.moving]
-        )
+        self._part_of = np.repeat(np.arange(len(world.moving)), [len(part.rectangles) for part in world.moving])
         one_cell = len(self._light.values) + np.arange(len(parts))
-        self._grid = np.vstack(
-            [self._light.grid, np.column_stack([one_cell, np.ones((len(parts), 2), np.int64)])]
-        )
+        self._grid = np.vstack([self._light.grid, np.column_stack([one_cell, np.ones((len(parts), 2), np.int64)])])
 
     def at(self, time_s: float) -> Surfaces:
         """The surfaces at a time in seconds since the start of the walk."""

@@ -82,16 +82,12 @@ def _cells(rng: Rng, rows: int, columns: int, joint: int, shift: bool, spread: f
 
 def _brick(rng: Rng) -> Map:
     fields, joints = _cells(rng, 16, 8, 5, shift=True, spread=0.09)
-    return np.asarray(
-        (0.33 + fields + 0.05 * _noise(rng, 16, 5)) * (1 - joints) + 0.68 * joints, dtype=np.float32
-    )
+    return np.asarray((0.33 + fields + 0.05 * _noise(rng, 16, 5)) * (1 - joints) + 0.68 * joints, dtype=np.float32)
 
 
 def _tiles(rng: Rng) -> Map:
     fields, joints = _cells(rng, 8, 8, 4, shift=False, spread=0.10)
-    return np.asarray(
-        (0.5 + fields + 0.05 * _noise(rng, 8, 6)) * (1 - joints) + 0.15 * joints, dtype=np.float32
-    )
+    return np.asarray((0.5 + fields + 0.05 * _noise(rng, 8, 6)) * (1 - joints) + 0.15 * joints, dtype=np.float32)
 
 
 def _planks(rng: Rng) -> Map:
@@ -222,9 +218,7 @@ def _lockers(rng: Rng) -> Map:
             cv2.rectangle(image, (x + 34, y), (x + 94, y + 6), 0.1, -1)
         cv2.rectangle(image, (x + 44, 150), (x + 84, 176), 0.85, -1)
         for k in range(3):
-            cv2.rectangle(
-                image, (x + 48 + 12 * k, 156), (x + 53 + 12 * k + int(rng.integers(0, 4)), 170), 0.1, -1
-            )
+            cv2.rectangle(image, (x + 48 + 12 * k, 156), (x + 53 + 12 * k + int(rng.integers(0, 4)), 170), 0.1, -1)
         cv2.rectangle(image, (x + 104, 240), (x + 114, 290), 0.7, -1)
     return np.asarray(image, dtype=np.float32)
 

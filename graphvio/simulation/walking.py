@@ -72,8 +72,7 @@ class Walk:
                 position[:, 1] + sway * np.cos(yaw),
                 position[:, 2] + stride * gait.vertical_m * np.sin(step),
                 yaw + stride * (gait.yaw_rad * np.sin(side + 0.7) + gait.glance_rad * np.sin(0.9 * t)),
-                stride
-                * (gait.pitch_rad * np.sin(step + 1.1) + 0.3 * gait.glance_rad * np.sin(0.53 * t + 0.5)),
+                stride * (gait.pitch_rad * np.sin(step + 1.1) + 0.3 * gait.glance_rad * np.sin(0.53 * t + 0.5)),
                 stride * gait.roll_rad * np.sin(side + 0.3),
             ]
         )

@@ -99,16 +99,12 @@ class World:
         a, b = np.array([*start, z1]), np.array([*end, z1])
         self._add(a, b - a, np.array([0.0, 0.0, z0 - z1]), texture, tint)
 
-    def outline(
-        self, corners: Sequence[tuple[float, float]], z0: float, z1: float, textures: Sequence[str]
-    ) -> None:
+    def outline(self, corners: Sequence[tuple[float, float]], z0: float, z1: float, textures: Sequence[str]) -> None:
         """Walls around a closed space whose corners are given clockwise from above, one texture for each."""
         for i, texture in enumerate(textures):
             self.wall(corners[i], corners[(i + 1) % len(corners)], z0, z1, texture)
 
-    def floor(
-        self, x: tuple[float, float], y: tuple[float, float], z: float, texture: str, tint: float = 1.0
-    ) -> None:
+    def floor(self, x: tuple[float, float], y: tuple[float, float], z: float, texture: str, tint: float = 1.0) -> None:
         """A horizontal surface that is seen from above."""
         self._add(
             np.array([x[0], y[1], z]),
@@ -141,13 +137,9 @@ class World:
         a, b = np.array([*start, z1]), np.array([*end, z1])
         right = (b - a) / np.linalg.norm(b - a)
         self._posters += 1
-        lift = (_POSTER_STANDS_OUT_M + _POSTER_STEP_M * (self._posters % 11)) * np.cross(
-            right, [0.0, 0.0, 1.0]
-        )
+        lift = (_POSTER_STANDS_OUT_M + _POSTER_STEP_M * (self._posters % 11)) * np.cross(right, [0.0, 0.0, 1.0])
         down = np.array([0.0, 0.0, z0 - z1])
-        self.rectangles.append(
-            Rectangle(a + lift, b - a, down, texture, fit=True, tint=tint, casts_shadow=False)
-        )
+        self.rectangles.append(Rectangle(a + lift, b - a, down, texture, fit=True, tint=tint, casts_shadow=False))
 
     def box(
         self,

@@ -55,9 +55,7 @@ def _open(folder: Path, rig: Rig | None, from_s: float | None, to_s: float | Non
     if rig is None:
         rig = find_rig(folder)
     if rig is None:
-        raise RigError(
-            f"{folder}: carries no calibration; write a rig.yaml into it, or give a rig of your own"
-        )
+        raise RigError(f"{folder}: carries no calibration; write a rig.yaml into it, or give a rig of your own")
     resolved = folder.resolve()
     faults = FaultLog(resolved.parent.name if resolved.name == "mav0" else resolved.name)
     return Recording(layout.read_index(folder, rig, faults), rig, faults, from_s, to_s)

@@ -43,9 +43,7 @@ def _track(root: Path, camera: str, faults: FaultLog) -> Track:
     folder = root / camera
     if not folder.is_dir():
         has = ", ".join(p.name for p in camera_folders(root))
-        raise SourceError(
-            f"{root}: has no camera {camera}, which the rig names; it has {has}: give the rig of these"
-        )
+        raise SourceError(f"{root}: has no camera {camera}, which the rig names; it has {has}: give the rig of these")
     images = folder / "data"
     csv = folder / "data.csv"
     if csv.is_file():
@@ -56,7 +54,5 @@ def _track(root: Path, camera: str, faults: FaultLog) -> Track:
         names = [p.name for p in files]
         faults.add("csv_missing", 0, f"{csv} does not exist; stamps are taken from the names of the images")
     if not names:
-        raise SourceError(
-            f"{folder}: lists no image in data.csv, and holds none in data/ that is named by its stamp"
-        )
+        raise SourceError(f"{folder}: lists no image in data.csv, and holds none in data/ that is named by its stamp")
     return Track(images, stamps, names)

@@ -36,18 +36,14 @@ def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
             rows.append(row)
             stamps.append(stamp)
         elif line.strip():
-            faults.add(
-                "frame_garbage", stamps[-1] if stamps else 0, f"{times}: line {row + 1} is no time; dropped"
-            )
+            faults.add("frame_garbage", stamps[-1] if stamps else 0, f"{times}: line {row + 1} is no time; dropped")
     stamps_ns = np.array(stamps, dtype=np.int64)
     kept = clean_stamps(stamps_ns, "frame", times, faults)
     names = [f"{row:06d}.png" for row, keep in zip(rows, kept, strict=True) if keep]
     tracks = {}
     for camera in rig.cameras:
         if not (path / camera.name).is_dir():
-            raise SourceError(
-                f"{path}: has no folder {camera.name}, which the rig names; give KITTI's own calib.txt"
-            )
+            raise SourceError(f"{path}: has no folder {camera.name}, which the rig names; give KITTI's own calib.txt")
         tracks[camera.name] = Track(path / camera.name, stamps_ns[kept], names)
     return Index(faults.name, tracks, None, _truth(path))
 

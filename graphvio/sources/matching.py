@@ -70,9 +70,7 @@ def match_sides(left_ns: Int, right_ns: Int) -> PairIndex:
         else:
             j += 1
     rows = np.array(matched, dtype=np.int32).reshape(-1, 2)
-    return PairIndex(
-        left_ns[rows[:, 0]], rows, np.delete(left_ns, rows[:, 0]), np.delete(right_ns, rows[:, 1])
-    )
+    return PairIndex(left_ns[rows[:, 0]], rows, np.delete(left_ns, rows[:, 0]), np.delete(right_ns, rows[:, 1]))
 
 
 def group_pairs(pairs: Sequence[PairIndex]) -> FramesetIndex:
@@ -82,9 +80,7 @@ def group_pairs(pairs: Sequence[PairIndex]) -> FramesetIndex:
     if all(np.array_equal(pair.stamps_ns, first) for pair in pairs[1:]):
         return FramesetIndex(first, np.stack([pair.rows for pair in pairs], axis=1))
     entries = sorted(
-        (stamp, number, row)
-        for number, pair in enumerate(pairs)
-        for row, stamp in enumerate(pair.stamps_ns.tolist())
+        (stamp, number, row) for number, pair in enumerate(pairs) for row, stamp in enumerate(pair.stamps_ns.tolist())
     )
     groups: list[dict[int, tuple[int, int]]] = []  # pair -> (stamp, row)
     begun_ns = 0

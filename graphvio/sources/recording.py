@@ -231,9 +231,7 @@ class Recording:
             last = len(table.stamps_ns) if is_whole else int(np.searchsorted(table.stamps_ns, end)) + 1
             table = table.slice(first, last)
         if table is None or not len(table.stamps_ns):
-            self.faults.add(
-                "imu_missing", self.start_ns, "the rig has an IMU, the recording no samples of it"
-            )
+            self.faults.add("imu_missing", self.start_ns, "the rig has an IMU, the recording no samples of it")
             return None
         stamps = table.stamps_ns
         period = int(np.median(np.diff(stamps))) if len(stamps) > 1 else 0

@@ -10,9 +10,7 @@ COVER_NS = 50_000_000
 """A sample further past a frameset than this does not cover it: the IMU has a gap there."""
 
 
-def merge(
-    imu: Iterable[ImuSample], framesets: Iterable[FrameSet], time_offset_ns: int = 0
-) -> Iterator[Event]:
+def merge(imu: Iterable[ImuSample], framesets: Iterable[FrameSet], time_offset_ns: int = 0) -> Iterator[Event]:
     """All samples and framesets in time order, where each frameset follows the sample that covers it.
 
     The covering sample is the first at or after the frameset's instant on the IMU's clock. In a gap of the

@@ -42,9 +42,7 @@ def read_imu_csv(path: Path, faults: FaultLog) -> ImuTable:
     table = _read_fast(path)
     if table is None:
         table = _read_tolerant(path, faults)
-    finite = (
-        np.isfinite(table.values).all(axis=1) & (table.stamps_ns >= 0) & (table.stamps_ns < _MAX_STAMP_NS)
-    )
+    finite = np.isfinite(table.values).all(axis=1) & (table.stamps_ns >= 0) & (table.stamps_ns < _MAX_STAMP_NS)
     if not finite.all():
         bad = int(np.argmin(finite))
         faults.add(
@@ -215,6 +213,4 @@ def _is_number(text: str) -> bool:
 
 
 def _count_garbage(kind: str, path: Path, number: int, stamps: list[int], faults: FaultLog) -> None:
-    faults.add(
-        kind, stamps[-1] if stamps else 0, f"{path}: line {number} is no row of this table; it is dropped"
-    )
+    faults.add(kind, stamps[-1] if stamps else 0, f"{path}: line {number} is no row of this table; it is dropped")

@@ -109,21 +109,25 @@ class Viewer:
         self._worker.join()
         error, self._error = self._error, None
         if error is not None:
-            raise GraphvioError(f"viewer: drawing failed ({error}); what was shown or saved is incomplete")
+            raise GraphvioError(f"viewer: drawing failed ({_first_line(error)}); what was shown or saved is incomplete")
 
     def _work(self, recording: Recording) -> None:
         try:
-            while self._draw_waiting(recording):
-                # Many small rounds would hold up the odometry; one carries many poses as cheaply as one pose.
-                with self._changed:
-                    self._changed.wait_for(lambda: self._closing, _ROUND_S)
+            try:
+                self._draw(recording)
+            finally:
+                recording.close()
         except Exception as error:
             self._error = error
             self._estimates.clear()
             self._extras.clear()
             self._frameset = None
-        finally:
-            recording.close()
+
+    def _draw(self, recording: Recording) -> None:
+        while self._draw_waiting(recording):
+            # Many small rounds would hold up the odometry; one carries many poses as cheaply as one pose.
+            with self._changed:
+                self._changed.wait_for(lambda: self._closing, _ROUND_S)
 
     def _draw_waiting(self, recording: Recording) -> bool:
         """Wait for work and do it; False when all is done and there will be no more."""
@@ -168,4 +172,8 @@ def _open_recording(rig: Rig, spawn: bool, save: Path | None) -> Recording:
     try:
         return Recording(rig, spawn=spawn, save=save)
     except (OSError, RuntimeError, ValueError) as error:
-        raise GraphvioError(f"viewer: cannot be opened ({str(error).splitlines()[0]})") from None
+        raise GraphvioError(f"viewer: cannot be opened ({_first_line(error)})") from None
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)

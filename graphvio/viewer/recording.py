@@ -17,6 +17,11 @@ The timeline ``time`` begins with the first stamp.
 
 from __future__ import annotations
 
+import contextlib
+import shutil
+import socket
+import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,6 +41,9 @@ _PIECE_POSES = 100
 _SIGMAS = 3.0
 _JPEG_QUALITY = 80
 _CURVES_NS = 500_000_000
+_PORT = 9876
+_WINDOW_S, _WINDOW_SURE_S = 8.0, 1.0
+_FLUSH_S = 30.0
 _FRUSTUM_M = 0.25
 _INLIER, _OUTLIER = (60, 220, 90), (235, 60, 50)
 _XYZ_COLOURS = [(220, 70, 60), (60, 170, 75), (70, 110, 230)]
@@ -55,19 +63,21 @@ class Recording:
 
     def __init__(self, rig: Rig, *, spawn: bool, save: Path | None) -> None:
         self._rig = rig
+        self._is_saved = save is not None
         self._stream = rr.RecordingStream("graphvio", recording_id=None, make_default=False)
         layout = blueprint(rig)
         sinks: list[Any] = []
         if save is not None:
             sinks.append(rr.FileSink(str(save)))
         if spawn:
-            rr.spawn(connect=False, recording=self._stream)
-            sinks.append(rr.GrpcSink())
+            rr.spawn(port=_PORT, connect=False, recording=self._stream, **_executable())
+            _wait_for_window()
+            sinks.append(rr.GrpcSink(f"rerun+http://127.0.0.1:{_PORT}/proxy"))
         self._stream.set_sinks(*sinks, default_blueprint=layout)
         self._start_ns: int | None = None
         self._unsent: list[Estimate] = []
         self._status: Status | None = None
-        self._piece: list[tuple[Float, Status]] = []
+        self._piece: list[tuple[int, Float, Status]] = []
         self._piece_number = 0
         self._epoch = 0
         self._log_static()
@@ -75,8 +85,13 @@ class Recording:
     def close(self) -> None:
         """Log what is left, flush and end."""
         self._send_curves()
-        self._stream.flush()
-        self._stream.disconnect()
+        try:
+            self._stream.flush(timeout_sec=_FLUSH_S)
+        except RuntimeError:
+            if self._is_saved:  # else somebody has closed the window, which is no failure
+                raise
+        finally:
+            self._stream.disconnect()
 
     def add_estimates(self, estimates: Sequence[Estimate]) -> None:
         """Poses, scalars and changes of status; a batch costs hardly more than one."""
@@ -189,26 +204,26 @@ class Recording:
     def _extend_path(self, posed: Sequence[Estimate]) -> None:
         """Log the path in pieces of bounded length, so that a long run costs no more per pose."""
         for estimate in posed:
-            position = np.asarray(estimate.nav_T_body)[:3, 3]
             if estimate.epoch != self._epoch:
+                self._log_piece()
                 self._piece, self._epoch, self._piece_number = [], estimate.epoch, 0
-            self._piece.append((position, estimate.status))
+            self._piece.append((estimate.stamp_ns, np.asarray(estimate.nav_T_body)[:3, 3], estimate.status))
             if len(self._piece) > _PIECE_POSES:
-                self._log_piece(estimate.stamp_ns)
+                self._log_piece()
                 self._piece, self._piece_number = self._piece[-1:], self._piece_number + 1
-        if posed:
-            self._log_piece(posed[-1].stamp_ns)
+        self._log_piece()
 
-    def _log_piece(self, stamp_ns: int) -> None:
+    def _log_piece(self) -> None:
+        """Log the piece that is growing, at the time of its last pose; again and again until it is full."""
         strips: list[list[Float]] = []
         colours: list[tuple[int, int, int]] = []
-        for (before, _), (position, status) in zip(self._piece, self._piece[1:], strict=False):
+        for (_, before, _), (_, position, status) in zip(self._piece, self._piece[1:], strict=False):
             if not colours or colours[-1] != STATUS_COLOURS[status]:
                 strips.append([before])
                 colours.append(STATUS_COLOURS[status])
             strips[-1].append(position)
         if strips:
-            self._at(stamp_ns)
+            self._at(self._piece[-1][0])
             entity = f"world/trajectory/{self._epoch}/{self._piece_number}"
             self._stream.log(entity, rr.LineStrips3D(strips, colors=colours, radii=rr.Radius.ui_points(1.5)))
 
@@ -227,6 +242,23 @@ def ellipsoid(covariance: Float) -> tuple[Float, Float]:
     if np.linalg.det(axes) < 0.0:
         axes[:, 0] = -axes[:, 0]
     return _SIGMAS * np.sqrt(np.maximum(variances, 0.0)), _quat_xyzw(axes)
+
+
+def _executable() -> dict[str, str]:
+    """Where rerun's program is when it is installed beside Python, but that folder is not in PATH."""
+    beside = Path(sys.executable).with_name("rerun")
+    return {} if shutil.which("rerun") or not beside.is_file() else {"executable_path": str(beside)}
+
+
+def _wait_for_window() -> None:
+    """Until rerun answers, and still does after a second: without a usable display it ends at once."""
+    began = time.monotonic()
+    while (waited := time.monotonic() - began) < _WINDOW_S:
+        time.sleep(0.1)
+        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", _PORT), timeout=1.0):
+            if waited > _WINDOW_SURE_S:
+                return
+    raise RuntimeError("rerun's window does not answer; is the display usable? --save-rrd FILE needs none")
 
 
 def _quat_xyzw(rotation: Float) -> Float:

@@ -33,7 +33,5 @@ def build_scene(name: str, duration_s: float | None = None, rest_s: float = 1.0)
         raise SourceError(f"there is no scene {name!r}; choose one of {', '.join(SCENE_NAMES)}")
     build, whole_s = _BUILDERS[name]
     if duration_s is not None and not 0.0 < duration_s < 3600.0:
-        raise SourceError(
-            f"a duration of {duration_s} s cannot be simulated; give seconds between 0 and 3600"
-        )
+        raise SourceError(f"a duration of {duration_s} s cannot be simulated; give seconds between 0 and 3600")
     return build(whole_s if duration_s is None else duration_s, rest_s)

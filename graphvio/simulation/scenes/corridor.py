@@ -184,9 +184,7 @@ def _crowd(world: World, walk: Walk) -> None:
         furniture.person(world, _pacing(x, crossing_s, reach, pace * sense), number)
 
 
-def _pacing(
-    x: float, crossing_s: float, reach: float, pace: float
-) -> Callable[[float], tuple[float, float, float]]:
+def _pacing(x: float, crossing_s: float, reach: float, pace: float) -> Callable[[float], tuple[float, float, float]]:
     """Back and forth across the lobby at one x, through its middle at a given time."""
 
     def track(time_s: float) -> tuple[float, float, float]:

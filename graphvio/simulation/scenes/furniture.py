@@ -127,9 +127,7 @@ def person(world: World, track: Callable[[float], tuple[float, float, float]], n
         length = size[2]
         faces = box_faces(size, texture, tint=tint, shift=(0.17 * number, 0.31 * number))
         hung = tuple(
-            Rectangle(
-                f.origin - np.array([0.0, 0.0, length]), f.edge_u, f.edge_v, f.texture, f.fit, f.shift, f.tint
-            )
+            Rectangle(f.origin - np.array([0.0, 0.0, length]), f.edge_u, f.edge_v, f.texture, f.fit, f.shift, f.tint)
             for f in faces
         )
 

@@ -1,0 +1,96 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphvio.cli import main
+from graphvio.geometry import se3, so3_exp
+from graphvio.trajectory import Trajectory
+
+START_NS = 1_403_636_579_763_555_584
+
+
+def walk(scale: float = 1.0) -> Trajectory:
+    u = np.linspace(0.0, 2.0 * np.pi, 400)
+    positions = scale * np.column_stack([4 * np.sin(u), 3 * (1 - np.cos(u)), 0.2 * np.sin(2 * u)])
+    poses = np.array([se3(so3_exp(np.array([0.0, 0.0, a])), p) for a, p in zip(u, positions, strict=True)])
+    return Trajectory(START_NS + np.arange(400) * 50_000_000, poses)
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """Exit code of the program itself, as a shell would see it."""
+    monkeypatch.setattr("sys.argv", ["graphvio", *map(str, arguments)])
+    monkeypatch.setenv("COLUMNS", "120")
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    walk(1.01).write(tmp_path / "estimate.txt")
+    rows = (
+        f"{stamp},{','.join(f'{v:.9f}' for v in pose[:3, 3])},{np.cos(a / 2):.12f},0,0,{np.sin(a / 2):.12f}"
+        for stamp, pose, a in zip(walk().stamps_ns, walk().nav_T_body, np.linspace(0.0, 2.0 * np.pi, 400), strict=True)
+    )
+    (tmp_path / "data.csv").write_text("#timestamp [ns],x,y,z,qw,qx,qy,qz\n" + "\n".join(rows) + "\n")
+    return tmp_path / "estimate.txt", tmp_path / "data.csv"
+
+
+def test_table_figures_and_picture(
+    files: tuple[Path, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    code = run(monkeypatch, "evaluate", *files, "--plot", tmp_path / "e.png", "--json", tmp_path / "e.json")
+    assert code == 0
+    shown = capsys.readouterr().out
+    assert "400 of 400 poses have a true one" in shown
+    for row in ("ATE, position", "ATE, rotation", "RPE over 10 m, position", "drift", "loop closure"):
+        assert row in shown
+    figures = json.loads((tmp_path / "e.json").read_text())
+    assert figures["rpe"]["1 m"]["percent"] == pytest.approx(1.0, rel=0.01)
+    assert figures["ate_rotation_deg"]["max"] < 1e-3
+    assert f"{figures['ate_position_m']['rmse']:.4f} m" in shown
+    assert (tmp_path / "e.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("", "holds no pose"), ("1 2 3\n", "line 1: has 3 columns"), ("5.0 0 0 0 0 0 0 1\n", "at least 3 are needed")],
+)
+def test_bad_files_give_one_line(
+    files: tuple[Path, Path],
+    text: str,
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    files[0].write_text(text)
+    assert run(monkeypatch, "evaluate", *files) == 2
+    shown = capsys.readouterr()
+    assert message in shown.err
+    assert shown.err.count("\n") == 1
+    assert shown.out == ""
+
+
+def test_gap_of_the_truth_can_be_chosen(
+    files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walk().select(np.arange(0, 400, 10)).write(tmp_path / "sparse.txt")
+    for gap, expected in ((0.25, 40), (0.6, 391)):
+        code = run(
+            monkeypatch,
+            *("evaluate", files[0], tmp_path / "sparse.txt", "--max-gap", gap, "--json", tmp_path / "e.json"),
+        )
+        assert code == 0
+        assert json.loads((tmp_path / "e.json").read_text())["associated"] == expected
+
+
+def test_unwritable_json(
+    files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(monkeypatch, "evaluate", *files, "--json", files[0].parent / "no" / "e.json") == 2
+    assert "cannot be written" in capsys.readouterr().err

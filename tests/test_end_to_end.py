@@ -1,0 +1,206 @@
+"""The main job, on simulated and on real recordings, through the command line."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recordings import REAL_DATA
+
+pytestmark = pytest.mark.xdist_group("room_walk")
+
+CLIP = REAL_DATA / "euroc_mh01_clip"
+needs_clip = pytest.mark.skipif(not CLIP.is_dir(), reason=f"the real recording {CLIP.name} is not beside the project")
+
+
+def graphvio(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from graphvio.cli import main; main()", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=300)
+
+
+def run(source: Path, out: Path, *options: object) -> dict[str, Any]:
+    """Run, expect success, and return the summary."""
+    done = graphvio("run", source, "--out", out, *options)
+    assert done.returncode == 0, done.stderr
+    summary: dict[str, Any] = json.loads((out / "summary.json").read_text())
+    return summary
+
+
+def refused(done: subprocess.CompletedProcess[str]) -> str:
+    """The one line of an error in the input, exit code 2."""
+    assert done.returncode == 2, (done.stdout, done.stderr)
+    assert "Traceback" not in done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.startswith("graphvio: ")]
+    assert len(lines) == 1, done.stderr
+    return lines[0]
+
+
+def copy_of(recording: Path, out: Path) -> Path:
+    """A copy whose csv files may be changed; images are linked."""
+    shutil.copytree(
+        recording, out, copy_function=lambda a, b: os.link(a, b) if a.endswith(".png") else shutil.copy(a, b)
+    )
+    return out
+
+
+def change_lines(path: Path, change: Any) -> None:
+    header, *lines = path.read_text().splitlines()
+    path.write_text("\n".join([header, *change(lines)]) + "\n")
+
+
+# ---------------------------------------------------------------- real data
+
+
+@needs_clip
+@pytest.mark.parametrize("options", [(), ("--no-imu",)], ids=["imu", "no-imu"])
+def test_real_clip_from_a_moving_start(tmp_path: Path, options: tuple[str, ...]) -> None:
+    summary = run(CLIP, tmp_path / "out", *options)
+    assert summary["framesets"] == summary["estimated"] == 340
+    assert summary["completion"] == 1.0
+    assert summary["input_faults"] == {"frame_gap": 1}
+    assert summary["resets"] == 0
+    assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.010
+
+
+# ---------------------------------------------------------------- simulated data
+
+
+def test_results_are_complete_accurate_and_repeatable(room_walk: Path, tmp_path: Path) -> None:
+    summary = run(room_walk, tmp_path / "a")
+    run(room_walk, tmp_path / "b")
+    assert (tmp_path / "a/trajectory.txt").read_bytes() == (tmp_path / "b/trajectory.txt").read_bytes()
+    names = {path.name for path in (tmp_path / "a").iterdir()}
+    assert names == {
+        "trajectory.txt", "trajectory_smoothed.txt", "covariance.csv", "imu_bias.csv", "events.jsonl",
+        "config.yaml", "rig.yaml", "summary.json", "trajectory.png",
+    }  # fmt: skip
+    assert summary["completion"] == 1.0
+    assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.01
+    assert set(summary["stage_ms"]) == {"predict", "track", "motion", "update"}
+    assert set(summary["frameset_ms"]) == {"median", "p95", "p99"}
+    assert summary["status"] == {"tracking": 100}
+
+
+@pytest.mark.parametrize("pair", [0, 1])
+def test_one_pair_alone(room_walk: Path, tmp_path: Path, pair: int) -> None:
+    summary = run(room_walk, tmp_path / "out", "--pairs", pair)
+    assert summary["completion"] == 1.0
+    assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.03
+
+
+def test_without_imu_and_with_the_papers_baseline(room_walk: Path, tmp_path: Path) -> None:
+    summary = run(room_walk, tmp_path / "out", "--no-imu", "--config", "best_pair")
+    assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.03
+    assert (tmp_path / "out/imu_bias.csv").read_text().count("\n") == 1  # the header alone
+
+
+def test_from_and_to(room_walk: Path, tmp_path: Path) -> None:
+    summary = run(room_walk, tmp_path / "out", "--from", 2, "--to", 4)
+    assert summary["framesets"] == 41
+    assert summary["completion"] == 1.0
+    assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.03
+
+
+def test_a_broken_image_costs_only_its_pair_at_that_instant(room_walk: Path, tmp_path: Path) -> None:
+    broken = copy_of(room_walk, tmp_path / "broken")
+    image = sorted((broken / "mav0/cam1/data").iterdir())[50]
+    whole = image.read_bytes()
+    image.unlink()
+    image.write_bytes(whole[: len(whole) // 2])
+    summary = run(broken, tmp_path / "out")
+    assert summary["input_faults"] == {"image_undecodable": 1}
+    assert summary["completion"] == 1.0
+    assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.01
+    events = [json.loads(line) for line in (tmp_path / "out/events.jsonl").read_text().splitlines()]
+    assert image.name in next(e["detail"] for e in events if e["kind"] == "image_undecodable")
+
+
+def test_an_imu_gap_of_two_seconds_is_bridged_by_vision(room_walk: Path, tmp_path: Path) -> None:
+    gap = copy_of(room_walk, tmp_path / "gap")
+    change_lines(gap / "mav0/imu0/data.csv", lambda lines: lines[:400] + lines[800:])
+    summary = run(gap, tmp_path / "out")
+    assert summary["input_faults"] == {"imu_gap": 1}
+    assert summary["completion"] == 1.0
+    assert summary["status"] == {"tracking": 100}
+    assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.02
+
+
+def test_stamps_that_go_backwards_are_left_out(room_walk: Path, tmp_path: Path) -> None:
+    def swap(lines: list[str]) -> list[str]:
+        return [*lines[:40], lines[41], lines[40], *lines[42:]]
+
+    backwards = copy_of(room_walk, tmp_path / "backwards")
+    for name in ("cam0", "cam1", "cam2", "cam3", "imu0"):
+        change_lines(backwards / "mav0" / name / "data.csv", swap)
+    summary = run(backwards, tmp_path / "out")
+    assert summary["framesets"] == 99
+    assert summary["input_faults"]["frame_backward"] == 4
+    assert summary["input_faults"]["imu_backward"] == 1
+    assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.01
+    stamps = np.loadtxt(tmp_path / "out/trajectory.txt")[:, 0]
+    assert (np.diff(stamps) > 0).all()
+
+
+def test_blind_framesets_end_with_exit_code_3(room_walk: Path, tmp_path: Path) -> None:
+    blind = copy_of(room_walk, tmp_path / "blind")
+    for cam in range(4):
+        for image in sorted((blind / f"mav0/cam{cam}/data").iterdir())[40:]:
+            image.unlink()
+            image.write_bytes(_grey_png())
+    shutil.rmtree(blind / "mav0/imu0")
+    (blind / "rig.yaml").write_text(re.sub(r"(?ms)^imu:.*?(?=^\w)", "", (blind / "rig.yaml").read_text()))
+    done = graphvio("run", blind, "--out", tmp_path / "out")
+    assert done.returncode == 3, done.stderr
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert summary["completion"] < 0.9
+    assert summary["incidents"]["lost"] == 1
+    assert (tmp_path / "out/trajectory.png").stat().st_size > 1000
+
+
+def _grey_png() -> bytes:
+    import cv2
+
+    return cv2.imencode(".png", np.full((480, 640), 128, dtype=np.uint8))[1].tobytes()
+
+
+# ---------------------------------------------------------------- mistakes
+
+
+def test_unreadable_and_empty_folders(tmp_path: Path) -> None:
+    assert "does not exist" in refused(graphvio("run", tmp_path / "nowhere"))
+    (tmp_path / "file").write_text("no folder")
+    assert "is no folder" in refused(graphvio("run", tmp_path / "file"))
+    (tmp_path / "empty").mkdir()
+    assert "is empty" in refused(graphvio("run", tmp_path / "empty"))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/notes.txt").write_text("no recording")
+    assert "known layouts" in refused(graphvio("run", tmp_path / "other"))
+
+
+def test_mistakes_in_the_options(room_walk: Path, tmp_path: Path) -> None:
+    (tmp_path / "typo.yaml").write_text("motion: {cauchy_scale: 2.0}")
+    assert "did you mean 'cauchy_scale_px'" in refused(graphvio("run", room_walk, "--config", tmp_path / "typo.yaml"))
+    assert "no pair 7" in refused(graphvio("run", room_walk, "--pairs", "0,7"))
+    assert "give numbers" in refused(graphvio("run", room_walk, "--pairs", "front"))
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/thesis.tex").write_text("do not overwrite")
+    assert "not empty" in refused(graphvio("run", room_walk, "--out", tmp_path / "full", "--to", 0.2))
+
+
+def test_verbose_shows_the_traceback(tmp_path: Path) -> None:
+    done = graphvio("run", tmp_path / "nowhere", "--verbose")
+    assert done.returncode != 0
+    assert "Traceback" in done.stderr
+
+
+def test_default_folders_are_numbered(room_walk: Path, tmp_path: Path) -> None:
+    for number in (1, 2):
+        done = graphvio("run", room_walk, "--to", 0.5, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert (tmp_path / f"results/room-{number}/trajectory.txt").is_file()

@@ -1,0 +1,313 @@
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from synthetic import random_transform, seen_points, transform, two_pair_rig
+
+from graphvio.arrays import Float
+from graphvio.config import MotionConfig
+from graphvio.frontend.cost import left_motions, robust_cost
+from graphvio.frontend.observations import Observations, RigArrays
+from graphvio.frontend.ransac import hypothesise, preempt
+from graphvio.frontend.refinement import explained, refine
+from graphvio.frontend.selection import best_pair_motion, global_cost, joint_motion
+from graphvio.geometry import se3_exp, se3_inverse, se3_log
+from graphvio.rig import Rig
+
+RIG = two_pair_rig()
+ARRAYS = RigArrays.of(RIG)
+CONFIG = MotionConfig(sigma_inflation=1.0)
+TRUTH = transform([0.02, -0.03, 0.05], [-0.06, 0.02, 0.01])  # cur_T_ref
+STILL = np.eye(4)
+
+
+def seed(number: int = 0) -> np.random.Generator:
+    return np.random.default_rng(number)
+
+
+def rho(pixels: Float, a: float) -> float:
+    return float(np.log(1.0 + pixels @ pixels / a**2))
+
+
+def paper_cost(rig: Rig, pair: int, left_next_T_left_prev: Float, seen: Observations, a: float) -> float:
+    """``c_j`` of eq. (2), as it is written."""
+    stereo, total = rig.pairs[pair], 0.0
+    for i in np.flatnonzero(seen.pair == pair):
+        x, y, w = seen.points[i]
+        point = left_next_T_left_prev @ [x, y, 1.0, w]
+        other = stereo.right_T_left @ point
+        total += rho(stereo.left.focal_px * (seen.left[i] - point[:2] / point[2]), a)
+        if seen.has_right[i]:
+            total += rho(stereo.right.focal_px * (seen.right[i] - other[:2] / other[2]), a)
+    return total
+
+
+# ------------------------------------------------------------------ the cost, eq. (1) to (3)
+
+
+def test_cost_of_one_and_two_points_by_hand() -> None:
+    focal, a = RIG.pairs[0].left.focal_px, 1.5
+    seen = seen_points(RIG.with_pairs([0]), STILL, 2, seed())
+    one = Observations(*(column[:1] for column in seen))
+    arrays = RigArrays.of(RIG.with_pairs([0]))
+    assert global_cost(arrays, one, STILL, a) == pytest.approx(0.0, abs=1e-12)
+    shifted = one._replace(left=one.left + [[3.0 / focal, 4.0 / focal]])
+    assert global_cost(arrays, shifted, STILL, a) == pytest.approx(np.log(1.0 + 25.0 / a**2))  # a 2-vector, robustified
+    alone = shifted._replace(has_right=np.array([False]), right=np.full((1, 2), np.nan))
+    assert global_cost(arrays, alone, STILL, a) == pytest.approx(np.log(1.0 + 25.0 / a**2))
+    two = seen._replace(
+        left=seen.left + np.array([[3.0, 4.0], [0.0, 0.0]]) / focal,
+        right=seen.right + np.array([[0.0, 0.0], [0.0, 1.0]]) / RIG.pairs[0].right.focal_px,
+    )
+    expected = np.log(1.0 + 25.0 / a**2) + np.log(1.0 + 1.0 / a**2)
+    assert global_cost(arrays, two, STILL, a) == pytest.approx(expected)
+    assert robust_cost(STILL, arrays, two, np.array([1]), a) == pytest.approx(np.log(1.0 + 1.0 / a**2))
+
+
+def test_a_point_behind_the_camera_costs_much_and_not_infinitely() -> None:
+    seen = seen_points(RIG, STILL, 5, seed())
+    backwards = transform([0.0, np.pi, 0.0], [0.0, 0.0, 0.0])
+    assert global_cost(ARRAYS, seen, backwards, 1.5) == pytest.approx(20 * np.log(1.0 + 1e6))
+
+
+def test_motions_of_the_pairs_are_transfers_of_each_other() -> None:
+    motions = left_motions(TRUTH, ARRAYS)
+    left2_T_left1 = RIG.left2_T_left1()
+    np.testing.assert_allclose(motions[1, 0], left2_T_left1 @ motions[0, 0] @ np.linalg.inv(left2_T_left1), atol=1e-12)
+    for j, pair in enumerate(RIG.pairs):
+        np.testing.assert_allclose(motions[j, 1], pair.right_T_left @ motions[j, 0], atol=1e-12)
+
+
+def test_global_cost_is_that_of_either_pairs_motion() -> None:
+    seen = seen_points(RIG, TRUTH, 40, seed(1), sigma_px=1.0, outlier_share=0.2)
+    seen = seen._replace(has_right=seed(2).random(80) < 0.7)
+    p12, p21 = RIG.left2_T_left1(), np.linalg.inv(RIG.left2_T_left1())
+    for _ in range(10):
+        p1 = TRUTH @ random_transform(seed(3), 0.01, 0.05)
+        p2 = p12 @ p1 @ p21  # eq. (1)
+        cost1 = paper_cost(RIG, 0, p1, seen, 1.5) + paper_cost(RIG, 1, p12 @ p1 @ p21, seen, 1.5)  # eq. (3)
+        cost2 = paper_cost(RIG, 1, p2, seen, 1.5) + paper_cost(RIG, 0, p21 @ p2 @ p12, seen, 1.5)
+        for j, motion in ((0, p1), (1, p2)):
+            body_T_left = RIG.pairs[j].left.body_T_cam
+            cur_T_ref = np.ascontiguousarray(body_T_left @ motion @ np.linalg.inv(body_T_left))
+            assert global_cost(ARRAYS, seen, cur_T_ref, 1.5) == pytest.approx(cost1, rel=1e-9)
+        assert cost1 == pytest.approx(cost2, rel=1e-9)
+
+
+# ------------------------------------------------------------------ hypotheses
+
+
+def test_hypotheses_of_each_pair_are_motions_of_body() -> None:
+    seen = seen_points(RIG, TRUTH, 60, seed(4))
+    for pair in range(2):
+        found = hypothesise(ARRAYS, seen, pair, 100, 0.3, seed())
+        assert len(found) > 90
+        errors = np.abs(found - TRUTH).max(axis=(1, 2))
+        assert np.mean(errors < 1e-6) > 0.9
+
+
+def test_no_hypotheses_without_three_near_points() -> None:
+    seen = seen_points(RIG, TRUTH, 2, seed())
+    assert hypothesise(ARRAYS, seen, 0, 10, 0.3, seed()).shape == (0, 4, 4)
+    far = seen_points(RIG, TRUTH, 30, seed())
+    far = far._replace(points=far.points * [1.0, 1.0, 1e-4])
+    assert hypothesise(ARRAYS, far, 0, 10, 0.3, seed()).shape == (0, 4, 4)
+    assert np.array_equal(preempt(ARRAYS, far, TRUTH[None], 100, 1.5, seed()), TRUTH)
+
+
+@pytest.mark.parametrize("chunk_points", [1, 10, 1000])
+def test_preemption_keeps_the_best(chunk_points: int) -> None:
+    seen = seen_points(RIG, TRUTH, 80, seed(5), sigma_px=0.2, outlier_share=0.2)
+    wrong = [TRUTH @ random_transform(seed(10 + i), 0.1, 0.3) for i in range(50)]
+    hypotheses = np.ascontiguousarray(np.array([*wrong[:31], TRUTH, *wrong[31:]]))
+    assert np.array_equal(preempt(ARRAYS, seen, hypotheses, chunk_points, 1.5, seed()), TRUTH)
+
+
+# ------------------------------------------------------------------ refinement
+
+
+def whitened_cost(seen: Observations, cur_T_ref: Float, weighed_at: Float, config: MotionConfig) -> float:
+    """The refinement's cost in plain numpy, its weights ``S`` taken at a given motion."""
+    total, sigma = 0.0, config.pixel_sigma_px
+    for i, j in enumerate(seen.pair):
+        pair = RIG.pairs[j]
+
+        def predict(point: Float, motion: Float, pair: object = pair, j: int = j) -> Float:
+            left = ARRAYS.cam_T_body[j, 0] @ motion @ ARRAYS.body_T_left[j] @ [point[0], point[1], 1.0, point[2]]
+            right = RIG.pairs[j].right_T_left @ left
+            focal = ARRAYS.focal_px[j]
+            return np.concatenate([focal[0] * left[:2] / left[2], focal[1] * right[:2] / right[2]])
+
+        point, h = seen.points[i], 1e-6
+        jacobian = np.column_stack(
+            [(predict(point + h * e, weighed_at) - predict(point - h * e, weighed_at)) / (2 * h) for e in np.eye(3)]
+        )
+        s = sigma**2 * (np.eye(4) + jacobian @ seen.covariances[i] @ jacobian.T)
+        places = np.concatenate([ARRAYS.focal_px[j, 0] * seen.left[i], ARRAYS.focal_px[j, 1] * seen.right[i]])
+        error = places - predict(point, cur_T_ref)
+        rows = 4 if seen.has_right[i] else 2
+        e2 = error[:rows] @ np.linalg.solve(s[:rows, :rows], error[:rows])
+        total += np.log1p(e2 / (config.cauchy_scale_px / sigma) ** 2)
+    return float(total)
+
+
+def test_the_refined_motion_is_a_minimum_of_the_cost() -> None:
+    seen = seen_points(RIG, TRUTH, 25, seed(6), sigma_px=0.3, outlier_share=0.1)
+    seen = seen._replace(has_right=seed(7).random(50) < 0.8)
+    refined = refine(ARRAYS, seen, TRUTH, CONFIG)
+    lowest = whitened_cost(seen, refined.cur_T_ref, refined.cur_T_ref, CONFIG)
+    assert refined.cost == pytest.approx(lowest, rel=1e-3)
+    steps = 0.1 * np.sqrt(np.diag(refined.covariance))
+    for axis in range(6):
+        costs = []
+        for sign in (-1.0, 1.0):
+            moved = se3_exp(sign * steps[axis] * np.eye(6)[axis]) @ refined.cur_T_ref
+            costs.append(whitened_cost(seen, moved, refined.cur_T_ref, CONFIG) - lowest)
+        assert min(costs) > 0.0
+        assert abs(costs[1] - costs[0]) < 0.2 * (costs[0] + costs[1])  # the gradient is nothing beside the curvature
+
+
+@pytest.mark.parametrize("pairs", [[0], [1], [0, 1]])
+def test_truth_is_recovered_from_points_without_noise(pairs: list[int]) -> None:
+    rig = RIG.with_pairs(pairs)
+    seen = seen_points(rig, TRUTH, 60, seed(8))
+    for start in (STILL, TRUTH @ transform([0.05, 0.05, -0.05], [0.1, -0.1, 0.1])):
+        refined = refine(RigArrays.of(rig), seen, np.ascontiguousarray(start), replace(CONFIG, cauchy_scale_px=30.0))
+        np.testing.assert_allclose(refined.cur_T_ref, TRUTH, atol=1e-6)
+        assert refined.inlier.all()
+
+
+Solver = Callable[[RigArrays, Observations, Float, MotionConfig, np.random.Generator], object]
+
+
+@pytest.mark.parametrize("number", range(5))
+def test_truth_is_recovered_among_outliers(number: int) -> None:
+    seen = seen_points(RIG, TRUTH, 80, seed(20 + number), sigma_px=0.3, outlier_share=0.3)
+    far_away = transform([0.3, 0.2, -0.2], [0.5, 0.5, 0.5])  # a prediction of no use
+    for solve in (joint_motion, best_pair_motion):
+        refined = solve(ARRAYS, seen, far_away, CONFIG, seed())
+        error = se3_log(refined.cur_T_ref @ np.linalg.inv(TRUTH))
+        assert error @ np.linalg.solve(refined.covariance, error) < chi2.ppf(0.9999, 6)
+        assert 0.6 < refined.inlier.mean() < 0.8
+
+
+def test_covariance_tells_the_truth_about_the_error() -> None:
+    nees = []
+    for number in range(300):
+        seen = seen_points(RIG, TRUTH, 50, seed(1000 + number), sigma_px=CONFIG.pixel_sigma_px)
+        refined = refine(ARRAYS, seen, TRUTH, CONFIG)
+        error = se3_log(refined.cur_T_ref @ np.linalg.inv(TRUTH))
+        nees.append(error @ np.linalg.solve(refined.covariance, error))
+    assert 4.5 < np.mean(nees) < 8.0  # of 6; the mean of 300 is known to 0.2
+    assert np.mean(np.array(nees) > chi2.ppf(0.95, 6)) < 0.12
+
+
+def test_covariance_follows_the_noise_and_the_inflation() -> None:
+    quiet, loud = (
+        refine(ARRAYS, seen_points(RIG, TRUTH, 80, seed(9), sigma_px=s), TRUTH, CONFIG).covariance for s in (0.3, 0.6)
+    )
+    assert np.trace(loud[3:, 3:]) / np.trace(quiet[3:, 3:]) == pytest.approx(4.0, rel=0.4)
+    seen = seen_points(RIG, TRUTH, 80, seed(9), sigma_px=0.3)
+    plain = refine(ARRAYS, seen, TRUTH, CONFIG).covariance
+    np.testing.assert_allclose(refine(ARRAYS, seen, TRUTH, replace(CONFIG, sigma_inflation=2.0)).covariance, 4.0 * plain)
+
+
+def test_directions_that_nothing_constrains_are_uncertain() -> None:
+    seen = seen_points(RIG, STILL, 50, seed(10), sigma_px=0.3)
+    far = seen._replace(points=seen.points * [1.0, 1.0, 0.0])  # at infinity: rotation only
+    rays = np.column_stack([far.points[:, :2], np.ones(100)])
+    far = far._replace(left=far.points[:, :2].copy(), has_right=np.zeros(100, dtype=bool))
+    refined = refine(ARRAYS, far, STILL, CONFIG)
+    sigmas = np.sqrt(np.diag(refined.covariance))
+    assert np.isfinite(refined.cur_T_ref).all()
+    assert rays.shape == (100, 3)
+    assert sigmas[:3].max() < 1e-3
+    assert sigmas[3:].min() > 1.0
+
+
+# ------------------------------------------------------------------ one, two, and swapped pairs
+
+
+def noisy(rig: Rig = RIG) -> Observations:
+    return seen_points(rig, TRUTH, 60, seed(11), sigma_px=0.3, outlier_share=0.1)
+
+
+def test_one_pair_is_the_single_pair_algorithm() -> None:
+    rig = RIG.with_pairs([1])
+    arrays, seen = RigArrays.of(rig), noisy(rig)
+    joint = joint_motion(arrays, seen, STILL, CONFIG, seed())
+    best = best_pair_motion(arrays, seen, STILL, CONFIG, seed())
+    assert np.array_equal(joint.cur_T_ref, best.cur_T_ref)
+    assert np.array_equal(joint.covariance, best.covariance)
+    assert np.array_equal(joint.inlier, best.inlier)
+    left = rig.pairs[0].left
+    motion = left.cam_T_body @ TRUTH @ left.body_T_cam
+    assert global_cost(arrays, seen, TRUTH, 1.5) == pytest.approx(paper_cost(rig, 0, motion, seen, 1.5))
+
+
+def test_a_pair_without_points_changes_nothing() -> None:
+    alone = noisy(RIG.with_pairs([0]))
+    one = joint_motion(RigArrays.of(RIG.with_pairs([0])), alone, STILL, CONFIG, seed())
+    two = joint_motion(ARRAYS, alone, STILL, CONFIG, seed())
+    np.testing.assert_allclose(one.cur_T_ref, two.cur_T_ref, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one.covariance, two.covariance, rtol=1e-9)
+
+
+def test_swapping_pairs_changes_only_their_names() -> None:
+    seen = noisy()
+    order = np.concatenate([np.flatnonzero(seen.pair == 1), np.flatnonzero(seen.pair == 0)])
+    swapped = Observations(*(np.ascontiguousarray(column[order]) for column in seen))._replace(pair=1 - seen.pair[order])
+    arrays = RigArrays.of(RIG.with_pairs([1, 0]))
+    assert global_cost(arrays, swapped, TRUTH, 1.5) == pytest.approx(global_cost(ARRAYS, seen, TRUTH, 1.5), rel=1e-12)
+    first, second = refine(ARRAYS, seen, STILL, CONFIG), refine(arrays, swapped, STILL, CONFIG)
+    np.testing.assert_allclose(second.cur_T_ref, first.cur_T_ref, atol=1e-9)
+    np.testing.assert_allclose(second.covariance, first.covariance, rtol=1e-6)
+    assert np.array_equal(second.inlier, first.inlier[order])
+
+
+@pytest.mark.parametrize("solve", [joint_motion, best_pair_motion])
+def test_the_same_seed_gives_the_same_motion(solve: Callable[..., object]) -> None:
+    seen = noisy()
+    first, again = (solve(ARRAYS, seen, STILL, CONFIG, seed(5)) for _ in range(2))
+    assert vars(first).keys() == vars(again).keys()
+    for name, value in vars(first).items():
+        assert np.array_equal(value, getattr(again, name)), name
+
+
+def test_eq_4_chooses_the_pair_whose_points_are_sound() -> None:
+    sound, broken = noisy(), noisy()
+    places = seed(12).uniform(-0.5, 0.5, (2, 60, 2))
+    for pair in range(2):
+        wrong = sound.pair == pair
+        left, right = sound.left.copy(), sound.right.copy()
+        left[wrong], right[wrong] = places
+        broken = sound._replace(left=left, right=right)
+        best = best_pair_motion(ARRAYS, broken, STILL, CONFIG, seed())
+        alone = joint_motion(ARRAYS, broken.of_pair(1 - pair), STILL, CONFIG, seed())
+        assert np.abs(best.cur_T_ref - TRUTH).max() < 5e-3
+        assert np.abs(best.cur_T_ref - alone.cur_T_ref).max() < 1e-3
+        assert len(best.inlier) == 120
+        assert best.inlier[~wrong].mean() > 0.8
+        assert best.inlier[wrong].mean() < 0.1
+        joint = joint_motion(ARRAYS, broken, STILL, CONFIG, seed())
+        assert np.abs(joint.cur_T_ref - TRUTH).max() < 5e-3
+
+
+def test_all_pairs_together_are_better_than_the_best_one() -> None:
+    errors: dict[str, list[float]] = {"joint": [], "best": []}
+    for number in range(40):
+        seen = seen_points(RIG, TRUTH, 40, seed(500 + number), sigma_px=0.3)
+        for name, solve in (("joint", joint_motion), ("best", best_pair_motion)):
+            refined = solve(ARRAYS, seen, TRUTH, replace(CONFIG, hypotheses=20), seed())
+            errors[name].append(float(np.linalg.norm((se3_inverse(TRUTH) @ refined.cur_T_ref)[:3, 3])))
+    assert np.mean(errors["joint"]) < 0.7 * np.mean(errors["best"])
+
+
+def test_explained_points_are_the_refinements_inliers() -> None:
+    seen = noisy()
+    refined = refine(ARRAYS, seen, TRUTH, CONFIG)
+    again = explained(ARRAYS, seen, refined.cur_T_ref, CONFIG)
+    assert np.mean(again == refined.inlier) > 0.98
+    assert 0.8 < again.mean() < 0.97

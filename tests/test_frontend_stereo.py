@@ -1,0 +1,164 @@
+import cv2
+import numpy as np
+import pytest
+from synthetic import transform
+
+from graphvio.arrays import Bool, Float, Image
+from graphvio.cameras import RADIAL_TANGENTIAL, project_points, unproject_pixels
+from graphvio.config import StereoConfig
+from graphvio.frontend.stereo import epipolar_search, triangulate
+
+FOCAL, BASELINE = 400.0, 0.1
+INTRINSICS = np.array([FOCAL, FOCAL, 160.0, 120.0])
+RECTIFIED = transform([0.0, 0.0, 0.0], [-BASELINE, 0.0, 0.0])
+SKEWED = transform([0.02, -0.05, 0.03], [-0.11, 0.01, -0.02])
+
+
+def homogeneous(points: Float) -> Float:
+    """Points (N, 3) in metres as ``[x, y, 1/Z]``."""
+    return np.column_stack([points[:, :2] / points[:, 2:], 1.0 / points[:, 2]])
+
+
+def views(points: Float, right_T_left: Float) -> tuple[Float, Float]:
+    moved = points @ right_T_left[:3, :3].T + right_T_left[:3, 3]
+    return (np.ascontiguousarray(points[:, :2] / points[:, 2:]), np.ascontiguousarray(moved[:, :2] / moved[:, 2:]))
+
+
+def scattered(n: int, seed: int = 0) -> Float:
+    rng = np.random.default_rng(seed)
+    depths = rng.uniform(0.4, 40.0, n)
+    return np.column_stack([rng.uniform(-0.6, 0.6, n), rng.uniform(-0.5, 0.5, n), np.ones(n)]) * depths[:, None]
+
+
+def test_rectified_pair_is_depth_from_disparity() -> None:
+    disparity_px = np.array([0.5, 1.0, 7.0, 40.0, 120.0])
+    left = np.column_stack([np.linspace(-0.3, 0.3, 5), np.linspace(0.2, -0.2, 5)])
+    right = left - np.column_stack([disparity_px / FOCAL, np.zeros(5)])
+    points, covariances, errors = triangulate(left, right, RECTIFIED, FOCAL, FOCAL)
+    np.testing.assert_allclose(1.0 / points[:, 2], FOCAL * BASELINE / disparity_px, rtol=1e-10)  # Z = f b / d
+    np.testing.assert_allclose(points[:, :2], left, atol=1e-12)
+    np.testing.assert_allclose(errors, 0.0, atol=1e-8)
+    # w = (x_l - x_r) / b, y seen twice: closed forms of the variances for 1 px.
+    np.testing.assert_allclose(covariances[:, 2, 2], 2.0 / (FOCAL * BASELINE) ** 2, rtol=1e-8)
+    np.testing.assert_allclose(covariances[:, 0, 0], 1.0 / FOCAL**2, rtol=1e-8)
+    np.testing.assert_allclose(covariances[:, 1, 1], 0.5 / FOCAL**2, rtol=1e-8)
+    np.testing.assert_allclose(covariances[:, 0, 2], 1.0 / (FOCAL**2 * BASELINE), rtol=1e-8)
+
+
+def test_any_pair_finds_the_points_and_opencv_agrees() -> None:
+    points = scattered(200)
+    left, right = views(points, SKEWED)
+    found, _, errors = triangulate(left, right, SKEWED, FOCAL, 1.1 * FOCAL)
+    np.testing.assert_allclose(found, homogeneous(points), atol=1e-9)
+    assert errors.max() < 1e-6
+    by_opencv = cv2.triangulatePoints(np.eye(4)[:3], np.ascontiguousarray(SKEWED[:3]), left.T, right.T)
+    np.testing.assert_allclose(found, homogeneous((by_opencv[:3] / by_opencv[3]).T), atol=1e-6)
+
+
+def test_error_is_the_distance_from_the_epipolar_line() -> None:
+    left = np.array([[0.1, 0.05]])
+    right = left - [[0.03, 6.0 / FOCAL]]
+    _, _, errors = triangulate(left, right, RECTIFIED, FOCAL, FOCAL)
+    assert errors[0] == pytest.approx(6.0 / np.sqrt(2.0))  # shared evenly by both images
+
+
+def test_infinitely_far_points_are_regular() -> None:
+    left = np.array([[0.0, 0.0], [0.3, -0.2]])
+    rays = np.column_stack([left, np.ones(2)]) @ SKEWED[:3, :3].T
+    found, covariances, errors = triangulate(left, rays[:, :2] / rays[:, 2:], SKEWED, FOCAL, FOCAL)
+    np.testing.assert_allclose(found, np.column_stack([left, np.zeros(2)]), atol=1e-12)
+    assert errors.max() < 1e-9
+    assert np.linalg.eigvalsh(covariances).min() > 0.0
+
+
+def test_negative_disparity_is_a_negative_inverse_depth() -> None:
+    left = np.array([[0.1, 0.0]])
+    found, _, _ = triangulate(left, left + [[2.0 / FOCAL, 0.0]], RECTIFIED, FOCAL, FOCAL)
+    assert found[0, 2] == pytest.approx(-2.0 / (FOCAL * BASELINE))
+
+
+@pytest.mark.parametrize("depth", [0.5, 3.0, 50.0])
+def test_covariance_against_monte_carlo(depth: float) -> None:
+    n, sigma_px = 20000, 0.3
+    rng = np.random.default_rng(3)
+    left, right = views(np.array([[0.2, -0.1, 1.0]]) * depth, SKEWED)
+    noisy_left = left + sigma_px / FOCAL * rng.standard_normal((n, 2))
+    noisy_right = right + sigma_px / (1.1 * FOCAL) * rng.standard_normal((n, 2))
+    found, covariances, errors = triangulate(noisy_left, noisy_right, SKEWED, FOCAL, 1.1 * FOCAL)
+    truth = np.array([0.2, -0.1, 1.0 / depth])
+    whitened = np.linalg.inv(np.linalg.cholesky(sigma_px**2 * covariances[0])) @ (found - truth).T
+    np.testing.assert_allclose(whitened.mean(axis=1), 0.0, atol=0.05)
+    np.testing.assert_allclose(np.cov(whitened), np.eye(3), atol=0.05)
+    assert np.mean(errors**2) == pytest.approx(sigma_px**2, rel=0.05)  # four coordinates, three unknowns
+
+
+# ------------------------------------------------------------------ epipolar search
+
+
+def textured(seed: int = 0) -> Image:
+    """Smooth random grey, finer than a patch, so that every place looks different."""
+    grey = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal((240, 320)), (0, 0), 1.5)
+    return np.clip(128.0 + 150.0 * grey, 0, 255).astype(np.uint8)
+
+
+def search(left: Image, right: Image, pixels: Float, nearest_m: float = 0.5) -> tuple[Float, Bool]:
+    lens = np.zeros(5)
+    rays, _ = unproject_pixels(RADIAL_TANGENTIAL, INTRINSICS, lens, pixels)
+    bounds = np.column_stack([np.zeros(len(pixels)), np.full(len(pixels), 1.0 / nearest_m)])
+    least = StereoConfig().min_correlation
+    return epipolar_search(left, right, pixels, rays, bounds, RECTIFIED, RADIAL_TANGENTIAL, INTRINSICS, lens, least)
+
+
+def grid() -> Float:
+    x, y = np.meshgrid(np.arange(100.0, 300.0, 23.0), np.arange(20.0, 220.0, 23.0))
+    return np.column_stack([x.ravel(), y.ravel()])
+
+
+@pytest.mark.parametrize("disparity", [0, 3, 17, 60])
+def test_the_known_disparity_is_found(disparity: int) -> None:
+    left = textured()
+    right = np.roll(left, -disparity, axis=1)
+    noise = np.random.default_rng(1).normal(0.0, 3.0, right.shape)
+    pixels = grid()
+    matches, found = search(left, np.clip(0.7 * right + 20.0 + noise, 0, 255).astype(np.uint8), pixels)
+    assert found.all()
+    np.testing.assert_allclose(matches, pixels - [disparity, 0.0], atol=0.76)
+
+
+def test_a_texture_that_repeats_is_refused() -> None:
+    tile = textured()[:, :24]
+    left = np.ascontiguousarray(np.tile(tile, (1, 14))[:, :320])
+    _, found = search(left, np.roll(left, -30, axis=1), grid())
+    assert not found.any()
+    _, found = search(left, np.roll(left, -10, axis=1), grid(), nearest_m=2.0)  # only 20 px are searched
+    assert found.mean() > 0.8
+
+
+def test_what_is_not_in_the_other_image_is_refused() -> None:
+    _, found = search(textured(), textured(1), grid())
+    assert found.mean() < 0.25  # a fine texture looks like any other somewhere
+    flat = np.full((240, 320), 90, dtype=np.uint8)
+    assert not search(flat, flat, grid())[1].any()
+    assert not search(textured(), flat, grid())[1].any()
+
+
+def test_the_search_follows_the_curve_of_a_distorted_lens() -> None:
+    left, lens = textured(2), np.array([-0.25, 0.06, 1e-3, -1e-3, 0.0])
+    pixels = grid()[::5]
+    rays, _ = unproject_pixels(RADIAL_TANGENTIAL, INTRINSICS, np.zeros(5), pixels)
+    points = np.column_stack([rays, np.ones(len(rays))]) * 2.0
+    moved = np.ascontiguousarray(points @ SKEWED[:3, :3].T + SKEWED[:3, 3])
+    places, _ = project_points(RADIAL_TANGENTIAL, INTRINSICS, lens, moved)
+    right = textured(3)
+    for (x, y), (u, v) in zip(pixels.astype(int), np.round(places).astype(int), strict=True):
+        if 8 <= u < 312 and 8 <= v < 232:
+            right[v - 7 : v + 8, u - 7 : u + 8] = left[y - 7 : y + 8, x - 7 : x + 8]
+    inside = (places.min(axis=1) > 8) & (places[:, 0] < 311) & (places[:, 1] < 231)
+    bounds = np.column_stack([np.zeros(len(rays)), np.full(len(rays), 2.0)])
+    matches, found = epipolar_search(
+        left, right, pixels, rays, bounds, SKEWED, RADIAL_TANGENTIAL, INTRINSICS, lens, 0.7
+    )
+    assert inside.sum() >= 10
+    assert found[inside].mean() > 0.8
+    good = inside & found
+    assert np.abs(matches[good] - places[good]).max() < 1.5

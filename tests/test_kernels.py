@@ -1,0 +1,146 @@
+import importlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphvio import kernels
+from graphvio.cameras import EQUIDISTANT, project_points
+from graphvio.frontend.resection import real_quartic_roots
+from graphvio.geometry import se3_adjoint, se3_exp, se3_log
+
+ROOT = Path(kernels.__file__).parents[1]
+
+
+@pytest.fixture
+def forgetful() -> Iterator[None]:
+    """Nothing that `kernels` remembers of this process' environment or sources leaks in or out."""
+    kernels.cache_root.cache_clear()
+    kernels._digest.cache_clear()
+    yield
+    kernels.cache_root.cache_clear()
+    kernels._digest.cache_clear()
+
+
+@pytest.mark.usefixtures("forgetful")
+def test_cache_folder_is_the_users_choice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GRAPHVIO_CACHE_DIR", str(tmp_path / "chosen"))
+    assert kernels.cache_root() == tmp_path / "chosen"
+    assert (tmp_path / "chosen").is_dir()
+    monkeypatch.delenv("GRAPHVIO_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    kernels.cache_root.cache_clear()
+    assert kernels.cache_root() == tmp_path / "xdg" / "graphvio" / "kernels"
+
+
+@pytest.mark.usefixtures("forgetful")
+def test_a_cache_that_cannot_be_written_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("GRAPHVIO_CACHE_DIR", str(tmp_path / "file" / "below"))
+    root = kernels.cache_root()
+    assert root.is_dir()
+    assert tmp_path not in root.parents
+
+
+def test_compiled_code_is_written_once_and_found_again(tmp_path: Path) -> None:
+    program = (
+        "import numpy as np; from graphvio import geometry, kernels;"
+        "before = kernels.any_compiled_before('graphvio.geometry'); geometry.skew(np.zeros(3));"
+        "print(before, *kernels.compile_counts())"
+    )
+    environment = {**os.environ, "GRAPHVIO_CACHE_DIR": str(tmp_path)}
+    answers = [
+        subprocess.run(
+            [sys.executable, "-c", program], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+        ).stdout.split()
+        for _ in range(2)
+    ]
+    assert answers == [["False", "0", "1"], ["True", "1", "0"]]
+    assert [path for path in tmp_path.iterdir() if path.name.startswith("graphvio.geometry-")]
+
+
+@pytest.mark.usefixtures("forgetful")
+def test_digest_changes_with_whatever_is_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "graphvio"
+    (package / "sub").mkdir(parents=True)
+    files = {
+        "top.py": "from graphvio.sub.middle import f\n",
+        "sub/__init__.py": "",
+        "sub/middle.py": "import numpy\nfrom graphvio.base import (\n    g,\n)\n",
+        "base.py": "from graphvio.top import f\n",  # a circle, which must end
+        "apart.py": "",
+    }
+    for name, text in files.items():
+        (package / name).write_text(text)
+    monkeypatch.setattr(kernels, "_PACKAGE", package)
+
+    def digest() -> str:
+        kernels._digest.cache_clear()
+        return kernels._digest("graphvio.top")
+
+    first = digest()
+    assert first.startswith("graphvio.top-")
+    assert digest() == first
+    (package / "apart.py").write_text("x = 1\n")
+    assert digest() == first
+    for name in ("top.py", "sub/middle.py", "base.py"):
+        (package / name).write_text(files[name] + "x = 1\n")
+        changed = digest()
+        assert changed != first, name
+        first = changed
+
+
+@pytest.mark.usefixtures("forgetful")
+def test_digest_of_a_real_kernel_reaches_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+    read_bytes = Path.read_bytes
+
+    def spy(path: Path) -> bytes:
+        read.append(path.name)
+        return read_bytes(path)
+
+    monkeypatch.setattr(Path, "read_bytes", spy)
+    kernels._digest("graphvio.frontend.refinement")
+    assert {"refinement.py", "cost.py", "geometry.py", "kernels.py", "observations.py"} <= set(read)
+
+
+def test_every_import_between_modules_of_kernels_is_of_the_form_that_the_digest_reads() -> None:
+    for path in (ROOT / "graphvio").rglob("*.py"):
+        text = path.read_text()
+        if "@kernel" not in text:
+            continue
+        for line in text.splitlines():
+            if line.startswith(("from .", "import graphvio", "from graphvio import")):
+                pytest.fail(f"{path.name}: {line}")
+
+
+def test_compiled_functions_do_what_their_python_says() -> None:
+    rng = np.random.default_rng(3)
+    xi = rng.standard_normal(6)
+    a_T_b = se3_exp(xi)
+    points = np.column_stack([rng.uniform(-1.0, 1.0, (20, 2)), rng.uniform(-0.5, 3.0, 20)])
+    lens = np.array([0.01, -0.02, 0.003, 0.001, 0.0])
+    calls: list[tuple[Any, tuple[Any, ...]]] = [
+        (se3_exp, (xi,)),
+        (se3_log, (a_T_b,)),
+        (se3_adjoint, (a_T_b,)),
+        (project_points, (EQUIDISTANT, np.array([300.0, 310.0, 320.0, 240.0]), lens, points)),
+        (real_quartic_roots, (np.array([1.0, -2.0, -7.0, 8.0, 12.0]),)),
+    ]
+    for compiled, arguments in calls:
+        found, expected = compiled(*arguments), compiled.py_func(*arguments)
+        for a, b in zip(np.atleast_1d(found) if isinstance(found, np.ndarray) else found, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+
+
+def test_kernels_release_the_interpreter_and_divide_by_zero_quietly() -> None:
+    for module in ("geometry", "cameras", "frontend.cost", "frontend.refinement", "frontend.stereo"):
+        for value in vars(importlib.import_module(f"graphvio.{module}")).values():
+            if hasattr(value, "py_func"):
+                assert value.targetoptions["nogil"]
+                assert value.targetoptions["error_model"] == "numpy"

@@ -1,0 +1,198 @@
+"""The odometry as a Python user calls it: what is held, what is refused, what each estimate promises."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphvio import Config, Estimate, FrameSet, ImuSample, Odometry, Status, open_source
+from graphvio.events import Event
+from graphvio.trajectory import Trajectory
+
+pytestmark = pytest.mark.xdist_group("room_walk")
+
+
+@pytest.fixture(scope="module")
+def events(room_walk: Path) -> list[Event]:
+    return list(open_source(room_walk, to_s=2.5))
+
+
+@pytest.fixture(scope="module")
+def truth(room_walk: Path) -> Trajectory:
+    return Trajectory.read(room_walk / "mav0/state_groundtruth_estimate0/data.csv")
+
+
+@pytest.fixture
+def odometry(room_walk: Path) -> Iterator[Odometry]:
+    made = Odometry(open_source(room_walk).rig)
+    yield made
+    list(made.finish())
+
+
+def framesets(events: list[Event]) -> list[FrameSet]:
+    return [event for event in events if isinstance(event, FrameSet)]
+
+
+def feed(odometry: Odometry, events: list[Event]) -> list[Estimate]:
+    estimates = [estimate for event in events if (estimate := odometry.process(event)) is not None]
+    return estimates + list(odometry.finish())
+
+
+def kinds(odometry: Odometry) -> list[str]:
+    return [incident.kind for incident in odometry.take_incidents()]
+
+
+def test_every_frameset_has_one_estimate_in_order(odometry: Odometry, events: list[Event]) -> None:
+    estimates = feed(odometry, events)
+    assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(events)]
+    assert kinds(odometry) == []
+    for estimate in estimates:
+        assert estimate.status is Status.TRACKING
+        assert estimate.nav_T_body is not None
+        assert estimate.covariance is not None
+        assert np.linalg.eigvalsh(estimate.covariance)[0] > 0
+        assert set(estimate.pairs) == {0, 1}
+    np.testing.assert_allclose(estimates[0].nav_T_body[:3, 3], 0, atol=1e-3)  # type: ignore[index]
+
+
+def test_smoothed_poses_cover_every_frameset_once(odometry: Odometry, events: list[Event]) -> None:
+    feed(odometry, events)
+    smoothed = sorted(stamp for stamp, _ in odometry.take_smoothed())
+    assert smoothed == [f.stamp_ns for f in framesets(events)]
+    assert odometry.take_smoothed() == []
+
+
+def test_nav_is_upright_and_scale_is_metric(odometry: Odometry, events: list[Event], truth: Trajectory) -> None:
+    estimate = feed(odometry, events)[-1]
+    assert estimate.nav_T_body is not None
+    true, _ = truth.at(np.array([framesets(events)[0].stamp_ns, estimate.stamp_ns]), 0.1)
+    up_error = np.arccos(min(1.0, estimate.nav_T_body[2, :3] @ true.rotations[1][2]))
+    assert np.rad2deg(up_error) < 0.5
+    walked = np.linalg.norm(true.positions[1] - true.positions[0])
+    assert np.linalg.norm(estimate.nav_T_body[:3, 3]) == pytest.approx(walked, abs=0.01)
+
+
+def test_a_frameset_is_held_until_its_imu_samples_have_come(odometry: Odometry, events: list[Event]) -> None:
+    feed_until = next(i for i, e in enumerate(events) if isinstance(e, FrameSet) and i > 300)
+    late = [e for e in events[feed_until - 8 : feed_until] if isinstance(e, ImuSample)]
+    for event in events[: feed_until - 8]:
+        odometry.process(event)
+    frameset = events[feed_until]
+    assert odometry.process(frameset) is None
+    results = [odometry.process(sample) for sample in late]
+    assert results[:-1] == [None] * (len(late) - 1)
+    assert results[-1] is not None
+    assert results[-1].stamp_ns == frameset.stamp_ns
+
+
+def test_framesets_are_not_held_for_ever(odometry: Odometry, events: list[Event]) -> None:
+    cut = 400
+    begun = [odometry.process(event) for event in events[:cut]]
+    assert any(begun)
+    rest = framesets(events[cut:])
+    estimates = [e for f in rest if (e := odometry.process(f)) is not None]
+    wait_ns = Config().timing.max_imu_wait_ms * 1e6
+    assert len(estimates) >= len(rest) - wait_ns // 50_000_000 - 1
+    assert all(e.status is Status.TRACKING for e in estimates)
+    assert "imu_not_covering" in kinds(odometry)
+
+
+def test_an_imu_that_comes_late_starts_a_new_epoch(odometry: Odometry, events: list[Event]) -> None:
+    first = framesets(events)[0].stamp_ns
+    estimates = feed(odometry, [replaced for e in events if (replaced := _without_early_imu(e, first)) is not None])
+    assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(events)]
+    assert all(e.nav_T_body is not None for e in estimates)
+
+
+def _without_early_imu(event: Event, first_ns: int) -> Event | None:
+    return None if isinstance(event, ImuSample) and event.stamp_ns < first_ns + 1_000_000_000 else event
+
+
+def test_time_never_goes_back(odometry: Odometry, events: list[Event]) -> None:
+    estimates = [e for event in events[:600] if (e := odometry.process(event)) is not None]
+    old = framesets(events)[5]
+    assert odometry.process(old) is None
+    assert odometry.process(framesets(events[:600])[-1]) is None
+    assert kinds(odometry) == ["frameset_backward_stamp"] * 2
+    stamps = [e.stamp_ns for e in estimates]
+    assert stamps == sorted(set(stamps))
+
+
+def test_unusable_samples_are_left_out_and_told(odometry: Odometry, events: list[Event]) -> None:
+    for event in events[:300]:
+        odometry.process(event)
+    last = next(e for e in reversed(events[:300]) if isinstance(e, ImuSample))
+    nan = ImuSample(last.stamp_ns + 1_000_000, np.array([np.nan, 0, 0]), np.zeros(3))
+    for bad in (last, replace(last, stamp_ns=last.stamp_ns - 7), nan):
+        odometry.process(bad)
+    assert kinds(odometry) == ["imu_duplicate_stamp", "imu_backward_stamp", "imu_not_finite"]
+
+
+def test_a_clock_jump_breaks_no_run(odometry: Odometry, events: list[Event]) -> None:
+    jump_ns = 10_000_000_000_000
+    cut = len(events) // 2
+    later = [replace(event, stamp_ns=event.stamp_ns + jump_ns) for event in events[cut:]]
+    estimates = feed(odometry, events[:cut] + later)
+    assert len(estimates) == len(framesets(events))
+    assert estimates[-1].nav_T_body is not None
+    assert estimates[-1].epoch == 1
+
+
+def test_a_pair_that_drops_out_is_not_missed(odometry: Odometry, events: list[Event], truth: Trajectory) -> None:
+    def without_back(event: Event) -> Event:
+        return replace(event, images={0: event.images[0]}) if isinstance(event, FrameSet) else event
+
+    third = len(events) // 3
+    broken = [*events[:third], *map(without_back, events[third : 2 * third]), *events[2 * third :]]
+    estimates = feed(odometry, broken)
+    assert all(e.status is Status.TRACKING for e in estimates)
+    assert estimates[-1].nav_T_body is not None
+    true, _ = truth.at(np.array([estimates[0].stamp_ns, estimates[-1].stamp_ns]), 0.1)
+    walked = np.linalg.norm(true.positions[1] - true.positions[0])
+    assert np.linalg.norm(estimates[-1].nav_T_body[:3, 3]) == pytest.approx(walked, abs=0.015)
+
+
+def test_pairs_that_are_not_triggered_together(odometry: Odometry, events: list[Event], truth: Trajectory) -> None:
+    """Front and back images alternate, each at its own time."""
+    alternating: list[Event] = []
+    count = 0
+    for event in events:
+        if isinstance(event, FrameSet):
+            alternating.append(replace(event, images={count % 2: event.images[count % 2]}))
+            count += 1
+        else:
+            alternating.append(event)
+    estimates = feed(odometry, alternating)
+    assert len(estimates) == count
+    assert all(e.status is Status.TRACKING for e in estimates[2:])
+    assert estimates[-1].nav_T_body is not None
+    true, _ = truth.at(np.array([estimates[0].stamp_ns, estimates[-1].stamp_ns]), 0.1)
+    walked = np.linalg.norm(true.positions[1] - true.positions[0])
+    assert np.linalg.norm(estimates[-1].nav_T_body[:3, 3]) == pytest.approx(walked, abs=0.03)
+
+
+def test_a_blackout_coasts_on_the_imu_with_growing_covariance(odometry: Odometry, events: list[Event]) -> None:
+    def darkened(event: Event) -> Event:
+        black = np.zeros((480, 640), dtype=np.uint8)
+        begin, end = framesets(events)[30].stamp_ns, framesets(events)[44].stamp_ns
+        if not isinstance(event, FrameSet) or not begin <= event.stamp_ns <= end:
+            return event
+        return replace(event, images={0: (black, black), 1: (black, black)})
+
+    estimates = feed(odometry, list(map(darkened, events)))
+    assert [e.status for e in estimates[30:45]] == [Status.COASTING] * 15
+    sigmas = [np.trace(e.covariance[3:, 3:]) for e in estimates[29:45] if e.covariance is not None]
+    assert (np.diff(sigmas) > 0).all()
+    assert estimates[-1].status is Status.TRACKING
+    steps = np.diff([e.nav_T_body[:3, 3] for e in estimates if e.nav_T_body is not None], axis=0)
+    assert np.linalg.norm(steps, axis=1).max() < 0.12  # walking speed: at most 6 cm a frameset, and no jump
+
+
+def test_importing_the_package_and_its_command_line_loads_nothing_heavy() -> None:
+    code = "import sys, graphvio, graphvio.cli; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
+    assert not {"numba", "gtsam", "cv2", "rerun", "matplotlib", "numpy"} & set(loaded)

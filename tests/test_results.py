@@ -1,0 +1,196 @@
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphvio import __version__
+from graphvio.errors import GraphvioError
+from graphvio.events import Estimate, Incident, Status
+from graphvio.geometry import se3, so3_exp
+from graphvio.results import ResultWriter, Summary
+from graphvio.rig import Camera, Imu, Rig, StereoPair
+from graphvio.trajectory import Trajectory
+
+START_NS = 1_403_636_579_763_555_584
+STEP_NS = 50_000_000
+COUNT = 60
+LOST = range(30, 35)
+
+
+def some_rig() -> Rig:
+    def camera(name: str, y: float) -> Camera:
+        body_T_cam = np.array([[0.0, 0, 1, 0], [-1, 0, 0, y], [0, -1, 0, 0], [0, 0, 0, 1]])
+        return Camera(name, "radial-tangential", (64, 48), np.array([40.0, 40, 32, 24]), np.zeros(5), body_T_cam)
+
+    return Rig((StereoPair("front", camera("cam0", 0.05), camera("cam1", -0.05)),), Imu(), "test")
+
+
+def pose(k: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.asarray(se3(so3_exp(np.array([0.0, 0.0, 0.02 * k])), np.array([0.1 * k, np.sin(0.1 * k), 0.0])))
+
+
+def estimates() -> list[Estimate]:
+    return [
+        Estimate(
+            START_NS + k * STEP_NS,
+            Status.LOST if k in LOST else Status.COASTING if 20 <= k < 30 else Status.TRACKING,
+            None if k in LOST else pose(k),
+            None if k in LOST else np.arange(36.0).reshape(6, 6) + np.arange(36.0).reshape(6, 6).T,
+            epoch=int(k >= LOST.stop),
+            gyro_bias=np.array([0.001, 0.002, 0.003]),
+            accel_bias=np.array([0.1, 0.2, 0.3]),
+            stage_ms={"track": float(k), "solve": 2.0},
+        )
+        for k in range(COUNT)
+    ]
+
+
+def finish(writer: ResultWriter, truth: Trajectory | None = None, framesets: int = COUNT) -> Summary:
+    return writer.finish(
+        wall_s=1.5,
+        frameset_ms=[1.0, 2.0, 3.0],
+        smoothed=[(START_NS, pose(0)), (START_NS + STEP_NS, pose(1))],
+        input_faults={"imu_gap": 2},
+        framesets=framesets,
+        awaited=COUNT - 5,
+        resets=1,
+        truth=truth,
+    )
+
+
+def write_all(folder: Path, truth: Trajectory | None = None) -> Summary:
+    with ResultWriter(folder, some_rig(), "profile: balanced\n") as writer:
+        for estimate in estimates():
+            writer.add(estimate)
+        writer.add_incident(Incident(START_NS, "vision_gated", "front: 3 of 40 points, «far off»"))
+        writer.add_incident(Incident(START_NS + 1, "reset", "lost"))
+        return finish(writer, truth)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder: Path = tmp_path_factory.mktemp("results") / "walk-1"
+    truth = Trajectory(START_NS + STEP_NS * np.arange(COUNT), np.array([pose(k) for k in range(COUNT)]))
+    write_all(folder, truth)
+    return folder
+
+
+def test_folder_holds_what_was_promised(folder: Path) -> None:
+    assert sorted(file.name for file in folder.iterdir()) == [
+        "config.yaml",
+        "covariance.csv",
+        "events.jsonl",
+        "imu_bias.csv",
+        "rig.yaml",
+        "summary.json",
+        "trajectory.png",
+        "trajectory.txt",
+        "trajectory_smoothed.txt",
+    ]
+    assert (folder / "config.yaml").read_text() == "profile: balanced\n"
+    assert Rig.load(folder / "rig.yaml").pairs[0].baseline_m == pytest.approx(0.1)
+
+
+def test_trajectory_has_one_line_for_each_pose(folder: Path) -> None:
+    lines = (folder / "trajectory.txt").read_text().splitlines()
+    assert len(lines) == COUNT - len(LOST)
+    assert lines[1].startswith("1403636579.813555584 0.100000000 ")
+    read = Trajectory.read(folder / "trajectory.txt")
+    np.testing.assert_allclose(read.nav_T_body[20], pose(20), atol=1e-8)
+    assert len(Trajectory.read(folder / "trajectory_smoothed.txt")) == 2
+
+
+def test_covariance_is_the_upper_triangle_row_by_row(folder: Path) -> None:
+    lines = (folder / "covariance.csv").read_text().splitlines()
+    header = lines[0].split(",")
+    assert len(header) == 22
+    first = dict(zip(header, lines[1].split(","), strict=True))
+    assert first["stamp_ns"] == str(START_NS)
+    assert float(first["rx_tz"]) == 5 + 30  # entry (0, 5) of the matrix above
+    assert float(first["ty_ty"]) == 2 * 28
+    assert len(lines) == 1 + COUNT - len(LOST)
+
+
+def test_biases_and_events(folder: Path) -> None:
+    bias = np.loadtxt(folder / "imu_bias.csv", delimiter=",", skiprows=1)
+    assert bias.shape == (COUNT, 7)
+    np.testing.assert_allclose(bias[0, 1:], [0.001, 0.002, 0.003, 0.1, 0.2, 0.3])
+    events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
+    assert events[0] == {
+        "stamp_ns": START_NS,
+        "kind": "vision_gated",
+        "detail": "front: 3 of 40 points, «far off»",
+    }
+    assert len(events) == 2
+
+
+def test_summary(folder: Path) -> None:
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["framesets"] == COUNT
+    assert summary["estimated"] == COUNT - len(LOST)
+    assert summary["completion"] == 1.0
+    assert summary["duration_s"] == pytest.approx(59 * 0.05)
+    assert summary["realtime_factor"] == pytest.approx(59 * 0.05 / 1.5)
+    assert summary["stage_ms"]["track"] == {"median": 29.5, "p95": 56.05, "p99": 58.41}
+    assert summary["frameset_ms"]["median"] == 2.0
+    assert summary["input_faults"] == {"imu_gap": 2}
+    assert summary["incidents"] == {"vision_gated": 1, "reset": 1}
+    assert summary["status"] == {"tracking": 45, "coasting": 10, "lost": 5}
+    assert [epoch["poses"] for epoch in summary["epochs"]] == [30, 25]
+    assert summary["graphvio_version"] == __version__
+    assert summary["config_sha256"] == hashlib.sha256(b"profile: balanced\n").hexdigest()
+    assert summary["evaluation"]["ate_position_m"]["rmse"] < 1e-9
+
+
+def test_path_does_not_count_the_jump_into_a_new_epoch(folder: Path) -> None:
+    positions = np.array([pose(k)[:3, 3] for k in range(COUNT)])
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    expected = steps.sum() - steps[LOST.start - 1 : LOST.stop].sum()
+    assert json.loads((folder / "summary.json").read_text())["path_length_m"] == pytest.approx(expected)
+
+
+def test_equal_input_gives_equal_bytes(folder: Path, tmp_path: Path) -> None:
+    write_all(tmp_path / "again")
+    for name in ("trajectory.txt", "trajectory_smoothed.txt", "covariance.csv", "imu_bias.csv", "events.jsonl"):
+        assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes(), name
+
+
+def test_folders_are_numbered_and_never_overwritten(folder: Path, tmp_path: Path) -> None:
+    assert [ResultWriter.new_folder(tmp_path / "r", "walk").name for _ in range(3)] == ["walk-1", "walk-2", "walk-3"]
+    before = (folder / "trajectory.txt").read_bytes()
+    with pytest.raises(GraphvioError, match="is not empty"):
+        ResultWriter(folder, some_rig(), "")
+    assert (folder / "trajectory.txt").read_bytes() == before
+
+
+def test_a_run_that_breaks_off_leaves_what_it_had(tmp_path: Path) -> None:
+    writer = ResultWriter(tmp_path / "broken", some_rig(), "")
+    for estimate in estimates()[:7]:
+        writer.add(estimate)
+    assert len((tmp_path / "broken" / "trajectory.txt").read_text().splitlines()) == 7  # not closed yet
+    writer.close()
+    assert not (tmp_path / "broken" / "summary.json").exists()
+
+
+def test_without_a_single_pose_there_is_still_a_summary(tmp_path: Path) -> None:
+    truth = Trajectory(START_NS + STEP_NS * np.arange(COUNT), np.array([pose(k) for k in range(COUNT)]))
+    with ResultWriter(tmp_path / "none", some_rig(), "") as writer:
+        summary = finish(writer, truth, framesets=0)
+    assert summary.estimated == 0
+    assert summary.completion == 0.0
+    assert summary.path_length_m == 0.0
+    assert summary.evaluation is None
+    assert summary.evaluation_error is not None
+    assert "0 poses" in summary.evaluation_error
+    assert (tmp_path / "none" / "trajectory.png").stat().st_size > 0
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(GraphvioError, match="cannot be written"):
+        ResultWriter(tmp_path / "file" / "x", some_rig(), "")
+    with pytest.raises(GraphvioError, match="cannot be written"):
+        ResultWriter.new_folder(tmp_path / "file", "x")

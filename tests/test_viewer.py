@@ -1,0 +1,262 @@
+import importlib
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from graphvio.errors import GraphvioError, MissingExtraError
+from graphvio.events import Estimate, FrameSet, Incident, PairReport, Status
+from graphvio.geometry import se3, so3_exp
+from graphvio.rig import Camera, Imu, Rig, StereoPair
+from graphvio.trajectory import Trajectory
+from graphvio.viewer import Viewer
+
+pytest.importorskip("rerun")
+
+START_NS = 1_403_636_579_763_555_584
+
+
+def some_rig() -> Rig:
+    def camera(name: str, y: float) -> Camera:
+        body_T_cam = np.array([[0.0, 0, 1, 0], [-1, 0, 0, y], [0, -1, 0, 0], [0, 0, 0, 1]])
+        return Camera(name, "radial-tangential", (640, 480), np.array([400.0, 400, 320, 240]), np.zeros(5), body_T_cam)
+
+    return Rig((StereoPair("front", camera("cam0", 0.05), camera("cam1", -0.05)),), Imu(), "test")
+
+
+def estimate(k: int) -> Estimate:
+    lost = 40 <= k < 45
+    return Estimate(
+        START_NS + k * 50_000_000,
+        Status.LOST if lost else Status.TRACKING,
+        None if lost else se3(so3_exp(np.array([0.0, 0.0, 0.01 * k])), np.array([0.1 * k, 0.0, 0.0])),
+        None if lost else np.eye(6) * 1e-4,
+        epoch=int(k >= 45),
+        gyro_bias=np.full(3, 1e-3),
+        accel_bias=np.zeros(3),
+        rates={"gyro": np.ones(3), "vision": np.ones(3), "fused": np.ones(3)},
+        pairs={0: PairReport(50, 40, np.full((50, 2), 100.0), np.arange(50) < 40)},
+        stage_ms={"track": 3.0},
+    )
+
+
+def frameset(k: int) -> FrameSet:
+    image = np.full((480, 640), k % 256, dtype=np.uint8)
+    return FrameSet(START_NS + k * 50_000_000, {0: (image, image)})
+
+
+def printed(*arguments: str) -> str:
+    command = [sys.executable, "-m", "rerun", "rrd", *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
+
+
+def rows_of(file: Path) -> dict[str, int]:
+    """Entity -> rows of data, as rerun's own reader counts them."""
+    counts: dict[str, int] = {}
+    for chunk in importlib.import_module("rerun.chunk").RrdReader(file).stream():
+        counts[chunk.entity_path] = counts.get(chunk.entity_path, 0) + chunk.num_rows
+    return counts
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file: Path = tmp_path_factory.mktemp("viewer") / "run.rrd"
+    with Viewer(some_rig(), save=file) as viewer:
+        for k in range(250):
+            viewer.show(frameset(k), estimate(k))
+        viewer.show_incident(Incident(START_NS, "vision_gated", "front"))
+        viewer.show_path("smoothed", Trajectory(np.arange(3), np.array([np.eye(4)] * 3)))
+    return file
+
+
+def test_recording_can_be_loaded_and_holds_every_entity(recording: Path) -> None:
+    printed("verify", str(recording))
+    entities = rows_of(recording)
+    for entity in (
+        "/world/rig",
+        "/world/rig/cam0",
+        "/world/rig/cam1",
+        "/world/rig/cam0/image",
+        "/world/rig/cam0/corners",
+        "/world/rig/uncertainty",
+        "/world/trajectory/0/0",
+        "/world/trajectory/1/0",
+        "/world/trajectory/1/2",
+        "/world/smoothed",
+        "/rates/x/gyro",
+        "/rates/z/fused",
+        "/biases/accel",
+        "/points/front/inliers",
+        "/timing/track",
+        "/events",
+    ):
+        assert entities.get(entity, 0) > 0, entity
+
+
+def test_no_pose_is_dropped_though_images_are(recording: Path) -> None:
+    entities = rows_of(recording)
+    assert entities["/world/rig"] == 245  # all but those lost
+    assert entities["/world/rig/uncertainty"] == 245
+    assert entities["/timing/track"] == 250
+    assert 1 <= entities["/world/rig/cam0/image"] < 250
+    assert entities["/events"] == 4  # tracking, lost, tracking, and the incident
+
+
+def test_handing_over_is_cheap_and_drawing_never_holds_it_up(tmp_path: Path, monkeypatch: Any) -> None:
+    from graphvio.viewer.recording import Recording
+
+    monkeypatch.setattr(Recording, "add_images", lambda *_: time.sleep(0.2))
+    spent_ms = []
+    frames = [frameset(k) for k in range(100)]
+    with Viewer(some_rig(), save=tmp_path / "slow.rrd") as viewer:
+        for k, frame in enumerate(frames):
+            began = time.perf_counter()
+            viewer.show(frame, estimate(k))
+            spent_ms.append(1e3 * (time.perf_counter() - began))
+            time.sleep(0.002)
+        assert viewer.dropped > 80
+    assert np.median(spent_ms) < 0.3
+    assert rows_of(tmp_path / "slow.rrd")["/timing/track"] == 100
+
+
+def test_a_failure_of_drawing_is_told_at_the_end_only(tmp_path: Path, monkeypatch: Any) -> None:
+    from graphvio.viewer.recording import Recording
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("no more paint")
+
+    monkeypatch.setattr(Recording, "add_estimates", fail)
+    viewer = Viewer(some_rig(), save=tmp_path / "f.rrd")
+    for k in range(10):
+        viewer.show(frameset(k), estimate(k))
+        time.sleep(0.005)
+    with pytest.raises(GraphvioError, match="no more paint"):
+        viewer.close()
+    viewer.close()
+    assert not [t for t in threading.enumerate() if t.name == "viewer"]
+
+
+def test_an_error_of_the_run_is_not_hidden_by_one_of_drawing(tmp_path: Path, monkeypatch: Any) -> None:
+    from graphvio.viewer.recording import Recording
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("no more paint")
+
+    monkeypatch.setattr(Recording, "add_estimates", fail)
+    with pytest.raises(ZeroDivisionError), Viewer(some_rig(), save=tmp_path / "f.rrd") as viewer:  # noqa: PT012
+        viewer.show(None, estimate(0))
+        raise ZeroDivisionError
+
+
+def test_ellipsoid_has_the_axes_of_the_covariance() -> None:
+    from graphvio.viewer.recording import ellipsoid
+
+    rotation = so3_exp(np.array([0.3, -0.5, 1.0]))
+    half, quat_xyzw = ellipsoid(rotation @ np.diag([0.04, 0.01, 0.09]) @ rotation.T)
+    np.testing.assert_allclose(sorted(half), [0.3, 0.6, 0.9])
+    from graphvio.geometry import rotation_from_quat_wxyz
+
+    axes = rotation_from_quat_wxyz(quat_xyzw[[3, 0, 1, 2]])
+    np.testing.assert_allclose(
+        axes @ np.diag((half / 3) ** 2) @ axes.T, rotation @ np.diag([0.04, 0.01, 0.09]) @ rotation.T, atol=1e-12
+    )
+
+
+def test_without_a_display_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    with pytest.raises(GraphvioError, match="no display") as caught:
+        Viewer(some_rig(), spawn=True)
+    assert "\n" not in str(caught.value)
+
+
+def test_without_rerun_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in [name for name in sys.modules if name.split(".")[0] == "rerun"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delitem(sys.modules, "graphvio.viewer.recording", raising=False)
+    monkeypatch.delitem(sys.modules, "graphvio.viewer.layout", raising=False)
+
+    class Absent:
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == "rerun":
+                raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+    monkeypatch.setattr(sys, "meta_path", [Absent(), *sys.meta_path])
+    with pytest.raises(MissingExtraError, match=r"pip install 'graphvio\[viewer\]'"):
+        Viewer(some_rig(), save=tmp_path / "x.rrd")
+
+
+def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
+    with pytest.raises(GraphvioError, match="cannot be written"):
+        Viewer(some_rig(), save=tmp_path / "no" / "x.rrd")
+    with pytest.raises(GraphvioError, match="cannot be opened"):
+        Viewer(some_rig(), save=tmp_path)
+
+
+def test_results_can_be_shown_again_from_their_files(tmp_path: Path) -> None:
+    from graphvio.results import ResultWriter
+    from graphvio.viewer.replay import read_estimates, replay
+
+    folder = tmp_path / "run-1"
+    shown = [estimate(k) for k in range(60)]
+    with ResultWriter(folder, some_rig(), "") as writer:
+        for each in shown:
+            writer.add(each)
+        writer.add_incident(Incident(START_NS, "vision_gated", "front"))
+        smoothed = [(e.stamp_ns, e.nav_T_body) for e in shown if e.nav_T_body is not None]
+        writer.finish(
+            wall_s=1.0,
+            frameset_ms=[],
+            smoothed=smoothed,
+            input_faults={},
+            framesets=60,
+            awaited=60,
+            resets=1,
+        )
+    read = list(read_estimates(folder))
+    assert [e.epoch for e in read] == [e.epoch for e in shown if e.nav_T_body is not None]
+    np.testing.assert_allclose(np.asarray(read[3].covariance), np.eye(6) * 1e-4)
+    np.testing.assert_allclose(np.asarray(read[3].gyro_bias), 1e-3)
+
+    replay(folder, save=tmp_path / "again.rrd")
+    entities = rows_of(tmp_path / "again.rrd")
+    assert entities["/world/rig"] == 55
+    assert entities["/world/trajectory/1/0"] > 0
+    assert entities["/world/smoothed"] > 0
+    assert entities["/biases/gyro"] >= 55
+
+    (folder / "covariance.csv").write_text("header\n1,2,3\n")
+    with pytest.raises(GraphvioError, match=r"covariance\.csv, line 2: is damaged"):
+        replay(folder, save=tmp_path / "again.rrd")
+    with pytest.raises(GraphvioError, match=r"holds no trajectory\.txt"):
+        replay(tmp_path, save=tmp_path / "again.rrd")
+
+
+def test_view_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    from graphvio.cli import main
+
+    def code_of(*arguments: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["graphvio", "view", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return int(ended.value.code or 0)
+
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    some_rig().save(tmp_path / "rig.yaml")
+    Trajectory(np.array([1, 2]), np.array([np.eye(4)] * 2)).write(tmp_path / "trajectory.txt")  # a broken-off run
+    assert code_of(str(tmp_path), "--save-rrd", str(tmp_path / "out.rrd")) == 0
+    assert rows_of(tmp_path / "out.rrd")["/world/rig"] == 2
+    assert code_of(str(tmp_path)) == 2
+    assert code_of(str(tmp_path / "absent")) == 2
+    shown = capsys.readouterr().err.splitlines()
+    assert len(shown) == 2
+    assert "no display" in shown[0]
+    assert "is no folder" in shown[1]
