@@ -22,7 +22,7 @@ class CornerConfig:
     cell_px: int = 40
     """Side of a cell: at most one new corner in each."""
     min_response: float = 4.0
-    """Least Harris response of a corner, as the corner's grey-level step: smaller eigenvalue's square root."""
+    """Least rms gradient along a corner's weaker direction, grey levels per pixel."""
     border_px: int = 8
     """Corners and tracks nearer to the image's edge are dropped."""
 
@@ -32,7 +32,9 @@ class TrackingConfig:
     """Temporal 2D-2D matching by pyramidal Lucas-Kanade (section 3)."""
 
     window_px: int = 15
+    """Side of the patch that is compared."""
     levels: int = 4
+    """Pyramid levels, each of half the size."""
     max_forward_backward_px: float = 0.7
     """Largest distance between a corner and its image tracked forth and back again."""
 
@@ -42,6 +44,7 @@ class StereoConfig:
     """Left-right matching under the epipolar and disparity constraints, and triangulation (section 3)."""
 
     min_depth_m: float = 0.3
+    """Nearest depth that is searched; there is no farthest."""
     max_epipolar_px: float = 1.0
     """Largest distance of a right corner from the epipolar line of its left one."""
     min_correlation: float = 0.7
@@ -71,9 +74,11 @@ class MotionConfig:
     sigma_inflation: float = 2.5
     """Factor on a motion's standard deviations: motions from one keyframe share the errors of its points."""
     min_inliers: int = 12
+    """Motions that explain fewer points are refused."""
     min_inlier_share: float = 0.3
-    """Motions that explain fewer points, or a smaller share of them, are refused."""
+    """Motions that explain a smaller share of the points are refused."""
     seed: int = 0
+    """Of the random triples: equal seeds give equal results, to the bit."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +102,7 @@ class SmootherConfig:
     """The fixed-lag window, its gate and its limits (section 5)."""
 
     lag_s: float = 2.0
+    """Age at which a state leaves the window, unless later motions are measured from it."""
     gate_probability: float = 0.9999
     """Vision is refused where its innovation lies outside this share of the chi-square distribution."""
     max_gated_s: float = 1.0

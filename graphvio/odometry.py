@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from time import perf_counter
@@ -10,22 +9,25 @@ from time import perf_counter
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import ImuBuffer, ImuSpan
+from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.initialisation import InitialAttitude, initial_attitude, level
-from graphvio.backend.smoother import RigState, Smoother, StartUncertainty
+from graphvio.backend.smoother import RigState, Smoother, StartUncertainty, origin_covariance
 from graphvio.backend.window import WindowError
 from graphvio.config import Config
 from graphvio.events import Estimate, Event, FrameSet, ImuSample, Incident, Status
 from graphvio.frontend.visual import RelativeMotion, VisualFrontend, VisualResult
-from graphvio.geometry import se3, se3_inverse, so3_log
+from graphvio.geometry import se3, se3_inverse
+from graphvio.rates import AngularRates
 from graphvio.rig import Rig
+from graphvio.synchroniser import Synchroniser
 
 _MAX_UNBRIDGED_S = 3.0
 _MOVING_START_SPEED_SIGMA = 2.0
 _RESTING_START_SPEED_SIGMA = 0.02
-_RESTART_SPEED_SIGMA = 0.5
-_RESTART_TILT_SIGMA = 0.05
+_RESTART_SPEED_SIGMA = 1.0
 _RESTART_GYRO_BIAS_SIGMA = 0.01
+_AFTER_REBUILD = np.diag([0.05] * 3 + [0.1] * 3) ** 2  # added to the pose's covariance, radians and metres
+_AFTER_JUMP = np.diag([0.2] * 3 + [1.0] * 3) ** 2
 
 
 class Odometry:
@@ -42,16 +44,15 @@ class Odometry:
         self.rig = rig
         self.config = config or Config()
         self._frontend = VisualFrontend(rig, self.config)
-        self._imu_buffer = ImuBuffer(self.config.timing.max_imu_gap_ms)
+        self._synchroniser = Synchroniser(rig, self.config, self._report)
         self._smoother: Smoother | None = None
-        self._held: deque[FrameSet] = deque()
-        self._newest_frameset_ns: int | None = None
         self._settled_ns = 0  # from this stamp on, a start in motion is over
         self._tracked_ns = 0  # stamp of the last state that vision constrains
         self._gated_since_ns: int | None = None
         self._lost = False
         self._epoch = 0
-        self._last_motion: RelativeMotion | None = None
+        self._last_covariance = np.zeros((6, 6))
+        self._rates = AngularRates()
         self._incidents: list[Incident] = []
         self._smoothed: list[tuple[int, Float]] = []
 
@@ -63,17 +64,16 @@ class Odometry:
             worked on in a call; what is still held comes with later events or with `finish`.
         """
         if isinstance(event, ImuSample):
-            fault = self._imu_buffer.add(event)
-            if fault:
-                self._report(event.stamp_ns, fault, "sample left out")
+            self._synchroniser.add_sample(event)
         else:
-            self._hold(event)
-        return self._estimate(self._held.popleft()) if self._held and self._is_due(self._held[0]) else None
+            self._synchroniser.add_frameset(event)
+        frameset = self._synchroniser.next_due(started=self._smoother is not None)
+        return None if frameset is None else self._estimate(frameset)
 
     def finish(self) -> Iterator[Estimate]:
         """Estimates of the framesets still held when the input has ended; the window's poses are final then."""
-        while self._held:
-            yield self._estimate(self._held.popleft())
+        while (frameset := self._synchroniser.next_held()) is not None:
+            yield self._estimate(frameset)
         if self._smoother is not None:
             self._smoothed += self._smoother.all_poses()
         self._frontend.close()
@@ -88,56 +88,24 @@ class Odometry:
         taken, self._smoothed = self._smoothed, []
         return taken
 
-    # ------------------------------------------------------------------ when a frameset is due
-
-    def _hold(self, frameset: FrameSet) -> None:
-        if self._newest_frameset_ns is not None and frameset.stamp_ns <= self._newest_frameset_ns:
-            self._report(frameset.stamp_ns, "frameset_backward_stamp", "frameset left out: time never goes back")
-            return
-        unknown = [j for j in frameset.images if not 0 <= j < len(self.rig.pairs)]
-        if unknown:
-            self._report(frameset.stamp_ns, "unknown_pair", f"pair {unknown[0]} is not in the rig: left out")
-            frameset = replace(frameset, images={j: v for j, v in frameset.images.items() if j not in unknown})
-        self._newest_frameset_ns = frameset.stamp_ns
-        self._held.append(frameset)
-
-    def _is_due(self, frameset: FrameSet) -> bool:
-        imu, timing = self.rig.imu, self.config.timing
-        if imu is None:
-            return True
-        assert self._newest_frameset_ns is not None
-        waited_ns = self._newest_frameset_ns - frameset.stamp_ns
-        if self._smoother is None:
-            return self._initial_span(frameset.stamp_ns) is not None or waited_ns > timing.max_imu_start_wait_s * 1e9
-        covered = self._imu_buffer.covers(self._imu_time(frameset.stamp_ns))
-        return covered or waited_ns > timing.max_imu_wait_ms * 1e6
-
-    def _initial_span(self, stamp_ns: int) -> tuple[ImuSpan, float] | None:
-        """The IMU around an instant, and the instant's place in it in seconds, once it is long enough."""
-        config, at_ns = self.config.initialisation, self._imu_time(stamp_ns)
-        before_ns, least_ns = round(config.window_s * 1e9), round(config.min_window_s * 1e9)
-        if not self._imu_buffer.covers(at_ns):
-            return None
-        for end_ns in (at_ns, at_ns + least_ns):
-            found = self._imu_buffer.stretch(at_ns - before_ns, end_ns)
-            if found is not None and found[0].steps_s.sum() >= 0.95e-9 * least_ns:
-                return found[0], (at_ns - found[1]) * 1e-9
-        return None
-
-    def _imu_time(self, stamp_ns: int) -> int:
-        return stamp_ns + (self.rig.imu.time_offset_ns if self.rig.imu else 0)
-
     # ------------------------------------------------------------------ one frameset
+
+    @property
+    def _running(self) -> Smoother:
+        assert self._smoother is not None, "the odometry has started"
+        return self._smoother
 
     def _estimate(self, frameset: FrameSet) -> Estimate:
         start = perf_counter()
         stamp_ns = frameset.stamp_ns
+        if self._smoother is None and self._synchroniser.precedes_imu(stamp_ns):
+            visual = self._frontend.process(frameset, self._predicted_motion)
+            return Estimate(stamp_ns, Status.INITIALISING, None, None, pairs=visual.pairs, stage_ms=visual.stage_ms)
         starting = self._must_start(stamp_ns)
         span = None
         if starting:
             self._start(stamp_ns)
-        smoother = self._smoother
-        assert smoother is not None
+        smoother = self._running
         if not starting:
             span = self._span(smoother.latest_ns, stamp_ns)
             if span is None and stamp_ns - smoother.latest_ns > _MAX_UNBRIDGED_S * 1e9:
@@ -167,8 +135,7 @@ class Odometry:
 
     def _use(self, motion: RelativeMotion) -> bool:
         """Gate a measured motion and insert it; a gate that refuses for too long is itself at fault."""
-        smoother = self._smoother
-        assert smoother is not None
+        smoother = self._running
         if not smoother.knows(motion.reference_stamp_ns):  # it started anew since then
             self._frontend.rekey()
             return False
@@ -197,8 +164,7 @@ class Odometry:
 
     def _update(self, visual: VisualResult, used: bool) -> bool:
         """Optimise and marginalise; a window without a solution is rebuilt around the prediction."""
-        smoother = self._smoother
-        assert smoother is not None
+        smoother = self._running
         if used:
             self._tracked_ns = smoother.latest_ns
         try:
@@ -207,17 +173,15 @@ class Odometry:
             state = smoother.state()
             self._smoothed += smoother.all_poses()
             self._report(smoother.latest_ns, "window_rebuilt", str(error))
-            smoother.start(smoother.latest_ns, state, _RESTART)
+            self._start_again(smoother.latest_ns, state, self._last_covariance + _AFTER_REBUILD)
             self._tracked_ns = smoother.latest_ns
             return False
-        self._imu_buffer.discard_before(self._imu_time(smoother.latest_ns) - self._history_ns())
+        self._synchroniser.forget_before(smoother.latest_ns)
         return True
 
     def _status(self, stamp_ns: int, used: bool, starting: bool) -> Status:
-        smoother = self._smoother
-        assert smoother is not None
+        smoother = self._running
         if used or starting:
-            self._tracked_ns = stamp_ns
             return Status.INITIALISING if stamp_ns < self._settled_ns else Status.TRACKING
         sigma = float(np.sqrt(np.linalg.eigvalsh(smoother.covariance_since(self._tracked_ns)[3:, 3:])[-1]))
         if not self._lost and sigma > self.config.smoother.lost_position_sigma_m:
@@ -231,7 +195,7 @@ class Odometry:
         """True at the first frameset, and where an IMU comes after a start without."""
         if self._smoother is None:
             return True
-        if self.rig.imu is None or self._smoother.has_imu or self._initial_span(stamp_ns) is None:
+        if self._smoother.has_imu or self._synchroniser.initial_span(stamp_ns) is None:
             return False
         self._epoch += 1
         self._report(stamp_ns, "imu_came", f"the IMU has come: epoch {self._epoch} starts upright")
@@ -240,8 +204,11 @@ class Odometry:
     def _start(self, stamp_ns: int) -> None:
         """Begin at a frameset, where the rig is thought to be, with what the IMU says of its attitude."""
         config = self.config.initialisation
-        position = np.zeros(3) if self._smoother is None else self._smoother.state().nav_T_body[:3, 3]
-        found = self._initial_span(stamp_ns) if self.rig.imu is not None else None
+        position = np.zeros(3)
+        if self._smoother is not None:
+            position = self._smoother.state().nav_T_body[:3, 3]
+            self._smoothed += self._smoother.all_poses()
+        found = self._synchroniser.initial_span(stamp_ns)
         if self.rig.imu is not None and found is None:
             self._report(stamp_ns, "started_without_imu", "no IMU samples came: vision alone from here")
         self._smoother = Smoother(self.config.smoother, self.rig.imu if found else None)
@@ -255,7 +222,7 @@ class Odometry:
         self._smoother.start(
             stamp_ns,
             RigState(se3(at.nav_R_body, position), np.zeros(3), at.gyro_bias, np.zeros(3)),
-            StartUncertainty(at.tilt_sigma_rad, speed_sigma, at.gyro_bias_sigma),
+            StartUncertainty(origin_covariance(at.nav_R_body, at.tilt_sigma_rad), speed_sigma, at.gyro_bias_sigma),
         )
         self._tracked_ns = stamp_ns
 
@@ -265,11 +232,10 @@ class Odometry:
 
     def _jump(self, stamp_ns: int) -> None:
         """After a gap that nothing bridges, be it a pause or a jump of the clock: a new epoch at the last pose."""
-        smoother = self._smoother
-        assert smoother is not None
+        smoother = self._running
         gap_s = (stamp_ns - smoother.latest_ns) * 1e-9
         self._smoothed += smoother.all_poses()
-        smoother.start(stamp_ns, smoother.state(), _AFTER_JUMP)
+        self._start_again(stamp_ns, smoother.state(), self._last_covariance + _AFTER_JUMP)
         self._epoch += 1
         self._lost = False
         self._gated_since_ns = None
@@ -284,31 +250,31 @@ class Odometry:
 
     def _restart(self, motion: RelativeMotion, kind: str, why: str) -> None:
         """Start the smoother anew at its newest pose, with the velocity that vision sees."""
-        smoother = self._smoother
-        assert smoother is not None
+        smoother = self._running
         self._smoothed += [(ns, pose) for ns, pose in smoother.all_poses() if ns <= self._tracked_ns]
         state = smoother.state()
         dt = (motion.stamp_ns - motion.reference_stamp_ns) * 1e-9
         velocity_body = motion.reference_T_current[:3, :3].T @ motion.reference_T_current[:3, 3] / dt
         velocity_nav = state.nav_T_body[:3, :3] @ velocity_body
-        smoother.start(motion.stamp_ns, replace(state, velocity_nav=velocity_nav), _RESTART)
+        self._start_again(motion.stamp_ns, replace(state, velocity_nav=velocity_nav), smoother.covariance())
         self._frontend.rekey()
         self._gated_since_ns = None
         self._tracked_ns = motion.stamp_ns
         self._report(motion.stamp_ns, kind, why)
+
+    def _start_again(self, stamp_ns: int, state: RigState, pose_covariance: Float) -> None:
+        uncertainty = StartUncertainty(pose_covariance, _RESTART_SPEED_SIGMA, _RESTART_GYRO_BIAS_SIGMA)
+        self._running.start(stamp_ns, state, uncertainty)
 
     # ------------------------------------------------------------------ what is told
 
     def _span(self, start_ns: int, end_ns: int) -> ImuSpan | None:
         if self._smoother is None or not self._smoother.has_imu:
             return None
-        span = self._imu_buffer.span(self._imu_time(start_ns), self._imu_time(end_ns))
+        span = self._synchroniser.span(start_ns, end_ns)
         if span is None:
             self._report(end_ns, "imu_not_covering", "no IMU for this interval: constant velocity instead")
         return span
-
-    def _history_ns(self) -> int:
-        return round(self.config.initialisation.window_s * 1e9)
 
     def _assemble(
         self,
@@ -318,48 +284,24 @@ class Odometry:
         span: ImuSpan | None,
         stage_ms: dict[str, float],
     ) -> Estimate:
-        smoother = self._smoother
-        assert smoother is not None
+        smoother = self._running
         state = smoother.state()
         honest = status is not Status.LOST
+        self._last_covariance = smoother.covariance()
         inertial = smoother.has_imu
         return Estimate(
             stamp_ns=stamp_ns,
             status=status,
             nav_T_body=state.nav_T_body if honest else None,
-            covariance=smoother.covariance() if honest else None,
+            covariance=self._last_covariance if honest else None,
             epoch=self._epoch,
             velocity_nav=state.velocity_nav if honest else None,
             gyro_bias=state.gyro_bias if inertial else None,
             accel_bias=state.accel_bias if inertial else None,
-            rates=self._rates(visual, span, state),
+            rates=self._rates.update(visual.motion, span, state.gyro_bias, smoother.latest_rate()),
             pairs=visual.pairs,
             stage_ms=stage_ms,
         )
 
-    def _rates(self, visual: VisualResult, span: ImuSpan | None, state: RigState) -> dict[str, Float]:
-        """Angular rates of body over the last interval by gyro, vision and both (the paper's figure 5)."""
-        rates: dict[str, Float] = {}
-        if span is not None:
-            rates["gyro"] = span.mean_rate - state.gyro_bias
-        before, now = self._last_motion, visual.motion
-        self._last_motion = now
-        if now is not None:
-            earlier = now.reference_T_current
-            since_ns = now.reference_stamp_ns
-            if before is not None and before.reference_stamp_ns == since_ns:
-                earlier = se3_inverse(before.reference_T_current) @ earlier
-                since_ns = before.stamp_ns
-            rates["vision"] = so3_log(earlier[:3, :3].copy()) / ((now.stamp_ns - since_ns) * 1e-9)
-        assert self._smoother is not None
-        fused = self._smoother.latest_rate()
-        if fused is not None:
-            rates["fused"] = fused
-        return rates
-
     def _report(self, stamp_ns: int, kind: str, detail: str) -> None:
         self._incidents.append(Incident(stamp_ns, kind, detail))
-
-
-_AFTER_JUMP = StartUncertainty(0.2, _MOVING_START_SPEED_SIGMA, _RESTART_GYRO_BIAS_SIGMA)
-_RESTART = StartUncertainty(_RESTART_TILT_SIGMA, _RESTART_SPEED_SIGMA, _RESTART_GYRO_BIAS_SIGMA)

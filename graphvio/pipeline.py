@@ -12,7 +12,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.events import Estimate, Event, FrameSet
+from graphvio.events import Estimate, Event, FrameSet, Status
 from graphvio.odometry import Odometry
 from graphvio.results import ResultWriter, Summary
 from graphvio.sources import Source
@@ -89,6 +89,7 @@ class _Run:
         self._smoothed: list[tuple[int, Float]] = []
         self._frameset_ms: list[float] = []
         self._delivered = 0
+        self._before_start = 0  # framesets that came before the IMU did: no pose can be asked of them
         self._resets = 0
         self._distance_m = 0.0
         self._last: Estimate | None = None
@@ -115,7 +116,7 @@ class _Run:
             smoothed=sorted(self._smoothed, key=lambda stamped: stamped[0]),
             input_faults=self._source.faults.counts,
             framesets=self._delivered,
-            awaited=self._delivered,
+            awaited=self._delivered - self._before_start,
             resets=self._resets,
             truth=truth,
         )
@@ -130,6 +131,7 @@ class _Run:
 
     def _take(self, estimate: Estimate) -> None:
         self._writer.add(estimate)
+        self._before_start += estimate.status is Status.INITIALISING and estimate.nav_T_body is None
         self._collect()
         if self._viewer is not None:
             self._viewer.show(self._waiting.pop(estimate.stamp_ns, None), estimate)

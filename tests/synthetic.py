@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import settings
 from scipy.spatial.transform import Rotation
 
-from graphvio.arrays import Float
+from graphvio.arrays import AnyArray, Float
 from graphvio.backend.inertial import GRAVITY_M_S2, ImuBuffer
 from graphvio.events import ImuSample
 from graphvio.frontend.observations import Observations, RigArrays
@@ -20,6 +20,7 @@ from graphvio.rig import Camera, Imu, Rig, StereoPair
 settings.register_profile("synthetic", deadline=None, derandomize=True)
 settings.load_profile("synthetic")
 
+UP = np.array([0.0, 0.0, GRAVITY_M_S2])  # specific force at rest
 CAM_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # body_R_cam of a camera that looks along x
 
 
@@ -76,7 +77,7 @@ def seen_points(
     Pixel noise is on all four images of a point; outliers have random places in both current images.
     """
     arrays = RigArrays.of(rig)
-    columns: list[list[Float]] = [[] for _ in range(6)]
+    columns: list[list[AnyArray]] = [[] for _ in range(6)]
     for j, pair in enumerate(rig.pairs):
         n = per_pair
         focal = np.array([pair.left.focal_px, pair.right.focal_px])
@@ -128,7 +129,7 @@ def imu_at(time_s: float) -> tuple[Float, Float]:
     before, now, after = pose_at(time_s - h), pose_at(time_s), pose_at(time_s + h)
     turn = Rotation.from_matrix(before[:3, :3].T @ after[:3, :3]).as_rotvec()
     acceleration = (after[:3, 3] - 2.0 * now[:3, 3] + before[:3, 3]) / h**2
-    return turn / (2.0 * h), now[:3, :3].T @ (acceleration + [0.0, 0.0, GRAVITY_M_S2])
+    return turn / (2.0 * h), now[:3, :3].T @ (acceleration + UP)
 
 
 def filled_buffer(

@@ -15,9 +15,7 @@ def find(
 ) -> Float:
     everywhere = np.ones(image.shape, dtype=bool) if allowed is None else allowed
     good = np.ones(len(tracked), dtype=bool) if settled is None else settled
-    return find_corners(
-        image, everywhere, tracked, good, cell_px, SETTINGS.border_px, SETTINGS.min_response
-    )
+    return find_corners(image, everywhere, tracked, good, cell_px, SETTINGS.border_px, SETTINGS.min_response)
 
 
 def crossing(x: float, y: float, angle_rad: float = 0.0) -> Image:
@@ -25,7 +23,7 @@ def crossing(x: float, y: float, angle_rad: float = 0.0) -> Image:
     v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
     a = (u - x) * np.cos(angle_rad) + (v - y) * np.sin(angle_rad)
     b = (v - y) * np.cos(angle_rad) - (u - x) * np.sin(angle_rad)
-    return np.round(128.0 + 80.0 * np.tanh(a) * np.tanh(b)).astype(np.uint8)
+    return np.asarray(np.round(128.0 + 80.0 * np.tanh(a) * np.tanh(b)), dtype=np.uint8)
 
 
 def texture(seed: int = 0) -> Image:

@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import chi2
 from synthetic import random_transform, seen_points, transform, two_pair_rig
 
-from graphvio.arrays import Float
+from graphvio.arrays import AnyArray, Float, Int
 from graphvio.config import MotionConfig
 from graphvio.frontend.cost import left_motions, robust_cost
 from graphvio.frontend.observations import Observations, RigArrays
@@ -25,6 +25,11 @@ STILL = np.eye(4)
 
 def seed(number: int = 0) -> np.random.Generator:
     return np.random.default_rng(number)
+
+
+def take(seen: Observations, rows: Int) -> Observations:
+    columns: list[AnyArray] = [column[rows] for column in seen]
+    return Observations(*columns)
 
 
 def rho(pixels: Float, a: float) -> float:
@@ -50,10 +55,10 @@ def paper_cost(rig: Rig, pair: int, left_next_T_left_prev: Float, seen: Observat
 def test_cost_of_one_and_two_points_by_hand() -> None:
     focal, a = RIG.pairs[0].left.focal_px, 1.5
     seen = seen_points(RIG.with_pairs([0]), STILL, 2, seed())
-    one = Observations(*(column[:1] for column in seen))
+    one = take(seen, np.array([0]))
     arrays = RigArrays.of(RIG.with_pairs([0]))
     assert global_cost(arrays, one, STILL, a) == pytest.approx(0.0, abs=1e-12)
-    shifted = one._replace(left=one.left + [[3.0 / focal, 4.0 / focal]])
+    shifted = one._replace(left=one.left + np.array([3.0, 4.0]) / focal)
     assert global_cost(arrays, shifted, STILL, a) == pytest.approx(np.log(1.0 + 25.0 / a**2))  # a 2-vector, robustified
     alone = shifted._replace(has_right=np.array([False]), right=np.full((1, 2), np.nan))
     assert global_cost(arrays, alone, STILL, a) == pytest.approx(np.log(1.0 + 25.0 / a**2))
@@ -84,8 +89,9 @@ def test_global_cost_is_that_of_either_pairs_motion() -> None:
     seen = seen_points(RIG, TRUTH, 40, seed(1), sigma_px=1.0, outlier_share=0.2)
     seen = seen._replace(has_right=seed(2).random(80) < 0.7)
     p12, p21 = RIG.left2_T_left1(), np.linalg.inv(RIG.left2_T_left1())
+    rng = seed(3)
     for _ in range(10):
-        p1 = TRUTH @ random_transform(seed(3), 0.01, 0.05)
+        p1 = TRUTH @ random_transform(rng, 0.01, 0.05)
         p2 = p12 @ p1 @ p21  # eq. (1)
         cost1 = paper_cost(RIG, 0, p1, seen, 1.5) + paper_cost(RIG, 1, p12 @ p1 @ p21, seen, 1.5)  # eq. (3)
         cost2 = paper_cost(RIG, 1, p2, seen, 1.5) + paper_cost(RIG, 0, p21 @ p2 @ p12, seen, 1.5)
@@ -131,25 +137,23 @@ def test_preemption_keeps_the_best(chunk_points: int) -> None:
 def whitened_cost(seen: Observations, cur_T_ref: Float, weighed_at: Float, config: MotionConfig) -> float:
     """The refinement's cost in plain numpy, its weights ``S`` taken at a given motion."""
     total, sigma = 0.0, config.pixel_sigma_px
+
+    def predict(j: int, point: Float, motion: Float) -> Float:
+        left = ARRAYS.cam_T_body[j, 0] @ motion @ ARRAYS.body_T_left[j] @ [point[0], point[1], 1.0, point[2]]
+        right = RIG.pairs[j].right_T_left @ left
+        focal = ARRAYS.focal_px[j]
+        return np.concatenate([focal[0] * left[:2] / left[2], focal[1] * right[:2] / right[2]])
+
     for i, j in enumerate(seen.pair):
-        pair = RIG.pairs[j]
-
-        def predict(point: Float, motion: Float, pair: object = pair, j: int = j) -> Float:
-            left = ARRAYS.cam_T_body[j, 0] @ motion @ ARRAYS.body_T_left[j] @ [point[0], point[1], 1.0, point[2]]
-            right = RIG.pairs[j].right_T_left @ left
-            focal = ARRAYS.focal_px[j]
-            return np.concatenate([focal[0] * left[:2] / left[2], focal[1] * right[:2] / right[2]])
-
         point, h = seen.points[i], 1e-6
-        jacobian = np.column_stack(
-            [(predict(point + h * e, weighed_at) - predict(point - h * e, weighed_at)) / (2 * h) for e in np.eye(3)]
-        )
-        s = sigma**2 * (np.eye(4) + jacobian @ seen.covariances[i] @ jacobian.T)
+        ahead, behind = ([predict(j, point + step * e, weighed_at) for e in np.eye(3)] for step in (h, -h))
+        jacobian = (np.array(ahead) - np.array(behind)).T / (2.0 * h)
+        spread = sigma**2 * (np.eye(4) + jacobian @ seen.covariances[i] @ jacobian.T)
         places = np.concatenate([ARRAYS.focal_px[j, 0] * seen.left[i], ARRAYS.focal_px[j, 1] * seen.right[i]])
-        error = places - predict(point, cur_T_ref)
+        misfit = places - predict(j, point, cur_T_ref)
         rows = 4 if seen.has_right[i] else 2
-        e2 = error[:rows] @ np.linalg.solve(s[:rows, :rows], error[:rows])
-        total += np.log1p(e2 / (config.cauchy_scale_px / sigma) ** 2)
+        e2 = float(misfit[:rows] @ np.linalg.solve(spread[:rows, :rows], misfit[:rows]))
+        total += float(np.log1p(e2 / (config.cauchy_scale_px / sigma) ** 2))
     return float(total)
 
 
@@ -177,9 +181,6 @@ def test_truth_is_recovered_from_points_without_noise(pairs: list[int]) -> None:
         refined = refine(RigArrays.of(rig), seen, np.ascontiguousarray(start), replace(CONFIG, cauchy_scale_px=30.0))
         np.testing.assert_allclose(refined.cur_T_ref, TRUTH, atol=1e-6)
         assert refined.inlier.all()
-
-
-Solver = Callable[[RigArrays, Observations, Float, MotionConfig, np.random.Generator], object]
 
 
 @pytest.mark.parametrize("number", range(5))
@@ -211,18 +212,18 @@ def test_covariance_follows_the_noise_and_the_inflation() -> None:
     assert np.trace(loud[3:, 3:]) / np.trace(quiet[3:, 3:]) == pytest.approx(4.0, rel=0.4)
     seen = seen_points(RIG, TRUTH, 80, seed(9), sigma_px=0.3)
     plain = refine(ARRAYS, seen, TRUTH, CONFIG).covariance
-    np.testing.assert_allclose(refine(ARRAYS, seen, TRUTH, replace(CONFIG, sigma_inflation=2.0)).covariance, 4.0 * plain)
+    np.testing.assert_allclose(
+        refine(ARRAYS, seen, TRUTH, replace(CONFIG, sigma_inflation=2.0)).covariance, 4.0 * plain
+    )
 
 
 def test_directions_that_nothing_constrains_are_uncertain() -> None:
     seen = seen_points(RIG, STILL, 50, seed(10), sigma_px=0.3)
     far = seen._replace(points=seen.points * [1.0, 1.0, 0.0])  # at infinity: rotation only
-    rays = np.column_stack([far.points[:, :2], np.ones(100)])
     far = far._replace(left=far.points[:, :2].copy(), has_right=np.zeros(100, dtype=bool))
     refined = refine(ARRAYS, far, STILL, CONFIG)
     sigmas = np.sqrt(np.diag(refined.covariance))
     assert np.isfinite(refined.cur_T_ref).all()
-    assert rays.shape == (100, 3)
     assert sigmas[:3].max() < 1e-3
     assert sigmas[3:].min() > 1.0
 
@@ -258,7 +259,7 @@ def test_a_pair_without_points_changes_nothing() -> None:
 def test_swapping_pairs_changes_only_their_names() -> None:
     seen = noisy()
     order = np.concatenate([np.flatnonzero(seen.pair == 1), np.flatnonzero(seen.pair == 0)])
-    swapped = Observations(*(np.ascontiguousarray(column[order]) for column in seen))._replace(pair=1 - seen.pair[order])
+    swapped = take(seen, order)._replace(pair=1 - seen.pair[order])
     arrays = RigArrays.of(RIG.with_pairs([1, 0]))
     assert global_cost(arrays, swapped, TRUTH, 1.5) == pytest.approx(global_cost(ARRAYS, seen, TRUTH, 1.5), rel=1e-12)
     first, second = refine(ARRAYS, seen, STILL, CONFIG), refine(arrays, swapped, STILL, CONFIG)

@@ -53,7 +53,7 @@ def test_solutions_are_opencvs() -> None:
     for seed in range(300):
         points, rays, _ = three_points(seed)
         image = np.ascontiguousarray(rays[:, :2] / rays[:, 2:])
-        n, rotations, translations = cv2.solveP3P(points, image, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_P3P)
+        _, rotations, translations = cv2.solveP3P(points, image, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_P3P)
         expected = []
         for r, t in zip(rotations, translations, strict=True):
             pose = np.eye(4)
@@ -71,7 +71,7 @@ def test_solutions_are_opencvs() -> None:
 def test_an_equilateral_triangle_seen_straight_on() -> None:
     angle = 2.0 * np.pi / 3.0 * np.arange(3)
     points = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(3)])
-    seen = points + [0.0, 0.0, 4.0]
+    seen = points + np.array([0.0, 0.0, 4.0])
     poses, count = resect(points, seen / np.linalg.norm(seen, axis=1, keepdims=True))
     truth = np.eye(4)
     truth[2, 3] = 4.0
@@ -117,7 +117,7 @@ def test_quartic_roots_against_numpys(seed: int) -> None:
     ],
 )
 def test_quartic_with_known_roots(roots: list[float]) -> None:
-    found = roots_of(-2.5 * np.poly(roots))
+    found = roots_of(np.asarray(-2.5 * np.poly(roots), dtype=np.float64))
     for root in roots:
         assert np.abs(found - root).min() < 1e-3 * max(1.0, abs(root))
     for x in found:

@@ -73,7 +73,7 @@ def test_infinitely_far_points_are_regular() -> None:
 
 def test_negative_disparity_is_a_negative_inverse_depth() -> None:
     left = np.array([[0.1, 0.0]])
-    found, _, _ = triangulate(left, left + [[2.0 / FOCAL, 0.0]], RECTIFIED, FOCAL, FOCAL)
+    found, _, _ = triangulate(left, left + np.array([2.0 / FOCAL, 0.0]), RECTIFIED, FOCAL, FOCAL)
     assert found[0, 2] == pytest.approx(-2.0 / (FOCAL * BASELINE))
 
 
@@ -98,7 +98,7 @@ def test_covariance_against_monte_carlo(depth: float) -> None:
 def textured(seed: int = 0) -> Image:
     """Smooth random grey, finer than a patch, so that every place looks different."""
     grey = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal((240, 320)), (0, 0), 1.5)
-    return np.clip(128.0 + 150.0 * grey, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(128.0 + 150.0 * grey, 0, 255), dtype=np.uint8)
 
 
 def search(left: Image, right: Image, pixels: Float, nearest_m: float = 0.5) -> tuple[Float, Bool]:

@@ -101,11 +101,25 @@ def test_framesets_are_not_held_for_ever(odometry: Odometry, events: list[Event]
     assert "imu_not_covering" in kinds(odometry)
 
 
-def test_an_imu_that_comes_late_starts_a_new_epoch(odometry: Odometry, events: list[Event]) -> None:
+def test_framesets_before_the_imu_have_no_pose_and_start_nothing(odometry: Odometry, events: list[Event]) -> None:
     first = framesets(events)[0].stamp_ns
-    estimates = feed(odometry, [replaced for e in events if (replaced := _without_early_imu(e, first)) is not None])
+    estimates = feed(odometry, [kept for e in events if (kept := _without_early_imu(e, first)) is not None])
     assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(events)]
+    assert all(e.status is Status.INITIALISING and e.nav_T_body is None for e in estimates[:20])
+    assert all(e.nav_T_body is not None and e.epoch == 0 for e in estimates[20:])
+    assert kinds(odometry) == []
+
+
+def test_an_imu_that_comes_after_a_start_without_opens_an_epoch(room_walk: Path, events: list[Event]) -> None:
+    rig = open_source(room_walk).rig
+    config = Config.from_yaml("timing: {max_imu_start_wait_s: 0.5}")
+    first = framesets(events)[0].stamp_ns
+    late = Odometry(rig, config)
+    estimates = feed(late, [kept for e in events if (kept := _without_early_imu(e, first)) is not None])
     assert all(e.nav_T_body is not None for e in estimates)
+    assert [estimates[0].epoch, estimates[-1].epoch] == [0, 1]
+    assert kinds(late)[0] == "started_without_imu"
+    assert estimates[-1].gyro_bias is not None
 
 
 def _without_early_imu(event: Event, first_ns: int) -> Event | None:

@@ -47,9 +47,9 @@ class ImuBuffer:
         self._max_gap_ns = round(max_gap_ms * 1e6)
 
     @property
-    def latest_ns(self) -> int | None:
-        """Stamp of the newest sample, or None."""
-        return self._stamps[-1] if self._stamps else None
+    def oldest_ns(self) -> int | None:
+        """Stamp of the oldest sample, or None."""
+        return self._stamps[0] if self._stamps else None
 
     def add(self, sample: ImuSample) -> str:
         """Take a sample; the name of its fault if it cannot be used, or an empty string."""

@@ -43,13 +43,28 @@ class RigState:
     accel_bias: Float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StartUncertainty:
-    """Standard deviations of a start; position and heading are the frame's origin and known."""
+    """How well a start is known.
 
-    tilt_rad: float
+    Attributes:
+        pose: (6, 6) covariance of the pose, tangent ``[rotation, translation]`` in body.
+        velocity_m_s: standard deviation of each component.
+        gyro_bias_rad_s: standard deviation of each component.
+    """
+
+    pose: Float
     velocity_m_s: float
     gyro_bias_rad_s: float
+
+
+def origin_covariance(nav_R_body: Float, tilt_sigma_rad: float) -> Float:
+    """Covariance (6, 6) of a pose whose position and heading define nav, and whose roll and pitch are measured."""
+    about_nav = np.diag([tilt_sigma_rad, tilt_sigma_rad, _HEADING_SIGMA_RAD]) ** 2
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = nav_R_body.T @ about_nav @ nav_R_body
+    covariance[3:, 3:] = np.eye(3) * _POSITION_SIGMA_M**2
+    return covariance
 
 
 class Smoother:
@@ -83,12 +98,7 @@ class Smoother:
         self._previous_motion = np.zeros(6)
         k = self._append(stamp_ns, state)
         self._constrained_ns = stamp_ns
-        rotation = state.nav_T_body[:3, :3]
-        tilt = np.diag([uncertainty.tilt_rad, uncertainty.tilt_rad, _HEADING_SIGMA_RAD]) ** 2  # about nav's axes
-        covariance = np.zeros((6, 6))
-        covariance[:3, :3] = rotation.T @ tilt @ rotation
-        covariance[3:, 3:] = np.eye(3) * _POSITION_SIGMA_M**2
-        pose_noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        pose_noise = gtsam.noiseModel.Gaussian.Covariance(uncertainty.pose)
         self._window.add(gtsam.PriorFactorPose3(_x(k), gtsam.Pose3(state.nav_T_body), pose_noise))
         if self.has_imu:
             self._window.add(

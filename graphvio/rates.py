@@ -1,0 +1,40 @@
+"""Angular rates of body by gyro, by vision and by both (the paper's figure 5)."""
+
+from __future__ import annotations
+
+from graphvio.arrays import Float
+from graphvio.backend.inertial import ImuSpan
+from graphvio.frontend.visual import RelativeMotion
+from graphvio.geometry import se3_inverse, so3_log
+
+
+class AngularRates:
+    """Turns successive measured motions, which may share a reference, into rates over the newest interval."""
+
+    def __init__(self) -> None:
+        self._before: RelativeMotion | None = None
+
+    def update(
+        self, motion: RelativeMotion | None, span: ImuSpan | None, gyro_bias: Float, fused: Float | None
+    ) -> dict[str, Float]:
+        """Rates (3,) rad/s in body by ``gyro``, ``vision`` and ``fused``, as far as known.
+
+        Args:
+            motion: measured motion that ends in the newest frameset, or None.
+            span: the IMU since the frameset before, or None.
+            gyro_bias: (3,) rad/s.
+            fused: (3,) rad/s by the smoother, or None.
+        """
+        rates: dict[str, Float] = {}
+        if span is not None:
+            rates["gyro"] = span.mean_rate - gyro_bias
+        before, self._before = self._before, motion
+        if motion is not None:
+            earlier_T_now, since_ns = motion.reference_T_current, motion.reference_stamp_ns
+            if before is not None and before.reference_stamp_ns == since_ns:
+                earlier_T_now = se3_inverse(before.reference_T_current) @ earlier_T_now
+                since_ns = before.stamp_ns
+            rates["vision"] = so3_log(earlier_T_now[:3, :3].copy()) / ((motion.stamp_ns - since_ns) * 1e-9)
+        if fused is not None:
+            rates["fused"] = fused
+        return rates

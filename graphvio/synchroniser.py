@@ -1,0 +1,103 @@
+"""Brings IMU and framesets together: holds a frameset until the samples that cover it have come."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+
+from graphvio.backend.inertial import ImuBuffer, ImuSpan
+from graphvio.config import Config
+from graphvio.events import FrameSet, ImuSample
+from graphvio.rig import Rig
+
+Report = Callable[[int, str, str], None]
+"""Takes stamp, kind and detail of an incident."""
+
+
+class Synchroniser:
+    """Framesets in time order, each with the IMU up to its instant.
+
+    Args:
+        rig: tells the number of pairs, whether there is an IMU, and its time offset.
+        config: tells how long things are waited for.
+        report: is told what had to be left out.
+    """
+
+    def __init__(self, rig: Rig, config: Config, report: Report) -> None:
+        self._pairs = len(rig.pairs)
+        self._has_imu = rig.imu is not None
+        self._offset_ns = rig.imu.time_offset_ns if rig.imu is not None else 0
+        self._timing = config.timing
+        self._initialisation = config.initialisation
+        self._report = report
+        self._imu = ImuBuffer(config.timing.max_imu_gap_ms)
+        self._held: deque[FrameSet] = deque()
+        self._newest_ns: int | None = None
+
+    def add_sample(self, sample: ImuSample) -> None:
+        """Take a sample of the IMU."""
+        fault = self._imu.add(sample)
+        if fault:
+            self._report(sample.stamp_ns, fault, "sample left out")
+
+    def add_frameset(self, frameset: FrameSet) -> None:
+        """Take a frameset; time never goes back."""
+        if self._newest_ns is not None and frameset.stamp_ns <= self._newest_ns:
+            self._report(frameset.stamp_ns, "frameset_backward_stamp", "frameset left out: time never goes back")
+            return
+        unknown = [j for j in frameset.images if not 0 <= j < self._pairs]
+        if unknown:
+            self._report(frameset.stamp_ns, "unknown_pair", f"pair {unknown[0]} is not in the rig: left out")
+            frameset = replace(frameset, images={j: v for j, v in frameset.images.items() if j not in unknown})
+        self._newest_ns = frameset.stamp_ns
+        self._held.append(frameset)
+
+    def next_due(self, *, started: bool) -> FrameSet | None:
+        """The oldest held frameset if it need wait no longer; the first one waits for samples to start from."""
+        if not self._held or not self._is_due(self._held[0], started):
+            return None
+        return self._held.popleft()
+
+    def next_held(self) -> FrameSet | None:
+        """The oldest held frameset, due or not, or None."""
+        return self._held.popleft() if self._held else None
+
+    def span(self, start_ns: int, end_ns: int) -> ImuSpan | None:
+        """The IMU between two framesets' stamps, or None where it does not cover them."""
+        return self._imu.span(start_ns + self._offset_ns, end_ns + self._offset_ns)
+
+    def initial_span(self, stamp_ns: int) -> tuple[ImuSpan, float] | None:
+        """The IMU around a frameset, and the frameset's place in it in seconds, once it is long enough."""
+        at_ns = stamp_ns + self._offset_ns
+        window_ns, least_ns = (
+            round(s * 1e9) for s in (self._initialisation.window_s, self._initialisation.min_window_s)
+        )
+        if not self._has_imu or not self._imu.covers(at_ns):
+            return None
+        for end_ns in (at_ns, at_ns + least_ns):
+            found = self._imu.stretch(at_ns - window_ns, end_ns)
+            if found is not None and found[0].steps_s.sum() >= 0.95e-9 * least_ns:
+                return found[0], (at_ns - found[1]) * 1e-9
+        return None
+
+    def precedes_imu(self, stamp_ns: int) -> bool:
+        """Whether the first sample of the IMU is later than a frameset."""
+        return self._imu.oldest_ns is not None and stamp_ns + self._offset_ns < self._imu.oldest_ns
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop samples that are older than a start at this frameset's stamp would need."""
+        self._imu.discard_before(stamp_ns + self._offset_ns - round(self._initialisation.window_s * 1e9))
+
+    def _is_due(self, frameset: FrameSet, started: bool) -> bool:
+        if not self._has_imu:
+            return True
+        assert self._newest_ns is not None
+        waited_ns = self._newest_ns - frameset.stamp_ns
+        if not started:
+            if self.precedes_imu(frameset.stamp_ns):
+                return True
+            enough = self.initial_span(frameset.stamp_ns) is not None
+            return enough or waited_ns > self._timing.max_imu_start_wait_s * 1e9
+        covered = self._imu.covers(frameset.stamp_ns + self._offset_ns)
+        return covered or waited_ns > self._timing.max_imu_wait_ms * 1e6
