@@ -85,6 +85,13 @@ def test_the_mask_is_respected() -> None:
     assert len(found) > 5
     assert not np.any((found[:, 0] > 100.5) & (found[:, 0] < 218.5))
     assert len(find(texture(), allowed=np.zeros_like(allowed))) == 0
+    first = find(texture())
+    whole = np.round(first).astype(int)
+    for shift in (0, 2):
+        dots = np.zeros_like(allowed)
+        dots[whole[:, 1], whole[:, 0] + shift] = True
+        again = find(texture(), allowed=dots)
+        assert len(again) > 0.9 * len(first) if shift == 0 else len(again) < 0.2 * len(first)
 
 
 def test_cells_with_a_settled_track_get_no_other() -> None:
