@@ -103,6 +103,19 @@ def undistort(model: int, distortion: Float, xd: float, yd: float) -> tuple[floa
 
 
 @kernel
+def fold_radius(model: int, distortion: Float) -> float:
+    """The normalised radius from which on distortion maps outer points inwards again, at most tan(80 degrees)."""
+    radius = 0.0
+    while radius < _MAX_TAN:
+        _, _, slope, _, _, _ = distort(model, distortion, radius, 0.0)
+        _, _, _, _, _, slope_y = distort(model, distortion, 0.0, radius)
+        if slope <= 0.0 or slope_y <= 0.0:
+            return radius
+        radius += 0.01
+    return _MAX_TAN
+
+
+@kernel
 def project_points(model: int, intrinsics: Float, distortion: Float, points: Float) -> tuple[Float, Bool]:
     """Pixels of points in the camera frame.
 
@@ -118,12 +131,13 @@ def project_points(model: int, intrinsics: Float, distortion: Float, points: Flo
     n = len(points)
     pixels = np.zeros((n, 2))
     valid = np.zeros(n, dtype=np.bool_)
+    limit = fold_radius(model, distortion)
     for i in range(n):
         z = points[i, 2]
         if not z > 1e-6:  # also refuses NaN
             continue
         x, y = points[i, 0] / z, points[i, 1] / z
-        if not x * x + y * y < _MAX_TAN * _MAX_TAN:
+        if not x * x + y * y < limit * limit:
             continue
         xd, yd, a, b, c, d = distort(model, distortion, x, y)
         pixels[i, 0] = intrinsics[0] * xd + intrinsics[2]

@@ -14,6 +14,13 @@ from typing import Any, Literal, get_args, get_type_hints
 
 from graphvio.errors import ConfigError
 
+_LARGEST = 1e12
+_MAY_BE_ZERO = frozenset(
+    ("seed", "border_px", "settle_s", "keyframe_overlap", "min_inliers", "min_inlier_share", "min_response",
+     "min_correlation", "max_gated_s", "max_imu_wait_ms", "max_imu_start_wait_s")
+)  # fmt: skip
+_SHARES = ("_share", "_overlap", "_probability", "_correlation")
+
 
 @dataclass(frozen=True)
 class CornerConfig:
@@ -221,15 +228,20 @@ def _checked(hint: Any, value: object, where: str) -> object:
         if value not in choices:
             raise ConfigError(f"{where}: is {value!r}; choose one of {', '.join(map(str, choices))}")
         return value
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if hint is float and number:
-        as_float = float(value)  # type: ignore[arg-type]
-        if not 0.0 <= as_float < float("inf"):
-            raise ConfigError(f"{where}: is {value!r}; it must be finite and not negative")
-        return as_float
-    if hint is int and number and value == int(value) and value >= 0:  # type: ignore[call-overload, operator]
-        return int(value)  # type: ignore[call-overload]
-    raise ConfigError(f"{where}: is {value!r}; it must be {'a number' if hint is float else 'a whole number from 0'}")
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise ConfigError(f"{where}: is {value!r}; it must be a number")
+    if not 0 <= value <= _LARGEST:  # also refuses NaN
+        raise ConfigError(f"{where}: is {value!r}; it must be finite and not negative")
+    name = where.rsplit(" ", 1)[-1]
+    if value == 0 and name not in _MAY_BE_ZERO:
+        raise ConfigError(f"{where}: is 0; it must be positive")
+    if name.endswith(_SHARES) and value > 1:
+        raise ConfigError(f"{where}: is {value!r}; a share or probability is at most 1")
+    if hint is float:
+        return float(value)
+    if value != int(value):
+        raise ConfigError(f"{where}: is {value!r}; it must be a whole number")
+    return int(value)
 
 
 def _nearest(key: str, names: object) -> str:

@@ -22,6 +22,7 @@ from graphvio.rig import Rig
 from graphvio.synchroniser import Synchroniser
 
 _MAX_UNBRIDGED_S = 3.0
+_UNKNOWN_SPEED_SIGMA = 30.0  # without an IMU the first motion is believed whatever it is, on foot or on the road
 _MOVING_START_SPEED_SIGMA = 2.0
 _RESTING_START_SPEED_SIGMA = 0.02
 _RESTART_SPEED_SIGMA = 1.0
@@ -213,12 +214,13 @@ class Odometry:
             self._report(stamp_ns, "started_without_imu", "no IMU samples came: vision alone from here")
         self._smoother = Smoother(self.config.smoother, self.rig.imu if found else None)
         if found is None:
-            at = InitialAttitude(self._upright_camera(), 1e-3, np.zeros(3), 1.0, True)
+            at = InitialAttitude(self._upright_camera(), 1e-3, np.zeros(3), 1.0, False)
+            speed_sigma = _UNKNOWN_SPEED_SIGMA
         else:
             at = initial_attitude(*found, config)
-        if not at.at_rest:
-            self._settled_ns = stamp_ns + round(config.settle_s * 1e9)
-        speed_sigma = _RESTING_START_SPEED_SIGMA if at.at_rest else _MOVING_START_SPEED_SIGMA
+            speed_sigma = _RESTING_START_SPEED_SIGMA if at.at_rest else _MOVING_START_SPEED_SIGMA
+            if not at.at_rest:
+                self._settled_ns = stamp_ns + round(config.settle_s * 1e9)
         self._smoother.start(
             stamp_ns,
             RigState(se3(at.nav_R_body, position), np.zeros(3), at.gyro_bias, np.zeros(3)),

@@ -48,9 +48,7 @@ def frame_stamps(frames: int) -> list[int]:
     return [START_NS + i * FRAME_PERIOD_NS for i in range(frames)]
 
 
-def noise_image(
-    seed: int, size_px: tuple[int, int] = SIZE_PX
-) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
+def noise_image(seed: int, size_px: tuple[int, int] = SIZE_PX) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
     """A grey image (height, width) that is the same for the same seed."""
     return np.random.default_rng(seed).integers(0, 256, (size_px[1], size_px[0]), dtype=np.uint8)
 
@@ -61,9 +59,7 @@ def write_image(path: Path, image: np.ndarray[tuple[int, ...], np.dtype[np.uint8
     assert cv2.imwrite(str(path), image)
 
 
-def write_euroc(
-    path: Path, pairs: int = 2, frames: int = 10, imu: bool = True, rig: Rig | None = None
-) -> Path:
+def write_euroc(path: Path, pairs: int = 2, frames: int = 10, imu: bool = True, rig: Rig | None = None) -> Path:
     """Write an EuRoC/ASL recording with a ``sensor.yaml`` per sensor; returns its path.
 
     Frames come every 50 ms from `START_NS`; the IMU, at 200 Hz and at rest, from 1 s before to 0.1 s after.
@@ -158,9 +154,7 @@ def write_kitti_odometry(path: Path, frames: int = 5, cameras: tuple[int, int] =
         for i in range(frames):
             write_image(path / f"image_{number}" / f"{i:06d}.png", noise_image(100 * number + i))
     write_rows(path / "times.txt", [f"{0.1 * i:e}" for i in range(frames)])
-    write_rows(
-        path / "calib.txt", [f"P{i}: {text}" for i, text in KITTI_P.items()] + ["Tr: 1 0 0 0 0 1 0 0 0 0 1 0"]
-    )
+    write_rows(path / "calib.txt", [f"P{i}: {text}" for i, text in KITTI_P.items()] + ["Tr: 1 0 0 0 0 1 0 0 0 0 1 0"])
     return path
 
 

@@ -170,17 +170,12 @@ def test_a_turn_is_integrated_better_at_a_higher_rate() -> None:
     assert fine[1] < 0.15 * coarse[1]
 
 
-HALF_STEP = "a step's force is turned by the attitude at the step's start, not at its middle, to which it belongs"
-
-
-@pytest.mark.xfail(strict=True, reason=HALF_STEP)
 def test_a_turn_under_constant_force_is_exact() -> None:
     velocity_error, position_error = turning_errors(200.0)
     assert velocity_error < 1e-4
     assert position_error < 1e-4
 
 
-@pytest.mark.xfail(strict=True, reason=HALF_STEP)
 def test_a_walk_is_integrated_from_its_samples() -> None:
     imu, rng = Imu(), np.random.default_rng(0)
     buffer = filled_buffer(imu, 3.0, rng, np.zeros(3), np.zeros(3), noise_scale=0.0)

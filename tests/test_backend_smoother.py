@@ -125,7 +125,6 @@ def test_a_walk_without_imu() -> None:
     assert 2.5 < np.mean(nees) < 10.0
 
 
-@pytest.mark.xfail(strict=True, reason="without an IMU the speed at the start is taken for zero and well known")
 def test_a_start_in_motion_without_imu_is_no_outlier() -> None:
     smoother = Smoother(CONFIG, None)
     standing = RigState(pose_at(0.0), np.zeros(3), np.zeros(3), np.zeros(3))

@@ -135,7 +135,6 @@ def test_what_is_not_constrained_has_no_solution_and_no_covariance() -> None:
         loose_window().joint_covariance([x(0), x(1)])
 
 
-@pytest.mark.xfail(strict=True, reason="it is left as it is, or an IndexError or ValueError escapes")
 @pytest.mark.parametrize(
     "use",
     [lambda w: w.optimise(), lambda w: w.joint_covariance([x(5)]), lambda w: w.marginalise([x(5)])],

@@ -67,7 +67,6 @@ def test_solutions_are_opencvs() -> None:
     assert agree >= 290
 
 
-@pytest.mark.xfail(strict=True, reason="where cos_g = v cos_a, u is not given by the equation that is used for it")
 def test_an_equilateral_triangle_seen_straight_on() -> None:
     angle = 2.0 * np.pi / 3.0 * np.arange(3)
     points = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(3)])

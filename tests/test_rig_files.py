@@ -171,9 +171,7 @@ def test_refused(tmp_path: Path, name: str) -> None:
 
 
 def test_pair_without_baseline_or_with_diverging_axes_is_refused(tmp_path: Path) -> None:
-    document = edited(
-        tmp_path, lambda d: d["pairs"][0]["right"].update(body_T_cam=d["pairs"][0]["left"]["body_T_cam"])
-    )
+    document = edited(tmp_path, lambda d: d["pairs"][0]["right"].update(body_T_cam=d["pairs"][0]["left"]["body_T_cam"]))
     with pytest.raises(RigError, match=r"baseline is 0\.000 mm"):
         load_rig(document)
     other = edited(tmp_path, lambda d: d["pairs"][0].update(right=d["pairs"][1]["left"]), pairs=2)

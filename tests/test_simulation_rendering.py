@@ -29,9 +29,7 @@ def board_world(world_T_board: Float) -> World:
     corner = np.array([-0.5 * BOARD_M, -0.5 * BOARD_M, 0.0])
     rotation = world_T_board[:3, :3]
     origin = rotation @ corner + world_T_board[:3, 3]
-    world.rectangles.append(
-        Rectangle(origin, BOARD_M * rotation[:, 0], BOARD_M * rotation[:, 1], "board", fit=True)
-    )
+    world.rectangles.append(Rectangle(origin, BOARD_M * rotation[:, 0], BOARD_M * rotation[:, 1], "board", fit=True))
     return world
 
 
@@ -78,9 +76,7 @@ def tracked(first: Image, second: Image, points: Float, guess: Float) -> tuple[F
     use_guess = cv2.OPTFLOW_USE_INITIAL_FLOW
 
     def flow(a: Image, b: Image, p: NDArray[np.float32], q: NDArray[np.float32]) -> tuple[Float, AnyArray]:
-        moved, ok, _ = cv2.calcOpticalFlowPyrLK(
-            a, b, p, q.copy(), winSize=(15, 15), maxLevel=1, flags=use_guess
-        )
+        moved, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, p, q.copy(), winSize=(15, 15), maxLevel=1, flags=use_guess)
         return np.asarray(moved, dtype=np.float64), np.asarray(ok).ravel() > 0
 
     found, ok = flow(first, second, start, there)

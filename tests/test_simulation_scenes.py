@@ -72,10 +72,7 @@ def test_door_fills_the_front_view(corridor: Simulator) -> None:
 def test_people_pass_both_pairs(corridor: Simulator) -> None:
     start, end = corridor.scene.events["people"]
     for camera in (0, 2):
-        seen = [
-            corridor.view(at(corridor, t), camera).is_moving.mean()
-            for t in np.arange(start + 2, end - 2, 0.5)
-        ]
+        seen = [corridor.view(at(corridor, t), camera).is_moving.mean() for t in np.arange(start + 2, end - 2, 0.5)]
         assert max(seen) > 0.1
 
 

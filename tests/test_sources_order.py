@@ -110,9 +110,7 @@ def test_match_sides(steps: list[int], jitter: list[int], lost_left: set[int], l
 def test_group_pairs(steps: list[int], lost: list[set[int]], delay_ns: list[int]) -> None:
     truth = np.cumsum(steps) * MS
     present = [[i for i in range(len(steps)) if i not in gone] for gone in lost]
-    pairs = [
-        match_sides(truth[i] + delay, truth[i] + delay) for i, delay in zip(present, delay_ns, strict=True)
-    ]
+    pairs = [match_sides(truth[i] + delay, truth[i] + delay) for i, delay in zip(present, delay_ns, strict=True)]
     index = group_pairs(pairs)
     instants = sorted(set().union(*present))
     assert len(index.stamps_ns) == len(instants)

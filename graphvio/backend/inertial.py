@@ -11,6 +11,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.events import ImuSample
+from graphvio.geometry import so3_exp
 from graphvio.rig import Imu
 
 GRAVITY_M_S2 = 9.81
@@ -118,11 +119,18 @@ def preintegration_params(imu: Imu, noise_scale: float) -> gtsam.PreintegrationC
 def preintegrate(
     span: ImuSpan, params: gtsam.PreintegrationCombinedParams, bias: gtsam.imuBias.ConstantBias
 ) -> gtsam.PreintegratedCombinedMeasurements:
-    """Preintegrate a span, linearised at a bias."""
+    """Preintegrate a span, linearised at a bias.
+
+    A step's mean force belongs to its middle, and gtsam takes it to be in the frame at the step's start: it is turned
+    there by half of the step's rotation.
+    """
     measurements = gtsam.PreintegratedCombinedMeasurements(params, bias)
+    accel_bias, gyro_bias = bias.accelerometer(), bias.gyroscope()
     for force, rate, step in zip(span.linear_acceleration, span.angular_velocity, span.steps_s, strict=True):
         if step > 0.0:
-            measurements.integrateMeasurement(force, rate, step)
+            start_R_middle = so3_exp(0.5 * step * (rate - gyro_bias))
+            at_start = start_R_middle @ (force - accel_bias) + accel_bias
+            measurements.integrateMeasurement(at_start, rate, step)
     return measurements
 
 

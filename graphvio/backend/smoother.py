@@ -24,6 +24,7 @@ from graphvio.rig import Imu
 _POSITION_SIGMA_M = 1e-3
 _HEADING_SIGMA_RAD = 1e-3
 _ACCEL_BIAS_SIGMA = 0.2
+_UNKNOWN_RATE_SIGMA_RAD_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +81,7 @@ class Smoother:
         self._index_of: dict[int, int] = {}
         self._previous_motion = np.zeros(6)  # tangent per second
         self._constrained_ns = 0  # stamp of the newest state whose motion was measured
+        self._rate_sigmas = np.zeros(2)  # of `_previous_motion`: rad/s and m/s
 
     @property
     def has_imu(self) -> bool:
@@ -95,7 +97,9 @@ class Smoother:
         """Begin, or begin anew, with one state."""
         self._window = Window()
         self._stamps, self._index_of = [], {}
-        self._previous_motion = np.zeros(6)
+        velocity_body = state.nav_T_body[:3, :3].T @ state.velocity_nav
+        self._previous_motion = np.concatenate([np.zeros(3), velocity_body])
+        self._rate_sigmas = np.array([_UNKNOWN_RATE_SIGMA_RAD_S, uncertainty.velocity_m_s])
         k = self._append(stamp_ns, state)
         self._constrained_ns = stamp_ns
         pose_noise = gtsam.noiseModel.Gaussian.Covariance(uncertainty.pose)
@@ -183,6 +187,7 @@ class Smoother:
     def accept(self, motion: RelativeMotion) -> None:
         """Insert a motion that ends in the newest state."""
         self._constrained_ns = motion.stamp_ns
+        self._rate_sigmas = np.zeros(2)
         self._window.add(
             gtsam.BetweenFactorPose3(
                 _x(self._index_of[motion.reference_stamp_ns]),
@@ -231,7 +236,7 @@ class Smoother:
         after = (self.latest_ns - self._constrained_ns) * 1e-9
         growth = 0.5 * np.sqrt(after**4 - (after - dt) ** 4)
         accelerations = [config.motion_angular_accel_sigma_rad_s2, config.motion_accel_sigma_m_s2]
-        sigmas = np.repeat(np.array(accelerations) * growth, 3)
+        sigmas = np.repeat(np.hypot(np.array(accelerations) * growth, self._rate_sigmas * dt), 3)
         self._window.add(
             gtsam.BetweenFactorPose3(_x(i), _x(j), gtsam.Pose3(motion), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
         )

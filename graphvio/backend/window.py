@@ -71,6 +71,9 @@ class Window:
         leaving = frozenset(keys)
         if not leaving:
             return
+        constrained = frozenset().union(*(involved for involved, _ in self._factors))
+        if not leaving <= constrained:
+            raise WindowError("a state cannot be marginalised: no factor constrains it")
         graph = gtsam.NonlinearFactorGraph()
         staying: list[tuple[frozenset[int], gtsam.NonlinearFactor]] = []
         for involved, factor in self._factors:
@@ -95,6 +98,9 @@ class Window:
 
     def _solve(self) -> gtsam.GaussianBayesTree:
         if self._solution is None:
+            loose = set(self.values.keys()).difference(*(involved for involved, _ in self._factors))
+            if loose:
+                raise WindowError(f"no factor constrains variable {gtsam.DefaultKeyFormatter(min(loose))}")
             graph = gtsam.NonlinearFactorGraph()
             for _, factor in self._factors:
                 graph.push_back(factor)

@@ -91,7 +91,19 @@ def _distance2(pixels: Float, x: float, y: float) -> float:
 
 @kernel
 def _harris(image: Image, x0: int, y0: int, x1: int, y1: int) -> tuple[Float, Float]:
-    """Harris response, and rms gradient along the weaker direction, of the pixels [y0:y1, x0:x1]."""
+    """Harris response, and rms gradient along the weaker direction, of the pixels [y0:y1, x0:x1].
+
+    The response is smoothed, because a box window leaves it level over several pixels around a corner.
+    """
+    response, weaker = _raw_harris(image, x0 - 1, y0 - 1, x1 + 1, y1 + 1)
+    across = response[:, :-2] + 2.0 * response[:, 1:-1] + response[:, 2:]
+    smooth = (across[:-2] + 2.0 * across[1:-1] + across[2:]) / 16.0
+    return smooth, weaker[1:-1, 1:-1]
+
+
+@kernel
+def _raw_harris(image: Image, x0: int, y0: int, x1: int, y1: int) -> tuple[Float, Float]:
+    """Both for each pixel by itself."""
     w, h = x1 - x0, y1 - y0
     wide, high = w + 2 * _RADIUS, h + 2 * _RADIUS
     sums = np.zeros((3, high, w))  # of gxx, gxy, gyy along x

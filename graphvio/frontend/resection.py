@@ -51,9 +51,12 @@ def resect(points: Float, rays: Float) -> tuple[Float, int]:
     for i in range(n_roots):
         v = roots[i]
         denominator = 2.0 * (cos_g - v * cos_a)
-        if v <= 0.0 or abs(denominator) < 1e-12:
+        if v <= 0.0:
             continue
-        u = ((p - 1.0) * v * v - 2.0 * p * cos_b * v + 1.0 + p) / denominator
+        if abs(denominator) > 1e-6:
+            u = ((p - 1.0) * v * v - 2.0 * p * cos_b * v + 1.0 + p) / denominator
+        else:  # 0/0, such as for an equilateral triangle seen straight on
+            u = _side_ratio(v, cos_a, cos_b, cos_g, a2 / b2, c2 / b2)
         s1_squared = b2 / (1.0 + v * v - 2.0 * v * cos_b)
         if u <= 0.0 or not s1_squared > 0.0:
             continue
@@ -62,6 +65,19 @@ def resect(points: Float, rays: Float) -> tuple[Float, int]:
         if _align_triangles(points, seen, poses[count]):
             count += 1
     return poses, count
+
+
+@kernel
+def _side_ratio(v: float, cos_a: float, cos_b: float, cos_g: float, a2_b2: float, c2_b2: float) -> float:
+    """The u = s2 / s1 that the side a demands, and of its two values the one that fits the side c better."""
+    first = 1.0 + v * v - 2.0 * v * cos_b
+    half = np.sqrt(max((v * cos_a) ** 2 - v * v + a2_b2 * first, 0.0))
+    best, least = 0.0, np.inf
+    for u in (v * cos_a - half, v * cos_a + half):
+        misfit = abs(1.0 + u * u - 2.0 * u * cos_g - c2_b2 * first)
+        if misfit < least:
+            best, least = u, misfit
+    return best
 
 
 @kernel
