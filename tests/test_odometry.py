@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphvio import Config, Estimate, FrameSet, ImuSample, Odometry, Status, open_source
+from graphvio import Config, Estimate, FrameSet, ImuSample, Odometry, RigError, Status, open_source
+from graphvio.arrays import Image
 from graphvio.events import Event
 from graphvio.trajectory import Trajectory
 
@@ -124,6 +125,15 @@ def test_an_imu_that_comes_after_a_start_without_opens_an_epoch(room_walk: Path,
 
 def _without_early_imu(event: Event, first_ns: int) -> Event | None:
     return None if isinstance(event, ImuSample) and event.stamp_ns < first_ns + 1_000_000_000 else event
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.zeros((240, 320), np.uint8), np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640))]
+)
+def test_images_that_are_not_the_rigs_are_refused(room_walk: Path, wrong: Image) -> None:
+    odometry = Odometry(open_source(room_walk).rig.without_imu())
+    with pytest.raises(RigError, match="cam0: image has shape"):
+        odometry.process(FrameSet(1, {0: (wrong, wrong)}))
 
 
 def test_time_never_goes_back(odometry: Odometry, events: list[Event]) -> None:

@@ -67,11 +67,11 @@ def run(
     chosen = _choose(opened.rig, pairs, no_imu)
     if chosen is not opened.rig:
         opened = open_source(source, chosen, from_s=from_s, to_s=to_s)
-    if is_first_use():
-        typer.echo("compiling numerical kernels for this machine, once: about a minute", err=True)
-    warm_up(opened.rig, settings)
     with ExitStack() as stack:
         viewer = stack.enter_context(Viewer(opened.rig, spawn=view, save=save_rrd)) if view or save_rrd else None
+        if is_first_use():
+            typer.echo("compiling numerical kernels for this machine, once: about a minute", err=True)
+        warm_up(opened.rig, settings)
         folder = out if out is not None else ResultWriter.new_folder(Path("results"), opened.name)
         line = stack.enter_context(_ProgressLine())
         summary = run_pipeline(opened, settings, folder, viewer=viewer, on_progress=line.show)

@@ -76,7 +76,11 @@ class PairTracker:
             left: (height, width).
             right: (height, width).
             left_T_left_prev: (4, 4) predicted motion of points since the images before, or None if unknown.
+
+        Raises:
+            RigError: if an image is not what the rig says.
         """
+        left, right = _checked(left, self._pair.left), _checked(right, self._pair.right)
         rejected: dict[str, int] = {}
         kept, pixels, inverse_depth = self._follow(left, left_T_left_prev, rejected)
         new = self._renew(left, pixels, np.isfinite(inverse_depth))
@@ -128,8 +132,6 @@ class PairTracker:
         last = self._last
         if last is None or self._last_image is None:
             return _NOTHING, np.zeros((0, 2)), np.zeros(0)
-        if self._last_image.shape != image.shape:
-            raise RigError(f"pair {self._pair.name}: image size changed to {image.shape[::-1]}; one rig has one size")
         last = last.keep(last.flat_for <= _MAX_FLAT_FRAMES)
         guess, inverse_depth = last.pixels, np.where(last.has_depth, last.points[:, 2], np.nan)
         if left_T_left_prev is not None:
@@ -236,6 +238,17 @@ def _thinned(pixels: Float, found: Bool, cell_px: int) -> Bool:
         taken[cell] = taken.get(cell, 0) + 1
         keep[i] = taken[cell] <= _MAX_TRACKS_PER_CELL
     return keep
+
+
+def _checked(image: Image, camera: Camera) -> Image:
+    """The image, contiguous; the kernels trust its type and size."""
+    width, height = camera.size_px
+    if image.dtype != np.uint8 or image.shape != (height, width):
+        raise RigError(
+            f"camera {camera.name}: image has shape {image.shape} and type {image.dtype}; the rig says grey, "
+            f"({height}, {width}), uint8"
+        )
+    return np.ascontiguousarray(image)
 
 
 def _allowed(camera: Camera) -> Bool:
