@@ -46,12 +46,16 @@ def robust_cost(
     motions = left_motions(cur_T_ref, rig)
     inverse_a2 = 1.0 / (cauchy_scale_px * cauchy_scale_px)
     total = 0.0
+    product = 1.0  # sum of logarithms = logarithm of the product, which is much cheaper
     for i in rows:
         j = observations.pair[i]
         point = observations.points[i]
         e2 = squared_error_px(motions[j, 0], point, observations.left[i], rig.focal_px[j, 0])
-        total += np.log1p(min(e2 * inverse_a2, 1e6))
+        product *= 1.0 + min(e2 * inverse_a2, 1e6)
         if observations.has_right[i]:
             e2 = squared_error_px(motions[j, 1], point, observations.right[i], rig.focal_px[j, 1])
-            total += np.log1p(min(e2 * inverse_a2, 1e6))
-    return total
+            product *= 1.0 + min(e2 * inverse_a2, 1e6)
+        if product > 1e200:
+            total += np.log(product)
+            product = 1.0
+    return total + np.log(product)

@@ -45,6 +45,7 @@ def track(
     forth, found, _ = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]
         source, target, start, np.array(guess, dtype=np.float32), **options
     )
+    options["maxLevel"] = 0  # the way back begins where it should end, so it needs no pyramid
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(  # type: ignore[call-overload]
         target, source, forth, start.copy(), **options
     )
