@@ -1,0 +1,37 @@
+"""The hard walk: a door in front, a crowd, and a bend where both pairs see blank walls for a second."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from graphvio.config import Config
+from graphvio.pipeline import run
+from graphvio.simulation import simulate
+from graphvio.sources import open_source
+
+pytestmark = pytest.mark.xdist_group("corridor")
+DURATION_S = 30.0
+
+
+@pytest.fixture(scope="module")
+def corridor(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("simulated") / "corridor"
+    recording = simulate("corridor", out, duration_s=DURATION_S)
+    assert {"door", "people", "blank"} <= {name for name, (_, end) in recording.events.items() if end < DURATION_S}
+    return out
+
+
+@pytest.mark.parametrize(("pairs", "most_drift_percent"), [([0, 1], 0.5), ([0], 1.0), ([1], 1.0)])
+def test_the_walk_is_finished_without_a_break(
+    corridor: Path, tmp_path: Path, pairs: list[int], most_drift_percent: float
+) -> None:
+    rig = open_source(corridor).rig.with_pairs(pairs)
+    summary = run(open_source(corridor, rig), Config(), tmp_path / "out")
+    assert summary.completion == 1.0
+    assert summary.resets == 0
+    assert summary.status["coasting"] >= 20  # a second at the bend, where nobody sees anything
+    assert summary.evaluation is not None
+    assert summary.evaluation["drift_percent"] < most_drift_percent
+    events = [json.loads(line) for line in (tmp_path / "out/events.jsonl").read_text().splitlines()]
+    assert not {"lost", "new_epoch"} & {event["kind"] for event in events}
