@@ -44,10 +44,22 @@ def cache_root() -> Path:
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function with numba: no GIL, cached on disk, IEEE division (no exception on 1/0)."""
+    return _compile(function, fastmath=False)
+
+
+def fast_kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """The same for sums over pixels: their order is left to the compiler, so that it may use vector instructions.
+
+    Equal inputs still give equal results on one machine; NaN and infinity must not occur.
+    """
+    return _compile(function, fastmath=True)
+
+
+def _compile(function: Callable[P, R], *, fastmath: bool) -> Callable[P, R]:
     callers_choice = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(cache_root() / _digest(function.__module__))  # read when the cache is attached
     try:
-        compiled = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=fastmath)(function)
     finally:
         numba.config.CACHE_DIR = callers_choice
     _registered.append(compiled)

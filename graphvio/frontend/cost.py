@@ -4,7 +4,11 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.kernels import kernel
+from graphvio.kernels import fast_kernel, kernel
+
+_NEAREST = 1e-3  # depth over the reference depth, below which a point is behind the camera
+_WORST = 1e6
+_BLOCK = 48  # (1 + 1e6)^48 is below the largest float
 
 
 @kernel
@@ -43,19 +47,68 @@ def robust_cost(
 
     A point that falls behind a camera counts as one with an error of a thousand scales.
     """
-    motions = left_motions(cur_T_ref, rig)
-    inverse_a2 = 1.0 / (cauchy_scale_px * cauchy_scale_px)
-    total = 0.0
-    product = 1.0  # sum of logarithms = logarithm of the product, which is much cheaper
+    return score_all(np.expand_dims(cur_T_ref, 0), rig, observations, rows, cauchy_scale_px)[0]
+
+
+@kernel
+def score_all(
+    hypotheses: Float, rig: RigArrays, observations: Observations, rows: Int, cauchy_scale_px: float
+) -> Float:
+    """`robust_cost` (H,) of each hypothesis (H, 4, 4) on the given rows."""
+    scores = np.zeros(len(hypotheses))
+    for j in range(len(rig.body_T_left)):
+        points, left, right, n = _columns_of_pair(observations, rows, j)
+        if n == 0:
+            continue
+        scale_left = rig.focal_px[j, 0] / cauchy_scale_px
+        scale_right = rig.focal_px[j, 1] / cauchy_scale_px
+        for h in range(len(hypotheses)):
+            body_T_left_ref = np.ascontiguousarray(hypotheses[h]) @ rig.body_T_left[j]
+            motion = np.ascontiguousarray(rig.cam_T_body[j, 0]) @ body_T_left_ref
+            scores[h] += _image_cost(motion, points, left, scale_left)
+            motion = np.ascontiguousarray(rig.cam_T_body[j, 1]) @ body_T_left_ref
+            scores[h] += _image_cost(motion, points, right, scale_right)
+    return scores
+
+
+@kernel
+def _columns_of_pair(observations: Observations, rows: Int, pair: int) -> tuple[Float, Float, Float, int]:
+    """One pair's points (3, n), and their left and right coordinates with weights (3, n), as columns in memory."""
+    n = 0
     for i in rows:
-        j = observations.pair[i]
-        point = observations.points[i]
-        e2 = squared_error_px(motions[j, 0], point, observations.left[i], rig.focal_px[j, 0])
-        product *= 1.0 + min(e2 * inverse_a2, 1e6)
+        n += observations.pair[i] == pair
+    points, left, right = np.empty((3, n)), np.ones((3, n)), np.ones((3, n))
+    k = 0
+    for i in rows:
+        if observations.pair[i] != pair:
+            continue
+        for c in range(3):
+            points[c, k] = observations.points[i, c]
+        left[0, k], left[1, k] = observations.left[i, 0], observations.left[i, 1]
         if observations.has_right[i]:
-            e2 = squared_error_px(motions[j, 1], point, observations.right[i], rig.focal_px[j, 1])
-            product *= 1.0 + min(e2 * inverse_a2, 1e6)
-        if product > 1e200:
-            total += np.log(product)
-            product = 1.0
-    return total + np.log(product)
+            right[0, k], right[1, k] = observations.right[i, 0], observations.right[i, 1]
+        else:
+            right[0, k] = right[1, k] = right[2, k] = 0.0
+        k += 1
+    return points, left, right, n
+
+
+@fast_kernel
+def _image_cost(motion: Float, points: Float, seen: Float, scale: float) -> float:
+    """Robust cost in one image; logarithms are taken of products, which fit into a float for a block of points."""
+    total = 0.0
+    n = points.shape[1]
+    a, b, w = points[0], points[1], points[2]
+    u, v, weight = seen[0], seen[1], seen[2]
+    for start in range(0, n, _BLOCK):
+        product = 1.0
+        for i in range(start, min(start + _BLOCK, n)):
+            x = motion[0, 0] * a[i] + motion[0, 1] * b[i] + motion[0, 2] + w[i] * motion[0, 3]
+            y = motion[1, 0] * a[i] + motion[1, 1] * b[i] + motion[1, 2] + w[i] * motion[1, 3]
+            z = motion[2, 0] * a[i] + motion[2, 1] * b[i] + motion[2, 2] + w[i] * motion[2, 3]
+            inverse_z = 1.0 / max(z, _NEAREST)
+            dx, dy = scale * (u[i] - x * inverse_z), scale * (v[i] - y * inverse_z)
+            error = min(dx * dx + dy * dy, _WORST) if z >= _NEAREST else _WORST
+            product *= 1.0 + weight[i] * error
+        total += np.log(product)
+    return total

@@ -3,7 +3,7 @@
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.frontend.cost import robust_cost, squared_error_px
+from graphvio.frontend.cost import score_all, squared_error_px
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.resection import resect
 from graphvio.geometry import se3_inverse
@@ -62,17 +62,6 @@ def preempt(
         start += chunk_points
     best = alive[np.argmin(scores[alive])]
     return np.asarray(hypotheses[best])
-
-
-@kernel
-def score_all(
-    hypotheses: Float, rig: RigArrays, observations: Observations, rows: Int, cauchy_scale_px: float
-) -> Float:
-    """Robust cost (H,) of each hypothesis (H, 4, 4) on the given rows."""
-    scores = np.empty(len(hypotheses))
-    for h in range(len(hypotheses)):
-        scores[h] = robust_cost(hypotheses[h], rig, observations, rows, cauchy_scale_px)
-    return scores
 
 
 @kernel
