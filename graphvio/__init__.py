@@ -10,7 +10,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from graphvio.config import Config
-    from graphvio.errors import ConfigError, GraphvioError, MissingExtraError, RigError, SourceError
+    from graphvio.errors import ConfigError, EventError, GraphvioError, MissingExtraError, RigError, SourceError
     from graphvio.events import Estimate, FrameSet, ImuSample, Status
     from graphvio.odometry import Odometry
     from graphvio.rig import Camera, Imu, Rig, StereoPair
@@ -21,6 +21,7 @@ _HOME_OF = {
     "Config": "config",
     "ConfigError": "errors",
     "Estimate": "events",
+    "EventError": "errors",
     "FrameSet": "events",
     "GraphvioError": "errors",
     "Imu": "rig",
@@ -40,6 +41,7 @@ __all__ = [
     "Config",
     "ConfigError",
     "Estimate",
+    "EventError",
     "FrameSet",
     "GraphvioError",
     "Imu",

@@ -17,6 +17,10 @@ class ConfigError(GraphvioError):
     """A configuration file, profile or value is not valid."""
 
 
+class EventError(GraphvioError):
+    """An IMU sample or frameset that a program hands over is malformed."""
+
+
 class TrajectoryError(GraphvioError):
     """A trajectory file cannot be read, or two trajectories cannot be compared."""
 

@@ -6,6 +6,7 @@ differ by the rig's ``time_offset_s``.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -13,6 +14,7 @@ from enum import StrEnum
 import numpy as np
 
 from graphvio.arrays import Float, Image
+from graphvio.errors import EventError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +46,29 @@ class FrameSet:
 
 
 Event = ImuSample | FrameSet
+
+
+def checked_event(event: Event) -> Event:
+    """The event with its stamp as an int and its vectors as float64 arrays.
+
+    Raises:
+        EventError: if it is of another type, its stamp is no whole number, or a vector or pair is malformed.
+    """
+    if not isinstance(event, ImuSample | FrameSet):
+        raise EventError(f"an event is an ImuSample or a FrameSet, not {type(event).__name__}")
+    try:
+        stamp_ns = operator.index(event.stamp_ns)
+    except TypeError:
+        raise EventError(f"stamp_ns is {event.stamp_ns!r}; give whole nanoseconds as an int") from None
+    if isinstance(event, ImuSample):
+        vectors = [np.asarray(v, dtype=np.float64) for v in (event.angular_velocity, event.linear_acceleration)]
+        if any(vector.shape != (3,) for vector in vectors):
+            raise EventError(f"IMU sample at {stamp_ns}: both vectors must have three components")
+        return ImuSample(stamp_ns, *vectors)
+    for pair, images in event.images.items():
+        if len(images) != 2:
+            raise EventError(f"frameset at {stamp_ns}: pair {pair} has {len(images)} images; give (left, right)")
+    return FrameSet(stamp_ns, event.images)
 
 
 class Status(StrEnum):

@@ -7,6 +7,7 @@ outdated machine code is never run by mistake.
 
 import functools
 import hashlib
+import logging
 import os
 import re
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
+from numba.core import event as numba_event
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -23,6 +25,7 @@ R = TypeVar("R")
 _PACKAGE = Path(__file__).parent
 _IMPORT = re.compile(r"^from (graphvio[\w.]*) import", re.MULTILINE)
 _registered: list[Any] = []
+_log = logging.getLogger(__name__)
 
 
 @functools.cache
@@ -96,3 +99,22 @@ def _digest(module: str) -> str:
     for name in sorted(sources):
         digest.update(name.encode() + sources[name])
     return f"{module}-{digest.hexdigest()[:16]}"
+
+
+class _Announcer(numba_event.Listener):  # type: ignore[misc]
+    """Tells once in a process that a kernel is being compiled, so that the pause is no riddle."""
+
+    def __init__(self) -> None:
+        self._told = False
+
+    def on_start(self, event: Any) -> None:
+        """Called by numba when it begins to compile a function that no cache holds."""
+        if not self._told and event.data["dispatcher"] in _registered:
+            self._told = True
+            _log.warning("compiling numerical kernels for this machine, once; it takes up to a minute")
+
+    def on_end(self, event: Any) -> None:
+        """Called by numba when it has compiled a function."""
+
+
+numba_event.register("numba:compile", _Announcer())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from time import perf_counter
 
@@ -14,9 +13,10 @@ from graphvio.backend.initialisation import InitialAttitude, initial_attitude, l
 from graphvio.backend.smoother import RigState, Smoother, StartUncertainty, origin_covariance
 from graphvio.backend.window import WindowError
 from graphvio.config import Config
-from graphvio.events import Estimate, Event, FrameSet, ImuSample, Incident, Status
+from graphvio.errors import EventError
+from graphvio.events import Estimate, Event, FrameSet, ImuSample, Incident, Status, checked_event
 from graphvio.frontend.visual import RelativeMotion, VisualFrontend, VisualResult
-from graphvio.geometry import se3, se3_inverse
+from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.rates import AngularRates
 from graphvio.rig import Rig
 from graphvio.synchroniser import Synchroniser
@@ -26,7 +26,8 @@ _UNKNOWN_SPEED_SIGMA = 30.0  # without an IMU the first motion is believed whate
 _MOVING_START_SPEED_SIGMA = 2.0
 _RESTING_START_SPEED_SIGMA = 0.02
 _RESTART_SPEED_SIGMA = 1.0
-_RESTART_GYRO_BIAS_SIGMA = 0.01
+_GYRO_BIAS_SIGMA = 0.01
+_WIDE_GYRO_BIAS_SIGMA = 0.1
 _AFTER_REBUILD = np.diag([0.05] * 3 + [0.1] * 3) ** 2  # added to the pose's covariance, radians and metres
 _AFTER_JUMP = np.diag([0.2] * 3 + [1.0] * 3) ** 2
 
@@ -49,13 +50,15 @@ class Odometry:
         self._smoother: Smoother | None = None
         self._settled_ns = 0  # from this stamp on, a start in motion is over
         self._tracked_ns = 0  # stamp of the last state that vision constrains
-        self._gated_since_ns: int | None = None
+        self._refused: dict[int, Float] = {}  # stamp -> nav_T_body by the motions that the gate refused
         self._lost = False
         self._epoch = 0
-        self._last_covariance = np.zeros((6, 6))
+        self._pose_covariance = np.zeros((6, 6))  # of the newest estimate
         self._rates = AngularRates()
         self._incidents: list[Incident] = []
         self._smoothed: list[tuple[int, Float]] = []
+        self._first_ns: int | None = None
+        self._finished = False
 
     def process(self, event: Event) -> Estimate | None:
         """Take one event.
@@ -63,7 +66,14 @@ class Odometry:
         Returns:
             The estimate of the oldest frameset that is due, or None while there is none. At most one frameset is
             worked on in a call; what is still held comes with later events or with `finish`.
+
+        Raises:
+            EventError: if the event is malformed, or the odometry has been finished.
+            RigError: if an image is not what the rig says.
         """
+        if self._finished:
+            raise EventError("the odometry has been finished; make a new one for more events")
+        event = checked_event(event)
         if isinstance(event, ImuSample):
             self._synchroniser.add_sample(event)
         else:
@@ -71,13 +81,18 @@ class Odometry:
         frameset = self._synchroniser.next_due(started=self._smoother is not None)
         return None if frameset is None else self._estimate(frameset)
 
-    def finish(self) -> Iterator[Estimate]:
+    def finish(self) -> list[Estimate]:
         """Estimates of the framesets still held when the input has ended; the window's poses are final then."""
+        if self._finished:
+            return []
+        estimates = []
         while (frameset := self._synchroniser.next_held()) is not None:
-            yield self._estimate(frameset)
+            estimates.append(self._estimate(frameset))
         if self._smoother is not None:
             self._smoothed += self._smoother.all_poses()
         self._frontend.close()
+        self._finished = True
+        return estimates
 
     def take_incidents(self) -> list[Incident]:
         """What happened since the last call that a person would want to know of."""
@@ -99,7 +114,7 @@ class Odometry:
     def _estimate(self, frameset: FrameSet) -> Estimate:
         start = perf_counter()
         stamp_ns = frameset.stamp_ns
-        if self._smoother is None and self._synchroniser.precedes_imu(stamp_ns):
+        if self._smoother is None and self._must_wait_for_imu(stamp_ns):
             visual = self._frontend.process(frameset, self._predicted_motion)
             return Estimate(stamp_ns, Status.INITIALISING, None, None, pairs=visual.pairs, stage_ms=visual.stage_ms)
         starting = self._must_start(stamp_ns)
@@ -117,9 +132,7 @@ class Odometry:
         visual = self._frontend.process(frameset, self._predicted_motion)
         measured = perf_counter()
         used = visual.motion is not None and self._use(visual.motion)
-        if not self._update(visual, used):
-            used = False
-        status = self._status(stamp_ns, used, starting)
+        status = self._update(stamp_ns, used, starting)
         stage_ms = {
             "predict": 1e3 * (predicted - start),
             **visual.stage_ms,
@@ -149,42 +162,44 @@ class Odometry:
             return False  # `_update` meets the same error, and rebuilds
         if verdict.accepted:
             smoother.accept(motion)
-            self._gated_since_ns = None
+            self._refused.clear()
             return True
         self._report(
             motion.stamp_ns,
             "vision_gated",
             f"innovation {verdict.statistic:.1f} beyond chi-square {verdict.threshold:.1f}, {motion.inliers} inliers",
         )
-        if self._gated_since_ns is None:
-            self._gated_since_ns = motion.stamp_ns
-        if motion.stamp_ns - self._gated_since_ns > self.config.smoother.max_gated_s * 1e9:
-            self._restart(motion, "gate_reset", "vision was refused for too long: velocity is taken from vision")
+        reference_ns = motion.reference_stamp_ns
+        nav_T_reference = self._refused[reference_ns] if reference_ns in self._refused else smoother.pose(reference_ns)
+        self._refused[motion.stamp_ns] = nav_T_reference @ motion.reference_T_current
+        if motion.stamp_ns - min(self._refused) > self.config.smoother.max_gated_s * 1e9:
+            self._believe_vision(motion)
             return True
         return False
 
-    def _update(self, visual: VisualResult, used: bool) -> bool:
+    def _update(self, stamp_ns: int, used: bool, starting: bool) -> Status:
         """Optimise and marginalise; a window without a solution is rebuilt around the prediction."""
         smoother = self._running
-        if used:
-            self._tracked_ns = smoother.latest_ns
+        if used or starting:
+            self._tracked_ns = stamp_ns
+        state = smoother.state()
         try:
             self._smoothed += smoother.settle(self._frontend.reference_stamps_ns | {self._tracked_ns})
+            self._pose_covariance = smoother.covariance()
+            status = self._status(stamp_ns, used or starting)
         except WindowError as error:
-            state = smoother.state()
-            self._smoothed += smoother.all_poses()
-            self._report(smoother.latest_ns, "window_rebuilt", str(error))
-            self._start_again(smoother.latest_ns, state, self._last_covariance + _AFTER_REBUILD)
-            self._tracked_ns = smoother.latest_ns
-            return False
-        self._synchroniser.forget_before(smoother.latest_ns)
-        return True
+            self._smoothed += [(ns, pose) for ns, pose in smoother.all_poses() if ns < stamp_ns]
+            self._report(stamp_ns, "window_rebuilt", str(error))
+            self._start_again(stamp_ns, state, self._pose_covariance + _AFTER_REBUILD)
+            return Status.COASTING
+        self._synchroniser.forget_before(stamp_ns)
+        return status
 
-    def _status(self, stamp_ns: int, used: bool, starting: bool) -> Status:
-        smoother = self._running
-        if used or starting:
+    def _status(self, stamp_ns: int, used: bool) -> Status:
+        if used:
             return Status.INITIALISING if stamp_ns < self._settled_ns else Status.TRACKING
-        sigma = float(np.sqrt(np.linalg.eigvalsh(smoother.covariance_since(self._tracked_ns)[3:, 3:])[-1]))
+        covariance = self._running.covariance_since(self._tracked_ns)
+        sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
         if not self._lost and sigma > self.config.smoother.lost_position_sigma_m:
             self._lost = True
             self._report(stamp_ns, "lost", f"position uncertain by {sigma:.2f} m since vision was last used")
@@ -216,6 +231,7 @@ class Odometry:
         if found is None:
             at = InitialAttitude(self._upright_camera(), 1e-3, np.zeros(3), 1.0, False)
             speed_sigma = _UNKNOWN_SPEED_SIGMA
+            self._settled_ns = stamp_ns + 1  # the first frameset has no motion to track
         else:
             at = initial_attitude(*found, config)
             speed_sigma = _RESTING_START_SPEED_SIGMA if at.at_rest else _MOVING_START_SPEED_SIGMA
@@ -227,46 +243,67 @@ class Odometry:
             StartUncertainty(origin_covariance(at.nav_R_body, at.tilt_sigma_rad), speed_sigma, at.gyro_bias_sigma),
         )
         self._tracked_ns = stamp_ns
+        self._refused.clear()
+        self._lost = False
 
     def _upright_camera(self) -> Float:
         """``nav_R_body`` without an IMU: the first pair's left camera is taken to be upright."""
         return level(-self.rig.pairs[0].left.body_T_cam[:3, 1])
+
+    def _must_wait_for_imu(self, stamp_ns: int) -> bool:
+        """Before the IMU's first sample there is nothing to start from, unless it has been awaited for long."""
+        if self._first_ns is None:
+            self._first_ns = stamp_ns
+        longest_ns = self.config.timing.max_imu_start_wait_s * 1e9
+        return self._synchroniser.precedes_imu(stamp_ns) and stamp_ns - self._first_ns < longest_ns
 
     def _jump(self, stamp_ns: int) -> None:
         """After a gap that nothing bridges, be it a pause or a jump of the clock: a new epoch at the last pose."""
         smoother = self._running
         gap_s = (stamp_ns - smoother.latest_ns) * 1e-9
         self._smoothed += smoother.all_poses()
-        self._start_again(stamp_ns, smoother.state(), self._last_covariance + _AFTER_JUMP)
+        self._start_again(stamp_ns, smoother.state(), self._pose_covariance + _AFTER_JUMP)
         self._epoch += 1
-        self._lost = False
-        self._gated_since_ns = None
-        self._tracked_ns = stamp_ns
         self._report(stamp_ns, "time_jump", f"{gap_s:.1f} s without data: epoch {self._epoch} starts at the last pose")
 
     def _recover(self, motion: RelativeMotion) -> None:
-        """After lost: a new epoch that starts at the best guess."""
-        self._epoch += 1
-        self._lost = False
-        self._restart(motion, "new_epoch", f"vision is back: epoch {self._epoch} starts at the best guess")
-
-    def _restart(self, motion: RelativeMotion, kind: str, why: str) -> None:
-        """Start the smoother anew at its newest pose, with the velocity that vision sees."""
+        """After lost: a new epoch that starts at the best guess, the prediction, with the velocity that vision sees."""
         smoother = self._running
         self._smoothed += [(ns, pose) for ns, pose in smoother.all_poses() if ns <= self._tracked_ns]
         state = smoother.state()
-        dt = (motion.stamp_ns - motion.reference_stamp_ns) * 1e-9
-        velocity_body = motion.reference_T_current[:3, :3].T @ motion.reference_T_current[:3, 3] / dt
-        velocity_nav = state.nav_T_body[:3, :3] @ velocity_body
-        self._start_again(motion.stamp_ns, replace(state, velocity_nav=velocity_nav), smoother.covariance())
-        self._frontend.rekey()
-        self._gated_since_ns = None
-        self._tracked_ns = motion.stamp_ns
-        self._report(motion.stamp_ns, kind, why)
+        covariance = smoother.covariance()
+        self._start_again(motion.stamp_ns, _with_velocity(state, motion), covariance)
+        self._epoch += 1
+        self._report(motion.stamp_ns, "new_epoch", f"vision is back: epoch {self._epoch} starts at the best guess")
 
-    def _start_again(self, stamp_ns: int, state: RigState, pose_covariance: Float) -> None:
-        uncertainty = StartUncertainty(pose_covariance, _RESTART_SPEED_SIGMA, _RESTART_GYRO_BIAS_SIGMA)
+    def _believe_vision(self, motion: RelativeMotion) -> None:
+        """Refused motions that go on agreeing with each other put the prediction in the wrong.
+
+        Their chain, which begins at a state that was accepted, is the pose from here on; by as much as it differs from
+        the prediction it is uncertain.
+        """
+        smoother = self._running
+        self._smoothed += [(ns, pose) for ns, pose in smoother.all_poses() if ns <= self._tracked_ns]
+        predicted, by_vision = smoother.state(), self._refused[motion.stamp_ns]
+        apart = se3_log(se3_inverse(by_vision) @ predicted.nav_T_body)
+        covariance = smoother.covariance() + np.outer(apart, apart)
+        state = _with_velocity(replace(predicted, nav_T_body=by_vision), motion)
+        self._start_again(motion.stamp_ns, state, covariance, _WIDE_GYRO_BIAS_SIGMA)
+        self._report(
+            motion.stamp_ns,
+            "gate_reset",
+            f"refused for too long, vision is believed now, {np.linalg.norm(apart[3:]):.3f} m from the prediction",
+        )
+
+    def _start_again(
+        self, stamp_ns: int, state: RigState, pose_covariance: Float, gyro_bias_sigma: float = _GYRO_BIAS_SIGMA
+    ) -> None:
+        uncertainty = StartUncertainty(pose_covariance, _RESTART_SPEED_SIGMA, gyro_bias_sigma)
         self._running.start(stamp_ns, state, uncertainty)
+        self._frontend.rekey()
+        self._refused.clear()
+        self._lost = False
+        self._tracked_ns = stamp_ns
 
     # ------------------------------------------------------------------ what is told
 
@@ -289,13 +326,12 @@ class Odometry:
         smoother = self._running
         state = smoother.state()
         honest = status is not Status.LOST
-        self._last_covariance = smoother.covariance()
         inertial = smoother.has_imu
         return Estimate(
             stamp_ns=stamp_ns,
             status=status,
             nav_T_body=state.nav_T_body if honest else None,
-            covariance=self._last_covariance if honest else None,
+            covariance=self._pose_covariance if honest else None,
             epoch=self._epoch,
             velocity_nav=state.velocity_nav if honest else None,
             gyro_bias=state.gyro_bias if inertial else None,
@@ -307,3 +343,10 @@ class Odometry:
 
     def _report(self, stamp_ns: int, kind: str, detail: str) -> None:
         self._incidents.append(Incident(stamp_ns, kind, detail))
+
+
+def _with_velocity(state: RigState, motion: RelativeMotion) -> RigState:
+    """The state with the mean velocity of a measured motion."""
+    duration_s = (motion.stamp_ns - motion.reference_stamp_ns) * 1e-9
+    nav_R_reference = state.nav_T_body[:3, :3] @ motion.reference_T_current[:3, :3].T
+    return replace(state, velocity_nav=nav_R_reference @ motion.reference_T_current[:3, 3] / duration_s)

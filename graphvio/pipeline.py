@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -16,7 +15,6 @@ from graphvio.events import Estimate, Event, FrameSet, Status
 from graphvio.odometry import Odometry
 from graphvio.results import ResultWriter, Summary
 from graphvio.sources import Source
-from graphvio.trajectory import Trajectory
 from graphvio.viewer import Viewer
 
 RESETS = ("gate_reset", "new_epoch", "window_rebuilt", "imu_came", "time_jump")
@@ -49,7 +47,7 @@ class Progress:
 def run(
     source: Source,
     config: Config,
-    folder: Path,
+    writer: ResultWriter,
     *,
     viewer: Viewer | None = None,
     on_progress: Callable[[Progress], None] | None = None,
@@ -59,16 +57,14 @@ def run(
     Args:
         source: of the events; its rig is used.
         config: of the odometry.
-        folder: for the results, new or empty.
+        writer: of the results.
         viewer: shows or saves what happens, or None.
         on_progress: called after each frameset.
 
     Raises:
         GraphvioError: if the source cannot be read or the folder not written.
     """
-    odometry = Odometry(source.rig, config)
-    with ResultWriter(folder, source.rig, config.to_yaml()) as writer:
-        return _Run(source, odometry, writer, viewer, on_progress).go()
+    return _Run(source, Odometry(source.rig, config), writer, viewer, on_progress).go()
 
 
 class _Run:
@@ -103,13 +99,15 @@ class _Run:
             if estimate is not None:
                 self._frameset_ms.append(1e3 * (perf_counter() - begin))
                 self._take(estimate)
+        begin = perf_counter()
         for estimate in self._odometry.finish():
+            self._frameset_ms.append(1e3 * (perf_counter() - begin))
             self._take(estimate)
+            begin = perf_counter()
         wall_s = perf_counter() - self._start
         self._collect()
         for incident in self._source.faults.incidents:
             self._writer.add_incident(incident)
-        truth = None if self._source.truth is None else Trajectory.read(self._source.truth)
         return self._writer.finish(
             wall_s=wall_s,
             frameset_ms=self._frameset_ms,
@@ -118,7 +116,7 @@ class _Run:
             framesets=self._delivered,
             awaited=self._delivered - self._before_start,
             resets=self._resets,
-            truth=truth,
+            truth=self._source.truth,
         )
 
     def _remember(self, event: Event) -> None:

@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Generic, TypeVar
 
 from graphvio.backend.inertial import ImuBuffer, ImuSpan
 from graphvio.config import Config
 from graphvio.events import FrameSet, ImuSample
 from graphvio.rig import Rig
 
+_LEAST_INTERVAL_NS = 1_000_000
+_SUSPICIOUS_JUMP_NS = 5_000_000_000
+
+Stamped = TypeVar("Stamped", ImuSample, FrameSet)
 Report = Callable[[int, str, str], None]
 """Takes stamp, kind and detail of an incident."""
 
@@ -34,17 +39,27 @@ class Synchroniser:
         self._imu = ImuBuffer(config.timing.max_imu_gap_ms)
         self._held: deque[FrameSet] = deque()
         self._newest_ns: int | None = None
+        self._sample_jumps: _JumpGuard[ImuSample] = _JumpGuard("imu_future_stamp", report)
+        self._frameset_jumps: _JumpGuard[FrameSet] = _JumpGuard("frameset_future_stamp", report)
 
     def add_sample(self, sample: ImuSample) -> None:
         """Take a sample of the IMU."""
-        fault = self._imu.add(sample)
-        if fault:
-            self._report(sample.stamp_ns, fault, "sample left out")
+        for confirmed in self._sample_jumps.confirm(sample):
+            fault = self._imu.add(confirmed)
+            if fault:
+                self._report(confirmed.stamp_ns, fault, "sample left out")
 
     def add_frameset(self, frameset: FrameSet) -> None:
         """Take a frameset; time never goes back."""
-        if self._newest_ns is not None and frameset.stamp_ns <= self._newest_ns:
-            self._report(frameset.stamp_ns, "frameset_backward_stamp", "frameset left out: time never goes back")
+        for confirmed in self._frameset_jumps.confirm(frameset):
+            self._add(confirmed)
+
+    def _add(self, frameset: FrameSet) -> None:
+        if self._newest_ns is not None and frameset.stamp_ns < self._newest_ns + _LEAST_INTERVAL_NS:
+            late = frameset.stamp_ns < self._newest_ns
+            kind = "frameset_backward_stamp" if late else "frameset_duplicate_stamp"
+            why = "time never goes back" if late else "less than 1 ms after the one before"
+            self._report(frameset.stamp_ns, kind, f"frameset left out: {why}")
             return
         unknown = [j for j in frameset.images if not 0 <= j < self._pairs]
         if unknown:
@@ -82,8 +97,10 @@ class Synchroniser:
         return None
 
     def precedes_imu(self, stamp_ns: int) -> bool:
-        """Whether the first sample of the IMU is later than a frameset."""
-        return self._imu.oldest_ns is not None and stamp_ns + self._offset_ns < self._imu.oldest_ns
+        """Whether the first sample of the IMU has not come yet, or is later than a frameset."""
+        if not self._has_imu:
+            return False
+        return self._imu.oldest_ns is None or stamp_ns + self._offset_ns < self._imu.oldest_ns
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop samples that are older than a start at this frameset's stamp would need."""
@@ -98,6 +115,30 @@ class Synchroniser:
             if self.precedes_imu(frameset.stamp_ns):
                 return True
             enough = self.initial_span(frameset.stamp_ns) is not None
-            return enough or waited_ns > self._timing.max_imu_start_wait_s * 1e9
+            return enough or waited_ns > 2.0 * self._initialisation.min_window_s * 1e9
         covered = self._imu.covers(frameset.stamp_ns + self._offset_ns)
         return covered or waited_ns > self._timing.max_imu_wait_ms * 1e6
+
+
+class _JumpGuard(Generic[Stamped]):
+    """Believes a jump of the clock only when a second stamp confirms it: one wild stamp must not stop time."""
+
+    def __init__(self, kind: str, report: Report) -> None:
+        self._kind = kind
+        self._report = report
+        self._newest_ns: int | None = None
+        self._suspect: Stamped | None = None
+
+    def confirm(self, event: Stamped) -> list[Stamped]:
+        """The events that may be taken now, in order."""
+        suspect, self._suspect = self._suspect, None
+        if suspect is not None:
+            if 0 < event.stamp_ns - suspect.stamp_ns < _SUSPICIOUS_JUMP_NS:
+                self._newest_ns = event.stamp_ns
+                return [suspect, event]
+            self._report(suspect.stamp_ns, self._kind, "left out: far ahead of the stamps before and after it")
+        if self._newest_ns is not None and event.stamp_ns - self._newest_ns > _SUSPICIOUS_JUMP_NS:
+            self._suspect = event
+            return []
+        self._newest_ns = max(event.stamp_ns, self._newest_ns or event.stamp_ns)
+        return [event]

@@ -1,4 +1,4 @@
-"""A sequence of stamped poses, and the two text formats in which they are exchanged.
+"""A sequence of stamped poses, and the text formats in which they are exchanged.
 
 TUM: ``stamp_s x y z q_x q_y q_z q_w``, separated by blanks. EuRoC: ``stamp_ns,x,y,z,q_w,q_x,q_y,q_z,...``,
 separated by commas. Stamps are converted exactly: float64 keeps only 0.2 microseconds of a Unix time.
@@ -19,6 +19,7 @@ from graphvio.geometry import interpolate, quat_wxyz_from_rotation, rotation_fro
 
 _NS_PER_S = 1_000_000_000
 _COLUMNS = 8
+_KITTI_COLUMNS = 12
 _NORM_TOLERANCE = 0.05
 _STAMP_MAX_NS = 2**62
 
@@ -119,7 +120,9 @@ class Trajectory:
 
     @staticmethod
     def read(path: str | Path) -> Trajectory:
-        """Read a TUM or EuRoC file; which of the two is told by blanks or commas between the columns.
+        """Read a TUM, EuRoC or KITTI file, told apart by commas or blanks and the number of columns.
+
+        KITTI's poses take their stamps from ``times.txt`` beside them, or in ``../sequences/NAME``.
 
         Raises:
             TrajectoryError: if the file cannot be read, a line is no pose, or the stamps do not increase.
@@ -184,9 +187,12 @@ def _read(path: Path) -> Trajectory:
         ) from None
     except UnicodeDecodeError:
         raise TrajectoryError(f"{path}: is not a text file; give a TUM or EuRoC trajectory file") from None
+    rows = list(_rows(text))
+    if rows and not rows[0][2] and len(rows[0][1]) == _KITTI_COLUMNS:
+        return _read_kitti(path, rows)
     stamps: list[int] = []
     poses: list[Float] = []
-    for number, fields, is_euroc in _rows(text):
+    for number, fields, is_euroc in rows:
         where = f"{path}, line {number}"
         stamp, pose = _pose(fields, is_euroc, where)
         if stamps and stamp <= stamps[-1]:
@@ -196,6 +202,22 @@ def _read(path: Path) -> Trajectory:
     if not poses:
         raise TrajectoryError(f"{path}: holds no pose; the run that wrote it estimated nothing, or it is another file")
     return Trajectory(np.array(stamps, dtype=np.int64), np.array(poses))
+
+
+def _read_kitti(path: Path, rows: Sequence[tuple[int, Sequence[str], bool]]) -> Trajectory:
+    """KITTI odometry's poses, upper 3x4 blocks by rows, with the stamps of their sequence's ``times.txt``."""
+    places = (path.with_name("times.txt"), path.parent.parent / "sequences" / path.stem / "times.txt")
+    times = next((place for place in places if place.is_file()), None)
+    if times is None:
+        raise TrajectoryError(f"{path}: KITTI poses carry no stamps; put the sequence's times.txt beside them")
+    try:
+        stamps = [stamp_ns_from_seconds(line) for line in times.read_text(encoding="utf-8").split()]
+        blocks = np.array([[float(field) for field in fields] for _, fields, _ in rows]).reshape(-1, 3, 4)
+    except (ValueError, OSError) as error:
+        raise TrajectoryError(f"{path}: with {times}: is not numeric ({error}); correct the line") from None
+    poses = np.tile(np.eye(4), (len(blocks), 1, 1))
+    poses[:, :3] = blocks
+    return Trajectory(np.array(stamps, dtype=np.int64), poses)
 
 
 def _rows(text: str) -> Iterator[tuple[int, Sequence[str], bool]]:

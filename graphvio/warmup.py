@@ -8,15 +8,9 @@ from graphvio.config import Config
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.tracker import PairTracker
-from graphvio.kernels import any_compiled_before
 from graphvio.rig import Rig
 
 _POINTS = 20
-
-
-def is_first_use() -> bool:
-    """Whether this machine has no compiled kernels of this version yet, so that `warm_up` will take long."""
-    return not any_compiled_before("graphvio.frontend.refinement")
 
 
 def warm_up(rig: Rig, config: Config) -> None:

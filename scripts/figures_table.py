@@ -5,6 +5,7 @@ from pathlib import Path
 
 from graphvio.config import Config
 from graphvio.pipeline import run
+from graphvio.results import ResultWriter
 from graphvio.simulation import SCENE_NAMES, simulate
 from graphvio.sources import open_source
 from graphvio.warmup import warm_up
@@ -34,7 +35,8 @@ def row(out: Path, recording: Path, title: str, pairs: list[int], name: str, *, 
     config = Config()
     warm_up(source.rig, config)
     folder = out / f"results-{recording.name}-{'-'.join(map(str, pairs))}{'' if with_imu else '-no-imu'}"
-    summary = run(source, config, folder)
+    with ResultWriter(folder, source.rig, config.to_yaml()) as writer:
+        summary = run(source, config, writer)
     if summary.evaluation is None:
         raise SystemExit(f"{recording}: {summary.evaluation_error}")
     path_m, drift = summary.evaluation["path_length_m"], summary.evaluation["drift_percent"]

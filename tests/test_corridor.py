@@ -7,6 +7,7 @@ import pytest
 
 from graphvio.config import Config
 from graphvio.pipeline import run
+from graphvio.results import ResultWriter
 from graphvio.simulation import simulate
 from graphvio.sources import open_source
 
@@ -27,7 +28,8 @@ def test_the_walk_is_finished_without_a_break(
     corridor: Path, tmp_path: Path, pairs: list[int], most_drift_percent: float
 ) -> None:
     rig = open_source(corridor).rig.with_pairs(pairs)
-    summary = run(open_source(corridor, rig), Config(), tmp_path / "out")
+    with ResultWriter(tmp_path / "out", rig, Config().to_yaml()) as writer:
+        summary = run(open_source(corridor, rig), Config(), writer)
     assert summary.completion == 1.0
     assert summary.resets == 0
     assert summary.status["coasting"] >= 20  # a second at the bend, where nobody sees anything

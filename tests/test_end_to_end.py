@@ -169,6 +169,50 @@ def _grey_png() -> bytes:
     return cv2.imencode(".png", np.full((480, 640), 128, dtype=np.uint8))[1].tobytes()
 
 
+def test_a_truth_that_cannot_be_read_costs_only_the_figures(room_walk: Path, tmp_path: Path) -> None:
+    spoilt = copy_of(room_walk, tmp_path / "spoilt")
+    truth = spoilt / "mav0/state_groundtruth_estimate0/data.csv"
+    truth.write_text(truth.read_text() + "no,pose,at,all\n")
+    summary = run(spoilt, tmp_path / "out", "--to", 1)
+    assert summary["evaluation"] is None
+    assert "columns" in summary["evaluation_error"]
+    assert (tmp_path / "out/trajectory_smoothed.txt").read_text().count("\n") == 21
+
+
+def test_kitti_odometry_with_poses(room_walk: Path, tmp_path: Path) -> None:
+    """The room's walk as a KITTI sequence: the images of pinholes without distortion are not those of the lenses."""
+    sequence = tmp_path / "sequences/07"
+    cameras = [sorted((room_walk / f"mav0/cam{k}/data").iterdir()) for k in range(2)]
+    for k in range(2):
+        (sequence / f"image_{k}").mkdir(parents=True)
+        for i, image in enumerate(cameras[k][:40]):
+            os.link(image, sequence / f"image_{k}/{i:06d}.png")
+    projection = ["430", "0", "320", "0", "0", "430", "240", "0", "0", "0", "1", "0"]
+    lines = []
+    for k in range(4):
+        projection[3] = str(-430 * 0.12 * (k % 2))
+        lines.append(f"P{k}: {' '.join(projection)}")
+    (sequence / "calib.txt").write_text("\n".join(lines) + "\n")
+    (sequence / "times.txt").write_text("".join(f"{0.05 * i:e}\n" for i in range(40)))
+    (tmp_path / "poses").mkdir()
+    (tmp_path / "poses/07.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {0.03 * i}\n" for i in range(40)))
+    summary = run(sequence, tmp_path / "out")
+    assert summary["framesets"] == 40
+    assert summary["evaluation"]["associated"] == 40
+
+
+def test_a_viewer_recording_inside_the_results(room_walk: Path, tmp_path: Path) -> None:
+    run(room_walk, tmp_path / "out", "--to", 0.5, "--save-rrd", tmp_path / "out/run.rrd")
+    assert (tmp_path / "out/run.rrd").stat().st_size > 10_000
+
+
+def test_a_run_that_cannot_begin_leaves_no_folder(room_walk: Path, tmp_path: Path) -> None:
+    other = copy_of(room_walk, tmp_path / "other")
+    (other / "rig.yaml").write_text((other / "rig.yaml").read_text().replace("[640, 480]", "[752, 480]"))
+    assert "image is 640x480, the rig says 752x480" in refused(graphvio("run", other, "--out", tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
 # ---------------------------------------------------------------- mistakes
 
 

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphvio import Config, Estimate, FrameSet, ImuSample, Odometry, RigError, Status, open_source
+from graphvio import Config, Estimate, EventError, FrameSet, ImuSample, Odometry, RigError, Status, open_source
 from graphvio.arrays import Image
+from graphvio.backend.window import Window, WindowError
 from graphvio.events import Event
 from graphvio.trajectory import Trajectory
 
@@ -31,7 +32,7 @@ def truth(room_walk: Path) -> Trajectory:
 def odometry(room_walk: Path) -> Iterator[Odometry]:
     made = Odometry(open_source(room_walk).rig)
     yield made
-    list(made.finish())
+    made.finish()
 
 
 def framesets(events: list[Event]) -> list[FrameSet]:
@@ -40,7 +41,7 @@ def framesets(events: list[Event]) -> list[FrameSet]:
 
 def feed(odometry: Odometry, events: list[Event]) -> list[Estimate]:
     estimates = [estimate for event in events if (estimate := odometry.process(event)) is not None]
-    return estimates + list(odometry.finish())
+    return estimates + odometry.finish()
 
 
 def kinds(odometry: Odometry) -> list[str]:
@@ -220,3 +221,99 @@ def test_importing_the_package_and_its_command_line_loads_nothing_heavy() -> Non
     code = "import sys, graphvio, graphvio.cli; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
     assert not {"numba", "gtsam", "cv2", "rerun", "matplotlib", "numpy"} & set(loaded)
+
+
+def test_numpys_integers_are_stamps_and_floats_are_not(odometry: Odometry, events: list[Event]) -> None:
+    for event in events[:400]:
+        for kind in (np.int64, np.uint64):
+            estimate = odometry.process(replace(event, stamp_ns=kind(event.stamp_ns)))
+            assert estimate is None or type(estimate.stamp_ns) is int
+    with pytest.raises(EventError, match="whole nanoseconds"):
+        odometry.process(replace(events[400], stamp_ns=events[400].stamp_ns * 1e-9))  # type: ignore[arg-type]
+
+
+def test_malformed_events_are_refused(odometry: Odometry) -> None:
+    with pytest.raises(EventError, match="three components"):
+        odometry.process(ImuSample(1, np.zeros(2), np.zeros(3)))
+    with pytest.raises(EventError, match=r"\(left, right\)"):
+        odometry.process(FrameSet(1, {0: (np.zeros((480, 640), np.uint8),)}))  # type: ignore[dict-item]
+    with pytest.raises(EventError, match="not NoneType"):
+        odometry.process(None)  # type: ignore[arg-type]
+
+
+def test_finishing_twice_adds_nothing_and_ends_it(odometry: Odometry, events: list[Event]) -> None:
+    feed(odometry, events[:300])
+    assert len(odometry.take_smoothed()) > 0
+    assert odometry.finish() == []
+    assert odometry.take_smoothed() == []
+    with pytest.raises(EventError, match="finished"):
+        odometry.process(events[300])
+
+
+def test_one_stamp_far_ahead_stops_nothing(odometry: Odometry, events: list[Event]) -> None:
+    ahead_ns = 10_000_000_000
+    spoilt: list[Event] = []
+    for i, event in enumerate(events):
+        spoilt.append(event)
+        if i in (200, 500):
+            spoilt.append(
+                replace(next(e for e in events if isinstance(e, ImuSample)), stamp_ns=event.stamp_ns + ahead_ns)
+            )
+            spoilt.append(replace(framesets(events)[0], stamp_ns=event.stamp_ns + ahead_ns))
+    estimates = feed(odometry, spoilt)
+    assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(events)]
+    assert all(e.status is Status.TRACKING for e in estimates)
+    assert sorted(set(kinds(odometry))) == ["frameset_future_stamp", "imu_future_stamp"]
+
+
+def test_a_rig_whose_imu_never_speaks_goes_on_without_it_and_without_delay(
+    odometry: Odometry, events: list[Event]
+) -> None:
+    for frameset in framesets(events):
+        estimate = odometry.process(frameset)
+        assert estimate is not None
+        assert estimate.stamp_ns == frameset.stamp_ns
+    assert estimate.status is Status.TRACKING
+    assert kinds(odometry) == ["started_without_imu"]
+
+
+@pytest.mark.parametrize("glitch", ["linear_acceleration", "angular_velocity"])
+def test_a_wild_imu_sample_leaves_an_error_that_the_covariance_admits(
+    odometry: Odometry, room_walk: Path, truth: Trajectory, glitch: str
+) -> None:
+    events = list(open_source(room_walk, to_s=4.0))
+    at = next(i for i in range(len(events) // 2, len(events)) if isinstance(events[i], ImuSample))
+    value = getattr(events[at], glitch) + np.array([0.0, 100.0 if glitch == "linear_acceleration" else 8.0, 0.0])
+    events[at] = replace(events[at], **{glitch: value})
+    estimates = feed(odometry, events)
+    assert "gate_reset" in kinds(odometry)
+    first, last = estimates[0], estimates[-1]
+    assert last.status is Status.TRACKING
+    assert first.nav_T_body is not None
+    assert last.nav_T_body is not None
+    assert last.covariance is not None
+    true, _ = truth.at(np.array([first.stamp_ns, last.stamp_ns]), 0.1)
+    walked = np.linalg.norm(true.positions[1] - true.positions[0])
+    error = abs(np.linalg.norm(last.nav_T_body[:3, 3] - first.nav_T_body[:3, 3]) - walked)
+    assert error < 0.05
+    assert error < 3.0 * np.sqrt(np.linalg.eigvalsh(last.covariance[3:, 3:])[-1])
+
+
+@pytest.mark.parametrize("method", ["optimise", "joint_covariance", "marginalise"])
+def test_a_window_that_fails_is_rebuilt(
+    odometry: Odometry, events: list[Event], monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise WindowError("made to fail")
+
+    half = next(i for i in range(len(events) - 150, len(events)) if isinstance(events[i], FrameSet))
+    estimates = [e for event in events[:half] if (e := odometry.process(event)) is not None]
+    with monkeypatch.context() as patch:
+        patch.setattr(Window, method, fail)
+        estimates += [e for event in events[half : half + 1] if (e := odometry.process(event)) is not None]
+    assert "window_rebuilt" in kinds(odometry)
+    estimates += [e for event in events[half + 1 :] if (e := odometry.process(event)) is not None]
+    assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(events)]
+    assert estimates[-1].status is Status.TRACKING
+    steps = np.diff([e.nav_T_body[:3, 3] for e in estimates if e.nav_T_body is not None], axis=0)
+    assert np.linalg.norm(steps, axis=1).max() < 0.12

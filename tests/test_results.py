@@ -48,6 +48,12 @@ def estimates() -> list[Estimate]:
     ]
 
 
+def written(truth: Trajectory, folder: Path) -> Path:
+    path = folder.with_name(f"{folder.name}-truth.txt")
+    truth.write(path)
+    return path
+
+
 def finish(writer: ResultWriter, truth: Trajectory | None = None, framesets: int = COUNT) -> Summary:
     return writer.finish(
         wall_s=1.5,
@@ -57,7 +63,7 @@ def finish(writer: ResultWriter, truth: Trajectory | None = None, framesets: int
         framesets=framesets,
         awaited=COUNT - 5,
         resets=1,
-        truth=truth,
+        truth=None if truth is None else written(truth, writer.folder),
     )
 
 

@@ -15,6 +15,8 @@ from graphvio.geometry import so3_exp
 from graphvio.rig import Imu
 
 GRAVITY_M_S2 = 9.81
+_MAX_RATE = 100.0  # rad/s and m/s^2: beyond what any inertial sensor for this use can read
+_MAX_FORCE = 1000.0
 _INTEGRATION_SIGMA = 1e-4  # m/s^2-like noise that stands for the error of integrating piecewise constant rates
 
 
@@ -56,6 +58,8 @@ class ImuBuffer:
         """Take a sample; the name of its fault if it cannot be used, or an empty string."""
         if not (np.isfinite(sample.angular_velocity).all() and np.isfinite(sample.linear_acceleration).all()):
             return "imu_not_finite"
+        if np.abs(sample.angular_velocity).max() > _MAX_RATE or np.abs(sample.linear_acceleration).max() > _MAX_FORCE:
+            return "imu_out_of_range"
         if self._stamps and sample.stamp_ns <= self._stamps[-1]:
             return "imu_duplicate_stamp" if sample.stamp_ns == self._stamps[-1] else "imu_backward_stamp"
         self._stamps.append(sample.stamp_ns)

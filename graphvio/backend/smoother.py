@@ -204,7 +204,7 @@ class Smoother:
             Stamps and final poses ``nav_T_body`` of the states that left the window, in time order.
 
         Raises:
-            WindowError: if the window cannot be solved; it is left as it was.
+            WindowError: if the window cannot be solved; no state leaves it.
         """
         self._window.optimise()
         if len(self._stamps) > 1:
@@ -259,11 +259,12 @@ class Smoother:
         finished = [(stamp, self.pose(stamp)) for stamp in leaving]
         keys: list[int] = []
         for stamp in leaving:
-            k = self._index_of.pop(stamp)
+            k = self._index_of[stamp]
             keys += [_x(k), _v(k), _b(k)] if self.has_imu else [_x(k)]
         self._window.marginalise(keys)
-        gone = set(leaving)
-        self._stamps = [s for s in self._stamps if s not in gone]
+        for stamp in leaving:
+            del self._index_of[stamp]
+        self._stamps = [stamp for stamp in self._stamps if stamp in self._index_of]
         return finished
 
 

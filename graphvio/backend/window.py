@@ -38,14 +38,26 @@ class Window:
         """Gauss-Newton from the present values.
 
         Raises:
-            WindowError: if some variable is not constrained.
+            WindowError: if some variable is not constrained, or the solution is not finite; the values stay as
+                they were.
         """
-        for _ in range(_MAX_ITERATIONS):
-            step = self._solve().optimize()
-            self.values = self.values.retract(step)
-            self._solution = None
-            if step.norm() < _CONVERGED:
-                break
+        values = self.values
+        try:
+            for _ in range(_MAX_ITERATIONS):
+                step = self._solve().optimize()
+                size = step.norm()
+                if not np.isfinite(size):
+                    raise WindowError("the window's solution is not finite")
+                self.values = self.values.retract(step)
+                self._solution = None
+                if size < _CONVERGED:
+                    break
+        except RuntimeError as error:
+            self.values, self._solution = values, None
+            raise WindowError(f"the window cannot be optimised: {_one_line(error)}") from None
+        except WindowError:
+            self.values, self._solution = values, None
+            raise
 
     def joint_covariance(self, keys: Sequence[int]) -> Float:
         """Covariance of some variables together, in the order given.

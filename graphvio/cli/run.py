@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from graphvio.rig import Rig
 
 EXIT_INCOMPLETE = 3
+EXIT_INTERRUPTED = 130
 _LEAST_COMPLETION = 0.9
 
 
@@ -60,21 +61,24 @@ def run(
     from graphvio.rig import Rig
     from graphvio.sources import open_source
     from graphvio.viewer import Viewer
-    from graphvio.warmup import is_first_use, warm_up
+    from graphvio.warmup import warm_up
 
     settings = Config.load(config)
     opened = open_source(source, None if rig is None else Rig.load(rig), from_s=from_s, to_s=to_s)
     chosen = _choose(opened.rig, pairs, no_imu)
     if chosen is not opened.rig:
         opened = open_source(source, chosen, from_s=from_s, to_s=to_s)
+    folder = out if out is not None else ResultWriter.new_folder(Path("results"), opened.name)
     with ExitStack() as stack:
+        writer = stack.enter_context(ResultWriter(folder, opened.rig, settings.to_yaml()))
         viewer = stack.enter_context(Viewer(opened.rig, spawn=view, save=save_rrd)) if view or save_rrd else None
-        if is_first_use():
-            typer.echo("compiling numerical kernels for this machine, once: about a minute", err=True)
         warm_up(opened.rig, settings)
-        folder = out if out is not None else ResultWriter.new_folder(Path("results"), opened.name)
         line = stack.enter_context(_ProgressLine())
-        summary = run_pipeline(opened, settings, folder, viewer=viewer, on_progress=line.show)
+        try:
+            summary = run_pipeline(opened, settings, writer, viewer=viewer, on_progress=line.show)
+        except KeyboardInterrupt:
+            typer.echo(f"graphvio: interrupted; what was estimated until then is in {folder}", err=True)
+            raise typer.Exit(EXIT_INTERRUPTED) from None
     _tell(summary, folder)
     if summary.completion < _LEAST_COMPLETION:
         typer.echo(

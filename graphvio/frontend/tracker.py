@@ -12,7 +12,7 @@ from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
 from graphvio.errors import RigError
 from graphvio.frontend.corners import find_corners
-from graphvio.frontend.flow import track
+from graphvio.frontend.lucas_kanade import Pyramid, build_pyramid, track
 from graphvio.frontend.stereo import epipolar_search, triangulate
 from graphvio.rig import Camera, StereoPair
 
@@ -66,7 +66,7 @@ class PairTracker:
         self._allowed = _allowed(pair.left)
         self._next_id = 0
         self._last: PairFrame | None = None
-        self._last_image: Image | None = None
+        self._last_pyramid: Pyramid = ()
 
     def observe(self, stamp_ns: int, left: Image, right: Image, left_T_left_prev: Float | None) -> PairFrame:
         """Track, renew and triangulate.
@@ -82,7 +82,8 @@ class PairTracker:
         """
         left, right = _checked(left, self._pair.left), _checked(right, self._pair.right)
         rejected: dict[str, int] = {}
-        kept, pixels, inverse_depth = self._follow(left, left_T_left_prev, rejected)
+        pyramid = build_pyramid(left, self._config.tracking.levels)
+        kept, pixels, inverse_depth = self._follow(pyramid, left_T_left_prev, rejected)
         new = self._renew(left, pixels, np.isfinite(inverse_depth))
         ids = np.concatenate([kept.ids, self._next_id + np.arange(len(new))])
         flat_for = np.concatenate([kept.flat_for, np.zeros(len(new), dtype=np.int64)])
@@ -90,7 +91,7 @@ class PairTracker:
         pixels = np.concatenate([pixels, new])
         inverse_depth = np.concatenate([inverse_depth, np.full(len(new), np.nan)])
         rays, has_ray = self._pair.left.unproject(pixels)
-        normalised_right, matched = self._match(left, right, pixels, rays, inverse_depth, rejected)
+        normalised_right, matched = self._match(pyramid, right, pixels, rays, inverse_depth, rejected)
         points, covariances, errors = triangulate(
             rays,
             normalised_right,
@@ -117,7 +118,7 @@ class PairTracker:
             flat_for=np.where(has_depth, 0, flat_for + 1),
             rejected=rejected,
         ).keep(has_ray)
-        self._last, self._last_image = frame, left
+        self._last, self._last_pyramid = frame, pyramid
         return frame
 
     def drop(self, ids: Int) -> None:
@@ -126,11 +127,11 @@ class PairTracker:
             self._last = self._last.keep(~np.isin(self._last.ids, ids))
 
     def _follow(
-        self, image: Image, left_T_left_prev: Float | None, rejected: dict[str, int]
+        self, pyramid: Pyramid, left_T_left_prev: Float | None, rejected: dict[str, int]
     ) -> tuple[PairFrame, Float, Float]:
         """The tracks that are still there, as they were, with their pixels and predicted inverse depths (or NaN)."""
         last = self._last
-        if last is None or self._last_image is None:
+        if last is None:
             return _NOTHING, np.zeros((0, 2)), np.zeros(0)
         last = last.keep(last.flat_for <= _MAX_FLAT_FRAMES)
         guess, inverse_depth = last.pixels, np.where(last.has_depth, last.points[:, 2], np.nan)
@@ -138,13 +139,13 @@ class PairTracker:
             guess, inverse_depth = self._predict(last, left_T_left_prev)
         settings = self._config.tracking
         pixels, found = track(
-            self._last_image,
-            image,
+            self._last_pyramid,
+            pyramid,
             last.pixels,
             guess,
             window_px=settings.window_px,
             levels=settings.levels,
-            max_forward_backward_px=settings.max_forward_backward_px,
+            max_return_px=settings.max_forward_backward_px,
         )
         rejected["flow"] = int((~found).sum())
         inside = self._pair.left.contains(pixels, self._config.corners.border_px)
@@ -179,7 +180,7 @@ class PairTracker:
 
     def _match(
         self,
-        left: Image,
+        left: Pyramid,
         right: Image,
         pixels: Float,
         rays: Float,
@@ -199,7 +200,7 @@ class PairTracker:
             ]
         )
         coarse, found = epipolar_search(
-            left,
+            left[0],
             right,
             pixels,
             rays,
@@ -215,12 +216,12 @@ class PairTracker:
         good = np.zeros(len(pixels), dtype=bool)
         fine[found], good[found] = track(
             left,
-            right,
+            build_pyramid(right, _REFINEMENT_LEVELS),
             pixels[found],
             coarse[found],
             window_px=self._config.tracking.window_px,
             levels=_REFINEMENT_LEVELS,
-            max_forward_backward_px=self._config.tracking.max_forward_backward_px,
+            max_return_px=self._config.tracking.max_forward_backward_px,
         )
         good &= np.linalg.norm(fine - coarse, axis=1) <= _MAX_REFINEMENT_PX
         rejected["left_right"] = int((found & ~good).sum())

@@ -109,6 +109,15 @@ class ResultWriter:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+        if kind is not None and self._first_ns is None:
+            self._discard()
+
+    def _discard(self) -> None:
+        """Remove the files of a run that failed before its first estimate."""
+        for name in ("config.yaml", "rig.yaml", *self._files):
+            (self.folder / name).unlink(missing_ok=True)
+        if not any(self.folder.iterdir()):
+            self.folder.rmdir()
 
     def close(self) -> None:
         """Close the files; what was added stays."""
@@ -159,7 +168,7 @@ class ResultWriter:
         framesets: int,
         awaited: int,
         resets: int,
-        truth: Trajectory | None = None,
+        truth: Path | None = None,
     ) -> Summary:
         """Write what is known only at the end: the smoothed trajectory, the summary and the picture.
 
@@ -171,7 +180,7 @@ class ResultWriter:
             framesets: framesets read.
             awaited: framesets that could have had a pose: those after initialisation may begin.
             resets: times the estimation was started anew.
-            truth: to measure the run against; if that fails, the summary says why.
+            truth: trajectory file to measure the run against; if that fails, the summary says why.
 
         Raises:
             GraphvioError: if a file cannot be written.
@@ -180,7 +189,7 @@ class ResultWriter:
         trajectory = Trajectory(
             np.array(self._stamps, dtype=np.int64), np.array(self._poses, dtype=np.float64).reshape(-1, 4, 4)
         )
-        evaluation, evaluation_error = _evaluate_if_possible(trajectory, truth)
+        true_trajectory, evaluation, evaluation_error = _evaluate_if_possible(trajectory, truth)
         duration_s = (self._last_ns - (self._first_ns or 0)) / _NS_PER_S if self._first_ns is not None else 0.0
         epochs = np.array(self._epochs, dtype=np.int64)
         summary = Summary(
@@ -212,7 +221,7 @@ class ResultWriter:
             status=self._pose_status,
             epochs=self._epochs,
             lost_ns=self._lost if len(trajectory) else (),
-            truth=truth,
+            truth=true_trajectory,
             evaluation=evaluation,
             name=self.folder.name,
         )
@@ -244,10 +253,15 @@ def _cannot_write(where: Path, error: OSError) -> GraphvioError:
     return GraphvioError(f"{where}: cannot be written ({error.strerror or error}); choose another place for results")
 
 
-def _evaluate_if_possible(trajectory: Trajectory, truth: Trajectory | None) -> tuple[Evaluation | None, str | None]:
+def _evaluate_if_possible(
+    trajectory: Trajectory, truth: Path | None
+) -> tuple[Trajectory | None, Evaluation | None, str | None]:
+    """The truth and the figures, as far as they can be had, and why not otherwise."""
     if truth is None:
-        return None, None
+        return None, None, None
+    read = None
     try:
-        return evaluate(trajectory, truth), None
+        read = Trajectory.read(truth)
+        return read, evaluate(trajectory, read), None
     except TrajectoryError as error:
-        return None, str(error)
+        return read, None, str(error)
