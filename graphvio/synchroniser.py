@@ -107,7 +107,7 @@ class Synchroniser:
         self._imu.discard_before(stamp_ns + self._offset_ns - round(self._initialisation.window_s * 1e9))
 
     def _is_due(self, frameset: FrameSet, started: bool) -> bool:
-        if not self._has_imu:
+        if not self._has_imu or self._imu.oldest_ns is None:
             return True
         assert self._newest_ns is not None
         waited_ns = self._newest_ns - frameset.stamp_ns

@@ -118,7 +118,7 @@ def test_an_imu_that_comes_after_a_start_without_opens_an_epoch(room_walk: Path,
     first = framesets(events)[0].stamp_ns
     late = Odometry(rig, config)
     estimates = feed(late, [kept for e in events if (kept := _without_early_imu(e, first)) is not None])
-    assert all(e.nav_T_body is not None for e in estimates)
+    assert [e.nav_T_body is None for e in estimates] == [True] * 10 + [False] * (len(estimates) - 10)
     assert [estimates[0].epoch, estimates[-1].epoch] == [0, 1]
     assert kinds(late)[0] == "started_without_imu"
     assert estimates[-1].gyro_bias is not None
@@ -142,7 +142,7 @@ def test_time_never_goes_back(odometry: Odometry, events: list[Event]) -> None:
     old = framesets(events)[5]
     assert odometry.process(old) is None
     assert odometry.process(framesets(events[:600])[-1]) is None
-    assert kinds(odometry) == ["frameset_backward_stamp"] * 2
+    assert kinds(odometry) == ["frameset_backward_stamp", "frameset_duplicate_stamp"]
     stamps = [e.stamp_ns for e in estimates]
     assert stamps == sorted(set(stamps))
 
@@ -226,7 +226,7 @@ def test_importing_the_package_and_its_command_line_loads_nothing_heavy() -> Non
 def test_numpys_integers_are_stamps_and_floats_are_not(odometry: Odometry, events: list[Event]) -> None:
     for event in events[:400]:
         for kind in (np.int64, np.uint64):
-            estimate = odometry.process(replace(event, stamp_ns=kind(event.stamp_ns)))
+            estimate = odometry.process(replace(event, stamp_ns=kind(event.stamp_ns)))  # type: ignore[arg-type]
             assert estimate is None or type(estimate.stamp_ns) is int
     with pytest.raises(EventError, match="whole nanoseconds"):
         odometry.process(replace(events[400], stamp_ns=events[400].stamp_ns * 1e-9))  # type: ignore[arg-type]
@@ -256,9 +256,8 @@ def test_one_stamp_far_ahead_stops_nothing(odometry: Odometry, events: list[Even
     for i, event in enumerate(events):
         spoilt.append(event)
         if i in (200, 500):
-            spoilt.append(
-                replace(next(e for e in events if isinstance(e, ImuSample)), stamp_ns=event.stamp_ns + ahead_ns)
-            )
+            sample = next(e for e in events if isinstance(e, ImuSample))
+            spoilt.append(replace(sample, stamp_ns=event.stamp_ns + ahead_ns))
             spoilt.append(replace(framesets(events)[0], stamp_ns=event.stamp_ns + ahead_ns))
     estimates = feed(odometry, spoilt)
     assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(events)]
@@ -269,11 +268,10 @@ def test_one_stamp_far_ahead_stops_nothing(odometry: Odometry, events: list[Even
 def test_a_rig_whose_imu_never_speaks_goes_on_without_it_and_without_delay(
     odometry: Odometry, events: list[Event]
 ) -> None:
-    for frameset in framesets(events):
-        estimate = odometry.process(frameset)
-        assert estimate is not None
-        assert estimate.stamp_ns == frameset.stamp_ns
-    assert estimate.status is Status.TRACKING
+    estimates = [odometry.process(frameset) for frameset in framesets(events)]
+    assert [e.stamp_ns for e in estimates if e is not None] == [f.stamp_ns for f in framesets(events)]
+    assert estimates[-1] is not None
+    assert estimates[-1].status is Status.TRACKING
     assert kinds(odometry) == ["started_without_imu"]
 
 
