@@ -41,7 +41,9 @@ def cache_root() -> Path:
     except (OSError, RuntimeError):
         pass  # a home that is read-only or unknown: compiled code then lives as long as /tmp does
     root = Path(tempfile.gettempdir()) / f"graphvio-{os.getuid()}-kernels"
-    root.mkdir(parents=True, exist_ok=True)
+    root.mkdir(mode=0o700, exist_ok=True)
+    if root.stat().st_uid != os.getuid():  # code is loaded from here: it must be our own
+        return Path(tempfile.mkdtemp(prefix="graphvio-kernels-"))
     return root
 
 

@@ -36,6 +36,7 @@ class Odometry:
     """Visual-inertial odometry of a rig of stereo pairs.
 
     Feed it events in time order with `process`. It holds a frameset until the IMU samples that cover it have come.
+    With more than one pair, OpenCV's own threads are switched off in this process: pairs run side by side instead.
 
     Args:
         rig: cameras and IMU; without an IMU, vision alone is used.

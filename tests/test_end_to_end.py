@@ -265,6 +265,14 @@ def test_mistakes_in_the_options(room_walk: Path, tmp_path: Path) -> None:
     assert "not empty" in refused(graphvio("run", room_walk, "--out", tmp_path / "full", "--to", 0.2))
 
 
+def test_mistakes_of_usage_are_one_line_too(tmp_path: Path) -> None:
+    assert "Missing argument" in refused(graphvio("run"))
+    assert "--from" in refused(graphvio("run", tmp_path, "--from", "soon"))
+    assert "No such option" in refused(graphvio("run", tmp_path, "--nope"))
+    assert "No such command" in refused(graphvio("walk"))
+    assert graphvio("--help").returncode == 0
+
+
 def test_verbose_shows_the_traceback(tmp_path: Path) -> None:
     done = graphvio("run", tmp_path / "nowhere", "--verbose")
     assert done.returncode != 0

@@ -1,6 +1,7 @@
 """The command line: one module per command; what is heavy is imported inside the command."""
 
 import sys
+from typing import NoReturn
 
 import typer
 
@@ -13,6 +14,7 @@ from graphvio.cli.view import view
 from graphvio.errors import GraphvioError
 
 EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
 
 app = typer.Typer(
     name="graphvio",
@@ -21,6 +23,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
+    epilog="Examples:  graphvio simulate room --out room  |  graphvio run room  |  graphvio doctor",
 )
 app.command()(run)
 app.command()(evaluate)
@@ -33,9 +36,25 @@ app.command()(doctor)
 def main() -> None:
     """Entry point: a user's mistake becomes one line and exit code 2; ``--verbose`` shows the traceback."""
     try:
-        app()
+        code = app(standalone_mode=False)
+    except typer.Abort:
+        sys.exit(EXIT_INTERRUPTED)
     except GraphvioError as error:
         if "--verbose" in sys.argv:
             raise
-        print(f"graphvio: {error}", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
+        _refuse(str(error))
+    except Exception as error:
+        usage = getattr(error, "format_message", None)  # of the command-line library's own errors
+        if usage is None:
+            raise
+        message = " ".join(usage().split())
+        if not message:  # no command was given, and the help has been shown
+            sys.exit(EXIT_BAD_INPUT)
+        _refuse(f"{message}  (graphvio --help tells what there is)")
+    else:
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+def _refuse(message: str) -> NoReturn:
+    print(f"graphvio: {message}", file=sys.stderr)
+    sys.exit(EXIT_BAD_INPUT)

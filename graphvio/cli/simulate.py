@@ -24,9 +24,9 @@ def simulate(
 
     Examples:
 
-        graphvio simulate room --out /tmp/room
+        graphvio simulate room --out room
 
-        graphvio simulate corridor --out /tmp/corridor --duration 40 --seed 1
+        graphvio simulate corridor --out corridor --duration 40 --seed 1
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
