@@ -287,7 +287,7 @@ class Odometry:
         self._smoothed += [(ns, pose) for ns, pose in smoother.all_poses() if ns <= self._tracked_ns]
         predicted, by_vision = smoother.state(), self._refused[motion.stamp_ns]
         apart = se3_log(se3_inverse(by_vision) @ predicted.nav_T_body)
-        covariance = smoother.covariance() + np.outer(apart, apart)
+        covariance = smoother.covariance() + np.diag(apart**2)
         state = _with_velocity(replace(predicted, nav_T_body=by_vision), motion)
         self._start_again(motion.stamp_ns, state, covariance, _WIDE_GYRO_BIAS_SIGMA)
         self._report(
