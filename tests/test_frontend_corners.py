@@ -114,4 +114,5 @@ def test_occupied_cells() -> None:
 
 def test_small_images_are_no_fault() -> None:
     for shape in ((16, 16), (17, 40), (41, 81)):
-        find(np.random.default_rng(5).integers(0, 256, shape).astype(np.uint8))
+        corners = find(np.random.default_rng(5).integers(0, 256, shape).astype(np.uint8))
+        assert ((corners >= 0) & (corners < shape[::-1])).all()

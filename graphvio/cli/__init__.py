@@ -8,13 +8,12 @@ import typer
 from graphvio.cli.doctor import doctor
 from graphvio.cli.dump_config import dump_config
 from graphvio.cli.evaluate import evaluate
-from graphvio.cli.run import run
+from graphvio.cli.run import EXIT_INTERRUPTED, run
 from graphvio.cli.simulate import simulate
 from graphvio.cli.view import view
 from graphvio.errors import GraphvioError
 
 EXIT_BAD_INPUT = 2
-EXIT_INTERRUPTED = 130
 
 app = typer.Typer(
     name="graphvio",
