@@ -21,7 +21,8 @@ def warm_up(rig: Rig, config: Config) -> None:
     tracker = PairTracker(pair, config)
     noise = rng.integers(0, 256, size=(height, width), dtype=np.uint8)
     for stamp_ns in range(2):
-        tracker.observe(stamp_ns, noise, noise, np.eye(4))
+        tracker.observe(stamp_ns, noise, noise, np.eye(4), np.eye(4))
+        tracker.anchor()
     points = np.column_stack([rng.uniform(-0.3, 0.3, (_POINTS, 2)), rng.uniform(0.1, 1.0, _POINTS)])
     observations = Observations(
         np.zeros(_POINTS, dtype=np.int64),

@@ -77,22 +77,7 @@ def _track_points(
             if not _sample(source[level], x, y, half + 1, bordered):
                 continue  # near the edge of a coarse level: the finer ones may still see it
             xx, xy, yy = _prepare(bordered, patch, gx, gy)
-            determinant = xx * yy - xy * xy
-            smaller = 0.5 * (xx + yy - np.sqrt((xx - yy) * (xx - yy) + 4.0 * xy * xy))
-            if smaller < _MIN_GRADIENT * _MIN_GRADIENT * side * side:
-                continue
-            converged = False
-            for _ in range(_MAX_ITERATIONS):
-                bx, by, inside = _mismatch(target[level], u, v, half, patch, gx, gy)
-                if not inside:
-                    break
-                step_u = (yy * bx - xy * by) / determinant
-                step_v = (xx * by - xy * bx) / determinant
-                u -= step_u
-                v -= step_v
-                if step_u * step_u + step_v * step_v < _CONVERGED_PX * _CONVERGED_PX:
-                    converged = True
-                    break
+            u, v, converged = _align(target[level], u, v, half, patch, gx, gy, xx, xy, yy)
             if converged or level > 0:
                 moved[i, 0], moved[i, 1] = u / scale, v / scale
             found[i] = converged and level == 0
@@ -187,3 +172,92 @@ def _mismatch(
             bx += gx[j, i] * difference
             by += gy[j, i] * difference
     return float(bx), float(by), True
+
+
+def register(
+    source: Image, target: Image, pixels: Float, warps: Float, guess: Float, *, window_px: int, max_shift_px: float
+) -> tuple[Float, Bool]:
+    """Where patches of one image are in another that sees them deformed, from a guess that is nearly right.
+
+    Args:
+        source: image that holds the patches.
+        target: image to find them in.
+        pixels: (N, 2) centres of the patches.
+        warps: (N, 2, 2) derivative of the source pixel by the target pixel.
+        guess: (N, 2) in the target.
+        window_px: side of the patch, odd.
+        max_shift_px: largest distance from the guess.
+
+    Returns:
+        Pixels (N, 2), equal to the guess where not found, and whether each was found (N,).
+    """
+    moved, found = _register_points(source, target, pixels, warps, guess, window_px // 2)
+    shift = np.hypot(moved[:, 0] - guess[:, 0], moved[:, 1] - guess[:, 1])
+    found &= shift <= max_shift_px
+    return np.where(found[:, None], moved, guess), found
+
+
+@fast_kernel
+def _register_points(
+    source: Image, target: Image, pixels: Float, warps: Float, guess: Float, half: int
+) -> tuple[Float, Bool]:
+    n = len(pixels)
+    moved = guess.copy()
+    found = np.zeros(n, dtype=np.bool_)
+    side = 2 * half + 1
+    bordered = np.empty((side + 2, side + 2), dtype=np.float32)
+    patch = np.empty((side, side), dtype=np.float32)
+    gx = np.empty((side, side), dtype=np.float32)
+    gy = np.empty((side, side), dtype=np.float32)
+    for i in range(n):
+        if not _sample_warped(source, pixels[i, 0], pixels[i, 1], warps[i], half + 1, bordered):
+            continue
+        xx, xy, yy = _prepare(bordered, patch, gx, gy)
+        moved[i, 0], moved[i, 1], found[i] = _align(
+            target, guess[i, 0], guess[i, 1], half, patch, gx, gy, xx, xy, yy
+        )
+    return moved, found
+
+
+@fast_kernel
+def _align(
+    image: Image, u: float, v: float, half: int, patch: AnyArray, gx: AnyArray, gy: AnyArray,
+    xx: float, xy: float, yy: float,
+) -> tuple[float, float, bool]:  # fmt: skip
+    """Gauss-Newton from (u, v): the patch's place in an image, and whether the iteration converged there."""
+    smaller = 0.5 * (xx + yy - np.sqrt((xx - yy) * (xx - yy) + 4.0 * xy * xy))
+    if smaller < _MIN_GRADIENT * _MIN_GRADIENT * patch.size:
+        return u, v, False
+    determinant = xx * yy - xy * xy
+    for _ in range(_MAX_ITERATIONS):
+        bx, by, inside = _mismatch(image, u, v, half, patch, gx, gy)
+        if not inside:
+            break
+        step_u = (yy * bx - xy * by) / determinant
+        step_v = (xx * by - xy * bx) / determinant
+        u -= step_u
+        v -= step_v
+        if step_u * step_u + step_v * step_v < _CONVERGED_PX * _CONVERGED_PX:
+            return u, v, True
+    return u, v, False
+
+
+@fast_kernel
+def _sample_warped(image: Image, x: float, y: float, warp: Float, half: int, out: AnyArray) -> bool:
+    """Fill a patch around (x, y) whose pixels are ``warp`` apart; False where it leaves the image."""
+    height, width = image.shape
+    reach_x = half * (abs(warp[0, 0]) + abs(warp[0, 1]))
+    reach_y = half * (abs(warp[1, 0]) + abs(warp[1, 1]))
+    if not (reach_x <= x < width - 1 - reach_x and reach_y <= y < height - 1 - reach_y):
+        return False
+    one = np.float32(1.0)
+    for j in range(2 * half + 1):
+        for i in range(2 * half + 1):
+            px = np.float32(x + warp[0, 0] * (i - half) + warp[0, 1] * (j - half))
+            py = np.float32(y + warp[1, 0] * (i - half) + warp[1, 1] * (j - half))
+            x0, y0 = int(px), int(py)
+            ax, ay = px - np.float32(x0), py - np.float32(y0)
+            upper = np.float32(image[y0, x0]) * (one - ax) + np.float32(image[y0, x0 + 1]) * ax
+            lower = np.float32(image[y0 + 1, x0]) * (one - ax) + np.float32(image[y0 + 1, x0 + 1]) * ax
+            out[j, i] = upper * (one - ay) + lower * ay
+    return True

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.frontend.tracker import PairFrame
+from graphvio.frontend.tracks import PairFrame
 from graphvio.rig import Rig
 
 

@@ -16,7 +16,8 @@ from graphvio.events import FrameSet, PairReport
 from graphvio.frontend.observations import Correspondences, RigArrays, correspond
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import best_pair_motion, joint_motion
-from graphvio.frontend.tracker import PairFrame, PairTracker
+from graphvio.frontend.tracker import PairTracker
+from graphvio.frontend.tracks import PairFrame
 from graphvio.geometry import se3_inverse
 from graphvio.rig import Rig
 
@@ -92,14 +93,14 @@ class VisualFrontend:
         tracked = perf_counter()
         reference = self._shared_reference(frames)
         if not reference:
-            self._references.update(frames)
+            self._refer_to(frames)
             reports = {j: _report(frame, None, None) for j, frame in frames.items()}
             return VisualResult(None, "first images", reports, {"track": 1e3 * (tracked - start)})
         reference_stamp_ns = next(iter(reference.values())).stamp_ns
         correspondences = correspond(reference, frames)
         refined, reason = self._estimate(correspondences, predict(reference_stamp_ns), frameset.stamp_ns)
         if refined is None or self._reference_is_spent(frames, correspondences, refined):
-            self._references.update(frames)
+            self._refer_to(frames)
         if refined is not None:
             self._drop_outliers(frames, correspondences, refined)
         reports = {j: _report(frame, correspondences, refined, j) for j, frame in frames.items()}
@@ -118,7 +119,8 @@ class VisualFrontend:
     def rekey(self) -> None:
         """Measure the next motions from the newest frames."""
         newest_ns = max(frame.stamp_ns for frame in self._latest.values())
-        self._references = {j: frame for j, frame in self._latest.items() if frame.stamp_ns == newest_ns}
+        self._references.clear()
+        self._refer_to({j: frame for j, frame in self._latest.items() if frame.stamp_ns == newest_ns})
 
     def close(self) -> None:
         """End the threads."""
@@ -127,18 +129,29 @@ class VisualFrontend:
     def _observe(self, frameset: FrameSet, predict: MotionPredictor) -> dict[int, PairFrame]:
         def observe(j: int) -> PairFrame:
             left, right = frameset.images[j]
-            latest = self._latest.get(j)
-            cur_T_prev = None if latest is None else predict(latest.stamp_ns)
-            motion = None
-            if cur_T_prev is not None:
-                body_T_left = self._arrays.body_T_left[j]
-                motion = se3_inverse(body_T_left) @ cur_T_prev @ body_T_left  # eq. (1)
-            return self._trackers[j].observe(frameset.stamp_ns, left, right, motion)
+            since_latest = self._predicted(j, self._latest.get(j), predict)
+            since_reference = self._predicted(j, self._references.get(j), predict)
+            return self._trackers[j].observe(frameset.stamp_ns, left, right, since_latest, since_reference)
 
         pairs = sorted(frameset.images)
         frames = dict(zip(pairs, self._workers.map(observe, pairs), strict=True))
         self._latest.update(frames)
         return frames
+
+    def _predicted(self, pair: int, then: PairFrame | None, predict: MotionPredictor) -> Float | None:
+        """Predicted motion of points in a pair's left camera since one of its frames, by eq. (1)."""
+        cur_T_then = None if then is None else predict(then.stamp_ns)
+        if cur_T_then is None:
+            return None
+        body_T_left = self._arrays.body_T_left[pair]
+        return np.asarray(se3_inverse(body_T_left) @ cur_T_then @ body_T_left)
+
+    def _refer_to(self, frames: Mapping[int, PairFrame]) -> None:
+        """Measure the next motions from these frames, the newest of their pairs."""
+        self._references.update(frames)
+        if self._config.motion.reference == "keyframe":
+            for j in frames:
+                self._trackers[j].anchor()
 
     def _shared_reference(self, frames: Mapping[int, PairFrame]) -> dict[int, PairFrame]:
         """Reference frames of one instant: where pairs were keyed at different times, the larger group counts."""

@@ -1,0 +1,67 @@
+"""What one stereo pair saw at one instant: its tracks, as columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float, Int
+
+
+@dataclass(frozen=True, eq=False)
+class PairFrame:
+    """What one pair saw at one instant: N tracks.
+
+    Attributes:
+        stamp_ns: of the frameset.
+        ids: (N,) identities, increasing.
+        ages: (N,) number of frames before this one in which the track was seen.
+        pixels: (N, 2) in the left image.
+        left: (N, 2) normalised coordinates in the left image.
+        right: (N, 2) the same in the right image; meaningful where ``has_depth``.
+        points: (N, 3) ``[x, y, 1/Z]`` in the left camera's frame, see `graphvio.frontend.stereo`.
+        covariances: (N, 3, 3) of ``points``, for a pixel noise of 1 px.
+        has_depth: (N,) whether the stereo match passed all its tests.
+        flat_for: (N,) number of frames, up to this one, without depth.
+        rejected: what each test of tracking and stereo matching threw out.
+        stage_ms: time by stage.
+    """
+
+    stamp_ns: int
+    ids: Int
+    ages: Int
+    pixels: Float
+    left: Float
+    right: Float
+    points: Float
+    covariances: Float
+    has_depth: Bool
+    flat_for: Int
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    stage_ms: Mapping[str, float] = field(default_factory=dict)
+
+    def keep(self, rows: Bool) -> PairFrame:
+        """The same with only some of its tracks."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
+
+    @staticmethod
+    def empty(stamp_ns: int = 0) -> PairFrame:
+        """A frame without tracks."""
+        none, whole = np.zeros(0), np.zeros(0, dtype=np.int64)
+        return PairFrame(
+            stamp_ns,
+            ids=whole,
+            ages=whole,
+            pixels=np.zeros((0, 2)),
+            left=np.zeros((0, 2)),
+            right=np.zeros((0, 2)),
+            points=np.zeros((0, 3)),
+            covariances=np.zeros((0, 3, 3)),
+            has_depth=none.astype(bool),
+            flat_for=whole,
+        )
+
+
+_COLUMNS = tuple(f.name for f in fields(PairFrame) if f.name not in ("stamp_ns", "rejected", "stage_ms"))
