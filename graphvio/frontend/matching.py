@@ -1,4 +1,4 @@
-"""Stereo matching of one pair: left corners found in the right image and triangulated, each test counted (section 3)."""
+"""Stereo matching of one pair: left corners found in the right image and triangulated (section 3)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Image
 from graphvio.config import Config
-from graphvio.frontend.lucas_kanade import Pyramid, build_pyramid, track
-from graphvio.frontend.stereo import epipolar_search, triangulate
+from graphvio.frontend.lucas_kanade import Pyramid, register
+from graphvio.frontend.slanted import align_slanted
+from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
 from graphvio.rig import StereoPair
 
-_REFINEMENT_LEVELS = 2
+_SEARCH_CORRELATION = 0.6  # of undeformed patches; aligned ones must reach `StereoConfig.min_correlation`
 _MAX_REFINEMENT_PX = 3.0
 _SEARCH_MARGIN_PX = 6.0
 
@@ -78,42 +79,39 @@ class StereoMatcher:
     ) -> tuple[Float, Bool]:
         """Pixels (N, 2) in the right image to sub-pixel precision, and whether appearance and the way back agree."""
         pair, settings, tracking = self._pair, self._config.stereo, self._config.tracking
-        margin = _SEARCH_MARGIN_PX / (pair.right.focal_px * pair.baseline_m)
-        nearest = 1.0 / settings.min_depth_m
         known = np.isfinite(inverse_depths)
-        expected = np.where(known, inverse_depths, 0.0)
-        bounds = np.column_stack(
-            [
-                np.where(known, np.clip(expected - margin, 0.0, nearest), 0.0),
-                np.where(known, np.clip(expected + margin, margin, nearest), nearest),
-            ]
+        expected = np.where(known, np.clip(inverse_depths, 0.0, 1.0 / settings.min_depth_m), 0.0)
+        guess, directions, usable = epipolar_lines(
+            rays, expected, pair.right_T_left, pair.right.model_number, pair.right.intrinsics, pair.right.distortion
         )
-        coarse, found = epipolar_search(
+        nearest = np.full(int((~known).sum()), 1.0 / settings.min_depth_m)
+        guess[~known], usable[~known] = epipolar_search(
             left[0],
             right,
-            pixels,
-            rays,
-            bounds,
+            pixels[~known],
+            rays[~known],
+            np.column_stack([np.zeros_like(nearest), nearest]),
             pair.right_T_left,
             pair.right.model_number,
             pair.right.intrinsics,
             pair.right.distortion,
-            settings.min_correlation,
+            _SEARCH_CORRELATION,
         )
-        found = _passes(np.ones(len(pixels), dtype=bool), found, "appearance", rejected)
-        fine = np.zeros_like(pixels)
-        returned = np.zeros(len(pixels), dtype=bool)
-        fine[found], returned[found] = track(
-            left,
-            build_pyramid(right, _REFINEMENT_LEVELS),
-            pixels[found],
-            coarse[found],
-            window_px=tracking.window_px,
-            levels=_REFINEMENT_LEVELS,
-            max_return_px=tracking.max_forward_backward_px,
-        )
-        returned &= np.linalg.norm(fine - coarse, axis=1) <= _MAX_REFINEMENT_PX
-        return fine, _passes(found, returned, "left_right", rejected)
+        found = _passes(np.ones(len(pixels), dtype=bool), usable, "search", rejected)
+        half = tracking.window_px // 2
+        matched, slopes, correlations, converged = align_slanted(left[0], right, pixels, guess, directions, half)
+        close = np.linalg.norm(matched - guess, axis=1) <= np.where(known, _SEARCH_MARGIN_PX, _MAX_REFINEMENT_PX)
+        found = _passes(found, converged & close, "alignment", rejected)
+        found = _passes(found, correlations >= settings.min_correlation, "appearance", rejected)
+        rows = np.flatnonzero(found)
+        warps = np.eye(2) + directions[rows][:, :, None] * slopes[rows][:, None, :]
+        _, returned = register(
+            right, left[0], matched[rows], warps, pixels[rows],
+            window_px=tracking.window_px, max_shift_px=tracking.max_forward_backward_px,
+        )  # fmt: skip
+        back = np.zeros(len(pixels), dtype=bool)
+        back[rows] = returned
+        return matched, _passes(found, back, "left_right", rejected)
 
 
 def _passes(candidates: Bool, test: Bool, name: str, rejected: dict[str, int]) -> Bool:

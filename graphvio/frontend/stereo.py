@@ -79,6 +79,29 @@ def epipolar_search(
 
 
 @kernel
+def epipolar_lines(
+    rays: Float, inverse_depths: Float, right_T_left: Float, model: int, intrinsics: Float, distortion: Float
+) -> tuple[Float, Float, Bool]:
+    """Where points of known depth fall in the right image.
+
+    Returns:
+        Pixels (N, 2), the directions (N, 2) in which they move when they come nearer, and whether both exist (N,).
+    """
+    n = len(rays)
+    pixels, directions, valid = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n, dtype=np.bool_)
+    for i in range(n):
+        w = inverse_depths[i]
+        u, v, ok = _on_curve(rays[i], w, right_T_left, model, intrinsics, distortion)
+        u1, v1, ok1 = _on_curve(rays[i], w + 0.01, right_T_left, model, intrinsics, distortion)
+        length = np.hypot(u1 - u, v1 - v)
+        if ok and ok1 and length > 1e-9:
+            pixels[i, 0], pixels[i, 1] = u, v
+            directions[i, 0], directions[i, 1] = (u1 - u) / length, (v1 - v) / length
+            valid[i] = True
+    return pixels, directions, valid
+
+
+@kernel
 def triangulate(
     left: Float, right: Float, right_T_left: Float, focal_left: float, focal_right: float
 ) -> tuple[Float, Float, Float]:

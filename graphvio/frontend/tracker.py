@@ -13,7 +13,6 @@ from graphvio.frontend.lucas_kanade import Pyramid, build_pyramid, register, tra
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.stopwatch import Stopwatch
 from graphvio.frontend.tracks import PairFrame
-from graphvio.geometry import se3_inverse
 from graphvio.rig import Camera, StereoPair
 
 _MAX_TRACKS_PER_CELL = 2
