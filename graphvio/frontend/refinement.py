@@ -19,7 +19,7 @@ from graphvio.kernels import kernel
 _ROUNDS = 3
 _STEPS_PER_ROUND = 6
 _CONVERGED = 1e-7
-_MIN_VARIANCE_FACTOR = 0.5
+_MIN_VARIANCE_FACTOR = 0.05
 _WEAK_DIRECTION_SIGMA = 10.0
 
 

@@ -123,36 +123,54 @@ def triangulate(
     covariances = np.zeros((n, 3, 3))
     errors = np.full(n, np.inf)
     r = right_T_left
-    jacobian = np.zeros((4, 3))
-    residual = np.empty(4)
+    weight = focal_left * focal_left
     for i in range(n):
         a, b, w = left[i, 0], left[i, 1], 0.0
-        hessian = np.zeros((3, 3))
-        regular = True
-        for _ in range(_GAUSS_NEWTON_STEPS):
+        for step in range(_GAUSS_NEWTON_STEPS + 1):
             y0 = r[0, 0] * a + r[0, 1] * b + r[0, 2] + w * r[0, 3]
             y1 = r[1, 0] * a + r[1, 1] * b + r[1, 2] + w * r[1, 3]
             y2 = r[2, 0] * a + r[2, 1] * b + r[2, 2] + w * r[2, 3]
             if y2 < 1e-3:
-                regular = False
                 break
-            u, v = y0 / y2, y1 / y2
-            residual[0], residual[1] = focal_left * (left[i, 0] - a), focal_left * (left[i, 1] - b)
-            residual[2], residual[3] = focal_right * (right[i, 0] - u), focal_right * (right[i, 1] - v)
-            jacobian[0, 0], jacobian[1, 1] = focal_left, focal_left
-            for c in range(3):
-                column = c if c < 2 else 3
-                jacobian[2, c] = focal_right * (r[0, column] - u * r[2, column]) / y2
-                jacobian[3, c] = focal_right * (r[1, column] - v * r[2, column]) / y2
-            hessian = jacobian.T @ jacobian
-            step = np.linalg.solve(hessian, jacobian.T @ residual)
-            a, b, w = a + step[0], b + step[1], w + step[2]
-        if not regular:
-            continue
-        points[i, 0], points[i, 1], points[i, 2] = a, b, w
-        covariances[i] = np.linalg.inv(hessian)
-        errors[i] = np.sqrt(np.sum((residual - jacobian @ step) ** 2))
+            u, v, scale = y0 / y2, y1 / y2, focal_right / y2
+            e0, e1 = focal_left * (left[i, 0] - a), focal_left * (left[i, 1] - b)
+            e2, e3 = focal_right * (right[i, 0] - u), focal_right * (right[i, 1] - v)
+            if step == _GAUSS_NEWTON_STEPS:
+                points[i, 0], points[i, 1], points[i, 2] = a, b, w
+                errors[i] = np.sqrt(e0 * e0 + e1 * e1 + e2 * e2 + e3 * e3)
+                break
+            # derivatives of (u, v) in pixels by a, b, w
+            ua, ub, uw = (
+                scale * (r[0, 0] - u * r[2, 0]), scale * (r[0, 1] - u * r[2, 1]), scale * (r[0, 3] - u * r[2, 3]),
+            )  # fmt: skip
+            va, vb, vw = (
+                scale * (r[1, 0] - v * r[2, 0]), scale * (r[1, 1] - v * r[2, 1]), scale * (r[1, 3] - v * r[2, 3]),
+            )  # fmt: skip
+            _invert_symmetric(
+                weight + ua * ua + va * va, ua * ub + va * vb, ua * uw + va * vw,
+                weight + ub * ub + vb * vb, ub * uw + vb * vw, uw * uw + vw * vw, covariances[i],
+            )  # fmt: skip
+            ga = focal_left * e0 + ua * e2 + va * e3
+            gb = focal_left * e1 + ub * e2 + vb * e3
+            gw = uw * e2 + vw * e3
+            c = covariances[i]
+            a += c[0, 0] * ga + c[0, 1] * gb + c[0, 2] * gw
+            b += c[1, 0] * ga + c[1, 1] * gb + c[1, 2] * gw
+            w += c[2, 0] * ga + c[2, 1] * gb + c[2, 2] * gw
     return points, covariances, errors
+
+
+@kernel
+def _invert_symmetric(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, inverse: Float) -> None:
+    """Fill the inverse (3, 3) of a symmetric matrix."""
+    cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    scale = 1.0 / (xx * cxx + xy * cxy + xz * cxz)
+    inverse[0, 0] = cxx * scale
+    inverse[0, 1] = inverse[1, 0] = cxy * scale
+    inverse[0, 2] = inverse[2, 0] = cxz * scale
+    inverse[1, 1] = (xx * zz - xz * xz) * scale
+    inverse[1, 2] = inverse[2, 1] = (xy * xz - xx * yz) * scale
+    inverse[2, 2] = (xx * yy - xy * xy) * scale
 
 
 @kernel

@@ -1,0 +1,225 @@
+"""``scripts/benchmark accuracy``: every scene and the real clip, with each profile, all pairs and each pair alone."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from benchmarks.picture import Panel, draw_trajectories
+from benchmarks.recordings import add_data_option, simulated
+from benchmarks.report import DOCS, Report, machine, tell
+from benchmarks.runs import BREAK_SIGMA, BREAK_STATISTIC, HEAD, Alter, Outcome, blinded, run, with_moved_pair
+from graphvio.config import Config
+from graphvio.errors import GraphvioError
+from graphvio.rig import Rig
+from graphvio.simulation import SCENE_NAMES
+from graphvio.sources import open_source
+
+DEFAULT = "default"
+CLIP = DOCS.parents[1] / "shared" / "data" / "euroc_mh01_clip"
+CLIP_NAME = "EuRoC MH_01 clip"
+CLIP_TRUTH_SIGMA_M = 1e-3
+"""Taken for the true positions of a real recording: an assumption, about right for a laser tracker."""
+_DRAWN = ("corridor", "stairs", CLIP_NAME)
+_ANGLE_DEG, _SHIFT_M = 1.0, 0.03
+_BLIND_SCENE, _BLIND_S, _BLIND_FROM_S = "room", 5.0, 10.0
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand."""
+    parser = subparsers.add_parser(
+        "accuracy",
+        help="errors of every scene and the real clip by profile, with all pairs and with each alone",
+        description="Runs every recording with each profile without the IMU, and the default profile with it, with "
+        "all pairs and with each pair alone; then with an error in the second pair's extrinsics, and with a pair "
+        "that is blind for 5 s. Writes OUT/accuracy.md and OUT/trajectories.png.",
+        epilog="Example: scripts/benchmark accuracy --scenes room --duration 10",
+    )
+    parser.add_argument(
+        "--clip",
+        type=Path,
+        default=CLIP,
+        metavar="DIR",
+        help="a real recording with truth, left out if it is not there (default: shared/data/euroc_mh01_clip beside "
+        "the project)",
+    )
+    parser.add_argument("--scenes", nargs="*", default=list(SCENE_NAMES), metavar="NAME", help="default: all")
+    parser.add_argument("--duration", type=float, metavar="S", help="only so much of each simulated walk")
+    parser.add_argument("--profiles", nargs="+", default=["paper", DEFAULT, "fast"], metavar="NAME")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks"), metavar="DIR", help="default: benchmarks")
+    parser.add_argument("--docs", action="store_true", help="put report and picture into docs, too")
+    add_data_option(parser)
+    parser.set_defaults(run=run_all)
+
+
+def run_all(args: argparse.Namespace) -> None:
+    """Measure and report."""
+    for scene in args.scenes:
+        if scene not in SCENE_NAMES:
+            raise GraphvioError(f"there is no scene {scene!r}; choose from {', '.join(SCENE_NAMES)}")
+    configs = {name: Config.load(name) for name in dict.fromkeys((DEFAULT, *args.profiles))}
+    recordings = {name: simulated(args.data, name, args.duration) for name in args.scenes}
+    report = Report()
+    report.add(machine())
+    if args.clip.is_dir():
+        recordings[CLIP_NAME if args.clip == CLIP else args.clip.name] = args.clip
+    else:
+        report.add(f"The real clip is left out: the folder {args.clip.name} is not there.")
+    if not recordings:
+        raise GraphvioError("nothing to run: no scene is named and the clip is not there")
+    bench = _Bench(recordings, configs)
+    _main_table(report, bench, args.profiles)
+    _moved_table(report, bench)
+    if _BLIND_SCENE in recordings:
+        _blind_table(report, bench, args.duration)
+    picture = args.out / "trajectories.png"
+    panels = [_panel(bench, name) for name in recordings if name in _DRAWN or name == args.clip.name]
+    panels = [panel for panel in panels if panel.lines]
+    link = ""
+    if panels:
+        draw_trajectories(picture, panels)
+        link = "![Trajectories by all pairs and by each alone, seen from above](trajectories.png)"
+    report.save(args.out / "accuracy.md")
+    if args.docs:
+        report.save_to_docs("accuracy", link)
+        if panels:
+            (DOCS / "trajectories.png").write_bytes(picture.read_bytes())
+    tell(f"written to {args.out}")
+
+
+@dataclass
+class _Bench:
+    """The recordings and configurations, and what has been run already."""
+
+    recordings: dict[str, Path]
+    configs: dict[str, Config]
+    _rigs: dict[str, Rig] = field(default_factory=dict)
+    _done: dict[tuple[str, str, tuple[int, ...], bool], Outcome] = field(default_factory=dict)
+
+    def rig(self, recording: str) -> Rig:
+        """As the recording carries it."""
+        if recording not in self._rigs:
+            self._rigs[recording] = open_source(self.recordings[recording]).rig
+        return self._rigs[recording]
+
+    def choices(self, recording: str) -> list[tuple[int, ...]]:
+        """All pairs, then each alone."""
+        count = len(self.rig(recording).pairs)
+        return [tuple(range(count)), *((j,) for j in range(count) if count > 1)]
+
+    def pair_names(self, recording: str, pairs: tuple[int, ...]) -> str:
+        """The names of pairs."""
+        return " + ".join(self.rig(recording).pairs[j].name for j in pairs)
+
+    def outcome(self, recording: str, profile: str, pairs: tuple[int, ...], imu: bool) -> Outcome:
+        """The run of a case, which is made once."""
+        key = (recording, profile, pairs, imu)
+        if key not in self._done:
+            self._done[key] = self.special(recording, profile, self.rig(recording).with_pairs(pairs), imu)
+        return self._done[key]
+
+    def special(self, recording: str, profile: str, rig: Rig, imu: bool, alter: Alter | None = None) -> Outcome:
+        """A run with another rig or other images."""
+        used = rig if imu else rig.without_imu()
+        truth_sigma_m = 0.0 if recording in SCENE_NAMES else CLIP_TRUTH_SIGMA_M
+        outcome = run(self.recordings[recording], used, self.configs[profile], alter, truth_sigma_m)
+        pairs = " + ".join(pair.name for pair in rig.pairs)
+        tell(f"  {recording}, {profile}, {pairs}, {_imu(imu)} IMU: ATE {100 * outcome.ate_m:.2f} cm")
+        return outcome
+
+
+def _main_table(report: Report, bench: _Bench, profiles: list[str]) -> None:
+    cases = [(profile, False) for profile in profiles]
+    if DEFAULT in profiles:
+        cases.insert(profiles.index(DEFAULT) + 1, (DEFAULT, True))
+    rows = [
+        [name, profile, bench.pair_names(name, pairs), "yes" if imu else "no", *outcome.cells()]
+        for name in bench.recordings
+        for profile, imu in cases
+        for pairs in bench.choices(name)
+        for outcome in [bench.outcome(name, profile, pairs, imu)]
+    ]
+    lengths = ", ".join(_length(bench, name) for name in bench.recordings)
+    report.add("#### Profiles and pairs", f"Recordings: {lengths}.")
+    report.table(["recording", "profile", "pairs", "IMU", *HEAD], rows)
+    report.add(
+        f"A break is a motion that was used though its squared Mahalanobis distance to the truth is beyond "
+        f"{BREAK_STATISTIC:.1f} ({BREAK_SIGMA:.0f} sigma). The truth of simulated recordings is exact; positions of a "
+        f"real one are taken to be good to {1e3 * CLIP_TRUTH_SIGMA_M:g} mm."
+    )
+
+
+def _moved_table(report: Report, bench: _Bench) -> None:
+    """The second pair is not where the calibration says; both pairs ought to be no worse than the better alone."""
+    rows = []
+    for name in bench.recordings:
+        if len(bench.rig(name).pairs) < 2:
+            continue
+        together, *alone = bench.choices(name)
+        moved = with_moved_pair(bench.rig(name), 1, _ANGLE_DEG, _SHIFT_M)
+        for imu in (False, True):
+            outcome = bench.special(name, DEFAULT, moved, imu)
+            exact = bench.outcome(name, DEFAULT, together, imu)
+            single = {bench.pair_names(name, pairs): bench.outcome(name, DEFAULT, pairs, imu).ate_m for pairs in alone}
+            best = min(single, key=lambda pair: single[pair])
+            rows.append(
+                [
+                    name,
+                    "yes" if imu else "no",
+                    f"{100 * exact.ate_m:.2f}",
+                    f"{100 * outcome.ate_m:.2f}",
+                    f"{100 * single[best]:.2f}",
+                    best,
+                    f"{outcome.ate_m / single[best]:.2f}",
+                    f"{outcome.breaks} / {outcome.motions}",
+                    f"{outcome.refused}",
+                ]
+            )
+    if not rows:
+        return
+    report.add(
+        "#### Error in P_12",
+        f"All pairs with the default profile, the second pair's extrinsics off by {_ANGLE_DEG:g} degree and "
+        f"{100 * _SHIFT_M:g} cm; ATE in cm, beside the exact rig and the better pair alone.",
+    )
+    head = ["recording", "IMU", "exact", "off", "better single", "which", "off / single", "breaks / motions", "refused"]
+    report.table(head, rows)
+
+
+def _blind_table(report: Report, bench: _Bench, duration_s: float | None) -> None:
+    rig = bench.rig(_BLIND_SCENE)
+    if len(rig.pairs) < 2:
+        return
+    begin_s = _BLIND_FROM_S if duration_s is None else min(_BLIND_FROM_S, 0.3 * duration_s)
+    start_ns = open_source(bench.recordings[_BLIND_SCENE]).start_ns
+    from_ns, to_ns = (start_ns + round(1e9 * s) for s in (begin_s, begin_s + _BLIND_S))
+    together = bench.choices(_BLIND_SCENE)[0]
+    rows = []
+    for imu in (False, True):
+        rows.append(["none", _imu(imu), *bench.outcome(_BLIND_SCENE, DEFAULT, together, imu).cells()])
+        for j in together:
+            outcome = bench.special(_BLIND_SCENE, DEFAULT, rig, imu, blinded(j, from_ns, to_ns))
+            rows.append([rig.pairs[j].name, _imu(imu), *outcome.cells()])
+    report.add(
+        "#### A blind pair",
+        f"The {_BLIND_SCENE} with both pairs and the default profile; one pair's images are black from {begin_s:g} to "
+        f"{begin_s + _BLIND_S:g} s.",
+    )
+    report.table(["blind", "IMU", *HEAD], rows)
+
+
+def _panel(bench: _Bench, name: str) -> Panel:
+    runs = {bench.pair_names(name, pairs): bench.outcome(name, DEFAULT, pairs, False) for pairs in bench.choices(name)}
+    lines = {pairs: outcome for pairs, outcome in runs.items() if outcome.evaluation is not None}
+    title = f"{_length(bench, name)}: default profile, vision only"
+    return Panel(title, lines)
+
+
+def _length(bench: _Bench, name: str) -> str:
+    evaluation = bench.outcome(name, DEFAULT, bench.choices(name)[0], False).evaluation
+    return name if evaluation is None else f"{name} {evaluation.path_length_m:.0f} m, {evaluation.duration_s:.0f} s"
+
+
+def _imu(imu: bool) -> str:
+    return "with" if imu else "without"

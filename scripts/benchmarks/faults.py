@@ -1,0 +1,238 @@
+"""``scripts/benchmark faults``: does the front-end ever return a confident wrong motion?
+
+Hard scenes and faults of cameras, light and cables are run through the odometry, on vision alone and with the IMU, and
+every motion that the front-end returns is held against the truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.fault_cases import CASES, WALKS, Case, hard_events
+from benchmarks.fault_judging import FIVE_SIGMA, MATERIAL_DEG, MATERIAL_M, Judged, Outcome, Run
+from benchmarks.fault_scenes import CORRIDOR_S, recording
+from benchmarks.recordings import add_data_option
+from benchmarks.report import Report, tell
+from graphvio.config import Config
+from graphvio.errors import GraphvioError
+from graphvio.sources import open_source
+from graphvio.trajectory import Trajectory
+from graphvio.warmup import warm_up
+
+_MODES = {False: "Vision alone", True: "Vision and IMU"}
+_HEAD = (
+    "case", "framesets", "in faults", "returned", "weak", "failed", "commonest reason", "inliers a pair",
+    "NEES median", "NEES mean", "> 5 sigma", "material", "used", "used, > 5 sigma", "used, material",
+)  # fmt: skip
+_COLUMNS = (
+    "case", "imu", "second", "in_fault", "quality", "used", "nees", "error_m", "error_deg", "span_s", "inliers",
+    "points",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run: a case by its name, seed, seconds of recording, folder of renders, pairs to use, configuration."""
+
+    case: str
+    seed: int
+    duration_s: float
+    data: Path
+    pairs: tuple[int, ...] | None
+    config: Config
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``faults``."""
+    parser = subparsers.add_parser(
+        "faults",
+        help="hard scenes and faults: the share of motions that are confident and wrong",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--seeds", type=int, default=1, help="runs of each case, each on another walk (default: 1)")
+    parser.add_argument("--duration", type=float, default=12.0, metavar="S", help="seconds of a walk (default: 12)")
+    parser.add_argument("--cases", nargs="+", metavar="CASE", choices=[c.name for c in CASES], help="only these")
+    parser.add_argument("--pairs", type=int, nargs="+", metavar="PAIR", help="only these pairs of the rig")
+    parser.add_argument("--jobs", type=int, default=1, help="cases that are run side by side (default: 1)")
+    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
+    parser.add_argument("--motions", type=Path, metavar="FILE.csv", help="write a line for each motion")
+    parser.add_argument("--config", metavar="NAME", help="profile or YAML file to run with (default: the defaults)")
+    parser.add_argument("--docs", action="store_true", help="write the report into docs/benchmarks.md")
+    add_data_option(parser)
+    parser.set_defaults(run=main)
+
+
+def main(args: argparse.Namespace) -> None:
+    """Run the campaign and report."""
+    if args.seeds < 1 or args.duration <= 0.0 or args.jobs < 1:
+        raise GraphvioError("--seeds, --duration and --jobs must be positive")
+    names = args.cases or [case.name for case in CASES]
+    pairs = tuple(args.pairs) if args.pairs else None
+    config = Config.load(args.config) if args.config else Config()
+    tasks = [Task(name, seed, args.duration, args.data, pairs, config) for name in names for seed in range(args.seeds)]
+    for task in tasks:
+        _folder(task)  # before processes would render the same scene twice
+    outcomes: dict[str, dict[bool, Outcome]] = {name: {mode: Outcome() for mode in _MODES} for name in names}
+    for task, by_mode in zip(tasks, _run_all(tasks, args.jobs), strict=True):
+        for mode, outcome in by_mode.items():
+            outcomes[task.case][mode].add(outcome)
+    report = Report()
+    _write(report, outcomes, args.seeds)
+    if args.out is not None:
+        report.save(args.out)
+    if args.motions is not None:
+        _list_motions(args.motions, outcomes)
+    if args.docs:
+        report.save_to_docs("faults")
+
+
+def run_case(task: Task) -> dict[bool, Outcome]:
+    """One case, without (False) and with (True) the IMU, on the very same images."""
+    case, duration_s = _case(task)
+    source = open_source(_folder(task))
+    if task.pairs is not None:
+        source = open_source(_folder(task), source.rig.with_pairs(task.pairs))
+    if source.truth is None:
+        raise GraphvioError(f"{source.name}: has no truth")
+    trajectory = Trajectory.read(source.truth)
+    truth = dict(zip(trajectory.stamps_ns.tolist(), trajectory.nav_T_body, strict=True))
+    warm_up(source.rig, task.config)
+    runs = {with_imu: Run(source.rig, task.config, with_imu=with_imu) for with_imu in _MODES}
+    for event, during in hard_events(case, task.seed, source, truth, duration_s):
+        for run in runs.values():
+            run.feed(event, during)
+    return {with_imu: run.finish(truth, source.start_ns) for with_imu, run in runs.items()}
+
+
+def _run_all(tasks: Sequence[Task], jobs: int) -> list[dict[bool, Outcome]]:
+    results = []
+    if jobs == 1:
+        for task in tasks:
+            results.append(run_case(task))
+            tell(_progress(task, results[-1]))
+        return results
+    with ProcessPoolExecutor(jobs) as pool:
+        for task, result in zip(tasks, pool.map(run_case, tasks), strict=True):
+            results.append(result)
+            tell(_progress(task, result))
+    return results
+
+
+def _case(task: Task) -> tuple[Case, float]:
+    """The case of a task, and how long its recording is."""
+    case = next(case for case in CASES if case.name == task.case)
+    return case, CORRIDOR_S if case.scene == "corridor" else task.duration_s
+
+
+def _folder(task: Task) -> Path:
+    case, duration_s = _case(task)
+    if case.scene is not None:
+        return recording(task.data, case.scene, duration_s, task.seed)
+    return recording(task.data, WALKS[task.seed % len(WALKS)], duration_s)
+
+
+def _progress(task: Task, by_mode: Mapping[bool, Outcome]) -> str:
+    parts = [
+        f"{_MODES[mode].lower()}: {len(o.motions)} motions, {sum(m.wrong for m in o.motions)} wrong, "
+        f"{sum(m.wrong and m.accepted for m in o.motions)} of them used"
+        for mode, o in by_mode.items()
+    ]
+    return f"{task.case}, seed {task.seed}: {'; '.join(parts)}"
+
+
+def _write(report: Report, outcomes: Mapping[str, Mapping[bool, Outcome]], seeds: int) -> None:
+    report.add(
+        f"Every motion that the front-end returned, against the truth; {seeds} run{'s' if seeds > 1 else ''} a case. "
+        "*In faults* counts the framesets that a fault touched. *NEES* is the squared Mahalanobis distance of the "
+        "motion from the truth (6 degrees of freedom: mean 6, median 5.3 where the covariance is honest). *> 5 sigma*: "
+        f"NEES above {FIVE_SIGMA:.1f}; *material*: and besides wrong by more than {100 * MATERIAL_M:g} cm or "
+        f"{MATERIAL_DEG:g} degrees. *Used*: the odometry's gate let it through."
+    )
+    for mode, name in _MODES.items():
+        report.add(f"#### {name}")
+        total = Outcome()
+        rows = []
+        for case in outcomes:
+            outcome = outcomes[case][mode]
+            total.add(outcome)
+            rows.append(_row(next(c.title for c in CASES if c.name == case), outcome))
+        rows.append(_row("**all**", total))
+        report.table(_HEAD, rows)
+        report.add(*_shares(total))
+
+
+def _row(title: str, outcome: Outcome) -> list[str]:
+    motions = outcome.motions
+    used = [m for m in motions if m.accepted]
+    commonest = outcome.failures.most_common(1)
+    nees = np.array([m.nees for m in motions])
+    return [
+        title,
+        f"{outcome.framesets}",
+        f"{outcome.during}",
+        f"{len(motions)}",
+        f"{sum(m.quality == 'weak' for m in motions)}",
+        f"{outcome.failures.total()}",
+        f"{commonest[0][0]} ({commonest[0][1]})" if commonest else "",
+        " + ".join(_mean_inliers(motions)),
+        f"{np.median(nees):.2f}" if motions else "",
+        f"{np.mean(nees):.2f}" if motions else "",
+        f"{sum(m.wrong for m in motions)}",
+        f"{sum(m.materially_wrong for m in motions)}",
+        f"{len(used)}",
+        f"{sum(m.wrong for m in used)}",
+        f"{sum(m.materially_wrong for m in used)}",
+    ]
+
+
+def _mean_inliers(motions: Sequence[Judged]) -> list[str]:
+    pairs = sorted({pair for motion in motions for pair in motion.inliers})
+    return [f"{np.mean([motion.inliers.get(pair, 0) for motion in motions]):.0f}" for pair in pairs]
+
+
+def _shares(total: Outcome) -> list[str]:
+    """One line for each group of motions."""
+    groups = {
+        "All returned motions": total.motions,
+        "of good quality": [m for m in total.motions if m.quality == "good"],
+        "of weak quality": [m for m in total.motions if m.quality == "weak"],
+        "returned while a fault lasted": [m for m in total.motions if m.during],
+        "used by the odometry": [m for m in total.motions if m.accepted],
+        "used while a fault lasted": [m for m in total.motions if m.accepted and m.during],
+    }
+    lines = []
+    for name, motions in groups.items():
+        if motions:
+            wrong, material = sum(m.wrong for m in motions), sum(m.materially_wrong for m in motions)
+            lines.append(
+                f"- {name}: {len(motions)}; beyond 5 sigma {wrong} ({100 * wrong / len(motions):.2f} %), "
+                f"material {material} ({100 * material / len(motions):.2f} %)"
+            )
+    kinds = ", ".join(f"{kind} {count}" for kind, count in sorted(total.incidents.items()))
+    return [*lines, f"- incidents: {kinds or 'none'}"]
+
+
+def _list_motions(path: Path, outcomes: Mapping[str, Mapping[bool, Outcome]]) -> None:
+    """A line for each motion that was returned."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(_COLUMNS)
+        for case, by_mode in outcomes.items():
+            for mode, outcome in by_mode.items():
+                table.writerows(_motion_row(case, mode, m) for m in outcome.motions)
+
+
+def _motion_row(case: str, with_imu: bool, m: Judged) -> list[str]:
+    flags = (int(m.during), m.quality, int(m.accepted))
+    figures = (f"{m.nees:.1f}", f"{m.error_m:.4f}", f"{m.error_deg:.3f}", f"{m.span_s:.2f}")
+    pairs = ("+".join(map(str, counts.values())) for counts in (m.inliers, m.points))
+    return [case, f"{int(with_imu)}", f"{m.since_s:.2f}", *map(str, flags), *figures, *pairs]

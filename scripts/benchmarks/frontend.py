@@ -1,0 +1,125 @@
+"""``scripts/benchmark frontend``: the time of each stage, beside a plain pipeline of OpenCV's functions."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.growth import add_growth
+from benchmarks.recordings import Footage, add_data_option, simulated
+from benchmarks.report import Report, machine, tell
+from benchmarks.timing import (
+    WARM_UP,
+    FrontendContender,
+    OdometryContender,
+    ReferenceContender,
+    Timings,
+    take_turns,
+)
+from graphvio.config import Config
+from graphvio.errors import GraphvioError
+from graphvio.warmup import warm_up
+
+AIM = 0.35
+"""The front-end's median over the reference's, for two pairs."""
+_SHORTEST_S = 12
+_RATE_HZ = 20
+_FEWEST = 10
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand."""
+    parser = subparsers.add_parser(
+        "frontend",
+        help="time of every stage, beside a pipeline of OpenCV's functions",
+        description="Times the odometry, its front-end alone and a plain pipeline of OpenCV's functions in turns on "
+        "the same images, which are decoded before. Prints medians, 95th and 99th percentiles for each stage, and "
+        "how the front-end's time grows with features, hypotheses, pairs and image size.",
+        epilog="Examples:  scripts/benchmark frontend --out speed.md  |  scripts/benchmark frontend --docs",
+    )
+    parser.add_argument(
+        "--recording", type=Path, metavar="DIR", help="time it on this recording (default: a simulated room)"
+    )
+    parser.add_argument("--framesets", type=int, default=200, metavar="N", help="counted framesets (default: 200)")
+    parser.add_argument(
+        "--growth-framesets", type=int, default=80, metavar="N", help="the same for each row of growth (default: 80)"
+    )
+    parser.add_argument("--no-growth", action="store_true", help="leave out the tables of growth")
+    parser.add_argument("--profile", default="default", metavar="NAME", help="configuration, by name or YAML file")
+    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report there, too")
+    parser.add_argument("--docs", action="store_true", help="put the report into docs/benchmarks.md")
+    add_data_option(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure and report."""
+    if min(args.framesets, args.growth_framesets) < _FEWEST:
+        raise GraphvioError(f"percentiles need framesets: give {_FEWEST} or more")
+    config = Config.load(args.profile)
+    count = WARM_UP + args.framesets
+    longest = count if args.no_growth else max(count, WARM_UP + args.growth_framesets)
+    folder = args.recording
+    if folder is None:
+        folder = simulated(args.data, "room", max(_SHORTEST_S, math.ceil((longest + 1) / _RATE_HZ)))
+    tell("decoding")
+    footage = Footage.load(folder, longest)
+    if len(footage.steps) < WARM_UP + _FEWEST:
+        raise GraphvioError(f"{folder}: has {len(footage.steps)} framesets; {WARM_UP + _FEWEST} are needed")
+    tell("compiling")
+    warm_up(footage.rig, config)
+    report = Report()
+    report.add(machine())
+    _stages(report, footage.first(count), config, "a simulated room" if args.recording is None else "a recording")
+    if not args.no_growth:
+        add_growth(report, footage, config, args.growth_framesets)
+    if args.out is not None:
+        report.save(args.out)
+    if args.docs:
+        report.save_to_docs("frontend")
+
+
+def _stages(report: Report, footage: Footage, config: Config, title: str) -> None:
+    tell("timing odometry, front-end and reference in turns")
+    frontend, reference = FrontendContender(footage, config), ReferenceContender(footage)
+    whole, ours, theirs = take_turns([OdometryContender(footage, config), frontend, reference], len(footage.steps))
+    pipeline = reference.pipeline
+    width, height = footage.rig.pairs[0].left.size_px
+    report.add(
+        f"{len(whole.total_ms)} framesets of {title}, {len(footage.rig.pairs)} pairs of {width}x{height} pixels, "
+        f"{'with' if footage.rig.imu else 'without'} IMU. The front-end followed {np.mean(frontend.tracks):.0f} tracks "
+        f"a pair, {np.mean(frontend.points):.0f} of them with depth and in the reference frameset, and found no motion "
+        f"in {frontend.failures} framesets; the reference offered {np.mean(pipeline.tracked):.0f} points a pair, of "
+        f"which {100 * np.sum(pipeline.inliers) / max(np.sum(pipeline.tracked), 1):.0f} % were inliers."
+    )
+    rows = [
+        *_rows("odometry", whole),
+        *_rows("front-end alone", ours),
+        *_rows("reference", theirs),
+    ]
+    report.table(["pipeline", "stage", "median, ms", "p95, ms", "p99, ms", "framesets"], rows)
+    ratio = ours.median_ms / theirs.median_ms
+    report.table(
+        ["ratio of medians", "value", "aim"],
+        [
+            ["front-end / reference", f"{ratio:.2f}", f"{AIM:.2f}: {'met' if ratio <= AIM else 'missed'}"],
+            ["odometry / reference", f"{whole.median_ms / theirs.median_ms:.2f}", "-"],
+        ],
+    )
+
+
+def _rows(name: str, timings: Timings) -> list[list[str]]:
+    """A row for each stage, in order of appearance, and one for the total; stages may run side by side."""
+    stages = {**timings.stage_ms, "**total**": timings.total_ms}
+    return [
+        [
+            name,
+            stage,
+            *(f"{value:.2f}" for value in np.percentile(values, (50, 95, 99))),
+            f"{len(values)}",
+        ]
+        for stage, values in stages.items()
+    ]

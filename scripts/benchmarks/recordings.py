@@ -1,0 +1,182 @@
+"""The recordings that are measured on: simulated once and kept, and decoded into memory before anything is timed."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import graphvio
+from benchmarks.report import tell
+from graphvio.arrays import Image
+from graphvio.errors import GraphvioError
+from graphvio.events import Event, FrameSet
+from graphvio.rig import Camera, Rig, StereoPair
+from graphvio.simulation import simulate
+from graphvio.sources import open_source
+
+
+def add_data_option(parser: argparse.ArgumentParser) -> None:
+    """``--data DIR``, where simulated recordings are kept."""
+    default = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "graphvio" / "benchmarks"
+    parser.add_argument(
+        "--data",
+        type=Path,
+        default=default,
+        metavar="DIR",
+        help="folder that keeps the simulated recordings (default: graphvio/benchmarks in the user's cache)",
+    )
+
+
+def simulated(data: Path, scene: str, duration_s: float | None = None) -> Path:
+    """The folder of a simulated recording, which is made if it is missing.
+
+    The name holds a digest of the simulator's sources, so that a changed simulator renders anew.
+
+    Args:
+        data: folder of all recordings.
+        scene: one of `graphvio.simulation.SCENE_NAMES`.
+        duration_s: only so much of the walk; None for all of it.
+
+    Raises:
+        GraphvioError: if it cannot be made.
+    """
+    length = "whole" if duration_s is None else f"{duration_s:g}s"
+    folder = data / f"{scene}-{length}-{_simulator_digest()}"
+    if folder.is_dir():
+        return folder
+    tell(f"rendering {scene} ({length}) into {data}; this is done once and takes about three times its length")
+    partial = folder.with_name(f"{folder.name}.partial")
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        simulate(scene, partial, duration_s=duration_s)
+        partial.rename(folder)
+    except OSError as error:
+        raise GraphvioError(f"{folder}: cannot be written ({error.strerror}); choose another with --data") from None
+    return folder
+
+
+def _simulator_digest() -> str:
+    package = Path(graphvio.__file__).parent
+    digest = hashlib.sha256()
+    for path in [package / "cameras.py", *sorted((package / "simulation").rglob("*.py"))]:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:8]
+
+
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """A recording in memory.
+
+    Attributes:
+        rig: to which the pair indices refer.
+        steps: for each frameset, the events since the one before; the frameset is the last of them.
+    """
+
+    rig: Rig
+    steps: list[list[Event]]
+
+    @staticmethod
+    def load(folder: Path, count: int, rig: Rig | None = None) -> Footage:
+        """Decode the first framesets of a recording.
+
+        Args:
+            folder: of the recording.
+            count: framesets at most.
+            rig: decides on pairs and IMU; None takes the recording's own.
+
+        Raises:
+            GraphvioError: if it cannot be read.
+        """
+        source = open_source(folder, rig)
+        steps: list[list[Event]] = []
+        waiting: list[Event] = []
+        for event in source:
+            waiting.append(event)
+            if isinstance(event, FrameSet):
+                steps.append(waiting)
+                waiting = []
+                if len(steps) == count:
+                    break
+        return Footage(source.rig, steps)
+
+    @property
+    def framesets(self) -> list[FrameSet]:
+        """All framesets, in order."""
+        return [event for step in self.steps for event in step if isinstance(event, FrameSet)]
+
+    def first(self, count: int) -> Footage:
+        """Only the first framesets."""
+        return Footage(self.rig, self.steps[:count])
+
+    def with_pair_count(self, count: int) -> Footage:
+        """A rig of so many pairs, without its IMU: beyond the recording's own pairs, copies of them in turn."""
+        own = len(self.rig.pairs)
+        pairs = tuple(_copied(self.rig.pairs[i % own], i // own) for i in range(count))
+        framesets = []
+        for frameset in self.framesets:
+            images = {
+                i: (left.copy(), right.copy())
+                for i in range(count)
+                for left, right in [frameset.images.get(i % own, (None, None))]
+                if left is not None and right is not None
+            }
+            framesets.append(FrameSet(frameset.stamp_ns, images))
+        return Footage(Rig(pairs, name=self.rig.name), [[frameset] for frameset in framesets])
+
+    def resized(self, scale: float) -> Footage:
+        """The same in another resolution, without its IMU: images are resampled, intrinsics follow."""
+        pairs = tuple(
+            replace(pair, left=_resized(pair.left, scale), right=_resized(pair.right, scale)) for pair in self.rig.pairs
+        )
+        steps: list[list[Event]] = []
+        for frameset in self.framesets:
+            images = {
+                j: (_resampled(left, pairs[j].left.size_px), _resampled(right, pairs[j].right.size_px))
+                for j, (left, right) in frameset.images.items()
+            }
+            steps.append([FrameSet(frameset.stamp_ns, images)])
+        return Footage(Rig(pairs, name=self.rig.name), steps)
+
+
+def blocks(events: Iterator[Event], framesets: int) -> Iterator[list[Event]]:
+    """Events in lists that hold so many framesets each: reading ahead is done before a list is worked on."""
+    block: list[Event] = []
+    held = 0
+    for event in events:
+        block.append(event)
+        held += isinstance(event, FrameSet)
+        if held == framesets:
+            yield block
+            block, held = [], 0
+    if block:
+        yield block
+
+
+def _copied(pair: StereoPair, copy: int) -> StereoPair:
+    if copy == 0:
+        return pair
+    left = replace(pair.left, name=f"{pair.left.name}-copy{copy}")
+    right = replace(pair.right, name=f"{pair.right.name}-copy{copy}")
+    return StereoPair(f"{pair.name}-copy{copy}", left, right)
+
+
+def _resized(camera: Camera, scale: float) -> Camera:
+    """The camera with ``scale`` times as many pixels a side; pixel (0, 0) is the centre of the upper left one."""
+    width, height = (round(scale * size) for size in camera.size_px)
+    fx, fy, cx, cy = camera.intrinsics
+    intrinsics = np.array([scale * fx, scale * fy, scale * (cx + 0.5) - 0.5, scale * (cy + 0.5) - 0.5])
+    return replace(camera, size_px=(width, height), intrinsics=intrinsics, mask=None)
+
+
+def _resampled(image: Image, size_px: tuple[int, int]) -> Image:
+    shrinks = size_px[0] < image.shape[1]
+    resampled = cv2.resize(image, size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+    return np.ascontiguousarray(resampled, dtype=np.uint8)

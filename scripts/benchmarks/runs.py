@@ -1,0 +1,242 @@
+"""One run of the odometry over a recording with truth, and what it is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+
+import cv2
+import numpy as np
+from scipy.stats import chi2, norm
+
+from benchmarks.recordings import blocks
+from graphvio.arrays import Float, Int
+from graphvio.config import Config
+from graphvio.errors import GraphvioError, TrajectoryError
+from graphvio.evaluation import MAX_GAP_S, Evaluation, evaluate
+from graphvio.events import Estimate, Event, FrameSet, Status
+from graphvio.frontend.visual import MotionPredictor, RelativeMotion, VisualResult
+from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
+from graphvio.odometry import Odometry
+from graphvio.rig import Rig, StereoPair
+from graphvio.sources import open_source
+from graphvio.trajectory import Trajectory
+from graphvio.warmup import warm_up
+
+BREAK_SIGMA = 5.0
+BREAK_STATISTIC = float(chi2.isf(2.0 * norm.sf(BREAK_SIGMA), 6))
+"""Squared Mahalanobis distance that 6 degrees of freedom exceed as rarely as one exceeds 5 sigma: 5.7e-7."""
+_BLOCK = 40
+_RPE_METRES = ("5 m", "1 m")
+
+Alter = Callable[[FrameSet], FrameSet]
+"""What is done to each frameset before the odometry sees it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a run came to.
+
+    Attributes:
+        estimate: causal poses of all epochs, ``nav_T_body``.
+        epochs: (N,) epoch of each pose.
+        truth: of the recording.
+        evaluation: of the estimate against the truth; None where too few poses could be compared.
+        framesets: that the odometry answered.
+        motions: motions by vision that the odometry used and whose truth is known.
+        breaks: how many of them are off by more than 5 sigma of their own covariance.
+        refused: motions of the front-end that the odometry did not use.
+        frameset_ms: median time of a frameset.
+    """
+
+    estimate: Trajectory
+    epochs: Int
+    truth: Trajectory
+    evaluation: Evaluation | None
+    framesets: int
+    motions: int
+    breaks: int
+    refused: int
+    frameset_ms: float
+
+    @property
+    def ate_m(self) -> float:
+        """Rmse of the position after alignment, metres; infinite where there is none."""
+        return self.evaluation.ate_position_m.rmse if self.evaluation is not None else np.inf
+
+    def cells(self) -> list[str]:
+        """The cells of `HEAD`."""
+        done = f"{100 * len(self.estimate) / max(self.framesets, 1):.0f}"
+        epochs = f"{len(np.unique(self.epochs))}"
+        breaks = [f"{self.breaks} / {self.motions}", f"{self.refused}", done, epochs, f"{self.frameset_ms:.1f}"]
+        if self.evaluation is None:
+            return ["-", "-", "-", "-", *breaks]
+        rpe = next((self.evaluation.rpe[d] for d in _RPE_METRES if d in self.evaluation.rpe), None)
+        return [
+            f"{100 * self.ate_m:.2f}",
+            "-" if self.evaluation.drift_percent is None else f"{self.evaluation.drift_percent:.2f}",
+            "-" if rpe is None or rpe.percent is None else f"{rpe.percent:.2f}",
+            "-" if rpe is None or rpe.deg_per_m is None else f"{rpe.deg_per_m:.3f}",
+            *breaks,
+        ]
+
+
+HEAD = (
+    "ATE, cm",
+    "drift, %",
+    "RPE, %",
+    "RPE, deg/m",
+    "breaks / motions",
+    "refused",
+    "poses, %",
+    "epochs",
+    "ms a frameset",
+)
+
+
+def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, truth_sigma_m: float = 0.0) -> Outcome:
+    """Run the odometry over a recording.
+
+    Images are decoded in blocks between which nothing is timed, so that decoding takes no time from the odometry.
+
+    Args:
+        recording: folder; it must hold the truth.
+        rig: pairs and IMU that are used.
+        config: of the odometry.
+        alter: applied to every frameset, or None.
+        truth_sigma_m: standard deviation of the true positions, along each axis; counts where breaks are told.
+
+    Raises:
+        GraphvioError: if the recording cannot be read or has no truth.
+    """
+    source = open_source(recording, rig)
+    if source.truth is None:
+        raise GraphvioError(f"{recording}: holds no true trajectory; accuracy cannot be told without")
+    truth = Trajectory.read(source.truth)
+    warm_up(source.rig, config)
+    cv2.setNumThreads(-1)  # as in a new process; the odometry then sets what it wants
+    odometry = Odometry(source.rig, config)
+    motions = _overhear_motions(odometry)
+    estimates: list[Estimate] = []
+    frameset_ms: list[float] = []
+    for block in blocks(iter(source), _BLOCK):
+        spent_s = 0.0
+        for event in _altered(block, alter):
+            begin = perf_counter()
+            estimate = odometry.process(event)
+            spent_s += perf_counter() - begin
+            if estimate is not None:
+                estimates.append(estimate)
+                frameset_ms.append(1e3 * spent_s)
+                spent_s = 0.0
+    estimates += odometry.finish()
+    cv2.setNumThreads(-1)
+    return _judge(estimates, motions, truth, truth_sigma_m, frameset_ms)
+
+
+def _overhear_motions(odometry: Odometry) -> dict[int, RelativeMotion]:
+    """Stamp -> motion of each frameset, filled while the odometry runs.
+
+    An estimate does not carry the motion that vision measured, only the pose that came of it, in which IMU and earlier
+    motions hide an error; so the front-end's answers are overheard on their way to the odometry.
+    """
+    motions: dict[int, RelativeMotion] = {}
+    process = odometry._frontend.process
+
+    def overheard(frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
+        result = process(frameset, predict)
+        if result.motion is not None:
+            motions[result.motion.stamp_ns] = result.motion
+        return result
+
+    odometry._frontend.process = overheard  # type: ignore[method-assign]
+    return motions
+
+
+def _altered(block: list[Event], alter: Alter | None) -> list[Event]:
+    if alter is None:
+        return block
+    return [alter(event) if isinstance(event, FrameSet) else event for event in block]
+
+
+def _judge(
+    estimates: list[Estimate],
+    motions: dict[int, RelativeMotion],
+    truth: Trajectory,
+    truth_sigma_m: float,
+    frameset_ms: list[float],
+) -> Outcome:
+    posed = [(e.stamp_ns, e.nav_T_body, e.epoch) for e in estimates if e.nav_T_body is not None]
+    stamps_ns = np.array([stamp_ns for stamp_ns, _, _ in posed], dtype=np.int64)
+    estimate = Trajectory(stamps_ns, np.array([pose for _, pose, _ in posed]).reshape(-1, 4, 4))
+    used_status = (Status.TRACKING, Status.INITIALISING)
+    used_ns = {e.stamp_ns for e in estimates if e.nav_T_body is not None and e.status in used_status}
+    used = [motion for stamp_ns, motion in motions.items() if stamp_ns in used_ns]
+    statistics = _mahalanobis2(used, truth, truth_sigma_m)
+    try:
+        evaluation = evaluate(estimate, truth)
+    except TrajectoryError:
+        evaluation = None
+    return Outcome(
+        estimate=estimate,
+        epochs=np.array([epoch for _, _, epoch in posed], dtype=np.int64),
+        truth=truth,
+        evaluation=evaluation,
+        framesets=len(estimates),
+        motions=len(statistics),
+        breaks=int(np.sum(statistics > BREAK_STATISTIC)),
+        refused=len(motions) - len(used),
+        frameset_ms=float(np.median(frameset_ms)) if frameset_ms else np.nan,
+    )
+
+
+def _mahalanobis2(motions: list[RelativeMotion], truth: Trajectory, truth_sigma_m: float) -> Float:
+    """Squared Mahalanobis distances (M,) to the truth, of those motions whose truth is known at both ends."""
+    stamps_ns = np.unique([ns for m in motions for ns in (m.reference_stamp_ns, m.stamp_ns)]).astype(np.int64)
+    known = truth.at(stamps_ns, MAX_GAP_S)[0]
+    world_T_body = dict(zip(known.stamps_ns.tolist(), known.nav_T_body, strict=True))
+    of_truth = np.diag([0.0] * 3 + [2.0 * truth_sigma_m**2] * 3)  # of the difference of two positions, in any frame
+    statistics = []
+    for motion in motions:
+        if motion.reference_stamp_ns not in world_T_body or motion.stamp_ns not in world_T_body:
+            continue
+        true_motion = se3_inverse(world_T_body[motion.reference_stamp_ns]) @ world_T_body[motion.stamp_ns]
+        error = se3_log(se3_inverse(motion.reference_T_current) @ true_motion)
+        statistics.append(float(error @ np.linalg.solve(motion.covariance + of_truth, error)))
+    return np.array(statistics)
+
+
+def blinded(pair: int, start_ns: int, end_ns: int) -> Alter:
+    """Black images of one pair from one stamp to before another."""
+
+    def alter(frameset: FrameSet) -> FrameSet:
+        if pair not in frameset.images or not start_ns <= frameset.stamp_ns < end_ns:
+            return frameset
+        left, right = frameset.images[pair]
+        black = (np.zeros_like(left), np.zeros_like(right))
+        return FrameSet(frameset.stamp_ns, {**frameset.images, pair: black})
+
+    return alter
+
+
+def with_moved_pair(rig: Rig, index: int, angle_deg: float, shift_m: float) -> Rig:
+    """The rig with an error of calibration: both cameras of a pair moved together, about the pair's left camera.
+
+    Args:
+        rig: the true one.
+        index: of the pair.
+        angle_deg: of the turn, about an axis that no camera axis is near to.
+        shift_m: length of the shift, along another such axis.
+    """
+    axis, direction = np.array([1.0, 1.0, 1.0]) / np.sqrt(3.0), np.array([1.0, -1.0, 1.0]) / np.sqrt(3.0)
+    left_T_moved = se3(so3_exp(np.deg2rad(angle_deg) * axis), shift_m * direction)
+    pair = rig.pairs[index]
+    body_T_left = pair.left.body_T_cam
+    moved_T_body = body_T_left @ left_T_moved @ pair.left.cam_T_body
+    left = replace(pair.left, body_T_cam=moved_T_body @ body_T_left)
+    right = replace(pair.right, body_T_cam=moved_T_body @ pair.right.body_T_cam)
+    pairs = list(rig.pairs)
+    pairs[index] = StereoPair(pair.name, left, right)
+    return replace(rig, pairs=tuple(pairs))

@@ -1,0 +1,198 @@
+"""Timing of several pipelines on the same framesets, in turns, so that the machine's load meets all of them alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from benchmarks.recordings import Footage
+from benchmarks.reference import ReferencePipeline
+from graphvio.arrays import Float
+from graphvio.config import Config
+from graphvio.frontend.visual import RelativeMotion, VisualFrontend
+from graphvio.geometry import se3_inverse
+from graphvio.odometry import Odometry
+
+WARM_UP = 20
+"""The first framesets are not counted: caches fill, and the odometry initialises."""
+_TURN = 10  # framesets; a change of turns costs OpenCV's threads their start, so it is not made at every frameset
+_OWN_THREADS = -1
+
+
+class Contender(Protocol):
+    """A pipeline that is timed."""
+
+    opencv_threads: int
+    """How many threads OpenCV uses while it is this pipeline's turn."""
+
+    def step(self, index: int) -> dict[str, float]:
+        """Work on the next frameset; returns the milliseconds by stage, as the pipeline itself tells them."""
+
+    def close(self) -> None:
+        """End what it has running."""
+
+
+@dataclass
+class Timings:
+    """Milliseconds for each counted frameset, in all and by stage."""
+
+    total_ms: list[float] = field(default_factory=list)
+    stage_ms: dict[str, list[float]] = field(default_factory=dict)
+
+    @property
+    def median_ms(self) -> float:
+        """Median of the total."""
+        return float(np.median(self.total_ms))
+
+    @property
+    def p95_ms(self) -> float:
+        """95th percentile of the total."""
+        return float(np.percentile(self.total_ms, 95))
+
+
+def take_turns(contenders: Sequence[Contender], count: int) -> list[Timings]:
+    """Time pipelines on framesets 0 to ``count``, ten framesets at a time; who begins changes from turn to turn.
+
+    Returns:
+        Timings of each, of the framesets from `WARM_UP` on.
+    """
+    timings = [Timings() for _ in contenders]
+    try:
+        for turn, begin in enumerate(range(0, count, _TURN)):
+            for k in range(len(contenders)):
+                i = (k + turn) % len(contenders)
+                _set_opencv_threads(contenders[i].opencv_threads)
+                for index in range(begin, min(begin + _TURN, count)):
+                    _step(contenders[i], index, timings[i])
+    finally:
+        for contender in contenders:
+            contender.close()
+        cv2.setNumThreads(_OWN_THREADS)
+    return timings
+
+
+def _step(contender: Contender, index: int, timings: Timings) -> None:
+    start = perf_counter()
+    stages = contender.step(index)
+    total_ms = 1e3 * (perf_counter() - start)
+    if index < WARM_UP:
+        return
+    timings.total_ms.append(total_ms)
+    for name, ms in stages.items():
+        timings.stage_ms.setdefault(name, []).append(ms)
+
+
+def _set_opencv_threads(threads: int) -> None:
+    """Set their number, and have them started before the clock runs."""
+    cv2.setNumThreads(threads)
+    noise = np.zeros((480, 640), dtype=np.uint8)
+    for _ in range(2):
+        cv2.goodFeaturesToTrack(noise, 10, 0.01, 10.0)
+        cv2.resize(noise, (1280, 960))
+
+
+class FrontendContender:
+    """The front-end alone, started from the prediction that the last motion goes on."""
+
+    def __init__(self, footage: Footage, config: Config) -> None:
+        cv2.setNumThreads(_OWN_THREADS)
+        self._frontend = VisualFrontend(footage.rig, config)
+        self.opencv_threads = cv2.getNumThreads()  # as the front-end wants it
+        self._framesets = footage.framesets
+        self._predictor = _SteadyMotion()
+        self.tracks: list[int] = []
+        """Corners followed in the left image, for each counted frameset and pair."""
+        self.points: list[int] = []
+        """Points offered to the estimation, likewise."""
+        self.failures = 0
+        """Counted framesets without a motion."""
+
+    def step(self, index: int) -> dict[str, float]:
+        """Time one frameset."""
+        frameset = self._framesets[index]
+        self._predictor.begin(frameset.stamp_ns)
+        result = self._frontend.process(frameset, self._predictor.predict)
+        self._predictor.end(result.motion)
+        if index >= WARM_UP:
+            self.tracks += [len(report.pixels) for report in result.pairs.values()]
+            self.points += [report.points for report in result.pairs.values()]
+            self.failures += result.motion is None
+        return dict(result.stage_ms)
+
+    def close(self) -> None:
+        """End its threads."""
+        self._frontend.close()
+
+
+class OdometryContender:
+    """The complete odometry, with the IMU if the rig has one; a frameset's time includes its IMU samples."""
+
+    def __init__(self, footage: Footage, config: Config) -> None:
+        cv2.setNumThreads(_OWN_THREADS)
+        self._odometry = Odometry(footage.rig, config)
+        self.opencv_threads = cv2.getNumThreads()
+        self._steps = footage.steps
+
+    def step(self, index: int) -> dict[str, float]:
+        """Time one frameset and the samples before it."""
+        stage_ms: dict[str, float] = {}
+        for event in self._steps[index]:
+            estimate = self._odometry.process(event)
+            if estimate is not None:
+                stage_ms = dict(estimate.stage_ms)
+        return stage_ms
+
+    def close(self) -> None:
+        """End its threads."""
+        self._odometry.finish()
+
+
+class ReferenceContender:
+    """The reference pipeline, with OpenCV's own threads."""
+
+    def __init__(self, footage: Footage, corners: int = 300, min_distance_px: float = 10.0) -> None:
+        self.opencv_threads = _OWN_THREADS
+        self.pipeline = ReferencePipeline(footage.rig, corners, min_distance_px)
+        self._framesets = footage.framesets
+
+    def step(self, index: int) -> dict[str, float]:
+        """Time one frameset."""
+        return self.pipeline.process(self._framesets[index])
+
+    def close(self) -> None:
+        """Nothing is left running."""
+
+
+class _SteadyMotion:
+    """Chains measured motions and predicts that the last one is repeated, as the odometry does without an IMU."""
+
+    def __init__(self) -> None:
+        self._nav_T_body: dict[int, Float] = {}
+        self._latest_ns: int | None = None
+        self._step = np.eye(4)  # earlier_T_later
+        self._now_ns = 0
+        self._nav_T_now = np.eye(4)
+
+    def begin(self, stamp_ns: int) -> None:
+        """Predict the pose of a frameset."""
+        self._now_ns = stamp_ns
+        self._nav_T_now = np.eye(4) if self._latest_ns is None else self._nav_T_body[self._latest_ns] @ self._step
+
+    def predict(self, then_ns: int) -> Float | None:
+        """``now_T_then`` (4, 4) of body."""
+        then = self._nav_T_body.get(then_ns)
+        return None if then is None else se3_inverse(self._nav_T_now) @ then
+
+    def end(self, motion: RelativeMotion | None) -> None:
+        """Take the measured pose; without one, the prediction stands."""
+        if motion is not None and motion.reference_stamp_ns in self._nav_T_body:
+            self._nav_T_now = self._nav_T_body[motion.reference_stamp_ns] @ motion.reference_T_current
+        if self._latest_ns is not None:
+            self._step = se3_inverse(self._nav_T_body[self._latest_ns]) @ self._nav_T_now
+        self._nav_T_body[self._now_ns] = self._nav_T_now
+        self._latest_ns = self._now_ns
