@@ -19,7 +19,7 @@ _MAY_BE_ZERO = frozenset(
     ("seed", "border_px", "settle_s", "keyframe_overlap", "min_inliers", "min_inlier_share", "min_response",
      "min_correlation", "max_gated_s", "max_imu_wait_ms", "max_imu_start_wait_s")
 )  # fmt: skip
-_SHARES = ("_share", "_overlap", "_probability", "_correlation")
+_SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,9 @@ class MotionConfig:
     keyframe_overlap: float = 0.7
     """Share of a keyframe's points that must still be tracked for it to stay."""
     hypotheses: int = 500
-    """3-point hypotheses of each pair."""
+    """Most 3-point hypotheses of each pair."""
+    confidence: float = 0.99999
+    """Probability of a hypothesis on three right points after which no more are drawn; 1 always draws them all."""
     chunk_points: int = 100
     """Points of each pair on which the hypotheses are scored before half of them are dropped."""
     cauchy_scale_px: float = 1.5
@@ -78,8 +80,8 @@ class MotionConfig:
     """Standard deviation of a tracked corner's position in one image."""
     max_error_px: float = 3.0
     """Reprojection error beyond which a point is no inlier."""
-    sigma_inflation: float = 2.5
-    """Factor on a motion's standard deviations: motions from one keyframe share the errors of its points."""
+    sigma_inflation: float = 1.5
+    """Factor on a motion's standard deviations, for errors that residuals do not show: matches that share a patch."""
     min_inliers: int = 12
     """Motions that explain fewer points are refused."""
     min_inlier_share: float = 0.3

@@ -3,7 +3,8 @@
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.frontend.cost import score_all, squared_error_px
+from graphvio.config import MotionConfig
+from graphvio.frontend.cost import left_motions, score_all, squared_error_px
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.resection import resect
 from graphvio.geometry import se3_inverse
@@ -11,6 +12,41 @@ from graphvio.kernels import kernel
 
 _MIN_INVERSE_DEPTH = 0.005
 _MAX_RELATIVE_DEPTH_SIGMA = 0.3
+_FIRST_BATCH = 25
+
+
+def search(
+    rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
+) -> Float:
+    """The best motion ``cur_T_ref`` (4, 4): hypotheses of every pair, scored on every pair (section 3.1).
+
+    Hypotheses are drawn in batches, until one of them rests with probability ``config.confidence`` on three right
+    points, as far as the share that the best one explains tells (M. Fischler, R. Bolles, *Random sample consensus*,
+    CACM 24(6), 1981); ``config.hypotheses`` of each pair is the most, and confidence 1 draws them all at once.
+
+    Args:
+        rig: of P pairs.
+        observations: of any subset of them.
+        predicted: ``cur_T_ref`` (4, 4), one more hypothesis.
+        config: of this stage.
+        rng: source of the random triples.
+    """
+    best, drawn = predicted, 0
+    pairs = [int(pair) for pair in np.unique(observations.pair)]
+    while drawn < config.hypotheses:
+        batch = config.hypotheses if config.confidence >= 1.0 else max(_FIRST_BATCH, drawn)
+        batch = min(batch, config.hypotheses - drawn)
+        found = [hypothesise(rig, observations, pair, batch, config.pixel_sigma_px, rng) for pair in pairs]
+        best = preempt(
+            rig, observations, np.concatenate([best[None], *found]), config.chunk_points, config.cauchy_scale_px, rng
+        )
+        drawn += batch
+        shares = _explained_shares(best, rig, observations, 2.0 * config.cauchy_scale_px)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            needed = np.log1p(-min(config.confidence, 1.0 - 1e-12)) / np.log1p(-(shares[pairs] ** 3))
+        if len(pairs) == 0 or drawn >= np.max(np.where(shares[pairs] < 1.0, needed, 0.0)):
+            break
+    return best
 
 
 def hypothesise(
@@ -62,6 +98,22 @@ def preempt(
         start += chunk_points
     best = alive[np.argmin(scores[alive])]
     return np.asarray(hypotheses[best])
+
+
+@kernel
+def _explained_shares(cur_T_ref: Float, rig: RigArrays, observations: Observations, max_error_px: float) -> Float:
+    """The share (P,) of each pair's points that a motion explains in both images; 0 for a pair without points."""
+    motions = left_motions(cur_T_ref, rig)
+    good, points = np.zeros(len(motions)), np.zeros(len(motions))
+    for i in range(len(observations.pair)):
+        j = observations.pair[i]
+        points[j] += 1.0
+        e2 = squared_error_px(motions[j, 0], observations.points[i], observations.left[i], rig.focal_px[j, 0])
+        if observations.has_right[i]:
+            other = squared_error_px(motions[j, 1], observations.points[i], observations.right[i], rig.focal_px[j, 1])
+            e2 = max(e2, other)
+        good[j] += 1.0 if e2 < max_error_px * max_error_px else 0.0
+    return good / np.maximum(points, 1.0)
 
 
 @kernel

@@ -1,12 +1,14 @@
 """One motion from all pairs: the best pair's (section 3, eq. 3 and 4), or all pairs jointly (section 3.1)."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.config import MotionConfig
 from graphvio.frontend.cost import robust_cost
 from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.frontend.ransac import hypothesise, preempt
+from graphvio.frontend.ransac import search
 from graphvio.frontend.refinement import Refined, explained, refine
 
 
@@ -26,11 +28,7 @@ def joint_motion(
         config: of this stage.
         rng: source of the random triples.
     """
-    hypotheses = [predicted[None]]
-    for pair in np.unique(observations.pair):
-        hypotheses.append(hypothesise(rig, observations, int(pair), config.hypotheses, config.pixel_sigma_px, rng))
-    winner = preempt(rig, observations, np.concatenate(hypotheses), config.chunk_points, config.cauchy_scale_px, rng)
-    return refine(rig, observations, winner, config)
+    return refine(rig, observations, search(rig, observations, predicted, config, rng), config)
 
 
 def best_pair_motion(
@@ -47,8 +45,7 @@ def best_pair_motion(
     ]
     costs = [global_cost(rig, observations, candidate.cur_T_ref, config.cauchy_scale_px) for candidate in candidates]
     winner = candidates[int(np.argmin(costs))]
-    inlier = explained(rig, observations, winner.cur_T_ref, config)
-    return Refined(winner.cur_T_ref, winner.covariance, inlier, winner.cost)
+    return replace(winner, inlier=explained(rig, observations, winner.cur_T_ref, config))
 
 
 def global_cost(rig: RigArrays, observations: Observations, cur_T_ref: Float, cauchy_scale_px: float) -> float:

@@ -1,0 +1,53 @@
+"""What the front-end says of a frameset: a measured motion, how far it can be trusted, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from graphvio.arrays import Float
+from graphvio.events import PairReport, Quality
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeMotion:
+    """A measured motion of the rig.
+
+    Attributes:
+        reference_stamp_ns: the earlier instant.
+        stamp_ns: the later one.
+        reference_T_current: (4, 4) of body: the motion that a between factor takes.
+        covariance: (6, 6), tangent ``[rotation, translation]`` in the body frame of the later instant.
+        shared_covariance: (6, 6) the part of it that all motions from this reference have in common, same tangent.
+        inliers: number of points that it explains.
+    """
+
+    reference_stamp_ns: int
+    stamp_ns: int
+    reference_T_current: Float
+    covariance: Float
+    shared_covariance: Float
+    inliers: int
+
+
+@dataclass(frozen=True, eq=False)
+class VisualResult:
+    """What the front-end made of one frameset.
+
+    Attributes:
+        motion: the measured motion, or None.
+        quality: how far the motion can be trusted.
+        reason: why it is not good, or empty.
+        alternatives: where pairs contradict each other, what each side says with its own covariance: one is right.
+        at_rest: the images show no motion since the reference.
+        pairs: pair index -> report.
+        stage_ms: time by stage.
+    """
+
+    motion: RelativeMotion | None
+    quality: Quality
+    reason: str
+    pairs: Mapping[int, PairReport]
+    alternatives: tuple[RelativeMotion, ...] = ()
+    at_rest: bool = False
+    stage_ms: Mapping[str, float] = field(default_factory=dict)

@@ -1,0 +1,66 @@
+"""What the residuals of a robust fit say of the noise, and of the covariance that the fit has.
+
+For an influence function ``psi(r) = w r`` the covariance of the minimum is ``E[psi^2] / E[psi']^2`` times the inverse
+of the unweighted normal matrix (P. Huber, *Robust Statistics*, 1981, chapter 7).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float
+
+_PRIOR_RESIDUALS = 3.0  # the noise model counts for so many, which helps where there are few points
+_COUNTED_AT_NOISY_POINTS = 1.04  # normal matrices at noisy points promise that much more than there is, by Monte Carlo
+_CUTOFF = 25.0  # squared error over the noise variance: one right point in 20,000 lies beyond (4 degrees of freedom)
+_MEDIAN_CHI2 = {2: 1.386, 4: 3.357}
+_LEAST_VARIANCE = 0.05
+
+
+class Influence(NamedTuple):
+    """Moments of the residuals.
+
+    Attributes:
+        factor: what the inverse of the weighted normal matrix is to be multiplied by.
+        weight: mean of ``w``.
+        slope: mean of ``psi'``.
+        variance: of the noise, over the modelled one.
+    """
+
+    factor: float
+    weight: float
+    slope: float
+    variance: float
+
+
+def influence(errors2: Float, has_right: Bool, scale: float) -> Influence:
+    """Moments of squared whitened errors (N,), of points with (4 dimensions) or without (2) a right image."""
+    finite = np.isfinite(errors2)
+    e2, d = errors2[finite], np.where(has_right[finite], 4.0, 2.0)
+    n = float(d.sum())
+    if n == 0.0:
+        return Influence(1.0, 1.0, 1.0, 1.0)
+    w = 1.0 / (1.0 + e2 / scale**2)
+    weight = float((d * w).sum()) / n
+    slope = float((d * influence_slopes(e2, has_right[finite], scale)).sum()) / n
+    square = float((w**2 * e2).sum()) / slope**2
+    # The mean of 1 / chi^2 lacks two degrees of freedom: without them the answer is honest on average.
+    variance = (square + _PRIOR_RESIDUALS) / (max(n - 6.0, 0.0) + _PRIOR_RESIDUALS - 2.0)
+    variance *= _COUNTED_AT_NOISY_POINTS
+    return Influence(weight * variance, weight, slope, variance)
+
+
+def influence_slopes(errors2: Float, has_right: Bool, scale: float) -> Float:
+    """The mean of ``psi'`` over the dimensions of each point's error (N,)."""
+    w = 1.0 / (1.0 + errors2 / scale**2)
+    return np.asarray(w - 2.0 * w * (1.0 - w) / np.where(has_right, 4.0, 2.0))
+
+
+def inlier_cutoff(errors2: Float, has_right: Bool, largest2: float) -> float:
+    """Squared error below which a point is an inlier: by the noise that most points have, at most ``largest2``."""
+    near = errors2 < largest2
+    if not near.any():
+        return largest2
+    medians = np.where(has_right[near], _MEDIAN_CHI2[4], _MEDIAN_CHI2[2])
+    variance = max(float(np.median(errors2[near] / medians)), _LEAST_VARIANCE)
+    return min(largest2, _CUTOFF * variance)
