@@ -13,7 +13,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from graphvio.arrays import Float, Image
+from graphvio.arrays import Float, Image, Int
 from graphvio.errors import EventError
 
 
@@ -84,21 +84,42 @@ class Status(StrEnum):
     """There is no honest pose; the next one starts a new epoch."""
 
 
+class Quality(StrEnum):
+    """How far a measured motion can be trusted."""
+
+    GOOD = "good"
+    """Its covariance says all there is to say."""
+    WEAK = "weak"
+    """Pairs contradict each other, points are few, or a direction is hardly constrained; the covariance allows for it."""
+    FAILED = "failed"
+    """There is no motion."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PairReport:
     """What one stereo pair contributed to a frameset.
 
     Attributes:
         points: points offered to the estimation.
-        inliers: points that the accepted motion explains.
+        inliers: points that the chosen motion explains.
         pixels: (N, 2) left-image pixels of the tracked corners, for display.
         is_inlier: (N,) whether each of them is explained.
+        ages: (N,) number of earlier frames that saw each of them.
+        rejected: test of tracking or stereo matching -> how many corners it threw out.
+        rms_px: rms error of the inliers of all pairs under the chosen motion, or None without one.
+        own_inliers: points that the pair's own motion explains, or None where there is but one pair or too few points.
+        own_rms_px: their rms error; much less than ``rms_px`` tells of a transfer between pairs that is wrong.
     """
 
     points: int
     inliers: int
     pixels: Float
     is_inlier: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    ages: Int | None = None
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    rms_px: float | None = None
+    own_inliers: int | None = None
+    own_rms_px: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,6 +136,9 @@ class Estimate:
         gyro_bias: (3,) rad/s, or None without an IMU.
         accel_bias: (3,) m/s^2, or None without an IMU.
         rates: angular rate of body (3,) rad/s by ``gyro``, ``vision`` and ``fused``, as far as known.
+        vision: how far the motion that vision measured can be trusted.
+        vision_reason: why that is not ``good``, or empty.
+        at_rest: images, and the IMU if there is one, show no motion.
         pairs: pair index -> what it contributed.
         stage_ms: processing time by stage, milliseconds.
     """
@@ -128,6 +152,9 @@ class Estimate:
     gyro_bias: Float | None = None
     accel_bias: Float | None = None
     rates: Mapping[str, Float] = field(default_factory=dict)
+    vision: Quality = Quality.FAILED
+    vision_reason: str = ""
+    at_rest: bool = False
     pairs: Mapping[int, PairReport] = field(default_factory=dict)
     stage_ms: Mapping[str, float] = field(default_factory=dict)
 

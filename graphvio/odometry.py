@@ -8,14 +8,16 @@ from time import perf_counter
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.backend.gating import Verdict
 from graphvio.backend.inertial import ImuSpan
-from graphvio.backend.initialisation import InitialAttitude, initial_attitude, level
+from graphvio.backend.initialisation import InitialAttitude, initial_attitude, is_at_rest, level
 from graphvio.backend.smoother import RigState, Smoother, StartUncertainty, origin_covariance
 from graphvio.backend.window import WindowError
 from graphvio.config import Config
 from graphvio.errors import EventError
-from graphvio.events import Estimate, Event, FrameSet, ImuSample, Incident, Status, checked_event
-from graphvio.frontend.visual import RelativeMotion, VisualFrontend, VisualResult
+from graphvio.events import Estimate, Event, FrameSet, ImuSample, Incident, Quality, Status, checked_event
+from graphvio.frontend.motion import RelativeMotion, VisualResult
+from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.rates import AngularRates
 from graphvio.rig import Rig
@@ -52,6 +54,7 @@ class Odometry:
         self._settled_ns = 0  # from this stamp on, a start in motion is over
         self._tracked_ns = 0  # stamp of the last state that vision constrains
         self._refused: dict[int, Float] = {}  # stamp -> nav_T_body by the motions that the gate refused
+        self._told_misaligned: set[int] = set()
         self._lost = False
         self._epoch = 0
         self._pose_covariance = np.zeros((6, 6))  # of the newest estimate
@@ -132,7 +135,9 @@ class Odometry:
         predicted = perf_counter()
         visual = self._frontend.process(frameset, self._predicted_motion)
         measured = perf_counter()
-        used = visual.motion is not None and self._use(visual.motion)
+        if not starting:
+            self._tell_of_vision(stamp_ns, visual)
+        used = self._use(visual)
         status = self._update(stamp_ns, used, starting)
         stage_ms = {
             "predict": 1e3 * (predicted - start),
@@ -148,9 +153,11 @@ class Odometry:
             return None
         return se3_inverse(smoother.pose(smoother.latest_ns)) @ smoother.pose(then_ns)
 
-    def _use(self, motion: RelativeMotion) -> bool:
+    def _use(self, visual: VisualResult) -> bool:
         """Gate a measured motion and insert it; a gate that refuses for too long is itself at fault."""
-        smoother = self._running
+        smoother, motion = self._running, visual.motion
+        if motion is None:
+            return False
         if not smoother.knows(motion.reference_stamp_ns):  # it started anew since then
             self._frontend.rekey()
             return False
@@ -158,7 +165,7 @@ class Odometry:
             self._recover(motion)
             return True
         try:
-            verdict = smoother.test(motion)
+            motion, verdict = self._judge(visual)
         except WindowError:
             return False  # `_update` meets the same error, and rebuilds
         if verdict.accepted:
@@ -170,6 +177,8 @@ class Odometry:
             "vision_gated",
             f"innovation {verdict.statistic:.1f} beyond chi-square {verdict.threshold:.1f}, {motion.inliers} inliers",
         )
+        if visual.quality is not Quality.GOOD:
+            return False  # vision that contradicts itself cannot put the prediction in the wrong
         reference_ns = motion.reference_stamp_ns
         nav_T_reference = self._refused[reference_ns] if reference_ns in self._refused else smoother.pose(reference_ns)
         self._refused[motion.stamp_ns] = nav_T_reference @ motion.reference_T_current
@@ -177,6 +186,15 @@ class Odometry:
             self._believe_vision(motion)
             return True
         return False
+
+    def _judge(self, visual: VisualResult) -> tuple[RelativeMotion, Verdict]:
+        """The motion and its test; where pairs contradict each other, the side that the prediction clearly prefers."""
+        assert visual.motion is not None
+        verdicts = [(self._running.test(motion), motion) for motion in visual.alternatives]
+        verdicts.sort(key=lambda judged: judged[0].statistic)
+        if verdicts and verdicts[0][0].accepted and not verdicts[1][0].accepted:
+            return verdicts[0][1], verdicts[0][0]
+        return visual.motion, self._running.test(visual.motion)
 
     def _update(self, stamp_ns: int, used: bool, starting: bool) -> Status:
         """Optimise and marginalise; a window without a solution is rebuilt around the prediction."""
@@ -338,9 +356,28 @@ class Odometry:
             gyro_bias=state.gyro_bias if inertial else None,
             accel_bias=state.accel_bias if inertial else None,
             rates=self._rates.update(visual.motion, span, state.gyro_bias, smoother.latest_rate()),
+            vision=visual.quality,
+            vision_reason=visual.reason,
+            at_rest=visual.at_rest and (span is None or is_at_rest(span, self.config.initialisation)),
             pairs=visual.pairs,
             stage_ms=stage_ms,
         )
+
+    def _tell_of_vision(self, stamp_ns: int, visual: VisualResult) -> None:
+        if visual.quality is not Quality.GOOD:
+            self._report(stamp_ns, f"vision_{visual.quality}", visual.reason)
+        for j, misalignment in self._frontend.misaligned.items():
+            if j in self._told_misaligned:
+                continue
+            self._told_misaligned.add(j)
+            d = misalignment.tangent
+            self._report(
+                stamp_ns,
+                "extrinsics_off",
+                f"pair {self.rig.pairs[j].name} is {np.rad2deg(np.linalg.norm(d[:3])):.2f} deg and "
+                f"{np.linalg.norm(d[3:]):.3f} m from where the rig has it, as its motion against the first pair's "
+                f"tells (chi-square {misalignment.statistic:.0f}); corrected for this run: calibrate the rig",
+            )
 
     def _report(self, stamp_ns: int, kind: str, detail: str) -> None:
         self._incidents.append(Incident(stamp_ns, kind, detail))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from graphvio.arrays import Float
 from graphvio.backend.inertial import ImuSpan
-from graphvio.frontend.visual import RelativeMotion
+from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_inverse, so3_log
 
 

@@ -45,20 +45,12 @@ def initial_attitude(span: ImuSpan, at_s: float, config: InitialisationConfig) -
     share falls with the duration; the bias is then left to the smoother.
     """
     duration = float(span.steps_s.sum())
-    rate_spread = float(np.sqrt(span.angular_velocity.var(axis=0).max()))
-    force_spread = float(np.sqrt(span.linear_acceleration.var(axis=0).max()))
     mean_force = span.linear_acceleration.mean(axis=0)
-    at_rest = (
-        duration >= _MIN_REST_S
-        and rate_spread < config.static_gyro_rad_s
-        and force_spread < config.static_accel_m_s2
-        and abs(float(np.linalg.norm(mean_force)) - GRAVITY_M_S2) < 0.5
-        and float(np.linalg.norm(span.mean_rate)) < 0.2  # beyond any gyro's bias
-    )
+    at_rest = duration >= _MIN_REST_S and is_at_rest(span, config)
     tilt_sigma = _ACCEL_BIAS_SIGMA_M_S2 / GRAVITY_M_S2
     if at_rest:
         samples = len(span.steps_s)
-        bias_sigma = max(3.0 * rate_spread / np.sqrt(samples), 1e-4)
+        bias_sigma = max(3.0 * _spread(span.angular_velocity) / np.sqrt(samples), 1e-4)
         return InitialAttitude(level(mean_force), tilt_sigma, span.mean_rate, float(bias_sigma), True)
     force = np.zeros(3)
     start_R_body = np.eye(3)
@@ -75,6 +67,21 @@ def initial_attitude(span: ImuSpan, at_s: float, config: InitialisationConfig) -
     return InitialAttitude(
         level(force), min(tilt_sigma + motion_sigma, 0.5), np.zeros(3), _UNKNOWN_GYRO_BIAS_SIGMA, False
     )
+
+
+def is_at_rest(span: ImuSpan, config: InitialisationConfig) -> bool:
+    """Whether a span of the IMU shows nothing but gravity and noise; a short one may by chance."""
+    return bool(
+        _spread(span.angular_velocity) < config.static_gyro_rad_s
+        and _spread(span.linear_acceleration) < config.static_accel_m_s2
+        and abs(float(np.linalg.norm(span.linear_acceleration.mean(axis=0))) - GRAVITY_M_S2) < 0.5
+        and float(np.linalg.norm(span.mean_rate)) < 0.2  # beyond any gyro's bias
+    )
+
+
+def _spread(samples: Float) -> float:
+    """The largest standard deviation of a column of (N, 3)."""
+    return float(np.sqrt(samples.var(axis=0).max()))
 
 
 def level(up: Float) -> Float:

@@ -17,8 +17,8 @@ from graphvio.backend.gating import Verdict, gate, relative_covariance
 from graphvio.backend.inertial import ImuSpan, preintegrate, preintegration_params
 from graphvio.backend.window import Window
 from graphvio.config import SmootherConfig
-from graphvio.frontend.visual import RelativeMotion
-from graphvio.geometry import se3_exp, se3_inverse, se3_log
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.rig import Imu
 
 _POSITION_SIGMA_M = 1e-3
@@ -79,6 +79,7 @@ class Smoother:
         self._stamps: list[int] = []
         self._index = 0
         self._index_of: dict[int, int] = {}
+        self._views: set[int] = set()  # stamps of references that have a variable of their own, see `_reference_key`
         self._previous_motion = np.zeros(6)  # tangent per second
         self._constrained_ns = 0  # stamp of the newest state whose motion was measured
         self._rate_sigmas = np.zeros(2)  # of `_previous_motion`: rad/s and m/s
@@ -96,7 +97,7 @@ class Smoother:
     def start(self, stamp_ns: int, state: RigState, uncertainty: StartUncertainty) -> None:
         """Begin, or begin anew, with one state."""
         self._window = Window()
-        self._stamps, self._index_of = [], {}
+        self._stamps, self._index_of, self._views = [], {}, set()
         velocity_body = state.nav_T_body[:3, :3].T @ state.velocity_nav
         self._previous_motion = np.concatenate([np.zeros(3), velocity_body])
         self._rate_sigmas = np.array([_UNKNOWN_RATE_SIGMA_RAD_S, uncertainty.velocity_m_s])
@@ -175,12 +176,14 @@ class Smoother:
 
     def test(self, motion: RelativeMotion) -> Verdict:
         """Chi-square test of a motion that ends in the newest state, against the window's prediction."""
-        predicted = se3_inverse(self.pose(motion.reference_stamp_ns)) @ self.pose(motion.stamp_ns)
+        reference, newest = self._reference_key(motion), _x(self._index_of[motion.stamp_ns])
+        nav_T_reference = np.asarray(self._window.values.atPose3(reference).matrix())
+        predicted = se3_inverse(nav_T_reference) @ self.pose(motion.stamp_ns)
         return gate(
             motion.reference_T_current,
-            motion.covariance,
+            motion.covariance - motion.shared_covariance,
             predicted,
-            self.covariance_since(motion.reference_stamp_ns),
+            relative_covariance(predicted, self._window.joint_covariance([reference, newest])),
             self._config.gate_probability,
         )
 
@@ -190,12 +193,30 @@ class Smoother:
         self._rate_sigmas = np.zeros(2)
         self._window.add(
             gtsam.BetweenFactorPose3(
-                _x(self._index_of[motion.reference_stamp_ns]),
+                self._reference_key(motion),
                 _x(self._index_of[motion.stamp_ns]),
                 gtsam.Pose3(motion.reference_T_current),
-                gtsam.noiseModel.Gaussian.Covariance(motion.covariance),
+                gtsam.noiseModel.Gaussian.Covariance(motion.covariance - motion.shared_covariance),
             )
         )
+
+    def _reference_key(self, motion: RelativeMotion) -> int:
+        """The variable that motions are measured from: the reference as vision sees it.
+
+        All motions from one reference share the error of its triangulated points. The reference as seen differs from
+        the reference's pose by that error, so that it is one unknown for all of them.
+        """
+        stamp_ns = motion.reference_stamp_ns
+        k = self._index_of[stamp_ns]
+        if not motion.shared_covariance.any():
+            return _x(k)
+        if stamp_ns not in self._views:
+            self._views.add(stamp_ns)
+            adjoint = se3_adjoint(motion.reference_T_current)  # takes the tangent from the current instant there
+            shared = gtsam.noiseModel.Gaussian.Covariance(adjoint @ motion.shared_covariance @ adjoint.T)
+            self._window.values.insert(_r(k), gtsam.Pose3(self.pose(stamp_ns)))
+            self._window.add(gtsam.BetweenFactorPose3(_x(k), _r(k), gtsam.Pose3(), shared))
+        return _r(k)
 
     def settle(self, keep: Iterable[int]) -> list[tuple[int, Float]]:
         """Optimise, then marginalise what is older than the lag, but for the stamps to keep.
@@ -261,9 +282,11 @@ class Smoother:
         for stamp in leaving:
             k = self._index_of[stamp]
             keys += [_x(k), _v(k), _b(k)] if self.has_imu else [_x(k)]
+            keys += [_r(k)] if stamp in self._views else []
         self._window.marginalise(keys)
         for stamp in leaving:
             del self._index_of[stamp]
+            self._views.discard(stamp)
         self._stamps = [stamp for stamp in self._stamps if stamp in self._index_of]
         return finished
 
@@ -278,6 +301,10 @@ def _v(k: int) -> int:
 
 def _b(k: int) -> int:
     return int(gtsam.symbol("b", k))
+
+
+def _r(k: int) -> int:
+    return int(gtsam.symbol("r", k))
 
 
 def _isotropic(dimension: int, sigma: float) -> gtsam.noiseModel.Isotropic:

@@ -41,6 +41,14 @@ class RigArrays(NamedTuple):
         )
 
 
+    def corrected(self, nominal: RigArrays, pair: int, correction: Float) -> RigArrays:
+        """The same, one pair's ``body_T_left`` being ``correction`` (4, 4) times the nominal one; both its cameras move."""
+        cam_T_body, body_T_left = self.cam_T_body.copy(), self.body_T_left.copy()
+        body_T_left[pair] = correction @ nominal.body_T_left[pair]
+        cam_T_body[pair] = nominal.cam_T_body[pair] @ np.linalg.inv(correction)
+        return RigArrays(cam_T_body, body_T_left, self.focal_px)
+
+
 class Observations(NamedTuple):
     """N points known at the reference instant and seen at the current one, sorted by pair.
 

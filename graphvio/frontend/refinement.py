@@ -21,6 +21,7 @@ _ROUNDS = 3
 _STEPS_PER_ROUND = 6
 _CONVERGED = 1e-7
 _WEAK_DIRECTION_SIGMA = 10.0
+_SHARED_BOUNDS = (0.02, 0.9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,15 +59,24 @@ def refine(rig: RigArrays, observations: Observations, cur_T_ref: Float, config:
     slopes = np.where(inlier, influence_slopes(errors2, has_right, scale), 0.0)
     through_points = _through_points(pose, rig, observations, sigma, slopes**2)
     gain = covariance / used.factor * (used.weight / used.slope)
-    shared = used.variance * gain @ through_points @ gain
+    shared = _bounded(used.variance * gain @ through_points @ gain, covariance)
     inflation = config.sigma_inflation**2
     return Refined(
         pose,
         inflation * 0.5 * (covariance + covariance.T),
-        inflation * 0.5 * (shared + shared.T),
+        inflation * shared,
         inlier,
         sigma * float(np.sqrt(used.variance)),
     )
+
+
+def _bounded(shared: Float, covariance: Float) -> Float:
+    """The shared part, so that both it and the rest are surely positive definite."""
+    lower = np.linalg.cholesky(covariance)
+    inverse = np.linalg.inv(lower)
+    shares, axes = np.linalg.eigh(inverse @ shared @ inverse.T)
+    root = lower @ axes
+    return np.asarray((root * np.clip(shares, *_SHARED_BOUNDS)) @ root.T)
 
 
 @kernel

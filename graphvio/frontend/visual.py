@@ -4,63 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from time import perf_counter
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from graphvio.arrays import Float
+from graphvio.arrays import Bool, Float
 from graphvio.config import Config
-from graphvio.events import FrameSet, PairReport
+from graphvio.events import FrameSet, PairReport, Quality
+from graphvio.frontend.agreement import Agreement, agree, is_supported
+from graphvio.frontend.alignment import Misalignment, PairAlignment
+from graphvio.frontend.frozen import FrozenImages
+from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.frontend.observations import Correspondences, RigArrays, correspond
+from graphvio.frontend.quality import at_rest, graded
+from graphvio.frontend.references import References
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import best_pair_motion, joint_motion
+from graphvio.frontend.stopwatch import Stopwatch
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import PairFrame
-from graphvio.geometry import se3_inverse
+from graphvio.geometry import se3_exp, se3_inverse
 from graphvio.rig import Rig
 
 MotionPredictor = Callable[[int], Float | None]
 """Takes an earlier stamp and returns the predicted ``cur_T_then`` (4, 4) of body, or None if unknown."""
-
-_MIN_KEYFRAME_POINTS = 20
-
-
-@dataclass(frozen=True, eq=False)
-class RelativeMotion:
-    """A measured motion of the rig.
-
-    Attributes:
-        reference_stamp_ns: the earlier instant.
-        stamp_ns: the later one.
-        reference_T_current: (4, 4) of body: the motion that a between factor takes.
-        covariance: (6, 6), tangent ``[rotation, translation]`` in the body frame of the later instant.
-        inliers: number of points that it explains.
-    """
-
-    reference_stamp_ns: int
-    stamp_ns: int
-    reference_T_current: Float
-    covariance: Float
-    inliers: int
-
-
-@dataclass(frozen=True, eq=False)
-class VisualResult:
-    """What the front-end made of one frameset.
-
-    Attributes:
-        motion: the measured motion, or None.
-        reason: why there is none, or empty.
-        pairs: pair index -> report.
-        stage_ms: time by stage.
-    """
-
-    motion: RelativeMotion | None
-    reason: str
-    pairs: Mapping[int, PairReport]
-    stage_ms: Mapping[str, float]
 
 
 class VisualFrontend:
@@ -68,10 +36,13 @@ class VisualFrontend:
 
     def __init__(self, rig: Rig, config: Config) -> None:
         self._config = config
-        self._arrays = RigArrays.of(rig)
+        self._nominal = self._arrays = RigArrays.of(rig)
         self._trackers = [PairTracker(pair, config) for pair in rig.pairs]
+        self._frozen = FrozenImages()
         self._latest: dict[int, PairFrame] = {}
-        self._references: dict[int, PairFrame] = {}
+        self._references = References(config.motion)
+        self._alignments = {j: PairAlignment() for j in range(1, len(rig.pairs))}
+        self._misaligned: dict[int, Misalignment] = {}
         self._workers = ThreadPoolExecutor(len(rig.pairs), thread_name_prefix="graphvio-pair")
         if len(rig.pairs) > 1:
             cv2.setNumThreads(1)  # pairs run side by side; OpenCV's own threads would only compete with them
@@ -79,7 +50,12 @@ class VisualFrontend:
     @property
     def reference_stamps_ns(self) -> frozenset[int]:
         """Stamps of the framesets that later motions will be measured from."""
-        return frozenset(frame.stamp_ns for frame in self._references.values())
+        return self._references.stamps_ns
+
+    @property
+    def misaligned(self) -> Mapping[int, Misalignment]:
+        """Pairs whose place relative to the first pair is not what the rig says: motions allow for it."""
+        return self._misaligned
 
     def process(self, frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
         """Measure the motion of a frameset.
@@ -88,33 +64,46 @@ class VisualFrontend:
             frameset: images of any subset of pairs.
             predict: the back-end's prediction, which starts the search.
         """
-        start = perf_counter()
-        frames = self._observe(frameset, predict)
-        tracked = perf_counter()
-        reference = self._shared_reference(frames)
+        watch = Stopwatch()
+        stamp_ns = frameset.stamp_ns
+        frozen = self._frozen.look(frameset)
+        frames = self._observe(frameset, frozen.pairs, predict)
+        watch.lap("track")
+        for stage in ("pyramid", "flow", "register", "corners", "stereo"):
+            watch.stage_ms[stage] = max((frame.stage_ms[stage] for frame in frames.values()), default=0.0)
+        reference = self._references.shared(frames)
         if not reference:
             self._refer_to(frames)
-            reports = {j: _report(frame, None, None) for j, frame in frames.items()}
-            return VisualResult(None, "first images", reports, {"track": 1e3 * (tracked - start)})
+            reports = {j: _report(frame) for j, frame in frames.items()}
+            reason = "first images" if frames else frozen.reason
+            return VisualResult(None, Quality.FAILED, reason, reports, stage_ms=watch.stage_ms)
         reference_stamp_ns = next(iter(reference.values())).stamp_ns
         correspondences = correspond(reference, frames)
-        refined, reason = self._estimate(correspondences, predict(reference_stamp_ns), frameset.stamp_ns)
-        if refined is None or self._reference_is_spent(frames, correspondences, refined):
+        predicted = predict(reference_stamp_ns)
+        agreement, reason = self._estimate(correspondences, predicted, stamp_ns)
+        watch.lap("motion")
+        if agreement is None:
             self._refer_to(frames)
-        if refined is not None:
-            self._drop_outliers(frames, correspondences, refined)
-        reports = {j: _report(frame, correspondences, refined, j) for j, frame in frames.items()}
-        stage_ms = {"track": 1e3 * (tracked - start), "motion": 1e3 * (perf_counter() - tracked)}
-        if refined is None:
-            return VisualResult(None, reason, reports, stage_ms)
-        motion = RelativeMotion(
-            reference_stamp_ns,
-            frameset.stamp_ns,
-            se3_inverse(refined.cur_T_ref),
-            refined.covariance,
-            int(refined.inlier.sum()),
+            reports = {j: _report(frame, correspondences, j) for j, frame in frames.items()}
+            return VisualResult(None, Quality.FAILED, reason, reports, stage_ms=watch.stage_ms)
+        refined = agreement.sides[0].refined
+        self._drop_outliers(frames, correspondences, agreement)
+        reports = {j: _report(frame, correspondences, j, agreement) for j, frame in frames.items()}
+        if self._references.are_spent(frames, correspondences, refined):
+            self._learn_alignments(agreement)
+            self._refer_to(frames)
+        motions = [_motion(reference_stamp_ns, stamp_ns, side.refined) for side in agreement.sides]
+        motion, quality, reason = graded(motions, frozen.all_since_ns)
+        watch.lap("judge")
+        return VisualResult(
+            motion,
+            quality,
+            reason,
+            reports,
+            alternatives=tuple(motions) if len(motions) > 1 else (),
+            at_rest=at_rest(reference, frames, correspondences, refined.inlier),
+            stage_ms=watch.stage_ms,
         )
-        return VisualResult(motion, "", reports, stage_ms)
 
     def rekey(self) -> None:
         """Measure the next motions from the newest frames."""
@@ -126,15 +115,20 @@ class VisualFrontend:
         """End the threads."""
         self._workers.shutdown()
 
-    def _observe(self, frameset: FrameSet, predict: MotionPredictor) -> dict[int, PairFrame]:
+    def _observe(
+        self, frameset: FrameSet, left_out: frozenset[int], predict: MotionPredictor
+    ) -> dict[int, PairFrame]:
         def observe(j: int) -> PairFrame:
             left, right = frameset.images[j]
             since_latest = self._predicted(j, self._latest.get(j), predict)
-            since_reference = self._predicted(j, self._references.get(j), predict)
+            since_reference = self._predicted(j, self._references.of(j), predict)
             return self._trackers[j].observe(frameset.stamp_ns, left, right, since_latest, since_reference)
 
-        pairs = sorted(frameset.images)
-        frames = dict(zip(pairs, self._workers.map(observe, pairs), strict=True))
+        pairs = sorted(frameset.images.keys() - left_out)
+        if len(pairs) == 1:
+            frames = {pairs[0]: observe(pairs[0])}
+        else:
+            frames = dict(zip(pairs, self._workers.map(observe, pairs), strict=True))
         self._latest.update(frames)
         return frames
 
@@ -148,69 +142,89 @@ class VisualFrontend:
 
     def _refer_to(self, frames: Mapping[int, PairFrame]) -> None:
         """Measure the next motions from these frames, the newest of their pairs."""
-        self._references.update(frames)
+        self._references.replace(frames)
         if self._config.motion.reference == "keyframe":
             for j in frames:
                 self._trackers[j].anchor()
 
-    def _shared_reference(self, frames: Mapping[int, PairFrame]) -> dict[int, PairFrame]:
-        """Reference frames of one instant: where pairs were keyed at different times, the larger group counts."""
-        groups: dict[int, dict[int, PairFrame]] = {}
-        for j in frames:
-            if j in self._references:
-                groups.setdefault(self._references[j].stamp_ns, {})[j] = self._references[j]
-        return max(groups.values(), key=len, default={})
-
     def _estimate(
         self, correspondences: Correspondences, predicted: Float | None, stamp_ns: int
-    ) -> tuple[Refined | None, str]:
-        config = self._config.motion
-        observations = correspondences.observations
+    ) -> tuple[Agreement | None, str]:
+        config, observations = self._config.motion, correspondences.observations
         if len(observations.pair) < config.min_inliers:
             return None, f"only {len(observations.pair)} points in view"
         rng = np.random.default_rng([config.seed, stamp_ns % 2**63])
+        start = np.eye(4) if predicted is None else predicted
         solve = joint_motion if config.selection == "joint" else best_pair_motion
-        refined = solve(self._arrays, observations, np.eye(4) if predicted is None else predicted, config, rng)
-        inliers = int(refined.inlier.sum())
-        if inliers < config.min_inliers or inliers < config.min_inlier_share * len(observations.pair):
-            return None, f"the best motion explains only {inliers} of {len(observations.pair)} points"
-        return refined, ""
-
-    def _reference_is_spent(
-        self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined
-    ) -> bool:
-        if self._config.motion.reference == "previous":
-            return True
-        if any(j not in correspondences.rows for j in frames):
-            return True  # a pair that came back takes part again from the next frameset on
-        pair, overlap = correspondences.observations.pair, self._config.motion.keyframe_overlap
-        explained = int(refined.inlier.sum())
-        if explained < overlap * correspondences.offered or explained < _MIN_KEYFRAME_POINTS:
-            return True
-        for (
-            j,
-            frame,
-        ) in frames.items():  # one pair's keyframe may be spent long before all points together are few
-            if np.sum(refined.inlier[pair == j]) < 0.5 * overlap * frame.has_depth.sum():
-                return True
-        return False
+        refined = solve(self._arrays, observations, start, config, rng)
+        agreement = agree(self._arrays, observations, refined, config, rng)
+        best = agreement.sides[0]
+        rows = np.isin(observations.pair, best.pairs)
+        if not is_supported(best.refined.inlier[rows], config):
+            return None, f"the best motion explains only {best.support} of {int(rows.sum())} points"
+        return agreement, ""
 
     def _drop_outliers(
-        self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined
+        self, frames: Mapping[int, PairFrame], correspondences: Correspondences, agreement: Agreement
     ) -> None:
-        pair = correspondences.observations.pair
+        """Forget tracks that their pair's motion does not explain."""
         for j, rows in correspondences.rows.items():
-            self._trackers[j].drop(frames[j].ids[rows[~refined.inlier[pair == j]]])
+            inlier = _inliers_of(j, correspondences, agreement)
+            self._trackers[j].drop(frames[j].ids[rows[~inlier]])
+
+    def _learn_alignments(self, agreement: Agreement) -> None:
+        """At the end of a keyframe, compare the pairs' motions over it with the first pair's."""
+        own = agreement.own
+        if 0 not in own or self._config.motion.selection != "joint":
+            return
+        for j, alignment in self._alignments.items():
+            if j not in own:
+                continue
+            alignment.add(own[0], own[j])
+            misalignment = alignment.solve()
+            if misalignment is not None and misalignment.is_significant:
+                alignment.apply(misalignment)
+                self._misaligned[j] = misalignment
+                self._arrays = self._arrays.corrected(self._nominal, j, se3_exp(misalignment.tangent))
+
+
+def _motion(reference_stamp_ns: int, stamp_ns: int, refined: Refined) -> RelativeMotion:
+    return RelativeMotion(
+        reference_stamp_ns,
+        stamp_ns,
+        se3_inverse(refined.cur_T_ref),
+        refined.covariance,
+        refined.shared_covariance,
+        int(refined.inlier.sum()),
+    )
+
+
+def _inliers_of(pair: int, correspondences: Correspondences, agreement: Agreement) -> Bool:
+    """Which of a pair's points are right: by its own motion, if it has one."""
+    if pair in agreement.own:
+        return agreement.own[pair].inlier
+    return np.asarray(agreement.sides[0].refined.inlier[correspondences.observations.pair == pair])
 
 
 def _report(
-    frame: PairFrame, correspondences: Correspondences | None, refined: Refined | None, pair: int = 0
+    frame: PairFrame, correspondences: Correspondences | None = None, pair: int = 0, agreement: Agreement | None = None
 ) -> PairReport:
     is_inlier = np.zeros(len(frame.ids), dtype=bool)
-    points = 0
-    if correspondences is not None and pair in correspondences.rows:
-        rows = correspondences.rows[pair]
-        points = len(rows)
-        if refined is not None:
-            is_inlier[rows] = refined.inlier[correspondences.observations.pair == pair]
-    return PairReport(points, int(is_inlier.sum()), frame.pixels, is_inlier)
+    report = PairReport(0, 0, frame.pixels, is_inlier, frame.ages, frame.rejected)
+    if correspondences is None or pair not in correspondences.rows:
+        return report
+    rows = correspondences.rows[pair]
+    report = replace(report, points=len(rows))
+    if agreement is None:
+        return report
+    explained = agreement.sides[0].refined.inlier[correspondences.observations.pair == pair]
+    is_inlier[rows] = explained
+    own = agreement.own.get(pair)
+    return replace(
+        report,
+        inliers=int(explained.sum()),
+        is_inlier=is_inlier,
+        rms_px=agreement.sides[0].refined.rms_px,
+        own_inliers=None if own is None else int(own.inlier.sum()),
+        own_rms_px=None if own is None else own.rms_px,
+    )

@@ -1,0 +1,51 @@
+"""Images that are delivered twice: a camera that is stuck shows a world that stands still, and shows it convincingly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.arrays import Image
+from graphvio.events import FrameSet
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """What is the matter with a frameset.
+
+    Attributes:
+        pairs: of which a camera repeats its image while another pair's cameras do not, or its partner does not.
+        all_since_ns: stamp since which every image is the same, or None. Cameras without noise at rest do so too.
+        reason: one line for people.
+    """
+
+    pairs: frozenset[int]
+    all_since_ns: int | None
+    reason: str
+
+
+class FrozenImages:
+    """Compares each image with the one before it, byte for byte: a sensor that lives has noise."""
+
+    def __init__(self) -> None:
+        self._last: dict[int, tuple[Image, Image]] = {}
+        self._changed_ns: dict[int, int] = {}  # when both of a pair's images last were new
+
+    def look(self, frameset: FrameSet) -> Frozen:
+        """Judge a frameset."""
+        repeats: dict[int, int] = {}
+        for j, images in frameset.images.items():
+            before = self._last.get(j)
+            repeats[j] = 0 if before is None else sum(_same(a, b) for a, b in zip(before, images, strict=True))
+            if repeats[j] == 0:
+                self._changed_ns[j] = frameset.stamp_ns
+            self._last[j] = (images[0], images[1])
+        if repeats and all(count == 2 for count in repeats.values()):
+            return Frozen(frozenset(), max(self._changed_ns[j] for j in repeats), "every image repeats the one before")
+        stuck = frozenset(j for j, count in repeats.items() if count)
+        return Frozen(stuck, None, f"pairs {sorted(stuck)} repeat an image" if stuck else "")
+
+
+def _same(one: Image, other: Image) -> bool:
+    return one is other or np.array_equal(one, other)

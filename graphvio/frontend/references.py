@@ -1,0 +1,62 @@
+"""The framesets that motion is measured from: the previous one, or keyframes that stay while enough is in view."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from graphvio.config import MotionConfig
+from graphvio.frontend.observations import Correspondences
+from graphvio.frontend.refinement import Refined
+from graphvio.frontend.tracks import PairFrame
+
+_FEWEST_POINTS = 20
+
+
+class References:
+    """Each pair's reference frame, and whether it still serves."""
+
+    def __init__(self, config: MotionConfig) -> None:
+        self._config = config
+        self._frames: dict[int, PairFrame] = {}
+
+    @property
+    def stamps_ns(self) -> frozenset[int]:
+        """Stamps of the framesets that later motions will be measured from."""
+        return frozenset(frame.stamp_ns for frame in self._frames.values())
+
+    def of(self, pair: int) -> PairFrame | None:
+        """A pair's reference frame, or None."""
+        return self._frames.get(pair)
+
+    def replace(self, frames: Mapping[int, PairFrame]) -> None:
+        """These frames are their pairs' references from here on."""
+        self._frames.update(frames)
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._frames.clear()
+
+    def shared(self, frames: Mapping[int, PairFrame]) -> dict[int, PairFrame]:
+        """Reference frames of one instant: where pairs were keyed at different times, the larger group counts."""
+        groups: dict[int, dict[int, PairFrame]] = {}
+        for j in frames:
+            if j in self._frames:
+                groups.setdefault(self._frames[j].stamp_ns, {})[j] = self._frames[j]
+        return max(groups.values(), key=len, default={})
+
+    def are_spent(
+        self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined
+    ) -> bool:
+        """Whether the next motions had better be measured from these frames."""
+        if self._config.reference == "previous":
+            return True
+        if any(j not in correspondences.rows for j in frames):
+            return True  # a pair that came back takes part again from the next frameset on
+        pair, overlap = correspondences.observations.pair, self._config.keyframe_overlap
+        explained = int(refined.inlier.sum())
+        if explained < overlap * correspondences.offered or explained < _FEWEST_POINTS:
+            return True
+        # One pair's keyframe may be spent long before all points together are few.
+        return any(
+            refined.inlier[pair == j].sum() < 0.5 * overlap * frame.has_depth.sum() for j, frame in frames.items()
+        )
