@@ -163,4 +163,4 @@ def measured_motion(
     noise = np.repeat([rotation_sigma, translation_sigma], 3) * rng.standard_normal(6)
     motion = np.linalg.inv(pose_at(start_ns * 1e-9)) @ pose_at(end_ns * 1e-9) @ transform(noise[:3], noise[3:])
     covariance = np.diag(np.repeat([rotation_sigma, translation_sigma], 3) ** 2)
-    return RelativeMotion(start_ns, end_ns, motion, covariance, 100)
+    return RelativeMotion(start_ns, end_ns, motion, covariance, np.zeros((6, 6)), 100)

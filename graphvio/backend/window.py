@@ -15,6 +15,7 @@ from graphvio.errors import GraphvioError
 
 _MAX_ITERATIONS = 4
 _CONVERGED = 1e-5
+_SINGULAR = 1e-9
 
 
 class WindowError(GraphvioError):
@@ -28,6 +29,7 @@ class Window:
         self._factors: list[tuple[frozenset[int], gtsam.NonlinearFactor]] = []
         self.values = gtsam.Values()
         self._solution: gtsam.GaussianBayesTree | None = None
+        self._last: tuple[int, ...] = ()  # variables that were eliminated last: the root of the solution holds them
 
     def add(self, factor: gtsam.NonlinearFactor) -> None:
         """Insert a factor; its variables must have values."""
@@ -44,14 +46,14 @@ class Window:
         values = self.values
         try:
             for _ in range(_MAX_ITERATIONS):
-                step = self._solve().optimize()
+                step = self._solve(self._last).optimize()
                 size = step.norm()
                 if not np.isfinite(size):
                     raise WindowError("the window's solution is not finite")
                 self.values = self.values.retract(step)
-                self._solution = None
                 if size < _CONVERGED:
-                    break
+                    break  # the solution still serves for covariances
+                self._solution = None
         except RuntimeError as error:
             self.values, self._solution = values, None
             raise WindowError(f"the window cannot be optimised: {_one_line(error)}") from None
@@ -65,14 +67,22 @@ class Window:
         Raises:
             WindowError: if some variable is not constrained.
         """
-        try:
-            if len(keys) == 1:
-                return np.asarray(self._solve().marginalCovariance(keys[0]))
-            joint = self._solve().jointMarginalCovariance(gtsam.KeyVector(list(keys)))
-        except RuntimeError as error:
-            raise WindowError(f"the window has no covariance: {_one_line(error)}") from None
-        blocks = [[joint.at(a, b) for b in keys] for a in keys]
-        return np.block(blocks)
+        unknown = [key for key in keys if not self.values.exists(key)]
+        if unknown:
+            raise WindowError(f"the window has no variable {gtsam.DefaultKeyFormatter(unknown[0])}")
+        solution = self._solve(tuple(keys))
+        for root in solution.roots():
+            if list(root.conditional().keys())[-len(keys) :] == list(keys):
+                # Eliminated last, the variables' marginal is the lower corner of the root. Its square root is
+                # inverted, not its square: states far less certain than the poses relative to them do no harm.
+                dims = self.values.dims()
+                size = sum(dims[key] for key in keys)
+                square_root = np.asarray(root.conditional().R())[-size:, -size:]
+                if np.abs(np.diag(square_root)).min() < _SINGULAR:
+                    break
+                inverse = np.linalg.inv(square_root)
+                return np.asarray(inverse @ inverse.T)
+        raise WindowError(f"the window has no covariance of {', '.join(map(gtsam.DefaultKeyFormatter, keys))}")
 
     def marginalise(self, keys: Iterable[int]) -> None:
         """Replace variables and their factors by the linear factor that says the same of the others.
@@ -108,21 +118,30 @@ class Window:
         self._factors = staying
         self._solution = None
 
-    def _solve(self) -> gtsam.GaussianBayesTree:
-        if self._solution is None:
-            loose = set(self.values.keys()).difference(*(involved for involved, _ in self._factors))
-            if loose:
-                raise WindowError(f"no factor constrains variable {gtsam.DefaultKeyFormatter(min(loose))}")
-            graph = gtsam.NonlinearFactorGraph()
-            for _, factor in self._factors:
-                graph.push_back(factor)
-            try:
-                self._solution = graph.linearize(self.values).eliminateMultifrontal(
-                    gtsam.Ordering.OrderingType.COLAMD, gtsam.EliminateQR
-                )
-            except RuntimeError as error:
-                raise WindowError(f"the window has no unique solution: {_one_line(error)}") from None
+    def _solve(self, last: tuple[int, ...]) -> gtsam.GaussianBayesTree:
+        """The window eliminated at its present values, in order of time but for the variables that come last."""
+        if self._solution is not None and self._last[-len(last) :] == last:
+            return self._solution
+        loose = set(self.values.keys()).difference(*(involved for involved, _ in self._factors))
+        if loose:
+            raise WindowError(f"no factor constrains variable {gtsam.DefaultKeyFormatter(min(loose))}")
+        graph = gtsam.NonlinearFactorGraph()
+        for _, factor in self._factors:
+            graph.push_back(factor)
+        last = tuple(key for key in last if self.values.exists(key))
+        others = sorted(set(self.values.keys()) - set(last), key=_age)
+        try:
+            self._solution = graph.linearize(self.values).eliminateMultifrontal(
+                gtsam.Ordering([*others, *last]), gtsam.EliminateQR
+            )
+        except RuntimeError as error:
+            raise WindowError(f"the window has no unique solution: {_one_line(error)}") from None
+        self._last = last
         return self._solution
+
+
+def _age(key: int) -> tuple[int, int]:
+    return gtsam.symbolIndex(key), gtsam.symbolChr(key)
 
 
 def _one_line(error: Exception) -> str:

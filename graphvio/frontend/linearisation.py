@@ -110,7 +110,9 @@ def _whitener(jacobian: Float, covariance: Float, sigma: float, inverse_l: Float
     for i in range(4):
         for d in range(3):
             spread[i, d] = (
-                jacobian[i, 0] * covariance[0, d] + jacobian[i, 1] * covariance[1, d] + jacobian[i, 2] * covariance[2, d]
+                jacobian[i, 0] * covariance[0, d]
+                + jacobian[i, 1] * covariance[1, d]
+                + jacobian[i, 2] * covariance[2, d]
             )
     lower = np.zeros((4, 4))
     for i in range(4):

@@ -40,7 +40,6 @@ class RigArrays(NamedTuple):
             np.array([[pair.left.focal_px, pair.right.focal_px] for pair in rig.pairs]),
         )
 
-
     def corrected(self, nominal: RigArrays, pair: int, correction: Float) -> RigArrays:
         """The same, one pair's ``body_T_left`` being ``correction`` (4, 4) times the nominal one; both its cameras move."""
         cam_T_body, body_T_left = self.cam_T_body.copy(), self.body_T_left.copy()

@@ -44,9 +44,7 @@ class References:
                 groups.setdefault(self._frames[j].stamp_ns, {})[j] = self._frames[j]
         return max(groups.values(), key=len, default={})
 
-    def are_spent(
-        self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined
-    ) -> bool:
+    def are_spent(self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined) -> bool:
         """Whether the next motions had better be measured from these frames."""
         if self._config.reference == "previous":
             return True

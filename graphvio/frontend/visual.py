@@ -115,9 +115,7 @@ class VisualFrontend:
         """End the threads."""
         self._workers.shutdown()
 
-    def _observe(
-        self, frameset: FrameSet, left_out: frozenset[int], predict: MotionPredictor
-    ) -> dict[int, PairFrame]:
+    def _observe(self, frameset: FrameSet, left_out: frozenset[int], predict: MotionPredictor) -> dict[int, PairFrame]:
         def observe(j: int) -> PairFrame:
             left, right = frameset.images[j]
             since_latest = self._predicted(j, self._latest.get(j), predict)

@@ -40,7 +40,7 @@ class SimulatedRecording:
     Attributes:
         path: folder that holds ``mav0`` and ``rig.yaml``.
         scene: its name.
-        framesets: number of instants at which all cameras took an image.
+        framesets: number of instants at which cameras took an image.
         images: number of image files.
         imu_samples: number of IMU samples.
         duration_s: length of the walk.
@@ -64,8 +64,9 @@ def simulate(
     *,
     duration_s: float | None = None,
     seed: int = 0,
-    rate_hz: float = 20.0,
+    rate_hz: float | Sequence[float] = 20.0,
     rest_s: float = 1.0,
+    trigger_offset_ms: float = 0.0,
     progress: Progress | None = None,
 ) -> SimulatedRecording:
     """Simulate a scene and write it as a recording.
@@ -75,8 +76,9 @@ def simulate(
         out: folder to write; it must be empty or not exist.
         duration_s: only so much of the walk; None for all of it.
         seed: of all noise; the same seed gives the same bytes.
-        rate_hz: framesets per second.
+        rate_hz: framesets per second; or one rate for each pair, of which the last holds for further pairs.
         rest_s: how long the rig stands still at first; 0 starts at walking speed.
+        trigger_offset_ms: each pair is triggered so much later than the pair before it; 0 triggers all together.
         progress: called as the framesets are written.
 
     Raises:
@@ -84,7 +86,14 @@ def simulate(
     """
     out = Path(out)
     _require_empty(out)
-    simulator = make_simulator(name, duration_s=duration_s, seed=seed, rate_hz=rate_hz, rest_s=rest_s)
+    simulator = make_simulator(
+        name,
+        duration_s=duration_s,
+        seed=seed,
+        rate_hz=rate_hz,
+        rest_s=rest_s,
+        trigger_offset_ms=trigger_offset_ms,
+    )
     return write_recording(simulator, out, progress)
 
 
@@ -106,9 +115,9 @@ def write_recording(simulator: Simulator, out: Path, progress: Progress | None =
 
     def write(index: int) -> None:
         surfaces = simulator.surfaces(index)
-        for number, camera in enumerate(cameras):
+        for number in (2 * pair + side for pair in simulator.triggered(index) for side in (0, 1)):
             image = simulator.image(index, number, surfaces=surfaces)
-            _write_image(mav0 / camera.name / "data" / f"{stamps[index]}.png", image)
+            _write_image(mav0 / cameras[number].name / "data" / f"{stamps[index]}.png", image)
 
     workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     write(0)  # compiles the kernels once, before threads would wait for each other
@@ -121,7 +130,7 @@ def write_recording(simulator: Simulator, out: Path, progress: Progress | None =
         path=out,
         scene=simulator.scene.name,
         framesets=len(stamps),
-        images=len(stamps) * len(cameras),
+        images=sum(2 * len(simulator.triggers_ns(pair)) for pair in range(len(simulator.rig.pairs))),
         imu_samples=len(simulator.imu_track.stamps_ns),
         duration_s=simulator.scene.motion.duration_s,
         path_length_m=float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
@@ -155,10 +164,11 @@ def _write_image(path: Path, image: Image) -> None:
 
 
 def _write_sensors(simulator: Simulator, mav0: Path) -> None:
-    for camera in simulator.rig.cameras:
+    for number, camera in enumerate(simulator.rig.cameras):
         folder = mav0 / camera.name
-        (folder / "sensor.yaml").write_text(_camera_yaml(camera, simulator.rate_hz))
-        rows = [f"{stamp},{stamp}.png" for stamp in simulator.stamps_ns]
+        pair = number // 2
+        (folder / "sensor.yaml").write_text(_camera_yaml(camera, simulator.rates_hz[pair]))
+        rows = [f"{stamp},{stamp}.png" for stamp in simulator.triggers_ns(pair)]
         (folder / "data.csv").write_text("\n".join(["#timestamp [ns],filename", *rows, ""]))
     for name in ("imu0", "state_groundtruth_estimate0"):
         (mav0 / name).mkdir()

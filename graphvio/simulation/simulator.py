@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -31,11 +32,15 @@ class Simulator:
         scene: where, and how it is walked.
         rig: cameras and IMU; None for the paper's. A rig without an IMU gets the default one.
         seed: of all noise and biases. World and walk do not depend on it.
-        rate_hz: framesets per second.
+        rate_hz: framesets per second; or one rate for each pair, of which the last holds for further pairs.
         atlas: textures of the world; None for the standard ones.
+        trigger_offset_ms: each pair is triggered so much later than the pair before it; 0 triggers all together.
+
+    Attributes:
+        rates_hz: of each pair, images per second.
 
     Raises:
-        SourceError: if the rate is impossible.
+        SourceError: if a rate or the offset is impossible.
     """
 
     def __init__(
@@ -43,27 +48,52 @@ class Simulator:
         scene: Scene,
         rig: Rig | None = None,
         seed: int = 0,
-        rate_hz: float = 20.0,
+        rate_hz: float | Sequence[float] = 20.0,
         atlas: Atlas | None = None,
+        trigger_offset_ms: float = 0.0,
     ) -> None:
-        if not 0.1 <= rate_hz <= 200.0:
-            raise SourceError(f"a rate of {rate_hz} Hz cannot be simulated; give 0.1 to 200 framesets per second")
+        rates = list(rate_hz) if isinstance(rate_hz, Sequence) else [rate_hz]
+        for rate in rates:
+            if not 0.1 <= rate <= 200.0:
+                raise SourceError(f"a rate of {rate} Hz cannot be simulated; give 0.1 to 200 framesets per second")
+        if not rates:
+            raise SourceError("no rate is given; give 0.1 to 200 framesets per second")
+        if not 0.0 <= trigger_offset_ms <= 1000.0:
+            raise SourceError(f"a trigger offset of {trigger_offset_ms} ms cannot be simulated; give 0 to 1000")
         if seed < 0:
             raise SourceError(f"the seed {seed} is negative; give 0 or more")
         self.scene = scene
         self.rig = rig if rig is not None else default_rig()
         self.imu = self.rig.imu if self.rig.imu is not None else Imu()
         self.seed = seed
-        self.rate_hz = rate_hz
+        pairs = len(self.rig.pairs)
+        self.rates_hz = tuple((rates + [rates[-1]] * pairs)[:pairs])
+        self._trigger_offset_ms = trigger_offset_ms
         self._stage = Stage(scene.world, atlas if atlas is not None else standard_atlas())
         self._rays = [CameraRays(camera) for camera in self.rig.cameras]
         self.films = [Film(r, _SENSITIVITIES[i % 4]) for i, r in enumerate(self._rays)]
 
     @cached_property
     def stamps_ns(self) -> Int:
-        """Stamps (N,) of the framesets."""
-        count = int(np.floor(self.scene.motion.duration_s * self.rate_hz + 1e-9))
-        return EPOCH_NS + np.round(np.arange(max(count, 1)) * (1e9 / self.rate_hz)).astype(np.int64)
+        """Stamps (N,) of the framesets: all instants at which a pair is triggered."""
+        return np.unique(np.concatenate([self.triggers_ns(pair) for pair in range(len(self.rig.pairs))]))
+
+    def triggers_ns(self, pair: int) -> Int:
+        """Stamps (M,) at which a pair takes its images, all within the walk."""
+        rate = self.rates_hz[pair]
+        late_ns = round(pair * self._trigger_offset_ms * 1e6)
+        count = int(np.floor((self.scene.motion.duration_s - 1e-9 * late_ns) * rate + 1e-9))
+        return EPOCH_NS + late_ns + np.round(np.arange(max(count, 1)) * (1e9 / rate)).astype(np.int64)
+
+    def triggered(self, index: int) -> tuple[int, ...]:
+        """The pairs that take images at a frameset's stamp."""
+        stamp = int(self.stamps_ns[index])
+        return tuple(pair for pair, triggers in enumerate(self._triggers) if stamp in triggers)
+
+    @property
+    def rate_hz(self) -> float:
+        """Images per second of the first pair."""
+        return self.rates_hz[0]
 
     @cached_property
     def world_T_body(self) -> Float:
@@ -95,13 +125,17 @@ class Simulator:
         return self.films[camera].expose(self.view(index, camera, surfaces).radiance, exposure, noise)
 
     def frameset(self, index: int, noisy: bool = True) -> FrameSet:
-        """Images of all pairs at one instant."""
+        """Images of the pairs that are triggered at one instant."""
         surfaces = self.surfaces(index)
-        images = [self.image(index, camera, noisy, surfaces) for camera in range(len(self.rig.cameras))]
-        return FrameSet(
-            int(self.stamps_ns[index]),
-            {k: (images[2 * k], images[2 * k + 1]) for k in range(len(self.rig.pairs))},
-        )
+        images = {
+            k: (self.image(index, 2 * k, noisy, surfaces), self.image(index, 2 * k + 1, noisy, surfaces))
+            for k in self.triggered(index)
+        }
+        return FrameSet(int(self.stamps_ns[index]), images)
+
+    @cached_property
+    def _triggers(self) -> list[frozenset[int]]:
+        return [frozenset(self.triggers_ns(pair).tolist()) for pair in range(len(self.rig.pairs))]
 
     @staticmethod
     def _seconds(stamps_ns: Int) -> Float:
@@ -109,11 +143,18 @@ class Simulator:
 
 
 def make_simulator(
-    name: str, *, duration_s: float | None = None, seed: int = 0, rate_hz: float = 20.0, rest_s: float = 1.0
+    name: str,
+    *,
+    duration_s: float | None = None,
+    seed: int = 0,
+    rate_hz: float | Sequence[float] = 20.0,
+    rest_s: float = 1.0,
+    trigger_offset_ms: float = 0.0,
 ) -> Simulator:
-    """A simulator of a scene by its name, with the paper's rig.
+    """A simulator of a scene by its name, with the paper's rig; `Simulator` tells of rates and offsets.
 
     Raises:
         SourceError: if there is no such scene, or a value is impossible.
     """
-    return Simulator(build_scene(name, duration_s, rest_s), seed=seed, rate_hz=rate_hz)
+    scene = build_scene(name, duration_s, rest_s)
+    return Simulator(scene, seed=seed, rate_hz=rate_hz, trigger_offset_ms=trigger_offset_ms)
