@@ -90,7 +90,7 @@ class Quality(StrEnum):
     GOOD = "good"
     """Its covariance says all there is to say."""
     WEAK = "weak"
-    """Pairs contradict each other, points are few, or a direction is hardly constrained; the covariance allows for it."""
+    """Pairs contradict each other, points are few, or a direction is hardly constrained; its covariance says so."""
     FAILED = "failed"
     """There is no motion."""
 

@@ -12,7 +12,7 @@ from graphvio.config import Config
 from graphvio.events import FrameSet, ImuSample
 from graphvio.rig import Rig
 
-_LEAST_INTERVAL_NS = 1_000_000
+_LEAST_INTERVAL_NS = 1_000_000  # between framesets: less is of one instant, and no motion can be told from it
 _SUSPICIOUS_JUMP_NS = 5_000_000_000
 
 Stamped = TypeVar("Stamped", ImuSample, FrameSet)
@@ -50,23 +50,39 @@ class Synchroniser:
                 self._report(confirmed.stamp_ns, fault, "sample left out")
 
     def add_frameset(self, frameset: FrameSet) -> None:
-        """Take a frameset; time never goes back."""
+        """Take a frameset; time never goes back.
+
+        Pairs may come in framesets of their own. Less than 1 ms after a frameset that is still held, further pairs
+        join it; after one that is not, and for pairs that it has already, there is no room for another state.
+        """
         for confirmed in self._frameset_jumps.confirm(frameset):
             self._add(confirmed)
 
     def _add(self, frameset: FrameSet) -> None:
+        unknown = [j for j in frameset.images if not 0 <= j < self._pairs]
         if self._newest_ns is not None and frameset.stamp_ns < self._newest_ns + _LEAST_INTERVAL_NS:
+            if not unknown and self._joins(frameset):
+                held = self._held[-1]
+                self._held[-1] = replace(held, images={**held.images, **frameset.images})
+                return
             late = frameset.stamp_ns < self._newest_ns
             kind = "frameset_backward_stamp" if late else "frameset_duplicate_stamp"
             why = "time never goes back" if late else "less than 1 ms after the one before"
             self._report(frameset.stamp_ns, kind, f"frameset left out: {why}")
             return
-        unknown = [j for j in frameset.images if not 0 <= j < self._pairs]
         if unknown:
             self._report(frameset.stamp_ns, "unknown_pair", f"pair {unknown[0]} is not in the rig: left out")
             frameset = replace(frameset, images={j: v for j, v in frameset.images.items() if j not in unknown})
         self._newest_ns = frameset.stamp_ns
         self._held.append(frameset)
+
+    def _joins(self, frameset: FrameSet) -> bool:
+        """Whether a frameset is of the instant of the newest one, which is held, and brings other pairs."""
+        return (
+            bool(self._held)
+            and abs(frameset.stamp_ns - self._held[-1].stamp_ns) < _LEAST_INTERVAL_NS
+            and not self._held[-1].images.keys() & frameset.images.keys()
+        )
 
     def next_due(self, *, started: bool) -> FrameSet | None:
         """The oldest held frameset if it need wait no longer; the first one waits for samples to start from."""

@@ -6,7 +6,7 @@ is then a compromise that is right for nobody: each side's own motion is kept ap
 side comes first, as in eq. (4).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from graphvio.geometry import se3_inverse, se3_log
 
 _BEYOND_5_SIGMA = 40.0  # chi-square of 6 degrees of freedom that a normal error exceeds once in 2 million
 _POORLY_EXPLAINED = 0.5  # share of a pair's points below which the pair looks for a motion of its own
+_RIVAL_POINTS = 12
+_RIVAL_SHARE = 0.12  # of all points, unexplained: from there on they may have a motion of their own
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +48,12 @@ class Agreement:
     Attributes:
         sides: one if all pairs that see enough agree; else one for each opinion, the best supported first.
         own: pair -> its own motion, of the pairs that see enough.
+        tension: the largest squared Mahalanobis distance between two pairs of one side, 0 for a single pair.
     """
 
     sides: tuple[Side, ...]
     own: dict[int, Refined]
+    tension: float = 0.0
 
 
 def agree(
@@ -61,17 +65,21 @@ def agree(
     own = {j: _own_motion(rig, observations.of_pair(j), joint, config, rng) for j in everyone} if everyone[1:] else {}
     own = {j: motion for j, motion in own.items() if is_supported(motion.inlier, config)}
     camps: list[list[int]] = []
+    tension = 0.0
     for j in sorted(own, key=lambda j: -int(own[j].inlier.sum())):
         for camp in camps:
-            if disagreement(own[camp[0]], own[j]) < _BEYOND_5_SIGMA:
+            distance = disagreement(own[camp[0]], own[j])
+            if distance < _BEYOND_5_SIGMA:
                 camp.append(j)
+                tension = max(tension, distance)
                 break
         else:
             camps.append([j])
-    if len(camps) < 2:
-        return Agreement((together,), own)
-    sides = [_side(rig, observations, sorted(camp), own, joint, config) for camp in camps]
-    return Agreement(tuple(sorted(sides, key=lambda side: -side.support)), own)
+    sides = [together]
+    if len(camps) > 1:
+        sides = [_side(rig, observations, sorted(camp), own, config) for camp in camps]
+    sides += _second_motion(rig, observations, sides, config, rng)
+    return Agreement(tuple(sorted(sides, key=lambda side: -side.support)), own, tension)
 
 
 def disagreement(one: Refined, other: Refined) -> float:
@@ -99,17 +107,33 @@ def _side(
     observations: Observations,
     camp: list[int],
     own: dict[int, Refined],
-    joint: Refined,
     config: MotionConfig,
 ) -> Side:
+    """The motion of pairs that agree."""
     rows = np.isin(observations.pair, camp)
     first = own[max(camp, key=lambda j: int(own[j].inlier.sum()))]
     refined = first
     if len(camp) > 1:
-        refined = refine(rig, Observations(*(column[rows] for column in observations)), first.cur_T_ref, config)
+        refined = refine(rig, observations.of_rows(rows), first.cur_T_ref, config)
+    return Side(tuple(camp), _spread_over(rows, refined))
+
+
+def _second_motion(
+    rig: RigArrays, observations: Observations, sides: list[Side], config: MotionConfig, rng: np.random.Generator
+) -> list[Side]:
+    """At most one more rigid motion, of most points that no side explains: the world's, or what moves in it."""
+    rest = ~np.any([side.refined.inlier for side in sides], axis=0)
+    if rest.sum() < max(_RIVAL_POINTS, _RIVAL_SHARE * len(rest)):
+        return []
+    seen = observations.of_rows(rest)
+    refined = refine(rig, seen, search(rig, seen, sides[0].refined.cur_T_ref, config, rng), config)
+    if refined.inlier.sum() < max(_RIVAL_POINTS, _POORLY_EXPLAINED * rest.sum()):
+        return []
+    return [Side(tuple(int(j) for j in np.unique(seen.pair)), _spread_over(rest, refined))]
+
+
+def _spread_over(rows: Bool, refined: Refined) -> Refined:
+    """A motion of some rows' points, its inliers among all points."""
     inlier = np.zeros(len(rows), dtype=bool)
     inlier[rows] = refined.inlier
-    return Side(
-        tuple(camp),
-        Refined(refined.cur_T_ref, refined.covariance, refined.shared_covariance, inlier, refined.rms_px),
-    )
+    return replace(refined, inlier=inlier)

@@ -76,7 +76,7 @@ class PairAlignment:
             weights = 1.0 / (1.0 + squared / _CAUCHY)
         if np.mean(squared > 4.0 * _CAUCHY) > _MOST_OUTLIERS:
             return None
-        return Misalignment(d, np.linalg.inv(information), float(d @ (information - prior) @ d))
+        return Misalignment(d, np.asarray(np.linalg.inv(information)), float(d @ (information - prior) @ d))
 
     def apply(self, misalignment: Misalignment) -> None:
         """From here on, motions that are added were computed with this correction."""

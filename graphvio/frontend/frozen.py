@@ -1,4 +1,4 @@
-"""Images that are delivered twice: a camera that is stuck shows a world that stands still, and shows it convincingly."""
+"""Images that are delivered twice: a camera that is stuck shows a world at rest, and shows it convincingly."""
 
 from __future__ import annotations
 

@@ -29,6 +29,11 @@ class RelativeMotion:
     shared_covariance: Float
     inliers: int
 
+    @property
+    def duration_s(self) -> float:
+        """Time between the two instants."""
+        return (self.stamp_ns - self.reference_stamp_ns) * 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class VisualResult:

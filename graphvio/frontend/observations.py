@@ -41,7 +41,7 @@ class RigArrays(NamedTuple):
         )
 
     def corrected(self, nominal: RigArrays, pair: int, correction: Float) -> RigArrays:
-        """The same, one pair's ``body_T_left`` being ``correction`` (4, 4) times the nominal one; both its cameras move."""
+        """The same, one pair's cameras moved: its ``body_T_left`` is ``correction`` (4, 4) times the nominal one."""
         cam_T_body, body_T_left = self.cam_T_body.copy(), self.body_T_left.copy()
         body_T_left[pair] = correction @ nominal.body_T_left[pair]
         cam_T_body[pair] = nominal.cam_T_body[pair] @ np.linalg.inv(correction)
@@ -69,8 +69,14 @@ class Observations(NamedTuple):
 
     def of_pair(self, pair: int) -> Observations:
         """Only one pair's points."""
-        rows = self.pair == pair
-        return Observations(*(column[rows] for column in self))
+        return self.of_rows(self.pair == pair)
+
+    def of_rows(self, rows: Bool) -> Observations:
+        """Only some points (N,)."""
+        return Observations(
+            self.pair[rows], self.points[rows], self.covariances[rows], self.left[rows], self.right[rows],
+            self.has_right[rows],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,42 +14,47 @@ from graphvio.frontend.observations import Correspondences
 from graphvio.frontend.tracks import PairFrame
 from graphvio.geometry import se3_inverse, se3_log
 
-_RIVAL_SHARE = 0.2  # of the best-supported side's points: from there on another side may be the right one
+_RIVAL_SHARE = 0.1  # of the best-supported side's points: from there on another side may be the right one
 _FEW_POINTS = 30  # fewer may agree by chance
+_USUAL_TENSION = 12.0  # beyond it the covariance grows in proportion: something small is wrong with one of the pairs
 _WEAK_ROTATION_RAD = 0.02
 _WEAK_TRANSLATION_M = 0.05
-_FROZEN_SPEEDS = np.repeat([0.5, 1.0], 3)  # rad/s and m/s that a rig whose images all repeat may really have
+_POSSIBLE_SPEEDS = np.repeat([0.5, 1.0], 3)  # rad/s and m/s that a rig may have where images say next to nothing
 _REST_MEDIAN_PX = 0.15
 _REST_MOST_PX = 0.5
 
 
-def graded(motions: Sequence[RelativeMotion], frozen_since_ns: int | None) -> tuple[RelativeMotion, Quality, str]:
+def graded(
+    motions: Sequence[RelativeMotion], tension: float, frozen_since_ns: int | None
+) -> tuple[RelativeMotion, Quality, str]:
     """The best-supported motion, with a covariance that allows for what speaks against it, its quality, and why.
 
     Args:
         motions: of each side of the pairs, the best supported first.
+        tension: squared Mahalanobis distance between pairs that are thought to agree.
         frozen_since_ns: stamp since which all images are the same, or None.
     """
     best = motions[0]
-    covariance, reasons = best.covariance, []
+    covariance, reasons = best.covariance * max(1.0, tension / _USUAL_TENSION), []
     for rival in motions[1:]:
         if rival.inliers >= _RIVAL_SHARE * best.inliers:
             apart = se3_log(se3_inverse(best.reference_T_current) @ rival.reference_T_current)
-            covariance = covariance + np.outer(apart, apart)
-            reasons.append(f"pairs disagree by {np.linalg.norm(apart[3:]):.3f} m")
+            covariance = covariance + rival.covariance + np.outer(apart, apart)
+            angle, distance = np.rad2deg(np.linalg.norm(apart[:3])), np.linalg.norm(apart[3:])
+            reasons.append(f"two motions are seen, {distance:.3f} m and {angle:.2f} deg apart")
     if best.inliers < _FEW_POINTS:
-        covariance = covariance * (_FEW_POINTS / best.inliers) ** 2
+        lacking = (_FEW_POINTS - best.inliers) / _FEW_POINTS
+        covariance = covariance + np.diag((2.0 * lacking * _POSSIBLE_SPEEDS * best.duration_s) ** 2)
         reasons.append(f"only {best.inliers} points")
     sigmas = np.sqrt([np.linalg.eigvalsh(covariance[block, block])[-1] for block in (slice(0, 3), slice(3, 6))])
     if frozen_since_ns is not None:
         elapsed_s = (best.stamp_ns - frozen_since_ns) * 1e-9
-        covariance = covariance + np.diag((_FROZEN_SPEEDS * elapsed_s) ** 2)
+        covariance = covariance + np.diag((_POSSIBLE_SPEEDS * elapsed_s) ** 2)
         reasons.append("every image repeats the one before")
     elif not reasons and (sigmas[0] > _WEAK_ROTATION_RAD or sigmas[1] > _WEAK_TRANSLATION_M):
         reasons.append(f"hardly constrained: {sigmas[0]:.4f} rad, {sigmas[1]:.3f} m")
-    if not reasons:
-        return best, Quality.GOOD, ""
-    return replace(best, covariance=covariance), Quality.WEAK, "; ".join(reasons)
+    quality = Quality.WEAK if reasons else Quality.GOOD
+    return replace(best, covariance=covariance), quality, "; ".join(reasons)
 
 
 def at_rest(

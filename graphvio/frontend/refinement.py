@@ -55,7 +55,7 @@ def refine(rig: RigArrays, observations: Observations, cur_T_ref: Float, config:
     pose, hessian, errors2 = _levenberg_marquardt(pose, rig, observations, inlier, sigma, scale)
     used = influence(errors2[inlier], has_right[inlier], scale)
     # Backward propagation of the reprojection covariance. The small prior keeps unconstrained directions finite.
-    covariance = np.linalg.inv(hessian / used.factor + np.eye(6) / _WEAK_DIRECTION_SIGMA**2)
+    covariance: Float = np.asarray(np.linalg.inv(hessian / used.factor + np.eye(6) / _WEAK_DIRECTION_SIGMA**2))
     slopes = np.where(inlier, influence_slopes(errors2, has_right, scale), 0.0)
     through_points = _through_points(pose, rig, observations, sigma, slopes**2)
     gain = covariance / used.factor * (used.weight / used.slope)

@@ -93,7 +93,7 @@ class VisualFrontend:
             self._learn_alignments(agreement)
             self._refer_to(frames)
         motions = [_motion(reference_stamp_ns, stamp_ns, side.refined) for side in agreement.sides]
-        motion, quality, reason = graded(motions, frozen.all_since_ns)
+        motion, quality, reason = graded(motions, agreement.tension, frozen.all_since_ns)
         watch.lap("judge")
         return VisualResult(
             motion,

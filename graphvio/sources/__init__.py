@@ -11,15 +11,22 @@ from graphvio.rig_files import find_rig
 from graphvio.sources import euroc, kitti_odometry, kitti_raw
 from graphvio.sources.base import Source
 from graphvio.sources.faults import FaultLog
+from graphvio.sources.matching import TOLERANCE_NS
 from graphvio.sources.recording import Recording
 
 __all__ = ["FaultLog", "Source", "open_source"]
 
 _FORMATS = (euroc, kitti_odometry, kitti_raw)
+_MAX_TOLERANCE_MS = 10.0
 
 
 def open_source(
-    path: str | Path, rig: Rig | None = None, *, from_s: float | None = None, to_s: float | None = None
+    path: str | Path,
+    rig: Rig | None = None,
+    *,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    tolerance_ms: float = 1e-6 * TOLERANCE_NS,
 ) -> Source:
     """Open a recording, whatever its layout.
 
@@ -28,6 +35,8 @@ def open_source(
         rig: decides which pairs are read, and whether the IMU is; None takes the recording's own.
         from_s: where to begin, seconds after the recording's first frameset.
         to_s: where to end (inclusive), on the same scale.
+        tolerance_ms: images whose stamps differ by no more are of one instant. Left and right images further apart
+            are no pair, and pairs further apart make framesets of their own.
 
     Raises:
         SourceError: if the folder cannot be read, has no known layout, or holds nothing in the given time.
@@ -36,13 +45,17 @@ def open_source(
     for name, value in (("from_s", from_s), ("to_s", to_s)):
         if value is not None and not math.isfinite(value):
             raise SourceError(f"{name} is {value}; give seconds after the first frameset")
+    if not 0.0 <= tolerance_ms <= _MAX_TOLERANCE_MS:
+        raise SourceError(
+            f"tolerance_ms is {tolerance_ms}; give 0 to {_MAX_TOLERANCE_MS:g}: what is triggered together"
+        )
     try:
-        return _open(Path(path), rig, from_s, to_s)
+        return _open(Path(path), rig, from_s, to_s, round(1e6 * tolerance_ms))
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
 
 
-def _open(folder: Path, rig: Rig | None, from_s: float | None, to_s: float | None) -> Recording:
+def _open(folder: Path, rig: Rig | None, from_s: float | None, to_s: float | None, tolerance_ns: int) -> Recording:
     if not folder.exists():
         raise SourceError(f"{folder}: does not exist; give the folder of a recording")
     if not folder.is_dir():
@@ -58,7 +71,7 @@ def _open(folder: Path, rig: Rig | None, from_s: float | None, to_s: float | Non
         raise RigError(f"{folder}: carries no calibration; write a rig.yaml into it, or give a rig of your own")
     resolved = folder.resolve()
     faults = FaultLog(resolved.parent.name if resolved.name == "mav0" else resolved.name)
-    return Recording(layout.read_index(folder, rig, faults), rig, faults, from_s, to_s)
+    return Recording(layout.read_index(folder, rig, faults), rig, faults, from_s, to_s, tolerance_ns)
 
 
 def _known() -> str:

@@ -1,4 +1,8 @@
-"""Which images belong together: left to right of a pair, and pairs to one frameset, by their stamps."""
+"""Which images belong together: left to right of a pair, and pairs to one frameset, by their stamps.
+
+What is not of one instant is never joined: pairs that are triggered at other times, or at other rates, make
+framesets of their own.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ from numpy.typing import NDArray
 from graphvio.arrays import Int
 
 TOLERANCE_NS = 2_000_000
-"""Images whose stamps differ by no more than this are of the same instant."""
+"""Images whose stamps differ by no more than this are of the same instant, unless `open_source` is told otherwise."""
 
 Rows = NDArray[np.int32]
 
@@ -50,8 +54,8 @@ class FramesetIndex:
         return FramesetIndex(self.stamps_ns[first:last], self.rows[first:last])
 
 
-def match_sides(left_ns: Int, right_ns: Int) -> PairIndex:
-    """Match left (N,) and right (M,) images of a pair by stamp; both increase."""
+def match_sides(left_ns: Int, right_ns: Int, tolerance_ns: int = TOLERANCE_NS) -> PairIndex:
+    """Match left (N,) and right (M,) images of a pair by stamp; both increase. The left stamp counts."""
     if np.array_equal(left_ns, right_ns):
         rows = np.repeat(np.arange(len(left_ns), dtype=np.int32)[:, None], 2, axis=1)
         nothing = np.zeros(0, dtype=np.int64)
@@ -61,10 +65,15 @@ def match_sides(left_ns: Int, right_ns: Int) -> PairIndex:
     lefts, rights = left_ns.tolist(), right_ns.tolist()
     while i < len(lefts) and j < len(rights):
         ahead = rights[j] - lefts[i]
-        if abs(ahead) <= TOLERANCE_NS:
-            matched.append((i, j))
-            i += 1
-            j += 1
+        if abs(ahead) <= tolerance_ns:
+            if j + 1 < len(rights) and abs(rights[j + 1] - lefts[i]) < abs(ahead):
+                j += 1
+            elif i + 1 < len(lefts) and abs(rights[j] - lefts[i + 1]) < abs(ahead):
+                i += 1
+            else:
+                matched.append((i, j))
+                i += 1
+                j += 1
         elif ahead > 0:
             i += 1
         else:
@@ -73,8 +82,12 @@ def match_sides(left_ns: Int, right_ns: Int) -> PairIndex:
     return PairIndex(left_ns[rows[:, 0]], rows, np.delete(left_ns, rows[:, 0]), np.delete(right_ns, rows[:, 1]))
 
 
-def group_pairs(pairs: Sequence[PairIndex]) -> FramesetIndex:
-    """Join pairs of the same instant to framesets, stamped by the first pair in each."""
+def group_pairs(pairs: Sequence[PairIndex], tolerance_ns: int = TOLERANCE_NS) -> FramesetIndex:
+    """Join pairs of the same instant to framesets.
+
+    A frameset bears the stamp of the first of its pairs; or of the earliest, where another frameset follows so
+    closely that it would otherwise lie within the tolerance of this one.
+    """
     count = len(pairs)
     first = pairs[0].stamps_ns
     if all(np.array_equal(pair.stamps_ns, first) for pair in pairs[1:]):
@@ -85,11 +98,14 @@ def group_pairs(pairs: Sequence[PairIndex]) -> FramesetIndex:
     groups: list[dict[int, tuple[int, int]]] = []  # pair -> (stamp, row)
     begun_ns = 0
     for stamp, number, row in entries:
-        if not groups or stamp - begun_ns > TOLERANCE_NS or number in groups[-1]:
+        if not groups or stamp - begun_ns > tolerance_ns or number in groups[-1]:
             groups.append({})
             begun_ns = stamp
         groups[-1][number] = (stamp, row)
+    earliest = np.array([min(group.values())[0] for group in groups], dtype=np.int64)
     stamps = np.array([group[min(group)][0] for group in groups], dtype=np.int64)
+    crowded = np.flatnonzero(earliest[1:] - stamps[:-1] <= tolerance_ns)
+    stamps[crowded] = earliest[crowded]
     rows = np.full((len(groups), count, 2), -1, dtype=np.int32)
     for at, group in enumerate(groups):
         for number, (_, row) in group.items():

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from graphvio.arrays import Image, Int
+from graphvio.arrays import Bool, Image, Int
 from graphvio.errors import RigError, SourceError
 from graphvio.events import Event, FrameSet, ImuSample
 from graphvio.rig import Camera, Rig
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.images import ImageError, read_grey
-from graphvio.sources.matching import FramesetIndex, PairIndex, group_pairs, match_sides
+from graphvio.sources.matching import TOLERANCE_NS, FramesetIndex, PairIndex, group_pairs, match_sides
 from graphvio.sources.read_ahead import read_ahead
 from graphvio.sources.sequencer import merge
 from graphvio.sources.tables import ImuTable
@@ -29,6 +29,7 @@ from graphvio.sources.tables import ImuTable
 LEAD_NS = 5_000_000_000
 """IMU samples from this long before the first frameset are yielded: they help to initialise."""
 _FRAME_GAP_PERIODS = 1.5
+_ABSENT_PERIODS = 0.75
 _IMU_GAP_PERIODS = 5.0
 
 
@@ -81,7 +82,13 @@ class Recording:
     """
 
     def __init__(
-        self, index: Index, rig: Rig, faults: FaultLog, from_s: float | None = None, to_s: float | None = None
+        self,
+        index: Index,
+        rig: Rig,
+        faults: FaultLog,
+        from_s: float | None = None,
+        to_s: float | None = None,
+        tolerance_ns: int = TOLERANCE_NS,
     ) -> None:
         """Match the images of an index, and cut it to a part of its time.
 
@@ -91,6 +98,7 @@ class Recording:
             faults: goes on to count.
             from_s: where to begin, seconds after the first frameset.
             to_s: where to end, on the same scale.
+            tolerance_ns: images whose stamps differ by no more are of one instant.
 
         Raises:
             SourceError: if no frameset is left.
@@ -101,11 +109,12 @@ class Recording:
         self.decode_ms: list[float] = []
         self._tracks = index.tracks
         self._fit_cameras: set[str] = set()
+        self._tolerance_ns = tolerance_ns
         pairs = [
-            match_sides(index.tracks[pair.left.name].stamps_ns, index.tracks[pair.right.name].stamps_ns)
+            match_sides(index.tracks[pair.left.name].stamps_ns, index.tracks[pair.right.name].stamps_ns, tolerance_ns)
             for pair in rig.pairs
         ]
-        self._framesets = _cut(group_pairs(pairs), from_s, to_s, index.name)
+        self._framesets = _cut(group_pairs(pairs, tolerance_ns), from_s, to_s, index.name)
         self.frameset_count = len(self._framesets.stamps_ns)
         self.start_ns = int(self._framesets.stamps_ns[0])
         self.end_ns = int(self._framesets.stamps_ns[-1])
@@ -208,9 +217,11 @@ class Recording:
             ):
                 alone = alone[(alone >= self.start_ns) & (alone <= self.end_ns)]
                 if len(alone):
-                    detail = f"{camera.name} has an image at {alone[0]}, {other.name} has none"
+                    within = f"within {1e-6 * self._tolerance_ns:g} ms"
+                    detail = f"{camera.name} has an image at {alone[0]}, {other.name} has none {within}"
                     self.faults.add("unpaired_image", int(alone[0]), detail, len(alone))
             absent = self._framesets.stamps_ns[self._framesets.rows[:, number, 0] < 0]
+            absent = absent[_far_from(absent, index.stamps_ns, _ABSENT_PERIODS)]  # not: triggered at another time
             if len(absent):
                 detail = f"{pair.name} has no images at {absent[0]}, another pair has"
                 self.faults.add("frameset_incomplete", int(absent[0]), detail, len(absent))
@@ -249,7 +260,9 @@ class Recording:
 def _cut(index: FramesetIndex, from_s: float | None, to_s: float | None, name: str) -> FramesetIndex:
     stamps = index.stamps_ns
     if not len(stamps):
-        raise SourceError(f"{name}: no left image has a right one; check the cameras' data.csv and images")
+        raise SourceError(
+            f"{name}: no left image has a right one of the same time; check the cameras' data.csv and images"
+        )
     begin = None if from_s is None else int(stamps[0]) + round(from_s * 1e9)
     end = None if to_s is None else int(stamps[0]) + round(to_s * 1e9)
     first = 0 if begin is None else int(np.searchsorted(stamps, begin))
@@ -269,6 +282,15 @@ def _gaps(stamps_ns: Int, periods: float) -> list[tuple[int, int]]:
         return []
     wide = np.flatnonzero(steps > periods * np.median(steps))
     return [(int(stamps_ns[i]), int(stamps_ns[i + 1])) for i in wide]
+
+
+def _far_from(stamps_ns: Int, own_ns: Int, periods: float) -> Bool:
+    """Which stamps (N,) lie further than so many median periods from all of a pair's own (M,), which increase."""
+    if len(own_ns) < 2:
+        return ~np.isin(stamps_ns, own_ns)
+    after = np.clip(np.searchsorted(own_ns, stamps_ns), 1, len(own_ns) - 1)
+    nearest = np.minimum(np.abs(stamps_ns - own_ns[after - 1]), np.abs(own_ns[after] - stamps_ns))
+    return np.asarray(nearest > periods * np.median(np.diff(own_ns)))
 
 
 def _ms(duration_ns: int) -> str:
