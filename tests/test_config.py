@@ -115,7 +115,7 @@ def test_unknown_profile_and_missing_file(tmp_path: Path) -> None:
 def test_every_profile_loads() -> None:
     folder = Path(__file__).parents[1] / "configs"
     assert set(profiles()) == {path.stem for path in folder.glob("*.yaml")}
-    assert {"default", "best_pair"} <= set(profiles())
+    assert {"default", "paper", "fast"} <= set(profiles())
     loaded = {name: Config.load(name) for name in profiles()}
     assert loaded["default"] == Config()
     assert loaded["best_pair"].motion.selection == "best_pair"

@@ -99,7 +99,7 @@ def test_one_pair_alone(room_walk: Path, tmp_path: Path, pair: int) -> None:
 
 
 def test_without_imu_and_with_the_papers_baseline(room_walk: Path, tmp_path: Path) -> None:
-    summary = run(room_walk, tmp_path / "out", "--no-imu", "--config", "best_pair")
+    summary = run(room_walk, tmp_path / "out", "--no-imu", "--config", "paper")
     assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.03
     assert (tmp_path / "out/imu_bias.csv").read_text().count("\n") == 1  # the header alone
 

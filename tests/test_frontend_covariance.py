@@ -154,8 +154,6 @@ SHARED_DRAWS = 600
 def test_shared_covariance_is_that_between_motions_of_one_reference(conditions: Conditions) -> None:
     """Two currents at one place: their errors have in common what comes from the reference's points."""
     drawn = draw_shared(conditions, CONFIG, (3, 3), SHARED_DRAWS, seed=16)
-    if not hasattr(drawn.refined[0], "shared_covariance"):
-        pytest.skip("motions do not tell what they share")
     shared, total = (
         at_reference(drawn.true_cur_T_ref, np.mean([getattr(r, name) for r in drawn.refined], axis=0))
         for name in ("shared_covariance", "covariance")

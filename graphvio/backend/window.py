@@ -14,7 +14,7 @@ from graphvio.arrays import Float
 from graphvio.errors import GraphvioError
 
 _MAX_ITERATIONS = 4
-_CONVERGED = 1e-5
+_CONVERGED = 1e-4  # radians, metres...: what a further step would still change is of the order of its square
 _SINGULAR = 1e-9
 
 
@@ -115,8 +115,7 @@ class Window:
                 staying.append((frozenset(marginal.keys()), container))
         for key in leaving:
             self.values.erase(key)
-        self._factors = staying
-        self._solution = None
+        self._factors = staying  # the solution still tells the covariances of those that stay
 
     def _solve(self, last: tuple[int, ...]) -> gtsam.GaussianBayesTree:
         """The window eliminated at its present values, in order of time but for the variables that come last."""

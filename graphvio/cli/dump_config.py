@@ -17,7 +17,7 @@ def dump_config(
 
         graphvio dump-config > mine.yaml
 
-        graphvio dump-config best_pair
+        graphvio dump-config paper
     """
     from graphvio.config import Config
 

@@ -6,6 +6,7 @@ is then a compromise that is right for nobody: each side's own motion is kept ap
 side comes first, as in eq. (4).
 """
 
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -57,13 +58,32 @@ class Agreement:
 
 
 def agree(
-    rig: RigArrays, observations: Observations, joint: Refined, config: MotionConfig, rng: np.random.Generator
+    rig: RigArrays,
+    observations: Observations,
+    joint: Refined,
+    config: MotionConfig,
+    rng: np.random.Generator,
+    workers: Executor,
 ) -> Agreement:
-    """Compare the pairs' own motions; arguments as of `graphvio.frontend.selection.joint_motion`, and its result."""
+    """Compare the pairs' own motions with each other.
+
+    Args:
+        rig: of P pairs.
+        observations: of any subset of them.
+        joint: `graphvio.frontend.selection.joint_motion` of these.
+        config: of this stage.
+        rng: source of random triples.
+        workers: run the pairs side by side.
+    """
     everyone = tuple(int(j) for j in np.unique(observations.pair))
     together = Side(everyone, joint)
-    own = {j: _own_motion(rig, observations.of_pair(j), joint, config, rng) for j in everyone} if everyone[1:] else {}
-    own = {j: motion for j, motion in own.items() if is_supported(motion.inlier, config)}
+    own: dict[int, Refined] = {}
+    if len(everyone) > 1:
+        sources = rng.spawn(len(everyone))  # one each, so that the threads' timing changes nothing
+        motions = workers.map(
+            lambda j, source: _own_motion(rig, observations.of_pair(j), joint, config, source), everyone, sources
+        )
+        own = {j: m for j, m in zip(everyone, motions, strict=True) if is_supported(m.inlier, config)}
     camps: list[list[int]] = []
     tension = 0.0
     for j in sorted(own, key=lambda j: -int(own[j].inlier.sum())):

@@ -39,7 +39,8 @@ def expand(motions: Float, rig: RigArrays, observations: Observations, sigma: fl
     """Linearise all points at motions (P, 2, 4, 4), see `graphvio.frontend.cost.left_motions`."""
     n = len(observations.pair)
     points, offsets, whiteners = observations.points.copy(), np.zeros((n, 4)), np.empty((n, 4, 4))
-    jacobian, residual, white = np.zeros((4, 3)), np.empty(4), np.zeros(4)
+    jacobian, residual, white, pull = np.zeros((4, 3)), np.empty(4), np.zeros(4), np.empty(3)
+    spread, lower = np.empty((4, 3)), np.zeros((4, 4))
     for i in range(n):
         j = observations.pair[i]
         covariance = observations.covariances[i]
@@ -54,7 +55,7 @@ def expand(motions: Float, rig: RigArrays, observations: Observations, sigma: fl
                 offsets[i, p] = 0.0
                 for k in range(3):
                     offsets[i, p] -= jacobian[p, k] * (points[i, k] - observations.points[i, k])
-            _whitener(jacobian, covariance, sigma, whiteners[i])
+            _whitener(jacobian, covariance, sigma, spread, lower, whiteners[i])
             if repeat == _EXPANSIONS - 1:
                 break
             e2 = 0.0
@@ -64,7 +65,10 @@ def expand(motions: Float, rig: RigArrays, observations: Observations, sigma: fl
                     white[p] += whiteners[i, p, q] * (residual[q] - offsets[i, q])
                 e2 += white[p] * white[p]
             share = sigma * sigma * min(1.0, _FARTHEST / max(e2, 1e-12))
-            _correct(points[i], observations.points[i], covariance, jacobian, whiteners[i], white, rows, share)
+            _pull_back(jacobian, whiteners[i], white, rows, pull)
+            for k in range(3):
+                along = covariance[k, 0] * pull[0] + covariance[k, 1] * pull[1] + covariance[k, 2] * pull[2]
+                points[i, k] = observations.points[i, k] + share * along
     return Expansion(points, offsets, whiteners)
 
 
@@ -86,27 +90,20 @@ def _derivatives_by_point(
 
 
 @kernel
-def _correct(
-    point: Float, triangulated: Float, covariance: Float, jacobian: Float, whitener: Float, white: Float,
-    rows: int, share: float,
-) -> None:  # fmt: skip
-    """Move the point to ``triangulated + share C J^T S^-1 r``: where the residual says that it is."""
-    pull = np.zeros(3)  # J^T S^-1 r
+def _pull_back(jacobian: Float, whitener: Float, white: Float, rows: int, pull: Float) -> None:
+    """Fill ``J^T S^-1 r`` (3,): the direction in which the residual r would have the point."""
+    pull[:] = 0.0
     for q in range(rows):
         back = 0.0
         for p in range(q, rows):
             back += whitener[p, q] * white[p]
         for k in range(3):
             pull[k] += jacobian[q, k] * back
-    for k in range(3):
-        along = covariance[k, 0] * pull[0] + covariance[k, 1] * pull[1] + covariance[k, 2] * pull[2]
-        point[k] = triangulated[k] + share * along
 
 
 @kernel
-def _whitener(jacobian: Float, covariance: Float, sigma: float, inverse_l: Float) -> None:
-    """Fill one point's inverse Cholesky factor (4, 4) of S."""
-    spread = np.empty((4, 3))
+def _whitener(jacobian: Float, covariance: Float, sigma: float, spread: Float, lower: Float, inverse_l: Float) -> None:
+    """Fill one point's inverse Cholesky factor (4, 4) of S, by way of ``J C`` (4, 3) and the factor (4, 4)."""
     for i in range(4):
         for d in range(3):
             spread[i, d] = (
@@ -114,7 +111,6 @@ def _whitener(jacobian: Float, covariance: Float, sigma: float, inverse_l: Float
                 + jacobian[i, 1] * covariance[1, d]
                 + jacobian[i, 2] * covariance[2, d]
             )
-    lower = np.zeros((4, 4))
     for i in range(4):
         for j in range(i + 1):
             total = 1.0 if i == j else 0.0
@@ -136,9 +132,9 @@ def _whitener(jacobian: Float, covariance: Float, sigma: float, inverse_l: Float
 
 @kernel
 def _derivatives_by_motion(
-    motion: Float, cam_T_body: Float, point: Float, focal_px: float, jacobian: Float, projected: Float
+    motion: Float, cam_T_body: Float, point: Float, focal_px: float, seen: Float, rows: Float
 ) -> bool:
-    """Fill the projection (2,) and its derivative (2, 6) by ``d`` in ``exp(d) cur_T_ref``; False behind the camera."""
+    """Fill derivatives by ``d`` in ``exp(d) cur_T_ref``, and in the last column the errors (2, 7); False if behind."""
     m, r = motion, cam_T_body
     a, b, w = point[0], point[1], point[2]
     z = m[2, 0] * a + m[2, 1] * b + m[2, 2] + w * m[2, 3]
@@ -146,51 +142,53 @@ def _derivatives_by_motion(
         return False
     x = m[0, 0] * a + m[0, 1] * b + m[0, 2] + w * m[0, 3]
     y = m[1, 0] * a + m[1, 1] * b + m[1, 2] + w * m[1, 3]
-    projected[0], projected[1] = x / z, y / z
     # d cam point = R_cam_body (-[p]x d_rotation + w d_translation), p the homogeneous point in body now
     qx, qy, qz = x - w * r[0, 3], y - w * r[1, 3], z - w * r[2, 3]
     px = r[0, 0] * qx + r[1, 0] * qy + r[2, 0] * qz
     py = r[0, 1] * qx + r[1, 1] * qy + r[2, 1] * qz
     pz = r[0, 2] * qx + r[1, 2] * qy + r[2, 2] * qz
+    scale = focal_px / z
     for k in range(2):
-        at = projected[k]
-        g0 = focal_px * (r[k, 0] - at * r[2, 0]) / z
-        g1 = focal_px * (r[k, 1] - at * r[2, 1]) / z
-        g2 = focal_px * (r[k, 2] - at * r[2, 2]) / z
-        jacobian[k, 0] = -g1 * pz + g2 * py
-        jacobian[k, 1] = g0 * pz - g2 * px
-        jacobian[k, 2] = -g0 * py + g1 * px
-        jacobian[k, 3], jacobian[k, 4], jacobian[k, 5] = w * g0, w * g1, w * g2
+        at = x / z if k == 0 else y / z
+        g0 = scale * (r[k, 0] - at * r[2, 0])
+        g1 = scale * (r[k, 1] - at * r[2, 1])
+        g2 = scale * (r[k, 2] - at * r[2, 2])
+        rows[k, 0] = -g1 * pz + g2 * py
+        rows[k, 1] = g0 * pz - g2 * px
+        rows[k, 2] = -g0 * py + g1 * px
+        rows[k, 3], rows[k, 4], rows[k, 5] = w * g0, w * g1, w * g2
+        rows[k, 6] = focal_px * (seen[k] - at)
     return True
 
 
 @kernel
 def _whitened(
-    i: int, motions: Float, rig: RigArrays, observations: Observations, at: Expansion, white: Float, jacobian: Float
-) -> bool:
-    """Fill one point's whitened error (4,) and its derivative (4, 6); False behind a camera."""
+    i: int, motions: Float, rig: RigArrays, observations: Observations, at: Expansion,
+    raw: Float, white: Float, jacobian: Float,
+) -> bool:  # fmt: skip
+    """Fill one point's whitened error (4,) and its derivative (4, 6), by way of raw (4, 7); False behind a camera."""
     j = observations.pair[i]
     rows = 4 if observations.has_right[i] else 2
-    raw, projected, residual = np.empty((4, 6)), np.empty(2), np.empty(4)
     for side in range(rows // 2):
-        focal_px = rig.focal_px[j, side]
-        ahead = _derivatives_by_motion(
-            motions[j, side], rig.cam_T_body[j, side], at.points[i], focal_px, raw[2 * side : 2 * side + 2], projected
-        )
-        if not ahead:
-            return False
         seen = observations.left[i] if side == 0 else observations.right[i]
-        for k in range(2):
-            residual[2 * side + k] = focal_px * (seen[k] - projected[k]) - at.offsets[i, 2 * side + k]
+        if not _derivatives_by_motion(
+            motions[j, side], rig.cam_T_body[j, side], at.points[i], rig.focal_px[j, side], seen,
+            raw[2 * side : 2 * side + 2],
+        ):  # fmt: skip
+            return False
+        for k in range(2 * side, 2 * side + 2):
+            raw[k, 6] -= at.offsets[i, k]
+    whiteners = at.whiteners[i]
     for p in range(rows):
-        white[p] = 0.0
-        for q in range(p + 1):
-            white[p] += at.whiteners[i, p, q] * residual[q]
         for c in range(6):
             value = 0.0
             for q in range(p + 1):
-                value += at.whiteners[i, p, q] * raw[q, c]
+                value += whiteners[p, q] * raw[q, c]
             jacobian[p, c] = value
+        value = 0.0
+        for q in range(p + 1):
+            value += whiteners[p, q] * raw[q, 6]
+        white[p] = value
     return True
 
 
@@ -215,10 +213,10 @@ def linearise(
     hessian[:] = 0.0
     gradient[:] = 0.0
     cost = 0.0
-    white, jacobian = np.empty(4), np.empty((4, 6))
+    raw, white, jacobian = np.empty((4, 7)), np.empty(4), np.empty((4, 6))
     inverse_scale2 = 1.0 / (scale * scale)
     for i in range(len(observations.pair)):
-        if not _whitened(i, motions, rig, observations, at, white, jacobian):
+        if not _whitened(i, motions, rig, observations, at, raw, white, jacobian):
             errors2[i] = np.inf
             cost += np.log1p(1e6) if active[i] else 0.0
             continue
@@ -249,9 +247,9 @@ def information_through_points(
     """``sum f (J^T S^-1 J - sigma^2 J^T S^-2 J)`` (6, 6): the part of the score's variance that the points' own errors
     contribute, each point with a factor f (N,)."""
     total = np.zeros((6, 6))
-    white, jacobian, twice = np.empty(4), np.empty((4, 6)), np.empty(6)
+    raw, white, jacobian, twice = np.empty((4, 7)), np.empty(4), np.empty((4, 6)), np.empty(6)
     for i in range(len(observations.pair)):
-        if factors[i] == 0.0 or not _whitened(i, motions, rig, observations, at, white, jacobian):
+        if factors[i] == 0.0 or not _whitened(i, motions, rig, observations, at, raw, white, jacobian):
             continue
         rows = 4 if observations.has_right[i] else 2
         for p in range(rows):

@@ -17,9 +17,9 @@ from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.geometry import se3_exp
 from graphvio.kernels import kernel
 
-_ROUNDS = 3
 _STEPS_PER_ROUND = 6
-_CONVERGED = 1e-7
+_CONVERGED = 1e-6  # radians and metres
+_NEAR = 1e-4  # enough to tell inliers
 _WEAK_DIRECTION_SIGMA = 10.0
 _SHARED_BOUNDS = (0.02, 0.9)
 
@@ -50,9 +50,9 @@ def refine(rig: RigArrays, observations: Observations, cur_T_ref: Float, config:
     scale, largest2 = config.cauchy_scale_px / sigma, (config.max_error_px / sigma) ** 2
     has_right = observations.has_right
     everything = np.ones(len(has_right), dtype=bool)
-    pose, _, errors2 = _levenberg_marquardt(cur_T_ref, rig, observations, everything, sigma, scale)
+    pose, _, errors2 = _levenberg_marquardt(cur_T_ref, rig, observations, everything, sigma, scale, 1, _NEAR)
     inlier = errors2 < inlier_cutoff(errors2, has_right, largest2)
-    pose, hessian, errors2 = _levenberg_marquardt(pose, rig, observations, inlier, sigma, scale)
+    pose, hessian, errors2 = _levenberg_marquardt(pose, rig, observations, inlier, sigma, scale, 2, _CONVERGED)
     used = influence(errors2[inlier], has_right[inlier], scale)
     # Backward propagation of the reprojection covariance. The small prior keeps unconstrained directions finite.
     covariance: Float = np.asarray(np.linalg.inv(hessian / used.factor + np.eye(6) / _WEAK_DIRECTION_SIGMA**2))
@@ -81,43 +81,49 @@ def _bounded(shared: Float, covariance: Float) -> Float:
 
 @kernel
 def _levenberg_marquardt(
-    cur_T_ref: Float, rig: RigArrays, observations: Observations, active: Bool, sigma: float, scale: float
+    cur_T_ref: Float,
+    rig: RigArrays,
+    observations: Observations,
+    active: Bool,
+    sigma: float,
+    scale: float,
+    rounds: int,
+    tolerance: float,
 ) -> tuple[Float, Float, Float]:
-    """Pose, normal matrix (6, 6) and squared whitened errors (N,) at the minimum."""
+    """Pose, normal matrix (6, 6) and squared whitened errors (N,) at the minimum.
+
+    In each round the places at which the points are linearised are found anew.
+    """
     pose = cur_T_ref.copy()
     n = len(observations.pair)
     hessian, gradient, errors2 = np.zeros((6, 6)), np.zeros(6), np.empty(n)
     new_hessian, new_gradient, new_errors2 = np.zeros((6, 6)), np.zeros(6), np.empty(n)
-    for turn in range(_ROUNDS):
+    for _ in range(rounds):
         motions = left_motions(pose, rig)
         at = expand(motions, rig, observations, sigma)
         cost = linearise(motions, rig, observations, at, active, scale, hessian, gradient, errors2)
         damping = 1e-6
-        moved = 0.0
         for _ in range(_STEPS_PER_ROUND):
             damped = hessian.copy()
             for k in range(6):
                 damped[k, k] += damping * hessian[k, k] + 1e-9
             step = np.linalg.solve(damped, gradient)
             candidate = se3_exp(step) @ pose  # type: ignore[arg-type]
+            if np.max(np.abs(step)) < tolerance:
+                pose = candidate
+                break
             new_cost = linearise(
                 left_motions(candidate, rig), rig, observations, at, active, scale,
                 new_hessian, new_gradient, new_errors2,
             )  # fmt: skip
-            size = np.max(np.abs(step))
             if new_cost <= cost:
                 pose, cost = candidate, new_cost
                 hessian, new_hessian = new_hessian, hessian
                 gradient, new_gradient = new_gradient, gradient
                 errors2, new_errors2 = new_errors2, errors2
                 damping *= 0.1
-                moved = max(moved, size)
             else:
                 damping = max(damping * 10.0, 1e-4)
-            if size < _CONVERGED:
-                break
-        if turn > 0 and moved < 1e-4:
-            break  # the points' places and weights would not change any more
     return pose, hessian, errors2
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.events import FrameSet, PairReport, Quality
-from graphvio.frontend.agreement import Agreement, agree, is_supported
+from graphvio.frontend.agreement import Agreement, Side, agree, is_supported
 from graphvio.frontend.alignment import Misalignment, PairAlignment
 from graphvio.frontend.frozen import FrozenImages
 from graphvio.frontend.motion import RelativeMotion, VisualResult
@@ -92,7 +92,7 @@ class VisualFrontend:
         if self._references.are_spent(frames, correspondences, refined):
             self._learn_alignments(agreement)
             self._refer_to(frames)
-        motions = [_motion(reference_stamp_ns, stamp_ns, side.refined) for side in agreement.sides]
+        motions = [self._motion(reference_stamp_ns, stamp_ns, side.refined) for side in agreement.sides]
         motion, quality, reason = graded(motions, agreement.tension, frozen.all_since_ns)
         watch.lap("judge")
         return VisualResult(
@@ -155,12 +155,27 @@ class VisualFrontend:
         start = np.eye(4) if predicted is None else predicted
         solve = joint_motion if config.selection == "joint" else best_pair_motion
         refined = solve(self._arrays, observations, start, config, rng)
-        agreement = agree(self._arrays, observations, refined, config, rng)
+        if config.selection == "best_pair":
+            everyone = tuple(int(j) for j in np.unique(observations.pair))
+            agreement = Agreement((Side(everyone, refined),), {})
+        else:
+            agreement = agree(self._arrays, observations, refined, config, rng, self._workers)
         best = agreement.sides[0]
         rows = np.isin(observations.pair, best.pairs)
         if not is_supported(best.refined.inlier[rows], config):
             return None, f"the best motion explains only {best.support} of {int(rows.sum())} points"
         return agreement, ""
+
+    def _motion(self, reference_stamp_ns: int, stamp_ns: int, refined: Refined) -> RelativeMotion:
+        used_once = self._config.motion.reference == "previous"  # nothing is shared with another motion
+        return RelativeMotion(
+            reference_stamp_ns,
+            stamp_ns,
+            se3_inverse(refined.cur_T_ref),
+            refined.covariance,
+            np.zeros((6, 6)) if used_once else refined.shared_covariance,
+            int(refined.inlier.sum()),
+        )
 
     def _drop_outliers(
         self, frames: Mapping[int, PairFrame], correspondences: Correspondences, agreement: Agreement
@@ -184,17 +199,6 @@ class VisualFrontend:
                 alignment.apply(misalignment)
                 self._misaligned[j] = misalignment
                 self._arrays = self._arrays.corrected(self._nominal, j, se3_exp(misalignment.tangent))
-
-
-def _motion(reference_stamp_ns: int, stamp_ns: int, refined: Refined) -> RelativeMotion:
-    return RelativeMotion(
-        reference_stamp_ns,
-        stamp_ns,
-        se3_inverse(refined.cur_T_ref),
-        refined.covariance,
-        refined.shared_covariance,
-        int(refined.inlier.sum()),
-    )
 
 
 def _inliers_of(pair: int, correspondences: Correspondences, agreement: Agreement) -> Bool:

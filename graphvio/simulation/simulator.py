@@ -80,10 +80,11 @@ class Simulator:
 
     def triggers_ns(self, pair: int) -> Int:
         """Stamps (M,) at which a pair takes its images, all within the walk."""
-        rate = self.rates_hz[pair]
+        rate, duration_s = self.rates_hz[pair], self.scene.motion.duration_s
         late_ns = round(pair * self._trigger_offset_ms * 1e6)
-        count = int(np.floor((self.scene.motion.duration_s - 1e-9 * late_ns) * rate + 1e-9))
-        return EPOCH_NS + late_ns + np.round(np.arange(max(count, 1)) * (1e9 / rate)).astype(np.int64)
+        count = int(np.floor(duration_s * rate + 1e-9))
+        since_ns = late_ns + np.round(np.arange(max(count, 1)) * (1e9 / rate)).astype(np.int64)
+        return np.asarray(EPOCH_NS + since_ns[(since_ns <= round(duration_s * 1e9)) | (since_ns == 0)])
 
     def triggered(self, index: int) -> tuple[int, ...]:
         """The pairs that take images at a frameset's stamp."""

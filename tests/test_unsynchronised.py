@@ -1,0 +1,297 @@
+"""Pairs that are not triggered together: framesets of their own, at their instants, as accurate a trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from recordings import START_NS, frame_stamps, small_rig, write_euroc, write_rows
+
+from graphvio import Estimate, FrameSet, ImuSample, Odometry, Status, open_source
+from graphvio.config import Config
+from graphvio.errors import SourceError
+from graphvio.evaluation import evaluate
+from graphvio.events import Event
+from graphvio.rig import Camera, Rig
+from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
+from graphvio.sources.matching import TOLERANCE_NS, PairIndex, group_pairs, match_sides
+from graphvio.sources.sequencer import merge
+from graphvio.synchroniser import Synchroniser
+from graphvio.trajectory import Trajectory
+
+pytestmark = pytest.mark.xdist_group("unsynchronised")
+
+MS = 1_000_000
+DURATION_S = 3.0
+
+
+def half_size(camera: Camera) -> Camera:
+    """The camera with pixels of twice the side: pixel (0, 0) is the centre of one."""
+    fx, fy, cx, cy = camera.intrinsics
+    width, height = camera.size_px
+    smaller = np.array([fx / 2, fy / 2, (cx - 0.5) / 2, (cy - 0.5) / 2])
+    return replace(camera, intrinsics=smaller, size_px=(width // 2, height // 2))
+
+
+def small_simulator(
+    rate_hz: float | Sequence[float] = 20.0, trigger_offset_ms: float = 0.0, duration_s: float = DURATION_S
+) -> Simulator:
+    """A walk through the room with the paper's rig and images of 320x240."""
+    rig = default_rig()
+    pairs = tuple(replace(pair, left=half_size(pair.left), right=half_size(pair.right)) for pair in rig.pairs)
+    scene = build_scene("room", duration_s, 0.5)
+    return Simulator(scene, replace(rig, pairs=pairs), 3, rate_hz, trigger_offset_ms=trigger_offset_ms)
+
+
+# ------------------------------------------------------------------ the simulator
+
+
+def test_staggered_pairs_are_imaged_at_their_own_instants() -> None:
+    """10 Hz with an offset of 50 ms shows by turns what 20 Hz shows at once."""
+    staggered = small_simulator(10.0, 50.0, duration_s=0.5)
+    together = small_simulator(20.0, duration_s=0.5)
+    assert staggered.stamps_ns.tolist() == together.stamps_ns.tolist()
+    for index in range(4):
+        frameset = staggered.frameset(index, noisy=False)
+        assert list(frameset.images) == [index % 2]
+        for mine, theirs in zip(
+            frameset.images[index % 2], together.frameset(index, noisy=False).images[index % 2], strict=True
+        ):
+            np.testing.assert_array_equal(mine, theirs)
+
+
+def test_each_pair_has_its_rate() -> None:
+    simulator = small_simulator((20.0, 15.0), duration_s=1.0)
+    assert [len(simulator.triggers_ns(pair)) for pair in (0, 1)] == [20, 15]
+    assert len(simulator.stamps_ns) == 30  # five instants are shared
+    both = [i for i in range(30) if simulator.triggered(i) == (0, 1)]
+    assert np.diff(simulator.stamps_ns[both]).tolist() == [200 * MS] * 4
+
+
+@pytest.mark.parametrize(
+    ("rates", "offset_ms"), [((20.0, 0.0), 0.0), ((), 0.0), (20.0, -1.0), (20.0, float("nan")), (20.0, 2000.0)]
+)
+def test_impossible_triggers_are_refused(rates: float | Sequence[float], offset_ms: float) -> None:
+    with pytest.raises(SourceError):
+        small_simulator(rates, offset_ms)
+
+
+# ------------------------------------------------------------------ sources
+
+
+@pytest.mark.parametrize(
+    ("rates", "offset_ms", "count", "shared"),
+    [(20.0, 17.0, 20, 0), ((20.0, 15.0), 0.0, 15, 3), (20.0, 3.0, 20, 0), (20.0, 1.5, 10, 10)],
+)
+def test_stamps_are_kept_and_nothing_is_lost(
+    tmp_path: Path, rates: float | Sequence[float], offset_ms: float, count: int, shared: int
+) -> None:
+    simulator = small_simulator(rates, offset_ms, duration_s=0.5)
+    write_recording(simulator, tmp_path / "walk")
+    source = open_source(tmp_path / "walk")
+    latest_imu, stamps = 0, []
+    seen: dict[int, list[int]] = {0: [], 1: []}
+    for event in source:
+        if isinstance(event, ImuSample):
+            latest_imu = event.stamp_ns
+            continue
+        stamps.append(event.stamp_ns)
+        assert latest_imu >= min(event.stamp_ns, int(simulator.imu_track.stamps_ns[-1]))
+        for pair in event.images:
+            seen[pair].append(event.stamp_ns)
+    assert source.frameset_count == len(stamps) == count
+    assert (np.diff(stamps) > 0).all()
+    assert sum(stamp in seen[0] for stamp in seen[1]) == shared
+    assert source.faults.counts == {}
+    assert seen[0] == simulator.triggers_ns(0).tolist()
+    joined = offset_ms * MS <= TOLERANCE_NS
+    assert seen[1] == (simulator.triggers_ns(1) - (round(offset_ms * MS) if joined else 0)).tolist()
+
+
+@given(
+    offsets=st.lists(st.integers(0, 25 * MS), min_size=2, max_size=4),
+    periods=st.lists(st.integers(20 * MS, 70 * MS), min_size=4, max_size=4),
+    tolerance_ns=st.integers(0, 5 * MS),
+    close=st.booleans(),
+)
+def test_framesets_hold_only_what_is_of_their_instant(
+    offsets: list[int], periods: list[int], tolerance_ns: int, close: bool
+) -> None:
+    if close:  # around the tolerance, where chains of pairs are ambiguous
+        offsets, periods = [offset % (3 * MS) for offset in offsets], [periods[0]] * 4
+    pairs: list[PairIndex] = []
+    for offset, period in zip(offsets, periods, strict=False):
+        stamps = START_NS + offset + period * np.arange(12, dtype=np.int64)
+        pairs.append(match_sides(stamps, stamps))
+    index = group_pairs(pairs, tolerance_ns)
+    assert (np.diff(index.stamps_ns) > tolerance_ns).all()
+    for number, pair in enumerate(pairs):
+        rows = index.rows[:, number, 0]
+        assert rows[rows >= 0].tolist() == list(range(12))  # each image once, in order
+        own = pair.stamps_ns[rows[rows >= 0]]
+        assert np.abs(own - index.stamps_ns[rows >= 0]).max() <= tolerance_ns
+
+
+def test_a_right_image_belongs_to_the_nearest_left_one() -> None:
+    index = match_sides(np.array([0, 8, 50]) * MS, np.array([7, 51, 53]) * MS, 9 * MS)
+    assert index.rows.tolist() == [[1, 0], [2, 1]]
+    assert index.stamps_ns.tolist() == [8 * MS, 50 * MS]
+    assert (index.left_alone.tolist(), index.right_alone.tolist()) == ([0], [53 * MS])
+
+
+def test_sides_further_apart_than_the_tolerance_are_no_pair(tmp_path: Path) -> None:
+    write_euroc(tmp_path)
+    shifted = [f"{s + 3 * MS},{s}.png" for s in frame_stamps(10)]
+    write_rows(tmp_path / "mav0/cam3/data.csv", shifted)
+    source = open_source(tmp_path)
+    assert all(list(event.images) == [0] for event in source if isinstance(event, FrameSet))
+    assert source.faults.counts["unpaired_image"] == 19  # the last right image comes after the last frameset
+    assert "cam3 has none within 2 ms" in next(i.detail for i in source.faults.incidents if i.kind == "unpaired_image")
+    wider = open_source(tmp_path, tolerance_ms=3.0)
+    assert [list(event.images) for event in wider if isinstance(event, FrameSet)] == [[0, 1]] * 10
+    assert wider.faults.counts == {}
+
+
+@pytest.mark.parametrize("tolerance_ms", [-0.1, 11.0, float("nan"), float("inf")])
+def test_tolerances_that_make_no_sense_are_refused(tmp_path: Path, tolerance_ms: float) -> None:
+    write_euroc(tmp_path, frames=2)
+    with pytest.raises(SourceError, match="tolerance_ms"):
+        open_source(tmp_path, tolerance_ms=tolerance_ms)
+
+
+def test_a_tolerance_of_zero_joins_equal_stamps_only(tmp_path: Path) -> None:
+    write_euroc(tmp_path)
+    for camera in ("cam2", "cam3"):
+        write_rows(tmp_path / "mav0" / camera / "data.csv", [f"{s + MS},{s}.png" for s in frame_stamps(10)])
+    assert open_source(tmp_path).frameset_count == 10
+    assert open_source(tmp_path, tolerance_ms=0.0).frameset_count == 20
+
+
+def test_only_what_is_missing_is_a_fault(tmp_path: Path) -> None:
+    """Another trigger is none; a pair that ends early is."""
+    write_euroc(tmp_path)
+    for camera in ("cam2", "cam3"):
+        rows = [f"{s + 20 * MS},{s}.png" for s in frame_stamps(10)]
+        write_rows(tmp_path / "mav0" / camera / "data.csv", rows[:6])
+    source = open_source(tmp_path)
+    assert source.frameset_count == 16
+    assert source.faults.counts == {"frameset_incomplete": 3}
+    assert source.faults.incidents[0].stamp_ns == START_NS + 7 * 50 * MS
+
+
+# ------------------------------------------------------------------ live framesets
+
+
+def images_of(*pairs: int) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    blank = np.zeros((2, 2), dtype=np.uint8)
+    return dict.fromkeys(pairs, (blank, blank))
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "apart_us", "framesets", "kinds"),
+    [
+        ((0,), (1,), 300, [[0, 1]], []),
+        ((0,), (1,), 0, [[0, 1]], []),
+        ((1,), (0,), 300, [[0, 1]], []),
+        ((0,), (1,), -300, [[0, 1]], []),
+        ((0,), (1,), 1000, [[0], [1]], []),
+        ((0, 1), (1,), 300, [[0, 1]], ["frameset_duplicate_stamp"]),
+        ((0,), (7,), 300, [[0]], ["frameset_duplicate_stamp"]),
+        ((0,), (1,), -3000, [[0]], ["frameset_backward_stamp"]),
+    ],
+)
+def test_pairs_of_one_instant_that_come_separately_are_joined_while_held(
+    first: tuple[int, ...], second: tuple[int, ...], apart_us: int, framesets: list[list[int]], kinds: list[str]
+) -> None:
+    told: list[str] = []
+    synchroniser = Synchroniser(small_rig(2), Config(), lambda _, kind, __: told.append(kind))
+    synchroniser.add_frameset(FrameSet(START_NS, images_of(*first)))
+    synchroniser.add_frameset(FrameSet(START_NS + 1000 * apart_us, images_of(*second)))
+    held: list[FrameSet] = []
+    while (frameset := synchroniser.next_held()) is not None:
+        held.append(frameset)
+    assert [sorted(frameset.images) for frameset in held] == framesets
+    assert held[0].stamp_ns == START_NS
+    assert told == kinds
+
+
+# ------------------------------------------------------------------ the odometry
+
+
+@cache
+def walk(rates: float | tuple[float, ...], offset_ms: float) -> tuple[Rig, list[FrameSet], list[ImuSample], Trajectory]:
+    simulator = small_simulator(rates, offset_ms)
+    track = simulator.imu_track
+    samples = [
+        ImuSample(int(stamp), rate, force)
+        for stamp, rate, force in zip(track.stamps_ns, track.angular_velocity, track.linear_acceleration, strict=True)
+    ]
+    framesets = [simulator.frameset(index) for index in range(len(simulator.stamps_ns))]
+    return simulator.rig, framesets, samples, Trajectory(simulator.stamps_ns, simulator.world_T_body)
+
+
+def feed(rig: Rig, events: Iterable[Event]) -> Iterator[Estimate]:
+    odometry = Odometry(rig)
+    for event in events:
+        estimate = odometry.process(event)
+        if estimate is not None:
+            yield estimate
+    yield from odometry.finish()
+
+
+@cache
+def estimates_of(rates: float | tuple[float, ...], offset_ms: float, imu: bool) -> tuple[list[Estimate], float]:
+    """The estimates of a walk, and the rmse of their positions, metres."""
+    rig, framesets, samples, truth = walk(rates, offset_ms)
+    if not imu:
+        rig, samples = rig.without_imu(), []
+    estimates = list(feed(rig, merge(samples, framesets)))
+    posed = [e for e in estimates if e.nav_T_body is not None]
+    made = Trajectory(np.array([e.stamp_ns for e in posed]), np.array([e.nav_T_body for e in posed]))
+    return estimates, evaluate(made, truth).ate_position_m.rmse
+
+
+@pytest.mark.parametrize("imu", [True, False], ids=["imu", "no-imu"])
+@pytest.mark.parametrize(
+    ("rates", "offset_ms"),
+    [(20.0, 17.0), (20.0, 3.0), ((20.0, 15.0), 0.0)],
+    ids=["17 ms", "3 ms", "15 Hz"],
+)
+def test_staggered_pairs_are_as_accurate_as_synchronised_ones(
+    rates: float | tuple[float, ...], offset_ms: float, imu: bool
+) -> None:
+    """Each frameset has an estimate at its own stamp, within 1.5 times the synchronised error and 2 mm."""
+    _, together = estimates_of(20.0, 0.0, imu)
+    _, framesets, _, _ = walk(rates, offset_ms)
+    estimates, apart = estimates_of(rates, offset_ms, imu)
+    assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets]
+    assert [sorted(e.pairs) for e in estimates] == [sorted(f.images) for f in framesets]
+    assert all(e.nav_T_body is not None and e.epoch == 0 for e in estimates)
+    first_of_back = next(i for i, f in enumerate(framesets) if 1 in f.images)
+    moved = [e.status for i, e in enumerate(estimates) if i not in (0, first_of_back)]
+    assert sum(status is not Status.TRACKING for status in moved) <= 1  # one motion in 10 000 is gated by chance
+    assert apart < 1.5 * together + 0.002
+    assert apart < 0.010
+
+
+@pytest.mark.parametrize("imu", [True, False], ids=["imu", "no-imu"])
+def test_staggered_pairs_are_both_used(imu: bool) -> None:
+    estimates, _ = estimates_of(20.0, 17.0, imu)
+    for pair in (0, 1):
+        reports = [e.pairs[pair] for e in estimates[2:] if pair in e.pairs]
+        assert len(reports) >= 59
+        assert np.median([report.inliers for report in reports]) > 20
+
+
+def test_a_late_pair_at_a_low_rate_breaks_nothing_without_an_imu() -> None:
+    """The first images of the second pair come 50 ms after the start, when the speed is not yet known."""
+    estimates, error = estimates_of(10.0, 50.0, False)
+    assert {e.epoch for e in estimates} == {0}
+    assert all(e.nav_T_body is not None for e in estimates[2:])
+    assert error < 0.010
