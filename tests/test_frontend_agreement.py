@@ -1,0 +1,147 @@
+"""Pairs that contradict each other, points that move on their own, and what is then said of a motion."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import random_transform, seen_points, transform, two_pair_rig
+
+from graphvio.arrays import Float
+from graphvio.config import MotionConfig
+from graphvio.events import Quality
+from graphvio.frontend.agreement import Agreement, agree
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.frontend.observations import Observations, RigArrays
+from graphvio.frontend.quality import graded
+from graphvio.frontend.selection import joint_motion
+from graphvio.geometry import se3_inverse, se3_log
+
+RIG = two_pair_rig()
+ARRAYS = RigArrays.of(RIG)
+CONFIG = MotionConfig()
+STILL = np.eye(4)
+TRUTH = transform([0.01, -0.03, 0.02], [0.05, -0.02, 0.03])
+DOOR = transform([0.0, 0.05, 0.0], [0.08, 0.04, 0.0])
+
+
+def judged(seen: Observations, seed: int = 0) -> Agreement:
+    rng = np.random.default_rng(seed)
+    joint = joint_motion(ARRAYS, seen, STILL, CONFIG, rng)
+    with ThreadPoolExecutor(2) as workers:
+        return agree(ARRAYS, seen, joint, CONFIG, rng, workers)
+
+
+def mixed(first: tuple[Float, int], second: tuple[Float, int], seed: int = 0) -> Observations:
+    """The first pair's points under one motion, the second's under another."""
+    parts = []
+    for pair, (motion, count) in enumerate((first, second)):
+        parts.append(seen_points(RIG, motion, count, np.random.default_rng(seed), sigma_px=0.2).of_pair(pair))
+    return Observations(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def distance(motion: Float, truth: Float) -> float:
+    return float(np.linalg.norm(se3_log(np.ascontiguousarray(motion @ np.linalg.inv(truth)))))
+
+
+def test_pairs_that_see_one_world_agree() -> None:
+    tensions = []
+    for seed in range(40):
+        agreement = judged(mixed((TRUTH, 80), (TRUTH, 80), seed), seed)
+        assert len(agreement.sides) == 1
+        assert agreement.sides[0].pairs == (0, 1)
+        assert set(agreement.own) == {0, 1}
+        tensions.append(agreement.tension)
+    assert np.mean(tensions) < 8.0  # chi-square of 6, and the covariances are a little too large
+
+
+@pytest.mark.parametrize(("points", "first"), [((120, 60), 0), ((60, 120), 1)])
+def test_a_door_that_fills_one_view_is_a_side_of_its_own(points: tuple[int, int], first: int) -> None:
+    agreement = judged(mixed((TRUTH, points[0]), (DOOR, points[1])))
+    assert [side.pairs for side in agreement.sides] == [(first,), (1 - first,)]
+    for side in agreement.sides:
+        assert distance(side.refined.cur_T_ref, (TRUTH, DOOR)[side.pairs[0]]) < 5e-3
+        assert side.refined.inlier.sum() > 0.95 * points[side.pairs[0]]
+        assert len(side.refined.inlier) == sum(points)
+
+
+def test_people_who_walk_through_all_views_are_a_second_motion() -> None:
+    world = seen_points(RIG, TRUTH, 80, np.random.default_rng(1), sigma_px=0.2)
+    people = seen_points(RIG, DOOR, 30, np.random.default_rng(2), sigma_px=0.2)
+    both = Observations(*(np.concatenate(columns) for columns in zip(world, people, strict=True)))
+    order = np.argsort(both.pair, kind="stable")
+    agreement = judged(Observations(*(column[order] for column in both)))
+    assert len(agreement.sides) == 2
+    assert distance(agreement.sides[0].refined.cur_T_ref, TRUTH) < 5e-3
+    assert distance(agreement.sides[1].refined.cur_T_ref, DOOR) < 1e-2
+
+
+def test_wrong_matches_are_no_second_motion() -> None:
+    seen = seen_points(RIG, TRUTH, 80, np.random.default_rng(3), sigma_px=0.2, outlier_share=0.4)
+    assert len(judged(seen).sides) == 1
+
+
+def test_a_single_pair_has_nobody_to_contradict_it() -> None:
+    seen = seen_points(RIG, TRUTH, 60, np.random.default_rng(4), sigma_px=0.2).of_pair(1)
+    agreement = judged(seen)
+    assert len(agreement.sides) == 1
+    assert agreement.own == {}
+
+
+def test_the_threads_timing_changes_nothing() -> None:
+    seen = mixed((TRUTH, 60), (DOOR, 60))
+    first, again = judged(seen), judged(seen)
+    for one, other in zip(first.sides, again.sides, strict=True):
+        assert np.array_equal(one.refined.cur_T_ref, other.refined.cur_T_ref)
+        assert np.array_equal(one.refined.covariance, other.refined.covariance)
+
+
+# ------------------------------------------------------------------ quality
+
+
+def measured(cur_T_ref: Float, inliers: int, sigma: float = 1e-4) -> RelativeMotion:
+    covariance = sigma**2 * np.eye(6)
+    return RelativeMotion(0, 50_000_000, se3_inverse(cur_T_ref), covariance, 0.3 * covariance, inliers)
+
+
+def test_a_good_motion_is_left_as_it_is() -> None:
+    motion, quality, reason = graded([measured(TRUTH, 200)], 5.0, None)
+    assert quality is Quality.GOOD
+    assert reason == ""
+    assert np.array_equal(motion.covariance, measured(TRUTH, 200).covariance)
+
+
+def test_the_covariance_covers_the_rival() -> None:
+    """Whichever of the two motions is right, it is within about a sigma."""
+    motion, quality, reason = graded([measured(TRUTH, 100), measured(DOOR, 80)], 0.0, None)
+    assert quality is Quality.WEAK
+    assert "two motions are seen" in reason
+    for right in (TRUTH, DOOR):
+        error = se3_log(np.ascontiguousarray(right @ motion.reference_T_current))
+        assert error @ np.linalg.solve(motion.covariance, error) < 1.5
+    few = graded([measured(TRUTH, 200), measured(DOOR, 12)], 0.0, None)
+    assert few[1] is Quality.GOOD  # somebody far away
+
+
+def test_few_points_are_believed_less_and_less() -> None:
+    sigmas = [np.sqrt(np.trace(graded([measured(TRUTH, n)], 0.0, None)[0].covariance)) for n in (40, 29, 20, 12)]
+    assert sigmas == sorted(sigmas)
+    assert sigmas[0] < 1e-3
+    assert sigmas[-1] > 0.03  # as far as a person walks in the time
+    assert graded([measured(TRUTH, 20)], 0.0, None)[1:] == (Quality.WEAK, "only 20 points")
+
+
+def test_images_that_all_repeat_say_nothing_for_sure() -> None:
+    motion, quality, reason = graded([measured(STILL, 300)], 0.0, -950_000_000)
+    assert quality is Quality.WEAK
+    assert "repeats" in reason
+    assert np.sqrt(motion.covariance[3, 3]) == pytest.approx(1.0, rel=0.01)  # a metre in a second
+
+
+def test_tension_and_weak_directions_are_told() -> None:
+    base = np.trace(measured(TRUTH, 200).covariance)
+    assert np.trace(graded([measured(TRUTH, 200)], 36.0, None)[0].covariance) == pytest.approx(3.0 * base)
+    weak = replace(measured(TRUTH, 200), covariance=np.diag([1e-8] * 5 + [0.01]))
+    assert graded([weak], 0.0, None)[1] is Quality.WEAK
+    random = random_transform(np.random.default_rng(0), 0.01, 0.01)
+    assert graded([measured(random, 200)], 0.0, None)[1] is Quality.GOOD

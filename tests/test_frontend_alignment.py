@@ -1,0 +1,119 @@
+"""The watch on P_12: an error of the extrinsics is found from motions, and nothing where there is none."""
+
+import numpy as np
+import pytest
+from synthetic import random_covariance, random_transform, transform
+
+from graphvio.arrays import Float
+from graphvio.frontend.alignment import PairAlignment
+from graphvio.frontend.refinement import Refined
+from graphvio.geometry import se3_exp, se3_log
+
+NONE = np.zeros(6)
+OFF = np.array([0.012, -0.009, 0.008, 0.02, -0.015, 0.018])  # about 1 degree and 3 cm
+INLIER = np.ones(50, dtype=bool)
+
+
+def refined(motion: Float, rng: np.random.Generator, sigma: float) -> Refined:
+    """A measurement of a motion with an error that its covariance describes."""
+    covariance = random_covariance(rng, 6, sigma)
+    error = np.linalg.cholesky(covariance) @ rng.standard_normal(6)
+    return Refined(np.ascontiguousarray(se3_exp(error) @ motion), covariance, 0.5 * covariance, INLIER, 0.3)
+
+
+def watch(
+    off: Float, keyframes: int, seed: int, outlier_share: float = 0.0, sigma: float = 2e-4
+) -> tuple[PairAlignment, np.random.Generator]:
+    rng = np.random.default_rng(seed)
+    alignment = PairAlignment()
+    for _ in range(keyframes):
+        add_keyframe(alignment, off, rng, outlier_share, sigma)
+    return alignment, rng
+
+
+def add_keyframe(
+    alignment: PairAlignment, off: Float, rng: np.random.Generator, outlier_share: float = 0.0, sigma: float = 2e-4
+) -> None:
+    motion = random_transform(rng, 0.1, 0.2)
+    seen = np.linalg.inv(se3_exp(off)) @ motion @ se3_exp(off)  # what the pair reports with the rig file's extrinsics
+    if rng.random() < outlier_share:
+        seen = seen @ random_transform(rng, 0.05, 0.1)
+    in_force = alignment.assumed
+    reported = np.ascontiguousarray(in_force @ seen @ np.linalg.inv(in_force))
+    alignment.add(refined(motion, rng, sigma), refined(reported, rng, sigma))
+
+
+def test_an_error_of_the_extrinsics_is_found() -> None:
+    nees = []
+    for seed in range(60):
+        alignment, _ = watch(OFF, 30, seed)
+        found = alignment.solve()
+        assert found is not None
+        assert found.is_significant
+        error = se3_log(np.ascontiguousarray(se3_exp(found.tangent) @ np.linalg.inv(se3_exp(OFF))))
+        nees.append(error @ np.linalg.solve(found.covariance, error))
+    assert 3.0 < np.mean(nees) < 9.0  # of 6; the Cauchy weights cost a little
+
+
+def test_it_is_found_among_outliers() -> None:
+    found = watch(OFF, 60, 1, outlier_share=0.2)[0].solve()
+    assert found is not None
+    assert found.is_significant
+    assert np.linalg.norm(found.tangent[:3] - OFF[:3]) < np.deg2rad(0.1)
+    assert np.linalg.norm(found.tangent[3:] - OFF[3:]) < 0.003
+
+
+def test_sound_extrinsics_are_left_alone() -> None:
+    for seed in range(60):
+        found = watch(NONE, 40, seed)[0].solve()
+        assert found is not None
+        assert not found.is_significant
+
+
+def test_motions_that_no_extrinsics_explain_are_no_error_of_them() -> None:
+    assert watch(NONE, 40, 2, outlier_share=0.7)[0].solve() is None
+    assert watch(OFF, 3, 3)[0].solve() is None  # too few
+
+
+def test_a_correction_in_force_goes_on_being_refined() -> None:
+    alignment, rng = watch(OFF, 10, 4)
+    for _ in range(6):
+        found = alignment.solve()
+        assert found is not None
+        alignment.apply(found)
+        for _ in range(10):
+            add_keyframe(alignment, OFF, rng)
+    found = alignment.solve()
+    assert found is not None
+    np.testing.assert_allclose(found.tangent, OFF, atol=1e-3)
+
+
+def test_what_no_motion_shows_is_not_made_up() -> None:
+    """Turning about the vertical in a plane leaves the height difference open."""
+    rng = np.random.default_rng(5)
+    alignment = PairAlignment()
+    for _ in range(40):
+        motion = transform([0.0, 0.0, rng.normal(0.0, 0.1)], [*rng.normal(0.0, 0.1, 2), 0.0])
+        seen = np.linalg.inv(se3_exp(OFF)) @ motion @ se3_exp(OFF)
+        alignment.add(refined(motion, rng, 1e-4), refined(np.ascontiguousarray(seen), rng, 1e-4))
+    found = alignment.solve()
+    assert found is not None
+    assert found.is_significant
+    sigmas = np.sqrt(np.diag(found.covariance))
+    assert sigmas[5] > 20.0 * sigmas[3:5].max()
+    assert abs(found.tangent[5] - OFF[5]) < 3.0 * sigmas[5]
+
+
+@pytest.mark.parametrize("translation_only", [True, False])
+def test_pure_translation_shows_rotation_only(translation_only: bool) -> None:
+    rng = np.random.default_rng(6)
+    alignment = PairAlignment()
+    for _ in range(30):
+        motion = random_transform(rng, 0.0 if translation_only else 0.1, 0.2)
+        seen = np.linalg.inv(se3_exp(OFF)) @ motion @ se3_exp(OFF)
+        alignment.add(refined(motion, rng, 1e-4), refined(np.ascontiguousarray(seen), rng, 1e-4))
+    found = alignment.solve()
+    assert found is not None
+    sigmas = np.sqrt(np.diag(found.covariance))
+    assert sigmas[:3].max() < 1e-3
+    assert (sigmas[3:].min() > 0.1) == translation_only
