@@ -102,8 +102,8 @@ def test_what_is_no_mapping(text: str) -> None:
 
 
 def test_unknown_profile_and_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="did you mean 'best_pair'"):
-        Config.load("best_pare")
+    with pytest.raises(ConfigError, match="did you mean 'paper'"):
+        Config.load("papper")
     with pytest.raises(ConfigError, match="cannot be read"):
         Config.load(tmp_path / "none.yaml")
     binary = tmp_path / "binary.yaml"
@@ -118,7 +118,7 @@ def test_every_profile_loads() -> None:
     assert {"default", "paper", "fast"} <= set(profiles())
     loaded = {name: Config.load(name) for name in profiles()}
     assert loaded["default"] == Config()
-    assert loaded["best_pair"].motion.selection == "best_pair"
+    assert loaded["paper"].motion.selection == "best_pair"
 
 
 def test_sha256_tells_configurations_apart_by_what_they_do() -> None:
