@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float
+from graphvio.arrays import Bool, Float, Int
 from graphvio.config import MotionConfig
 from graphvio.frontend.cost import left_motions
 from graphvio.frontend.linearisation import expand, information_through_points, linearise
@@ -21,6 +21,7 @@ _STEPS_PER_ROUND = 6
 _CONVERGED = 1e-6  # radians and metres
 _NEAR = 1e-4  # enough to tell inliers
 _WEAK_DIRECTION_SIGMA = 10.0
+_LEAST_SHARE_OF_A_PAIR = 0.25
 _SHARED_BOUNDS = (0.02, 0.9)
 
 
@@ -52,6 +53,7 @@ def refine(rig: RigArrays, observations: Observations, cur_T_ref: Float, config:
     everything = np.ones(len(has_right), dtype=bool)
     pose, _, errors2 = _levenberg_marquardt(cur_T_ref, rig, observations, everything, sigma, scale, 1, _NEAR)
     inlier = errors2 < inlier_cutoff(errors2, has_right, largest2)
+    inlier &= _is_of_an_explained_pair(observations.pair, inlier)
     pose, hessian, errors2 = _levenberg_marquardt(pose, rig, observations, inlier, sigma, scale, 2, _CONVERGED)
     used = influence(errors2[inlier], has_right[inlier], scale)
     # Backward propagation of the reprojection covariance. The small prior keeps unconstrained directions finite.
@@ -68,6 +70,12 @@ def refine(rig: RigArrays, observations: Observations, cur_T_ref: Float, config:
         inlier,
         sigma * float(np.sqrt(used.variance)),
     )
+
+
+def _is_of_an_explained_pair(pair: Int, inlier: Bool) -> Bool:
+    """Which points (N,) belong to a pair of which more than a few fit: some always do by chance."""
+    fitting = np.bincount(pair, weights=inlier)
+    return np.asarray((fitting >= _LEAST_SHARE_OF_A_PAIR * np.bincount(pair))[pair])
 
 
 def _bounded(shared: Float, covariance: Float) -> Float:

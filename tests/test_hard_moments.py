@@ -1,0 +1,223 @@
+"""What goes wrong in front of the cameras and behind them: vision alone, on rendered images of a walk in a room."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from graphvio import Estimate, FrameSet, Odometry, Status, open_source
+from graphvio.arrays import Float, Image
+from graphvio.events import Event, Incident, Quality
+from graphvio.frontend.motion import RelativeMotion, VisualResult
+from graphvio.geometry import se3_exp, se3_inverse, se3_log
+from graphvio.rig import Rig
+from graphvio.trajectory import Trajectory
+
+pytestmark = pytest.mark.xdist_group("room_walk")
+
+Change = Callable[[float, FrameSet], FrameSet]
+"""Takes seconds since the first frameset, and a frameset."""
+
+
+class Walk:
+    """One run over the walk, and what the front-end said in it."""
+
+    def __init__(self, recording: Path, events: list[Event], change: Change, *, rig: Rig | None = None) -> None:
+        self.truth = Trajectory.read(recording / "mav0/state_groundtruth_estimate0/data.csv")
+        self.odometry = Odometry(rig or open_source(recording).rig.without_imu())
+        self.results: list[VisualResult] = []
+        frontend = self.odometry._frontend
+        process = frontend.process
+
+        def listened(*arguments: object) -> VisualResult:
+            self.results.append(process(*arguments))  # type: ignore[arg-type]
+            return self.results[-1]
+
+        frontend.process = listened  # type: ignore[method-assign,assignment]
+        start_ns = next(event.stamp_ns for event in events if isinstance(event, FrameSet))
+        self.estimates: list[Estimate] = []
+        for event in events:
+            if isinstance(event, FrameSet):
+                estimate = self.odometry.process(change((event.stamp_ns - start_ns) * 1e-9, event))
+                self.estimates += [estimate] if estimate is not None else []
+        self.estimates += self.odometry.finish()
+        self.incidents: list[Incident] = self.odometry.take_incidents()
+
+    def pose(self, stamp_ns: int) -> Float:
+        """True ``world_T_body`` at a frameset."""
+        at = int(np.argmin(np.abs(self.truth.stamps_ns - stamp_ns)))
+        assert self.truth.stamps_ns[at] == stamp_ns
+        return np.asarray(self.truth.nav_T_body[at])
+
+    def statistic(self, motion: RelativeMotion) -> float:
+        """Chi-square (6) of a motion's error."""
+        true = se3_inverse(self.pose(motion.reference_stamp_ns)) @ self.pose(motion.stamp_ns)
+        error = se3_log(np.ascontiguousarray(se3_inverse(true) @ motion.reference_T_current))
+        return float(error @ np.linalg.solve(motion.covariance, error))
+
+    @property
+    def worst(self) -> float:
+        """The largest chi-square of all motions."""
+        return max(self.statistic(result.motion) for result in self.results if result.motion is not None)
+
+    @property
+    def end_error_m(self) -> float:
+        """Distance of the last position from the true one, seen from the first pose."""
+        first, last = self.estimates[0], self.estimates[-1]
+        assert first.nav_T_body is not None
+        assert last.nav_T_body is not None
+        moved = se3_inverse(first.nav_T_body) @ last.nav_T_body
+        true = se3_inverse(self.pose(first.stamp_ns)) @ self.pose(last.stamp_ns)
+        return float(np.linalg.norm(moved[:3, 3] - true[:3, 3]))
+
+    def kinds(self) -> set[str]:
+        return {incident.kind for incident in self.incidents}
+
+
+@pytest.fixture(scope="module")
+def events(room_walk: Path) -> list[Event]:
+    return list(open_source(room_walk))
+
+
+def as_it_is(_: float, frameset: FrameSet) -> FrameSet:
+    return frameset
+
+
+def altered(pair: int, left: Callable[[Image], Image], right: Callable[[Image], Image] | None = None) -> Change:
+    """One pair's images altered from 2 s to 4 s."""
+
+    def change(seconds: float, frameset: FrameSet) -> FrameSet:
+        if not 2.0 <= seconds < 4.0:
+            return frameset
+        images = dict(frameset.images)
+        images[pair] = (left(images[pair][0]), (right or left)(images[pair][1]))
+        return replace(frameset, images=images)
+
+    return change
+
+
+def noise_like(image: Image, level: float, seed: int) -> Image:
+    return np.asarray(np.random.default_rng(seed).normal(level, 2.0, image.shape).clip(0, 255), dtype=np.uint8)
+
+
+def test_the_walk_as_it_is(room_walk: Path, events: list[Event]) -> None:
+    walk = Walk(room_walk, events, as_it_is)
+    assert walk.end_error_m < 0.004
+    assert walk.worst < 45.0
+    assert walk.kinds() <= {"vision_weak"}
+    resting = [estimate.at_rest for estimate in walk.estimates]
+    assert np.mean(resting[2:19]) > 0.9  # the first second
+    assert not any(resting[40:])  # and then it has begun to walk
+    again = Walk(room_walk, events, as_it_is)
+    for one, other in zip(walk.estimates, again.estimates, strict=True):
+        assert np.array_equal(one.nav_T_body, other.nav_T_body)  # type: ignore[arg-type]
+        assert np.array_equal(one.covariance, other.covariance)  # type: ignore[arg-type]
+
+
+def test_an_error_of_p12_is_told_and_corrected(room_walk: Path, events: list[Event]) -> None:
+    """1 degree and 3 cm: the two pairs stay better than the better one of them."""
+    rig = open_source(room_walk).rig.without_imu()
+    error = se3_exp(
+        np.concatenate([np.deg2rad(1.0) * np.array([0.6, -0.64, 0.48]), 0.03 * np.array([0.48, 0.6, 0.64])])
+    )
+    back = rig.pairs[1]
+    moved = [replace(camera, body_T_cam=error @ camera.body_T_cam) for camera in (back.left, back.right)]
+    wrong = replace(rig, pairs=(rig.pairs[0], replace(back, left=moved[0], right=moved[1])))
+    walk = Walk(room_walk, events, as_it_is, rig=wrong)
+    told = [incident for incident in walk.incidents if incident.kind == "extrinsics_off"]
+    assert len(told) == 1
+    assert "pair back" in told[0].detail
+    found = walk.odometry._frontend.misaligned[1].tangent
+    assert np.linalg.norm(found + se3_log(error)) < np.hypot(np.deg2rad(0.2), 0.01)
+    alone = [Walk(room_walk, events, as_it_is, rig=rig.with_pairs([pair])).end_error_m for pair in (0, 1)]
+    assert walk.end_error_m < max(1.05 * min(alone), 0.004)
+    assert all(estimate.epoch == 0 for estimate in walk.estimates)
+
+
+@pytest.mark.parametrize("pair", [0, 1])
+def test_a_blinded_pair_breaks_nothing(room_walk: Path, events: list[Event], pair: int) -> None:
+    numbers = iter(range(1000))
+    walk = Walk(room_walk, events, altered(pair, lambda image: noise_like(image, 3.0, next(numbers))))
+    assert all(estimate.status is Status.TRACKING for estimate in walk.estimates[1:])
+    assert walk.end_error_m < 0.012
+    assert walk.worst < 45.0
+
+
+@pytest.mark.parametrize("pair", [0, 1])
+def test_a_frozen_pair_is_left_out(room_walk: Path, events: list[Event], pair: int) -> None:
+    kept: dict[int, tuple[Image, Image]] = {}
+
+    def freeze(seconds: float, frameset: FrameSet) -> FrameSet:
+        if not 2.0 <= seconds < 4.0:
+            return frameset
+        kept.setdefault(pair, frameset.images[pair])
+        left, right = kept[pair]
+        return replace(frameset, images={**frameset.images, pair: (left.copy(), right.copy())})
+
+    walk = Walk(room_walk, events, freeze)
+    assert walk.end_error_m < 0.02
+    assert walk.worst < 45.0
+    frozen = [result for result in walk.results if pair not in result.pairs]
+    assert len(frozen) == 39  # the first of forty is new
+
+
+def test_all_frozen_is_never_sure(room_walk: Path, events: list[Event]) -> None:
+    kept: dict[int, tuple[Image, Image]] = {}
+
+    def freeze(seconds: float, frameset: FrameSet) -> FrameSet:
+        if not 2.0 <= seconds < 2.5:
+            return frameset
+        kept.update({} if kept else frameset.images)
+        return replace(frameset, images=dict(kept))
+
+    walk = Walk(room_walk, events, freeze)
+    during = [result for result in walk.results if "repeats" in result.reason]
+    assert len(during) == 9
+    assert all(result.quality is Quality.WEAK for result in during)
+    assert max(walk.statistic(result.motion) for result in during if result.motion is not None) < 45.0
+
+
+def test_left_and_right_swapped(room_walk: Path, events: list[Event]) -> None:
+    def swap(seconds: float, frameset: FrameSet) -> FrameSet:
+        if not 2.0 <= seconds < 4.0:
+            return frameset
+        left, right = frameset.images[0]
+        return replace(frameset, images={**frameset.images, 0: (right, left)})
+
+    walk = Walk(room_walk, events, swap)
+    assert walk.end_error_m < 0.012
+    assert all(estimate.status is Status.TRACKING for estimate in walk.estimates[1:])
+
+
+def test_exposure_that_jumps(room_walk: Path, events: list[Event]) -> None:
+    numbers = iter(range(1000))
+
+    def dim(image: Image) -> Image:
+        gain = (1.0, 0.6)[(next(numbers) // 2) % 2]
+        return np.asarray((gain * image).clip(0, 255), dtype=np.uint8)
+
+    walk = Walk(room_walk, events, altered(0, dim))
+    assert walk.end_error_m < 0.012
+    assert all(estimate.status is Status.TRACKING for estimate in walk.estimates[1:])
+
+
+def test_a_poster_that_is_carried_across_one_view(room_walk: Path, events: list[Event]) -> None:
+    """A textured plane, 1 m away, fills the first pair's view and moves: its motion is not the rig's."""
+    noise = np.random.default_rng(5).integers(0, 256, (480, 2000), dtype=np.uint8)
+    poster = np.asarray(cv2.equalizeHist(cv2.GaussianBlur(noise, (0, 0), 3)), dtype=np.uint8)
+    pair = open_source(room_walk).rig.pairs[0]
+    disparity = round(pair.left.focal_px * pair.baseline_m / 1.0)
+
+    def carry(seconds: float, frameset: FrameSet) -> FrameSet:
+        if not 2.0 <= seconds < 4.0:
+            return frameset
+        at = 300 + round(120 * (seconds - 2.0))  # pixels: 0.3 m/s
+        left, right = (np.ascontiguousarray(poster[:, at + shift : at + shift + 640]) for shift in (0, disparity))
+        return replace(frameset, images={**frameset.images, 0: (left, right)})
+
+    walk = Walk(room_walk, events, carry)
+    assert walk.worst < 45.0
+    assert walk.end_error_m < 0.02
