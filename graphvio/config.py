@@ -17,7 +17,7 @@ from graphvio.errors import ConfigError
 _LARGEST = 1e12
 _MAY_BE_ZERO = frozenset(
     ("seed", "border_px", "settle_s", "keyframe_overlap", "min_inliers", "min_inlier_share", "min_response",
-     "min_correlation", "max_gated_s", "max_imu_wait_ms", "max_imu_start_wait_s")
+     "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s")
 )  # fmt: skip
 _SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
 
@@ -130,6 +130,8 @@ class SmootherConfig:
 class TimingConfig:
     """How long things are waited for."""
 
+    simultaneous_ms: float = 2.0
+    """Images of a recording whose stamps differ by no more are of the same instant."""
     max_imu_wait_ms: float = 100.0
     """A frameset whose IMU samples have not come is held until one arrives that is newer by this much."""
     max_imu_gap_ms: float = 50.0

@@ -161,7 +161,7 @@ class Odometry:
         if not smoother.knows(motion.reference_stamp_ns):  # it started anew since then
             self._frontend.rekey()
             return False
-        if self._lost:
+        if self._lost and motion.reference_stamp_ns > self._tracked_ns:  # not from a state that was known
             self._recover(motion)
             return True
         try:
@@ -171,6 +171,7 @@ class Odometry:
         if verdict.accepted:
             smoother.accept(motion)
             self._refused.clear()
+            self._lost = False
             return True
         self._report(
             motion.stamp_ns,

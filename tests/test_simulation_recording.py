@@ -117,7 +117,7 @@ def test_command_writes_a_recording(tmp_path: Path) -> None:
         command(), ["room", "--out", str(tmp_path / "r"), "--duration", "0.2", "--rate", "10", "--seed", "1"]
     )
     assert result.exit_code == 0, result.output
-    assert "2 framesets of 4 cameras" in result.output
+    assert "2 framesets, 8 images" in result.output
     assert (tmp_path / "r" / "rig.yaml").is_file()
 
 

@@ -118,7 +118,7 @@ class Window:
         self._factors = staying  # the solution still tells the covariances of those that stay
 
     def _solve(self, last: tuple[int, ...]) -> gtsam.GaussianBayesTree:
-        """The window eliminated at its present values, in order of time but for the variables that come last."""
+        """The window eliminated at its present values, some variables last."""
         if self._solution is not None and self._last[-len(last) :] == last:
             return self._solution
         loose = set(self.values.keys()).difference(*(involved for involved, _ in self._factors))
@@ -128,19 +128,15 @@ class Window:
         for _, factor in self._factors:
             graph.push_back(factor)
         last = tuple(key for key in last if self.values.exists(key))
-        others = sorted(set(self.values.keys()) - set(last), key=_age)
         try:
-            self._solution = graph.linearize(self.values).eliminateMultifrontal(
-                gtsam.Ordering([*others, *last]), gtsam.EliminateQR
+            ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(
+                graph, gtsam.KeyVector(list(last)), True
             )
+            self._solution = graph.linearize(self.values).eliminateMultifrontal(ordering, gtsam.EliminateQR)
         except RuntimeError as error:
             raise WindowError(f"the window has no unique solution: {_one_line(error)}") from None
         self._last = last
         return self._solution
-
-
-def _age(key: int) -> tuple[int, int]:
-    return gtsam.symbolIndex(key), gtsam.symbolChr(key)
 
 
 def _one_line(error: Exception) -> str:

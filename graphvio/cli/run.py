@@ -64,10 +64,12 @@ def run(
     from graphvio.warmup import warm_up
 
     settings = Config.load(config)
-    opened = open_source(source, None if rig is None else Rig.load(rig), from_s=from_s, to_s=to_s)
+    tolerance_ms = settings.timing.simultaneous_ms
+    loaded = None if rig is None else Rig.load(rig)
+    opened = open_source(source, loaded, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms)
     chosen = _choose(opened.rig, pairs, no_imu)
     if chosen is not opened.rig:
-        opened = open_source(source, chosen, from_s=from_s, to_s=to_s)
+        opened = open_source(source, chosen, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms)
     folder = out if out is not None else ResultWriter.new_folder(Path("results"), opened.name)
     with ExitStack() as stack:
         writer = stack.enter_context(ResultWriter(folder, opened.rig, settings.to_yaml()))

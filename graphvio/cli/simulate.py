@@ -16,6 +16,9 @@ def simulate(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", help="Of all noise: same seed, same bytes.")] = 0,
     rate: Annotated[float, typer.Option("--rate", help="Framesets per second.")] = 20.0,
+    trigger_offset_ms: Annotated[
+        float, typer.Option("--trigger-offset-ms", help="Each pair is triggered so much after the one before.")
+    ] = 0.0,
     verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
 ) -> None:
     """Simulate a walk with four cameras and an IMU, and write it in the EuRoC/ASL layout.
@@ -42,11 +45,11 @@ def simulate(
             duration_s=duration,
             seed=seed,
             rate_hz=rate,
+            trigger_offset_ms=trigger_offset_ms,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
-    cameras = recording.images // recording.framesets
     typer.echo(
-        f"{recording.path}: {recording.framesets} framesets of {cameras} cameras, "
+        f"{recording.path}: {recording.framesets} framesets, {recording.images} images, "
         f"{recording.imu_samples} IMU samples, {recording.path_length_m:.1f} m in {recording.duration_s:g} s"
     )
     for event, (start, end) in recording.events.items():

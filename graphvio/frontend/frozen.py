@@ -31,9 +31,11 @@ class FrozenImages:
     def __init__(self) -> None:
         self._last: dict[int, tuple[Image, Image]] = {}
         self._changed_ns: dict[int, int] = {}  # when both of a pair's images last were new
+        self._seen_ns: dict[int, int] = {}  # when a pair last had images
 
     def look(self, frameset: FrameSet) -> Frozen:
         """Judge a frameset."""
+        others_changed = self._others_changed(frameset)
         repeats: dict[int, int] = {}
         for j, images in frameset.images.items():
             before = self._last.get(j)
@@ -41,10 +43,20 @@ class FrozenImages:
             if repeats[j] == 0:
                 self._changed_ns[j] = frameset.stamp_ns
             self._last[j] = (images[0], images[1])
-        if repeats and all(count == 2 for count in repeats.values()):
+            self._seen_ns[j] = frameset.stamp_ns
+        if repeats and all(count == 2 for count in repeats.values()) and not others_changed:
             return Frozen(frozenset(), max(self._changed_ns[j] for j in repeats), "every image repeats the one before")
         stuck = frozenset(j for j, count in repeats.items() if count)
         return Frozen(stuck, None, f"pairs {sorted(stuck)} repeat an image" if stuck else "")
+
+    def _others_changed(self, frameset: FrameSet) -> bool:
+        """Whether pairs that are triggered at other times have seen something new since these pairs' last images."""
+        since_ns = min((self._seen_ns.get(j, frameset.stamp_ns) for j in frameset.images), default=0)
+        return any(
+            seen_ns > since_ns and self._changed_ns.get(j) == seen_ns
+            for j, seen_ns in self._seen_ns.items()
+            if j not in frameset.images
+        )
 
 
 def _same(one: Image, other: Image) -> bool:

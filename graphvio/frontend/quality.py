@@ -15,7 +15,7 @@ from graphvio.frontend.tracks import PairFrame
 from graphvio.geometry import se3_inverse, se3_log
 
 _RIVAL_SHARE = 0.1  # of the best-supported side's points: from there on another side may be the right one
-_FEW_POINTS = 30  # fewer may agree by chance
+_FEW_POINTS = 25  # fewer may agree by chance
 _USUAL_TENSION = 12.0  # beyond it the covariance grows in proportion: something small is wrong with one of the pairs
 _WEAK_ROTATION_RAD = 0.02
 _WEAK_TRANSLATION_M = 0.05
