@@ -17,7 +17,7 @@ from graphvio.errors import ConfigError
 _LARGEST = 1e12
 _MAY_BE_ZERO = frozenset(
     ("seed", "border_px", "settle_s", "keyframe_overlap", "min_inliers", "min_inlier_share", "min_response",
-     "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s")
+     "scarce_share", "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s")
 )  # fmt: skip
 _SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
 
@@ -30,6 +30,10 @@ class CornerConfig:
     """Side of a cell: at most one new corner in each."""
     min_response: float = 4.0
     """Least rms gradient along a corner's weaker direction, grey levels per pixel."""
+    scarce_share: float = 0.33
+    """Where fewer of the cells hold a track with depth or a new corner, weaker corners are admitted as well."""
+    noise_factor: float = 1.5
+    """What they must still have: so many times the standard deviation of the image's noise."""
     border_px: int = 8
     """Corners and tracks nearer to the image's edge are dropped."""
 

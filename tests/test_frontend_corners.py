@@ -1,9 +1,10 @@
+import cv2
 import numpy as np
 import pytest
 
 from graphvio.arrays import Bool, Float, Image
 from graphvio.config import CornerConfig
-from graphvio.frontend.corners import find_corners, occupied_cells
+from graphvio.frontend.corners import find_corners, occupied_cells, thinned
 
 SETTINGS = CornerConfig()
 HEIGHT, WIDTH = 240, 320
@@ -116,3 +117,25 @@ def test_small_images_are_no_fault() -> None:
     for shape in ((16, 16), (17, 40), (41, 81)):
         corners = find(np.random.default_rng(5).integers(0, 256, shape).astype(np.uint8))
         assert ((corners >= 0) & (corners < shape[::-1])).all()
+
+
+def test_only_the_first_tracks_of_a_cell_stay() -> None:
+    pixels = np.array([[5.0, 5.0], [6.0, 30.0], [39.0, 39.0], [41.0, 5.0], [100.0, 90.0], [-1e9, 1e9]])
+    found = np.array([True, True, True, True, True, False])
+    assert thinned(pixels, found, 40, 2).tolist() == [True, True, False, True, True, False]
+    assert thinned(pixels, ~found & (pixels[:, 0] > 0), 40, 2).tolist() == [False] * 6
+
+
+def test_the_response_is_that_of_its_definition() -> None:
+    image = np.asarray(cv2.GaussianBlur(texture(6), (0, 0), 1.0), dtype=np.uint8)
+    gx, gy = np.zeros(image.shape), np.zeros(image.shape)
+    grey = image.astype(np.float64)
+    gx[:, 1:-1], gy[1:-1] = 0.5 * (grey[:, 2:] - grey[:, :-2]), 0.5 * (grey[2:] - grey[:-2])
+    a, b, c = (cv2.blur(product, (7, 7)) for product in (gx * gx, gx * gy, gy * gy))
+    smooth = np.array([1.0, 2.0, 1.0]) / 4.0
+    response = cv2.sepFilter2D(a * c - b * b - 0.04 * (a + c) ** 2, -1, smooth, smooth)
+    found = find(image)
+    assert len(found) > 10
+    for x, y in np.round(found).astype(int):
+        around = response[y - 1 : y + 2, x - 1 : x + 2]
+        assert around.max() >= 0.999 * response[y - 2 : y + 3, x - 2 : x + 3].max()

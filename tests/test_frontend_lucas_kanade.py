@@ -3,9 +3,10 @@
 import cv2
 import numpy as np
 import pytest
+from waves import picture, waves
 
-from graphvio.arrays import Float, Image
-from graphvio.frontend.lucas_kanade import build_pyramid, track
+from graphvio.arrays import Bool, Float, Image
+from graphvio.frontend.lucas_kanade import build_pyramid, register, track
 
 LEVELS = 4
 
@@ -86,3 +87,114 @@ def test_another_scene_fails_the_way_back() -> None:
     source, target = build_pyramid(texture(seed=1), LEVELS), build_pyramid(texture(seed=2), LEVELS)
     _, found = track(source, target, grid(), grid(), window_px=15, levels=LEVELS, max_return_px=0.5)
     assert found.mean() < 0.2
+
+
+# ------------------------------------------------------------------ deformed patches
+
+
+def warped(warp: Float, middle: Float, place: Float) -> Image:
+    """`waves` as a camera sees it whose pixel ``q`` shows what is at ``middle + warp (q - place)`` elsewhere."""
+    y, x = np.mgrid[:240, :320].astype(np.float64)
+    u, v = x - place[0], y - place[1]
+    return picture(waves(middle[0] + warp[0, 0] * u + warp[0, 1] * v, middle[1] + warp[1, 0] * u + warp[1, 1] * v))
+
+
+def rotation(angle_rad: float) -> Float:
+    return np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
+
+
+WARPS = [np.eye(2), rotation(0.5), 1.4 * np.eye(2), 0.75 * rotation(-0.3), np.array([[1.0, 0.4], [0.0, 1.0]])]
+
+
+def registered(warp: Float, assumed: Float, guess_error: Float) -> tuple[Float, Bool]:
+    """Errors (N, 2) of patches found in an image deformed by a warp, and whether each was found (N,)."""
+    source, place = warped(np.eye(2), np.zeros(2), np.zeros(2)), np.array([160.7, 120.4])
+    errors, found = [], []
+    for middle in grid()[::7]:
+        target = warped(warp, middle, place)
+        guess = (place + guess_error)[None]
+        moved, ok, _ = register(source, target, middle[None], assumed[None], guess, np.ones(1, dtype=bool), 7, 2.0, 1.0)
+        errors.append(moved[0] - place)
+        found.append(ok[0])
+    return np.array(errors), np.array(found)
+
+
+@pytest.mark.parametrize("warp", WARPS)
+def test_deformed_patches_are_found_between_the_pixels(warp: Float) -> None:
+    errors, found = registered(warp, warp, np.array([0.6, -0.5]))
+    assert found.mean() > 0.8
+    assert np.median(np.linalg.norm(errors[found], axis=1)) < 0.03
+
+
+@pytest.mark.parametrize("warp", WARPS[1:])
+def test_without_their_deformation_they_are_off_or_lost(warp: Float) -> None:
+    right, found = registered(warp, warp, np.zeros(2))
+    wrong, kept = registered(warp, np.eye(2), np.zeros(2))
+    off = np.where(kept, np.linalg.norm(wrong, axis=1), np.inf)
+    assert np.median(off) > 3.0 * np.median(np.linalg.norm(right[found], axis=1))
+
+
+def test_what_is_not_registered_stays_where_it_was() -> None:
+    image = warped(np.eye(2), np.zeros(2), np.zeros(2))
+    flat = np.full_like(image, 90)
+    pixels = np.vstack([grid()[:3], [[4.0, 4.0], [-50.0, 10.0], [1e6, 1e6]]])
+    guess, n = pixels + np.array([0.3, 0.2]), len(pixels)
+    warps, everything = np.tile(np.eye(2), (n, 1, 1)), np.ones(n, dtype=bool)
+    for source, target, wanted in ((image, image, ~everything), (flat, image, everything)):
+        moved, found, localised = register(source, target, pixels, warps, guess, wanted, 7, 2.0, 1.0)
+        np.testing.assert_array_equal(moved, guess)
+        assert not found.any()
+        assert not localised.any()
+    moved, found, localised = register(image, image, pixels, warps, guess, everything, 7, 2.0, 1.0)
+    np.testing.assert_array_equal(found, [True, True, True, False, False, False])
+    np.testing.assert_array_equal(localised, found)
+    np.testing.assert_array_equal(moved[~found], guess[~found])
+    _, found, _ = register(image, image, pixels[:3], warps[:3], guess[:3], everything[:3], 7, 0.1, 1.0)
+    assert not found.any()  # they are further from the guess than that
+
+
+# ------------------------------------------------------------------ levels and thresholds
+
+
+def test_few_levels_are_enough_for_a_good_guess_and_failures_get_all() -> None:
+    shift = (-14.2, 9.9)
+    source, target = build_pyramid(texture(), LEVELS), build_pyramid(texture(shift), LEVELS)
+    good, poor = grid() + shift + [0.8, -0.6], grid() + 1.0
+    for guess in (good, poor):
+        moved, found = track(
+            source, target, grid(), guess, window_px=15, levels=LEVELS, max_return_px=0.5, first_levels=2
+        )
+        assert found.mean() > 0.75
+        right = np.linalg.norm(moved - grid() - shift, axis=1)[found] < 0.1
+        assert right.mean() > 0.8  # the finest levels alone may take a similar place for the right one
+
+
+def test_the_least_gradient_is_a_choice() -> None:
+    faint = np.round(128.0 + (texture().astype(np.float64) - 128.0) / 40.0).astype(np.uint8)
+    pyramid = build_pyramid(faint, LEVELS)
+    shares = [
+        track(pyramid, pyramid, grid(), grid(), window_px=15, levels=1, max_return_px=0.5, min_gradient=least)[1].mean()
+        for least in (1.0, 0.2)
+    ]
+    assert shares[0] < 0.1
+    assert shares[1] > 0.9
+
+
+@pytest.mark.parametrize("window_px", [9, 15, 17, 33])  # with and without a whole vector register to a row
+def test_patches_of_any_size(window_px: int) -> None:
+    source, target = build_pyramid(texture(), LEVELS), build_pyramid(texture((0.6, -0.3)), LEVELS)
+    moved, found = track(source, target, grid(), grid(), window_px=window_px, levels=2, max_return_px=0.5)
+    assert found.mean() > 0.85
+    assert np.median(np.linalg.norm(moved - grid() - (0.6, -0.3), axis=1)[found]) < 0.03
+
+
+def test_patches_up_to_the_very_edge_stay_within_the_image() -> None:
+    image = texture()
+    pyramid = build_pyramid(image, 1)
+    x, y = np.meshgrid(np.arange(0.0, 320.0, 3.1), np.arange(0.0, 240.0, 3.1))
+    pixels = np.column_stack([x.ravel(), y.ravel()])
+    moved, found = track(pyramid, pyramid, pixels, pixels, window_px=15, levels=1, max_return_px=0.5)
+    inside = (pixels >= 9.0).all(axis=1) & (pixels < [310.0, 230.0]).all(axis=1)
+    assert found[inside].mean() > 0.9
+    assert not found[(pixels < 8.0).any(axis=1)].any()
+    np.testing.assert_allclose(moved[found], pixels[found], atol=0.01)

@@ -6,7 +6,7 @@ from synthetic import transform
 from graphvio.arrays import Bool, Float, Image
 from graphvio.cameras import RADIAL_TANGENTIAL, project_points, unproject_pixels
 from graphvio.config import StereoConfig
-from graphvio.frontend.stereo import epipolar_search, triangulate
+from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
 
 FOCAL, BASELINE = 400.0, 0.1
 INTRINSICS = np.array([FOCAL, FOCAL, 160.0, 120.0])
@@ -162,3 +162,45 @@ def test_the_search_follows_the_curve_of_a_distorted_lens() -> None:
     assert found[inside].mean() > 0.8
     good = inside & found
     assert np.abs(matches[good] - places[good]).max() < 1.5
+
+
+# ------------------------------------------------------------------ epipolar lines
+
+
+def test_lines_of_a_rectified_pair_are_rows() -> None:
+    rays = np.array([[0.1, -0.05], [-0.2, 0.1], [0.0, 0.0]])
+    pixels, directions, valid = epipolar_lines(
+        rays, np.array([0.0, 0.5, 2.0]), RECTIFIED, RADIAL_TANGENTIAL, INTRINSICS, np.zeros(5)
+    )
+    assert valid.all()
+    disparity = FOCAL * BASELINE * np.array([0.0, 0.5, 2.0])
+    left = FOCAL * rays + INTRINSICS[2:]
+    np.testing.assert_allclose(pixels, left - np.column_stack([disparity, np.zeros(3)]), atol=1e-9)
+    np.testing.assert_allclose(directions, np.tile([-1.0, 0.0], (3, 1)), atol=1e-9)
+
+
+def test_lines_of_any_pair_follow_the_projection() -> None:
+    lens, points = np.array([-0.25, 0.06, 1e-3, -1e-3, 0.0]), scattered(50, seed=4)
+    points = points[points[:, 2] > 1.0]
+    rays, _ = views(points, SKEWED)
+    w = 1.0 / points[:, 2]
+    pixels, directions, valid = epipolar_lines(rays, w, SKEWED, RADIAL_TANGENTIAL, INTRINSICS, lens)
+
+    def projected(inverse_depths: Float) -> Float:
+        moved = np.column_stack([rays, np.ones(len(rays))]) @ SKEWED[:3, :3].T
+        moved = moved + inverse_depths[:, None] * SKEWED[:3, 3]
+        return project_points(RADIAL_TANGENTIAL, INTRINSICS, lens, np.ascontiguousarray(moved))[0]
+
+    np.testing.assert_allclose(pixels[valid], projected(w)[valid], atol=1e-9)
+    slope = (projected(w + 1e-6) - projected(w - 1e-6))[valid]
+    slope /= np.linalg.norm(slope, axis=1)[:, None]
+    np.testing.assert_allclose(directions[valid], slope, atol=0.01)
+    assert valid.mean() > 0.9
+
+
+def test_points_behind_the_right_camera_have_no_line() -> None:
+    ahead = transform([0.0, 0.0, 0.0], [-BASELINE, 0.0, -1.0])
+    _, _, valid = epipolar_lines(
+        np.zeros((2, 2)), np.array([2.0, 0.5]), ahead, RADIAL_TANGENTIAL, INTRINSICS, np.zeros(5)
+    )
+    assert valid.tolist() == [False, True]

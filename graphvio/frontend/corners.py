@@ -2,11 +2,12 @@
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Image
-from graphvio.kernels import kernel
+from graphvio.arrays import AnyArray, Bool, Float, Image
+from graphvio.kernels import fast_kernel, kernel
 
 _HARRIS_K = 0.04
 _RADIUS = 3  # of the 7x7 window over which gradients are summed
+_BORDER = 2  # around a cell: one pixel to smooth the response, one to see whether it peaks
 
 
 @kernel
@@ -19,6 +20,22 @@ def occupied_cells(pixels: Float, cell_px: int, rows: int, columns: int) -> Bool
         if 0 <= row < rows and 0 <= column < columns:
             occupied[row, column] = True
     return occupied
+
+
+@kernel
+def thinned(pixels: Float, found: Bool, cell_px: int, most: int) -> Bool:
+    """Of the found tracks (N, 2) that have gathered in one cell, only the first ones, at most so many, stay (N,)."""
+    keep = np.zeros(len(pixels), dtype=np.bool_)
+    rows = columns = 1
+    for i in np.flatnonzero(found):
+        rows = max(rows, int(pixels[i, 1]) // cell_px + 1)
+        columns = max(columns, int(pixels[i, 0]) // cell_px + 1)
+    taken = np.zeros((rows, columns), dtype=np.int64)
+    for i in np.flatnonzero(found):
+        row, column = int(pixels[i, 1]) // cell_px, int(pixels[i, 0]) // cell_px
+        taken[row, column] += 1
+        keep[i] = taken[row, column] <= most
+    return keep
 
 
 @kernel
@@ -48,11 +65,19 @@ def find_corners(
     height, width = image.shape
     rows, columns = (height + cell_px - 1) // cell_px, (width + cell_px - 1) // cell_px
     occupied = occupied_cells(tracked[settled], cell_px, rows, columns)
-    margin = max(border_px, _RADIUS + 2)
+    margin = max(border_px, _RADIUS + _BORDER + 1)
     found = np.empty((rows * columns + len(tracked), 2))
     found[: len(tracked)] = tracked
+    near = np.empty_like(found)
     count = len(tracked)
-    least_distance2 = 0.25 * cell_px * cell_px
+    side = cell_px + 2 * _BORDER
+    lines = np.empty((2 * _RADIUS + 1, 3, side + 2 * _RADIUS), dtype=np.float32)
+    sums = np.empty((3, side + 2 * _RADIUS), dtype=np.float32)
+    raw, smooth, weaker2 = (
+        np.empty((side, side), dtype=np.float32),
+        np.empty((side, side), dtype=np.float32),
+        np.empty((side, side), dtype=np.float32),
+    )
     for row in range(rows):
         for column in range(columns):
             if occupied[row, column]:
@@ -61,22 +86,106 @@ def find_corners(
             y0, y1 = max(margin, row * cell_px), min(height - margin, (row + 1) * cell_px)
             if x1 - x0 < 3 or y1 - y0 < 3:
                 continue
-            response, weaker = _harris(image, x0 - 1, y0 - 1, x1 + 1, y1 + 1)
-            best, bx, by = 0.0, -1, -1
-            for y in range(1, y1 - y0 + 1):
-                for x in range(1, x1 - x0 + 1):
-                    r = response[y, x]
-                    if r <= best or weaker[y, x] <= min_response or not allowed[y0 - 1 + y, x0 - 1 + x]:
-                        continue
-                    if _distance2(found[:count], x0 - 1.0 + x, y0 - 1.0 + y) >= least_distance2:
-                        best, bx, by = r, x, y
-            if bx < 0 or not _is_peak(response, bx, by):
+            high, wide = y1 - y0 + 2 * _BORDER, x1 - x0 + 2 * _BORDER
+            _harris(image, x0 - _BORDER, y0 - _BORDER, high, wide, lines, sums, raw, weaker2)
+            _smooth(raw, high, wide, smooth)
+            neighbours = _within(found[:count], x0, y0, x1, y1, 0.5 * cell_px, near)
+            x, y = _strongest(
+                smooth, weaker2, min_response * min_response, allowed, x0, y0, x1, y1, near[:neighbours], 0.5 * cell_px
+            )
+            if x < 0 or not _is_peak(smooth, x, y):
                 continue
-            px = x0 - 1 + bx + _peak_offset(response[by, bx - 1], best, response[by, bx + 1])
-            py = y0 - 1 + by + _peak_offset(response[by - 1, bx], best, response[by + 1, bx])
-            found[count, 0], found[count, 1] = px, py
+            at = smooth[y, x]
+            found[count, 0] = x0 - _BORDER + x + _peak_offset(smooth[y, x - 1], at, smooth[y, x + 1])
+            found[count, 1] = y0 - _BORDER + y + _peak_offset(smooth[y - 1, x], at, smooth[y + 1, x])
             count += 1
     return found[len(tracked) : count]
+
+
+@fast_kernel
+def _harris(
+    image: Image, x0: int, y0: int, high: int, wide: int, lines: AnyArray, sums: AnyArray,
+    response: AnyArray, weaker2: AnyArray,
+) -> None:  # fmt: skip
+    """Fill Harris' response, and the mean square gradient along the weaker direction, from pixel (x0, y0) on.
+
+    Sums over the window's columns are carried from row to row; all numbers in them are exact in single precision.
+    """
+    area = np.float32((2 * _RADIUS + 1) ** 2)
+    half, k = np.float32(0.5), np.float32(_HARRIS_K)
+    reach = wide + 2 * _RADIUS
+    left = x0 - _RADIUS
+    sums[:, :reach] = np.float32(0.0)
+    lines[:, :, :reach] = np.float32(0.0)
+    sxx, sxy, syy = sums[0], sums[1], sums[2]
+    for j in range(high + 2 * _RADIUS):
+        y = y0 - _RADIUS + j
+        above, at, below = image[y - 1, left:], image[y, left - 1 :], image[y + 1, left:]
+        line = lines[j % (2 * _RADIUS + 1)]
+        xx, xy, yy = line[0], line[1], line[2]
+        for i in range(reach):
+            gx = half * (np.float32(at[i + 2]) - np.float32(at[i]))
+            gy = half * (np.float32(below[i]) - np.float32(above[i]))
+            sxx[i] += gx * gx - xx[i]
+            sxy[i] += gx * gy - xy[i]
+            syy[i] += gy * gy - yy[i]
+            xx[i], xy[i], yy[i] = gx * gx, gx * gy, gy * gy
+        if j < 2 * _RADIUS:
+            continue
+        strength, weaker = response[j - 2 * _RADIUS], weaker2[j - 2 * _RADIUS]
+        for i in range(wide):
+            a = b = c = np.float32(0.0)
+            for shift in range(2 * _RADIUS + 1):
+                a += sxx[i + shift]
+                b += sxy[i + shift]
+                c += syy[i + shift]
+            a, b, c = a / area, b / area, c / area
+            strength[i] = a * c - b * b - k * (a + c) * (a + c)
+            weaker[i] = half * (a + c - np.sqrt((a - c) * (a - c) + np.float32(4.0) * b * b))
+
+
+@fast_kernel
+def _smooth(response: AnyArray, high: int, wide: int, smooth: AnyArray) -> None:
+    """Fill the response smoothed, because a box window leaves it level over several pixels around a corner."""
+    two, scale = np.float32(2.0), np.float32(1.0 / 16.0)
+    for j in range(1, high - 1):
+        above, at, below, out = response[j - 1], response[j], response[j + 1], smooth[j]
+        for i in range(1, wide - 1):
+            out[i] = scale * (
+                (above[i - 1] + two * at[i - 1] + below[i - 1])
+                + two * (above[i] + two * at[i] + below[i])
+                + (above[i + 1] + two * at[i + 1] + below[i + 1])
+            )
+
+
+@kernel
+def _within(pixels: Float, x0: int, y0: int, x1: int, y1: int, distance: float, near: Float) -> int:
+    """Fill those of pixels (N, 2) that are nearer than a distance to the rectangle; return their number."""
+    count = 0
+    for i in range(len(pixels)):
+        x, y = pixels[i, 0], pixels[i, 1]
+        if x0 - distance < x < x1 + distance and y0 - distance < y < y1 + distance:
+            near[count, 0], near[count, 1] = x, y
+            count += 1
+    return count
+
+
+@kernel
+def _strongest(
+    response: AnyArray, weaker2: AnyArray, least2: float, allowed: Bool, x0: int, y0: int, x1: int, y1: int,
+    near: Float, distance: float,
+) -> tuple[int, int]:  # fmt: skip
+    """Column and row of the response's largest value that is allowed and keeps its distance, or (-1, -1)."""
+    best, bx, by = np.float32(0.0), -1, -1
+    least_distance2 = distance * distance
+    for y in range(_BORDER, y1 - y0 + _BORDER):
+        for x in range(_BORDER, x1 - x0 + _BORDER):
+            if response[y, x] <= best or weaker2[y, x] <= least2:
+                continue
+            px, py = x0 - _BORDER + x, y0 - _BORDER + y
+            if allowed[py, px] and _distance2(near, px, py) >= least_distance2:
+                best, bx, by = response[y, x], x, y
+    return bx, by
 
 
 @kernel
@@ -90,64 +199,7 @@ def _distance2(pixels: Float, x: float, y: float) -> float:
 
 
 @kernel
-def _harris(image: Image, x0: int, y0: int, x1: int, y1: int) -> tuple[Float, Float]:
-    """Harris response, and rms gradient along the weaker direction, of the pixels [y0:y1, x0:x1].
-
-    The response is smoothed, because a box window leaves it level over several pixels around a corner.
-    """
-    response, weaker = _raw_harris(image, x0 - 1, y0 - 1, x1 + 1, y1 + 1)
-    across = response[:, :-2] + 2.0 * response[:, 1:-1] + response[:, 2:]
-    smooth = (across[:-2] + 2.0 * across[1:-1] + across[2:]) / 16.0
-    return smooth, weaker[1:-1, 1:-1]
-
-
-@kernel
-def _raw_harris(image: Image, x0: int, y0: int, x1: int, y1: int) -> tuple[Float, Float]:
-    """Both for each pixel by itself."""
-    w, h = x1 - x0, y1 - y0
-    wide, high = w + 2 * _RADIUS, h + 2 * _RADIUS
-    sums = np.zeros((3, high, w))  # of gxx, gxy, gyy along x
-    line = np.empty((3, wide))
-    for j in range(high):
-        y = min(max(y0 - _RADIUS + j, 1), image.shape[0] - 2)
-        for i in range(wide):
-            x = min(max(x0 - _RADIUS + i, 1), image.shape[1] - 2)
-            gx = 0.5 * (float(image[y, x + 1]) - float(image[y, x - 1]))
-            gy = 0.5 * (float(image[y + 1, x]) - float(image[y - 1, x]))
-            line[0, i], line[1, i], line[2, i] = gx * gx, gx * gy, gy * gy
-        for c in range(3):
-            total = 0.0
-            for i in range(2 * _RADIUS):
-                total += line[c, i]
-            for i in range(w):
-                total += line[c, i + 2 * _RADIUS]
-                sums[c, j, i] = total
-                total -= line[c, i]
-    response = np.empty((h, w))
-    weaker = np.empty((h, w))
-    area = (2 * _RADIUS + 1) ** 2
-    for i in range(w):
-        xx = xy = yy = 0.0
-        for j in range(2 * _RADIUS):
-            xx += sums[0, j, i]
-            xy += sums[1, j, i]
-            yy += sums[2, j, i]
-        for j in range(h):
-            xx += sums[0, j + 2 * _RADIUS, i]
-            xy += sums[1, j + 2 * _RADIUS, i]
-            yy += sums[2, j + 2 * _RADIUS, i]
-            a, b, c = xx / area, xy / area, yy / area
-            response[j, i] = a * c - b * b - _HARRIS_K * (a + c) * (a + c)
-            smaller = 0.5 * (a + c - np.sqrt((a - c) * (a - c) + 4.0 * b * b))
-            weaker[j, i] = np.sqrt(max(smaller, 0.0))
-            xx -= sums[0, j, i]
-            xy -= sums[1, j, i]
-            yy -= sums[2, j, i]
-    return response, weaker
-
-
-@kernel
-def _is_peak(response: Float, x: int, y: int) -> bool:
+def _is_peak(response: AnyArray, x: int, y: int) -> bool:
     """False on the slope towards a corner of the next cell."""
     for j in range(-1, 2):
         for i in range(-1, 2):

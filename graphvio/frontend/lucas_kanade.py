@@ -13,8 +13,11 @@ import cv2
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Image
-from graphvio.frontend.patches import align, prepare, sample, sample_warped
+from graphvio.frontend.patches import align, patches, prepare, sample, sample_affine, weaker2
 from graphvio.kernels import fast_kernel
+
+MIN_GRADIENT = 1.0
+"""Rms grey levels per pixel along a patch's weaker direction; below, it is not localised."""
 
 Pyramid = tuple[Image, ...]
 """An image and its halves, quarters..."""
@@ -29,7 +32,16 @@ def build_pyramid(image: Image, levels: int) -> Pyramid:
 
 
 def track(
-    source: Pyramid, target: Pyramid, pixels: Float, guess: Float, *, window_px: int, levels: int, max_return_px: float
+    source: Pyramid,
+    target: Pyramid,
+    pixels: Float,
+    guess: Float,
+    *,
+    window_px: int,
+    levels: int,
+    max_return_px: float,
+    min_gradient: float = MIN_GRADIENT,
+    first_levels: int | None = None,
 ) -> tuple[Float, Bool]:
     """Where corners of one image are in another, forth and, for a check, back again.
 
@@ -41,49 +53,63 @@ def track(
         window_px: side of the patch that is compared, odd.
         levels: pyramid levels that are used, 1 for the image alone.
         max_return_px: largest distance from the corner after tracking forth and back.
+        min_gradient: least rms gradient of a patch along its weaker direction, grey levels per pixel.
+        first_levels: where the guess is good: levels that are tried first; what fails is tried again with all.
 
     Returns:
         Pixels (N, 2) and whether each was found (N,).
     """
     half = window_px // 2
-    forth, found = _track_points(source[:levels], target[:levels], pixels, guess, half)
-    # The way back begins where it should end, so it needs no coarse levels.
-    back, returned = _track_points(target[:1], source[:1], forth, np.ascontiguousarray(pixels), half)
-    distance = np.hypot(back[:, 0] - pixels[:, 0], back[:, 1] - pixels[:, 1])
-    return forth, found & returned & (distance <= max_return_px)
+    few = levels if first_levels is None else min(first_levels, levels)
+    moved, found = _forth_and_back(source, target, pixels, guess, half, few, max_return_px, min_gradient)
+    if few < levels and not found.all():
+        again = ~found
+        moved[again], found[again] = _forth_and_back(
+            source, target, pixels[again], guess[again], half, levels, max_return_px, min_gradient
+        )
+    return moved, found
 
 
 @fast_kernel
-def _track_points(
-    source: Sequence[Image], target: Sequence[Image], pixels: Float, guess: Float, half: int
-) -> tuple[Float, Bool]:
-    """Points (N, 2) tracked through all levels, the coarsest first, and whether the finest one converged (N,)."""
+def _forth_and_back(
+    source: Sequence[Image], target: Sequence[Image], pixels: Float, guess: Float, half: int, levels: int,
+    max_return_px: float, min_gradient: float,
+) -> tuple[Float, Bool]:  # fmt: skip
+    """Points (N, 2) tracked through some levels, the coarsest first, and whether they are found and come back (N,)."""
     n = len(pixels)
     moved = guess.copy()
     found = np.zeros(n, dtype=np.bool_)
-    side = 2 * half + 1
-    bordered = np.empty((side + 2, side + 2), dtype=np.float32)
-    patch = np.empty((side, side), dtype=np.float32)
-    gx = np.empty((side, side), dtype=np.float32)
-    gy = np.empty((side, side), dtype=np.float32)
+    bordered = np.empty((2 * half + 3, 2 * half + 3), dtype=np.float32)
+    buffers = patches(3, half)
+    patch, gx, gy = buffers[0], buffers[1], buffers[2]
     for i in range(n):
-        for level in range(len(source) - 1, -1, -1):
+        for level in range(levels - 1, -1, -1):
             scale = 1.0 / (1 << level)
             x, y = pixels[i, 0] * scale, pixels[i, 1] * scale
             u, v = moved[i, 0] * scale, moved[i, 1] * scale
             if not sample(source[level], x, y, half + 1, bordered):
                 continue  # near the edge of a coarse level: the finer ones may still see it
             xx, xy, yy = prepare(bordered, patch, gx, gy)
-            u, v, converged = align(target[level], u, v, half, patch, gx, gy, xx, xy, yy)
+            u, v, converged = align(target[level], u, v, half, patch, gx, gy, xx, xy, yy, min_gradient)
             if converged or level > 0:
                 moved[i, 0], moved[i, 1] = u / scale, v / scale
             found[i] = converged and level == 0
+        if found[i]:
+            # The way back begins where it should end, so it needs no coarse levels.
+            found[i] = sample(target[0], moved[i, 0], moved[i, 1], half + 1, bordered)
+        if found[i]:
+            xx, xy, yy = prepare(bordered, patch, gx, gy)
+            x, y = pixels[i, 0], pixels[i, 1]
+            u, v, converged = align(source[0], x, y, half, patch, gx, gy, xx, xy, yy, min_gradient)
+            found[i] = converged and (u - x) ** 2 + (v - y) ** 2 <= max_return_px * max_return_px
     return moved, found
 
 
+@fast_kernel
 def register(
-    source: Image, target: Image, pixels: Float, warps: Float, guess: Float, *, window_px: int, max_shift_px: float
-) -> tuple[Float, Bool]:
+    source: Image, target: Image, pixels: Float, warps: Float, guess: Float, wanted: Bool, half: int,
+    max_shift_px: float, min_gradient: float,
+) -> tuple[Float, Bool, Bool]:  # fmt: skip
     """Where patches of one image are in another that sees them deformed, from a guess that is nearly right.
 
     Args:
@@ -92,33 +118,32 @@ def register(
         pixels: (N, 2) centres of the patches.
         warps: (N, 2, 2) derivative of the source pixel by the target pixel.
         guess: (N, 2) in the target.
-        window_px: side of the patch, odd.
+        wanted: (N,) which patches to look for.
+        half: of the patch's side, without its middle.
         max_shift_px: largest distance from the guess.
+        min_gradient: least rms gradient of a patch along its weaker direction, grey levels per pixel.
 
     Returns:
-        Pixels (N, 2), equal to the guess where not found, and whether each was found (N,).
+        Pixels (N, 2), equal to the guess where not found; whether each was found (N,); and whether its patch is in
+        the source and has that gradient (N,).
     """
-    moved, found = _register_points(source, target, pixels, warps, guess, window_px // 2)
-    shift = np.hypot(moved[:, 0] - guess[:, 0], moved[:, 1] - guess[:, 1])
-    found &= shift <= max_shift_px
-    return np.where(found[:, None], moved, guess), found
-
-
-@fast_kernel
-def _register_points(
-    source: Image, target: Image, pixels: Float, warps: Float, guess: Float, half: int
-) -> tuple[Float, Bool]:
     n = len(pixels)
     moved = guess.copy()
-    found = np.zeros(n, dtype=np.bool_)
-    side = 2 * half + 1
-    bordered = np.empty((side + 2, side + 2), dtype=np.float32)
-    patch = np.empty((side, side), dtype=np.float32)
-    gx = np.empty((side, side), dtype=np.float32)
-    gy = np.empty((side, side), dtype=np.float32)
+    found, localised = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+    bordered = np.empty((2 * half + 3, 2 * half + 3), dtype=np.float32)
+    buffers = patches(3, half)
+    patch, gx, gy = buffers[0], buffers[1], buffers[2]
+    least2 = (min_gradient * (2 * half + 1)) ** 2
     for i in range(n):
-        if not sample_warped(source, pixels[i, 0], pixels[i, 1], warps[i], half + 1, bordered):
+        x, y, warp = pixels[i, 0], pixels[i, 1], warps[i]
+        if not wanted[i] or not sample_affine(
+            source, x, y, warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1], half + 1, bordered
+        ):
             continue
         xx, xy, yy = prepare(bordered, patch, gx, gy)
-        moved[i, 0], moved[i, 1], found[i] = align(target, guess[i, 0], guess[i, 1], half, patch, gx, gy, xx, xy, yy)
-    return moved, found
+        localised[i] = weaker2(xx, xy, yy) >= least2
+        x, y = guess[i, 0], guess[i, 1]
+        u, v, converged = align(target, x, y, half, patch, gx, gy, xx, xy, yy, min_gradient)
+        if converged and (u - x) ** 2 + (v - y) ** 2 <= max_shift_px * max_shift_px:
+            moved[i, 0], moved[i, 1], found[i] = u, v, True
+    return moved, found, localised

@@ -1,13 +1,24 @@
-"""Square patches of an image: sampled with sub-pixel precision, compared with each other, and aligned."""
+"""Square patches of an image: sampled with sub-pixel precision, compared with each other, and aligned.
+
+A patch's rows are padded with zeros to a multiple of `_LANES`, so that loops over pixels run in whole vector
+registers. What stands in the padding of the image that it is compared with then has no weight.
+"""
 
 import numpy as np
 
-from graphvio.arrays import AnyArray, Float, Image
+from graphvio.arrays import AnyArray, Image
 from graphvio.kernels import fast_kernel
 
+_LANES = 16
 _MAX_ITERATIONS = 20
-_CONVERGED_PX = 0.01
-_MIN_GRADIENT = 1.0  # rms grey levels per pixel along the weaker direction; below, a point is not localised
+_CONVERGED_PX = 0.03  # the step is still taken: what is left after it is several times smaller
+
+
+@fast_kernel
+def patches(count: int, half: int) -> AnyArray:
+    """Room for patches of ``2 half + 1`` pixels on each side (count, side, padded side), all zero."""
+    side = 2 * half + 1
+    return np.zeros((count, side, (side + _LANES - 1) // _LANES * _LANES), dtype=np.float32)
 
 
 @fast_kernel
@@ -38,32 +49,47 @@ def sample(image: Image, x: float, y: float, half: int, out: AnyArray) -> bool:
 
 @fast_kernel
 def prepare(bordered: AnyArray, patch: AnyArray, gx: AnyArray, gy: AnyArray) -> tuple[float, float, float]:
-    """Fill the patch and its gradients, all of zero mean, and return the normal matrix's xx, xy, yy."""
+    """Fill the patch and its gradients, all of zero mean, and return the normal matrix's xx, xy, yy.
+
+    Args:
+        bordered: (side + 2, side + 2) the patch with one more pixel on each side.
+        patch: (side, padded side), as are the gradients.
+        gx: along the rows.
+        gy: along the columns.
+    """
     side = patch.shape[0]
-    mean = mean_x = mean_y = np.float32(0.0)
     half = np.float32(0.5)
     for j in range(side):
+        above, at, below = bordered[j], bordered[j + 1], bordered[j + 2]
+        values, dx, dy = patch[j], gx[j], gy[j]
         for i in range(side):
-            patch[j, i] = bordered[j + 1, i + 1]
-            gx[j, i] = half * (bordered[j + 1, i + 2] - bordered[j + 1, i])
-            gy[j, i] = half * (bordered[j + 2, i + 1] - bordered[j, i + 1])
-            mean += patch[j, i]
-            mean_x += gx[j, i]
-            mean_y += gy[j, i]
+            values[i] = at[i + 1]
+            dx[i] = half * (at[i + 2] - at[i])
+            dy[i] = half * (below[i + 1] - above[i + 1])
+    flat, flat_x, flat_y = patch.reshape(-1), gx.reshape(-1), gy.reshape(-1)
+    mean = mean_x = mean_y = xx = xy = yy = np.float32(0.0)
+    for k in range(flat.size):
+        mean += flat[k]
+        mean_x += flat_x[k]
+        mean_y += flat_y[k]
+        xx += flat_x[k] * flat_x[k]
+        xy += flat_x[k] * flat_y[k]
+        yy += flat_y[k] * flat_y[k]
     area = np.float32(side * side)
     mean /= area
     mean_x /= area
     mean_y /= area
-    xx = xy = yy = np.float32(0.0)
     for j in range(side):
+        values, dx, dy = patch[j], gx[j], gy[j]
         for i in range(side):
-            patch[j, i] -= mean
-            gx[j, i] -= mean_x
-            gy[j, i] -= mean_y
-            xx += gx[j, i] * gx[j, i]
-            xy += gx[j, i] * gy[j, i]
-            yy += gy[j, i] * gy[j, i]
-    return float(xx), float(xy), float(yy)
+            values[i] -= mean
+            dx[i] -= mean_x
+            dy[i] -= mean_y
+    return (
+        float(xx - area * mean_x * mean_x),
+        float(xy - area * mean_x * mean_y),
+        float(yy - area * mean_y * mean_y),
+    )
 
 
 @fast_kernel
@@ -75,39 +101,49 @@ def mismatch(
     The gradients have zero mean, so a constant difference of brightness contributes nothing.
     """
     height, width = image.shape
+    side, stride = patch.shape
     if not (half <= u < width - half - 1 and half <= v < height - half - 1):
         return 0.0, 0.0, False
     x0, y0 = int(np.floor(u)), int(np.floor(v))
+    first = (y0 - half) * width + x0 - half
+    if first + side * width + stride >= height * width:
+        return 0.0, 0.0, False  # the padding of the lowest row would read on beyond the image's end
     ax, ay = np.float32(u - x0), np.float32(v - y0)
     one = np.float32(1.0)
     w00, w01, w10, w11 = (one - ax) * (one - ay), ax * (one - ay), (one - ax) * ay, ax * ay
-    reach = 2 * half + 2
-    left, top = x0 - half, y0 - half
+    flat = image.reshape(-1)
     bx = by = np.float32(0.0)
-    for j in range(patch.shape[0]):
-        upper = image[top + j, left : left + reach]
-        lower = image[top + j + 1, left : left + reach]
-        for i in range(patch.shape[1]):
-            difference = (
-                w00 * np.float32(upper[i])
-                + w01 * np.float32(upper[i + 1])
-                + w10 * np.float32(lower[i])
-                + w11 * np.float32(lower[i + 1])
-                - patch[j, i]
-            )
-            bx += gx[j, i] * difference
-            by += gy[j, i] * difference
+    for j in range(side):
+        for k in range(0, stride, _LANES):
+            start = first + j * width + k
+            upper, lower = flat[start : start + _LANES + 1], flat[start + width : start + width + _LANES + 1]
+            values, dx, dy = patch[j, k : k + _LANES], gx[j, k : k + _LANES], gy[j, k : k + _LANES]
+            row_x = row_y = np.float32(0.0)  # sums of their own: a row need not wait for the one before
+            for i in range(_LANES):
+                difference = (
+                    w00 * np.float32(upper[i])
+                    + w01 * np.float32(upper[i + 1])
+                    + w10 * np.float32(lower[i])
+                    + w11 * np.float32(lower[i + 1])
+                    - values[i]
+                )
+                row_x += dx[i] * difference
+                row_y += dy[i] * difference
+            bx += row_x
+            by += row_y
     return float(bx), float(by), True
 
 
 @fast_kernel
 def align(
     image: Image, u: float, v: float, half: int, patch: AnyArray, gx: AnyArray, gy: AnyArray,
-    xx: float, xy: float, yy: float,
+    xx: float, xy: float, yy: float, min_gradient: float,
 ) -> tuple[float, float, bool]:  # fmt: skip
-    """Gauss-Newton from (u, v): the patch's place in an image, and whether the iteration converged there."""
-    smaller = 0.5 * (xx + yy - np.sqrt((xx - yy) * (xx - yy) + 4.0 * xy * xy))
-    if smaller < _MIN_GRADIENT * _MIN_GRADIENT * patch.size:
+    """Gauss-Newton from (u, v): the patch's place in an image, and whether the iteration converged there.
+
+    A patch whose rms gradient along the weaker direction is less than ``min_gradient`` is not localised.
+    """
+    if weaker2(xx, xy, yy) < min_gradient * min_gradient * (2 * half + 1) ** 2:
         return u, v, False
     determinant = xx * yy - xy * xy
     for _ in range(_MAX_ITERATIONS):
@@ -124,21 +160,39 @@ def align(
 
 
 @fast_kernel
-def sample_warped(image: Image, x: float, y: float, warp: Float, half: int, out: AnyArray) -> bool:
-    """Fill a patch around (x, y) whose pixels are ``warp`` apart; False where it leaves the image."""
+def weaker2(xx: float, xy: float, yy: float) -> float:
+    """Smaller eigenvalue of a normal matrix: the sum of squared gradients along their weaker direction."""
+    return float(0.5 * (xx + yy - np.sqrt((xx - yy) * (xx - yy) + 4.0 * xy * xy)))
+
+
+@fast_kernel
+def sample_affine(
+    image: Image, x: float, y: float, xx: float, xy: float, yx: float, yy: float, half: int, out: AnyArray
+) -> bool:
+    """Fill a patch around (x, y); False where it leaves the image.
+
+    Its pixels are the columns of ``[[xx, xy], [yx, yy]]`` apart, along its rows and along its columns.
+    """
     height, width = image.shape
-    reach_x = half * (abs(warp[0, 0]) + abs(warp[0, 1]))
-    reach_y = half * (abs(warp[1, 0]) + abs(warp[1, 1]))
-    if not (reach_x <= x < width - 1 - reach_x and reach_y <= y < height - 1 - reach_y):
-        return False
-    one = np.float32(1.0)
+    reach_x, reach_y = half * (abs(xx) + abs(xy)), half * (abs(yx) + abs(yy))
+    if not (reach_x + 1 <= x < width - 2 - reach_x and reach_y + 1 <= y < height - 2 - reach_y):
+        return False  # with a pixel to spare for rounding
+    flat = image.reshape(-1)
+    along_x, along_y = np.float32(xx), np.float32(yx)
+    # Places are counted from the patch's own corner of the image, where single precision is fine enough.
+    left, top = int(x - reach_x), int(y - reach_y)
+    first, stride, one = np.uint64(top * width + left), np.uint64(width), np.uint64(1)
     for j in range(2 * half + 1):
+        row = out[j]
+        px = np.float32(x - left - half * xx + xy * (j - half))
+        py = np.float32(y - top - half * yx + yy * (j - half))
         for i in range(2 * half + 1):
-            px = np.float32(x + warp[0, 0] * (i - half) + warp[0, 1] * (j - half))
-            py = np.float32(y + warp[1, 0] * (i - half) + warp[1, 1] * (j - half))
-            x0, y0 = int(px), int(py)
-            ax, ay = px - np.float32(x0), py - np.float32(y0)
-            upper = np.float32(image[y0, x0]) * (one - ax) + np.float32(image[y0, x0 + 1]) * ax
-            lower = np.float32(image[y0 + 1, x0]) * (one - ax) + np.float32(image[y0 + 1, x0 + 1]) * ax
-            out[j, i] = upper * (one - ay) + lower * ay
+            at_x, at_y = px + along_x * np.float32(i), py + along_y * np.float32(i)
+            x0, y0 = int(at_x), int(at_y)
+            ax, ay = at_x - np.float32(x0), at_y - np.float32(y0)
+            k = first + stride * np.uint64(y0) + np.uint64(x0)
+            a, b = np.float32(flat[k]), np.float32(flat[k + one])
+            c, d = np.float32(flat[k + stride]), np.float32(flat[k + stride + one])
+            upper, lower = a + ax * (b - a), c + ax * (d - c)
+            row[i] = upper + ay * (lower - upper)
     return True

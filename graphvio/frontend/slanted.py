@@ -8,19 +8,22 @@ Inverse compositional Gauss-Newton, as in `graphvio.frontend.lucas_kanade`.
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
-from graphvio.frontend.patches import align, prepare, sample
+from graphvio.frontend.patches import align, patches, prepare, sample, sample_affine
 from graphvio.kernels import fast_kernel
 
 _MAX_ITERATIONS = 10
-_CONVERGED_PX = 0.01
+_CONVERGED_PX = 0.01  # where texture is weak, much of a step is left to do; it would lean to the depth of before
+_CONVERGED_SLOPE = 0.003  # a slope from before must be free to change, or its error would last
 _MAX_SLOPE = 0.8
 _SLOPE_PRIOR = 100.0  # squared grey levels: a slope of 0.3 against noise of 3 grey levels; decides where nothing else
+_SHIFT_PRIOR = 1e-3  # keeps the normal matrix of a flat patch regular
 
 
 @fast_kernel
 def align_slanted(
-    left: Image, right: Image, pixels: Float, guess: Float, directions: Float, half: int
-) -> tuple[Float, Float, Float, Bool]:
+    left: Image, right: Image, pixels: Float, guess: Float, directions: Float, slopes: Float, known: Bool,
+    wanted: Bool, half: int,
+) -> tuple[Float, Float, Float, Bool]:  # fmt: skip
     """Align patches of the left image in the right one.
 
     Args:
@@ -29,99 +32,130 @@ def align_slanted(
         pixels: (N, 2) centres of the patches.
         guess: (N, 2) where the search starts.
         directions: (N, 2) unit vectors along the epipolar lines in the right image.
+        slopes: (N, 2) where their search starts: derivative of the shift along the line by the left pixel.
+        known: (N,) whether guess and slopes are known from before; elsewhere the patch is first shifted alone.
+        wanted: (N,) which patches to align.
         half: of the patch's side, without its middle.
 
     Returns:
-        Pixels (N, 2) in the right image; slopes (N, 2), the derivative of the shift along the line by the left
-        pixel; normalised cross-correlations there (N,); and whether each alignment converged (N,).
+        Pixels (N, 2) in the right image; slopes (N, 2); normalised cross-correlations there (N,); and whether each
+        alignment converged (N,).
     """
     n = len(pixels)
-    moved, slopes, correlations = guess.copy(), np.zeros((n, 2)), np.full(n, -1.0)
+    moved, found_slopes, correlations = guess.copy(), np.zeros((n, 2)), np.full(n, -1.0)
     found = np.zeros(n, dtype=np.bool_)
-    side = 2 * half + 1
-    bordered = np.empty((side + 2, side + 2), dtype=np.float32)
-    patch, gx, gy, sheared = (
-        np.empty((side, side), dtype=np.float32),
-        np.empty((side, side), dtype=np.float32),
-        np.empty((side, side), dtype=np.float32),
-        np.empty((side, side), dtype=np.float32),
-    )
-    columns = np.empty((4, side, side), dtype=np.float32)
+    bordered = np.empty((2 * half + 3, 2 * half + 3), dtype=np.float32)
+    buffers = patches(6, half)
+    patch, sheared, columns = buffers[0], buffers[1], buffers[2:]
+    factor, parameters, step = np.empty((4, 4)), np.empty(4), np.empty(4)
     for i in range(n):
-        if not sample(left, pixels[i, 0], pixels[i, 1], half + 1, bordered):
+        if not wanted[i] or not sample(left, pixels[i, 0], pixels[i, 1], half + 1, bordered):
             continue
-        xx, xy, yy = prepare(bordered, patch, gx, gy)
-        u, v, _ = align(right, guess[i, 0], guess[i, 1], half, patch, gx, gy, xx, xy, yy)
+        xx, xy, yy = prepare(bordered, patch, columns[0], columns[1])
         ex, ey = directions[i, 0], directions[i, 1]
-        inverse = np.linalg.inv(_steepest_descent(gx, gy, np.float32(ex), np.float32(ey), half, columns))
-        parameters = np.array([u, v, 0.0, 0.0])
+        parameters[0], parameters[1] = guess[i, 0], guess[i, 1]
+        parameters[2], parameters[3] = slopes[i, 0], slopes[i, 1]
+        if not known[i]:
+            parameters[0], parameters[1], _ = align(
+                right, guess[i, 0], guess[i, 1], half, patch, columns[0], columns[1], xx, xy, yy, 0.0
+            )
+        _steepest_descent(columns, ex, ey, half)
+        _factorise(columns, xx, xy, yy, factor)
         for _ in range(_MAX_ITERATIONS):
             if not _sample_sheared(right, parameters, ex, ey, half, sheared):
                 break
-            step = inverse @ _project(columns, sheared, patch)
+            _project(columns, sheared, patch, step)
+            _solve(factor, step)
             _compose(parameters, step, ex, ey)
-            if step[0] * step[0] + step[1] * step[1] < _CONVERGED_PX * _CONVERGED_PX:
+            if _is_small(step):
                 found[i] = True
                 break
         moved[i, 0], moved[i, 1] = parameters[0], parameters[1]
-        slopes[i, 0], slopes[i, 1] = parameters[2], parameters[3]
+        found_slopes[i, 0], found_slopes[i, 1] = parameters[2], parameters[3]
         if found[i]:
-            correlations[i] = _correlation(patch, sheared)
-    return moved, slopes, correlations, found
+            correlations[i] = _correlation(patch, sheared, 2 * half + 1)
+    return moved, found_slopes, correlations, found
 
 
 @fast_kernel
-def _steepest_descent(gx: AnyArray, gy: AnyArray, ex: float, ey: float, half: int, columns: AnyArray) -> Float:
-    """Fill the derivatives (4, side, side) of the patch by the parameters, of zero mean; return the normal matrix."""
+def _steepest_descent(columns: AnyArray, ex: float, ey: float, half: int) -> None:
+    """Fill the last two of the patch's derivatives (4, side, padded side) by its parameters, of zero mean."""
     side = 2 * half + 1
+    along_x, along_y = np.float32(ex), np.float32(ey)
     mean2 = mean3 = np.float32(0.0)
     for j in range(side):
+        gx, gy, by_x, by_y = columns[0, j], columns[1, j], columns[2, j], columns[3, j]
+        y = np.float32(j - half)
+        row2 = row3 = np.float32(0.0)
         for i in range(side):
-            along = gx[j, i] * ex + gy[j, i] * ey
-            columns[0, j, i], columns[1, j, i] = gx[j, i], gy[j, i]
-            columns[2, j, i] = along * np.float32(i - half)
-            columns[3, j, i] = along * np.float32(j - half)
-            mean2 += columns[2, j, i]
-            mean3 += columns[3, j, i]
+            along = gx[i] * along_x + gy[i] * along_y
+            by_x[i] = along * np.float32(i - half)
+            by_y[i] = along * y
+            row2 += by_x[i]
+            row3 += by_y[i]
+        mean2 += row2
+        mean3 += row3
     area = np.float32(side * side)
-    columns[2] -= mean2 / area
-    columns[3] -= mean3 / area
-    hessian = np.empty((4, 4))
+    mean2 /= area
+    mean3 /= area
+    for j in range(side):
+        by_x, by_y = columns[2, j], columns[3, j]
+        for i in range(side):
+            by_x[i] -= mean2
+            by_y[i] -= mean3
+
+
+@fast_kernel
+def _factorise(columns: AnyArray, xx: float, xy: float, yy: float, factor: Float) -> None:
+    """Fill the lower Cholesky factor (4, 4) of the normal matrix; its block of the shift alone is known."""
+    c0, c1 = columns[0].reshape(-1), columns[1].reshape(-1)
+    c2, c3 = columns[2].reshape(-1), columns[3].reshape(-1)
+    h02 = h03 = h12 = h13 = h22 = h23 = h33 = np.float32(0.0)
+    for k in range(c0.size):
+        h02 += c0[k] * c2[k]
+        h03 += c0[k] * c3[k]
+        h12 += c1[k] * c2[k]
+        h13 += c1[k] * c3[k]
+        h22 += c2[k] * c2[k]
+        h23 += c2[k] * c3[k]
+        h33 += c3[k] * c3[k]
+    factor[0, 0], factor[1, 0], factor[1, 1] = xx + _SHIFT_PRIOR, xy, yy + _SHIFT_PRIOR
+    factor[2, 0], factor[2, 1], factor[2, 2] = h02, h12, h22 + _SLOPE_PRIOR
+    factor[3, 0], factor[3, 1], factor[3, 2], factor[3, 3] = h03, h13, h23, h33 + _SLOPE_PRIOR
     for a in range(4):
-        for b in range(a + 1):
-            total = np.float32(0.0)
-            for j in range(side):
-                for i in range(side):
-                    total += columns[a, j, i] * columns[b, j, i]
-            hessian[a, b] = hessian[b, a] = total
-    hessian[2, 2] += _SLOPE_PRIOR
-    hessian[3, 3] += _SLOPE_PRIOR
-    hessian[0, 0] += 1e-3
-    hessian[1, 1] += 1e-3
-    return hessian
+        for b in range(a):
+            for k in range(b):
+                factor[a, b] -= factor[a, k] * factor[b, k]
+            factor[a, b] /= factor[b, b]
+            factor[a, a] -= factor[a, b] * factor[a, b]
+        factor[a, a] = np.sqrt(max(factor[a, a], _SHIFT_PRIOR))
+
+
+@fast_kernel
+def _solve(factor: Float, b: Float) -> None:
+    """Replace b (4,) by the solution of ``L L^T x = b``."""
+    for a in range(4):
+        for k in range(a):
+            b[a] -= factor[a, k] * b[k]
+        b[a] /= factor[a, a]
+    for a in range(3, -1, -1):
+        for k in range(a + 1, 4):
+            b[a] -= factor[k, a] * b[k]
+        b[a] /= factor[a, a]
+
+
+@fast_kernel
+def _is_small(step: Float) -> bool:
+    shift2 = step[0] * step[0] + step[1] * step[1]
+    slope2 = step[2] * step[2] + step[3] * step[3]
+    return bool(shift2 < _CONVERGED_PX * _CONVERGED_PX and slope2 < _CONVERGED_SLOPE * _CONVERGED_SLOPE)
 
 
 @fast_kernel
 def _sample_sheared(image: Image, parameters: Float, ex: float, ey: float, half: int, out: AnyArray) -> bool:
     """Fill the patch that the parameters ``[u, v, slope x, slope y]`` point at; False where it leaves the image."""
     u, v, a, b = parameters[0], parameters[1], parameters[2], parameters[3]
-    height, width = image.shape
-    reach = half * (1.0 + abs(a) + abs(b))
-    if not (reach <= u < width - 1 - reach and reach <= v < height - 1 - reach):
-        return False
-    one = np.float32(1.0)
-    along_x, along_y = np.float32(1.0 + ex * a), np.float32(ey * a)
-    for j in range(2 * half + 1):
-        x = np.float32(u + ex * b * (j - half) - half * (1.0 + ex * a))
-        y = np.float32(v + (j - half) * (1.0 + ey * b) - half * ey * a)
-        for i in range(2 * half + 1):
-            px, py = x + along_x * np.float32(i), y + along_y * np.float32(i)
-            x0, y0 = int(px), int(py)
-            ax, ay = px - np.float32(x0), py - np.float32(y0)
-            upper = np.float32(image[y0, x0]) * (one - ax) + np.float32(image[y0, x0 + 1]) * ax
-            lower = np.float32(image[y0 + 1, x0]) * (one - ax) + np.float32(image[y0 + 1, x0 + 1]) * ax
-            out[j, i] = upper * (one - ay) + lower * ay
-    return True
+    return sample_affine(image, u, v, 1.0 + ex * a, ex * b, ey * a, 1.0 + ey * b, half, out)
 
 
 @fast_kernel
@@ -136,30 +170,32 @@ def _compose(parameters: Float, step: Float, ex: float, ey: float) -> None:
 
 
 @fast_kernel
-def _project(columns: AnyArray, sheared: AnyArray, patch: AnyArray) -> Float:
-    """Derivatives times the difference of the patches (4,)."""
+def _project(columns: AnyArray, sheared: AnyArray, patch: AnyArray, out: Float) -> None:
+    """Fill the derivatives times the difference of the patches (4,)."""
+    c0, c1 = columns[0].reshape(-1), columns[1].reshape(-1)
+    c2, c3 = columns[2].reshape(-1), columns[3].reshape(-1)
+    seen, expected = sheared.reshape(-1), patch.reshape(-1)
     b0 = b1 = b2 = b3 = np.float32(0.0)
-    for j in range(patch.shape[0]):
-        for i in range(patch.shape[1]):
-            difference = sheared[j, i] - patch[j, i]
-            b0 += columns[0, j, i] * difference
-            b1 += columns[1, j, i] * difference
-            b2 += columns[2, j, i] * difference
-            b3 += columns[3, j, i] * difference
-    return np.array([b0, b1, b2, b3], dtype=np.float64)
+    for k in range(seen.size):
+        difference = seen[k] - expected[k]
+        b0 += c0[k] * difference
+        b1 += c1[k] * difference
+        b2 += c2[k] * difference
+        b3 += c3[k] * difference
+    out[0], out[1], out[2], out[3] = b0, b1, b2, b3
 
 
 @fast_kernel
-def _correlation(patch: AnyArray, other: AnyArray) -> float:
-    """Normalised cross-correlation of a patch of zero mean with another."""
+def _correlation(patch: AnyArray, other: AnyArray, side: int) -> float:
+    """Normalised cross-correlation of a patch of zero mean with another, both padded with zeros."""
+    a, b = patch.reshape(-1), other.reshape(-1)
     product = square = total = own = np.float32(0.0)
-    for j in range(patch.shape[0]):
-        for i in range(patch.shape[1]):
-            product += patch[j, i] * other[j, i]
-            square += other[j, i] * other[j, i]
-            total += other[j, i]
-            own += patch[j, i] * patch[j, i]
-    variance = square - total * total / np.float32(patch.size)
+    for k in range(a.size):
+        product += a[k] * b[k]
+        square += b[k] * b[k]
+        total += b[k]
+        own += a[k] * a[k]
+    variance = square - total * total / np.float32(side * side)
     if variance < 1e-3 or own < 1e-3:
         return -1.0
-    return float(product) / np.sqrt(float(variance) * float(own))
+    return float(product / np.sqrt(float(variance) * float(own)))

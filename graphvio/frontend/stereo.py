@@ -7,11 +7,12 @@ keep what they say about rotation.
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Image
+from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.cameras import distort
-from graphvio.kernels import kernel
+from graphvio.kernels import fast_kernel, kernel
 
 _HALF_PATCH = 5
+_SIDE = 2 * _HALF_PATCH + 1
 _AMBIGUOUS = 0.97
 _GAUSS_NEWTON_STEPS = 4
 
@@ -48,7 +49,7 @@ def epipolar_search(
     matches = np.zeros((n, 2))
     found = np.zeros(n, dtype=np.bool_)
     height, width = right.shape
-    patch = np.empty((2 * _HALF_PATCH + 1, 2 * _HALF_PATCH + 1))
+    patch = np.empty((_SIDE, _SIDE), dtype=np.float32)
     for i in range(n):
         if not _normalised_patch(left, pixels[i, 0], pixels[i, 1], patch):
             continue
@@ -190,36 +191,38 @@ def _on_curve(
 
 
 @kernel
-def _normalised_patch(image: Image, x: float, y: float, patch: Float) -> bool:
+def _normalised_patch(image: Image, x: float, y: float, patch: AnyArray) -> bool:
     """Fill the patch around (x, y) with zero mean and unit norm; False at the edge or without contrast."""
     cx, cy = round(x), round(y)
     height, width = image.shape
     if cx < _HALF_PATCH or cy < _HALF_PATCH or cx >= width - _HALF_PATCH or cy >= height - _HALF_PATCH:
         return False
-    mean = 0.0
-    for j in range(patch.shape[0]):
-        for i in range(patch.shape[1]):
-            value = float(image[int(cy) + j - _HALF_PATCH, int(cx) + i - _HALF_PATCH])
-            patch[j, i] = value
-            mean += value
-    patch -= mean / patch.size
-    norm = np.sqrt(np.sum(patch * patch))
+    left, top = int(cx) - _HALF_PATCH, int(cy) - _HALF_PATCH
+    values = image[top : top + _SIDE, left : left + _SIDE].astype(np.float32)
+    values -= np.mean(values)
+    norm = np.sqrt(np.sum(values * values))
     if norm < 1e-6:
         return False
-    patch /= norm
+    patch[:] = values / norm
     return True
 
 
-@kernel
-def _correlation(image: Image, cx: int, cy: int, patch: Float) -> float:
-    total = square = product = 0.0
-    for j in range(patch.shape[0]):
-        for i in range(patch.shape[1]):
-            value = float(image[cy + j - _HALF_PATCH, cx + i - _HALF_PATCH])
+@fast_kernel
+def _correlation(image: Image, cx: int, cy: int, patch: AnyArray) -> float:
+    """Normalised cross-correlation of a patch of zero mean and unit norm with the image around a pixel."""
+    total = square = 0
+    product = np.float32(0.0)
+    left, top = cx - _HALF_PATCH, cy - _HALF_PATCH
+    for j in range(_SIDE):
+        values, weights = image[top + j, left : left + _SIDE], patch[j]
+        row = np.float32(0.0)  # of its own: a row need not wait for the one before
+        for i in range(_SIDE):
+            value = int(values[i])
             total += value
             square += value * value
-            product += value * patch[j, i]
-    variance = square - total * total / patch.size
-    if variance < 1e-6:
+            row += np.float32(value) * weights[i]
+        product += row
+    variance = square - float(total) * total / (_SIDE * _SIDE)
+    if variance < 1e-3:
         return -1.0
-    return product / np.sqrt(variance)
+    return float(product / np.sqrt(variance))

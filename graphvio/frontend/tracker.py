@@ -8,16 +8,19 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
 from graphvio.errors import RigError
-from graphvio.frontend.corners import find_corners
-from graphvio.frontend.lucas_kanade import Pyramid, build_pyramid, register, track
+from graphvio.frontend.corners import find_corners, occupied_cells, thinned
+from graphvio.frontend.grain import noise_sigma
+from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, register, track
 from graphvio.frontend.matching import StereoMatcher
+from graphvio.frontend.prediction import predict_pixels, predict_warps
 from graphvio.frontend.stopwatch import Stopwatch
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import PairFrame, passes
 from graphvio.rig import Camera, StereoPair
 
 _MAX_TRACKS_PER_CELL = 2
 _MAX_FLAT_FRAMES = 3  # then another corner of the cell gets its chance
 _MAX_REGISTRATION_PX = 2.0
+_LEVELS_AFTER_PREDICTION = 2  # are enough where the motion is known; tracks that fail are tried again with all
 
 
 class PairTracker:
@@ -33,7 +36,8 @@ class PairTracker:
         self._last_pyramid: Pyramid = ()
         self._anchor = PairFrame.empty()
         self._anchor_image: Image | None = None
-        self._anchor_rays: list[Float] = []  # of each of its pixels and of the ones to the right and below
+        self._anchor_rays = np.zeros((3, 0, 2))  # of each of its pixels and of the ones to the right and below
+        self._noise_sigma = 0.0
 
     def observe(
         self,
@@ -58,19 +62,23 @@ class PairTracker:
         left, right = _checked(left, self._pair.left), _checked(right, self._pair.right)
         watch = Stopwatch()
         pyramid = build_pyramid(left, self._config.tracking.levels)
+        self._noise_sigma = noise_sigma(left)
+        # A patch of nothing but noise has 0.7 of its standard deviation.
+        min_gradient = min(MIN_GRADIENT, self._noise_sigma)
         watch.lap("pyramid")
         rejected: dict[str, int] = {}
-        kept, pixels, inverse_depths = self._follow(pyramid, left_T_left_prev, rejected)
+        kept, pixels, inverse_depths = self._follow(pyramid, left_T_left_prev, min_gradient, rejected)
         watch.lap("flow")
         if left_T_left_anchor is not None:
-            pixels = self._register(left, kept.ids, pixels, left_T_left_anchor)
+            pixels = self._register(left, kept.ids, pixels, left_T_left_anchor, min_gradient)
         watch.lap("register")
         new = self._renew(left, pixels, np.isfinite(inverse_depths))
         watch.lap("corners")
         pixels = np.concatenate([pixels, new])
         rays, has_ray = self._pair.left.unproject(pixels)
         inverse_depths = np.concatenate([inverse_depths, np.full(len(new), np.nan)])
-        matches = self._matcher.match(pyramid, right, pixels, rays, inverse_depths)
+        slopes = np.concatenate([kept.slopes, np.zeros((len(new), 2))])
+        matches = self._matcher.match(left, right, pixels, rays, inverse_depths, slopes, min_gradient)
         watch.lap("stereo")
         none = np.zeros(len(new), dtype=np.int64)
         has_depth = matches.good & has_ray
@@ -83,6 +91,7 @@ class PairTracker:
             right=matches.right,
             points=matches.points,
             covariances=matches.covariances,
+            slopes=matches.slopes,
             has_depth=has_depth,
             flat_for=np.where(has_depth, 0, np.concatenate([kept.flat_for, none]) + 1),
             rejected=rejected | matches.rejected,
@@ -97,7 +106,7 @@ class PairTracker:
         self._anchor = self._last
         self._anchor_image = self._last_pyramid[0] if self._last_pyramid else None
         beside = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        self._anchor_rays = [self._pair.left.unproject(self._last.pixels + step)[0] for step in beside]
+        self._anchor_rays = np.stack([self._pair.left.unproject(self._last.pixels + step)[0] for step in beside])
 
     def drop(self, ids: Int) -> None:
         """Forget tracks, so that fresh corners may take their place."""
@@ -105,7 +114,7 @@ class PairTracker:
             self._last = self._last.keep(~np.isin(self._last.ids, ids))
 
     def _follow(
-        self, pyramid: Pyramid, left_T_left_prev: Float | None, rejected: dict[str, int]
+        self, pyramid: Pyramid, left_T_left_prev: Float | None, min_gradient: float, rejected: dict[str, int]
     ) -> tuple[PairFrame, Float, Float]:
         """The tracks that are still there, as they were, with their pixels and predicted inverse depths (or NaN)."""
         last = self._last.keep(self._last.flat_for <= _MAX_FLAT_FRAMES)
@@ -114,7 +123,7 @@ class PairTracker:
         guess, inverse_depths = last.pixels, np.where(last.has_depth, last.points[:, 2], np.nan)
         if left_T_left_prev is not None:
             guess, inverse_depths = self._predict(last, left_T_left_prev)
-        settings = self._config.tracking
+        settings, corners = self._config.tracking, self._config.corners
         pixels, found = track(
             self._last_pyramid,
             pyramid,
@@ -123,84 +132,76 @@ class PairTracker:
             window_px=settings.window_px,
             levels=settings.levels,
             max_return_px=settings.max_forward_backward_px,
+            min_gradient=min_gradient,
+            first_levels=None if left_T_left_prev is None else _LEVELS_AFTER_PREDICTION,
         )
-        rejected["flow"] = int((~found).sum())
-        found &= self._pair.left.contains(pixels, self._config.corners.border_px)
-        whole = np.where(found[:, None], pixels, 0).round().astype(np.int64)
-        found &= self._allowed[whole[:, 1], whole[:, 0]]
-        found &= _thinned(pixels, found, self._config.corners.cell_px)
+        found = passes(np.ones(len(found), dtype=bool), found, "flow", rejected)
+        found = passes(found, self._pair.left.contains(pixels, corners.border_px), "edge", rejected)
+        columns, rows = np.where(found[:, None], pixels, 0.0).round().astype(np.int64).T
+        found = passes(found, self._allowed[rows, columns], "masked_left", rejected)
+        alone = thinned(pixels, found, corners.cell_px, _MAX_TRACKS_PER_CELL)  # the oldest of a cell come first
+        found = passes(found, alone, "crowded", rejected)
         return last.keep(found), pixels[found], inverse_depths[found]
 
     def _predict(self, last: PairFrame, left_T_left_prev: Float) -> tuple[Float, Float]:
         """Pixels (N, 2) and inverse depths (N,) of the tracks after a motion."""
+        camera = self._pair.left
         w = np.where(last.has_depth, np.maximum(last.points[:, 2], 0.0), 0.0)
-        moved = _moved(left_T_left_prev, last.left, w)
-        pixels, valid = self._pair.left.project(moved)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inverse_depths = np.where(last.has_depth & valid, w / moved[:, 2], np.nan)
+        pixels, inverse_depths, valid = predict_pixels(
+            last.left, w, left_T_left_prev, camera.model_number, camera.intrinsics, camera.distortion
+        )
+        valid &= camera.contains(pixels)
+        inverse_depths[~(last.has_depth & valid)] = np.nan
         return np.where(valid[:, None], pixels, last.pixels), inverse_depths
 
-    def _register(self, image: Image, ids: Int, pixels: Float, left_T_left_anchor: Float) -> Float:
+    def _register(self, image: Image, ids: Int, pixels: Float, left_T_left_anchor: Float, min_gradient: float) -> Float:
         """Pixels (N, 2) of the tracks, put right by the patches that they had at the anchor.
 
         Following a point from frame to frame adds up the errors of each step. The anchor's patch, deformed as the
         predicted motion would have it, shows where the point really is.
         """
-        if self._anchor_image is None:
-            return pixels
-        _, at_anchor, now = np.intersect1d(self._anchor.ids, ids, assume_unique=True, return_indices=True)
-        rows = self._anchor.has_depth[at_anchor]
-        at_anchor, now = at_anchor[rows], now[rows]
         anchor = self._anchor
-        w = np.maximum(anchor.points[at_anchor, 2], 0.0)
+        if self._anchor_image is None or not len(anchor.ids):
+            return pixels
+        rows = np.minimum(np.searchsorted(anchor.ids, ids), len(anchor.ids) - 1)
+        wanted = (anchor.ids[rows] == ids) & anchor.has_depth[rows]
         camera = self._pair.left
-        ahead = [_moved(left_T_left_anchor, rays[at_anchor], w) for rays in self._anchor_rays]
-        (at, ok), (right, ok_right), (below, ok_below) = (camera.project(points) for points in ahead)
-        target_by_source = np.stack([right - at, below - at], axis=-1)
-        usable = ok & ok_right & ok_below & (np.linalg.det(target_by_source) > 0.1)
-        at_anchor, now = at_anchor[usable], now[usable]
-        registered = pixels.copy()
-        registered[now], _ = register(
+        warps, usable = predict_warps(
+            self._anchor_rays[:, rows],
+            np.maximum(anchor.points[rows, 2], 0.0),
+            left_T_left_anchor,
+            camera.model_number,
+            camera.intrinsics,
+            camera.distortion,
+        )
+        registered, _, _ = register(
             self._anchor_image,
             image,
-            anchor.pixels[at_anchor],
-            np.linalg.inv(target_by_source[usable]),
-            pixels[now],
-            window_px=self._config.tracking.window_px,
-            max_shift_px=_MAX_REGISTRATION_PX,
+            anchor.pixels[rows],
+            warps,
+            pixels,
+            wanted & usable,
+            self._config.tracking.window_px // 2,
+            _MAX_REGISTRATION_PX,
+            min_gradient,
         )
         return registered
 
     def _renew(self, image: Image, pixels: Float, has_depth: Bool) -> Float:
-        """New corners (M, 2) where no track gives geometry."""
+        """New corners (M, 2) where no track gives geometry, weak ones too where there are few."""
         settings = self._config.corners
-        return find_corners(
-            image,
-            self._allowed,
-            pixels,
-            has_depth,
-            settings.cell_px,
-            settings.border_px,
-            settings.min_response,
-        )
-
-
-def _moved(motion: Float, rays: Float, inverse_depths: Float) -> Float:
-    """Points (N, 3) on rays (N, 2), seen after a motion (4, 4), up to scale: in units of the depth before it."""
-    ahead = np.column_stack([rays, np.ones(len(rays))])
-    return np.asarray(ahead @ motion[:3, :3].T + inverse_depths[:, None] * motion[:3, 3])
-
-
-def _thinned(pixels: Float, found: Bool, cell_px: int) -> Bool:
-    """Of the found tracks that have gathered in one cell, only the oldest (lowest id comes first) stay."""
-    cells = (pixels // cell_px).astype(np.int64)
-    keep = np.zeros(len(pixels), dtype=bool)
-    taken: dict[tuple[int, int], int] = {}
-    for i in np.flatnonzero(found):
-        cell = (int(cells[i, 0]), int(cells[i, 1]))
-        taken[cell] = taken.get(cell, 0) + 1
-        keep[i] = taken[cell] <= _MAX_TRACKS_PER_CELL
-    return keep
+        cell_px, border_px = settings.cell_px, settings.border_px
+        new = find_corners(image, self._allowed, pixels, has_depth, cell_px, border_px, settings.min_response)
+        admitted = settings.noise_factor * self._noise_sigma
+        rows, columns = -(-image.shape[0] // cell_px), -(-image.shape[1] // cell_px)
+        both = np.concatenate([pixels[has_depth], new])
+        share = occupied_cells(both, cell_px, rows, columns).mean()
+        if share >= settings.scarce_share or admitted >= settings.min_response:
+            return new
+        both = np.concatenate([pixels, new])
+        settled = np.concatenate([has_depth, np.ones(len(new), dtype=bool)])
+        weak = find_corners(image, self._allowed, both, settled, cell_px, border_px, admitted)
+        return np.concatenate([new, weak])
 
 
 def _checked(image: Image, camera: Camera) -> Image:

@@ -23,6 +23,7 @@ class PairFrame:
         right: (N, 2) the same in the right image; meaningful where ``has_depth``.
         points: (N, 3) ``[x, y, 1/Z]`` in the left camera's frame, see `graphvio.frontend.stereo`.
         covariances: (N, 3, 3) of ``points``, for a pixel noise of 1 px.
+        slopes: (N, 2) of the right patch, see `graphvio.frontend.slanted`; meaningful where ``has_depth``.
         has_depth: (N,) whether the stereo match passed all its tests.
         flat_for: (N,) number of frames, up to this one, without depth.
         rejected: what each test of tracking and stereo matching threw out.
@@ -37,6 +38,7 @@ class PairFrame:
     right: Float
     points: Float
     covariances: Float
+    slopes: Float
     has_depth: Bool
     flat_for: Int
     rejected: Mapping[str, int] = field(default_factory=dict)
@@ -44,6 +46,8 @@ class PairFrame:
 
     def keep(self, rows: Bool) -> PairFrame:
         """The same with only some of its tracks."""
+        if rows.all():
+            return self
         return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
     @staticmethod
@@ -59,9 +63,16 @@ class PairFrame:
             right=np.zeros((0, 2)),
             points=np.zeros((0, 3)),
             covariances=np.zeros((0, 3, 3)),
+            slopes=np.zeros((0, 2)),
             has_depth=none.astype(bool),
             flat_for=whole,
         )
 
 
 _COLUMNS = tuple(f.name for f in fields(PairFrame) if f.name not in ("stamp_ns", "rejected", "stage_ms"))
+
+
+def passes(candidates: Bool, test: Bool, name: str, rejected: dict[str, int]) -> Bool:
+    """Which candidates (N,) pass a test (N,); how many did not is noted under the test's name."""
+    rejected[name] = int((candidates & ~test).sum())
+    return np.asarray(candidates & test)

@@ -1,0 +1,96 @@
+"""Where points should be after a predicted motion, and how it deforms their surroundings."""
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float
+from graphvio.cameras import distort, fold_radius
+from graphvio.kernels import kernel
+
+_MIN_AREA = 0.1  # a patch that has shrunk more than this is no longer comparable
+
+
+@kernel
+def predict_pixels(
+    rays: Float, inverse_depths: Float, motion: Float, model: int, intrinsics: Float, distortion: Float
+) -> tuple[Float, Float, Bool]:
+    """Pixels and inverse depths of points after a motion.
+
+    Args:
+        rays: (N, 2) normalised coordinates before.
+        inverse_depths: (N,) before, 1/m.
+        motion: (4, 4) maps points before to points after.
+        model: of the camera, with its ``intrinsics`` (4,) and ``distortion`` (5,).
+
+    Returns:
+        Pixels (N, 2), inverse depths (N,), and whether each point is in front of the camera (N,).
+    """
+    n = len(rays)
+    pixels, moved, valid = np.zeros((n, 2)), np.zeros(n), np.zeros(n, dtype=np.bool_)
+    limit = fold_radius(model, distortion)
+    for i in range(n):
+        x, y, z = _moved(rays[i, 0], rays[i, 1], inverse_depths[i], motion)
+        pixels[i, 0], pixels[i, 1], valid[i] = _project(x, y, z, limit, model, intrinsics, distortion)
+        if valid[i]:
+            moved[i] = inverse_depths[i] / z
+    return pixels, moved, valid
+
+
+@kernel
+def predict_warps(
+    rays: Float, inverse_depths: Float, motion: Float, model: int, intrinsics: Float, distortion: Float
+) -> tuple[Float, Bool]:
+    """How a motion deforms the surroundings of points that face the camera.
+
+    Args:
+        rays: (3, N, 2) normalised coordinates before, of each point's pixel, the next to its right, the next below.
+        inverse_depths: (N,) before, 1/m.
+        motion: (4, 4) maps points before to points after.
+        model: of the camera, with its ``intrinsics`` (4,) and ``distortion`` (5,).
+
+    Returns:
+        Derivatives (N, 2, 2) of the pixel before by the pixel after, and whether each exists (N,).
+    """
+    n = len(inverse_depths)
+    warps, valid = np.zeros((n, 2, 2)), np.zeros(n, dtype=np.bool_)
+    limit = fold_radius(model, distortion)
+    for i in range(n):
+        w = inverse_depths[i]
+        x, y, z = _moved(rays[0, i, 0], rays[0, i, 1], w, motion)
+        u, v, ok = _project(x, y, z, limit, model, intrinsics, distortion)
+        x, y, z = _moved(rays[1, i, 0], rays[1, i, 1], w, motion)
+        u_right, v_right, ok_right = _project(x, y, z, limit, model, intrinsics, distortion)
+        x, y, z = _moved(rays[2, i, 0], rays[2, i, 1], w, motion)
+        u_below, v_below, ok_below = _project(x, y, z, limit, model, intrinsics, distortion)
+        a, b, c, d = u_right - u, u_below - u, v_right - v, v_below - v
+        area = a * d - b * c
+        if ok and ok_right and ok_below and area > _MIN_AREA:
+            warps[i, 0, 0], warps[i, 0, 1] = d / area, -b / area
+            warps[i, 1, 0], warps[i, 1, 1] = -c / area, a / area
+            valid[i] = True
+    return warps, valid
+
+
+@kernel
+def _moved(x: float, y: float, w: float, motion: Float) -> tuple[float, float, float]:
+    """The point ``[x, y, 1, w]`` after a motion, up to scale: in units of the depth before it."""
+    m = motion
+    return (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] + w * m[0, 3],
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] + w * m[1, 3],
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] + w * m[2, 3],
+    )
+
+
+@kernel
+def _project(
+    x: float, y: float, z: float, limit: float, model: int, intrinsics: Float, distortion: Float
+) -> tuple[float, float, bool]:
+    """Pixel of a point, and whether the camera's model reaches that far from its axis."""
+    if not z > 1e-6 or not x * x + y * y < (limit * z) ** 2:
+        return 0.0, 0.0, False
+    xd, yd, a, b, c, d = distort(model, distortion, x / z, y / z)
+    return (
+        intrinsics[0] * xd + intrinsics[2],
+        intrinsics[1] * yd + intrinsics[3],
+        a * d - b * c > 0.0 and a > 0.0,
+    )

@@ -1,0 +1,119 @@
+"""Alignment of patches on slanted surfaces, seen by a rectified pair: disparities and their gradients are known."""
+
+import numpy as np
+import pytest
+from waves import picture, waves
+
+from graphvio.arrays import Bool, Float, Image
+from graphvio.frontend.lucas_kanade import register
+from graphvio.frontend.slanted import align_slanted
+
+HALF = 7
+DISPARITY = 12.3
+MIDDLE = (160.0, 120.0)
+X, Y = np.meshgrid(np.arange(320.0), np.arange(240.0))
+NEARER = np.array([-1.0, 0.0])  # where a right pixel moves when its point comes nearer
+
+
+def views(slope_x: float, slope_y: float, seed: int = 0, noise: float = 1.0) -> tuple[Image, Image]:
+    """Left and right image of a plane whose disparity grows by these slopes along the left image's axes."""
+    # x_right = x - d with d = DISPARITY + slope_x (x - mx) + slope_y (y - my), solved for x
+    source_x = (X + DISPARITY - slope_x * MIDDLE[0] + slope_y * (Y - MIDDLE[1])) / (1.0 - slope_x)
+    rng = np.random.default_rng(seed)
+    left, right = waves(X, Y, seed), waves(source_x, Y, seed)
+    grain = noise / 45.0 * rng.standard_normal((2, *X.shape))
+    return picture(left + grain[0]), picture(right + grain[1])
+
+
+def grid() -> Float:
+    x, y = np.meshgrid(np.arange(100.0, 221.0, 24.0), np.arange(70.0, 171.0, 20.0))
+    return np.column_stack([x.ravel(), y.ravel()]) + 0.3
+
+
+def truth(pixels: Float, slope_x: float, slope_y: float) -> Float:
+    disparity = DISPARITY + slope_x * (pixels[:, 0] - MIDDLE[0]) + slope_y * (pixels[:, 1] - MIDDLE[1])
+    return np.asarray(pixels - np.column_stack([disparity, np.zeros(len(pixels))]))
+
+
+def aligned(
+    images: tuple[Image, Image], guess: Float, slopes: Float | None = None, wanted: Bool | None = None
+) -> tuple[Float, Float, Float, Bool]:
+    n = len(guess)
+    known = np.full(n, slopes is not None)
+    return align_slanted(
+        *images, grid(), guess, np.tile(NEARER, (n, 1)), np.zeros((n, 2)) if slopes is None else slopes, known,
+        np.ones(n, dtype=bool) if wanted is None else wanted, HALF,
+    )  # fmt: skip
+
+
+SLANTS = [(0.0, 0.0), (0.15, 0.0), (0.0, 0.3), (-0.25, 0.2), (0.3, -0.35)]
+
+
+@pytest.mark.parametrize("slant", SLANTS)
+def test_place_and_slopes_are_found(slant: tuple[float, float]) -> None:
+    right = truth(grid(), *slant)
+    moved, slopes, correlations, found = aligned(views(*slant), right + np.array([0.7, 0.2]))
+    assert found.mean() > 0.8
+    error = np.linalg.norm(moved - right, axis=1)[found]
+    assert np.median(error) < 0.04
+    assert np.quantile(error, 0.9) < 0.12
+    np.testing.assert_allclose(np.median(slopes[found], axis=0), slant, atol=0.01)
+    assert np.median(correlations[found]) > 0.98
+
+
+@pytest.mark.parametrize("slant", SLANTS[2:])
+def test_a_shift_alone_is_off_or_lost(slant: tuple[float, float]) -> None:
+    images, right = views(*slant), truth(grid(), *slant)
+    n = len(right)
+    level, everything = np.tile(np.eye(2), (n, 1, 1)), np.ones(n, dtype=bool)
+    shifted, kept, _ = register(*images, grid(), level, right, everything, HALF, 3.0, 1.0)
+    moved, _, _, found = aligned(images, right)
+    by_shift = np.where(kept, np.linalg.norm(shifted - right, axis=1), np.inf)
+    by_slant = np.where(found, np.linalg.norm(moved - right, axis=1), np.inf)
+    assert np.median(by_shift) > 3.0 * np.median(by_slant)
+
+
+def test_it_may_start_with_the_slopes_of_before() -> None:
+    slant = (-0.25, 0.2)
+    images, right = views(*slant), truth(grid(), *slant)
+    before = np.tile(slant, (len(right), 1)) + np.array([0.03, -0.03])
+    known, slopes, _, found_known = aligned(images, right + np.array([0.5, -0.2]), before)
+    new, _, _, found_new = aligned(images, right + np.array([0.5, -0.2]))
+    both = found_known & found_new
+    assert both.mean() > 0.95
+    assert np.median(np.linalg.norm(known - new, axis=1)[both]) < 0.02
+    np.testing.assert_allclose(np.median(slopes[both], axis=0), slant, atol=0.01)
+
+
+@pytest.mark.parametrize(("gain", "offset", "within_px"), [(1.0, -20.0, 0.05), (0.9, -10.0, 0.2)])
+def test_a_change_of_exposure_hardly_counts(gain: float, offset: float, within_px: float) -> None:
+    left, right_image = views(0.1, 0.1)
+    darker = np.clip(np.round(gain * right_image + offset), 0, 255).astype(np.uint8)
+    right = truth(grid(), 0.1, 0.1)
+    moved, _, correlations, found = aligned((left, darker), right)
+    assert found.mean() > 0.9
+    assert np.median(np.linalg.norm(moved - right, axis=1)[found]) < within_px
+    assert np.median(correlations[found]) > 0.97
+
+
+def test_what_is_not_there_does_not_correlate() -> None:
+    left, _ = views(0.0, 0.0)
+    _, other = views(0.0, 0.0, seed=1)
+    _, _, correlations, found = aligned((left, other), truth(grid(), 0.0, 0.0))
+    assert np.mean(found & (correlations > 0.7)) < 0.3
+    flat = np.full_like(left, 100)
+    _, _, correlations, _ = aligned((left, flat), grid())
+    assert correlations.max() <= 0.0
+    _, _, correlations, _ = aligned((flat, flat), grid())
+    assert correlations.max() <= 0.0
+
+
+def test_only_wanted_patches_are_aligned_and_none_beyond_the_edge() -> None:
+    images, right = views(0.0, 0.0), truth(grid(), 0.0, 0.0)
+    wanted = np.arange(len(right)) % 2 == 0
+    assert not aligned(images, right, wanted=wanted)[3][~wanted].any()
+    for far in ([-50.0, 0.0], [400.0, 0.0], [0.0, -300.0], [0.0, 300.0]):
+        moved, _, _, found = aligned(images, right + far)
+        outside = ((right + far) < 0).any(axis=1) | ((right + far) > [320.0, 240.0]).any(axis=1)
+        assert not found[outside].any()
+        np.testing.assert_array_equal(moved[outside], (right + far)[outside])

@@ -1,0 +1,251 @@
+"""One pair's tracks, on images of a textured wall that faces the cameras: where each point goes is known."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from synthetic import transform
+from waves import picture, waves
+
+from graphvio.arrays import AnyArray, Bool, Float, Image
+from graphvio.config import Config, CornerConfig
+from graphvio.errors import RigError
+from graphvio.frontend.grain import noise_sigma
+from graphvio.frontend.matching import StereoMatcher
+from graphvio.frontend.tracker import PairTracker
+from graphvio.frontend.tracks import PairFrame
+from graphvio.rig import Camera, StereoPair
+
+WIDTH, HEIGHT = 320, 240
+FOCAL, BASELINE, DISTANCE = 250.0, 0.1, 2.0
+DISPARITY = FOCAL * BASELINE / DISTANCE
+X, Y = np.meshgrid(np.arange(float(WIDTH)), np.arange(float(HEIGHT)))
+FOLLOWED = ("flow", "edge", "masked_left", "crowded")
+MATCHED = ("search", "alignment", "appearance", "corner", "left_right", "outside", "masked", "epipolar", "depth_range")
+
+
+def rectified(left_mask: Path | None = None, right_mask: Path | None = None) -> StereoPair:
+    intrinsics = np.array([FOCAL, FOCAL, 0.5 * WIDTH, 0.5 * HEIGHT])
+    model = ("radial-tangential", (WIDTH, HEIGHT), intrinsics, np.zeros(5))
+    right = transform([0.0, 0.0, 0.0], [BASELINE, 0.0, 0.0])
+    return StereoPair(
+        "pair", Camera("left", *model, np.eye(4), mask=left_mask), Camera("right", *model, right, mask=right_mask)
+    )
+
+
+def on_wall(pixels: Float, left_T_wall: Float) -> Float:
+    """Points (N, 3) of the wall ``z = DISTANCE`` that pixels (N, 2) of the left camera see."""
+    rays = np.column_stack([(pixels - [0.5 * WIDTH, 0.5 * HEIGHT]) / FOCAL, np.ones(len(pixels))])
+    wall_T_left = np.linalg.inv(left_T_wall)
+    ahead = rays @ wall_T_left[:3, :3].T
+    depths = (DISTANCE - wall_T_left[2, 3]) / ahead[:, 2]
+    return np.asarray(wall_T_left[:3, 3] + depths[:, None] * ahead)
+
+
+def seen(points: Float, left_T_wall: Float) -> Float:
+    moved = points @ left_T_wall[:3, :3].T + left_T_wall[:3, 3]
+    return np.asarray(FOCAL * moved[:, :2] / moved[:, 2:] + [0.5 * WIDTH, 0.5 * HEIGHT])
+
+
+def view(camera_T_wall: Float, seed: int, noise: float) -> Image:
+    """What a camera sees of the wall."""
+    points = on_wall(np.column_stack([X.ravel(), Y.ravel()]), camera_T_wall)
+    scale = FOCAL / DISTANCE  # one pixel of wall at the start
+    grey = waves(points[:, 0].reshape(X.shape) * scale, points[:, 1].reshape(X.shape) * scale)
+    return picture(grey + noise / 45.0 * np.random.default_rng(seed).standard_normal(X.shape))
+
+
+def views(left_T_wall: Float, seed: int = 0, noise: float = 1.5) -> tuple[Image, Image]:
+    right_T_left = transform([0.0, 0.0, 0.0], [-BASELINE, 0.0, 0.0])
+    return view(left_T_wall, 2 * seed, noise), view(right_T_left @ left_T_wall, 2 * seed + 1, noise)
+
+
+def walk(frames: int) -> list[Float]:
+    """``left_T_wall`` of a camera that turns slowly about its axis and approaches."""
+    return [transform([0.0, 0.0, 0.015 * k], [0.002 * k, 0.0, -0.025 * k]) for k in range(frames)]
+
+
+def followed(poses: list[Float], *, anchored: bool, tracker: PairTracker | None = None) -> list[PairFrame]:
+    tracker = PairTracker(rectified(), Config()) if tracker is None else tracker
+    frames = []
+    for k, pose in enumerate(poses):
+        since_last = pose @ np.linalg.inv(poses[k - 1]) if k else None
+        since_first = pose @ np.linalg.inv(poses[0]) if k and anchored else None
+        frames.append(tracker.observe(k, *views(pose, k), since_last, since_first))
+        if k == 0:
+            tracker.anchor()
+    return frames
+
+
+def test_identities_and_ages() -> None:
+    frames = followed(walk(6), anchored=True)
+    for before, after in pairwise(frames):
+        assert (np.diff(after.ids) > 0).all()
+        old = np.isin(after.ids, before.ids)
+        assert old.mean() > 0.6
+        np.testing.assert_array_equal(after.ages[old], before.ages[np.isin(before.ids, after.ids)] + 1)
+        assert (after.ages[~old] == 0).all()
+        assert after.ids[~old].min(initial=10**9) > before.ids.max()  # no identity is given twice
+    assert frames[-1].ages.max() == 5
+
+
+def test_depths_are_those_of_the_wall() -> None:
+    poses = walk(5)
+    frame = followed(poses, anchored=True)[-1]
+    good = frame.has_depth
+    assert good.mean() > 0.8
+    points = on_wall(frame.pixels[good], poses[-1])
+    depths = (points @ poses[-1][:3, :3].T + poses[-1][:3, 3])[:, 2]
+    sigma = 0.3 * np.sqrt(frame.covariances[good, 2, 2])
+    assert np.median(np.abs(frame.points[good, 2] - 1.0 / depths) / sigma) < 1.0
+
+
+def test_the_anchor_keeps_points_where_they_are() -> None:
+    poses = walk(16)
+    errors = {}
+    for anchored in (False, True):
+        frames = followed(poses, anchored=anchored)
+        first, last = frames[0], frames[-1]
+        both, at_first, at_last = np.intersect1d(first.ids, last.ids, return_indices=True)
+        assert len(both) > 12
+        expected = seen(on_wall(first.pixels[at_first], poses[0]), poses[-1])
+        errors[anchored] = np.median(np.linalg.norm(last.pixels[at_last] - expected, axis=1))
+    assert errors[True] < 0.1
+    assert errors[True] < 0.6 * errors[False]
+
+
+def test_every_rejection_is_counted() -> None:
+    frames = followed(walk(8), anchored=True)
+    for before, after in pairwise(frames):
+        entered = int((before.flat_for <= 3).sum())
+        kept = int((after.ages > 0).sum())
+        assert entered - kept == sum(after.rejected[name] for name in FOLLOWED)
+        assert int((~after.has_depth).sum()) == sum(after.rejected[name] for name in MATCHED)
+    assert set(frames[-1].rejected) == {*FOLLOWED, *MATCHED}
+
+
+def test_dropped_tracks_are_gone() -> None:
+    tracker = PairTracker(rectified(), Config())
+    poses = walk(2)
+    first = tracker.observe(0, *views(poses[0]), None, None)
+    tracker.drop(first.ids[::2])
+    second = tracker.observe(1, *views(poses[1]), None, None)
+    assert not np.isin(first.ids[::2], second.ids).any()
+    assert np.isin(first.ids[1::2], second.ids).mean() > 0.6
+
+
+def test_a_wrong_prediction_costs_few_tracks() -> None:
+    poses = walk(2)
+    tracker = PairTracker(rectified(), Config())
+    first = tracker.observe(0, *views(poses[0]), None, None)
+    wrong = transform([0.0, 0.03, 0.0], [0.0, 0.0, 0.0])  # by 8 pixels: too far for the finest levels alone
+    second = tracker.observe(1, *views(poses[1], 1), wrong, None)
+    assert np.isin(first.ids, second.ids).mean() > 0.7
+
+
+def mask_of(allowed: Bool, path: Path) -> Path:
+    cv2.imwrite(str(path), 255 * allowed.astype(np.uint8))
+    return path
+
+
+def test_the_left_mask_keeps_corners_and_tracks_out(tmp_path: Path) -> None:
+    pair = rectified(left_mask=mask_of(X < 200, tmp_path / "left.png"))
+    for frame in followed(walk(4), anchored=True, tracker=PairTracker(pair, Config())):
+        assert len(frame.ids) > 10
+        assert frame.pixels[:, 0].max() < 200.5
+
+
+def test_the_right_mask_keeps_matches_out(tmp_path: Path) -> None:
+    pair = rectified(right_mask=mask_of(X < 200, tmp_path / "right.png"))
+    images = views(np.eye(4))
+    frame = PairTracker(pair, Config()).observe(0, *images, None, None)
+    whole = PairTracker(rectified(), Config()).observe(0, *images, None, None)
+    np.testing.assert_array_equal(frame.pixels, whole.pixels)
+    hidden = frame.pixels[:, 0] - DISPARITY > 200.7
+    clear = frame.pixels[:, 0] - DISPARITY < 198.5
+    assert hidden.sum() > 5
+    assert not frame.has_depth[hidden].any()
+    np.testing.assert_array_equal(frame.has_depth[clear], whole.has_depth[clear])
+    assert frame.rejected["masked"] == int((whole.has_depth & ~frame.has_depth).sum())
+
+
+def test_a_match_must_be_a_corner_in_the_right_image_too() -> None:
+    left, right = views(np.eye(4))
+    pair = rectified()
+    matcher = StereoMatcher(pair, Config(), np.ones(left.shape, dtype=bool))
+    x, y = np.meshgrid(np.arange(60.0, 280.0, 30.0), np.arange(40.0, 210.0, 30.0))
+    pixels = np.column_stack([x.ravel(), y.ravel()])
+    rays, _ = pair.left.unproject(pixels)
+    n = len(pixels)
+    fainter = np.round(128.0 + 0.6 * (right.astype(float) - 128.0)).astype(np.uint8)
+    rejected = []
+    for seen_right in (right, fainter):
+        matches = matcher.match(left, seen_right, pixels, rays, np.full(n, 0.5), np.zeros((n, 2)), 6.0)
+        rejected.append(matches.rejected["corner"])
+        assert matches.good.sum() + sum(matches.rejected.values()) == n
+    assert rejected[0] < 0.15 * n
+    assert rejected[1] > 2 * rejected[0]
+
+
+# ------------------------------------------------------------------ low light
+
+
+def half_blank(brightness: float, noise: float, seed: int = 0) -> Image:
+    """Texture on the left, a blank wall on the right."""
+    light = 128.0 + 45.0 * np.where(X < 160, waves(X, Y), 0.0)
+    grain = noise * np.random.default_rng(seed).standard_normal(X.shape)
+    return np.asarray(np.clip(np.round(brightness * light + grain), 0, 255), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("noise", [0.3, 0.7])
+def test_weak_corners_are_admitted_in_low_light_but_no_noise(noise: float) -> None:
+    dark = half_blank(0.1, noise)
+    frame = PairTracker(rectified(), Config()).observe(0, dark, dark, None, None)
+    plain = Config(corners=CornerConfig(scarce_share=0.0))
+    before = PairTracker(rectified(), plain).observe(0, dark, dark, None, None)
+    assert len(before.ids) < 6
+    assert np.sum(frame.pixels[:, 0] < 165) > 12
+    assert np.sum(frame.pixels[:, 0] > 170) <= 1
+
+
+def test_weak_corners_are_tracked_and_matched() -> None:
+    poses = walk(4)
+    tracker = PairTracker(rectified(), Config())
+    for k, pose in enumerate(poses):
+        left, right = views(pose, k, noise=3.0)
+        left, right = (np.round(0.1 * image).astype(np.uint8) for image in (left, right))
+        frame = tracker.observe(k, left, right, None, None)
+    assert np.sum(frame.ages == 3) > 10
+    assert frame.has_depth.mean() > 0.5
+
+
+def test_a_rich_image_gets_no_weak_corners() -> None:
+    images = views(np.eye(4))
+    frames = [
+        PairTracker(rectified(), Config(corners=CornerConfig(scarce_share=share))).observe(0, *images, None, None)
+        for share in (0.0, CornerConfig().scarce_share)
+    ]
+    np.testing.assert_array_equal(frames[0].pixels, frames[1].pixels)
+
+
+def test_noise_is_told_from_texture() -> None:
+    flat = np.full((HEIGHT, WIDTH), 100.0)
+    for sigma in (0.7, 2.0, 6.0):
+        grain = sigma * np.random.default_rng(1).standard_normal(flat.shape)
+        for scene in (flat, flat + 0.2 * X, flat + 40.0 * (X > 150)):
+            assert noise_sigma(np.round(scene + grain).astype(np.uint8)) == pytest.approx(sigma, rel=0.12)
+        smooth = picture(waves(0.5 * X, 0.5 * Y) + grain / 45.0)
+        assert noise_sigma(smooth) == pytest.approx(sigma, rel=0.5)
+    assert noise_sigma(flat.astype(np.uint8)) == pytest.approx(1.0 / np.sqrt(12.0))  # rounding is noise
+    assert noise_sigma(np.zeros((HEIGHT, WIDTH), dtype=np.uint8)) > 0.0
+
+
+def test_images_must_fit_the_rig() -> None:
+    tracker = PairTracker(rectified(), Config())
+    image = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+    wrongs: list[AnyArray] = [image[:-1], image.astype(np.float64), np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)]
+    for wrong in wrongs:
+        with pytest.raises(RigError, match="the rig says"):
+            tracker.observe(0, image, wrong, None, None)
