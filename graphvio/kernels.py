@@ -52,6 +52,11 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     return _compile(function, fastmath=False)
 
 
+def inner_kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """A kernel that is called for each point of a loop: always made part of its caller, which saves the arguments."""
+    return _compile(function, fastmath=False, forceinline=True)
+
+
 def fast_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """The same for sums over pixels: their order is left to the compiler, so that it may use vector instructions.
 
@@ -60,11 +65,12 @@ def fast_kernel(function: Callable[P, R]) -> Callable[P, R]:
     return _compile(function, fastmath=True)
 
 
-def _compile(function: Callable[P, R], *, fastmath: bool) -> Callable[P, R]:
+def _compile(function: Callable[P, R], *, fastmath: bool, forceinline: bool = False) -> Callable[P, R]:
     callers_choice = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(cache_root() / _digest(function.__module__))  # read when the cache is attached
     try:
-        compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=fastmath)(function)
+        options = {"forceinline": True} if forceinline else {}
+        compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=fastmath, **options)(function)
     finally:
         numba.config.CACHE_DIR = callers_choice
     _registered.append(compiled)

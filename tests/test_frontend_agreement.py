@@ -37,7 +37,14 @@ def mixed(first: tuple[Float, int], second: tuple[Float, int], seed: int = 0) ->
     parts = []
     for pair, (motion, count) in enumerate((first, second)):
         parts.append(seen_points(RIG, motion, count, np.random.default_rng(seed), sigma_px=0.2).of_pair(pair))
-    return Observations(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return joined(*parts)
+
+
+def joined(first: Observations, second: Observations) -> Observations:
+    """All points of both, sorted by pair."""
+    columns = [np.concatenate(parts) for parts in zip(first, second, strict=True)]
+    order = np.argsort(columns[0], kind="stable")
+    return Observations._make(column[order] for column in columns)
 
 
 def distance(motion: Float, truth: Float) -> float:
@@ -68,9 +75,7 @@ def test_a_door_that_fills_one_view_is_a_side_of_its_own(points: tuple[int, int]
 def test_people_who_walk_through_all_views_are_a_second_motion() -> None:
     world = seen_points(RIG, TRUTH, 80, np.random.default_rng(1), sigma_px=0.2)
     people = seen_points(RIG, DOOR, 30, np.random.default_rng(2), sigma_px=0.2)
-    both = Observations(*(np.concatenate(columns) for columns in zip(world, people, strict=True)))
-    order = np.argsort(both.pair, kind="stable")
-    agreement = judged(Observations(*(column[order] for column in both)))
+    agreement = judged(joined(world, people))
     assert len(agreement.sides) == 2
     assert distance(agreement.sides[0].refined.cur_T_ref, TRUTH) < 5e-3
     assert distance(agreement.sides[1].refined.cur_T_ref, DOOR) < 1e-2

@@ -11,15 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float
+from graphvio.arrays import Bool
 from graphvio.config import MotionConfig
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.ransac import search
-from graphvio.frontend.refinement import Refined, explained, refine
+from graphvio.frontend.refinement import Refined, refine
 from graphvio.geometry import se3_inverse, se3_log
 
 _BEYOND_5_SIGMA = 40.0  # chi-square of 6 degrees of freedom that a normal error exceeds once in 2 million
 _POORLY_EXPLAINED = 0.5  # share of a pair's points below which the pair looks for a motion of its own
+_WELL_EXPLAINED = 0.9  # from there on its own motion is next to the joint one
 _RIVAL_POINTS = 12
 _RIVAL_SHARE = 0.12  # of all points, unexplained: from there on they may have a motion of their own
 
@@ -81,7 +82,7 @@ def agree(
     if len(everyone) > 1:
         sources = rng.spawn(len(everyone))  # one each, so that the threads' timing changes nothing
         motions = workers.map(
-            lambda j, source: _own_motion(rig, observations.of_pair(j), joint, config, source), everyone, sources
+            lambda j, source: _own_motion(rig, observations, j, joint, config, source), everyone, sources
         )
         own = {j: m for j, m in zip(everyone, motions, strict=True) if is_supported(m.inlier, config)}
     camps: list[list[int]] = []
@@ -114,12 +115,22 @@ def is_supported(inlier: Bool, config: MotionConfig) -> bool:
 
 
 def _own_motion(
-    rig: RigArrays, observations: Observations, joint: Refined, config: MotionConfig, rng: np.random.Generator
+    rig: RigArrays,
+    observations: Observations,
+    pair: int,
+    joint: Refined,
+    config: MotionConfig,
+    rng: np.random.Generator,
 ) -> Refined:
-    start: Float = joint.cur_T_ref
-    if np.mean(explained(rig, observations, start, config)) < _POORLY_EXPLAINED:
-        start = search(rig, observations, start, config, rng)
-    return refine(rig, observations, start, config)
+    rows = observations.pair == pair
+    seen, inlier = observations.of_rows(rows), joint.inlier[rows]
+    share = float(inlier.mean())
+    if share >= _WELL_EXPLAINED:
+        return refine(rig, seen, joint.cur_T_ref, config, known=inlier)
+    start = joint.cur_T_ref
+    if share < _POORLY_EXPLAINED:
+        start = search(rig, seen, start, config, rng)
+    return refine(rig, seen, start, config)
 
 
 def _side(

@@ -13,7 +13,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float
 from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.kernels import kernel
+from graphvio.kernels import inner_kernel, kernel
 
 _NEAREST = 1e-3
 _EXPANSIONS = 3
@@ -72,7 +72,7 @@ def expand(motions: Float, rig: RigArrays, observations: Observations, sigma: fl
     return Expansion(points, offsets, whiteners)
 
 
-@kernel
+@inner_kernel
 def _derivatives_by_point(
     motion: Float, point: Float, seen: Float, focal_px: float, jacobian: Float, residual: Float
 ) -> None:
@@ -89,7 +89,7 @@ def _derivatives_by_point(
     residual[0], residual[1] = focal_px * (seen[0] - u), focal_px * (seen[1] - v)
 
 
-@kernel
+@inner_kernel
 def _pull_back(jacobian: Float, whitener: Float, white: Float, rows: int, pull: Float) -> None:
     """Fill ``J^T S^-1 r`` (3,): the direction in which the residual r would have the point."""
     pull[:] = 0.0
@@ -101,7 +101,7 @@ def _pull_back(jacobian: Float, whitener: Float, white: Float, rows: int, pull: 
             pull[k] += jacobian[q, k] * back
 
 
-@kernel
+@inner_kernel
 def _whitener(jacobian: Float, covariance: Float, sigma: float, spread: Float, lower: Float, inverse_l: Float) -> None:
     """Fill one point's inverse Cholesky factor (4, 4) of S, by way of ``J C`` (4, 3) and the factor (4, 4)."""
     for i in range(4):
@@ -130,7 +130,7 @@ def _whitener(jacobian: Float, covariance: Float, sigma: float, spread: Float, l
             inverse_l[i, j] = total / lower[i, i]
 
 
-@kernel
+@inner_kernel
 def _derivatives_by_motion(
     motion: Float, cam_T_body: Float, point: Float, focal_px: float, seen: Float, rows: Float
 ) -> bool:
@@ -161,7 +161,7 @@ def _derivatives_by_motion(
     return True
 
 
-@kernel
+@inner_kernel
 def _whitened(
     i: int, motions: Float, rig: RigArrays, observations: Observations, at: Expansion,
     raw: Float, white: Float, jacobian: Float,

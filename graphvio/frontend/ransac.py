@@ -12,7 +12,7 @@ from graphvio.kernels import kernel
 
 _MIN_INVERSE_DEPTH = 0.005
 _MAX_RELATIVE_DEPTH_SIGMA = 0.3
-_FIRST_BATCH = 25
+_FIRST_BATCH = 12
 
 
 def search(

@@ -11,17 +11,19 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Int
 from graphvio.config import MotionConfig
 from graphvio.frontend.cost import left_motions
-from graphvio.frontend.linearisation import expand, information_through_points, linearise
+from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise
 from graphvio.frontend.noise import influence, influence_slopes, inlier_cutoff
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.geometry import se3_exp
 from graphvio.kernels import kernel
 
+_MOST_ROUNDS = 3
 _STEPS_PER_ROUND = 6
 _CONVERGED = 1e-6  # radians and metres
 _NEAR = 1e-4  # enough to tell inliers
 _WEAK_DIRECTION_SIGMA = 10.0
 _LEAST_SHARE_OF_A_PAIR = 0.25
+_LEAST_POINTS_OF_A_PAIR = 5
 _SHARED_BOUNDS = (0.02, 0.9)
 
 
@@ -45,27 +47,43 @@ class Refined:
     rms_px: float
 
 
-def refine(rig: RigArrays, observations: Observations, cur_T_ref: Float, config: MotionConfig) -> Refined:
-    """Minimise the robust cost from a start (4, 4); directions that no point constrains get a large variance."""
+def refine(
+    rig: RigArrays, observations: Observations, cur_T_ref: Float, config: MotionConfig, known: Bool | None = None
+) -> Refined:
+    """Minimise the robust cost; directions that no point constrains get a large variance.
+
+    Args:
+        rig: of P pairs.
+        observations: N points of any subset of them.
+        cur_T_ref: start (4, 4).
+        config: of this stage.
+        known: (N,) the inliers, where they are known already and the start is near; else they are found first.
+    """
     sigma = config.pixel_sigma_px
     scale, largest2 = config.cauchy_scale_px / sigma, (config.max_error_px / sigma) ** 2
     has_right = observations.has_right
-    everything = np.ones(len(has_right), dtype=bool)
-    pose, _, errors2 = _levenberg_marquardt(cur_T_ref, rig, observations, everything, sigma, scale, 1, _NEAR)
-    inlier = errors2 < inlier_cutoff(errors2, has_right, largest2)
-    inlier &= _is_of_an_explained_pair(observations.pair, inlier)
-    pose, hessian, errors2 = _levenberg_marquardt(pose, rig, observations, inlier, sigma, scale, 2, _CONVERGED)
+    pose, inlier = cur_T_ref, known
+    if inlier is None:
+        everything = np.ones(len(has_right), dtype=bool)
+        pose, _, errors2, _ = _levenberg_marquardt(pose, rig, observations, everything, sigma, scale, 1, _NEAR)
+        inlier = errors2 < inlier_cutoff(errors2, has_right, largest2)
+        inlier &= _is_of_an_explained_pair(observations.pair, inlier)
+    pose, hessian, errors2, at = _levenberg_marquardt(
+        pose, rig, observations, inlier, sigma, scale, _MOST_ROUNDS, _CONVERGED
+    )
     used = influence(errors2[inlier], has_right[inlier], scale)
     # Backward propagation of the reprojection covariance. The small prior keeps unconstrained directions finite.
-    covariance: Float = np.asarray(np.linalg.inv(hessian / used.factor + np.eye(6) / _WEAK_DIRECTION_SIGMA**2))
+    information = hessian / used.factor + np.eye(6) / _WEAK_DIRECTION_SIGMA**2
+    root: Float = np.asarray(np.linalg.inv(np.linalg.cholesky(information)).T)
+    covariance = root @ root.T
     slopes = np.where(inlier, influence_slopes(errors2, has_right, scale), 0.0)
-    through_points = _through_points(pose, rig, observations, sigma, slopes**2)
+    through_points = _through_points(pose, rig, observations, at, sigma, slopes**2)
     gain = covariance / used.factor * (used.weight / used.slope)
-    shared = _bounded(used.variance * gain @ through_points @ gain, covariance)
+    shared = _bounded(used.variance * gain @ through_points @ gain, root)
     inflation = config.sigma_inflation**2
     return Refined(
         pose,
-        inflation * 0.5 * (covariance + covariance.T),
+        inflation * covariance,
         inflation * shared,
         inlier,
         sigma * float(np.sqrt(used.variance)),
@@ -73,18 +91,18 @@ def refine(rig: RigArrays, observations: Observations, cur_T_ref: Float, config:
 
 
 def _is_of_an_explained_pair(pair: Int, inlier: Bool) -> Bool:
-    """Which points (N,) belong to a pair of which more than a few fit: some always do by chance."""
+    """Which points (N,) belong to a pair of which more than a few fit, as some always do by chance; all, if no pair."""
     fitting = np.bincount(pair, weights=inlier)
-    return np.asarray((fitting >= _LEAST_SHARE_OF_A_PAIR * np.bincount(pair))[pair])
+    explained = fitting >= np.maximum(_LEAST_SHARE_OF_A_PAIR * np.bincount(pair), _LEAST_POINTS_OF_A_PAIR)
+    return np.asarray(explained[pair] | ~explained.any())
 
 
-def _bounded(shared: Float, covariance: Float) -> Float:
-    """The shared part, so that both it and the rest are surely positive definite."""
-    lower = np.linalg.cholesky(covariance)
-    inverse = np.linalg.inv(lower)
+def _bounded(shared: Float, root: Float) -> Float:
+    """The shared part of a covariance ``root root^T``, so that both it and the rest are surely positive definite."""
+    inverse = np.linalg.inv(root)
     shares, axes = np.linalg.eigh(inverse @ shared @ inverse.T)
-    root = lower @ axes
-    return np.asarray((root * np.clip(shares, *_SHARED_BOUNDS)) @ root.T)
+    turned = root @ axes
+    return np.asarray((turned * np.clip(shares, *_SHARED_BOUNDS)) @ turned.T)
 
 
 @kernel
@@ -97,8 +115,8 @@ def _levenberg_marquardt(
     scale: float,
     rounds: int,
     tolerance: float,
-) -> tuple[Float, Float, Float]:
-    """Pose, normal matrix (6, 6) and squared whitened errors (N,) at the minimum.
+) -> tuple[Float, Float, Float, Expansion]:
+    """Pose, normal matrix (6, 6), squared whitened errors (N,) and the points' linearisation at the minimum.
 
     In each round the places at which the points are linearised are found anew.
     """
@@ -106,9 +124,12 @@ def _levenberg_marquardt(
     n = len(observations.pair)
     hessian, gradient, errors2 = np.zeros((6, 6)), np.zeros(6), np.empty(n)
     new_hessian, new_gradient, new_errors2 = np.zeros((6, 6)), np.zeros(6), np.empty(n)
-    for _ in range(rounds):
+    at = expand(left_motions(pose, rig), rig, observations, sigma)
+    for turn in range(rounds):
         motions = left_motions(pose, rig)
-        at = expand(motions, rig, observations, sigma)
+        if turn > 0:
+            at = expand(motions, rig, observations, sigma)
+        moved = 0.0
         cost = linearise(motions, rig, observations, at, active, scale, hessian, gradient, errors2)
         damping = 1e-6
         for _ in range(_STEPS_PER_ROUND):
@@ -130,17 +151,19 @@ def _levenberg_marquardt(
                 gradient, new_gradient = new_gradient, gradient
                 errors2, new_errors2 = new_errors2, errors2
                 damping *= 0.1
+                moved = max(moved, np.max(np.abs(step)))
             else:
                 damping = max(damping * 10.0, 1e-4)
-    return pose, hessian, errors2
+        if moved < _NEAR:
+            break  # the points' places and weights would not change any more
+    return pose, hessian, errors2, at
 
 
 @kernel
-def _through_points(pose: Float, rig: RigArrays, observations: Observations, sigma: float, factors: Float) -> Float:
-    motions = left_motions(pose, rig)
-    return information_through_points(
-        motions, rig, observations, expand(motions, rig, observations, sigma), sigma, factors
-    )
+def _through_points(
+    pose: Float, rig: RigArrays, observations: Observations, at: Expansion, sigma: float, factors: Float
+) -> Float:
+    return information_through_points(left_motions(pose, rig), rig, observations, at, sigma, factors)
 
 
 def explained(rig: RigArrays, observations: Observations, cur_T_ref: Float, config: MotionConfig) -> Bool:
