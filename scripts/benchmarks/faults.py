@@ -11,6 +11,7 @@ import csv
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -119,7 +120,8 @@ def _run_all(tasks: Sequence[Task], jobs: int) -> list[dict[bool, Outcome]]:
             results.append(run_case(task))
             tell(_progress(task, results[-1]))
         return results
-    with ProcessPoolExecutor(jobs) as pool:
+    # A fork would copy the locks of the threads that have run before, and wait for them for ever.
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         for task, result in zip(tasks, pool.map(run_case, tasks), strict=True):
             results.append(result)
             tell(_progress(task, result))
