@@ -171,3 +171,22 @@ def test_a_failed_solution_leaves_the_values() -> None:
     window.add(gtsam.PriorFactorVector(x(0), np.zeros(3), noise(np.eye(3))))
     window.optimise()
     np.testing.assert_allclose(window.values.atVector(x(1)), np.ones(3), atol=1e-9)
+
+
+def test_covariances_of_followed_variables_need_no_new_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(4)
+    followed, plain = Window(), Window()
+    for k in range(6):
+        add_point([followed, plain], k, rng)
+    for window, last in ((followed, [x(4), x(5)]), (plain, [])):
+        window.optimise(last)
+        add_point([window], 6, np.random.default_rng(5))
+    expected = plain.joint_covariance([x(4), x(6)])
+    with monkeypatch.context() as patched:
+        patched.delattr(Window, "_solve")
+        np.testing.assert_allclose(followed.joint_covariance([x(4), x(6)]), expected, atol=1e-12)
+    # A factor that ties in what is not followed needs the whole window.
+    for window in (followed, plain):
+        window.add(gtsam.BetweenFactorVector(x(0), x(6), np.zeros(3), noise(np.eye(3) * 0.01)))
+    expected = plain.joint_covariance([x(4), x(6)])
+    np.testing.assert_allclose(followed.joint_covariance([x(4), x(6)]), expected, atol=1e-12)

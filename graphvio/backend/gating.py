@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.stats import chi2
@@ -45,5 +46,10 @@ def gate(
     innovation = se3_log(se3_inverse(measured) @ predicted)
     covariance = measured_covariance + predicted_covariance
     statistic = float(innovation @ np.linalg.solve(covariance, innovation))
-    threshold = float(chi2.ppf(probability, _DEGREES_OF_FREEDOM))
+    threshold = _quantile(probability)
     return Verdict(statistic <= threshold, statistic, threshold)
+
+
+@cache
+def _quantile(probability: float) -> float:
+    return float(chi2.ppf(probability, _DEGREES_OF_FREEDOM))

@@ -176,12 +176,15 @@ class Smoother:
 
     def test(self, motion: RelativeMotion) -> Verdict:
         """Chi-square test of a motion that ends in the newest state, against the window's prediction."""
-        reference, newest = self._reference_key(motion), _x(self._index_of[motion.stamp_ns])
+        newest = _x(self._index_of[motion.stamp_ns])
+        reference, covariance = _x(self._index_of[motion.reference_stamp_ns]), motion.covariance
+        if motion.reference_stamp_ns in self._views:
+            reference, covariance = self._reference_key(motion), motion.covariance - motion.shared_covariance
         nav_T_reference = np.asarray(self._window.values.atPose3(reference).matrix())
         predicted = se3_inverse(nav_T_reference) @ self.pose(motion.stamp_ns)
         return gate(
             motion.reference_T_current,
-            motion.covariance - motion.shared_covariance,
+            covariance,
             predicted,
             relative_covariance(predicted, self._window.joint_covariance([reference, newest])),
             self._config.gate_probability,
@@ -227,12 +230,13 @@ class Smoother:
         Raises:
             WindowError: if the window cannot be solved; no state leaves it.
         """
-        self._window.optimise()
+        keep = frozenset(keep)
+        self._window.optimise(self._followed(keep))
         if len(self._stamps) > 1:
             dt = (self._stamps[-1] - self._stamps[-2]) * 1e-9
             step = se3_inverse(self.pose(self._stamps[-2])) @ self.pose(self._stamps[-1])
             self._previous_motion = se3_log(step) / dt
-        return self._forget(self.latest_ns - round(self._config.lag_s * 1e9), frozenset(keep))
+        return self._forget(self.latest_ns - round(self._config.lag_s * 1e9), keep)
 
     def all_poses(self) -> list[tuple[int, Float]]:
         """Stamps and poses of the window, in time order."""
@@ -274,6 +278,13 @@ class Smoother:
                 _b(i), _b(j), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(bias_sigmas)
             )
         )
+
+    def _followed(self, keep: frozenset[int]) -> list[int]:
+        """Variables that the next motion and the next span of the IMU will be tied to."""
+        references = [(self._index_of[ns], ns) for ns in sorted(keep & self._index_of.keys() - {self.latest_ns})]
+        keys = [_r(k) if ns in self._views else _x(k) for k, ns in references]
+        newest = self._index_of[self.latest_ns]
+        return [*keys, _x(newest), _v(newest), _b(newest)] if self.has_imu else [*keys, _x(newest)]
 
     def _forget(self, oldest_ns: int, keep: frozenset[int]) -> list[tuple[int, Float]]:
         leaving = [s for s in self._stamps[:-1] if s < oldest_ns and s not in keep]

@@ -6,6 +6,7 @@ Factors and values are kept here, outside gtsam's solvers, so that the window ca
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -14,12 +15,29 @@ from graphvio.arrays import Float
 from graphvio.errors import GraphvioError
 
 _MAX_ITERATIONS = 4
-_CONVERGED = 1e-4  # radians, metres...: what a further step would still change is of the order of its square
+_CONVERGED = 1e-2  # radians, metres...: what a further step would still change is of the order of its square
 _SINGULAR = 1e-9
 
 
 class WindowError(GraphvioError):
     """The window's equations have no unique solution."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Marginal:
+    """What the window says of some variables together: the upper triangle R, where ``R^T R`` is their information."""
+
+    columns: dict[int, slice]
+    square_root: Float
+
+    def covariance(self, keys: Sequence[int]) -> Float:
+        """Covariance of some of the variables, in the order given. R is inverted, not its square: states far less
+        certain than the poses relative to them do no harm."""
+        if np.abs(np.diag(self.square_root)).min() < _SINGULAR:
+            raise WindowError(f"the window has no covariance of {_named(keys)}")
+        inverse = np.linalg.inv(self.square_root)
+        rows = np.concatenate([inverse[self.columns[key]] for key in keys])
+        return np.asarray(rows @ rows.T)
 
 
 class Window:
@@ -28,16 +46,20 @@ class Window:
     def __init__(self) -> None:
         self._factors: list[tuple[frozenset[int], gtsam.NonlinearFactor]] = []
         self.values = gtsam.Values()
-        self._solution: gtsam.GaussianBayesTree | None = None
-        self._last: tuple[int, ...] = ()  # variables that were eliminated last: the root of the solution holds them
+        self._marginal: _Marginal | None = None  # of the variables that the last solution eliminated last
+        self._unknown = 0  # how many factors, the newest, it does not know
 
     def add(self, factor: gtsam.NonlinearFactor) -> None:
         """Insert a factor; its variables must have values."""
         self._factors.append((frozenset(factor.keys()), factor))
-        self._solution = None
+        self._unknown += 1
 
-    def optimise(self) -> None:
+    def optimise(self, followed: Sequence[int] = ()) -> None:
         """Gauss-Newton from the present values.
+
+        Args:
+            followed: variables whose covariance will be asked for, and to which new factors will be tied: those
+                covariances are then found without solving the whole window again.
 
         Raises:
             WindowError: if some variable is not constrained, or the solution is not finite; the values stay as
@@ -46,19 +68,18 @@ class Window:
         values = self.values
         try:
             for _ in range(_MAX_ITERATIONS):
-                step = self._solve(self._last).optimize()
-                size = step.norm()
-                if not np.isfinite(size):
+                step = self._solve(followed).optimize()
+                largest = np.abs(step.vector()).max()
+                if not np.isfinite(largest):
                     raise WindowError("the window's solution is not finite")
                 self.values = self.values.retract(step)
-                if size < _CONVERGED:
-                    break  # the solution still serves for covariances
-                self._solution = None
+                if largest < _CONVERGED:
+                    break
         except RuntimeError as error:
-            self.values, self._solution = values, None
+            self.values, self._marginal = values, None
             raise WindowError(f"the window cannot be optimised: {_one_line(error)}") from None
         except WindowError:
-            self.values, self._solution = values, None
+            self.values, self._marginal = values, None
             raise
 
     def joint_covariance(self, keys: Sequence[int]) -> Float:
@@ -69,20 +90,14 @@ class Window:
         """
         unknown = [key for key in keys if not self.values.exists(key)]
         if unknown:
-            raise WindowError(f"the window has no variable {gtsam.DefaultKeyFormatter(unknown[0])}")
-        solution = self._solve(tuple(keys))
-        for root in solution.roots():
-            if list(root.conditional().keys())[-len(keys) :] == list(keys):
-                # Eliminated last, the variables' marginal is the lower corner of the root. Its square root is
-                # inverted, not its square: states far less certain than the poses relative to them do no harm.
-                dims = self.values.dims()
-                size = sum(dims[key] for key in keys)
-                square_root = np.asarray(root.conditional().R())[-size:, -size:]
-                if np.abs(np.diag(square_root)).min() < _SINGULAR:
-                    break
-                inverse = np.linalg.inv(square_root)
-                return np.asarray(inverse @ inverse.T)
-        raise WindowError(f"the window has no covariance of {', '.join(map(gtsam.DefaultKeyFormatter, keys))}")
+            raise WindowError(f"the window has no variable {_named(unknown[:1])}")
+        marginal = self._followed()
+        if marginal is None or not marginal.columns.keys() >= set(keys):
+            self._solve(keys)
+            marginal = self._marginal
+        if marginal is None:
+            raise WindowError(f"the window has no covariance of {_named(keys)}")
+        return marginal.covariance(keys)
 
     def marginalise(self, keys: Iterable[int]) -> None:
         """Replace variables and their factors by the linear factor that says the same of the others.
@@ -115,28 +130,68 @@ class Window:
                 staying.append((frozenset(marginal.keys()), container))
         for key in leaving:
             self.values.erase(key)
-        self._factors = staying  # the solution still tells the covariances of those that stay
+        self._factors = staying
+        if self._unknown or (self._marginal is not None and self._marginal.columns.keys() & leaving):
+            self._marginal = None  # else it still tells the covariances of those that stay
 
-    def _solve(self, last: tuple[int, ...]) -> gtsam.GaussianBayesTree:
-        """The window eliminated at its present values, some variables last."""
-        if self._solution is not None and self._last[-len(last) :] == last:
-            return self._solution
+    def _solve(self, last: Sequence[int]) -> gtsam.GaussianBayesTree:
+        """The window eliminated at its present values, some variables last; their marginal is kept."""
         loose = set(self.values.keys()).difference(*(involved for involved, _ in self._factors))
         if loose:
-            raise WindowError(f"no factor constrains variable {gtsam.DefaultKeyFormatter(min(loose))}")
+            raise WindowError(f"no factor constrains variable {_named([min(loose)])}")
         graph = gtsam.NonlinearFactorGraph()
         for _, factor in self._factors:
             graph.push_back(factor)
-        last = tuple(key for key in last if self.values.exists(key))
         try:
             ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(
                 graph, gtsam.KeyVector(list(last)), True
             )
-            self._solution = graph.linearize(self.values).eliminateMultifrontal(ordering, gtsam.EliminateQR)
+            solution = graph.linearize(self.values).eliminateMultifrontal(ordering, gtsam.EliminateQR)
         except RuntimeError as error:
             raise WindowError(f"the window has no unique solution: {_one_line(error)}") from None
-        self._last = last
-        return self._solution
+        self._marginal, self._unknown = None, 0
+        for root in solution.roots():
+            if list(root.conditional().keys())[-len(last) :] == list(last):
+                columns, size = self._columns(last)  # eliminated last, they are the lower corner of the root
+                self._marginal = _Marginal(columns, np.array(root.conditional().R())[-size:, -size:])
+        return solution
+
+    def _followed(self) -> _Marginal | None:
+        """The marginal of the followed variables and those added since, or None if that cannot be told from them."""
+        if self._marginal is None or not self._unknown:
+            return self._marginal
+        followed = self._marginal.columns.keys()
+        known, unknown = self._factors[: -self._unknown], self._factors[-self._unknown :]
+        settled = frozenset().union(*(keys for keys, _ in known))
+        touched = frozenset().union(*(keys for keys, _ in unknown))
+        if touched & settled - followed:
+            return None
+        columns, size = self._columns([*followed, *sorted(touched - followed)])
+        old = self._marginal.square_root
+        rows = [np.pad(old, ((0, 0), (0, size - len(old))))]
+        for _, factor in unknown:
+            linear = factor.linearize(self.values)
+            jacobian, at = linear.jacobian()[0], 0
+            block = np.zeros((len(jacobian), size))
+            for key in list(linear.keys()):
+                width = columns[key].stop - columns[key].start
+                block[:, columns[key]] = jacobian[:, at : at + width]
+                at += width
+            rows.append(block)
+        root = np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))
+        return _Marginal(columns, root) if len(root) == size else None
+
+    def _columns(self, keys: Iterable[int]) -> tuple[dict[int, slice], int]:
+        """Where variables stand in a matrix that has them side by side, and how wide it is."""
+        dims, columns, size = self.values.dims(), {}, 0
+        for key in keys:
+            columns[key] = slice(size, size + dims[key])
+            size += dims[key]
+        return columns, size
+
+
+def _named(keys: Iterable[int]) -> str:
+    return ", ".join(map(gtsam.DefaultKeyFormatter, keys))
 
 
 def _one_line(error: Exception) -> str:

@@ -1,0 +1,117 @@
+"""Where the smoother starts: at first, from what the IMU says, and again after each kind of break."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.inertial import ImuSpan
+from graphvio.backend.initialisation import InitialAttitude, initial_attitude, level
+from graphvio.backend.smoother import RigState, StartUncertainty, origin_covariance
+from graphvio.config import InitialisationConfig
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.geometry import se3, se3_inverse, se3_log
+from graphvio.rig import Rig
+
+_UNKNOWN_SPEED_SIGMA = 30.0  # without an IMU the first motion is believed whatever it is, on foot or on the road
+_MOVING_START_SPEED_SIGMA = 2.0
+_RESTING_START_SPEED_SIGMA = 0.02
+_RESTART_SPEED_SIGMA = 1.0
+_GYRO_BIAS_SIGMA = 0.01
+_WIDE_GYRO_BIAS_SIGMA = 0.1
+_AFTER_REBUILD = np.diag([0.05] * 3 + [0.1] * 3) ** 2  # added to the pose's covariance, radians and metres
+_AFTER_JUMP = np.diag([0.2] * 3 + [1.0] * 3) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What the smoother starts from.
+
+    Attributes:
+        stamp_ns: of the first state.
+        state: the rig then.
+        uncertainty: how well it is known.
+        settled_ns: from this stamp on, a start in motion is over; 0 where there is nothing to settle.
+    """
+
+    stamp_ns: int
+    state: RigState
+    uncertainty: StartUncertainty
+    settled_ns: int = 0
+
+
+def first_start(
+    stamp_ns: int, position: Float, found: tuple[ImuSpan, float] | None, rig: Rig, config: InitialisationConfig
+) -> Start:
+    """A start at a position (3,) in nav, with the attitude that the IMU tells.
+
+    Args:
+        stamp_ns: of the first state.
+        position: metres.
+        found: the IMU around the first state and that state's place in it, seconds. Without it, the first pair's left
+            camera is taken to be upright, and nothing is known of the speed.
+        rig: cameras.
+        config: of this stage.
+    """
+    if found is None:
+        at = InitialAttitude(level(-rig.pairs[0].left.body_T_cam[:3, 1]), 1e-3, np.zeros(3), 1.0, False)
+        speed_sigma = _UNKNOWN_SPEED_SIGMA
+        settled_ns = stamp_ns + 1  # the first frameset has no motion to track
+    else:
+        at = initial_attitude(*found, config)
+        speed_sigma = _RESTING_START_SPEED_SIGMA if at.at_rest else _MOVING_START_SPEED_SIGMA
+        settled_ns = 0 if at.at_rest else stamp_ns + round(config.settle_s * 1e9)
+    state = RigState(se3(at.nav_R_body, position), np.zeros(3), at.gyro_bias, np.zeros(3))
+    pose_covariance = origin_covariance(at.nav_R_body, at.tilt_sigma_rad)
+    return Start(stamp_ns, state, StartUncertainty(pose_covariance, speed_sigma, at.gyro_bias_sigma), settled_ns)
+
+
+def after_failure(stamp_ns: int, state: RigState, pose_covariance: Float) -> Start:
+    """A start at the predicted state, after a window that has no solution.
+
+    Args:
+        stamp_ns: of the state.
+        state: the prediction.
+        pose_covariance: (6, 6) of the last pose that was known, tangent in body.
+    """
+    return _restart(stamp_ns, state, pose_covariance + _AFTER_REBUILD)
+
+
+def after_gap(stamp_ns: int, state: RigState, pose_covariance: Float) -> Start:
+    """A start at the last state, after a gap that nothing bridges. For arguments see `after_failure`."""
+    return _restart(stamp_ns, state, pose_covariance + _AFTER_JUMP)
+
+
+def after_lost(motion: RelativeMotion, state: RigState, pose_covariance: Float) -> Start:
+    """A start at the predicted state with the velocity of the first motion that vision sees again.
+
+    Args:
+        motion: it ends in the state.
+        state: the prediction.
+        pose_covariance: (6, 6) of it, tangent in body.
+    """
+    return _restart(motion.stamp_ns, _with_velocity(state, motion), pose_covariance)
+
+
+def by_vision(motion: RelativeMotion, nav_T_body: Float, state: RigState, pose_covariance: Float) -> Start:
+    """A start at the pose (4, 4) that vision has, as uncertain as it differs from the prediction.
+
+    For the other arguments see `after_lost`.
+    """
+    apart = se3_log(se3_inverse(nav_T_body) @ state.nav_T_body)
+    state = _with_velocity(replace(state, nav_T_body=nav_T_body), motion)
+    return _restart(motion.stamp_ns, state, pose_covariance + np.diag(apart**2), _WIDE_GYRO_BIAS_SIGMA)
+
+
+def _restart(
+    stamp_ns: int, state: RigState, pose_covariance: Float, gyro_bias_sigma: float = _GYRO_BIAS_SIGMA
+) -> Start:
+    return Start(stamp_ns, state, StartUncertainty(pose_covariance, _RESTART_SPEED_SIGMA, gyro_bias_sigma))
+
+
+def _with_velocity(state: RigState, motion: RelativeMotion) -> RigState:
+    """The state with the mean velocity of a measured motion."""
+    nav_R_reference = state.nav_T_body[:3, :3] @ motion.reference_T_current[:3, :3].T
+    return replace(state, velocity_nav=nav_R_reference @ motion.reference_T_current[:3, 3] / motion.duration_s)
