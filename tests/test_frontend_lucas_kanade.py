@@ -113,7 +113,7 @@ def registered(warp: Float, assumed: Float, guess_error: Float) -> tuple[Float, 
     for middle in grid()[::7]:
         target = warped(warp, middle, place)
         guess = (place + guess_error)[None]
-        moved, ok, _ = register(source, target, middle[None], assumed[None], guess, np.ones(1, dtype=bool), 7, 2.0, 1.0)
+        moved, ok, _, _ = register(source, target, middle[None], assumed[None], guess, np.ones(1, dtype=bool), 7, 2.0, 1.0)
         errors.append(moved[0] - place)
         found.append(ok[0])
     return np.array(errors), np.array(found)
@@ -141,15 +141,15 @@ def test_what_is_not_registered_stays_where_it_was() -> None:
     guess, n = pixels + np.array([0.3, 0.2]), len(pixels)
     warps, everything = np.tile(np.eye(2), (n, 1, 1)), np.ones(n, dtype=bool)
     for source, target, wanted in ((image, image, ~everything), (flat, image, everything)):
-        moved, found, localised = register(source, target, pixels, warps, guess, wanted, 7, 2.0, 1.0)
+        moved, found, localised, _ = register(source, target, pixels, warps, guess, wanted, 7, 2.0, 1.0)
         np.testing.assert_array_equal(moved, guess)
         assert not found.any()
         assert not localised.any()
-    moved, found, localised = register(image, image, pixels, warps, guess, everything, 7, 2.0, 1.0)
+    moved, found, localised, _ = register(image, image, pixels, warps, guess, everything, 7, 2.0, 1.0)
     np.testing.assert_array_equal(found, [True, True, True, False, False, False])
     np.testing.assert_array_equal(localised, found)
     np.testing.assert_array_equal(moved[~found], guess[~found])
-    _, found, _ = register(image, image, pixels[:3], warps[:3], guess[:3], everything[:3], 7, 0.1, 1.0)
+    _, found, _, _ = register(image, image, pixels[:3], warps[:3], guess[:3], everything[:3], 7, 0.1, 1.0)
     assert not found.any()  # they are further from the guess than that
 
 

@@ -66,7 +66,7 @@ def test_a_shift_alone_is_off_or_lost(slant: tuple[float, float]) -> None:
     images, right = views(*slant), truth(grid(), *slant)
     n = len(right)
     level, everything = np.tile(np.eye(2), (n, 1, 1)), np.ones(n, dtype=bool)
-    shifted, kept, _ = register(*images, grid(), level, right, everything, HALF, 3.0, 1.0)
+    shifted, kept, _, _ = register(*images, grid(), level, right, everything, HALF, 3.0, 1.0)
     moved, _, _, found = aligned(images, right)
     by_shift = np.where(kept, np.linalg.norm(shifted - right, axis=1), np.inf)
     by_slant = np.where(found, np.linalg.norm(moved - right, axis=1), np.inf)

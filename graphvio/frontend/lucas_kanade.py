@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Image
-from graphvio.frontend.patches import align, patches, prepare, sample, sample_affine, weaker2
+from graphvio.frontend.patches import align, correlation, patches, prepare, sample, sample_affine, weaker2
 from graphvio.kernels import fast_kernel
 
 MIN_GRADIENT = 1.0
@@ -109,7 +109,7 @@ def _forth_and_back(
 def register(
     source: Image, target: Image, pixels: Float, warps: Float, guess: Float, wanted: Bool, half: int,
     max_shift_px: float, min_gradient: float,
-) -> tuple[Float, Bool, Bool]:  # fmt: skip
+) -> tuple[Float, Bool, Bool, Float]:  # fmt: skip
     """Where patches of one image are in another that sees them deformed, from a guess that is nearly right.
 
     Args:
@@ -124,15 +124,15 @@ def register(
         min_gradient: least rms gradient of a patch along its weaker direction, grey levels per pixel.
 
     Returns:
-        Pixels (N, 2), equal to the guess where not found; whether each was found (N,); and whether its patch is in
-        the source and has that gradient (N,).
+        Pixels (N, 2), equal to the guess where not found; whether each was found (N,); whether its patch is in the
+        source and has that gradient (N,); and the normalised cross-correlations at the places found (N,).
     """
     n = len(pixels)
-    moved = guess.copy()
+    moved, correlations = guess.copy(), np.full(n, -1.0)
     found, localised = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     bordered = np.empty((2 * half + 3, 2 * half + 3), dtype=np.float32)
-    buffers = patches(3, half)
-    patch, gx, gy = buffers[0], buffers[1], buffers[2]
+    buffers = patches(4, half)
+    patch, gx, gy, seen = buffers[0], buffers[1], buffers[2], buffers[3]
     least2 = (min_gradient * (2 * half + 1)) ** 2
     for i in range(n):
         x, y, warp = pixels[i, 0], pixels[i, 1], warps[i]
@@ -146,4 +146,6 @@ def register(
         u, v, converged = align(target, x, y, half, patch, gx, gy, xx, xy, yy, min_gradient)
         if converged and (u - x) ** 2 + (v - y) ** 2 <= max_shift_px * max_shift_px:
             moved[i, 0], moved[i, 1], found[i] = u, v, True
-    return moved, found, localised
+            if sample(target, u, v, half, seen):
+                correlations[i] = correlation(patch, seen, 2 * half + 1)
+    return moved, found, localised, correlations

@@ -17,6 +17,7 @@ from graphvio.rig import StereoPair
 _SEARCH_CORRELATION = 0.6  # of undeformed patches; aligned ones must reach `StereoConfig.min_correlation`
 _MAX_REFINEMENT_PX = 3.0
 _SEARCH_MARGIN_PX = 6.0
+_FORETOLD_PX = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +115,11 @@ class StereoMatcher:
         close = shift <= np.where(known, _SEARCH_MARGIN_PX, _MAX_REFINEMENT_PX)
         found = passes(found, converged & close, "alignment", rejected)
         found = passes(found, correlations >= settings.min_correlation, "appearance", rejected)
+        # A match that the motion and the depth of before foretold has been checked by them.
+        unchecked = found & ~(known & (shift < _FORETOLD_PX))
         warps = np.eye(2) + directions[:, :, None] * slopes[:, None, :]
-        _, returned, localised = register(
-            right, left, matched, warps, pixels, found, half, tracking.max_forward_backward_px, min_gradient
+        _, returned, localised, _ = register(
+            right, left, matched, warps, pixels, unchecked, half, tracking.max_forward_backward_px, min_gradient
         )
-        found = passes(found, localised, "corner", rejected)
-        return matched, slopes, passes(found, returned, "left_right", rejected)
+        found = passes(found, localised | ~unchecked, "corner", rejected)
+        return matched, slopes, passes(found, returned | ~unchecked, "left_right", rejected)

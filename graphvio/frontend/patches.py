@@ -196,3 +196,19 @@ def sample_affine(
             upper, lower = a + ax * (b - a), c + ax * (d - c)
             row[i] = upper + ay * (lower - upper)
     return True
+
+
+@fast_kernel
+def correlation(patch: AnyArray, other: AnyArray, side: int) -> float:
+    """Normalised cross-correlation of a patch of zero mean with another, both padded with zeros."""
+    a, b = patch.reshape(-1), other.reshape(-1)
+    product = square = total = own = np.float32(0.0)
+    for k in range(a.size):
+        product += a[k] * b[k]
+        square += b[k] * b[k]
+        total += b[k]
+        own += a[k] * a[k]
+    variance = square - total * total / np.float32(side * side)
+    if variance < 1e-3 or own < 1e-3:
+        return -1.0
+    return float(product / np.sqrt(float(variance) * float(own)))

@@ -8,7 +8,7 @@ Inverse compositional Gauss-Newton, as in `graphvio.frontend.lucas_kanade`.
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
-from graphvio.frontend.patches import align, patches, prepare, sample, sample_affine
+from graphvio.frontend.patches import align, correlation, patches, prepare, sample, sample_affine
 from graphvio.kernels import fast_kernel
 
 _MAX_ITERATIONS = 10
@@ -73,7 +73,7 @@ def align_slanted(
         moved[i, 0], moved[i, 1] = parameters[0], parameters[1]
         found_slopes[i, 0], found_slopes[i, 1] = parameters[2], parameters[3]
         if found[i]:
-            correlations[i] = _correlation(patch, sheared, 2 * half + 1)
+            correlations[i] = correlation(patch, sheared, 2 * half + 1)
     return moved, found_slopes, correlations, found
 
 
@@ -183,19 +183,3 @@ def _project(columns: AnyArray, sheared: AnyArray, patch: AnyArray, out: Float) 
         b2 += c2[k] * difference
         b3 += c3[k] * difference
     out[0], out[1], out[2], out[3] = b0, b1, b2, b3
-
-
-@fast_kernel
-def _correlation(patch: AnyArray, other: AnyArray, side: int) -> float:
-    """Normalised cross-correlation of a patch of zero mean with another, both padded with zeros."""
-    a, b = patch.reshape(-1), other.reshape(-1)
-    product = square = total = own = np.float32(0.0)
-    for k in range(a.size):
-        product += a[k] * b[k]
-        square += b[k] * b[k]
-        total += b[k]
-        own += a[k] * a[k]
-    variance = square - total * total / np.float32(side * side)
-    if variance < 1e-3 or own < 1e-3:
-        return -1.0
-    return float(product / np.sqrt(float(variance) * float(own)))

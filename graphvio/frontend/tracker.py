@@ -20,6 +20,7 @@ from graphvio.rig import Camera, StereoPair
 _MAX_TRACKS_PER_CELL = 2
 _MAX_FLAT_FRAMES = 3  # then another corner of the cell gets its chance
 _MAX_REGISTRATION_PX = 2.0
+_SAME_PATCH = 0.8  # correlation with the anchor's patch
 _LEVELS_AFTER_PREDICTION = 2  # are enough where the motion is known; tracks that fail are tried again with all
 
 
@@ -67,11 +68,10 @@ class PairTracker:
         min_gradient = min(MIN_GRADIENT, self._noise_sigma)
         watch.lap("pyramid")
         rejected: dict[str, int] = {}
-        kept, pixels, inverse_depths = self._follow(pyramid, left_T_left_prev, min_gradient, rejected)
-        watch.lap("flow")
-        if left_T_left_anchor is not None:
-            pixels = self._register(left, kept.ids, pixels, left_T_left_anchor, min_gradient)
-        watch.lap("register")
+        last, guess, inverse_depths = self._predict(left_T_left_prev)
+        pixels, found = self._follow(pyramid, last, guess, left_T_left_prev, left_T_left_anchor, min_gradient, watch)
+        stays = self._still_wanted(pixels, found, rejected)
+        kept, pixels, inverse_depths = last.keep(stays), pixels[stays], inverse_depths[stays]
         new = self._renew(left, pixels, np.isfinite(inverse_depths))
         watch.lap("corners")
         pixels = np.concatenate([pixels, new])
@@ -113,56 +113,66 @@ class PairTracker:
         if len(ids):
             self._last = self._last.keep(~np.isin(self._last.ids, ids))
 
-    def _follow(
-        self, pyramid: Pyramid, left_T_left_prev: Float | None, min_gradient: float, rejected: dict[str, int]
-    ) -> tuple[PairFrame, Float, Float]:
-        """The tracks that are still there, as they were, with their pixels and predicted inverse depths (or NaN)."""
-        last = self._last.keep(self._last.flat_for <= _MAX_FLAT_FRAMES)
-        if not len(last.ids):
-            return last, np.zeros((0, 2)), np.zeros(0)
-        guess, inverse_depths = last.pixels, np.where(last.has_depth, last.points[:, 2], np.nan)
-        if left_T_left_prev is not None:
-            guess, inverse_depths = self._predict(last, left_T_left_prev)
-        settings, corners = self._config.tracking, self._config.corners
-        pixels, found = track(
-            self._last_pyramid,
-            pyramid,
-            last.pixels,
-            guess,
-            window_px=settings.window_px,
-            levels=settings.levels,
-            max_return_px=settings.max_forward_backward_px,
-            min_gradient=min_gradient,
-            first_levels=None if left_T_left_prev is None else _LEVELS_AFTER_PREDICTION,
-        )
-        found = passes(np.ones(len(found), dtype=bool), found, "flow", rejected)
-        found = passes(found, self._pair.left.contains(pixels, corners.border_px), "edge", rejected)
-        columns, rows = np.where(found[:, None], pixels, 0.0).round().astype(np.int64).T
-        found = passes(found, self._allowed[rows, columns], "masked_left", rejected)
-        alone = thinned(pixels, found, corners.cell_px, _MAX_TRACKS_PER_CELL)  # the oldest of a cell come first
-        found = passes(found, alone, "crowded", rejected)
-        return last.keep(found), pixels[found], inverse_depths[found]
-
-    def _predict(self, last: PairFrame, left_T_left_prev: Float) -> tuple[Float, Float]:
-        """Pixels (N, 2) and inverse depths (N,) of the tracks after a motion."""
-        camera = self._pair.left
+    def _predict(self, left_T_left_prev: Float | None) -> tuple[PairFrame, Float, Float]:
+        """The tracks worth following, and their pixels (N, 2) and inverse depths (N,), or NaN, after a motion."""
+        last, camera = self._last.keep(self._last.flat_for <= _MAX_FLAT_FRAMES), self._pair.left
+        if left_T_left_prev is None:
+            return last, last.pixels, np.where(last.has_depth, last.points[:, 2], np.nan)
         w = np.where(last.has_depth, np.maximum(last.points[:, 2], 0.0), 0.0)
         pixels, inverse_depths, valid = predict_pixels(
             last.left, w, left_T_left_prev, camera.model_number, camera.intrinsics, camera.distortion
         )
         valid &= camera.contains(pixels)
         inverse_depths[~(last.has_depth & valid)] = np.nan
-        return np.where(valid[:, None], pixels, last.pixels), inverse_depths
+        return last, np.where(valid[:, None], pixels, last.pixels), inverse_depths
 
-    def _register(self, image: Image, ids: Int, pixels: Float, left_T_left_anchor: Float, min_gradient: float) -> Float:
-        """Pixels (N, 2) of the tracks, put right by the patches that they had at the anchor.
+    def _follow(
+        self,
+        pyramid: Pyramid,
+        last: PairFrame,
+        guess: Float,
+        left_T_left_prev: Float | None,
+        left_T_left_anchor: Float | None,
+        min_gradient: float,
+        watch: Stopwatch,
+    ) -> tuple[Float, Bool]:
+        """Where the tracks are now (N, 2), and which of them were found (N,).
 
         Following a point from frame to frame adds up the errors of each step. The anchor's patch, deformed as the
-        predicted motion would have it, shows where the point really is.
+        predicted motion would have it, shows where the point really is: most tracks are found on it at once, near
+        their predicted place. The others go by way of the frame before.
         """
+        pixels, found = guess, np.zeros(len(guess), dtype=bool)
+        if left_T_left_anchor is not None and left_T_left_prev is not None:
+            pixels, found = self._register(pyramid[0], last.ids, guess, left_T_left_anchor, min_gradient)
+        watch.lap("register")
+        rest, settings = np.flatnonzero(~found), self._config.tracking
+        if len(rest):
+            pixels[rest], found[rest] = track(
+                self._last_pyramid,
+                pyramid,
+                last.pixels[rest],
+                guess[rest],
+                window_px=settings.window_px,
+                levels=settings.levels,
+                max_return_px=settings.max_forward_backward_px,
+                min_gradient=min_gradient,
+                first_levels=None if left_T_left_prev is None else _LEVELS_AFTER_PREDICTION,
+            )
+        watch.lap("flow")
+        if left_T_left_anchor is not None:
+            rest = rest[found[rest]]
+            pixels[rest], _ = self._register(pyramid[0], last.ids[rest], pixels[rest], left_T_left_anchor, min_gradient)
+        watch.lap("register")
+        return pixels, found
+
+    def _register(
+        self, image: Image, ids: Int, guess: Float, left_T_left_anchor: Float, min_gradient: float
+    ) -> tuple[Float, Bool]:
+        """Pixels (N, 2) where the patches that the tracks had at the anchor are now, and whether they are (N,)."""
         anchor = self._anchor
-        if self._anchor_image is None or not len(anchor.ids):
-            return pixels
+        if self._anchor_image is None or not len(anchor.ids) or not len(ids):
+            return guess.copy(), np.zeros(len(ids), dtype=bool)
         rows = np.minimum(np.searchsorted(anchor.ids, ids), len(anchor.ids) - 1)
         wanted = (anchor.ids[rows] == ids) & anchor.has_depth[rows]
         camera = self._pair.left
@@ -174,18 +184,30 @@ class PairTracker:
             camera.intrinsics,
             camera.distortion,
         )
-        registered, _, _ = register(
+        pixels, found, _, correlations = register(
             self._anchor_image,
             image,
             anchor.pixels[rows],
             warps,
-            pixels,
+            guess,
             wanted & usable,
             self._config.tracking.window_px // 2,
             _MAX_REGISTRATION_PX,
             min_gradient,
         )
-        return registered
+        found &= correlations > _SAME_PATCH
+        pixels[~found] = guess[~found]
+        return pixels, found
+
+    def _still_wanted(self, pixels: Float, found: Bool, rejected: dict[str, int]) -> Bool:
+        """Which tracks (N,) stay: found, where the image may be used, and not crowded together."""
+        corners = self._config.corners
+        found = passes(np.ones(len(found), dtype=bool), found, "flow", rejected)
+        found = passes(found, self._pair.left.contains(pixels, corners.border_px), "edge", rejected)
+        columns, rows = np.where(found[:, None], pixels, 0.0).round().astype(np.int64).T
+        found = passes(found, self._allowed[rows, columns], "masked_left", rejected)
+        alone = thinned(pixels, found, corners.cell_px, _MAX_TRACKS_PER_CELL)  # the oldest of a cell come first
+        return passes(found, alone, "crowded", rejected)
 
     def _renew(self, image: Image, pixels: Float, has_depth: Bool) -> Float:
         """New corners (M, 2) where no track gives geometry, weak ones too where there are few."""
