@@ -6,6 +6,7 @@ from synthetic import transform
 from graphvio.arrays import Bool, Float, Image
 from graphvio.cameras import RADIAL_TANGENTIAL, project_points, unproject_pixels
 from graphvio.config import StereoConfig
+from graphvio.frontend.lucas_kanade import build_pyramid
 from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
 
 FOCAL, BASELINE = 400.0, 0.1
@@ -106,7 +107,8 @@ def search(left: Image, right: Image, pixels: Float, nearest_m: float = 0.5) -> 
     rays, _ = unproject_pixels(RADIAL_TANGENTIAL, INTRINSICS, lens, pixels)
     bounds = np.column_stack([np.zeros(len(pixels)), np.full(len(pixels), 1.0 / nearest_m)])
     least = StereoConfig().min_correlation
-    return epipolar_search(left, right, pixels, rays, bounds, RECTIFIED, RADIAL_TANGENTIAL, INTRINSICS, lens, least)
+    images = build_pyramid(left, 2), build_pyramid(right, 2)
+    return epipolar_search(*images, pixels, rays, bounds, RECTIFIED, RADIAL_TANGENTIAL, INTRINSICS, lens, least)
 
 
 def grid() -> Float:
@@ -151,13 +153,12 @@ def test_the_search_follows_the_curve_of_a_distorted_lens() -> None:
     places, _ = project_points(RADIAL_TANGENTIAL, INTRINSICS, lens, moved)
     right = textured(3)
     for (x, y), (u, v) in zip(pixels.astype(int), np.round(places).astype(int), strict=True):
-        if 8 <= u < 312 and 8 <= v < 232:
-            right[v - 7 : v + 8, u - 7 : u + 8] = left[y - 7 : y + 8, x - 7 : x + 8]
-    inside = (places.min(axis=1) > 8) & (places[:, 0] < 311) & (places[:, 1] < 231)
+        if 12 <= u < 308 and 12 <= v < 228:
+            right[v - 11 : v + 12, u - 11 : u + 12] = left[y - 11 : y + 12, x - 11 : x + 12]
+    inside = (places.min(axis=1) > 12) & (places[:, 0] < 307) & (places[:, 1] < 227)
     bounds = np.column_stack([np.zeros(len(rays)), np.full(len(rays), 2.0)])
-    matches, found = epipolar_search(
-        left, right, pixels, rays, bounds, SKEWED, RADIAL_TANGENTIAL, INTRINSICS, lens, 0.7
-    )
+    images = build_pyramid(left, 2), build_pyramid(right, 2)
+    matches, found = epipolar_search(*images, pixels, rays, bounds, SKEWED, RADIAL_TANGENTIAL, INTRINSICS, lens, 0.7)
     assert inside.sum() >= 10
     assert found[inside].mean() > 0.8
     good = inside & found

@@ -13,6 +13,7 @@ from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.config import Config, CornerConfig
 from graphvio.errors import RigError
 from graphvio.frontend.grain import noise_sigma
+from graphvio.frontend.lucas_kanade import build_pyramid
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import PairFrame
@@ -182,7 +183,8 @@ def test_a_match_must_be_a_corner_in_the_right_image_too() -> None:
     fainter = np.round(128.0 + 0.6 * (right.astype(float) - 128.0)).astype(np.uint8)
     rejected = []
     for seen_right in (right, fainter):
-        matches = matcher.match(left, seen_right, pixels, rays, np.full(n, 0.5), np.zeros((n, 2)), 6.0)
+        images = build_pyramid(left, 2), build_pyramid(seen_right, 2)
+        matches = matcher.match(*images, pixels, rays, np.full(n, np.nan), np.zeros((n, 2)), 6.0)
         rejected.append(matches.rejected["corner"])
         assert matches.good.sum() + sum(matches.rejected.values()) == n
     assert rejected[0] < 0.15 * n

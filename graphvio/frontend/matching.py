@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Image
+from graphvio.arrays import Bool, Float
 from graphvio.config import Config
-from graphvio.frontend.lucas_kanade import register
+from graphvio.frontend.lucas_kanade import Pyramid, register
 from graphvio.frontend.slanted import align_slanted
 from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
 from graphvio.frontend.tracks import passes
@@ -51,8 +51,8 @@ class StereoMatcher:
 
     def match(
         self,
-        left: Image,
-        right: Image,
+        left: Pyramid,
+        right: Pyramid,
         pixels: Float,
         rays: Float,
         inverse_depths: Float,
@@ -62,8 +62,8 @@ class StereoMatcher:
         """Search, refine, test, triangulate.
 
         Args:
-            left: image (height, width).
-            right: image (height, width).
+            left: image and the one of half the size, at least.
+            right: image and the one of half the size, at least.
             pixels: (N, 2) corners in the left image.
             rays: (N, 2) their normalised coordinates.
             inverse_depths: (N,) expected, 1/m, NaN where nothing is known.
@@ -91,7 +91,7 @@ class StereoMatcher:
         return StereoMatches(normalised, points, covariances, slopes, good, rejected)
 
     def _search(
-        self, left: Image, right: Image, pixels: Float, rays: Float, inverse_depths: Float, slopes: Float,
+        self, left: Pyramid, right: Pyramid, pixels: Float, rays: Float, inverse_depths: Float, slopes: Float,
         min_gradient: float, rejected: dict[str, int],
     ) -> tuple[Float, Float, Bool]:  # fmt: skip
         """Pixels (N, 2) in the right image to sub-pixel precision, slopes (N, 2), and whether appearance agrees."""
@@ -104,12 +104,12 @@ class StereoMatcher:
         if len(unknown):
             bounds = np.tile([0.0, 1.0 / settings.min_depth_m], (len(unknown), 1))
             guess[unknown], usable[unknown] = epipolar_search(
-                left, right, pixels[unknown], rays[unknown], bounds, *camera, _SEARCH_CORRELATION
+                left[:2], right[:2], pixels[unknown], rays[unknown], bounds, *camera, _SEARCH_CORRELATION
             )
         found = passes(np.ones(len(pixels), dtype=bool), usable, "search", rejected)
         half = tracking.window_px // 2
         matched, slopes, correlations, converged = align_slanted(
-            left, right, pixels, guess, directions, slopes, known, found, half
+            left[0], right[0], pixels, guess, directions, slopes, known, found, half
         )
         shift = np.hypot(matched[:, 0] - guess[:, 0], matched[:, 1] - guess[:, 1])
         close = shift <= np.where(known, _SEARCH_MARGIN_PX, _MAX_REFINEMENT_PX)
@@ -119,7 +119,7 @@ class StereoMatcher:
         unchecked = found & ~(known & (shift < _FORETOLD_PX))
         warps = np.eye(2) + directions[:, :, None] * slopes[:, None, :]
         _, returned, localised, _ = register(
-            right, left, matched, warps, pixels, unchecked, half, tracking.max_forward_backward_px, min_gradient
+            right[0], left[0], matched, warps, pixels, unchecked, half, tracking.max_forward_backward_px, min_gradient
         )
         found = passes(found, localised | ~unchecked, "corner", rejected)
         return matched, slopes, passes(found, returned | ~unchecked, "left_right", rejected)

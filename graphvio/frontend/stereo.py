@@ -5,6 +5,8 @@ coordinates ``[x, y, 1, w]``. Points so far away that their depth is unknown are
 keep what they say about rotation.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
@@ -12,15 +14,17 @@ from graphvio.cameras import distort
 from graphvio.kernels import fast_kernel, kernel
 
 _HALF_PATCH = 5
-_SIDE = 2 * _HALF_PATCH + 1
+_HALF_COARSE_PATCH = 4
+_MOST_STEPS = 400
+_FINE_STEPS = 2  # of the half-sized image, to either side
 _AMBIGUOUS = 0.97
 _GAUSS_NEWTON_STEPS = 4
 
 
 @kernel
 def epipolar_search(
-    left: Image,
-    right: Image,
+    left: Sequence[Image],
+    right: Sequence[Image],
     pixels: Float,
     rays: Float,
     inverse_depths: Float,
@@ -32,9 +36,11 @@ def epipolar_search(
 ) -> tuple[Float, Bool]:
     """The best place of each corner on its epipolar curve in the right image, to the pixel.
 
+    The curve is searched in images of half the size; the whole image then decides around the best place there.
+
     Args:
-        left: image (height, width).
-        right: image (height, width).
+        left: image (height, width), and the same in half the size.
+        right: image (height, width), and the same in half the size.
         pixels: (N, 2) corners in the left image.
         rays: (N, 2) their normalised coordinates.
         inverse_depths: (N, 2) range that is searched, 1/m.
@@ -48,35 +54,64 @@ def epipolar_search(
     n = len(pixels)
     matches = np.zeros((n, 2))
     found = np.zeros(n, dtype=np.bool_)
-    height, width = right.shape
-    patch = np.empty((_SIDE, _SIDE), dtype=np.float32)
+    coarse, fine = _square(_HALF_COARSE_PATCH), _square(_HALF_PATCH)
+    scores = np.empty(_MOST_STEPS + 1)
+    camera = (right_T_left, model, intrinsics, distortion)
     for i in range(n):
-        if not _normalised_patch(left, pixels[i, 0], pixels[i, 1], patch):
+        x, y, w0, w1 = pixels[i, 0], pixels[i, 1], inverse_depths[i, 0], inverse_depths[i, 1]
+        if not (_normalised_patch(left[1], 0.5 * x, 0.5 * y, coarse) and _normalised_patch(left[0], x, y, fine)):
             continue
-        u0, v0, ok0 = _on_curve(rays[i], inverse_depths[i, 0], right_T_left, model, intrinsics, distortion)
-        u1, v1, ok1 = _on_curve(rays[i], inverse_depths[i, 1], right_T_left, model, intrinsics, distortion)
-        if not (ok0 and ok1):
+        best, steps = _scan(right[1], 0.5, coarse, rays[i], w0, w1, camera, scores)
+        if steps == 0 or scores[best] < min_correlation or _is_ambiguous(scores[: steps + 1], best):
             continue
-        steps = min(max(int(np.hypot(u1 - u0, v1 - v0)) + 1, 2), 400)
-        scores = np.full(steps + 1, -1.0)
-        best, best_step = -1.0, -1
-        for k in range(steps + 1):
-            w = inverse_depths[i, 0] + (inverse_depths[i, 1] - inverse_depths[i, 0]) * k / steps
-            u, v, ok = _on_curve(rays[i], w, right_T_left, model, intrinsics, distortion)
-            x, y = round(u), round(v)
-            if not ok or x < _HALF_PATCH or y < _HALF_PATCH or x >= width - _HALF_PATCH or y >= height - _HALF_PATCH:
-                continue
-            scores[k] = _correlation(right, int(x), int(y), patch)
-            if scores[k] > best:
-                best, best_step = scores[k], k
-                matches[i, 0], matches[i, 1] = u, v
-        if best < min_correlation:
+        step = (w1 - w0) / steps
+        w0, w1 = w0 + (best - _FINE_STEPS) * step, w0 + (best + _FINE_STEPS) * step
+        best, steps = _scan(right[0], 1.0, fine, rays[i], w0, w1, camera, scores)
+        if steps == 0 or scores[best] < min_correlation:
             continue
-        found[i] = True
-        for k in range(steps + 1):
-            if abs(k - best_step) > 3 and scores[k] > _AMBIGUOUS * best:
-                found[i] = False  # a repeating texture: another place is as good
+        w = w0 + (w1 - w0) * best / steps
+        matches[i, 0], matches[i, 1], found[i] = _on_curve(rays[i], w, right_T_left, model, intrinsics, distortion)
     return matches, found
+
+
+@kernel
+def _scan(
+    image: Image, scale: float, patch: AnyArray, ray: Float, w0: float, w1: float,
+    camera: tuple[Float, int, Float, Float], scores: Float,
+) -> tuple[int, int]:  # fmt: skip
+    """Fill a patch's correlations along its epipolar curve, a pixel apart, in an image of so many times the size.
+
+    Returns:
+        Which is the best, and the number of steps, 0 where the curve's ends are not in the image plane.
+    """
+    height, width = image.shape
+    half = len(patch) // 2
+    right_T_left, model, intrinsics, distortion = camera
+    u0, v0, ok0 = _on_curve(ray, w0, right_T_left, model, intrinsics, distortion)
+    u1, v1, ok1 = _on_curve(ray, w1, right_T_left, model, intrinsics, distortion)
+    if not (ok0 and ok1):
+        return 0, 0
+    steps = min(max(int(scale * np.hypot(u1 - u0, v1 - v0)) + 1, 2), _MOST_STEPS)
+    best = 0
+    for k in range(steps + 1):
+        scores[k] = -1.0
+        u, v, ok = _on_curve(ray, w0 + (w1 - w0) * k / steps, right_T_left, model, intrinsics, distortion)
+        x, y = round(scale * u), round(scale * v)
+        if not ok or x < half or y < half or x >= width - half or y >= height - half:
+            continue
+        scores[k] = _correlation(image, int(x), int(y), patch)
+        if scores[k] > scores[best]:
+            best = k
+    return best, steps
+
+
+@kernel
+def _is_ambiguous(scores: Float, best: int) -> bool:
+    """Whether another place of a curve is as good as the best: a texture that repeats."""
+    for k in range(len(scores)):  # noqa: SIM110 (numba knows no generators)
+        if abs(k - best) > _FINE_STEPS and scores[k] > _AMBIGUOUS * scores[best]:
+            return True
+    return False
 
 
 @kernel
@@ -191,14 +226,20 @@ def _on_curve(
 
 
 @kernel
+def _square(half: int) -> AnyArray:
+    return np.empty((2 * half + 1, 2 * half + 1), dtype=np.float32)
+
+
+@kernel
 def _normalised_patch(image: Image, x: float, y: float, patch: AnyArray) -> bool:
     """Fill the patch around (x, y) with zero mean and unit norm; False at the edge or without contrast."""
-    cx, cy = round(x), round(y)
+    cx, cy, side = round(x), round(y), len(patch)
+    half = side // 2
     height, width = image.shape
-    if cx < _HALF_PATCH or cy < _HALF_PATCH or cx >= width - _HALF_PATCH or cy >= height - _HALF_PATCH:
+    if cx < half or cy < half or cx >= width - half or cy >= height - half:
         return False
-    left, top = int(cx) - _HALF_PATCH, int(cy) - _HALF_PATCH
-    values = image[top : top + _SIDE, left : left + _SIDE].astype(np.float32)
+    left, top = int(cx) - half, int(cy) - half
+    values = image[top : top + side, left : left + side].astype(np.float32)
     values -= np.mean(values)
     norm = np.sqrt(np.sum(values * values))
     if norm < 1e-6:
@@ -212,17 +253,18 @@ def _correlation(image: Image, cx: int, cy: int, patch: AnyArray) -> float:
     """Normalised cross-correlation of a patch of zero mean and unit norm with the image around a pixel."""
     total = square = 0
     product = np.float32(0.0)
-    left, top = cx - _HALF_PATCH, cy - _HALF_PATCH
-    for j in range(_SIDE):
-        values, weights = image[top + j, left : left + _SIDE], patch[j]
+    side = len(patch)
+    left, top = cx - side // 2, cy - side // 2
+    for j in range(side):
+        values, weights = image[top + j, left : left + side], patch[j]
         row = np.float32(0.0)  # of its own: a row need not wait for the one before
-        for i in range(_SIDE):
+        for i in range(side):
             value = int(values[i])
             total += value
             square += value * value
             row += np.float32(value) * weights[i]
         product += row
-    variance = square - float(total) * total / (_SIDE * _SIDE)
+    variance = square - float(total) * total / (side * side)
     if variance < 1e-3:
         return -1.0
     return float(product / np.sqrt(variance))

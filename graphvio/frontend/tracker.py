@@ -62,7 +62,7 @@ class PairTracker:
         """
         left, right = _checked(left, self._pair.left), _checked(right, self._pair.right)
         watch = Stopwatch()
-        pyramid = build_pyramid(left, self._config.tracking.levels)
+        pyramid = build_pyramid(left, max(self._config.tracking.levels, 2))
         self._noise_sigma = noise_sigma(left)
         # A patch of nothing but noise has 0.7 of its standard deviation.
         min_gradient = min(MIN_GRADIENT, self._noise_sigma)
@@ -78,7 +78,9 @@ class PairTracker:
         rays, has_ray = self._pair.left.unproject(pixels)
         inverse_depths = np.concatenate([inverse_depths, np.full(len(new), np.nan)])
         slopes = np.concatenate([kept.slopes, np.zeros((len(new), 2))])
-        matches = self._matcher.match(left, right, pixels, rays, inverse_depths, slopes, min_gradient)
+        matches = self._matcher.match(
+            pyramid, build_pyramid(right, 2), pixels, rays, inverse_depths, slopes, min_gradient
+        )
         watch.lap("stereo")
         none = np.zeros(len(new), dtype=np.int64)
         has_depth = matches.good & has_ray
