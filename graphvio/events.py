@@ -106,9 +106,11 @@ class PairReport:
         is_inlier: (N,) whether each of them is explained.
         ages: (N,) number of earlier frames that saw each of them.
         rejected: test of tracking or stereo matching -> how many corners it threw out.
-        rms_px: rms error of the inliers of all pairs under the chosen motion, or None without one.
+        rms_px: rms reprojection error of these under the chosen motion, per direction and without the share of the
+            points' own uncertainty; None where there are none.
         own_inliers: points that the pair's own motion explains, or None where there is but one pair or too few points.
-        own_rms_px: their rms error; much less than ``rms_px`` tells of a transfer between pairs that is wrong.
+        own_rms_px: their rms error under it, or None; much less than ``rms_px`` tells of a transfer between pairs that
+            is wrong.
     """
 
     points: int
@@ -140,7 +142,9 @@ class Estimate:
         vision_reason: why that is not ``good``, or empty.
         at_rest: images, and the IMU if there is one, show no motion.
         pairs: pair index -> what it contributed.
-        stage_ms: processing time by stage, milliseconds.
+        stage_ms: processing time by stage, milliseconds: ``predict``; ``track``, with all pairs side by side; its parts
+            ``pyramid``, ``flow``, ``register``, ``corners`` and ``stereo``, each of the pair that took longest; then
+            ``motion``, ``judge`` and ``update``. A stage that was not reached is absent.
     """
 
     stamp_ns: int

@@ -371,5 +371,6 @@ def run_chains(
             total = motion.cur_T_ref @ total
             covariance = adjoint @ covariance @ adjoint.T + motion.covariance
             inlier &= motion.inlier
-        campaign.add(motion_between(poses[0], poses[-1]), Refined(total, covariance, np.zeros((6, 6)), inlier, 0.0))
+        untold = np.full(len(inlier), np.nan)
+        campaign.add(motion_between(poses[0], poses[-1]), Refined(total, covariance, np.zeros((6, 6)), inlier, untold))
     return campaign

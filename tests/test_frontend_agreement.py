@@ -12,9 +12,11 @@ from graphvio.config import MotionConfig
 from graphvio.events import Quality
 from graphvio.frontend.agreement import Agreement, agree
 from graphvio.frontend.motion import RelativeMotion
-from graphvio.frontend.observations import Observations, RigArrays
+from graphvio.frontend.observations import Correspondences, Observations, RigArrays
 from graphvio.frontend.quality import graded
 from graphvio.frontend.selection import joint_motion
+from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.visual import _report
 from graphvio.geometry import se3_inverse, se3_log
 
 RIG = two_pair_rig()
@@ -91,6 +93,32 @@ def test_a_single_pair_has_nobody_to_contradict_it() -> None:
     agreement = judged(seen)
     assert len(agreement.sides) == 1
     assert agreement.own == {}
+
+
+def test_each_pair_is_told_its_own_error() -> None:
+    quiet_px, loud_px = 0.15, 0.3
+    quiet = seen_points(RIG, TRUTH, 200, np.random.default_rng(5), sigma_px=quiet_px).of_pair(0)
+    loud = seen_points(RIG, TRUTH, 200, np.random.default_rng(6), sigma_px=loud_px).of_pair(1)
+    seen = joined(quiet, loud)
+    agreement = judged(seen)
+    assert len(agreement.sides) == 1
+    rows = {j: np.arange(200) for j in range(2)}
+    frame = replace(PairFrame.empty(), ids=np.arange(200), ages=np.zeros(200, dtype=np.int64))
+    for j, sigma_px in enumerate((quiet_px, loud_px)):
+        report = _report(frame, Correspondences(seen, rows, 400), j, agreement)
+        assert report.inliers > 180
+        assert report.rms_px == pytest.approx(sigma_px, rel=0.1)
+        assert report.own_rms_px == pytest.approx(sigma_px, rel=0.1)
+
+
+def test_a_pair_that_the_chosen_motion_does_not_explain_has_no_error_under_it() -> None:
+    seen = mixed((TRUTH, 120), (DOOR, 60))
+    agreement = judged(seen)
+    rows = {0: np.arange(120), 1: np.arange(60)}
+    frame = replace(PairFrame.empty(), ids=np.arange(60), ages=np.zeros(60, dtype=np.int64))
+    report = _report(frame, Correspondences(seen, rows, 180), 1, agreement)
+    assert (report.inliers, report.rms_px) == (0, None)
+    assert report.own_rms_px == pytest.approx(0.2, rel=0.15)
 
 
 def test_the_threads_timing_changes_nothing() -> None:

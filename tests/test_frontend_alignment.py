@@ -12,13 +12,14 @@ from graphvio.geometry import se3_exp, se3_log
 NONE = np.zeros(6)
 OFF = np.array([0.012, -0.009, 0.008, 0.02, -0.015, 0.018])  # about 1 degree and 3 cm
 INLIER = np.ones(50, dtype=bool)
+ERRORS_PX = np.full(50, 0.3)
 
 
 def refined(motion: Float, rng: np.random.Generator, sigma: float) -> Refined:
     """A measurement of a motion with an error that its covariance describes."""
     covariance = random_covariance(rng, 6, sigma)
     error = np.linalg.cholesky(covariance) @ rng.standard_normal(6)
-    return Refined(np.ascontiguousarray(se3_exp(error) @ motion), covariance, 0.5 * covariance, INLIER, 0.3)
+    return Refined(np.ascontiguousarray(se3_exp(error) @ motion), covariance, 0.5 * covariance, INLIER, ERRORS_PX)
 
 
 def watch(
@@ -38,8 +39,8 @@ def add_keyframe(
     seen = np.linalg.inv(se3_exp(off)) @ motion @ se3_exp(off)  # what the pair reports with the rig file's extrinsics
     if rng.random() < outlier_share:
         seen = seen @ random_transform(rng, 0.05, 0.1)
-    in_force = alignment.assumed
-    reported = np.ascontiguousarray(in_force @ seen @ np.linalg.inv(in_force))
+    correction = alignment.correction
+    reported = np.ascontiguousarray(correction @ seen @ np.linalg.inv(correction))
     alignment.add(refined(motion, rng, sigma), refined(reported, rng, sigma))
 
 
@@ -80,7 +81,7 @@ def test_a_correction_in_force_goes_on_being_refined() -> None:
     for _ in range(6):
         found = alignment.solve()
         assert found is not None
-        alignment.apply(found)
+        alignment.in_force = found
         for _ in range(10):
             add_keyframe(alignment, OFF, rng)
     found = alignment.solve()

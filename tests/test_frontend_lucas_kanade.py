@@ -113,7 +113,9 @@ def registered(warp: Float, assumed: Float, guess_error: Float) -> tuple[Float, 
     for middle in grid()[::7]:
         target = warped(warp, middle, place)
         guess = (place + guess_error)[None]
-        moved, ok, _, _ = register(source, target, middle[None], assumed[None], guess, np.ones(1, dtype=bool), 7, 2.0, 1.0)
+        moved, ok, _, _ = register(
+            source, target, middle[None], assumed[None], guess, np.ones(1, dtype=bool), 7, 2.0, 1.0
+        )
         errors.append(moved[0] - place)
         found.append(ok[0])
     return np.array(errors), np.array(found)

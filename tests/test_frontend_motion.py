@@ -312,6 +312,7 @@ def test_all_pairs_together_are_better_than_the_best_one() -> None:
 def test_explained_points_are_the_refinements_inliers() -> None:
     seen = noisy()
     refined = refine(ARRAYS, seen, TRUTH, CONFIG)
-    again = explained(ARRAYS, seen, refined.cur_T_ref, CONFIG)
+    again, errors_px = explained(ARRAYS, seen, refined.cur_T_ref, CONFIG)
     assert np.mean(again == refined.inlier) > 0.98
     assert 0.8 < again.mean() < 0.97
+    np.testing.assert_allclose(errors_px[again], refined.errors_px[again], atol=1e-3)

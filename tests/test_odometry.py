@@ -12,7 +12,7 @@ import pytest
 from graphvio import Config, Estimate, EventError, FrameSet, ImuSample, Odometry, RigError, Status, open_source
 from graphvio.arrays import Image
 from graphvio.backend.window import Window, WindowError
-from graphvio.events import Event
+from graphvio.events import Event, Quality
 from graphvio.trajectory import Trajectory
 
 pytestmark = pytest.mark.xdist_group("room_walk")
@@ -108,6 +108,8 @@ def test_framesets_before_the_imu_have_no_pose_and_start_nothing(odometry: Odome
     estimates = feed(odometry, [kept for e in events if (kept := _without_early_imu(e, first)) is not None])
     assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(events)]
     assert all(e.status is Status.INITIALISING and e.nav_T_body is None for e in estimates[:20])
+    assert (estimates[0].vision, estimates[0].vision_reason) == (Quality.FAILED, "first images")
+    assert all(e.vision is not Quality.FAILED for e in estimates[1:20])
     assert all(e.nav_T_body is not None and e.epoch == 0 for e in estimates[20:])
     assert kinds(odometry) == []
 

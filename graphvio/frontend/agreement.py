@@ -164,7 +164,7 @@ def _second_motion(
 
 
 def _spread_over(rows: Bool, refined: Refined) -> Refined:
-    """A motion of some rows' points, its inliers among all points."""
-    inlier = np.zeros(len(rows), dtype=bool)
-    inlier[rows] = refined.inlier
-    return replace(refined, inlier=inlier)
+    """A motion of some rows' points, its inliers and errors among all points."""
+    inlier, errors_px = np.zeros(len(rows), dtype=bool), np.full(len(rows), np.nan)
+    inlier[rows], errors_px[rows] = refined.inlier, refined.errors_px
+    return replace(refined, inlier=inlier, errors_px=errors_px)

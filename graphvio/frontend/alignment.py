@@ -46,15 +46,25 @@ class Misalignment(NamedTuple):
 
 
 class PairAlignment:
-    """Collects what one pair's motions say of its place relative to another pair."""
+    """Collects what one pair's motions say of its place relative to another pair.
+
+    Attributes:
+        in_force: the error that the pair's motions allow for from here on, or None as long as it is none.
+    """
 
     def __init__(self) -> None:
         self._equations: deque[tuple[Float, Float]] = deque(maxlen=_KEPT)  # whitened A (6, 6) and y (6,)
-        self.assumed = np.eye(4)  # correction that is in force: exp(d) of the last `Misalignment` applied
+        self.in_force: Misalignment | None = None
+
+    @property
+    def correction(self) -> Float:
+        """What the rig file's ``body_T_left`` of the pair is to be multiplied by from the left (4, 4)."""
+        return np.eye(4) if self.in_force is None else se3_exp(self.in_force.tangent)
 
     def add(self, trusted: Refined, pair: Refined) -> None:
         """Take two motions over the same keyframe, the pair's computed with the correction in force."""
-        nominal = se3_inverse(self.assumed) @ pair.cur_T_ref @ self.assumed
+        correction = self.correction
+        nominal = se3_inverse(correction) @ pair.cur_T_ref @ correction
         y = se3_log(np.ascontiguousarray(nominal @ se3_inverse(trusted.cur_T_ref)))
         a = se3_adjoint(trusted.cur_T_ref) - np.eye(6)
         whiten = np.linalg.inv(np.linalg.cholesky(trusted.covariance + pair.covariance))
@@ -77,7 +87,3 @@ class PairAlignment:
         if np.mean(squared > 4.0 * _CAUCHY) > _MOST_OUTLIERS:
             return None
         return Misalignment(d, np.asarray(np.linalg.inv(information)), float(d @ (information - prior) @ d))
-
-    def apply(self, misalignment: Misalignment) -> None:
-        """From here on, motions that are added were computed with this correction."""
-        self.assumed = se3_exp(misalignment.tangent)

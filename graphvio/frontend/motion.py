@@ -46,7 +46,8 @@ class VisualResult:
         alternatives: where pairs contradict each other, what each side says with its own covariance: one is right.
         at_rest: the images show no motion since the reference.
         pairs: pair index -> report.
-        stage_ms: time by stage.
+        stage_ms: time by stage, milliseconds: ``track``, with all pairs side by side; its parts ``pyramid``, ``flow``,
+            ``register``, ``corners`` and ``stereo``, each of the pair that took longest; then ``motion`` and ``judge``.
     """
 
     motion: RelativeMotion | None

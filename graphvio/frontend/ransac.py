@@ -24,12 +24,7 @@ def search(
     points, as far as the share that the best one explains tells (M. Fischler, R. Bolles, *Random sample consensus*,
     CACM 24(6), 1981); ``config.hypotheses`` of each pair is the most, and confidence 1 draws them all at once.
 
-    Args:
-        rig: of P pairs.
-        observations: of any subset of them.
-        predicted: ``cur_T_ref`` (4, 4), one more hypothesis.
-        config: of this stage.
-        rng: source of the random triples.
+    For arguments see `graphvio.frontend.selection.joint_motion`.
     """
     best, drawn = predicted, 0
     pairs = [int(pair) for pair in np.unique(observations.pair)]

@@ -37,14 +37,21 @@ class Refined:
         shared_covariance: (6, 6) the part of it that all motions from the same reference have in common, since they
             rest on the same triangulated points.
         inlier: (N,) the points that it explains.
-        rms_px: root mean square of the inliers' errors in one direction, the points' own uncertainty allowed for.
+        errors_px: (N,) each point's reprojection error in one direction, root mean square over its images, the point's
+            own uncertainty allowed for: what is left is the noise of the pixels. Infinite behind a camera, NaN for
+            points that the motion was not tried on.
     """
 
     cur_T_ref: Float
     covariance: Float
     shared_covariance: Float
     inlier: Bool
-    rms_px: float
+    errors_px: Float
+
+    def rms_px(self, among: Bool | None = None) -> float | None:
+        """Root mean square of the inliers' errors, of all or among some points (N,); None where there are none."""
+        errors_px = self.errors_px[self.inlier if among is None else self.inlier & among]
+        return float(np.sqrt(np.mean(errors_px**2))) if len(errors_px) else None
 
 
 def refine(
@@ -86,7 +93,7 @@ def refine(
         inflation * covariance,
         inflation * shared,
         inlier,
-        sigma * float(np.sqrt(used.variance)),
+        _errors_px(errors2, has_right, sigma),
     )
 
 
@@ -166,12 +173,17 @@ def _through_points(
     return information_through_points(left_motions(pose, rig), rig, observations, at, sigma, factors)
 
 
-def explained(rig: RigArrays, observations: Observations, cur_T_ref: Float, config: MotionConfig) -> Bool:
-    """The points (N,) that are inliers of a motion (4, 4), their own uncertainty allowed for."""
-    sigma = config.pixel_sigma_px
+def explained(rig: RigArrays, observations: Observations, cur_T_ref: Float, config: MotionConfig) -> tuple[Bool, Float]:
+    """Which points (N,) are inliers of a motion (4, 4), and the errors (N,) of all, see `Refined`."""
+    sigma, has_right = config.pixel_sigma_px, observations.has_right
     errors2 = _squared_errors(cur_T_ref, rig, observations, sigma)
     largest2 = (config.max_error_px / sigma) ** 2
-    return np.asarray(errors2 < inlier_cutoff(errors2, observations.has_right, largest2))
+    return np.asarray(errors2 < inlier_cutoff(errors2, has_right, largest2)), _errors_px(errors2, has_right, sigma)
+
+
+def _errors_px(errors2: Float, has_right: Bool, sigma: float) -> Float:
+    """Squared whitened errors (N,) as pixels in one direction."""
+    return np.asarray(sigma * np.sqrt(errors2 / np.where(has_right, 4.0, 2.0)))
 
 
 @kernel

@@ -45,7 +45,8 @@ def best_pair_motion(
     ]
     costs = [global_cost(rig, observations, candidate.cur_T_ref, config.cauchy_scale_px) for candidate in candidates]
     winner = candidates[int(np.argmin(costs))]
-    return replace(winner, inlier=explained(rig, observations, winner.cur_T_ref, config))
+    inlier, errors_px = explained(rig, observations, winner.cur_T_ref, config)
+    return replace(winner, inlier=inlier, errors_px=errors_px)
 
 
 def global_cost(rig: RigArrays, observations: Observations, cur_T_ref: Float, cauchy_scale_px: float) -> float:

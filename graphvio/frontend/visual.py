@@ -24,7 +24,7 @@ from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.stopwatch import Stopwatch
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import PairFrame
-from graphvio.geometry import se3_exp, se3_inverse
+from graphvio.geometry import se3_inverse
 from graphvio.rig import Rig
 
 MotionPredictor = Callable[[int], Float | None]
@@ -36,13 +36,13 @@ class VisualFrontend:
 
     def __init__(self, rig: Rig, config: Config) -> None:
         self._config = config
-        self._nominal = self._arrays = RigArrays.of(rig)
+        self._rig = rig
+        self._arrays = RigArrays.of(rig)  # with the corrections that are in force
         self._trackers = [PairTracker(pair, config) for pair in rig.pairs]
         self._frozen = FrozenImages()
         self._latest: dict[int, PairFrame] = {}
         self._references = References(config.motion)
         self._alignments = {j: PairAlignment() for j in range(1, len(rig.pairs))}
-        self._misaligned: dict[int, Misalignment] = {}
         self._workers = ThreadPoolExecutor(len(rig.pairs), thread_name_prefix="graphvio-pair")
         if len(rig.pairs) > 1:
             cv2.setNumThreads(1)  # pairs run side by side; OpenCV's own threads would only compete with them
@@ -55,7 +55,7 @@ class VisualFrontend:
     @property
     def misaligned(self) -> Mapping[int, Misalignment]:
         """Pairs whose place relative to the first pair is not what the rig says: motions allow for it."""
-        return self._misaligned
+        return {j: alignment.in_force for j, alignment in self._alignments.items() if alignment.in_force is not None}
 
     def process(self, frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
         """Measure the motion of a frameset.
@@ -153,13 +153,13 @@ class VisualFrontend:
             return None, f"only {len(observations.pair)} points in view"
         rng = np.random.default_rng([config.seed, stamp_ns % 2**63])
         start = np.eye(4) if predicted is None else predicted
-        solve = joint_motion if config.selection == "joint" else best_pair_motion
-        refined = solve(self._arrays, observations, start, config, rng)
-        if config.selection == "best_pair":
+        if config.selection == "joint":
+            refined = joint_motion(self._arrays, observations, start, config, rng)
+            agreement = agree(self._arrays, observations, refined, config, rng, self._workers)
+        else:
+            refined = best_pair_motion(self._arrays, observations, start, config, rng)
             everyone = tuple(int(j) for j in np.unique(observations.pair))
             agreement = Agreement((Side(everyone, refined),), {})
-        else:
-            agreement = agree(self._arrays, observations, refined, config, rng, self._workers)
         best = agreement.sides[0]
         rows = np.isin(observations.pair, best.pairs)
         if not is_supported(best.refined.inlier[rows], config):
@@ -188,7 +188,7 @@ class VisualFrontend:
     def _learn_alignments(self, agreement: Agreement) -> None:
         """At the end of a keyframe, compare the pairs' motions over it with the first pair's."""
         own = agreement.own
-        if 0 not in own or self._config.motion.selection != "joint":
+        if 0 not in own:
             return
         for j, alignment in self._alignments.items():
             if j not in own:
@@ -196,9 +196,8 @@ class VisualFrontend:
             alignment.add(own[0], own[j])
             misalignment = alignment.solve()
             if misalignment is not None and misalignment.is_significant:
-                alignment.apply(misalignment)
-                self._misaligned[j] = misalignment
-                self._arrays = self._arrays.corrected(self._nominal, j, se3_exp(misalignment.tangent))
+                alignment.in_force = misalignment
+                self._arrays = self._arrays.corrected(RigArrays.of(self._rig), j, alignment.correction)
 
 
 def _inliers_of(pair: int, correspondences: Correspondences, agreement: Agreement) -> Bool:
@@ -219,14 +218,14 @@ def _report(
     report = replace(report, points=len(rows))
     if agreement is None:
         return report
-    explained = agreement.sides[0].refined.inlier[correspondences.observations.pair == pair]
-    is_inlier[rows] = explained
+    of_pair, chosen = correspondences.observations.pair == pair, agreement.sides[0].refined
+    is_inlier[rows] = chosen.inlier[of_pair]
     own = agreement.own.get(pair)
     return replace(
         report,
-        inliers=int(explained.sum()),
+        inliers=int(is_inlier.sum()),
         is_inlier=is_inlier,
-        rms_px=agreement.sides[0].refined.rms_px,
+        rms_px=chosen.rms_px(of_pair),
         own_inliers=None if own is None else int(own.inlier.sum()),
-        own_rms_px=None if own is None else own.rms_px,
+        own_rms_px=None if own is None else own.rms_px(),
     )

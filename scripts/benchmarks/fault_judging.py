@@ -14,7 +14,8 @@ from scipy.stats import chi2, norm
 from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.events import Estimate, Event, FrameSet, Status
-from graphvio.frontend.visual import RelativeMotion, VisualFrontend, VisualResult
+from graphvio.frontend.motion import RelativeMotion, VisualResult
+from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
-import shutil
-import tempfile
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-import graphvio.simulation
+from benchmarks.recordings import rendered_once
 from graphvio.simulation import SCENE_NAMES, Simulator, build_scene, write_recording
 from graphvio.simulation.atlas import Atlas, Map, pack
 from graphvio.simulation.scenes.scene import Scene
@@ -28,11 +23,6 @@ _SPEED_MPS = 1.0
 _RATE_HZ = 20.0
 
 
-def default_data_folder() -> Path:
-    """Where renders are kept: ``graphvio/benchmarks`` in the user's cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "graphvio" / "benchmarks"
-
-
 def recording(data: Path, scene: str, duration_s: float, seed: int = 0) -> Path:
     """The folder of a rendered scene; it is rendered when it is not there yet, or the simulator has changed.
 
@@ -41,23 +31,15 @@ def recording(data: Path, scene: str, duration_s: float, seed: int = 0) -> Path:
         scene: of the simulator's, or ``repeating`` or ``bare``.
         duration_s: length of the walk.
         seed: of the noise.
+
+    Raises:
+        GraphvioError: if it cannot be made.
     """
-    folder = data / "faults" / f"{scene}-{duration_s:g}s-seed{seed}-{_simulator_digest()}"
-    if folder.is_dir():
-        return folder
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    begun = Path(tempfile.mkdtemp(prefix=f".{scene}-", dir=folder.parent))
-    try:
-        print(f"rendering {scene}, {duration_s:g} s", flush=True)
-        write_recording(_simulator(scene, duration_s, seed), begun)
-        try:
-            begun.rename(folder)  # in one step, so that an interrupted render is never taken for a whole one
-        except OSError:
-            if not folder.is_dir():  # another run has finished the same render first
-                raise
-    finally:
-        shutil.rmtree(begun, ignore_errors=True)
-    return folder
+
+    def render(folder: Path) -> None:
+        write_recording(_simulator(scene, duration_s, seed), folder)
+
+    return rendered_once(data / "faults", f"{scene}-{duration_s:g}s-seed{seed}", render, Path(__file__))
 
 
 def texture_map(name: str) -> Map:
@@ -66,14 +48,6 @@ def texture_map(name: str) -> Map:
     number = atlas.numbers[name]
     side, start = int(atlas.sides[number]), int(atlas.starts[number, 0])
     return atlas.texels[start : start + side * side].reshape(side, side)
-
-
-@cache
-def _simulator_digest() -> str:
-    digest = hashlib.sha256(Path(__file__).read_bytes())
-    for file in sorted(Path(graphvio.simulation.__file__).parent.rglob("*.py")):
-        digest.update(file.read_bytes())
-    return digest.hexdigest()[:8]
 
 
 def _simulator(scene: str, duration_s: float, seed: int) -> Simulator:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import hashlib
 import os
-import shutil
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -38,8 +39,6 @@ def add_data_option(parser: argparse.ArgumentParser) -> None:
 def simulated(data: Path, scene: str, duration_s: float | None = None) -> Path:
     """The folder of a simulated recording, which is made if it is missing.
 
-    The name holds a digest of the simulator's sources, so that a changed simulator renders anew.
-
     Args:
         data: folder of all recordings.
         scene: one of `graphvio.simulation.SCENE_NAMES`.
@@ -49,24 +48,49 @@ def simulated(data: Path, scene: str, duration_s: float | None = None) -> Path:
         GraphvioError: if it cannot be made.
     """
     length = "whole" if duration_s is None else f"{duration_s:g}s"
-    folder = data / f"{scene}-{length}-{_simulator_digest()}"
+    return rendered_once(data, f"{scene}-{length}", lambda folder: simulate(scene, folder, duration_s=duration_s))
+
+
+def rendered_once(data: Path, name: str, render: Callable[[Path], object], *sources: Path) -> Path:
+    """The folder of a recording, which is rendered if it is missing.
+
+    Its name ends in a digest of the simulator's sources, so that a changed simulator renders anew.
+
+    Args:
+        data: folder of all recordings.
+        name: tells this recording from all others.
+        render: writes it into a folder that does not exist yet.
+        sources: further files that decide what is rendered.
+
+    Raises:
+        GraphvioError: if it cannot be made.
+    """
+    folder = data / f"{name}-{_digest(sources)}"
     if folder.is_dir():
         return folder
-    tell(f"rendering {scene} ({length}) into {data}; this is done once and takes about three times its length")
-    partial = folder.with_name(f"{folder.name}.partial")
+    tell(f"rendering {name} into {data}; this is done once and takes about three times its length")
     try:
-        shutil.rmtree(partial, ignore_errors=True)
-        simulate(scene, partial, duration_s=duration_s)
-        partial.rename(folder)
+        data.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{name}-", dir=data) as unfinished:
+            made = Path(unfinished) / "recording"
+            render(made)
+            try:
+                made.rename(folder)  # in one step, so that an interrupted render is never taken for a whole one
+            except OSError:
+                if not folder.is_dir():  # else another run has finished the same recording first
+                    raise
     except OSError as error:
         raise GraphvioError(f"{folder}: cannot be written ({error.strerror}); choose another with --data") from None
     return folder
 
 
-def _simulator_digest() -> str:
+@cache
+def _digest(sources: tuple[Path, ...]) -> str:
+    """Of everything that decides the bytes of a recording: the simulator, and what it takes from the package."""
     package = Path(graphvio.__file__).parent
+    taken = ("cameras.py", "geometry.py", "kernels.py", "rig.py", "rig_files/native.py")
     digest = hashlib.sha256()
-    for path in [package / "cameras.py", *sorted((package / "simulation").rglob("*.py"))]:
+    for path in [*(package / name for name in taken), *sorted((package / "simulation").rglob("*.py")), *sources]:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:8]
 

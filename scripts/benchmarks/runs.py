@@ -17,7 +17,8 @@ from graphvio.config import Config
 from graphvio.errors import GraphvioError, TrajectoryError
 from graphvio.evaluation import MAX_GAP_S, Evaluation, evaluate
 from graphvio.events import Estimate, Event, FrameSet, Status
-from graphvio.frontend.visual import MotionPredictor, RelativeMotion, VisualResult
+from graphvio.frontend.motion import RelativeMotion, VisualResult
+from graphvio.frontend.visual import MotionPredictor
 from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig, StereoPair

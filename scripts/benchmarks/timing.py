@@ -14,7 +14,8 @@ from benchmarks.recordings import Footage
 from benchmarks.reference import ReferencePipeline
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.frontend.visual import RelativeMotion, VisualFrontend
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import se3_inverse
 from graphvio.odometry import Odometry
 

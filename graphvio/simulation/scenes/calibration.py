@@ -36,6 +36,7 @@ def build(duration_s: float, rest_s: float) -> Scene:
             world.lamps.append(Lamp(np.array([x, y, _HEIGHT_M - 0.2]), 1.3))
 
     def course(times: Float) -> Float:
+        """``[x, y, z, yaw, pitch, roll]`` (N, 6) of body in world, metres and radians, at times (N,) in seconds."""
         t = np.clip(times - (rest_s if rest_s > 0.0 else -_START_S), 0.0, None)
         # Motion time runs up smoothly, so that the first moments are truly at rest.
         r = np.minimum(t / _START_S, 1.0)

@@ -124,6 +124,7 @@ def person(world: World, track: Callable[[float], tuple[float, float, float]], n
     tall = 0.94 + 0.03 * (number % 5)
 
     def limb(size: tuple[float, float, float], side: float, top: float, swing: float, texture: str) -> None:
+        """A box that hangs from a joint at height ``top``, ``side`` to the left, and swings as the person walks."""
         length = size[2]
         faces = box_faces(size, texture, tint=tint, shift=(0.17 * number, 0.31 * number))
         hung = tuple(
