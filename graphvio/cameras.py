@@ -147,23 +147,6 @@ def project_points(model: int, intrinsics: Float, distortion: Float, points: Flo
 
 
 @kernel
-def project_jacobians(model: int, intrinsics: Float, distortion: Float, points: Float) -> Float:
-    """Derivatives (N, 2, 3) of `project_points`' pixels by the points' coordinates, in pixels per metre."""
-    n = len(points)
-    jacobians = np.zeros((n, 2, 3))
-    for i in range(n):
-        z = points[i, 2]
-        if not z > 1e-6:
-            continue
-        x, y = points[i, 0] / z, points[i, 1] / z
-        _, _, a, b, c, d = distort(model, distortion, x, y)
-        fx, fy = intrinsics[0] / z, intrinsics[1] / z
-        jacobians[i, 0, 0], jacobians[i, 0, 1], jacobians[i, 0, 2] = fx * a, fx * b, -fx * (a * x + b * y)
-        jacobians[i, 1, 0], jacobians[i, 1, 1], jacobians[i, 1, 2] = fy * c, fy * d, -fy * (c * x + d * y)
-    return jacobians
-
-
-@kernel
 def unproject_pixels(model: int, intrinsics: Float, distortion: Float, pixels: Float) -> tuple[Float, Bool]:
     """Normalised image coordinates (N, 2) of pixels (N, 2), and whether each exists (N,)."""
     n = len(pixels)

@@ -82,15 +82,6 @@ def any_compiled_before(module: str) -> bool:
     return any((cache_root() / _digest(module)).rglob("*.nbc"))
 
 
-def compile_counts() -> tuple[int, int]:
-    """(loaded from the cache, compiled now) over all kernels of this process."""
-    stats = [compiled.stats for compiled in _registered if hasattr(compiled, "stats")]
-    return (
-        sum(sum(s.cache_hits.values()) for s in stats),
-        sum(sum(s.cache_misses.values()) for s in stats),
-    )
-
-
 @functools.cache
 def _digest(module: str) -> str:
     sources: dict[str, bytes] = {}

@@ -10,7 +10,6 @@ from graphvio.cameras import (
     EQUIDISTANT,
     RADIAL_TANGENTIAL,
     distort,
-    project_jacobians,
     project_points,
     undistort,
     unproject_pixels,
@@ -75,17 +74,6 @@ def test_projection_is_opencvs(model: int, distortion: Float) -> None:
         expected, _ = cv2.projectPoints(points, still, still, matrix, distortion)
     pixels, _ = project_points(model, INTRINSICS, distortion, points)
     np.testing.assert_allclose(pixels, expected[:, 0], atol=1e-7)
-
-
-@lens
-def test_jacobians(model: int, distortion: Float) -> None:
-    points = points_within(min(widest(model), 75.0))
-    jacobians = project_jacobians(model, INTRINSICS, distortion, points)
-    for axis in range(3):
-        step = 1e-6 * np.eye(3)[axis]
-        ahead, _ = project_points(model, INTRINSICS, distortion, points + step)
-        behind, _ = project_points(model, INTRINSICS, distortion, points - step)
-        np.testing.assert_allclose(jacobians[:, :, axis], (ahead - behind) / 2e-6, rtol=1e-5, atol=1e-4)
 
 
 @lens
