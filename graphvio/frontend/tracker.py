@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -34,7 +36,8 @@ class PairTracker:
         self._matcher = StereoMatcher(pair, config, _allowed(pair.right))
         self._next_id = 0
         self._last = PairFrame.empty()
-        self._last_pyramid: Pyramid = ()
+        self._left: Pyramid = ()
+        self._right: Pyramid = ()
         self._anchor = PairFrame.empty()
         self._anchor_image: Image | None = None
         self._anchor_rays = np.zeros((3, 0, 2))  # of each of its pixels and of the ones to the right and below
@@ -48,7 +51,7 @@ class PairTracker:
         left_T_left_prev: Float | None,
         left_T_left_anchor: Float | None,
     ) -> PairFrame:
-        """Track, register, renew and triangulate.
+        """Follow the tracks, match them left to right and triangulate; where few are left, add new ones.
 
         Args:
             stamp_ns: of these images.
@@ -62,51 +65,46 @@ class PairTracker:
         """
         left, right = _checked(left, self._pair.left), _checked(right, self._pair.right)
         watch = Stopwatch()
-        pyramid = build_pyramid(left, max(self._config.tracking.levels, 2))
+        before, levels = self._left, max(self._config.tracking.levels, 2)
+        self._left, self._right = build_pyramid(left, levels), build_pyramid(right, 2)
         self._noise_sigma = noise_sigma(left)
-        # A patch of nothing but noise has 0.7 of its standard deviation.
-        min_gradient = min(MIN_GRADIENT, self._noise_sigma)
         watch.lap("pyramid")
-        rejected: dict[str, int] = {}
         last, guess, inverse_depths = self._predict(left_T_left_prev)
-        pixels, found = self._follow(pyramid, last, guess, left_T_left_prev, left_T_left_anchor, min_gradient, watch)
+        pixels, found = self._follow(before, last, guess, left_T_left_prev, left_T_left_anchor, watch)
+        rejected: dict[str, int] = {}
         stays = self._still_wanted(pixels, found, rejected)
-        kept, pixels, inverse_depths = last.keep(stays), pixels[stays], inverse_depths[stays]
-        new = self._renew(left, pixels, np.isfinite(inverse_depths))
-        watch.lap("corners")
-        pixels = np.concatenate([pixels, new])
-        rays, has_ray = self._pair.left.unproject(pixels)
-        inverse_depths = np.concatenate([inverse_depths, np.full(len(new), np.nan)])
-        slopes = np.concatenate([kept.slopes, np.zeros((len(new), 2))])
-        matches = self._matcher.match(
-            pyramid, build_pyramid(right, 2), pixels, rays, inverse_depths, slopes, min_gradient
+        last = last.keep(stays)
+        self._last = self._matched(
+            stamp_ns,
+            last.ids,
+            last.ages + 1,
+            pixels[stays],
+            inverse_depths[stays],
+            last.slopes,
+            last.flat_for,
+            rejected,
         )
         watch.lap("stereo")
-        none = np.zeros(len(new), dtype=np.int64)
-        has_depth = matches.good & has_ray
-        self._last = PairFrame(
-            stamp_ns=stamp_ns,
-            ids=np.concatenate([kept.ids, self._next_id + np.arange(len(new))]),
-            ages=np.concatenate([kept.ages + 1, none]),
-            pixels=pixels,
-            left=rays,
-            right=matches.right,
-            points=matches.points,
-            covariances=matches.covariances,
-            slopes=matches.slopes,
-            has_depth=has_depth,
-            flat_for=np.where(has_depth, 0, np.concatenate([kept.flat_for, none]) + 1),
-            rejected=rejected | matches.rejected,
-            stage_ms=watch.stage_ms,
-        ).keep(has_ray)
-        self._next_id += len(new)
-        self._last_pyramid = pyramid
+        self._last = replace(self._last, stage_ms=watch.stage_ms)
+        return self.renew() if self._share_of_cells(self._last) < self._config.corners.scarce_share else self._last
+
+    def renew(self) -> PairFrame:
+        """Add new corners to the newest frame, where no track gives geometry."""
+        watch = Stopwatch()
+        pixels = self._new_corners(self._last)
+        watch.lap("corners")
+        n = len(pixels)
+        ids, none = self._next_id + np.arange(n), np.zeros(n, dtype=np.int64)
+        new = self._matched(self._last.stamp_ns, ids, none, pixels, np.full(n, np.nan), np.zeros((n, 2)), none, {})
+        self._next_id += n
+        watch.lap("stereo")
+        self._last = self._last.extended(replace(new, stage_ms=watch.stage_ms))
         return self._last
 
     def anchor(self) -> None:
         """Hold the tracks against the newest frame's own patches from here on."""
         self._anchor = self._last
-        self._anchor_image = self._last_pyramid[0] if self._last_pyramid else None
+        self._anchor_image = self._left[0] if self._left else None
         beside = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         self._anchor_rays = np.stack([self._pair.left.unproject(self._last.pixels + step)[0] for step in beside])
 
@@ -130,12 +128,11 @@ class PairTracker:
 
     def _follow(
         self,
-        pyramid: Pyramid,
+        before: Pyramid,
         last: PairFrame,
         guess: Float,
         left_T_left_prev: Float | None,
         left_T_left_anchor: Float | None,
-        min_gradient: float,
         watch: Stopwatch,
     ) -> tuple[Float, Bool]:
         """Where the tracks are now (N, 2), and which of them were found (N,).
@@ -146,31 +143,29 @@ class PairTracker:
         """
         pixels, found = guess, np.zeros(len(guess), dtype=bool)
         if left_T_left_anchor is not None and left_T_left_prev is not None:
-            pixels, found = self._register(pyramid[0], last.ids, guess, left_T_left_anchor, min_gradient)
+            pixels, found = self._register(last.ids, guess, left_T_left_anchor)
         watch.lap("register")
         rest, settings = np.flatnonzero(~found), self._config.tracking
         if len(rest):
             pixels[rest], found[rest] = track(
-                self._last_pyramid,
-                pyramid,
+                before,
+                self._left,
                 last.pixels[rest],
                 guess[rest],
                 window_px=settings.window_px,
                 levels=settings.levels,
                 max_return_px=settings.max_forward_backward_px,
-                min_gradient=min_gradient,
+                min_gradient=self._min_gradient,
                 first_levels=None if left_T_left_prev is None else _LEVELS_AFTER_PREDICTION,
             )
         watch.lap("flow")
         if left_T_left_anchor is not None:
             rest = rest[found[rest]]
-            pixels[rest], _ = self._register(pyramid[0], last.ids[rest], pixels[rest], left_T_left_anchor, min_gradient)
+            pixels[rest], _ = self._register(last.ids[rest], pixels[rest], left_T_left_anchor)
         watch.lap("register")
         return pixels, found
 
-    def _register(
-        self, image: Image, ids: Int, guess: Float, left_T_left_anchor: Float, min_gradient: float
-    ) -> tuple[Float, Bool]:
+    def _register(self, ids: Int, guess: Float, left_T_left_anchor: Float) -> tuple[Float, Bool]:
         """Pixels (N, 2) where the patches that the tracks had at the anchor are now, and whether they are (N,)."""
         anchor = self._anchor
         if self._anchor_image is None or not len(anchor.ids) or not len(ids):
@@ -188,14 +183,14 @@ class PairTracker:
         )
         pixels, found, _, correlations = register(
             self._anchor_image,
-            image,
+            self._left[0],
             anchor.pixels[rows],
             warps,
             guess,
             wanted & usable,
             self._config.tracking.window_px // 2,
             _MAX_REGISTRATION_PX,
-            min_gradient,
+            self._min_gradient,
         )
         found &= correlations > _SAME_PATCH
         pixels[~found] = guess[~found]
@@ -211,20 +206,52 @@ class PairTracker:
         alone = thinned(pixels, found, corners.cell_px, _MAX_TRACKS_PER_CELL)  # the oldest of a cell come first
         return passes(found, alone, "crowded", rejected)
 
-    def _renew(self, image: Image, pixels: Float, has_depth: Bool) -> Float:
-        """New corners (M, 2) where no track gives geometry, weak ones too where there are few."""
-        settings = self._config.corners
+    def _matched(
+        self, stamp_ns: int, ids: Int, ages: Int, pixels: Float, inverse_depths: Float, slopes: Float, flat_for: Int,
+        rejected: dict[str, int],
+    ) -> PairFrame:  # fmt: skip
+        """Tracks of the newest left image, matched to the right one and triangulated."""
+        rays, has_ray = self._pair.left.unproject(pixels)
+        matches = self._matcher.match(self._left, self._right, pixels, rays, inverse_depths, slopes, self._min_gradient)
+        has_depth = matches.good & has_ray
+        return PairFrame(
+            stamp_ns=stamp_ns,
+            ids=ids,
+            ages=ages,
+            pixels=pixels,
+            left=rays,
+            right=matches.right,
+            points=matches.points,
+            covariances=matches.covariances,
+            slopes=matches.slopes,
+            has_depth=has_depth,
+            flat_for=np.where(has_depth, 0, flat_for + 1),
+            rejected=rejected | matches.rejected,
+        ).keep(has_ray)
+
+    @property
+    def _min_gradient(self) -> float:
+        """Least rms gradient along a patch's weaker direction: one of nothing but noise has 0.7 of its deviation."""
+        return min(MIN_GRADIENT, self._noise_sigma)
+
+    def _share_of_cells(self, frame: PairFrame, new: Float | None = None) -> float:
+        """The share of the image's cells that hold a track with depth, or a new corner (M, 2)."""
+        cell_px, (width, height) = self._config.corners.cell_px, self._pair.left.size_px
+        pixels = frame.pixels[frame.has_depth]
+        both = pixels if new is None else np.concatenate([pixels, new])
+        return float(occupied_cells(both, cell_px, -(-height // cell_px), -(-width // cell_px)).mean())
+
+    def _new_corners(self, frame: PairFrame) -> Float:
+        """Corners (M, 2) where no track of a frame gives geometry, weak ones too where there are few."""
+        settings, image = self._config.corners, self._left[0]
+        tracked, settled = frame.pixels, frame.has_depth
         cell_px, border_px = settings.cell_px, settings.border_px
-        new = find_corners(image, self._allowed, pixels, has_depth, cell_px, border_px, settings.min_response)
+        new = find_corners(image, self._allowed, tracked, settled, cell_px, border_px, settings.min_response)
         admitted = settings.noise_factor * self._noise_sigma
-        rows, columns = -(-image.shape[0] // cell_px), -(-image.shape[1] // cell_px)
-        both = np.concatenate([pixels[has_depth], new])
-        share = occupied_cells(both, cell_px, rows, columns).mean()
-        if share >= settings.scarce_share or admitted >= settings.min_response:
+        if admitted >= settings.min_response or self._share_of_cells(frame, new) >= settings.scarce_share:
             return new
-        both = np.concatenate([pixels, new])
-        settled = np.concatenate([has_depth, np.ones(len(new), dtype=bool)])
-        weak = find_corners(image, self._allowed, both, settled, cell_px, border_px, admitted)
+        tracked, settled = np.concatenate([tracked, new]), np.concatenate([settled, np.ones(len(new), dtype=bool)])
+        weak = find_corners(image, self._allowed, tracked, settled, cell_px, border_px, admitted)
         return np.concatenate([new, weak])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -50,6 +51,17 @@ class PairFrame:
             return self
         return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
+    def extended(self, other: PairFrame) -> PairFrame:
+        """The same with the tracks of another frame of this instant, whose ids are greater; counts and times add up."""
+        both = self, other
+        columns: dict[str, Any] = {name: np.concatenate([getattr(each, name) for each in both]) for name in _COLUMNS}
+        return replace(
+            self,
+            **columns,
+            rejected=_added(self.rejected, other.rejected),
+            stage_ms=_added(self.stage_ms, other.stage_ms),
+        )
+
     @staticmethod
     def empty(stamp_ns: int = 0) -> PairFrame:
         """A frame without tracks."""
@@ -70,6 +82,10 @@ class PairFrame:
 
 
 _COLUMNS = tuple(f.name for f in fields(PairFrame) if f.name not in ("stamp_ns", "rejected", "stage_ms"))
+
+
+def _added(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: one.get(name, 0) + other.get(name, 0) for name in (*one, *(other.keys() - one.keys()))}
 
 
 def passes(candidates: Bool, test: Bool, name: str, rejected: dict[str, int]) -> Bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -69,12 +69,12 @@ class VisualFrontend:
         frozen = self._frozen.look(frameset)
         frames = self._observe(frameset, frozen.pairs, predict)
         watch.lap("track")
-        for stage in ("pyramid", "flow", "register", "corners", "stereo"):
+        for stage in ("pyramid", "register", "flow", "stereo"):
             watch.stage_ms[stage] = max((frame.stage_ms[stage] for frame in frames.values()), default=0.0)
         reference = self._references.shared(frames)
         if not reference:
-            self._refer_to(frames)
-            reports = {j: _report(frame) for j, frame in frames.items()}
+            reports = {j: _report(frame) for j, frame in self._refer_to(frames).items()}
+            watch.lap("renew")
             reason = "first images" if frames else frozen.reason
             return VisualResult(None, Quality.FAILED, reason, reports, stage_ms=watch.stage_ms)
         reference_stamp_ns = next(iter(reference.values())).stamp_ns
@@ -82,26 +82,28 @@ class VisualFrontend:
         predicted = predict(reference_stamp_ns)
         agreement, reason = self._estimate(correspondences, predicted, stamp_ns)
         watch.lap("motion")
+        reports = {j: _report(frame, correspondences, j, agreement) for j, frame in frames.items()}
         if agreement is None:
             self._refer_to(frames)
-            reports = {j: _report(frame, correspondences, j) for j, frame in frames.items()}
+            watch.lap("renew")
             return VisualResult(None, Quality.FAILED, reason, reports, stage_ms=watch.stage_ms)
         refined = agreement.sides[0].refined
+        motions = [self._motion(reference_stamp_ns, stamp_ns, side.refined) for side in agreement.sides]
+        motion, quality, reason = graded(motions, agreement.tension, frozen.all_since_ns)
+        resting = at_rest(reference, frames, correspondences, refined.inlier)
         self._drop_outliers(frames, correspondences, agreement)
-        reports = {j: _report(frame, correspondences, j, agreement) for j, frame in frames.items()}
+        watch.lap("judge")
         if self._references.are_spent(frames, correspondences, refined):
             self._learn_alignments(agreement)
             self._refer_to(frames)
-        motions = [self._motion(reference_stamp_ns, stamp_ns, side.refined) for side in agreement.sides]
-        motion, quality, reason = graded(motions, agreement.tension, frozen.all_since_ns)
-        watch.lap("judge")
+        watch.lap("renew")
         return VisualResult(
             motion,
             quality,
             reason,
             reports,
             alternatives=tuple(motions) if len(motions) > 1 else (),
-            at_rest=at_rest(reference, frames, correspondences, refined.inlier),
+            at_rest=resting,
             stage_ms=watch.stage_ms,
         )
 
@@ -122,13 +124,16 @@ class VisualFrontend:
             since_reference = self._predicted(j, self._references.of(j), predict)
             return self._trackers[j].observe(frameset.stamp_ns, left, right, since_latest, since_reference)
 
-        pairs = sorted(frameset.images.keys() - left_out)
-        if len(pairs) == 1:
-            frames = {pairs[0]: observe(pairs[0])}
-        else:
-            frames = dict(zip(pairs, self._workers.map(observe, pairs), strict=True))
+        frames = self._side_by_side(observe, frameset.images.keys() - left_out)
         self._latest.update(frames)
         return frames
+
+    def _side_by_side(self, work: Callable[[int], PairFrame], pairs: Iterable[int]) -> dict[int, PairFrame]:
+        """Work on each pair, all but the first in threads of their own."""
+        ordered = sorted(pairs)
+        others = [(j, self._workers.submit(work, j)) for j in ordered[1:]]
+        frames = {j: work(j) for j in ordered[:1]}
+        return frames | {j: other.result() for j, other in others}
 
     def _predicted(self, pair: int, then: PairFrame | None, predict: MotionPredictor) -> Float | None:
         """Predicted motion of points in a pair's left camera since one of its frames, by eq. (1)."""
@@ -138,12 +143,15 @@ class VisualFrontend:
         body_T_left = self._arrays.body_T_left[pair]
         return np.asarray(se3_inverse(body_T_left) @ cur_T_then @ body_T_left)
 
-    def _refer_to(self, frames: Mapping[int, PairFrame]) -> None:
-        """Measure the next motions from these frames, the newest of their pairs."""
-        self._references.replace(frames)
+    def _refer_to(self, frames: Mapping[int, PairFrame]) -> dict[int, PairFrame]:
+        """Measure the next motions from these frames, the newest of their pairs, with new corners beside the tracks."""
+        renewed = self._side_by_side(lambda j: self._trackers[j].renew(), frames)
+        self._latest.update(renewed)
+        self._references.replace(renewed)
         if self._config.motion.reference == "keyframe":
-            for j in frames:
+            for j in renewed:
                 self._trackers[j].anchor()
+        return renewed
 
     def _estimate(
         self, correspondences: Correspondences, predicted: Float | None, stamp_ns: int
