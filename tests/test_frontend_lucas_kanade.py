@@ -7,6 +7,7 @@ from waves import picture, waves
 
 from graphvio.arrays import Bool, Float, Image
 from graphvio.frontend.lucas_kanade import build_pyramid, register, track
+from graphvio.frontend.patches import packed, patches, sample_affine, scratch
 
 LEVELS = 4
 
@@ -114,7 +115,7 @@ def registered(warp: Float, assumed: Float, guess_error: Float) -> tuple[Float, 
         target = warped(warp, middle, place)
         guess = (place + guess_error)[None]
         moved, ok, _, _ = register(
-            source, target, middle[None], assumed[None], guess, np.ones(1, dtype=bool), 7, 2.0, 1.0
+            packed(source), target, middle[None], assumed[None], guess, np.ones(1, dtype=bool), 7, 2.0, 1.0
         )
         errors.append(moved[0] - place)
         found.append(ok[0])
@@ -143,15 +144,15 @@ def test_what_is_not_registered_stays_where_it_was() -> None:
     guess, n = pixels + np.array([0.3, 0.2]), len(pixels)
     warps, everything = np.tile(np.eye(2), (n, 1, 1)), np.ones(n, dtype=bool)
     for source, target, wanted in ((image, image, ~everything), (flat, image, everything)):
-        moved, found, localised, _ = register(source, target, pixels, warps, guess, wanted, 7, 2.0, 1.0)
+        moved, found, localised, _ = register(packed(source), target, pixels, warps, guess, wanted, 7, 2.0, 1.0)
         np.testing.assert_array_equal(moved, guess)
         assert not found.any()
         assert not localised.any()
-    moved, found, localised, _ = register(image, image, pixels, warps, guess, everything, 7, 2.0, 1.0)
+    moved, found, localised, _ = register(packed(image), image, pixels, warps, guess, everything, 7, 2.0, 1.0)
     np.testing.assert_array_equal(found, [True, True, True, False, False, False])
     np.testing.assert_array_equal(localised, found)
     np.testing.assert_array_equal(moved[~found], guess[~found])
-    _, found, _, _ = register(image, image, pixels[:3], warps[:3], guess[:3], everything[:3], 7, 0.1, 1.0)
+    _, found, _, _ = register(packed(image), image, pixels[:3], warps[:3], guess[:3], everything[:3], 7, 0.1, 1.0)
     assert not found.any()  # they are further from the guess than that
 
 
@@ -200,3 +201,19 @@ def test_patches_up_to_the_very_edge_stay_within_the_image() -> None:
     assert found[inside].mean() > 0.9
     assert not found[(pixels < 8.0).any(axis=1)].any()
     np.testing.assert_allclose(moved[found], pixels[found], atol=0.01)
+
+
+@pytest.mark.parametrize("half", [4, 7, 8])
+def test_a_deformed_patch_is_interpolated_pixel_by_pixel(half: int) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (60, 80)).astype(np.uint8)
+    warp, middle = np.array([[1.1, 0.2], [-0.15, 0.9]]), np.array([41.3, 30.6])
+    out = patches(1, half)[0]
+    a, b, c, d = warp.ravel()
+    assert sample_affine(packed(image), middle[0], middle[1], a, b, c, d, half, scratch(half), out)
+    steps = np.arange(-half, half + 1.0)
+    x, y = np.moveaxis(middle + np.stack(np.meshgrid(steps, steps), axis=-1) @ warp.T, -1, 0)
+    expected = cv2.remap(image.astype(np.float32), x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+    np.testing.assert_allclose(out[:, : 2 * half + 1], expected, atol=4.0)  # remap rounds places to 1/32 pixel
+    assert np.abs(out[:, : 2 * half + 1] - expected).mean() < 1.0
+    assert not out[:, 2 * half + 1 :].any()
+    assert not sample_affine(packed(image), 5.0, 30.0, a, b, c, d, half, scratch(half), out)

@@ -6,6 +6,7 @@ from waves import picture, waves
 
 from graphvio.arrays import Bool, Float, Image
 from graphvio.frontend.lucas_kanade import register
+from graphvio.frontend.patches import packed
 from graphvio.frontend.slanted import align_slanted
 
 HALF = 7
@@ -39,9 +40,9 @@ def aligned(
     images: tuple[Image, Image], guess: Float, slopes: Float | None = None, wanted: Bool | None = None
 ) -> tuple[Float, Float, Float, Bool]:
     n = len(guess)
-    known = np.full(n, slopes is not None)
+    known, start = np.full(n, slopes is not None), np.zeros((n, 2)) if slopes is None else slopes
     return align_slanted(
-        *images, grid(), guess, np.tile(NEARER, (n, 1)), np.zeros((n, 2)) if slopes is None else slopes, known,
+        *images, packed(images[1]), grid(), guess, np.tile(NEARER, (n, 1)), start, known,
         np.ones(n, dtype=bool) if wanted is None else wanted, HALF,
     )  # fmt: skip
 
@@ -64,9 +65,9 @@ def test_place_and_slopes_are_found(slant: tuple[float, float]) -> None:
 @pytest.mark.parametrize("slant", SLANTS[2:])
 def test_a_shift_alone_is_off_or_lost(slant: tuple[float, float]) -> None:
     images, right = views(*slant), truth(grid(), *slant)
-    n = len(right)
+    n, packed_left = len(right), packed(images[0])
     level, everything = np.tile(np.eye(2), (n, 1, 1)), np.ones(n, dtype=bool)
-    shifted, kept, _, _ = register(*images, grid(), level, right, everything, HALF, 3.0, 1.0)
+    shifted, kept, _, _ = register(packed_left, images[1], grid(), level, right, everything, HALF, 3.0, 1.0)
     moved, _, _, found = aligned(images, right)
     by_shift = np.where(kept, np.linalg.norm(shifted - right, axis=1), np.inf)
     by_slant = np.where(found, np.linalg.norm(moved - right, axis=1), np.inf)

@@ -127,6 +127,24 @@ def test_every_rejection_is_counted() -> None:
     assert set(frames[-1].rejected) == {*FOLLOWED, *MATCHED}
 
 
+def test_new_corners_come_on_demand_or_when_few_tracks_are_left() -> None:
+    poses = walk(4)
+    tracker = PairTracker(rectified(), Config())
+    first, second = followed(poses[:2], anchored=True, tracker=tracker)
+    assert np.isin(second.ids, first.ids).all()
+    renewed = tracker.renew()
+    new = ~np.isin(renewed.ids, second.ids)
+    assert new.any()
+    np.testing.assert_array_equal(renewed.ids[~new], second.ids)
+    cell_px = CornerConfig().cell_px
+    taken = {tuple(cell) for cell in (second.pixels[second.has_depth] // cell_px).astype(int)}
+    assert not taken & {tuple(cell) for cell in (renewed.pixels[new] // cell_px).astype(int)}
+    tracker.drop(renewed.ids[8:])
+    scarce = tracker.observe(2, *views(poses[2], 2), poses[2] @ np.linalg.inv(poses[1]), None)
+    assert len(scarce.ids) > 20
+    assert not np.isin(renewed.ids[8:], scarce.ids).any()
+
+
 def test_dropped_tracks_are_gone() -> None:
     tracker = PairTracker(rectified(), Config())
     poses = walk(2)
@@ -224,11 +242,11 @@ def test_weak_corners_are_tracked_and_matched() -> None:
 
 
 def test_a_rich_image_gets_no_weak_corners() -> None:
-    images = views(np.eye(4))
-    frames = [
-        PairTracker(rectified(), Config(corners=CornerConfig(scarce_share=share))).observe(0, *images, None, None)
-        for share in (0.0, CornerConfig().scarce_share)
-    ]
+    frames = []
+    for share in (0.0, CornerConfig().scarce_share):
+        tracker = PairTracker(rectified(), Config(corners=CornerConfig(scarce_share=share)))
+        frame = tracker.observe(0, *views(np.eye(4)), None, None)
+        frames.append(frame if len(frame.ids) else tracker.renew())
     np.testing.assert_array_equal(frames[0].pixels, frames[1].pixels)
 
 

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Image
-from graphvio.frontend.patches import align, correlation, patches, prepare, sample, sample_affine, weaker2
+from graphvio.arrays import AnyArray, Bool, Float, Image
+from graphvio.frontend.patches import align, correlation, patches, prepare, sample, sample_affine, scratch, weaker2
 from graphvio.kernels import fast_kernel
 
 MIN_GRADIENT = 1.0
@@ -107,13 +107,13 @@ def _forth_and_back(
 
 @fast_kernel
 def register(
-    source: Image, target: Image, pixels: Float, warps: Float, guess: Float, wanted: Bool, half: int,
+    source: AnyArray, target: Image, pixels: Float, warps: Float, guess: Float, wanted: Bool, half: int,
     max_shift_px: float, min_gradient: float,
 ) -> tuple[Float, Bool, Bool, Float]:  # fmt: skip
     """Where patches of one image are in another that sees them deformed, from a guess that is nearly right.
 
     Args:
-        source: image that holds the patches.
+        source: image that holds the patches, see `graphvio.frontend.patches.packed`.
         target: image to find them in.
         pixels: (N, 2) centres of the patches.
         warps: (N, 2, 2) derivative of the source pixel by the target pixel.
@@ -130,14 +130,14 @@ def register(
     n = len(pixels)
     moved, correlations = guess.copy(), np.full(n, -1.0)
     found, localised = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
-    bordered = np.empty((2 * half + 3, 2 * half + 3), dtype=np.float32)
+    bordered, row = patches(1, half + 1)[0], scratch(half + 1)
     buffers = patches(4, half)
     patch, gx, gy, seen = buffers[0], buffers[1], buffers[2], buffers[3]
     least2 = (min_gradient * (2 * half + 1)) ** 2
     for i in range(n):
         x, y, warp = pixels[i, 0], pixels[i, 1], warps[i]
         if not wanted[i] or not sample_affine(
-            source, x, y, warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1], half + 1, bordered
+            source, x, y, warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1], half + 1, row, bordered
         ):
             continue
         xx, xy, yy = prepare(bordered, patch, gx, gy)

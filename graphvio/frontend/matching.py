@@ -9,6 +9,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.frontend.lucas_kanade import Pyramid, register
+from graphvio.frontend.patches import packed
 from graphvio.frontend.slanted import align_slanted
 from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
 from graphvio.frontend.tracks import passes
@@ -107,9 +108,9 @@ class StereoMatcher:
                 left[:2], right[:2], pixels[unknown], rays[unknown], bounds, *camera, _SEARCH_CORRELATION
             )
         found = passes(np.ones(len(pixels), dtype=bool), usable, "search", rejected)
-        half = tracking.window_px // 2
+        half, packed_right = tracking.window_px // 2, packed(right[0])
         matched, slopes, correlations, converged = align_slanted(
-            left[0], right[0], pixels, guess, directions, slopes, known, found, half
+            left[0], right[0], packed_right, pixels, guess, directions, slopes, known, found, half
         )
         shift = np.hypot(matched[:, 0] - guess[:, 0], matched[:, 1] - guess[:, 1])
         close = shift <= np.where(known, _SEARCH_MARGIN_PX, _MAX_REFINEMENT_PX)
@@ -119,7 +120,15 @@ class StereoMatcher:
         unchecked = found & ~(known & (shift < _FORETOLD_PX))
         warps = np.eye(2) + directions[:, :, None] * slopes[:, None, :]
         _, returned, localised, _ = register(
-            right[0], left[0], matched, warps, pixels, unchecked, half, tracking.max_forward_backward_px, min_gradient
+            packed_right,
+            left[0],
+            matched,
+            warps,
+            pixels,
+            unchecked,
+            half,
+            tracking.max_forward_backward_px,
+            min_gradient,
         )
         found = passes(found, localised | ~unchecked, "corner", rejected)
         return matched, slopes, passes(found, returned | ~unchecked, "left_right", rejected)

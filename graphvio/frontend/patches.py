@@ -7,9 +7,10 @@ registers. What stands in the padding of the image that it is compared with then
 import numpy as np
 
 from graphvio.arrays import AnyArray, Image
-from graphvio.kernels import fast_kernel
+from graphvio.kernels import fast_kernel, kernel
 
 _LANES = 16
+_HALF_LANES = 8
 _MAX_ITERATIONS = 20
 _CONVERGED_PX = 0.03  # the step is still taken: what is left after it is several times smaller
 
@@ -52,7 +53,7 @@ def prepare(bordered: AnyArray, patch: AnyArray, gx: AnyArray, gy: AnyArray) -> 
     """Fill the patch and its gradients, all of zero mean, and return the normal matrix's xx, xy, yy.
 
     Args:
-        bordered: (side + 2, side + 2) the patch with one more pixel on each side.
+        bordered: (side + 2, at least side + 2) the patch with one more pixel on each side.
         patch: (side, padded side), as are the gradients.
         gx: along the rows.
         gy: along the columns.
@@ -165,11 +166,37 @@ def weaker2(xx: float, xy: float, yy: float) -> float:
     return float(0.5 * (xx + yy - np.sqrt((xx - yy) * (xx - yy) + 4.0 * xy * xy)))
 
 
+@kernel
+def packed(image: Image) -> AnyArray:
+    """Each pixel (height, width) with those to its right, below, and to the right below, a byte each: what bilinear
+    interpolation needs is then one word. The last row and column are zero."""
+    height, width = image.shape
+    words = np.zeros((height, width), dtype=np.uint32)
+    for y in range(height - 1):
+        upper, lower, row = image[y], image[y + 1], words[y]
+        for x in range(width - 1):
+            row[x] = (
+                np.uint32(upper[x])
+                | np.uint32(upper[x + 1]) << np.uint32(8)
+                | np.uint32(lower[x]) << np.uint32(16)
+                | np.uint32(lower[x + 1]) << np.uint32(24)
+            )
+    return words
+
+
+@fast_kernel
+def scratch(half: int) -> tuple[AnyArray, AnyArray]:
+    """Room for one row of `sample_affine`: places and fractions."""
+    lanes = patches(1, half).shape[2]
+    return np.zeros(lanes, dtype=np.uint32), np.zeros((2, lanes), dtype=np.float32)
+
+
 @fast_kernel
 def sample_affine(
-    image: Image, x: float, y: float, xx: float, xy: float, yx: float, yy: float, half: int, out: AnyArray
-) -> bool:
-    """Fill a patch around (x, y); False where it leaves the image.
+    image: AnyArray, x: float, y: float, xx: float, xy: float, yx: float, yy: float, half: int,
+    row: tuple[AnyArray, AnyArray], out: AnyArray,
+) -> bool:  # fmt: skip
+    """Fill a patch around (x, y) of a `packed` image, by way of a row of `scratch`; False where it leaves the image.
 
     Its pixels are the columns of ``[[xx, xy], [yx, yy]]`` apart, along its rows and along its columns.
     """
@@ -177,24 +204,33 @@ def sample_affine(
     reach_x, reach_y = half * (abs(xx) + abs(xy)), half * (abs(yx) + abs(yy))
     if not (reach_x + 1 <= x < width - 2 - reach_x and reach_y + 1 <= y < height - 2 - reach_y):
         return False  # with a pixel to spare for rounding
-    flat = image.reshape(-1)
+    side = 2 * half + 1
+    lanes = (side + _HALF_LANES - 1) // _HALF_LANES * _HALF_LANES
     along_x, along_y = np.float32(xx), np.float32(yx)
     # Places are counted from the patch's own corner of the image, where single precision is fine enough.
     left, top = int(x - reach_x), int(y - reach_y)
-    first, stride, one = np.uint64(top * width + left), np.uint64(width), np.uint64(1)
-    for j in range(2 * half + 1):
-        row = out[j]
+    flat = image.reshape(-1)[top * width + left :]
+    stride, last = np.int32(width), np.int32(flat.size - 1)
+    places, right_of, below = row[0], row[1][0], row[1][1]
+    eight, byte = np.uint32(8), np.uint32(255)
+    for j in range(side):
+        values = out[j]
         px = np.float32(x - left - half * xx + xy * (j - half))
         py = np.float32(y - top - half * yx + yy * (j - half))
-        for i in range(2 * half + 1):
+        for i in range(lanes):
             at_x, at_y = px + along_x * np.float32(i), py + along_y * np.float32(i)
-            x0, y0 = int(at_x), int(at_y)
-            ax, ay = at_x - np.float32(x0), at_y - np.float32(y0)
-            k = first + stride * np.uint64(y0) + np.uint64(x0)
-            a, b = np.float32(flat[k]), np.float32(flat[k + one])
-            c, d = np.float32(flat[k + stride]), np.float32(flat[k + stride + one])
-            upper, lower = a + ax * (b - a), c + ax * (d - c)
-            row[i] = upper + ay * (lower - upper)
+            x0, y0 = np.int32(at_x), np.int32(at_y)
+            right_of[i], below[i] = at_x - np.float32(x0), at_y - np.float32(y0)
+            places[i] = max(min(stride * y0 + x0, last), np.int32(0))  # lanes beyond the patch mean nothing
+        for i in range(lanes):
+            places[i] = flat[places[i]]
+        for i in range(lanes):
+            word = places[i]
+            a, b = np.float32(np.int32(word & byte)), np.float32(np.int32(word >> eight & byte))
+            c, d = np.float32(np.int32(word >> (eight + eight) & byte)), np.float32(np.int32(word >> np.uint32(24)))
+            upper, lower = a + right_of[i] * (b - a), c + right_of[i] * (d - c)
+            values[i] = upper + below[i] * (lower - upper)
+        values[side:] = np.float32(0.0)
     return True
 
 

@@ -8,7 +8,7 @@ Inverse compositional Gauss-Newton, as in `graphvio.frontend.lucas_kanade`.
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
-from graphvio.frontend.patches import align, correlation, patches, prepare, sample, sample_affine
+from graphvio.frontend.patches import align, correlation, patches, prepare, sample, sample_affine, scratch
 from graphvio.kernels import fast_kernel
 
 _MAX_ITERATIONS = 10
@@ -21,14 +21,15 @@ _SHIFT_PRIOR = 1e-3  # keeps the normal matrix of a flat patch regular
 
 @fast_kernel
 def align_slanted(
-    left: Image, right: Image, pixels: Float, guess: Float, directions: Float, slopes: Float, known: Bool,
-    wanted: Bool, half: int,
+    left: Image, right: Image, packed_right: AnyArray, pixels: Float, guess: Float, directions: Float, slopes: Float,
+    known: Bool, wanted: Bool, half: int,
 ) -> tuple[Float, Float, Float, Bool]:  # fmt: skip
     """Align patches of the left image in the right one.
 
     Args:
         left: image (height, width).
         right: image (height, width).
+        packed_right: the same, see `graphvio.frontend.patches.packed`.
         pixels: (N, 2) centres of the patches.
         guess: (N, 2) where the search starts.
         directions: (N, 2) unit vectors along the epipolar lines in the right image.
@@ -47,6 +48,7 @@ def align_slanted(
     bordered = np.empty((2 * half + 3, 2 * half + 3), dtype=np.float32)
     buffers = patches(6, half)
     patch, sheared, columns = buffers[0], buffers[1], buffers[2:]
+    row = scratch(half)
     factor, parameters, step = np.empty((4, 4)), np.empty(4), np.empty(4)
     for i in range(n):
         if not wanted[i] or not sample(left, pixels[i, 0], pixels[i, 1], half + 1, bordered):
@@ -62,7 +64,7 @@ def align_slanted(
         _steepest_descent(columns, ex, ey, half)
         _factorise(columns, xx, xy, yy, factor)
         for _ in range(_MAX_ITERATIONS):
-            if not _sample_sheared(right, parameters, ex, ey, half, sheared):
+            if not _sample_sheared(packed_right, parameters, ex, ey, half, row, sheared):
                 break
             _project(columns, sheared, patch, step)
             _solve(factor, step)
@@ -152,10 +154,12 @@ def _is_small(step: Float) -> bool:
 
 
 @fast_kernel
-def _sample_sheared(image: Image, parameters: Float, ex: float, ey: float, half: int, out: AnyArray) -> bool:
+def _sample_sheared(
+    image: AnyArray, parameters: Float, ex: float, ey: float, half: int, row: tuple[AnyArray, AnyArray], out: AnyArray
+) -> bool:
     """Fill the patch that the parameters ``[u, v, slope x, slope y]`` point at; False where it leaves the image."""
     u, v, a, b = parameters[0], parameters[1], parameters[2], parameters[3]
-    return sample_affine(image, u, v, 1.0 + ex * a, ex * b, ey * a, 1.0 + ey * b, half, out)
+    return sample_affine(image, u, v, 1.0 + ex * a, ex * b, ey * a, 1.0 + ey * b, half, row, out)
 
 
 @fast_kernel

@@ -7,13 +7,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Image, Int
+from graphvio.arrays import AnyArray, Bool, Float, Image, Int
 from graphvio.config import Config
 from graphvio.errors import RigError
 from graphvio.frontend.corners import find_corners, occupied_cells, thinned
 from graphvio.frontend.grain import noise_sigma
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, register, track
 from graphvio.frontend.matching import StereoMatcher
+from graphvio.frontend.patches import packed
 from graphvio.frontend.prediction import predict_pixels, predict_warps
 from graphvio.frontend.stopwatch import Stopwatch
 from graphvio.frontend.tracks import PairFrame, passes
@@ -39,7 +40,7 @@ class PairTracker:
         self._left: Pyramid = ()
         self._right: Pyramid = ()
         self._anchor = PairFrame.empty()
-        self._anchor_image: Image | None = None
+        self._anchor_image: AnyArray | None = None  # packed
         self._anchor_rays = np.zeros((3, 0, 2))  # of each of its pixels and of the ones to the right and below
         self._noise_sigma = 0.0
 
@@ -104,7 +105,7 @@ class PairTracker:
     def anchor(self) -> None:
         """Hold the tracks against the newest frame's own patches from here on."""
         self._anchor = self._last
-        self._anchor_image = self._left[0] if self._left else None
+        self._anchor_image = packed(self._left[0]) if self._left else None
         beside = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         self._anchor_rays = np.stack([self._pair.left.unproject(self._last.pixels + step)[0] for step in beside])
 
