@@ -60,4 +60,7 @@ class FrozenImages:
 
 
 def _same(one: Image, other: Image) -> bool:
-    return one is other or np.array_equal(one, other)
+    if one is other:
+        return True
+    middle = len(one) // 2  # one row nearly always tells
+    return bool(np.array_equal(one[middle], other[middle]) and np.array_equal(one, other))

@@ -9,7 +9,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.frontend.lucas_kanade import Pyramid, register
-from graphvio.frontend.patches import packed
+from graphvio.frontend.patches import pack
 from graphvio.frontend.slanted import align_slanted
 from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
 from graphvio.frontend.tracks import passes
@@ -49,6 +49,7 @@ class StereoMatcher:
         self._pair = pair
         self._config = config
         self._allowed = allowed_right
+        self._packed_right = np.zeros(allowed_right.shape, dtype=np.uint32)
 
     def match(
         self,
@@ -98,37 +99,41 @@ class StereoMatcher:
         """Pixels (N, 2) in the right image to sub-pixel precision, slopes (N, 2), and whether appearance agrees."""
         pair, settings, tracking = self._pair, self._config.stereo, self._config.tracking
         known = np.isfinite(inverse_depths)
-        expected = np.where(known, np.clip(inverse_depths, 0.0, 1.0 / settings.min_depth_m), 0.0)
+        nearest = 1.0 / settings.min_depth_m
+        expected = np.where(known, np.minimum(np.maximum(inverse_depths, 0.0), nearest), 0.0)
         camera = (pair.right_T_left, pair.right.model_number, pair.right.intrinsics, pair.right.distortion)
         guess, directions, usable = epipolar_lines(rays, expected, *camera)
         unknown = np.flatnonzero(~known)
         if len(unknown):
-            bounds = np.tile([0.0, 1.0 / settings.min_depth_m], (len(unknown), 1))
+            bounds = np.zeros((len(unknown), 2))
+            bounds[:, 1] = nearest
             guess[unknown], usable[unknown] = epipolar_search(
                 left[:2], right[:2], pixels[unknown], rays[unknown], bounds, *camera, _SEARCH_CORRELATION
             )
         found = passes(np.ones(len(pixels), dtype=bool), usable, "search", rejected)
-        half, packed_right = tracking.window_px // 2, packed(right[0])
+        half = tracking.window_px // 2
+        pack(right[0], self._packed_right)
         matched, slopes, correlations, converged = align_slanted(
-            left[0], right[0], packed_right, pixels, guess, directions, slopes, known, found, half
+            left[0], right[0], self._packed_right, pixels, guess, directions, slopes, known, found, half
         )
         shift = np.hypot(matched[:, 0] - guess[:, 0], matched[:, 1] - guess[:, 1])
         close = shift <= np.where(known, _SEARCH_MARGIN_PX, _MAX_REFINEMENT_PX)
         found = passes(found, converged & close, "alignment", rejected)
         found = passes(found, correlations >= settings.min_correlation, "appearance", rejected)
         # A match that the motion and the depth of before foretold has been checked by them.
-        unchecked = found & ~(known & (shift < _FORETOLD_PX))
-        warps = np.eye(2) + directions[:, :, None] * slopes[:, None, :]
-        _, returned, localised, _ = register(
-            packed_right,
-            left[0],
-            matched,
-            warps,
-            pixels,
-            unchecked,
-            half,
-            tracking.max_forward_backward_px,
-            min_gradient,
-        )
-        found = passes(found, localised | ~unchecked, "corner", rejected)
-        return matched, slopes, passes(found, returned | ~unchecked, "left_right", rejected)
+        unchecked = np.flatnonzero(found & ~(known & (shift < _FORETOLD_PX)))
+        localised, returned = np.ones(len(found), dtype=bool), np.ones(len(found), dtype=bool)
+        if len(unchecked):
+            _, returned[unchecked], localised[unchecked], _ = register(
+                self._packed_right,
+                left[0],
+                matched[unchecked],
+                np.eye(2) + directions[unchecked, :, None] * slopes[unchecked, None, :],
+                pixels[unchecked],
+                np.ones(len(unchecked), dtype=bool),
+                half,
+                tracking.max_forward_backward_px,
+                min_gradient,
+            )
+        found = passes(found, localised, "corner", rejected)
+        return matched, slopes, passes(found, returned, "left_right", rejected)

@@ -9,11 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float
+from graphvio.kernels import kernel
 
 _PRIOR_RESIDUALS = 3.0  # the noise model counts for so many, which helps where there are few points
 _COUNTED_AT_NOISY_POINTS = 1.04  # normal matrices at noisy points promise that much more than there is, by Monte Carlo
 _CUTOFF = 25.0  # squared error over the noise variance: one right point in 20,000 lies beyond (4 degrees of freedom)
-_MEDIAN_CHI2 = {2: 1.386, 4: 3.357}
+_MEDIAN_CHI2_OF_2, _MEDIAN_CHI2_OF_4 = 1.386, 3.357
 _LEAST_VARIANCE = 0.05
 
 
@@ -33,34 +34,37 @@ class Influence(NamedTuple):
     variance: float
 
 
+@kernel
 def influence(errors2: Float, has_right: Bool, scale: float) -> Influence:
     """Moments of squared whitened errors (N,), of points with (4 dimensions) or without (2) a right image."""
     finite = np.isfinite(errors2)
     e2, d = errors2[finite], np.where(has_right[finite], 4.0, 2.0)
-    n = float(d.sum())
+    n = d.sum()
     if n == 0.0:
         return Influence(1.0, 1.0, 1.0, 1.0)
     w = 1.0 / (1.0 + e2 / scale**2)
-    weight = float((d * w).sum()) / n
-    slope = float((d * influence_slopes(e2, has_right[finite], scale)).sum()) / n
-    square = float((w**2 * e2).sum()) / slope**2
+    weight = (d * w).sum() / n
+    slope = (d * influence_slopes(e2, has_right[finite], scale)).sum() / n
+    square = (w**2 * e2).sum() / slope**2
     # The mean of 1 / chi^2 lacks two degrees of freedom: without them the answer is honest on average.
     variance = (square + _PRIOR_RESIDUALS) / (max(n - 6.0, 0.0) + _PRIOR_RESIDUALS - 2.0)
     variance *= _COUNTED_AT_NOISY_POINTS
     return Influence(weight * variance, weight, slope, variance)
 
 
+@kernel
 def influence_slopes(errors2: Float, has_right: Bool, scale: float) -> Float:
     """The mean of ``psi'`` over the dimensions of each point's error (N,)."""
     w = 1.0 / (1.0 + errors2 / scale**2)
-    return np.asarray(w - 2.0 * w * (1.0 - w) / np.where(has_right, 4.0, 2.0))
+    return w - 2.0 * w * (1.0 - w) / np.where(has_right, 4.0, 2.0)
 
 
+@kernel
 def inlier_cutoff(errors2: Float, has_right: Bool, largest2: float) -> float:
     """Squared error below which a point is an inlier: by the noise that most points have, at most ``largest2``."""
     near = errors2 < largest2
     if not near.any():
         return largest2
-    medians = np.where(has_right[near], _MEDIAN_CHI2[4], _MEDIAN_CHI2[2])
-    variance = max(float(np.median(errors2[near] / medians)), _LEAST_VARIANCE)
+    medians = np.where(has_right[near], _MEDIAN_CHI2_OF_4, _MEDIAN_CHI2_OF_2)
+    variance = max(np.median(errors2[near] / medians), _LEAST_VARIANCE)
     return min(largest2, _CUTOFF * variance)

@@ -166,12 +166,18 @@ def weaker2(xx: float, xy: float, yy: float) -> float:
     return float(0.5 * (xx + yy - np.sqrt((xx - yy) * (xx - yy) + 4.0 * xy * xy)))
 
 
-@kernel
 def packed(image: Image) -> AnyArray:
     """Each pixel (height, width) with those to its right, below, and to the right below, a byte each: what bilinear
     interpolation needs is then one word. The last row and column are zero."""
+    words = np.zeros(image.shape, dtype=np.uint32)
+    pack(image, words)
+    return words
+
+
+@kernel
+def pack(image: Image, words: AnyArray) -> None:
+    """Fill what `packed` returns, but for the last row and column."""
     height, width = image.shape
-    words = np.zeros((height, width), dtype=np.uint32)
     for y in range(height - 1):
         upper, lower, row = image[y], image[y + 1], words[y]
         for x in range(width - 1):
@@ -181,7 +187,6 @@ def packed(image: Image) -> AnyArray:
                 | np.uint32(lower[x]) << np.uint32(16)
                 | np.uint32(lower[x + 1]) << np.uint32(24)
             )
-    return words
 
 
 @fast_kernel

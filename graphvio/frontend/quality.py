@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphvio.arrays import Bool
+from graphvio.arrays import Bool, Float
 from graphvio.events import Quality
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.frontend.observations import Correspondences
@@ -64,11 +64,14 @@ def at_rest(
     inlier: Bool,
 ) -> bool:
     """Whether no right point (of N) has moved in the left images since the reference."""
-    moved = []
+    moved: list[Float] = []
     for j, rows in correspondences.rows.items():
         rows = rows[inlier[correspondences.observations.pair == j]]
         at_reference = np.searchsorted(reference[j].ids, current[j].ids[rows])
-        moved.append(np.linalg.norm(current[j].pixels[rows] - reference[j].pixels[at_reference], axis=1))
+        shift = current[j].pixels[rows] - reference[j].pixels[at_reference]
+        moved.append(np.hypot(shift[:, 0], shift[:, 1]))
+        if len(rows) and np.median(moved[-1]) > _REST_MOST_PX:
+            return False  # as nearly always: no need to look at the other pairs
     distance = np.concatenate(moved)
     if len(distance) < _FEW_POINTS:
         return False

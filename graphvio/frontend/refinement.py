@@ -66,12 +66,24 @@ def refine(
         config: of this stage.
         known: (N,) the inliers, where they are known already and the start is near; else they are found first.
     """
-    sigma = config.pixel_sigma_px
-    scale, largest2 = config.cauchy_scale_px / sigma, (config.max_error_px / sigma) ** 2
+    start = np.zeros(0, dtype=bool) if known is None else known
+    return Refined(*_refined(
+        np.ascontiguousarray(cur_T_ref), rig, observations, start, config.pixel_sigma_px, config.cauchy_scale_px,
+        config.max_error_px, config.sigma_inflation**2,
+    ))  # fmt: skip
+
+
+@kernel
+def _refined(
+    cur_T_ref: Float, rig: RigArrays, observations: Observations, known: Bool, sigma: float, scale_px: float,
+    max_error_px: float, inflation: float,
+) -> tuple[Float, Float, Float, Bool, Float]:  # fmt: skip
+    """What `Refined` holds, in its order; inliers that are not known have no elements."""
+    scale, largest2 = scale_px / sigma, (max_error_px / sigma) ** 2
     has_right = observations.has_right
     pose, inlier = cur_T_ref, known
-    if inlier is None:
-        everything = np.ones(len(has_right), dtype=bool)
+    if len(inlier) != len(has_right):
+        everything = np.ones(len(has_right), dtype=np.bool_)
         pose, _, errors2, _ = _levenberg_marquardt(pose, rig, observations, everything, sigma, scale, 1, _NEAR)
         inlier = errors2 < inlier_cutoff(errors2, has_right, largest2)
         inlier &= _is_of_an_explained_pair(observations.pair, inlier)
@@ -81,35 +93,32 @@ def refine(
     used = influence(errors2[inlier], has_right[inlier], scale)
     # Backward propagation of the reprojection covariance. The small prior keeps unconstrained directions finite.
     information = hessian / used.factor + np.eye(6) / _WEAK_DIRECTION_SIGMA**2
-    root: Float = np.asarray(np.linalg.inv(np.linalg.cholesky(information)).T)
+    root = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(information)).T)
     covariance = root @ root.T
-    slopes = np.where(inlier, influence_slopes(errors2, has_right, scale), 0.0)
-    through_points = _through_points(pose, rig, observations, at, sigma, slopes**2)
+    factors = np.where(inlier, influence_slopes(errors2, has_right, scale) ** 2, 0.0)
+    through_points = information_through_points(left_motions(pose, rig), rig, observations, at, sigma, factors)
     gain = covariance / used.factor * (used.weight / used.slope)
     shared = _bounded(used.variance * gain @ through_points @ gain, root)
-    inflation = config.sigma_inflation**2
-    return Refined(
-        pose,
-        inflation * covariance,
-        inflation * shared,
-        inlier,
-        _errors_px(errors2, has_right, sigma),
-    )
+    return pose, inflation * covariance, inflation * shared, inlier, _errors_px(errors2, has_right, sigma)
 
 
+@kernel
 def _is_of_an_explained_pair(pair: Int, inlier: Bool) -> Bool:
     """Which points (N,) belong to a pair of which more than a few fit, as some always do by chance; all, if no pair."""
-    fitting = np.bincount(pair, weights=inlier)
+    fitting = np.bincount(pair, weights=inlier.astype(np.float64))
     explained = fitting >= np.maximum(_LEAST_SHARE_OF_A_PAIR * np.bincount(pair), _LEAST_POINTS_OF_A_PAIR)
-    return np.asarray(explained[pair] | ~explained.any())
+    those: Bool = explained[pair] | (not explained.any())
+    return those
 
 
+@kernel
 def _bounded(shared: Float, root: Float) -> Float:
     """The shared part of a covariance ``root root^T``, so that both it and the rest are surely positive definite."""
     inverse = np.linalg.inv(root)
     shares, axes = np.linalg.eigh(inverse @ shared @ inverse.T)
     turned = root @ axes
-    return np.asarray((turned * np.clip(shares, *_SHARED_BOUNDS)) @ turned.T)
+    bounded: Float = (turned * np.minimum(np.maximum(shares, _SHARED_BOUNDS[0]), _SHARED_BOUNDS[1])) @ turned.T
+    return bounded
 
 
 @kernel
@@ -166,13 +175,6 @@ def _levenberg_marquardt(
     return pose, hessian, errors2, at
 
 
-@kernel
-def _through_points(
-    pose: Float, rig: RigArrays, observations: Observations, at: Expansion, sigma: float, factors: Float
-) -> Float:
-    return information_through_points(left_motions(pose, rig), rig, observations, at, sigma, factors)
-
-
 def explained(rig: RigArrays, observations: Observations, cur_T_ref: Float, config: MotionConfig) -> tuple[Bool, Float]:
     """Which points (N,) are inliers of a motion (4, 4), and the errors (N,) of all, see `Refined`."""
     sigma, has_right = config.pixel_sigma_px, observations.has_right
@@ -181,9 +183,10 @@ def explained(rig: RigArrays, observations: Observations, cur_T_ref: Float, conf
     return np.asarray(errors2 < inlier_cutoff(errors2, has_right, largest2)), _errors_px(errors2, has_right, sigma)
 
 
+@kernel
 def _errors_px(errors2: Float, has_right: Bool, sigma: float) -> Float:
     """Squared whitened errors (N,) as pixels in one direction."""
-    return np.asarray(sigma * np.sqrt(errors2 / np.where(has_right, 4.0, 2.0)))
+    return sigma * np.sqrt(errors2 / np.where(has_right, 4.0, 2.0))
 
 
 @kernel
