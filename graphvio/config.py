@@ -26,8 +26,8 @@ _SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
 class CornerConfig:
     """Harris corners, one in each cell of the left image that has no track (section 3)."""
 
-    cell_px: int = 40
-    """Side of a cell: at most one new corner in each."""
+    cells_across: int = 18
+    """Square cells across an image's width, whatever its size: at most one new corner in each."""
     min_response: float = 4.0
     """Least rms gradient along a corner's weaker direction, grey levels per pixel."""
     scarce_share: float = 0.33
@@ -36,6 +36,10 @@ class CornerConfig:
     """What they must still have: so many times the standard deviation of the image's noise."""
     border_px: int = 8
     """Corners and tracks nearer to the image's edge are dropped."""
+
+    def cell_px(self, width_px: int) -> int:
+        """Side of a cell in an image of some width."""
+        return max(round(width_px / self.cells_across), 1)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ def test_one_value_leaves_its_neighbours() -> None:
         ("moton: {}", "motion"),
         ("smother: {}", "smoother"),
         ("motion: {hypothesis: 3}", "hypotheses"),
-        ("corners: {cell_pixels: 3}", "cell_px"),
+        ("corners: {cells_accross: 3}", "cells_across"),
         ("smoother: {lag: 3}", "lag_s"),
     ],
 )
@@ -78,7 +78,7 @@ def test_numbers_that_no_whole_number_or_float_holds(value: str) -> None:
 @pytest.mark.parametrize(
     "value",
     [
-        "corners: {cell_px: 0}",
+        "corners: {cells_across: 0}",
         "tracking: {window_px: 0}",
         "tracking: {levels: 0}",
         "stereo: {min_depth_m: 0}",

@@ -8,11 +8,17 @@ from graphvio.frontend.corners import find_corners, occupied_cells, thinned
 
 SETTINGS = CornerConfig()
 HEIGHT, WIDTH = 240, 320
+CELL_PX = 40
 NONE = np.zeros((0, 2))
 
 
 def find(
-    image: Image, *, allowed: Bool | None = None, tracked: Float = NONE, settled: Bool | None = None, cell_px: int = 40
+    image: Image,
+    *,
+    allowed: Bool | None = None,
+    tracked: Float = NONE,
+    settled: Bool | None = None,
+    cell_px: int = CELL_PX,
 ) -> Float:
     everywhere = np.ones(image.shape, dtype=bool) if allowed is None else allowed
     good = np.ones(len(tracked), dtype=bool) if settled is None else settled
@@ -59,7 +65,7 @@ def test_nothing_is_found_where_nothing_is() -> None:
 
 def test_one_in_each_cell_and_none_at_the_border() -> None:
     found = find(texture())
-    cells = {tuple(cell) for cell in (found // SETTINGS.cell_px).astype(int)}
+    cells = {tuple(cell) for cell in (found // CELL_PX).astype(int)}
     assert len(cells) >= len(found) - 2  # half a pixel may carry one over a seam
     assert len(found) > 0.6 * (HEIGHT // 40) * (WIDTH // 40)
     assert found.min() >= SETTINGS.border_px - 0.5
@@ -70,7 +76,7 @@ def test_one_in_each_cell_and_none_at_the_border() -> None:
 def test_corners_keep_their_distance_from_each_other() -> None:
     found = find(texture(1))
     distance = np.linalg.norm(found[:, None] - found[None], axis=2) + 1e9 * np.eye(len(found))
-    assert distance.min() >= 0.5 * SETTINGS.cell_px - 1.5
+    assert distance.min() >= 0.5 * CELL_PX - 1.5
 
 
 def test_the_mask_is_respected() -> None:
@@ -104,7 +110,7 @@ def test_new_corners_keep_half_a_cell_from_every_track() -> None:
     tracked = np.random.default_rng(4).uniform([0.0, 0.0], [WIDTH, HEIGHT], (15, 2))
     found = find(texture(), tracked=tracked, settled=np.zeros(15, dtype=bool))
     assert len(found) > 5
-    assert np.linalg.norm(found[:, None] - tracked[None], axis=2).min() >= 0.5 * SETTINGS.cell_px - 0.75
+    assert np.linalg.norm(found[:, None] - tracked[None], axis=2).min() >= 0.5 * CELL_PX - 0.75
 
 
 def test_occupied_cells() -> None:

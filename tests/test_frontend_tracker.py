@@ -136,7 +136,7 @@ def test_new_corners_come_on_demand_or_when_few_tracks_are_left() -> None:
     new = ~np.isin(renewed.ids, second.ids)
     assert new.any()
     np.testing.assert_array_equal(renewed.ids[~new], second.ids)
-    cell_px = CornerConfig().cell_px
+    cell_px = CornerConfig().cell_px(WIDTH)
     taken = {tuple(cell) for cell in (second.pixels[second.has_depth] // cell_px).astype(int)}
     assert not taken & {tuple(cell) for cell in (renewed.pixels[new] // cell_px).astype(int)}
     tracker.drop(renewed.ids[8:])

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from recordings import START_NS, frame_stamps, small_rig, write_euroc, write_rows
 
 from graphvio import Estimate, FrameSet, ImuSample, Odometry, Status, open_source
-from graphvio.config import Config, CornerConfig
+from graphvio.config import Config
 from graphvio.errors import SourceError
 from graphvio.evaluation import evaluate
 from graphvio.events import Event
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.xdist_group("unsynchronised")
 
 MS = 1_000_000
 DURATION_S = 3.0
-CONFIG = Config(corners=CornerConfig(cell_px=20))  # for images of half the size, as many corners as in whole ones
+CONFIG = Config()
 
 
 def half_size(camera: Camera) -> Camera:

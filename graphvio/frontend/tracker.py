@@ -33,6 +33,7 @@ class PairTracker:
     def __init__(self, pair: StereoPair, config: Config) -> None:
         self._pair = pair
         self._config = config
+        self._cell_px = config.corners.cell_px(pair.left.size_px[0])
         self._allowed = _allowed(pair.left)
         self._matcher = StereoMatcher(pair, config, _allowed(pair.right))
         self._next_id = 0
@@ -204,7 +205,7 @@ class PairTracker:
         found = passes(found, self._pair.left.contains(pixels, corners.border_px), "edge", rejected)
         columns, rows = np.where(found[:, None], pixels, 0.0).round().astype(np.int64).T
         found = passes(found, self._allowed[rows, columns], "masked_left", rejected)
-        alone = thinned(pixels, found, corners.cell_px, _MAX_TRACKS_PER_CELL)  # the oldest of a cell come first
+        alone = thinned(pixels, found, self._cell_px, _MAX_TRACKS_PER_CELL)  # the oldest of a cell come first
         return passes(found, alone, "crowded", rejected)
 
     def _matched(
@@ -237,7 +238,7 @@ class PairTracker:
 
     def _share_of_cells(self, frame: PairFrame, new: Float | None = None) -> float:
         """The share of the image's cells that hold a track with depth, or a new corner (M, 2)."""
-        cell_px, (width, height) = self._config.corners.cell_px, self._pair.left.size_px
+        cell_px, (width, height) = self._cell_px, self._pair.left.size_px
         pixels = frame.pixels[frame.has_depth]
         both = pixels if new is None else np.concatenate([pixels, new])
         return float(occupied_cells(both, cell_px, -(-height // cell_px), -(-width // cell_px)).mean())
@@ -246,7 +247,7 @@ class PairTracker:
         """Corners (M, 2) where no track of a frame gives geometry, weak ones too where there are few."""
         settings, image = self._config.corners, self._left[0]
         tracked, settled = frame.pixels, frame.has_depth
-        cell_px, border_px = settings.cell_px, settings.border_px
+        cell_px, border_px = self._cell_px, settings.border_px
         new = find_corners(image, self._allowed, tracked, settled, cell_px, border_px, settings.min_response)
         admitted = settings.noise_factor * self._noise_sigma
         if admitted >= settings.min_response or self._share_of_cells(frame, new) >= settings.scarce_share:

@@ -46,14 +46,14 @@ def add_growth(report: Report, footage: Footage, config: Config, framesets: int)
 def _features(report: Report, footage: Footage, config: Config) -> None:
     rows = []
     for wanted in TRACKS:
-        cell_px = _cell_for(footage, config, wanted)
-        dense = replace(config, corners=replace(config.corners, cell_px=cell_px))
+        across = _cells_for(footage, config, wanted)
+        dense = replace(config, corners=replace(config.corners, cells_across=across))
         corners = int(round(_mean_tracks(footage, dense), -1))
-        distance_px = min(_REFERENCE_DISTANCE_PX, 0.5 * cell_px)
+        distance_px = min(_REFERENCE_DISTANCE_PX, 0.5 * dense.corners.cell_px(footage.rig.pairs[0].left.size_px[0]))
         row = _row(footage, dense, ReferenceContender(footage, corners, distance_px))
-        rows.append([f"{wanted}", f"{cell_px}", *row])
+        rows.append([f"{wanted}", f"{across}", *row])
     report.add("#### Features", "The reference looks for as many corners as there are tracks.")
-    report.table(["tracks wanted", "`corners.cell_px`", *_HEAD], rows)
+    report.table(["tracks wanted", "`corners.cells_across`", *_HEAD], rows)
 
 
 def _hypotheses(report: Report, footage: Footage, config: Config) -> None:
@@ -79,13 +79,11 @@ def _sizes(report: Report, footage: Footage, config: Config) -> None:
     rows = []
     for scale in SCALES:
         resized = footage.resized(scale)
-        cell_px = round(scale * config.corners.cell_px)
-        varied = replace(config, corners=replace(config.corners, cell_px=cell_px))
         reference = ReferenceContender(resized, _REFERENCE_CORNERS, scale * _REFERENCE_DISTANCE_PX)
         width, height = resized.rig.pairs[0].left.size_px
-        rows.append([f"{width}x{height}", f"{cell_px}", *_row(resized, varied, reference)])
+        rows.append([f"{width}x{height}", *_row(resized, config, reference)])
     report.add("#### Image size", "Images are resampled; cells keep their share of the image, windows their pixels.")
-    report.table(["image, px", "`corners.cell_px`", *_HEAD], rows)
+    report.table(["image, px", *_HEAD], rows)
 
 
 def _row(footage: Footage, config: Config, reference: ReferenceContender) -> list[str]:
@@ -104,16 +102,16 @@ def _row(footage: Footage, config: Config, reference: ReferenceContender) -> lis
     ]
 
 
-def _cell_for(footage: Footage, config: Config, wanted: int) -> int:
-    """The side of a cell with which about so many tracks a pair are kept: their number goes as its square's inverse."""
+def _cells_for(footage: Footage, config: Config, wanted: int) -> int:
+    """The cells across with which about so many tracks a pair are kept: their number goes as its square."""
     width, height = footage.rig.pairs[0].left.size_px
-    cell_px = round(np.sqrt(width * height / wanted))
+    across = round(width / np.sqrt(width * height / wanted))
     tried: dict[int, float] = {}
-    while cell_px not in tried:
-        dense = replace(config, corners=replace(config.corners, cell_px=cell_px))
-        tried[cell_px] = _mean_tracks(footage, dense)
-        cell_px = max(round(cell_px * np.sqrt(tried[cell_px] / wanted)), 4)
-    return min(tried, key=lambda cell: abs(tried[cell] - wanted))
+    while across not in tried:
+        dense = replace(config, corners=replace(config.corners, cells_across=across))
+        tried[across] = _mean_tracks(footage, dense)
+        across = max(round(across * np.sqrt(wanted / tried[across])), 1)
+    return min(tried, key=lambda cells: abs(tried[cells] - wanted))
 
 
 def _mean_tracks(footage: Footage, config: Config) -> float:
