@@ -78,23 +78,32 @@ def test_real_clip_from_a_moving_start(tmp_path: Path, options: tuple[str, ...])
 def test_results_are_complete_accurate_and_repeatable(room_walk: Path, tmp_path: Path) -> None:
     summary = run(room_walk, tmp_path / "a")
     run(room_walk, tmp_path / "b")
-    assert (tmp_path / "a/trajectory.txt").read_bytes() == (tmp_path / "b/trajectory.txt").read_bytes()
+    for name in ("trajectory.txt", "pairs.csv"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
     names = {path.name for path in (tmp_path / "a").iterdir()}
     assert names == {
-        "trajectory.txt", "trajectory_smoothed.txt", "covariance.csv", "imu_bias.csv", "events.jsonl",
-        "config.yaml", "rig.yaml", "summary.json", "trajectory.png",
+        "trajectory.txt", "trajectory_smoothed.txt", "covariance.csv", "imu_bias.csv", "pairs.csv",
+        "events.jsonl", "config.yaml", "rig.yaml", "summary.json", "trajectory.png",
     }  # fmt: skip
     assert summary["completion"] == 1.0
     assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.01
     assert {"predict", "track", "stereo", "motion", "update"} <= set(summary["stage_ms"])
     assert set(summary["frameset_ms"]) == {"median", "p95", "p99"}
     assert summary["status"] == {"tracking": 100}
+    assert (tmp_path / "a/pairs.csv").read_text().count("\n") == 1 + 2 * 100
+    assert set(summary["pair_medians"]) == {pair.name for pair in open_source(room_walk).rig.pairs}
+    for medians in summary["pair_medians"].values():
+        assert medians["inliers"] > 50
+        assert 0.0 < medians["own_rms_px"] <= 1.05 * medians["rms_px"] < 1.0
 
 
 @pytest.mark.parametrize("pair", [0, 1])
 def test_one_pair_alone(room_walk: Path, tmp_path: Path, pair: int) -> None:
     summary = run(room_walk, tmp_path / "out", "--pairs", pair)
     assert summary["completion"] == 1.0
+    (medians,) = summary["pair_medians"].values()
+    assert medians["rms_px"] < 1.0
+    assert medians["own_rms_px"] is None  # there is no other motion
     assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.03
 
 

@@ -1,3 +1,4 @@
+import csv
 import hashlib
 import json
 from pathlib import Path
@@ -8,9 +9,9 @@ import pytest
 
 from graphvio import __version__
 from graphvio.errors import GraphvioError
-from graphvio.events import Estimate, Incident, Status
+from graphvio.events import Estimate, Incident, PairReport, Status
 from graphvio.geometry import se3, so3_exp
-from graphvio.results import ResultWriter, Summary
+from graphvio.results import PairMedians, ResultWriter, Summary
 from graphvio.rig import Camera, Imu, Rig, StereoPair
 from graphvio.trajectory import Trajectory
 
@@ -25,11 +26,22 @@ def some_rig() -> Rig:
         body_T_cam = np.array([[0.0, 0, 1, 0], [-1, 0, 0, y], [0, -1, 0, 0], [0, 0, 0, 1]])
         return Camera(name, "radial-tangential", (64, 48), np.array([40.0, 40, 32, 24]), np.zeros(5), body_T_cam)
 
-    return Rig((StereoPair("front", camera("cam0", 0.05), camera("cam1", -0.05)),), Imu(), "test")
+    front = StereoPair("front", camera("cam0", 0.05), camera("cam1", -0.05))
+    return Rig((front, StereoPair("rear, low", camera("cam2", 0.25), camera("cam3", 0.15))), Imu(), "test")
 
 
 def pose(k: int) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.asarray(se3(so3_exp(np.array([0.0, 0.0, 0.02 * k])), np.array([0.1 * k, np.sin(0.1 * k), 0.0])))
+
+
+def reports(k: int) -> dict[int, PairReport]:
+    """Both pairs, the rear one first; that has no images at every third frameset, and never a motion of its own."""
+    nothing = np.zeros((0, 2)), np.zeros(0, dtype=bool)
+    front = PairReport(
+        50, k, *nothing, rms_px=0.2 + 0.01 * k if k else None, own_inliers=k + 1, own_rms_px=0.1 + 0.003 * k
+    )
+    rear = {1: PairReport(7, 0, *nothing)}
+    return {**(rear if k % 3 else {}), 0: front}
 
 
 def estimates() -> list[Estimate]:
@@ -42,6 +54,7 @@ def estimates() -> list[Estimate]:
             epoch=int(k >= LOST.stop),
             gyro_bias=np.array([0.001, 0.002, 0.003]),
             accel_bias=np.array([0.1, 0.2, 0.3]),
+            pairs=reports(k),
             stage_ms={"track": float(k), "solve": 2.0},
         )
         for k in range(COUNT)
@@ -90,6 +103,7 @@ def test_folder_holds_what_was_promised(folder: Path) -> None:
         "covariance.csv",
         "events.jsonl",
         "imu_bias.csv",
+        "pairs.csv",
         "rig.yaml",
         "summary.json",
         "trajectory.png",
@@ -133,6 +147,42 @@ def test_biases_and_events(folder: Path) -> None:
     assert len(events) == 2
 
 
+def test_pairs_have_a_line_for_each_report_with_a_pose_or_without(folder: Path) -> None:
+    text = (folder / "pairs.csv").read_text()
+    header, *rows = csv.reader(text.splitlines())
+    assert header == ["stamp_ns", "pair", "points", "inliers", "rms_px", "own_inliers", "own_rms_px"]
+    expected = [
+        (START_NS + k * STEP_NS, name, report)
+        for k in range(COUNT)
+        for index, name in enumerate(["front", "rear, low"])
+        if (report := reports(k).get(index)) is not None
+    ]
+    assert [(int(row[0]), row[1]) for row in rows] == [(stamp, name) for stamp, name, _ in expected]
+    for row, (_, _, report) in zip(rows, expected, strict=True):
+        told = [report.points, report.inliers, report.rms_px, report.own_inliers, report.own_rms_px]
+        assert [float(field) if field else None for field in row[2:]] == pytest.approx(told, abs=1e-9)
+    lines = text.splitlines()
+    assert lines[1] == f"{START_NS},front,50,0,,1,1.000000000e-01"
+    assert lines[3] == f'{START_NS + STEP_NS},"rear, low",7,0,,,'
+
+
+def test_pair_medians(folder: Path) -> None:
+    medians = json.loads((folder / "summary.json").read_text())["pair_medians"]
+    assert medians == {
+        "front": {"inliers": 29.5, "rms_px": 0.5, "own_rms_px": 0.1885},
+        "rear, low": {"inliers": 0.0, "rms_px": None, "own_rms_px": None},
+    }
+
+
+def test_a_residual_that_is_not_finite_spoils_no_summary(tmp_path: Path) -> None:
+    behind = PairReport(1, 1, np.zeros((1, 2)), np.ones(1, dtype=bool), rms_px=np.inf)
+    with ResultWriter(tmp_path / "behind", some_rig(), "") as writer:
+        writer.add(Estimate(START_NS, Status.LOST, None, None, pairs={0: behind}))
+        summary = finish(writer)
+    assert summary.pair_medians["front"] == PairMedians(1.0, None, None)
+    assert json.loads((tmp_path / "behind" / "summary.json").read_text())["pair_medians"]["front"]["rms_px"] is None
+
+
 def test_summary(folder: Path) -> None:
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["framesets"] == COUNT
@@ -160,7 +210,9 @@ def test_path_does_not_count_the_jump_into_a_new_epoch(folder: Path) -> None:
 
 def test_equal_input_gives_equal_bytes(folder: Path, tmp_path: Path) -> None:
     write_all(tmp_path / "again")
-    for name in ("trajectory.txt", "trajectory_smoothed.txt", "covariance.csv", "imu_bias.csv", "events.jsonl"):
+    for name in (
+        "trajectory.txt", "trajectory_smoothed.txt", "covariance.csv", "imu_bias.csv", "pairs.csv", "events.jsonl",
+    ):  # fmt: skip
         assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes(), name
 
 
@@ -188,6 +240,7 @@ def test_without_a_single_pose_there_is_still_a_summary(tmp_path: Path) -> None:
     assert summary.estimated == 0
     assert summary.completion == 0.0
     assert summary.path_length_m == 0.0
+    assert summary.pair_medians["front"] == PairMedians(None, None, None)
     assert summary.evaluation is None
     assert summary.evaluation_error is not None
     assert "0 poses" in summary.evaluation_error

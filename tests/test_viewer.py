@@ -3,6 +3,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,18 @@ def rows_of(file: Path) -> dict[str, int]:
     return counts
 
 
+def scalars_of(file: Path, entity: str) -> dict[int, float]:
+    """Stamp -> value, of an entity that holds one number at a time."""
+    values: dict[int, float] = {}
+    for chunk in importlib.import_module("rerun.chunk").RrdReader(file).stream():
+        if chunk.entity_path == entity:
+            rows = chunk.to_record_batch()
+            since_ns = rows.column("time").cast("int64").to_pylist()
+            numbers = [number for (number,) in rows.column("Scalars:scalars").to_pylist()]
+            values.update(zip((START_NS + ns for ns in since_ns), numbers, strict=True))
+    return values
+
+
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file: Path = tmp_path_factory.mktemp("viewer") / "run.rrd"
@@ -105,6 +118,23 @@ def test_no_pose_is_dropped_though_images_are(recording: Path) -> None:
     assert entities["/timing/track"] == 250
     assert 1 <= entities["/world/rig/cam0/image"] < 250
     assert entities["/events"] == 4  # tracking, lost, tracking, and the incident
+
+
+def test_residuals_of_each_pair_are_curves_without_those_that_are_not_known(tmp_path: Path) -> None:
+    shown = []
+    for k in range(30):
+        joint_px, own_px = 0.3 + 0.01 * k if k else None, 0.1 + 0.02 * k if k % 2 else None
+        report = replace(estimate(k).pairs[0], rms_px=joint_px, own_rms_px=own_px)
+        shown.append(replace(estimate(k), pairs={0: report}))
+    with Viewer(some_rig(), save=tmp_path / "r.rrd") as viewer:
+        for each in shown:
+            viewer.show(None, each)
+    for entity, figure in (("joint", "rms_px"), ("own", "own_rms_px")):
+        expected = {e.stamp_ns: getattr(e.pairs[0], figure) for e in shown}
+        expected = {stamp: value for stamp, value in expected.items() if value is not None}
+        assert scalars_of(tmp_path / "r.rrd", f"/residuals/front/{entity}") == expected
+    assert scalars_of(tmp_path / "r.rrd", "/points/front/offered") == {e.stamp_ns: 50.0 for e in shown}
+    assert scalars_of(tmp_path / "r.rrd", "/points/front/inliers") == {e.stamp_ns: 40.0 for e in shown}
 
 
 def test_handing_over_is_cheap_and_drawing_never_holds_it_up(tmp_path: Path, monkeypatch: Any) -> None:

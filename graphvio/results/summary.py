@@ -29,6 +29,26 @@ class Percentiles:
 
 
 @dataclass(frozen=True)
+class PairMedians:
+    """Medians over all reports on one pair, of those that have the figure; None where none has.
+
+    Attributes:
+        inliers: points that the chosen motion explains.
+        rms_px: their rms reprojection error under it, pixels.
+        own_rms_px: rms reprojection error of the pair's points under its own motion, pixels.
+    """
+
+    inliers: float | None
+    rms_px: float | None
+    own_rms_px: float | None
+
+    @staticmethod
+    def of(figures: Mapping[str, Sequence[float]]) -> PairMedians:
+        """Of any number of values of each figure, by its name."""
+        return PairMedians(**{name: _median(values) for name, values in figures.items()})
+
+
+@dataclass(frozen=True)
 class Summary:
     """What ``summary.json`` holds.
 
@@ -46,6 +66,7 @@ class Summary:
         resets: times the estimation was started anew.
         incidents: kind -> count, of everything in ``events.jsonl``.
         status: status -> number of estimates.
+        pair_medians: name of each of the rig's pairs -> its medians.
         epochs: for each epoch its number, first and last stamp in nanoseconds, and number of poses.
         graphvio_version: that made the run.
         config_sha256: of ``config.yaml``.
@@ -66,11 +87,20 @@ class Summary:
     resets: int
     incidents: Mapping[str, int]
     status: Mapping[str, int]
+    pair_medians: Mapping[str, PairMedians]
     epochs: Sequence[Mapping[str, int]]
     graphvio_version: str
     config_sha256: str
     evaluation: Mapping[str, Any] | None = None
     evaluation_error: str | None = None
+
+
+def _median(values: Sequence[float]) -> float | None:
+    """None of no values, and where the median is not finite."""
+    if not len(values):
+        return None
+    median = float(np.median(np.asarray(values)))
+    return round(median, 4) if np.isfinite(median) else None
 
 
 def path_length(trajectory: Trajectory, epochs: Int) -> float:

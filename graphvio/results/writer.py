@@ -7,12 +7,14 @@ byte.
 
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import json
 from array import array
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from itertools import combinations_with_replacement
 from pathlib import Path
 from types import TracebackType
@@ -24,15 +26,16 @@ from graphvio import __version__
 from graphvio.arrays import Float
 from graphvio.errors import GraphvioError, TrajectoryError
 from graphvio.evaluation import Evaluation, evaluate
-from graphvio.events import Estimate, Incident
+from graphvio.events import Estimate, Incident, PairReport
 from graphvio.plotting import draw_run
-from graphvio.results.summary import Percentiles, Summary, epoch_spans, path_length
+from graphvio.results.summary import PairMedians, Percentiles, Summary, epoch_spans, path_length
 from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory, tum_line
 
 _TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
 _COVARIANCE_HEADER = ",".join(["stamp_ns", *(f"{a}_{b}" for a, b in combinations_with_replacement(_TANGENT, 2))])
 _BIAS_HEADER = "stamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
+_PAIRS_HEADER = "stamp_ns,pair,points,inliers,rms_px,own_inliers,own_rms_px"
 _UPPER = np.triu_indices(6)
 _NS_PER_S = 1e9
 
@@ -42,7 +45,7 @@ class ResultWriter:
 
     Args:
         folder: made if absent.
-        rig: written to ``rig.yaml``.
+        rig: written to ``rig.yaml``; the pairs that estimates report on are its pairs.
         config_yaml: written to ``config.yaml`` as it is.
 
     Raises:
@@ -76,6 +79,10 @@ class ResultWriter:
         self._first_ns: int | None = None
         self._last_ns = 0
         self._stage_ms: dict[str, array[float]] = {}
+        self._pair_names = [pair.name for pair in rig.pairs]
+        self._pair_figures: dict[str, dict[str, array[float]]] = {
+            name: {figure.name: array("d") for figure in fields(PairMedians)} for name in self._pair_names
+        }
         self._status: Counter[str] = Counter()
         self._incidents: Counter[str] = Counter()
         self._stamps, self._epochs, self._lost = array("q"), array("q"), array("q")
@@ -93,6 +100,7 @@ class ResultWriter:
                 ("trajectory.txt", ""),
                 ("covariance.csv", _COVARIANCE_HEADER),
                 ("imu_bias.csv", _BIAS_HEADER),
+                ("pairs.csv", _PAIRS_HEADER),
                 ("events.jsonl", ""),
             ):
                 self._files[name] = (self.folder / name).open("x", encoding="utf-8", newline="\n")
@@ -138,6 +146,8 @@ class ResultWriter:
             self._stage_ms.setdefault(stage, array("d")).append(spent_ms)
         if estimate.gyro_bias is not None and estimate.accel_bias is not None:
             self._write("imu_bias.csv", _csv(stamp, [*estimate.gyro_bias, *estimate.accel_bias]))
+        for index in sorted(estimate.pairs):
+            self._add_report(stamp, self._pair_names[index], estimate.pairs[index])
         if estimate.nav_T_body is None:
             self._lost.append(stamp)
             return
@@ -206,6 +216,7 @@ class ResultWriter:
             resets=resets,
             incidents=dict(self._incidents),
             status=dict(self._status),
+            pair_medians={name: PairMedians.of(figures) for name, figures in self._pair_figures.items()},
             epochs=epoch_spans(trajectory, epochs),
             graphvio_version=__version__,
             config_sha256=self._config_sha256,
@@ -227,6 +238,13 @@ class ResultWriter:
         )
         return summary
 
+    def _add_report(self, stamp_ns: int, name: str, report: PairReport) -> None:
+        self._write("pairs.csv", _report_line(stamp_ns, name, report))
+        for figure, values in self._pair_figures[name].items():
+            value = getattr(report, figure)
+            if value is not None:
+                values.append(value)
+
     def _write(self, name: str, line: str) -> None:
         file = self._files[name]
         try:
@@ -246,7 +264,21 @@ class ResultWriter:
 
 
 def _csv(stamp_ns: int, values: Iterable[float]) -> str:
-    return ",".join([str(stamp_ns), *(f"{float(value):.9e}" for value in values)])
+    return ",".join([str(stamp_ns), *(_number(value) for value in values)])
+
+
+def _report_line(stamp_ns: int, name: str, report: PairReport) -> str:
+    """A line of ``pairs.csv``: quoted where the name asks for it, empty where the report has None."""
+    line = io.StringIO()
+    rms, own_rms = (None if px is None else _number(px) for px in (report.rms_px, report.own_rms_px))
+    csv.writer(line, lineterminator="").writerow(
+        [stamp_ns, name, report.points, report.inliers, rms, report.own_inliers, own_rms]
+    )
+    return line.getvalue()
+
+
+def _number(value: float) -> str:
+    return f"{float(value):.9e}"
 
 
 def _cannot_write(where: Path, error: OSError) -> GraphvioError:

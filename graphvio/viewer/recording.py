@@ -9,6 +9,7 @@
 | ``rates/<axis>/<source>`` | angular rate of body by gyro, vision and fused, rad/s (figure 5 of the paper) |
 | ``biases/gyro``, ``biases/accel`` | rad/s, m/s^2 |
 | ``points/<pair>/offered``, ``inliers`` | number of points |
+| ``residuals/<pair>/joint``, ``own`` | rms reprojection error, px, under the chosen motion and the pair's own |
 | ``timing/<stage>`` | milliseconds |
 | ``events`` | changes of status, gates, resets, faults |
 
@@ -46,6 +47,12 @@ _WINDOW_S, _WINDOW_SURE_S = 8.0, 1.0
 _FLUSH_S = 30.0
 _FRUSTUM_M = 0.25
 _INLIER, _OUTLIER = (60, 220, 90), (235, 60, 50)
+_PAIR_CURVES = {
+    "points/{}/offered": "points",
+    "points/{}/inliers": "inliers",
+    "residuals/{}/joint": "rms_px",
+    "residuals/{}/own": "own_rms_px",
+}
 _XYZ_COLOURS = [(220, 70, 60), (60, 170, 75), (70, 110, 230)]
 
 
@@ -183,8 +190,8 @@ class Recording:
             self._send_scalars(f"timing/{stage}", estimates, _stage_of(stage))
         for index in sorted({index for e in estimates for index in e.pairs}):
             name = self._rig.pairs[index].name
-            self._send_scalars(f"points/{name}/offered", estimates, _points_of(index, inliers=False))
-            self._send_scalars(f"points/{name}/inliers", estimates, _points_of(index, inliers=True))
+            for entity, figure in _PAIR_CURVES.items():
+                self._send_scalars(entity.format(name), estimates, _reported(index, figure))
 
     def _send_scalars(self, entity: str, estimates: Sequence[Estimate], value: Callable[[Estimate], Any]) -> None:
         """The values, numbers or vectors (3,), of those estimates that have one."""
@@ -274,9 +281,5 @@ def _stage_of(stage: str) -> Callable[[Estimate], Any]:
     return lambda e: e.stage_ms.get(stage)
 
 
-def _points_of(index: int, inliers: bool) -> Callable[[Estimate], Any]:
-    def count(estimate: Estimate) -> int | None:
-        report = estimate.pairs.get(index)
-        return None if report is None else report.inliers if inliers else report.points
-
-    return count
+def _reported(index: int, figure: str) -> Callable[[Estimate], Any]:
+    return lambda e: getattr(e.pairs[index], figure) if index in e.pairs else None
