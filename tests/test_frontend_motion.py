@@ -197,6 +197,34 @@ def test_truth_is_recovered_among_outliers(number: int) -> None:
         assert 0.6 < refined.inlier.mean() < 0.8
 
 
+@pytest.mark.parametrize("off_px", [2.0, 4.0, 8.0])
+def test_wrong_points_next_to_the_camera_have_no_leverage(off_px: float) -> None:
+    """Where images are sharp, an error of a few pixels is many times the noise, and must count as such."""
+    seen, wrong = seen_points(RIG, TRUTH, 100, seed(30), sigma_px=0.04), 20
+    points, left, right = seen.points.copy(), seen.left.copy(), seen.right.copy()
+    for i in range(wrong):  # a third of a metre away, and all seen to one side of where they should be
+        points[i] = [0.1 * (i % 5) - 0.2, 0.05 * (i // 5), 3.0]
+        for motion, image, focal_px in zip(
+            left_motions(TRUTH, ARRAYS)[0], (left, right), ARRAYS.focal_px[0], strict=True
+        ):
+            x, y, z = (motion @ [*points[i, :2], 1.0, points[i, 2]])[:3]
+            image[i] = [x / z + off_px / focal_px, y / z]
+    refined = refine(ARRAYS, seen._replace(points=points, left=left, right=right), TRUTH, CONFIG)
+    error = se3_log(refined.cur_T_ref @ np.linalg.inv(TRUTH))
+    assert error @ np.linalg.solve(refined.covariance, error) < chi2.ppf(0.9999, 6)
+    assert not refined.inlier[:wrong].any()
+    assert refined.inlier[wrong:].mean() > 0.95
+
+
+def test_what_stands_for_a_missing_right_image_means_nothing() -> None:
+    seen = seen_points(RIG, TRUTH, 40, seed(31), sigma_px=0.3)
+    seen = seen._replace(has_right=seed(32).random(80) < 0.6)
+    none = np.where(seen.has_right[:, None], seen.right, 0.0)
+    refined, again = (refine(ARRAYS, seen._replace(right=right), TRUTH, CONFIG) for right in (seen.right, none))
+    np.testing.assert_allclose(refined.cur_T_ref, again.cur_T_ref, atol=1e-12)
+    np.testing.assert_allclose(refined.covariance, again.covariance, rtol=1e-9)
+
+
 def test_covariance_tells_the_truth_about_the_error() -> None:
     nees = []
     for number in range(300):

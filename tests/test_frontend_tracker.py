@@ -138,7 +138,9 @@ def test_new_corners_come_on_demand_or_when_few_tracks_are_left() -> None:
     np.testing.assert_array_equal(renewed.ids[~new], second.ids)
     cell_px = CornerConfig().cell_px(WIDTH)
     taken = {tuple(cell) for cell in (second.pixels[second.has_depth] // cell_px).astype(int)}
-    assert not taken & {tuple(cell) for cell in (renewed.pixels[new] // cell_px).astype(int)}
+    # Sub-pixel precision may carry a corner by half a pixel into the next cell.
+    inside = np.all(np.abs(renewed.pixels % cell_px - 0.5 * cell_px) < 0.5 * cell_px - 0.5, axis=1)
+    assert not taken & {tuple(cell) for cell in (renewed.pixels[new & inside] // cell_px).astype(int)}
     tracker.drop(renewed.ids[8:])
     scarce = tracker.observe(2, *views(poses[2], 2), poses[2] @ np.linalg.inv(poses[1]), None)
     assert len(scarce.ids) > 20

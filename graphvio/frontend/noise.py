@@ -60,11 +60,16 @@ def influence_slopes(errors2: Float, has_right: Bool, scale: float) -> Float:
 
 
 @kernel
-def inlier_cutoff(errors2: Float, has_right: Bool, largest2: float) -> float:
-    """Squared error below which a point is an inlier: by the noise that most points have, at most ``largest2``."""
+def noise_variance(errors2: Float, has_right: Bool, largest2: float) -> float:
+    """Variance of the noise that most points have, over the modelled one, by the median of those below ``largest2``."""
     near = errors2 < largest2
     if not near.any():
-        return largest2
+        return 1.0
     medians = np.where(has_right[near], _MEDIAN_CHI2_OF_4, _MEDIAN_CHI2_OF_2)
-    variance = max(np.median(errors2[near] / medians), _LEAST_VARIANCE)
-    return min(largest2, _CUTOFF * variance)
+    return max(float(np.median(errors2[near] / medians)), _LEAST_VARIANCE)
+
+
+@kernel
+def inlier_cutoff(errors2: Float, has_right: Bool, largest2: float) -> float:
+    """Squared error below which a point is an inlier: by the noise that most points have, at most ``largest2``."""
+    return min(largest2, _CUTOFF * noise_variance(errors2, has_right, largest2))

@@ -56,7 +56,7 @@ class Observations(NamedTuple):
         points: (N, 3) ``[x, y, 1/Z]`` in the pair's left camera at the reference instant.
         covariances: (N, 3, 3) of ``points``, for a pixel noise of 1 px.
         left: (N, 2) normalised coordinates in the current left image.
-        right: (N, 2) the same in the current right image; meaningful where ``has_right``.
+        right: (N, 2) the same in the current right image; zero where it is not ``has_right``.
         has_right: (N,).
     """
 
@@ -111,7 +111,7 @@ def correspond(reference: Mapping[int, PairFrame], current: Mapping[int, PairFra
             then.points[at_then],
             then.covariances[at_then],
             now.left[at_now],
-            now.right[at_now],
+            np.where(now.has_depth[at_now, None], now.right[at_now], 0.0),
             now.has_depth[at_now],
         )
         for column, part in zip(columns, parts, strict=True):

@@ -12,12 +12,13 @@ from graphvio.arrays import Bool, Float, Int
 from graphvio.config import MotionConfig
 from graphvio.frontend.cost import left_motions
 from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise
-from graphvio.frontend.noise import influence, influence_slopes, inlier_cutoff
+from graphvio.frontend.noise import influence, influence_slopes, inlier_cutoff, noise_variance
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.geometry import se3_exp
 from graphvio.kernels import kernel
 
 _MOST_ROUNDS = 3
+_SCALES = 2
 _STEPS_PER_ROUND = 6
 _CONVERGED = 1e-6  # radians and metres
 _NEAR = 1e-4  # enough to tell inliers
@@ -79,12 +80,17 @@ def _refined(
     max_error_px: float, inflation: float,
 ) -> tuple[Float, Float, Float, Bool, Float]:  # fmt: skip
     """What `Refined` holds, in its order; inliers that are not known have no elements."""
-    scale, largest2 = scale_px / sigma, (max_error_px / sigma) ** 2
+    widest, largest2 = scale_px / sigma, (max_error_px / sigma) ** 2
     has_right = observations.has_right
     pose, inlier = cur_T_ref, known
-    if len(inlier) != len(has_right):
+    errors2 = _squared_errors(pose, rig, observations, sigma)
+    if len(inlier) == len(has_right):
+        scale = _scale(errors2[inlier], has_right[inlier], widest, largest2)
+    else:
         everything = np.ones(len(has_right), dtype=np.bool_)
-        pose, _, errors2, _ = _levenberg_marquardt(pose, rig, observations, everything, sigma, scale, 1, _NEAR)
+        for _ in range(_SCALES):
+            scale = _scale(errors2, has_right, widest, largest2)
+            pose, _, errors2, _ = _levenberg_marquardt(pose, rig, observations, everything, sigma, scale, 1, _NEAR)
         inlier = errors2 < inlier_cutoff(errors2, has_right, largest2)
         inlier &= _is_of_an_explained_pair(observations.pair, inlier)
     pose, hessian, errors2, at = _levenberg_marquardt(
@@ -100,6 +106,13 @@ def _refined(
     gain = covariance / used.factor * (used.weight / used.slope)
     shared = _bounded(used.variance * gain @ through_points @ gain, root)
     return pose, inflation * covariance, inflation * shared, inlier, _errors_px(errors2, has_right, sigma)
+
+
+@kernel
+def _scale(errors2: Float, has_right: Bool, widest: float, largest2: float) -> float:
+    """Scale of the Cauchy cost where the noise is less than modelled: a wrong point next to a camera has the leverage
+    of a hundred others, and must look as wrong as it is."""
+    return float(widest * np.sqrt(min(noise_variance(errors2, has_right, largest2), 1.0)))
 
 
 @kernel

@@ -40,6 +40,7 @@ def blueprint(rig: Rig) -> Any:
         biases,
         rrb.TimeSeriesView(origin="timing", name="milliseconds"),
         rrb.TimeSeriesView(origin="points", name="points"),
+        rrb.TimeSeriesView(origin="residuals", name="residuals, px"),
     )
     return rrb.Blueprint(
         rrb.Horizontal(
