@@ -9,8 +9,9 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.backend.gating import Verdict
 from graphvio.backend.inertial import ImuSpan
-from graphvio.backend.smoother import RigState, Smoother
+from graphvio.backend.smoother import Smoother
 from graphvio.backend.starts import Start, after_failure, after_gap, after_lost, by_vision, first_start
+from graphvio.backend.states import RigState
 from graphvio.backend.window import WindowError
 from graphvio.config import Config
 from graphvio.events import Quality, Status

@@ -7,7 +7,8 @@ from synthetic import filled_buffer, measured_motion, pose_at, stamps_ns, transf
 
 from graphvio.arrays import Float
 from graphvio.backend.inertial import ImuBuffer
-from graphvio.backend.smoother import RigState, Smoother, StartUncertainty, origin_covariance
+from graphvio.backend.smoother import Smoother
+from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
 from graphvio.config import SmootherConfig
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.rig import Imu

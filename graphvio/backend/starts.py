@@ -9,7 +9,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.initialisation import InitialAttitude, initial_attitude, level
-from graphvio.backend.smoother import RigState, StartUncertainty, origin_covariance
+from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
 from graphvio.config import InitialisationConfig
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3, se3_inverse, se3_log

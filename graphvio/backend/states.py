@@ -1,0 +1,53 @@
+"""The state of the rig at one instant, and how well a first one is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.arrays import Float
+
+_POSITION_SIGMA_M = 1e-3
+_HEADING_SIGMA_RAD = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class RigState:
+    """The rig at one instant.
+
+    Attributes:
+        nav_T_body: (4, 4).
+        velocity_nav: (3,) m/s.
+        gyro_bias: (3,) rad/s.
+        accel_bias: (3,) m/s^2.
+    """
+
+    nav_T_body: Float
+    velocity_nav: Float
+    gyro_bias: Float
+    accel_bias: Float
+
+
+@dataclass(frozen=True, eq=False)
+class StartUncertainty:
+    """How well a start is known.
+
+    Attributes:
+        pose: (6, 6) covariance of the pose, tangent ``[rotation, translation]`` in body.
+        velocity_m_s: standard deviation of each component.
+        gyro_bias_rad_s: standard deviation of each component.
+    """
+
+    pose: Float
+    velocity_m_s: float
+    gyro_bias_rad_s: float
+
+
+def origin_covariance(nav_R_body: Float, tilt_sigma_rad: float) -> Float:
+    """Covariance (6, 6) of a pose whose position and heading define nav, and whose roll and pitch are measured."""
+    about_nav = np.diag([tilt_sigma_rad, tilt_sigma_rad, _HEADING_SIGMA_RAD]) ** 2
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = nav_R_body.T @ about_nav @ nav_R_body
+    covariance[3:, 3:] = np.eye(3) * _POSITION_SIGMA_M**2
+    return covariance
