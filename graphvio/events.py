@@ -143,8 +143,9 @@ class Estimate:
         at_rest: images, and the IMU if there is one, show no motion.
         pairs: pair index -> what it contributed.
         stage_ms: processing time by stage, milliseconds: ``predict``; ``track``, with all pairs side by side; its parts
-            ``pyramid``, ``flow``, ``register``, ``corners`` and ``stereo``, each of the pair that took longest; then
-            ``motion``, ``judge`` and ``update``. A stage that was not reached is absent.
+            ``pyramid``, ``register``, ``flow`` and ``stereo``, each of the pair that took longest; then ``motion``,
+            ``judge``, ``renew`` (next to nothing unless the reference changes) and ``update``. A stage that was not
+            reached is absent.
     """
 
     stamp_ns: int

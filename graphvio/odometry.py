@@ -38,6 +38,7 @@ class Odometry:
         self._synchroniser = Synchroniser(rig, self.config, self._report)
         self._belief = Belief(rig, self.config, self._report, lambda: self._frontend.rekey())
         self._told_misaligned: set[int] = set()
+        self._frozen: frozenset[int] = frozenset()
         self._rates = AngularRates()
         self._incidents: list[Incident] = []
         self._first_ns: int | None = None
@@ -183,6 +184,13 @@ class Odometry:
     def _tell_of_vision(self, stamp_ns: int, visual: VisualResult) -> None:
         if visual.quality is not Quality.GOOD:
             self._report(stamp_ns, f"vision_{visual.quality}", visual.reason)
+        for j in sorted(visual.frozen - self._frozen):
+            self._report(
+                stamp_ns,
+                "camera_frozen",
+                f"pair {self.rig.pairs[j].name} is left out: a camera repeats its image while others do not",
+            )
+        self._frozen = visual.frozen
         for j, misalignment in self._frontend.misaligned.items():
             if j in self._told_misaligned:
                 continue

@@ -105,7 +105,7 @@ def test_each_pair_is_told_its_own_error() -> None:
     rows = {j: np.arange(200) for j in range(2)}
     frame = replace(PairFrame.empty(), ids=np.arange(200), ages=np.zeros(200, dtype=np.int64))
     for j, sigma_px in enumerate((quiet_px, loud_px)):
-        report = _report(frame, Correspondences(seen, rows, 400), j, agreement)
+        report = _report(frame, Correspondences(seen, rows, {0: 200, 1: 200}), j, agreement)
         assert report.inliers > 180
         assert report.rms_px == pytest.approx(sigma_px, rel=0.1)
         assert report.own_rms_px == pytest.approx(sigma_px, rel=0.1)
@@ -116,7 +116,7 @@ def test_a_pair_that_the_chosen_motion_does_not_explain_has_no_error_under_it() 
     agreement = judged(seen)
     rows = {0: np.arange(120), 1: np.arange(60)}
     frame = replace(PairFrame.empty(), ids=np.arange(60), ages=np.zeros(60, dtype=np.int64))
-    report = _report(frame, Correspondences(seen, rows, 180), 1, agreement)
+    report = _report(frame, Correspondences(seen, rows, {0: 120, 1: 60}), 1, agreement)
     assert (report.inliers, report.rms_px) == (0, None)
     assert report.own_rms_px == pytest.approx(0.2, rel=0.15)
 

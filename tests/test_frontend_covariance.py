@@ -82,7 +82,7 @@ def test_far_points_do_not_bias_the_motion() -> None:
 
 @pytest.mark.parametrize("noise_px", [0.15, 0.6])
 def test_covariance_follows_the_noise_that_there_is(noise_px: float) -> None:
-    """Within 10 % of 6 beyond the band of the mean: the Cauchy scale stays where it is while the noise changes."""
+    """Within 10 % of 6 beyond the band of the mean: the Cauchy scale follows only noise that is less than modelled."""
     campaign = run_campaign(replace(RICH, noise_px=noise_px, per_pair=(80, 80)), CONFIG, FRAMES, seed=13)
     low, high = band(FRAMES)
     assert low - 0.6 < campaign.nees().mean() < high + 0.6

@@ -91,7 +91,7 @@ class Window:
         unknown = [key for key in keys if not self.values.exists(key)]
         if unknown:
             raise WindowError(f"the window has no variable {_named(unknown[:1])}")
-        marginal = self._followed()
+        marginal = self._extended_marginal()
         if marginal is None or not marginal.columns.keys() >= set(keys):
             self._solve(keys)
             marginal = self._marginal
@@ -152,11 +152,12 @@ class Window:
         self._marginal, self._unknown = None, 0
         for root in solution.roots():
             if list(root.conditional().keys())[-len(last) :] == list(last):
-                columns, size = self._columns(last)  # eliminated last, they are the lower corner of the root
+                # All states are tied to each other, so those that are eliminated last are the lower corner of the root.
+                columns, size = self._columns(last)
                 self._marginal = _Marginal(columns, np.array(root.conditional().R())[-size:, -size:])
         return solution
 
-    def _followed(self) -> _Marginal | None:
+    def _extended_marginal(self) -> _Marginal | None:
         """The marginal of the followed variables and those added since, or None if that cannot be told from them."""
         if self._marginal is None or not self._unknown:
             return self._marginal

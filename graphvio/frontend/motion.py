@@ -45,9 +45,11 @@ class VisualResult:
         reason: why it is not good, or empty.
         alternatives: where pairs contradict each other, what each side says with its own covariance: one is right.
         at_rest: the images show no motion since the reference.
+        frozen: pairs that were left out because a camera of theirs repeats an image.
         pairs: pair index -> report.
-        stage_ms: time by stage, milliseconds: ``track``, with all pairs side by side; its parts ``pyramid``, ``flow``,
-            ``register``, ``corners`` and ``stereo``, each of the pair that took longest; then ``motion`` and ``judge``.
+        stage_ms: time by stage, milliseconds: ``track``, with all pairs side by side; its parts ``pyramid``,
+            ``register``, ``flow`` and ``stereo``, each of the pair that took longest; then ``motion``, ``judge``, and
+            ``renew``, which is next to nothing unless the reference changes.
     """
 
     motion: RelativeMotion | None
@@ -56,4 +58,5 @@ class VisualResult:
     pairs: Mapping[int, PairReport]
     alternatives: tuple[RelativeMotion, ...] = ()
     at_rest: bool = False
+    frozen: frozenset[int] = frozenset()
     stage_ms: Mapping[str, float] = field(default_factory=dict)

@@ -86,22 +86,22 @@ class Correspondences:
     Attributes:
         observations: of all pairs.
         rows: pair -> (M,) rows of the current `PairFrame` that take part, in order.
-        offered: number of points that the reference had, over the pairs that take part.
+        offered: pair -> number of points that its reference had, of the pairs that take part.
     """
 
     observations: Observations
     rows: Mapping[int, Int]
-    offered: int
+    offered: Mapping[int, int]
 
 
 def correspond(reference: Mapping[int, PairFrame], current: Mapping[int, PairFrame]) -> Correspondences:
     """Join the tracks of two instants by their identities; points without depth at the reference stay out."""
     columns: list[list[np.ndarray]] = [[] for _ in range(6)]
     rows: dict[int, Int] = {}
-    offered = 0
+    offered: dict[int, int] = {}
     for pair in sorted(reference.keys() & current.keys()):
         then, now = reference[pair], current[pair]
-        offered += int(then.has_depth.sum())
+        offered[pair] = int(then.has_depth.sum())
         _, at_then, at_now = np.intersect1d(then.ids, now.ids, assume_unique=True, return_indices=True)
         known = then.has_depth[at_then]
         at_then, at_now = at_then[known], at_now[known]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from graphvio.config import MotionConfig
 from graphvio.frontend.observations import Correspondences
 from graphvio.frontend.refinement import Refined
@@ -45,16 +47,23 @@ class References:
         return max(groups.values(), key=len, default={})
 
     def are_spent(self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined) -> bool:
-        """Whether the next motions had better be measured from these frames."""
+        """Whether the next motions had better be measured from these frames.
+
+        A pair that the motion does not explain at all, such as one with a door in front of it, does not end the
+        keyframe of the others.
+        """
         if self._config.reference == "previous":
             return True
         if any(j not in correspondences.rows for j in frames):
             return True  # a pair that came back takes part again from the next frameset on
         pair, overlap = correspondences.observations.pair, self._config.keyframe_overlap
-        explained = int(refined.inlier.sum())
-        if explained < overlap * correspondences.offered or explained < _FEWEST_POINTS:
+        explained = {int(j) for j in np.unique(pair[refined.inlier])}
+        support, offered = int(refined.inlier.sum()), sum(correspondences.offered[j] for j in explained)
+        if support < overlap * offered or support < _FEWEST_POINTS:
             return True
         # One pair's keyframe may be spent long before all points together are few.
-        return any(
-            refined.inlier[pair == j].sum() < 0.5 * overlap * frame.has_depth.sum() for j, frame in frames.items()
-        )
+        for j, frame in frames.items():
+            usable = refined.inlier[pair == j] if j in explained else pair == j
+            if usable.sum() < 0.5 * overlap * frame.has_depth.sum():
+                return True
+        return False

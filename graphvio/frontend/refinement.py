@@ -2,6 +2,7 @@
 
 Levenberg-Marquardt minimises the Cauchy cost of the whitened errors of `graphvio.frontend.linearisation`; points that
 turn out to be no inliers are then left out, since the Cauchy weight of a coherent crowd of them never becomes nothing.
+The cost's scale is that of the configuration for the modelled noise, and less where the residuals are smaller.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from graphvio.geometry import se3_exp
 from graphvio.kernels import kernel
 
 _MOST_ROUNDS = 3
-_SCALES = 2
+_ROUNDS_TO_FIND_INLIERS = 2
 _STEPS_PER_ROUND = 6
 _CONVERGED = 1e-6  # radians and metres
 _NEAR = 1e-4  # enough to tell inliers
@@ -88,7 +89,7 @@ def _refined(
         scale = _scale(errors2[inlier], has_right[inlier], widest, largest2)
     else:
         everything = np.ones(len(has_right), dtype=np.bool_)
-        for _ in range(_SCALES):
+        for _ in range(_ROUNDS_TO_FIND_INLIERS):
             scale = _scale(errors2, has_right, widest, largest2)
             pose, _, errors2, _ = _levenberg_marquardt(pose, rig, observations, everything, sigma, scale, 1, _NEAR)
         inlier = errors2 < inlier_cutoff(errors2, has_right, largest2)

@@ -143,7 +143,7 @@ class PairTracker:
         predicted motion would have it, shows where the point really is: most tracks are found on it at once, near
         their predicted place. The others go by way of the frame before.
         """
-        pixels, found = guess, np.zeros(len(guess), dtype=bool)
+        pixels, found = guess.copy(), np.zeros(len(guess), dtype=bool)
         if left_T_left_anchor is not None and left_T_left_prev is not None:
             pixels, found = self._register(last.ids, guess, left_T_left_anchor)
         watch.lap("register")

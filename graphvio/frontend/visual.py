@@ -76,7 +76,7 @@ class VisualFrontend:
             reports = {j: _report(frame) for j, frame in self._refer_to(frames).items()}
             watch.lap("renew")
             reason = "first images" if frames else frozen.reason
-            return VisualResult(None, Quality.FAILED, reason, reports, stage_ms=watch.stage_ms)
+            return VisualResult(None, Quality.FAILED, reason, reports, frozen=frozen.pairs, stage_ms=watch.stage_ms)
         reference_stamp_ns = next(iter(reference.values())).stamp_ns
         correspondences = correspond(reference, frames)
         predicted = predict(reference_stamp_ns)
@@ -86,7 +86,7 @@ class VisualFrontend:
         if agreement is None:
             self._refer_to(frames)
             watch.lap("renew")
-            return VisualResult(None, Quality.FAILED, reason, reports, stage_ms=watch.stage_ms)
+            return VisualResult(None, Quality.FAILED, reason, reports, frozen=frozen.pairs, stage_ms=watch.stage_ms)
         refined = agreement.sides[0].refined
         motions = [self._motion(reference_stamp_ns, stamp_ns, side.refined) for side in agreement.sides]
         motion, quality, reason = graded(motions, agreement.tension, frozen.all_since_ns)
@@ -104,11 +104,14 @@ class VisualFrontend:
             reports,
             alternatives=tuple(motions) if len(motions) > 1 else (),
             at_rest=resting,
+            frozen=frozen.pairs,
             stage_ms=watch.stage_ms,
         )
 
     def rekey(self) -> None:
         """Measure the next motions from the newest frames."""
+        if not self._latest:
+            return  # no image has come yet
         newest_ns = max(frame.stamp_ns for frame in self._latest.values())
         self._references.clear()
         self._refer_to({j: frame for j, frame in self._latest.items() if frame.stamp_ns == newest_ns})
