@@ -31,7 +31,8 @@ class CornerConfig:
     min_response: float = 4.0
     """Least rms gradient along a corner's weaker direction, grey levels per pixel."""
     scarce_share: float = 0.33
-    """Where fewer of the cells hold a track with depth or a new corner, weaker corners are admitted as well."""
+    """Where fewer of the cells hold a track with depth, new corners are looked for before the reference changes, too;
+    where few do even with the new corners, weaker ones are admitted."""
     noise_factor: float = 1.5
     """What they must still have: so many times the standard deviation of the image's noise."""
     border_px: int = 8
@@ -44,14 +45,17 @@ class CornerConfig:
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """Temporal 2D-2D matching by pyramidal Lucas-Kanade (section 3)."""
+    """Temporal 2D-2D matching by Lucas-Kanade (section 3): each track is looked for on the keyframe's own patch at its
+    predicted place, and through pyramids from the frame before where that fails."""
 
     window_px: int = 15
-    """Side of the patch that is compared."""
+    """Side of the patch that is compared, odd (an even one counts as the next); also of the patch that registration on
+    the keyframe and the alignment in stereo take."""
     levels: int = 4
     """Pyramid levels, each of half the size."""
     max_forward_backward_px: float = 0.7
-    """Largest distance between a corner and its image tracked forth and back again."""
+    """Largest distance from a corner after the way forth and back: of tracks followed from the frame before, and from
+    left to right and back in stereo."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,8 @@ class StereoConfig:
     min_depth_m: float = 0.3
     """Nearest depth that is searched; there is no farthest."""
     max_epipolar_px: float = 1.0
-    """Largest distance of a right corner from the epipolar line of its left one."""
+    """Largest reprojection error of the triangulated point, over both images together: how far a match is off the
+    epipolar line."""
     min_correlation: float = 0.7
     """Least normalised cross-correlation of the two patches."""
 
@@ -83,7 +88,8 @@ class MotionConfig:
     chunk_points: int = 100
     """Points of each pair on which the hypotheses are scored before half of them are dropped."""
     cauchy_scale_px: float = 1.5
-    """Scale ``a`` of the robust cost, eq. (2), in pixels."""
+    """Scale ``a`` of the robust cost, eq. (2), in pixels, for the modelled noise; the refinement shrinks it where
+    residuals are smaller."""
     pixel_sigma_px: float = 0.3
     """Standard deviation of a tracked corner's position in one image."""
     max_error_px: float = 3.0

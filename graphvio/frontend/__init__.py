@@ -1,7 +1,20 @@
 """The visual front-end: images of the stereo pairs in, relative poses of the rig with covariance out.
 
-It follows sections 2 and 3 of the paper. Each pair finds corners (`corners`), tracks them (`flow`), matches and
-triangulates them (`stereo`); `tracker` joins these for one pair. 3-point hypotheses (`resection`) of every pair are
-scored on every pair (`cost`, `ransac`), the winner is refined and given its covariance (`refinement`), and `selection`
-decides between pairs or joins them. `visual` is the front-end as the odometry uses it.
+It follows sections 2 and 3 of the paper.
+
+*One pair.* `corners` finds corners, above the noise that `grain` measures. `prediction` tells where a motion puts them
+and how it deforms their patches; `lucas_kanade` registers or follows them, by the alignment of `patches`. `matching`
+finds them in the right image: `stereo` searches and triangulates, `slanted` aligns. `tracker` joins these, and `tracks`
+is what it returns.
+
+*All pairs.* `observations` puts the tracks of a reference and the present side by side. 3-point hypotheses
+(`resection`) of every pair are scored on every pair (`cost`, `ransac`); the winner is refined and given its covariance
+(`refinement`, with the normal equations of `linearisation` and what `noise` reads from the residuals). `selection`
+joins the pairs or decides between them.
+
+*Judgement.* `agreement` keeps apart what contradicting pairs say, `quality` grades a motion and tells standstill,
+`alignment` watches the transfer between pairs, `frozen` notices cameras that repeat an image.
+
+`visual` is the front-end as the odometry uses it: `references` are the framesets that it measures from, `motion` is
+what it answers, `stopwatch` takes the time.
 """

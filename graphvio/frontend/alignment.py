@@ -2,7 +2,8 @@
 
 With a small error ``d`` of ``body_T_left`` (from the left, in body), a pair reports the motion ``exp(-d) M exp(d)``
 where the rig's is M: its difference from another pair's motion is ``(Ad_M - 1) d``, linear in d. Motions over whole
-keyframes, which share no noise, are collected, and d is their robust least-squares solution: section 4 in small.
+keyframes, which share next to no noise, are collected, and d is their robust least-squares solution: section 4 in
+small.
 """
 
 from __future__ import annotations

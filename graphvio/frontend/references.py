@@ -46,13 +46,23 @@ class References:
                 groups.setdefault(self._frames[j].stamp_ns, {})[j] = self._frames[j]
         return max(groups.values(), key=len, default={})
 
-    def are_spent(self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined) -> bool:
+    def are_spent(
+        self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined, contradicted: bool
+    ) -> bool:
         """Whether the next motions had better be measured from these frames.
 
-        A pair that the motion does not explain at all, such as one with a door in front of it, does not end the
+        A pair that the motion does not explain at all, such as one with a crowd in front of it, does not end the
         keyframe of the others.
+
+        Args:
+            frames: the newest of each pair.
+            correspondences: of them with the references.
+            refined: the motion.
+            contradicted: whether more than one motion is seen. Who is right is soonest told by many short motions.
         """
         if self._config.reference == "previous":
+            return True
+        if contradicted:
             return True
         if any(j not in correspondences.rows for j in frames):
             return True  # a pair that came back takes part again from the next frameset on

@@ -93,7 +93,7 @@ class VisualFrontend:
         resting = at_rest(reference, frames, correspondences, refined.inlier)
         self._drop_outliers(frames, correspondences, agreement)
         watch.lap("judge")
-        if self._references.are_spent(frames, correspondences, refined):
+        if self._references.are_spent(frames, correspondences, refined, len(agreement.sides) > 1):
             self._learn_alignments(agreement)
             self._refer_to(frames)
         watch.lap("renew")
