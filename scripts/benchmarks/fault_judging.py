@@ -6,22 +6,14 @@ import re
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, cast
 
-import numpy as np
-from scipy.stats import chi2, norm
-
+from benchmarks.motions import BREAK_STATISTIC, motion_error, overhear, uses_vision
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.events import Estimate, Event, FrameSet, Status
+from graphvio.events import Estimate, Event, FrameSet, Quality
 from graphvio.frontend.motion import RelativeMotion, VisualResult
-from graphvio.frontend.visual import VisualFrontend
-from graphvio.geometry import se3_inverse, se3_log
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig
-
-FIVE_SIGMA = float(chi2.isf(2.0 * norm.sf(5.0), 6))
-"""The squared Mahalanobis distance of six errors that is as rare as one error beyond five standard deviations."""
 
 MATERIAL_M, MATERIAL_DEG = 0.01, 0.2
 
@@ -33,7 +25,7 @@ class Judged:
     Attributes:
         since_s: since the first frameset.
         during: whether it ends while the fault lasts.
-        quality: as the front-end says, in lower case: ``good`` or ``weak``.
+        quality: as the front-end says.
         accepted: whether the odometry used it.
         nees: squared Mahalanobis distance from the truth, 6 degrees of freedom.
         error_m: of the translation.
@@ -45,7 +37,7 @@ class Judged:
 
     since_s: float
     during: bool
-    quality: str
+    quality: Quality
     accepted: bool
     nees: float
     error_m: float
@@ -57,7 +49,7 @@ class Judged:
     @property
     def wrong(self) -> bool:
         """Beyond 5 sigma."""
-        return not self.nees <= FIVE_SIGMA
+        return not self.nees <= BREAK_STATISTIC
 
     @property
     def materially_wrong(self) -> bool:
@@ -104,8 +96,8 @@ class Run:
     def __init__(self, rig: Rig, config: Config, *, with_imu: bool) -> None:
         self._with_imu = with_imu
         self._odometry = Odometry(rig if with_imu else rig.without_imu(), config)
-        self._listener = _Listener(self._odometry._frontend)
-        self._odometry._frontend = cast(VisualFrontend, self._listener)
+        self._results: list[tuple[int, VisualResult]] = []
+        overhear(self._odometry, lambda stamp_ns, result: self._results.append((stamp_ns, result)))
         self._used: dict[int, bool] = {}
         self._during: dict[int, bool] = {}
 
@@ -121,63 +113,32 @@ class Run:
     def finish(self, truth: dict[int, Float], start_ns: int) -> Outcome:
         """End the run and judge it by the truth, stamp -> ``world_T_body`` (4, 4)."""
         self._note(self._odometry.finish())
-        outcome = Outcome(len(self._listener.results), sum(self._during.values()))
+        outcome = Outcome(len(self._results), sum(self._during.values()))
         outcome.incidents.update(incident.kind for incident in self._odometry.take_incidents())
-        for stamp_ns, result in self._listener.results:
-            quality = getattr(result, "quality", "good")
-            quality = str(getattr(quality, "name", quality)).lower()
-            if result.motion is None or quality == "failed":
+        for stamp_ns, result in self._results:
+            if result.motion is None:
                 outcome.failures[re.sub(r"\d+", "N", result.reason) or "no reason given"] += 1
-                continue
-            nees, error_m, error_deg = errors(result.motion, truth)
-            outcome.motions.append(
-                Judged(
-                    since_s=(stamp_ns - start_ns) * 1e-9,
-                    during=self._during[stamp_ns],
-                    quality=quality,
-                    accepted=self._used.get(stamp_ns, False),
-                    nees=nees,
-                    error_m=error_m,
-                    error_deg=error_deg,
-                    span_s=(stamp_ns - result.motion.reference_stamp_ns) * 1e-9,
-                    inliers={pair: report.inliers for pair, report in sorted(result.pairs.items())},
-                    points={pair: report.points for pair, report in sorted(result.pairs.items())},
-                )
-            )
+            else:
+                outcome.motions.append(self._judged(stamp_ns, result, result.motion, truth, start_ns))
         return outcome
+
+    def _judged(
+        self, stamp_ns: int, result: VisualResult, motion: RelativeMotion, truth: dict[int, Float], start_ns: int
+    ) -> Judged:
+        error = motion_error(motion, truth[motion.reference_stamp_ns], truth[motion.stamp_ns])
+        return Judged(
+            since_s=(stamp_ns - start_ns) * 1e-9,
+            during=self._during[stamp_ns],
+            quality=result.quality,
+            accepted=self._used.get(stamp_ns, False),
+            nees=error.statistic,
+            error_m=error.error_m,
+            error_deg=error.error_deg,
+            span_s=motion.duration_s,
+            inliers={pair: report.inliers for pair, report in sorted(result.pairs.items())},
+            points={pair: report.points for pair, report in sorted(result.pairs.items())},
+        )
 
     def _note(self, estimates: Iterable[Estimate]) -> None:
         for estimate in estimates:
-            self._used[estimate.stamp_ns] = estimate.status in (Status.TRACKING, Status.INITIALISING)
-
-
-def errors(motion: RelativeMotion, truth: dict[int, Float]) -> tuple[float, float, float]:
-    """Squared Mahalanobis distance of a motion from the truth, metres and degrees of its error.
-
-    The error is the tangent ``log(true^-1 measured)``, in the body frame of the later instant as the covariance is.
-    """
-    true = se3_inverse(truth[motion.reference_stamp_ns]) @ truth[motion.stamp_ns]
-    error = se3_log(se3_inverse(true) @ motion.reference_T_current)
-    try:
-        nees = float(error @ np.linalg.solve(motion.covariance, error))
-    except np.linalg.LinAlgError:
-        nees = np.inf  # it claims to know something exactly
-    if not nees >= 0.0:
-        nees = np.inf
-    return nees, float(np.linalg.norm(error[3:])), float(np.rad2deg(np.linalg.norm(error[:3])))
-
-
-class _Listener:
-    """Stands before a front-end and keeps all that it returns."""
-
-    def __init__(self, frontend: VisualFrontend) -> None:
-        self._frontend = frontend
-        self.results: list[tuple[int, VisualResult]] = []
-
-    def process(self, frameset: FrameSet, *arguments: Any, **named: Any) -> VisualResult:
-        result = self._frontend.process(frameset, *arguments, **named)
-        self.results.append((frameset.stamp_ns, result))
-        return result
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._frontend, name)
+            self._used[estimate.stamp_ns] = uses_vision(estimate)

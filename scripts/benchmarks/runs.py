@@ -9,26 +9,22 @@ from time import perf_counter
 
 import cv2
 import numpy as np
-from scipy.stats import chi2, norm
 
+from benchmarks.motions import BREAK_STATISTIC, EXACT, TruthNoise, motion_error, overhear, uses_vision
 from benchmarks.recordings import blocks
 from graphvio.arrays import Float, Int
 from graphvio.config import Config
 from graphvio.errors import GraphvioError, TrajectoryError
 from graphvio.evaluation import MAX_GAP_S, Evaluation, evaluate
-from graphvio.events import Estimate, Event, FrameSet, Status
+from graphvio.events import Estimate, Event, FrameSet
 from graphvio.frontend.motion import RelativeMotion, VisualResult
-from graphvio.frontend.visual import MotionPredictor
-from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
+from graphvio.geometry import se3, so3_exp
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig, StereoPair
 from graphvio.sources import open_source
 from graphvio.trajectory import Trajectory
 from graphvio.warmup import warm_up
 
-BREAK_SIGMA = 5.0
-BREAK_STATISTIC = float(chi2.isf(2.0 * norm.sf(BREAK_SIGMA), 6))
-"""Squared Mahalanobis distance that 6 degrees of freedom exceed as rarely as one exceeds 5 sigma: 5.7e-7."""
 _BLOCK = 40
 _RPE_METRES = ("5 m", "1 m")
 
@@ -97,7 +93,7 @@ HEAD = (
 )
 
 
-def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, truth_sigma_m: float = 0.0) -> Outcome:
+def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, noise: TruthNoise = EXACT) -> Outcome:
     """Run the odometry over a recording.
 
     Images are decoded in blocks between which nothing is timed, so that decoding takes no time from the odometry.
@@ -107,7 +103,7 @@ def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, t
         rig: pairs and IMU that are used.
         config: of the odometry.
         alter: applied to every frameset, or None.
-        truth_sigma_m: standard deviation of the true positions, along each axis; counts where breaks are told.
+        noise: of the true poses; counts where breaks are told.
 
     Raises:
         GraphvioError: if the recording cannot be read or has no truth.
@@ -119,7 +115,7 @@ def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, t
     warm_up(source.rig, config)
     cv2.setNumThreads(-1)  # as in a new process; the odometry then sets what it wants
     odometry = Odometry(source.rig, config)
-    motions = _overhear_motions(odometry)
+    motions = _motions_of(odometry)
     estimates: list[Estimate] = []
     frameset_ms: list[float] = []
     for block in blocks(iter(source), _BLOCK):
@@ -134,25 +130,18 @@ def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, t
                 spent_s = 0.0
     estimates += odometry.finish()
     cv2.setNumThreads(-1)
-    return _judge(estimates, motions, truth, truth_sigma_m, frameset_ms)
+    return _judge(estimates, motions, truth, noise, frameset_ms)
 
 
-def _overhear_motions(odometry: Odometry) -> dict[int, RelativeMotion]:
-    """Stamp -> motion of each frameset, filled while the odometry runs.
-
-    An estimate does not carry the motion that vision measured, only the pose that came of it, in which IMU and earlier
-    motions hide an error; so the front-end's answers are overheard on their way to the odometry.
-    """
+def _motions_of(odometry: Odometry) -> dict[int, RelativeMotion]:
+    """Stamp -> motion that vision measured, filled while the odometry runs."""
     motions: dict[int, RelativeMotion] = {}
-    process = odometry._frontend.process
 
-    def overheard(frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
-        result = process(frameset, predict)
+    def keep(stamp_ns: int, result: VisualResult) -> None:
         if result.motion is not None:
-            motions[result.motion.stamp_ns] = result.motion
-        return result
+            motions[stamp_ns] = result.motion
 
-    odometry._frontend.process = overheard  # type: ignore[method-assign]
+    overhear(odometry, keep)
     return motions
 
 
@@ -166,16 +155,15 @@ def _judge(
     estimates: list[Estimate],
     motions: dict[int, RelativeMotion],
     truth: Trajectory,
-    truth_sigma_m: float,
+    noise: TruthNoise,
     frameset_ms: list[float],
 ) -> Outcome:
     posed = [(e.stamp_ns, e.nav_T_body, e.epoch) for e in estimates if e.nav_T_body is not None]
     stamps_ns = np.array([stamp_ns for stamp_ns, _, _ in posed], dtype=np.int64)
     estimate = Trajectory(stamps_ns, np.array([pose for _, pose, _ in posed]).reshape(-1, 4, 4))
-    used_status = (Status.TRACKING, Status.INITIALISING)
-    used_ns = {e.stamp_ns for e in estimates if e.nav_T_body is not None and e.status in used_status}
+    used_ns = {e.stamp_ns for e in estimates if e.nav_T_body is not None and uses_vision(e)}
     used = [motion for stamp_ns, motion in motions.items() if stamp_ns in used_ns]
-    statistics = _mahalanobis2(used, truth, truth_sigma_m)
+    statistics = _statistics(used, truth, noise)
     try:
         evaluation = evaluate(estimate, truth)
     except TrajectoryError:
@@ -193,20 +181,19 @@ def _judge(
     )
 
 
-def _mahalanobis2(motions: list[RelativeMotion], truth: Trajectory, truth_sigma_m: float) -> Float:
+def _statistics(motions: list[RelativeMotion], truth: Trajectory, noise: TruthNoise) -> Float:
     """Squared Mahalanobis distances (M,) to the truth, of those motions whose truth is known at both ends."""
     stamps_ns = np.unique([ns for m in motions for ns in (m.reference_stamp_ns, m.stamp_ns)]).astype(np.int64)
     known = truth.at(stamps_ns, MAX_GAP_S)[0]
     world_T_body = dict(zip(known.stamps_ns.tolist(), known.nav_T_body, strict=True))
-    of_truth = np.diag([0.0] * 3 + [2.0 * truth_sigma_m**2] * 3)  # of the difference of two positions, in any frame
-    statistics = []
-    for motion in motions:
-        if motion.reference_stamp_ns not in world_T_body or motion.stamp_ns not in world_T_body:
-            continue
-        true_motion = se3_inverse(world_T_body[motion.reference_stamp_ns]) @ world_T_body[motion.stamp_ns]
-        error = se3_log(se3_inverse(motion.reference_T_current) @ true_motion)
-        statistics.append(float(error @ np.linalg.solve(motion.covariance + of_truth, error)))
-    return np.array(statistics)
+    return np.array(
+        [
+            motion_error(motion, world_T_body[earlier_ns], world_T_body[later_ns], noise).statistic
+            for motion in motions
+            for earlier_ns, later_ns in [(motion.reference_stamp_ns, motion.stamp_ns)]
+            if earlier_ns in world_T_body and later_ns in world_T_body
+        ]
+    )
 
 
 def blinded(pair: int, start_ns: int, end_ns: int) -> Alter:

@@ -1,0 +1,95 @@
+"""The motions that vision measures: overheard on their way to the odometry, and held against the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+from graphvio.arrays import Float
+from graphvio.events import Estimate, FrameSet, Status
+from graphvio.frontend.motion import RelativeMotion, VisualResult
+from graphvio.frontend.visual import MotionPredictor
+from graphvio.geometry import se3_inverse, se3_log
+from graphvio.odometry import Odometry
+
+BREAK_SIGMA = 5.0
+BREAK_STATISTIC = float(chi2.isf(2.0 * norm.sf(BREAK_SIGMA), 6))
+"""Squared Mahalanobis distance that 6 degrees of freedom exceed as rarely as one exceeds 5 sigma: 5.7e-7."""
+
+
+class TruthNoise(NamedTuple):
+    """How good true poses are.
+
+    Attributes:
+        angle_rad: standard deviation of their orientations, about each axis.
+        position_m: of their positions, along each axis.
+    """
+
+    angle_rad: float = 0.0
+    position_m: float = 0.0
+
+
+EXACT = TruthNoise()
+
+
+class MotionError(NamedTuple):
+    """How far a motion is from the truth.
+
+    Attributes:
+        statistic: squared Mahalanobis distance by the motion's own covariance, 6 degrees of freedom.
+        error_m: of the translation.
+        error_deg: of the rotation.
+    """
+
+    statistic: float
+    error_m: float
+    error_deg: float
+
+
+def overhear(odometry: Odometry, hear: Callable[[int, VisualResult], None]) -> None:
+    """Have ``hear`` called with the stamp of each frameset and what the front-end made of it.
+
+    An estimate does not carry the motion that vision measured, only the pose that came of it, in which IMU and earlier
+    motions hide an error; so the front-end's answers are overheard on their way to the odometry.
+    """
+    process = odometry._frontend.process
+
+    def overheard(frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
+        result = process(frameset, predict)
+        hear(frameset.stamp_ns, result)
+        return result
+
+    odometry._frontend.process = overheard  # type: ignore[method-assign]
+
+
+def uses_vision(estimate: Estimate) -> bool:
+    """Whether the odometry used the motion that ends at this estimate."""
+    return estimate.status in (Status.TRACKING, Status.INITIALISING)
+
+
+def motion_error(
+    motion: RelativeMotion, world_T_reference: Float, world_T_current: Float, noise: TruthNoise = EXACT
+) -> MotionError:
+    """Hold a motion against the truth.
+
+    The error is the tangent ``log(true^-1 measured)``, in the body frame of the later instant as the covariance is.
+
+    Args:
+        motion: measured.
+        world_T_reference: (4, 4) true pose of body at the motion's earlier instant.
+        world_T_current: (4, 4) the same at the later one.
+        noise: of the two true poses.
+    """
+    true_motion = se3_inverse(world_T_reference) @ world_T_current
+    error = se3_log(se3_inverse(true_motion) @ motion.reference_T_current)
+    of_truth = np.diag(np.repeat(2.0 * np.square(noise), 3))  # of the difference of two poses, in any frame
+    try:
+        statistic = float(error @ np.linalg.solve(motion.covariance + of_truth, error))
+    except np.linalg.LinAlgError:
+        statistic = np.inf  # it claims to know something exactly
+    if not statistic >= 0.0:
+        statistic = np.inf
+    return MotionError(statistic, float(np.linalg.norm(error[3:])), float(np.rad2deg(np.linalg.norm(error[:3]))))
