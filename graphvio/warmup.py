@@ -8,6 +8,7 @@ from graphvio.config import Config
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.tracker import PairTracker
+from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log, so3_log
 from graphvio.rig import Rig
 
 _POINTS = 20
@@ -34,3 +35,9 @@ def warm_up(rig: Rig, config: Config) -> None:
     )
     for solve in (joint_motion, best_pair_motion):
         solve(RigArrays.of(rig), observations, np.eye(4), config.motion, rng)
+    se3_exp(np.zeros(6))
+    for pose in (np.eye(4), np.asfortranarray(np.eye(4))):  # gtsam's matrices are in Fortran's order
+        se3_log(pose)
+        se3_inverse(pose)
+        se3_adjoint(pose)
+        so3_log(pose[:3, :3].copy(order="K"))

@@ -14,7 +14,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from graphvio.arrays import AnyArray, Bool, Float
-from graphvio.config import MotionConfig
+from graphvio.backend.smoother import Smoother
+from graphvio.backend.states import RigState, StartUncertainty
+from graphvio.config import MotionConfig, SmootherConfig
+from graphvio.frontend.motion import RelativeMotion
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import joint_motion
@@ -117,15 +120,6 @@ class Campaign:
     def nees(self) -> Float:
         """Squared error of each motion in units of its covariance."""
         return np.array([e @ np.linalg.solve(c, e) for e, c in zip(self.errors, self.covariances, strict=True)])
-
-    def part_nees(self, part: slice) -> Float:
-        """The same of some of the six coordinates alone."""
-        return np.array(
-            [
-                e[part] @ np.linalg.solve(c[part, part], e[part])
-                for e, c in zip(self.errors, self.covariances, strict=True)
-            ]
-        )
 
 
 def band(count: int, dimensions: int = 6, probability: float = 0.95) -> tuple[float, float]:
@@ -349,28 +343,52 @@ def draw_shared(
     return SharedErrors(np.array(errors[0]), np.array(errors[1]), refined, truths[0])
 
 
-def run_chains(
-    conditions: Conditions, config: MotionConfig, links: int, frames_per_link: int, chains: int, seed: int
-) -> Campaign:
-    """Motions of keyframe to keyframe, composed, with covariances composed as if the motions were independent.
+FIRST, FRAMES, KEYFRAME = 2, 20, 5  # a pose is composed from the first frameset over so many, between no two keyframes
+_ANY_MOTION = SmootherConfig(lag_s=10.0, motion_accel_sigma_m_s2=1e3, motion_angular_accel_sigma_rad_s2=1e3)
 
-    The same tracks go on through all keyframes: the noise of a keyframe is in the motion to it and in the one from it.
+
+def run_smoothed(
+    conditions: Conditions, config: MotionConfig, chains: int, seed: int, *, renewed: bool, split: bool = True
+) -> Campaign:
+    """Poses composed by the smoother, vision alone, from the motions of every frameset since its keyframe.
+
+    Args:
+        conditions: without outliers.
+        config: of the motions.
+        chains: how many poses.
+        seed: of all that is drawn.
+        renewed: each keyframe has tracks and views of its own; else the same tracks go on through all keyframes, and
+            the noise of a keyframe's images is in the motion to it and in the ones from it.
+        split: whether the smoother is told what motions from one keyframe share.
     """
     campaign = Campaign()
-    walk = walk_through(conditions.scene)
+    walk, last = walk_through(conditions.scene), FIRST + FRAMES
+    stamps_ns = [round(k * 1e9 / RATE_HZ) for k in range(last + 1)]
     for number in range(chains):
         rng = np.random.default_rng([seed, number])
-        poses = list(draw_poses(walk, links * frames_per_link, rng)[::frames_per_link])
-        tracks = draw_tracks(walk, poses, conditions, rng)
-        views = [see(tracks, pose, conditions, rng) for pose in poses]
-        total, covariance, inlier = np.eye(4), np.zeros((6, 6)), np.ones(len(tracks.pair), dtype=bool)
-        for k in range(links):
-            truth = motion_between(poses[k], poses[k + 1])
-            motion = solve(observe(tracks, views[k], views[k + 1]), truth, config, rng)
-            adjoint = se3_adjoint(motion.cur_T_ref)
-            total = motion.cur_T_ref @ total
-            covariance = adjoint @ covariance @ adjoint.T + motion.covariance
-            inlier &= motion.inlier
-        untold = np.full(len(inlier), np.nan)
-        campaign.add(motion_between(poses[0], poses[-1]), Refined(total, covariance, np.zeros((6, 6)), inlier, untold))
+        poses = list(draw_poses(walk, last, rng))
+        smoother = Smoother(_ANY_MOTION, None)
+        start = RigState(poses[0], np.zeros(3), np.zeros(3), np.zeros(3))
+        smoother.start(0, start, StartUncertainty(1e-8 * np.eye(6), 1.0, 1.0))
+        for key in range(0, last, KEYFRAME):
+            to = min(key + KEYFRAME, last)
+            if renewed or key == 0:
+                tracks = draw_tracks(walk, poses[key : to + 1] if renewed else poses, conditions, rng)
+                current = see(tracks, poses[key], conditions, rng)
+            reference = current
+            for k in range(key + 1, to + 1):
+                current = see(tracks, poses[k], conditions, rng)
+                refined = solve(observe(tracks, reference, current), motion_between(poses[key], poses[k]), config, rng)
+                shared = refined.shared_covariance if split else np.zeros((6, 6))
+                smoother.extend(stamps_ns[k], None)
+                smoother.accept(
+                    RelativeMotion(
+                        stamps_ns[key], stamps_ns[k], se3_inverse(refined.cur_T_ref), refined.covariance, shared,
+                        int(refined.inlier.sum()),
+                    )
+                )  # fmt: skip
+                smoother.settle({stamps_ns[k // KEYFRAME * KEYFRAME]})
+        estimate = motion_between(smoother.pose(stamps_ns[FIRST]), smoother.pose(stamps_ns[last]))
+        campaign.errors.append(error_of(estimate, motion_between(poses[FIRST], poses[last])))
+        campaign.covariances.append(smoother.covariance_since(stamps_ns[FIRST]))
     return campaign

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 
 import numpy as np
 from hypothesis import settings
@@ -123,6 +124,7 @@ def velocity_at(time_s: float) -> Float:
     return np.asarray((pose_at(time_s + h)[:3, 3] - pose_at(time_s - h)[:3, 3]) / (2.0 * h))
 
 
+@cache
 def imu_at(time_s: float) -> tuple[Float, Float]:
     """True angular rate and specific force (3,) in body, by differences of the pose."""
     h = 1e-3

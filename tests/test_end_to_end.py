@@ -62,14 +62,14 @@ def change_lines(path: Path, change: Any) -> None:
 
 
 @needs_clip
-@pytest.mark.parametrize("options", [(), ("--no-imu",)], ids=["imu", "no-imu"])
-def test_real_clip_from_a_moving_start(tmp_path: Path, options: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(("options", "most_m"), [((), 0.010), (("--no-imu",), 0.006)], ids=["imu", "no-imu"])
+def test_real_clip_from_a_moving_start(tmp_path: Path, options: tuple[str, ...], most_m: float) -> None:
     summary = run(CLIP, tmp_path / "out", *options)
     assert summary["framesets"] == summary["estimated"] == 340
     assert summary["completion"] == 1.0
     assert summary["input_faults"] == {"frame_gap": 1}
     assert summary["resets"] == 0
-    assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.010
+    assert summary["evaluation"]["ate_position_m"]["rmse"] < most_m
 
 
 # ---------------------------------------------------------------- simulated data

@@ -5,15 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from dawdling import Dawdling
 from synthetic import random_transform, seen_points, transform, two_pair_rig
 
-from graphvio.arrays import Float
+from graphvio.arrays import AnyArray, Float
 from graphvio.config import MotionConfig
 from graphvio.events import Quality
 from graphvio.frontend.agreement import Agreement, agree
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.frontend.observations import Correspondences, Observations, RigArrays
 from graphvio.frontend.quality import graded
+from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import joint_motion
 from graphvio.frontend.tracks import PairFrame
 from graphvio.frontend.visual import _report
@@ -25,13 +27,16 @@ CONFIG = MotionConfig()
 STILL = np.eye(4)
 TRUTH = transform([0.01, -0.03, 0.02], [0.05, -0.02, 0.03])
 DOOR = transform([0.0, 0.05, 0.0], [0.08, 0.04, 0.0])
+OTHER_DOOR = transform([0.03, 0.0, -0.04], [-0.05, 0.06, 0.0])
 
 
-def judged(seen: Observations, seed: int = 0) -> Agreement:
+def judged(
+    seen: Observations, seed: int = 0, arrays: RigArrays = ARRAYS, threads: ThreadPoolExecutor | None = None
+) -> Agreement:
     rng = np.random.default_rng(seed)
-    joint = joint_motion(ARRAYS, seen, STILL, CONFIG, rng)
-    with ThreadPoolExecutor(2) as workers:
-        return agree(ARRAYS, seen, joint, CONFIG, rng, workers)
+    joint = joint_motion(arrays, seen, STILL, CONFIG, rng)
+    with threads or ThreadPoolExecutor(2) as workers:
+        return agree(arrays, seen, joint, CONFIG, rng, workers)
 
 
 def mixed(first: tuple[Float, int], second: tuple[Float, int], seed: int = 0) -> Observations:
@@ -121,12 +126,52 @@ def test_a_pair_that_the_chosen_motion_does_not_explain_has_no_error_under_it() 
     assert report.own_rms_px == pytest.approx(0.2, rel=0.15)
 
 
-def test_the_threads_timing_changes_nothing() -> None:
+@pytest.mark.parametrize("doors", [1, 2])
+def test_the_threads_timing_changes_nothing(doors: int) -> None:
+    """Also where a door in each view has both pairs search for a motion of their own at the same time."""
     seen = mixed((TRUTH, 60), (DOOR, 60))
-    first, again = judged(seen), judged(seen)
+    if doors == 2:
+        seen = joined(mixed((TRUTH, 40), (TRUTH, 40)), mixed((DOOR, 60), (OTHER_DOOR, 60)))
+    first = judged(seen)
+    assert len(first.sides) == doors + 1
+    for seed in range(6):
+        threads = Dawdling(2, seed)
+        again = judged(seen, threads=threads)
+        assert len(threads.delays_ms) == 2
+        assert [side.pairs for side in first.sides] == [side.pairs for side in again.sides]
+        motions = [(first.own[j], again.own[j]) for j in first.own.keys() | again.own.keys()]
+        motions += [(one.refined, other.refined) for one, other in zip(first.sides, again.sides, strict=True)]
+        for one, other in motions:
+            for name, value in vars(one).items():
+                np.testing.assert_array_equal(getattr(other, name), value, err_msg=name)
+
+
+@pytest.mark.parametrize("second", [TRUTH, DOOR], ids=["one world", "a door"])
+@pytest.mark.parametrize("seed", range(3))
+def test_swapping_pairs_changes_only_their_names(second: Float, seed: int) -> None:
+    """Other triples are drawn, so that motions agree as far as refinement converges: to a hundredth of a sigma."""
+    seen = mixed((TRUTH, 90), (second, 60), seed)
+    order = np.argsort(1 - seen.pair, kind="stable")
+    columns: list[AnyArray] = [column[order] for column in seen]
+    swapped = Observations(*columns)._replace(pair=1 - seen.pair[order])
+    first, again = judged(seen, seed), judged(swapped, seed, RigArrays.of(RIG.with_pairs([1, 0])))
+    assert [side.pairs for side in again.sides] == [tuple(sorted(1 - j for j in side.pairs)) for side in first.sides]
+    assert again.tension == pytest.approx(first.tension, rel=0.02)
     for one, other in zip(first.sides, again.sides, strict=True):
-        assert np.array_equal(one.refined.cur_T_ref, other.refined.cur_T_ref)
-        assert np.array_equal(one.refined.covariance, other.refined.covariance)
+        assert_same(one.refined, other.refined)
+        np.testing.assert_array_equal(other.refined.inlier, one.refined.inlier[order])
+    assert again.own.keys() == {1 - j for j in first.own}
+    for j, own in first.own.items():
+        assert_same(own, again.own[1 - j])
+        np.testing.assert_array_equal(again.own[1 - j].inlier, own.inlier)
+
+
+def assert_same(one: Refined, other: Refined) -> None:
+    sigmas = np.sqrt(np.diag(one.covariance))
+    apart = se3_log(np.ascontiguousarray(one.cur_T_ref @ np.linalg.inv(other.cur_T_ref)))
+    assert np.abs(apart / sigmas).max() < 0.01
+    scale = np.outer(sigmas, sigmas)
+    np.testing.assert_allclose(other.covariance / scale, one.covariance / scale, atol=0.01)
 
 
 # ------------------------------------------------------------------ quality

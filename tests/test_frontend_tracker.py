@@ -68,20 +68,27 @@ def walk(frames: int) -> list[Float]:
     return [transform([0.0, 0.0, 0.015 * k], [0.002 * k, 0.0, -0.025 * k]) for k in range(frames)]
 
 
-def followed(poses: list[Float], *, anchored: bool, tracker: PairTracker | None = None) -> list[PairFrame]:
+def followed(
+    poses: list[Float], *, anchored: bool, tracker: PairTracker | None = None, renewed: tuple[int, ...] = ()
+) -> list[PairFrame]:
+    """Frames of a walk, some of them with new corners."""
     tracker = PairTracker(rectified(), Config()) if tracker is None else tracker
     frames = []
     for k, pose in enumerate(poses):
         since_last = pose @ np.linalg.inv(poses[k - 1]) if k else None
         since_first = pose @ np.linalg.inv(poses[0]) if k and anchored else None
-        frames.append(tracker.observe(k, *views(pose, k), since_last, since_first))
+        frame = tracker.observe(k, *views(pose, k), since_last, since_first)
+        frames.append(tracker.renew() if k in renewed else frame)
         if k == 0:
             tracker.anchor()
     return frames
 
 
 def test_identities_and_ages() -> None:
-    frames = followed(walk(6), anchored=True)
+    renewed = (2, 4)
+    frames = followed(walk(6), anchored=True, renewed=renewed)
+    added = [int((frame.ages == 0).sum()) for frame in frames]
+    assert [k for k in range(1, 6) if added[k]] == list(renewed)
     for before, after in pairwise(frames):
         assert (np.diff(after.ids) > 0).all()
         old = np.isin(after.ids, before.ids)
@@ -145,6 +152,21 @@ def test_new_corners_come_on_demand_or_when_few_tracks_are_left() -> None:
     scarce = tracker.observe(2, *views(poses[2], 2), poses[2] @ np.linalg.inv(poses[1]), None)
     assert len(scarce.ids) > 20
     assert not np.isin(renewed.ids[8:], scarce.ids).any()
+
+
+def test_a_frame_stays_as_it_was_when_the_next_one_comes() -> None:
+    """Frames are the front-end's references: following their tracks, foreseen or not, must not move them."""
+    poses = walk(2)
+    for predicted in (None, poses[1] @ np.linalg.inv(poses[0])):
+        tracker = PairTracker(rectified(), Config())
+        first = tracker.observe(0, *views(poses[0]), None, None)
+        tracker.anchor()
+        held: dict[str, AnyArray] = {name: v.copy() for name, v in vars(first).items() if isinstance(v, np.ndarray)}
+        second = tracker.observe(1, *views(poses[1], 1), predicted, predicted)
+        _, then, now = np.intersect1d(first.ids, second.ids, return_indices=True)
+        assert np.abs(second.pixels[now] - held["pixels"][then]).max() > 0.5
+        for name, value in held.items():
+            np.testing.assert_array_equal(getattr(first, name), value, err_msg=name)
 
 
 def test_dropped_tracks_are_gone() -> None:
@@ -225,9 +247,9 @@ def half_blank(brightness: float, noise: float, seed: int = 0) -> Image:
 def test_weak_corners_are_admitted_in_low_light_but_no_noise(noise: float) -> None:
     dark = half_blank(0.1, noise)
     frame = PairTracker(rectified(), Config()).observe(0, dark, dark, None, None)
-    plain = Config(corners=CornerConfig(scarce_share=0.0))
-    before = PairTracker(rectified(), plain).observe(0, dark, dark, None, None)
-    assert len(before.ids) < 6
+    plain = PairTracker(rectified(), Config(corners=CornerConfig(scarce_share=0.0)))
+    plain.observe(0, dark, dark, None, None)
+    assert len(plain.renew().ids) < 6  # strong ones alone
     assert np.sum(frame.pixels[:, 0] < 165) > 12
     assert np.sum(frame.pixels[:, 0] > 170) <= 1
 

@@ -10,6 +10,7 @@ import pytest
 
 from graphvio import Estimate, FrameSet, Odometry, Status, open_source
 from graphvio.arrays import Float, Image
+from graphvio.evaluation.measures import umeyama_se3
 from graphvio.events import Event, Incident, Quality
 from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
@@ -73,6 +74,30 @@ class Walk:
         true = se3_inverse(self.pose(first.stamp_ns)) @ self.pose(last.stamp_ns)
         return float(np.linalg.norm(moved[:3, 3] - true[:3, 3]))
 
+    def _poses(self) -> tuple[Float, Float]:
+        """Estimated and true poses (N, 4, 4) of all framesets."""
+        poses = [estimate.nav_T_body for estimate in self.estimates if estimate.nav_T_body is not None]
+        assert len(poses) == len(self.estimates)
+        return np.array(poses), np.array([self.pose(estimate.stamp_ns) for estimate in self.estimates])
+
+    @property
+    def ate_m(self) -> float:
+        """Root mean square of the distances to the true positions, after alignment without scale."""
+        estimated, true = self._poses()
+        aligned = umeyama_se3(estimated[:, :3, 3], true[:, :3, 3])
+        moved = estimated[:, :3, 3] @ aligned[:3, :3].T + aligned[:3, 3]
+        return float(np.sqrt(np.mean(np.sum((moved - true[:, :3, 3]) ** 2, axis=1))))
+
+    @property
+    def error_over_1s_m(self) -> float:
+        """Root mean square of the errors of the motions over one second, from every frameset."""
+        estimated, true = self._poses()
+        errors = []
+        for i in range(len(true) - 20):
+            moved, truly = (np.linalg.inv(poses[i]) @ poses[i + 20] for poses in (estimated, true))
+            errors.append(np.linalg.norm((np.linalg.inv(truly) @ moved)[:3, 3]))
+        return float(np.sqrt(np.mean(np.square(errors))))
+
     def kinds(self) -> set[str]:
         return {incident.kind for incident in self.incidents}
 
@@ -118,7 +143,10 @@ def test_the_walk_as_it_is(room_walk: Path, events: list[Event]) -> None:
 
 
 def test_an_error_of_p12_is_told_and_corrected(room_walk: Path, events: list[Event]) -> None:
-    """1 degree and 3 cm: the two pairs stay better than the better one of them."""
+    """1 degree and 3 cm: over each second the two pairs stay better than the better one of them.
+
+    The ATE of so short a walk, half a millimetre, is partly luck: it stays below a multiple of the better pair's.
+    """
     rig = open_source(room_walk).rig.without_imu()
     error = se3_exp(
         np.concatenate([np.deg2rad(1.0) * np.array([0.6, -0.64, 0.48]), 0.03 * np.array([0.48, 0.6, 0.64])])
@@ -136,13 +164,15 @@ def test_an_error_of_p12_is_told_and_corrected(room_walk: Path, events: list[Eve
     def only(pair: int) -> Change:
         return lambda _, frameset: replace(frameset, images={0: frameset.images[pair]})
 
-    alone = [Walk(room_walk, events, only(pair), rig=rig.with_pairs([pair])).end_error_m for pair in (0, 1)]
-    assert walk.end_error_m < max(1.05 * min(alone), 0.004)
+    alone = [Walk(room_walk, events, only(pair), rig=rig.with_pairs([pair])) for pair in (0, 1)]
+    assert walk.error_over_1s_m < 1.05 * min(single.error_over_1s_m for single in alone)
+    assert walk.ate_m < 1.5 * min(single.ate_m for single in alone)
     assert all(estimate.epoch == 0 for estimate in walk.estimates)
 
 
 @pytest.mark.parametrize("pair", [0, 1])
 def test_a_blinded_pair_breaks_nothing(room_walk: Path, events: list[Event], pair: int) -> None:
+    """For 2 s, which is what the walk has room for; the benchmark of faults blinds pairs for 5 s."""
     numbers = iter(range(1000))
     walk = Walk(room_walk, events, altered(pair, lambda image: noise_like(image, 3.0, next(numbers))))
     assert all(estimate.status is Status.TRACKING for estimate in walk.estimates[1:])

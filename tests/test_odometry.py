@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dawdling import Dawdling
 
 from graphvio import Config, Estimate, EventError, FrameSet, ImuSample, Odometry, RigError, Status, open_source
 from graphvio.arrays import Image
@@ -59,6 +60,26 @@ def test_every_frameset_has_one_estimate_in_order(odometry: Odometry, events: li
         assert np.linalg.eigvalsh(estimate.covariance)[0] > 0
         assert set(estimate.pairs) == {0, 1}
     np.testing.assert_allclose(estimates[0].nav_T_body[:3, 3], 0, atol=1e-3)  # type: ignore[index]
+
+
+def test_the_threads_timing_changes_nothing(room_walk: Path, events: list[Event]) -> None:
+    rig, runs = open_source(room_walk).rig, []
+    for seed in range(3):
+        odometry = Odometry(rig)
+        frontend = odometry._frontend
+        if seed:
+            frontend._workers.shutdown()
+            frontend._workers = Dawdling(len(rig.pairs), seed)
+        runs.append(feed(odometry, events))
+        assert not seed or len(frontend._workers.delays_ms) > 100  # type: ignore[attr-defined]
+    for again in runs[1:]:
+        for one, other in zip(runs[0], again, strict=True):
+            assert one.nav_T_body is not None
+            np.testing.assert_array_equal(one.nav_T_body, other.nav_T_body)
+            np.testing.assert_array_equal(one.covariance, other.covariance)
+            for j, report in one.pairs.items():
+                np.testing.assert_array_equal(report.pixels, other.pairs[j].pixels)
+                np.testing.assert_array_equal(report.is_inlier, other.pairs[j].is_inlier)
 
 
 def test_smoothed_poses_cover_every_frameset_once(odometry: Odometry, events: list[Event]) -> None:

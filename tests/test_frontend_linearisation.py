@@ -1,0 +1,177 @@
+"""Derivatives and whitening of the refinement, against numerical derivatives and plain numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic import random_transform, seen_points, transform, two_pair_rig
+
+from graphvio.arrays import Float
+from graphvio.frontend.cost import left_motions
+from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise
+from graphvio.frontend.observations import Observations, RigArrays
+
+RIG = two_pair_rig()
+ARRAYS = RigArrays.of(RIG)
+SIGMA, SCALE = 0.3, 2.5
+TRUTH = transform([0.02, -0.03, 0.05], [-0.06, 0.02, 0.01])  # cur_T_ref
+PAIRS_AND_RIGHTS = pytest.mark.parametrize(
+    ("pairs", "share"), [((0,), 1.0), ((0,), 0.0), ((1,), 1.0), ((1,), 0.0), ((0, 1), 0.6)],
+    ids=["first", "first, no right", "second", "second, no right", "both, some right"],
+)  # fmt: skip
+
+
+def scene(pairs: tuple[int, ...], share: float) -> tuple[Observations, Float]:
+    """Points of some pairs, a share of them in the right image too, and a motion (4, 4) that is a little wrong."""
+    rng = np.random.default_rng(len(pairs) + 10 * pairs[0])
+    seen = seen_points(RIG, TRUTH, 25, rng, sigma_px=SIGMA, outlier_share=0.1)
+    seen = seen.of_rows(np.isin(seen.pair, pairs))
+    return seen._replace(has_right=rng.random(len(seen.pair)) < share), TRUTH @ random_transform(rng, 0.001, 0.003)
+
+
+def errors_px(seen: Observations, i: int, point: Float, cur_T_ref: Float) -> Float:
+    """Reprojection errors (4,) of a point ``[x, y, 1/Z]``, or (2,) where the right image does not see it."""
+    pair, errors = RIG.pairs[seen.pair[i]], []
+    body = cur_T_ref @ pair.left.body_T_cam @ [point[0], point[1], 1.0, point[2]]
+    for camera, place in ((pair.left, seen.left[i]), (pair.right, seen.right[i])):
+        x, y, z, _ = np.linalg.inv(camera.body_T_cam) @ body
+        errors.append(camera.focal_px * (place - np.array([x, y]) / z))
+    return np.concatenate(errors if seen.has_right[i] else errors[:1])
+
+
+def moved(step: Float, cur_T_ref: Float) -> Float:
+    """``exp(step) cur_T_ref`` for a step along one axis."""
+    return transform(step[:3], step[3:]) @ cur_T_ref
+
+
+def by_motion(seen: Observations, i: int, point: Float, cur_T_ref: Float) -> Float:
+    """Derivative (4 or 2, 6) of a point's predicted pixels by a step of the motion."""
+    h = 1e-6 * np.eye(6)
+    return np.column_stack(
+        [
+            (errors_px(seen, i, point, moved(-step, cur_T_ref)) - errors_px(seen, i, point, moved(step, cur_T_ref)))
+            / 2e-6
+            for step in h
+        ]
+    )
+
+
+def by_point(seen: Observations, i: int, point: Float, cur_T_ref: Float) -> Float:
+    """Derivative (4 or 2, 3) of a point's predicted pixels by the point."""
+    h = 1e-7 * np.eye(3)
+    return np.column_stack(
+        [
+            (errors_px(seen, i, point - step, cur_T_ref) - errors_px(seen, i, point + step, cur_T_ref)) / 2e-7
+            for step in h
+        ]
+    )
+
+
+def linearised(seen: Observations, cur_T_ref: Float, at: Expansion) -> tuple[float, Float, Float, Float]:
+    """What `linearise` says: cost, normal matrix (6, 6), gradient (6,) and squared errors (N,)."""
+    hessian, gradient, errors2 = np.empty((6, 6)), np.empty(6), np.empty(len(seen.pair))
+    active = np.ones(len(seen.pair), dtype=bool)
+    motions = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
+    cost = linearise(motions, ARRAYS, seen, at, active, SCALE, hessian, gradient, errors2)
+    return cost, hessian, gradient, errors2
+
+
+def expanded(seen: Observations, cur_T_ref: Float) -> Expansion:
+    return expand(left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS), ARRAYS, seen, SIGMA)
+
+
+@PAIRS_AND_RIGHTS
+def test_the_gradient_is_the_costs_numerical_derivative(pairs: tuple[int, ...], share: float) -> None:
+    """``sum w J^T r``, r being measured minus predicted, is ``-scale^2 / 2`` times the derivative of the cost."""
+    seen, cur_T_ref = scene(pairs, share)
+    at = expanded(seen, cur_T_ref)
+    gradient = linearised(seen, cur_T_ref, at)[2]
+    numerical = np.empty(6)
+    for axis, step in enumerate(1e-6 * np.eye(6)):
+        more, less = (linearised(seen, moved(sign * step, cur_T_ref), at)[0] for sign in (1.0, -1.0))
+        numerical[axis] = (more - less) / 2e-6
+    np.testing.assert_allclose(gradient, -0.5 * SCALE**2 * numerical, rtol=1e-5, atol=1e-6 * np.abs(gradient).max())
+
+
+@PAIRS_AND_RIGHTS
+def test_the_normal_equations_are_those_of_numerical_derivatives(pairs: tuple[int, ...], share: float) -> None:
+    seen, cur_T_ref = scene(pairs, share)
+    at = expanded(seen, cur_T_ref)
+    cost, hessian, gradient, errors2 = linearised(seen, cur_T_ref, at)
+    expected_hessian, expected_gradient = np.zeros((6, 6)), np.zeros(6)
+    expected_cost = 0.0
+    for i in range(len(seen.pair)):
+        plain = errors_px(seen, i, at.points[i], cur_T_ref)
+        n = len(plain)
+        whitener = at.whiteners[i, :n, :n]
+        errors = whitener @ (plain - at.offsets[i, :n])
+        derivative = whitener @ by_motion(seen, i, at.points[i], cur_T_ref)
+        assert errors2[i] == pytest.approx(errors @ errors, rel=1e-9)
+        weight = 1.0 / (1.0 + errors @ errors / SCALE**2)
+        expected_cost += float(np.log1p(errors @ errors / SCALE**2))
+        expected_hessian += weight * derivative.T @ derivative
+        expected_gradient += weight * derivative.T @ errors
+    assert cost == pytest.approx(expected_cost, rel=1e-9)
+    scale = np.sqrt(np.diag(expected_hessian))
+    np.testing.assert_allclose(hessian / np.outer(scale, scale), expected_hessian / np.outer(scale, scale), atol=1e-7)
+    np.testing.assert_allclose(gradient / scale, expected_gradient / scale, atol=1e-6)
+
+
+@PAIRS_AND_RIGHTS
+def test_points_are_whitened_where_both_instants_say_that_they_are(pairs: tuple[int, ...], share: float) -> None:
+    """The covariance ``sigma^2 (1 + J C J^T)``, and the correction ``C J^T S^-1 r`` that leads to the same place."""
+    seen, cur_T_ref = scene(pairs, share)
+    at = expanded(seen, cur_T_ref)
+    followed = 0
+    for i in range(len(seen.pair)):
+        derivative = by_point(seen, i, at.points[i], cur_T_ref)
+        n = len(derivative)
+        covariance = SIGMA**2 * (np.eye(n) + derivative @ seen.covariances[i] @ derivative.T)
+        whitener = np.linalg.inv(np.linalg.cholesky(covariance))
+        np.testing.assert_allclose(at.whiteners[i, :n, :n], whitener, rtol=1e-5, atol=1e-6 * np.abs(whitener).max())
+        shift = at.points[i] - seen.points[i]
+        np.testing.assert_allclose(at.offsets[i, :n], -derivative @ shift, rtol=1e-5, atol=1e-6)
+        errors = errors_px(seen, i, at.points[i], cur_T_ref) + derivative @ shift
+        e2 = float(errors @ np.linalg.solve(covariance, errors))
+        if e2 < 16.0:  # farther errors move a point only in part
+            best = SIGMA**2 * seen.covariances[i] @ derivative.T @ np.linalg.solve(covariance, errors)
+            sigmas = SIGMA * np.sqrt(np.diag(seen.covariances[i]))
+            np.testing.assert_allclose(shift / sigmas, best / sigmas, atol=0.02)
+            followed += int(np.linalg.norm(shift / sigmas) > 0.3)
+    assert followed > 0.3 * len(seen.pair)
+
+
+@PAIRS_AND_RIGHTS
+def test_information_through_points_is_its_formula(pairs: tuple[int, ...], share: float) -> None:
+    seen, cur_T_ref = scene(pairs, share)
+    at = expanded(seen, cur_T_ref)
+    factors = np.random.default_rng(3).uniform(-0.2, 1.0, len(seen.pair)).clip(0.0)
+    motions = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
+    found = information_through_points(motions, ARRAYS, seen, at, SIGMA, factors)
+    expected = np.zeros((6, 6))
+    for i, factor in enumerate(factors):
+        derivative = by_motion(seen, i, at.points[i], cur_T_ref)
+        through = by_point(seen, i, at.points[i], cur_T_ref)
+        inverse = np.linalg.inv(SIGMA**2 * (np.eye(len(through)) + through @ seen.covariances[i] @ through.T))
+        expected += factor * derivative.T @ (inverse - SIGMA**2 * inverse @ inverse) @ derivative
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-5)
+
+
+def test_points_behind_a_camera_and_inactive_ones_give_no_equations() -> None:
+    seen, cur_T_ref = scene((0, 1), 0.6)
+    at = expanded(seen, cur_T_ref)
+    behind, n = 7, len(seen.pair)
+    motions = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
+    places = at.points.copy()
+    places[behind, 2] = -2.0 / motions[0, 0, 2, 3]  # the motion takes its depth from 1 to about -1 of itself
+    at = at._replace(points=places)
+    active = np.arange(n) != 3
+    hessian, gradient, errors2 = np.empty((6, 6)), np.empty(6), np.empty(n)
+    cost = linearise(motions, ARRAYS, seen, at, active, SCALE, hessian, gradient, errors2)
+    assert np.flatnonzero(np.isinf(errors2)).tolist() == [behind]
+    rest = active & (np.arange(n) != behind)
+    part = linearised(seen.of_rows(rest), cur_T_ref, Expansion(*(column[rest] for column in at)))
+    assert cost == pytest.approx(part[0] + np.log1p(1e6))
+    np.testing.assert_allclose(hessian, part[1], rtol=1e-12)
+    np.testing.assert_allclose(gradient, part[2], rtol=1e-9, atol=1e-9)
