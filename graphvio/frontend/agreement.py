@@ -22,7 +22,7 @@ _BEYOND_5_SIGMA = 40.0  # chi-square of 6 degrees of freedom that a normal error
 _POORLY_EXPLAINED = 0.5  # share of a pair's points below which the pair looks for a motion of its own
 _WELL_EXPLAINED = 0.9  # from there on its own motion is next to the joint one
 _RIVAL_POINTS = 12
-_RIVAL_SHARE = 0.12  # of all points, unexplained: from there on they may have a motion of their own
+_UNEXPLAINED_SHARE = 0.12  # of all points, unexplained: from there on they may have a motion of their own
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +154,7 @@ def _second_motion(
 ) -> list[Side]:
     """At most one more rigid motion, of most points that no side explains: the world's, or what moves in it."""
     rest = ~np.any([side.refined.inlier for side in sides], axis=0)
-    if rest.sum() < max(_RIVAL_POINTS, _RIVAL_SHARE * len(rest)):
+    if rest.sum() < max(_RIVAL_POINTS, _UNEXPLAINED_SHARE * len(rest)):
         return []
     seen = observations.of_rows(rest)
     refined = refine(rig, seen, search(rig, seen, sides[0].refined.cur_T_ref, config, rng), config)

@@ -6,8 +6,10 @@ from graphvio.arrays import Float, Int
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.kernels import fast_kernel, kernel
 
-_NEAREST = 1e-3  # depth over the reference depth, below which a point is behind the camera
-_WORST = 1e6
+NEAREST = 1e-3
+"""Depth over the reference depth, below which a point is behind the camera."""
+WORST = 1e6
+"""Squared error that stands for a point behind the camera; no other counts for more."""
 _BLOCK = 48  # (1 + 1e6)^48 is below the largest float
 
 
@@ -31,7 +33,7 @@ def squared_error_px(motion: Float, point: Float, seen: Float, focal_px: float) 
     """Squared reprojection error in pixels of a point ``[x, y, 1/Z]``; infinite behind the camera."""
     a, b, w = point[0], point[1], point[2]
     z = motion[2, 0] * a + motion[2, 1] * b + motion[2, 2] + w * motion[2, 3]
-    if z < 1e-3:
+    if z < NEAREST:
         return np.inf
     x = motion[0, 0] * a + motion[0, 1] * b + motion[0, 2] + w * motion[0, 3]
     y = motion[1, 0] * a + motion[1, 1] * b + motion[1, 2] + w * motion[1, 3]
@@ -106,9 +108,9 @@ def _image_cost(motion: Float, points: Float, seen: Float, scale: float) -> floa
             x = motion[0, 0] * a[i] + motion[0, 1] * b[i] + motion[0, 2] + w[i] * motion[0, 3]
             y = motion[1, 0] * a[i] + motion[1, 1] * b[i] + motion[1, 2] + w[i] * motion[1, 3]
             z = motion[2, 0] * a[i] + motion[2, 1] * b[i] + motion[2, 2] + w[i] * motion[2, 3]
-            inverse_z = 1.0 / max(z, _NEAREST)
+            inverse_z = 1.0 / max(z, NEAREST)
             dx, dy = scale * (u[i] - x * inverse_z), scale * (v[i] - y * inverse_z)
-            error = min(dx * dx + dy * dy, _WORST) if z >= _NEAREST else _WORST
+            error = min(dx * dx + dy * dy, WORST) if z >= NEAREST else WORST
             product *= 1.0 + weight[i] * error
         total += np.log(product)
     return total

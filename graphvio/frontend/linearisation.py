@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float
+from graphvio.frontend.cost import NEAREST, WORST
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.kernels import inner_kernel, kernel
 
-_NEAREST = 1e-3
 _EXPANSIONS = 3
 _Row = tuple[float, float, float, float, float, float, float]
 _Vector = tuple[float, float, float]
@@ -99,7 +99,7 @@ def _by_point(
     """Derivatives of a point's two coordinates in one image by ``[x, y, 1/Z]``, and their errors, pixels."""
     m = motion
     x, y, w = point
-    z = max(m[2, 0] * x + m[2, 1] * y + m[2, 2] + w * m[2, 3], _NEAREST)
+    z = max(m[2, 0] * x + m[2, 1] * y + m[2, 2] + w * m[2, 3], NEAREST)
     u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] + w * m[0, 3]) / z
     v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] + w * m[1, 3]) / z
     scale = focal_px / z
@@ -157,7 +157,7 @@ def _by_motion(
     them; False if the point ``[x, y, 1/Z]`` is behind the camera."""
     m, r = motion, cam_T_body
     depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] + w * m[2, 3]
-    z = max(depth, _NEAREST)
+    z = max(depth, NEAREST)
     u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] + w * m[0, 3]) / z
     v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] + w * m[1, 3]) / z
     # d cam point = R_cam_body (-[p]x d_rotation + w d_translation), p the homogeneous point in body now
@@ -171,7 +171,7 @@ def _by_motion(
     return (
         (c * py - b * pz, a * pz - c * px, b * px - a * py, w * a, w * b, w * c, focal_px * (at_u - u)),
         (f * py - e * pz, d * pz - f * px, e * px - d * py, w * d, w * e, w * f, focal_px * (at_v - v)),
-        depth >= _NEAREST,
+        depth >= NEAREST,
     )
 
 
@@ -263,7 +263,7 @@ def linearise(
     for i in range(len(observations.pair)):
         if not _whitened(i, motions, rig, observations, at, rows):
             errors2[i] = np.inf
-            cost += np.log1p(1e6) if active[i] else 0.0
+            cost += np.log1p(WORST) if active[i] else 0.0
             continue
         e2 = rows[0, 6] ** 2 + rows[1, 6] ** 2 + rows[2, 6] ** 2 + rows[3, 6] ** 2
         errors2[i] = e2

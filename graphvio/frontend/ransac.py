@@ -4,7 +4,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.config import MotionConfig
-from graphvio.frontend.cost import left_motions, score_all, squared_error_px
+from graphvio.frontend.cost import WORST, left_motions, score_all, squared_error_px
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.resection import resect
 from graphvio.geometry import se3_inverse
@@ -138,7 +138,7 @@ def _resect_triples(triples: Int, rig: RigArrays, observations: Observations, pa
                 row = triples[i, k]
                 if observations.has_right[row]:
                     e2 = squared_error_px(motion, points[row], right[row], rig.focal_px[pair, 1])
-                    error += min(e2, 1e6)
+                    error += min(e2, WORST)
             if error < least:
                 least = error
                 best[i] = poses[c]
