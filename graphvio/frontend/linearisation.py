@@ -98,10 +98,7 @@ def _by_point(
 ) -> tuple[_Vector, _Vector, float, float]:
     """Derivatives of a point's two coordinates in one image by ``[x, y, 1/Z]``, and their errors, pixels."""
     m = motion
-    x, y, w = point
-    z = max(m[2, 0] * x + m[2, 1] * y + m[2, 2] + w * m[2, 3], NEAREST)
-    u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] + w * m[0, 3]) / z
-    v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] + w * m[1, 3]) / z
+    u, v, z, _ = _project(m, point)
     scale = focal_px / z
     return (
         (scale * (m[0, 0] - u * m[2, 0]), scale * (m[0, 1] - u * m[2, 1]), scale * (m[0, 3] - u * m[2, 3])),
@@ -150,16 +147,26 @@ def _inverse_cholesky(
 
 
 @inner_kernel
-def _by_motion(
-    motion: Float, cam_T_body: Float, x: float, y: float, w: float, focal_px: float, at_u: float, at_v: float
-) -> tuple[_Row, _Row, bool]:
-    """Derivatives of a point's two coordinates in one image by ``d`` in ``exp(d) cur_T_ref``, and their errors behind
-    them; False if the point ``[x, y, 1/Z]`` is behind the camera."""
-    m, r = motion, cam_T_body
+def _project(motion: Float, point: _Vector) -> tuple[float, float, float, bool]:
+    """Normalised coordinates of a point ``[x, y, 1/Z]`` after a motion, its depth over the one before, at least what
+    counts as in front of the camera, and whether it is there."""
+    m = motion
+    x, y, w = point
     depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] + w * m[2, 3]
     z = max(depth, NEAREST)
     u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] + w * m[0, 3]) / z
     v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] + w * m[1, 3]) / z
+    return u, v, z, depth >= NEAREST
+
+
+@inner_kernel
+def _by_motion(
+    pair: int, side: int, motions: Float, rig: RigArrays, point: _Vector, seen: Float
+) -> tuple[_Row, _Row, bool]:
+    """Derivatives of a point's two coordinates in one image by ``d`` in ``exp(d) cur_T_ref``, and their errors behind
+    them; False if the point ``[x, y, 1/Z]`` is behind the camera."""
+    r, focal_px, w = rig.cam_T_body[pair, side], rig.focal_px[pair, side], point[2]
+    u, v, z, in_front = _project(motions[pair, side], point)
     # d cam point = R_cam_body (-[p]x d_rotation + w d_translation), p the homogeneous point in body now
     qx, qy, qz = u * z - w * r[0, 3], v * z - w * r[1, 3], z - w * r[2, 3]
     px = r[0, 0] * qx + r[1, 0] * qy + r[2, 0] * qz
@@ -169,9 +176,9 @@ def _by_motion(
     a, b, c = scale * (r[0, 0] - u * r[2, 0]), scale * (r[0, 1] - u * r[2, 1]), scale * (r[0, 2] - u * r[2, 2])
     d, e, f = scale * (r[1, 0] - v * r[2, 0]), scale * (r[1, 1] - v * r[2, 1]), scale * (r[1, 2] - v * r[2, 2])
     return (
-        (c * py - b * pz, a * pz - c * px, b * px - a * py, w * a, w * b, w * c, focal_px * (at_u - u)),
-        (f * py - e * pz, d * pz - f * px, e * px - d * py, w * d, w * e, w * f, focal_px * (at_v - v)),
-        depth >= NEAREST,
+        (c * py - b * pz, a * pz - c * px, b * px - a * py, w * a, w * b, w * c, focal_px * (seen[0] - u)),
+        (f * py - e * pz, d * pz - f * px, e * px - d * py, w * d, w * e, w * f, focal_px * (seen[1] - v)),
+        in_front,
     )
 
 
@@ -182,27 +189,9 @@ def _whitened(i: int, motions: Float, rig: RigArrays, observations: Observations
     The right image's rows are computed always, and zero where it does not see the point: fixed lengths and no
     branches make this several times faster.
     """
-    j, x, y, w = observations.pair[i], at.points[i, 0], at.points[i, 1], at.points[i, 2]
-    left_u, left_v, in_front = _by_motion(
-        motions[j, 0],
-        rig.cam_T_body[j, 0],
-        x,
-        y,
-        w,
-        rig.focal_px[j, 0],
-        observations.left[i, 0],
-        observations.left[i, 1],
-    )
-    right_u, right_v, in_front_of_right = _by_motion(
-        motions[j, 1],
-        rig.cam_T_body[j, 1],
-        x,
-        y,
-        w,
-        rig.focal_px[j, 1],
-        observations.right[i, 0],
-        observations.right[i, 1],
-    )
+    j, point = observations.pair[i], (at.points[i, 0], at.points[i, 1], at.points[i, 2])
+    left_u, left_v, in_front = _by_motion(j, 0, motions, rig, point, observations.left[i])
+    right_u, right_v, in_front_of_right = _by_motion(j, 1, motions, rig, point, observations.right[i])
     has_right = observations.has_right[i]
     if not in_front or (has_right and not in_front_of_right):
         return False
