@@ -167,6 +167,7 @@ def test_an_error_of_p12_is_told_and_corrected(room_walk: Path, events: list[Eve
     alone = [Walk(room_walk, events, only(pair), rig=rig.with_pairs([pair])) for pair in (0, 1)]
     assert walk.error_over_1s_m < 1.05 * min(single.error_over_1s_m for single in alone)
     assert walk.ate_m < 1.5 * min(single.ate_m for single in alone)
+    assert walk.end_error_m < max(1.05 * min(single.end_error_m for single in alone), 0.004)
     assert all(estimate.epoch == 0 for estimate in walk.estimates)
 
 
