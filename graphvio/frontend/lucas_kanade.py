@@ -13,11 +13,24 @@ import cv2
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
-from graphvio.frontend.patches import align, correlation, patches, prepare, sample, sample_affine, scratch, weaker2
+from graphvio.frontend.patches import (
+    align,
+    correlation,
+    localisation2,
+    patches,
+    prepare,
+    sample,
+    sample_affine,
+    scratch,
+    weaker2,
+)
 from graphvio.kernels import fast_kernel
 
 MIN_GRADIENT = 1.0
 """Rms grey levels per pixel along a patch's weaker direction; below, it is not localised."""
+
+_MOST_SIGMA_PX = 0.2
+"""Of a place along the weaker direction; sharp images have less than half of it."""
 
 Pyramid = tuple[Image, ...]
 """An image and its halves, quarters..."""
@@ -80,8 +93,9 @@ def _forth_and_back(
     moved = guess.copy()
     found = np.zeros(n, dtype=np.bool_)
     bordered = np.empty((2 * half + 3, 2 * half + 3), dtype=np.float32)
-    buffers = patches(3, half)
-    patch, gx, gy = buffers[0], buffers[1], buffers[2]
+    buffers = patches(4, half)
+    patch, gx, gy, seen = buffers[0], buffers[1], buffers[2], buffers[3]
+    side, most2 = 2 * half + 1, _MOST_SIGMA_PX**2
     for i in range(n):
         for level in range(levels - 1, -1, -1):
             scale = 1.0 / (1 << level)
@@ -98,9 +112,11 @@ def _forth_and_back(
             # The way back begins where it should end, so it needs no coarse levels.
             found[i] = sample(target[0], moved[i, 0], moved[i, 1], half + 1, bordered)
         if found[i]:
-            xx, xy, yy = prepare(bordered, patch, gx, gy)
+            xx, xy, yy = prepare(bordered, seen, gx, gy)
+            found[i] = localisation2(patch, seen, xx, xy, yy, side) <= most2
+        if found[i]:
             x, y = pixels[i, 0], pixels[i, 1]
-            u, v, converged = align(source[0], x, y, half, patch, gx, gy, xx, xy, yy, min_gradient)
+            u, v, converged = align(source[0], x, y, half, seen, gx, gy, xx, xy, yy, min_gradient)
             found[i] = converged and (u - x) ** 2 + (v - y) ** 2 <= max_return_px * max_return_px
     return moved, found
 
@@ -133,7 +149,8 @@ def register(
     bordered, row = patches(1, half + 1)[0], scratch(half + 1)
     buffers = patches(4, half)
     patch, gx, gy, seen = buffers[0], buffers[1], buffers[2], buffers[3]
-    least2 = (min_gradient * (2 * half + 1)) ** 2
+    side, most2 = 2 * half + 1, _MOST_SIGMA_PX**2
+    least2 = (min_gradient * side) ** 2
     for i in range(n):
         x, y, warp = pixels[i, 0], pixels[i, 1], warps[i]
         if not wanted[i] or not sample_affine(
@@ -145,7 +162,11 @@ def register(
         x, y = guess[i, 0], guess[i, 1]
         u, v, converged = align(target, x, y, half, patch, gx, gy, xx, xy, yy, min_gradient)
         if converged and (u - x) ** 2 + (v - y) ** 2 <= max_shift_px * max_shift_px:
+            if not sample(target, u, v, half + 1, bordered):
+                continue
+            xx, xy, yy = prepare(bordered, seen, gx, gy)
+            if localisation2(patch, seen, xx, xy, yy, side) > most2:
+                continue
             moved[i, 0], moved[i, 1], found[i] = u, v, True
-            if sample(target, u, v, half, seen):
-                correlations[i] = correlation(patch, seen, 2 * half + 1)
+            correlations[i] = correlation(patch, seen, side)
     return moved, found, localised, correlations

@@ -253,3 +253,28 @@ def correlation(patch: AnyArray, other: AnyArray, side: int) -> float:
     if variance < 1e-3 or own < 1e-3:
         return -1.0
     return float(product / np.sqrt(float(variance) * float(own)))
+
+
+@fast_kernel
+def localisation2(patch: AnyArray, other: AnyArray, xx: float, xy: float, yy: float, side: int) -> float:
+    """Variance of a patch's place in an image along the weaker direction, square pixels.
+
+    What differs between patch and image, but for contrast and brightness, is taken for white noise. A blurred image
+    leaves a place free along the blur: an iteration that starts there ends there.
+
+    Args:
+        patch: of zero mean, padded with zeros.
+        other: the image at the patch's place, likewise.
+        xx: normal matrix of ``other``, as are xy and yy.
+        side: of the patch.
+    """
+    a, b = patch.reshape(-1), other.reshape(-1)
+    product = own = square = np.float32(0.0)
+    for k in range(a.size):
+        product += a[k] * b[k]
+        own += a[k] * a[k]
+        square += b[k] * b[k]
+    weaker = weaker2(xx, xy, yy)
+    if own < 1e-3 or weaker < 1e-3:
+        return np.inf
+    return float(square - product * product / own) / (weaker * side * side)

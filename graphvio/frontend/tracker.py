@@ -15,7 +15,7 @@ from graphvio.frontend.grain import noise_sigma
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, register, track
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.patches import packed
-from graphvio.frontend.prediction import predict_pixels, predict_warps
+from graphvio.frontend.prediction import predict_pixels, predict_warps, surface_inverse_depths
 from graphvio.frontend.stopwatch import Stopwatch
 from graphvio.frontend.tracks import PairFrame, passes
 from graphvio.rig import Camera, StereoPair
@@ -42,7 +42,9 @@ class PairTracker:
         self._right: Pyramid = ()
         self._anchor = PairFrame.empty()
         self._anchor_image: AnyArray | None = None  # packed
-        self._anchor_rays = np.zeros((3, 0, 2))  # of each of its pixels and of the ones to the right and below
+        # Of each of its tracks' pixels, and of the ones to the right and below:
+        self._anchor_rays = np.zeros((3, 0, 2))
+        self._anchor_inverse_depths = np.zeros((3, 0))
         self._noise_sigma = 0.0
 
     def observe(
@@ -109,6 +111,16 @@ class PairTracker:
         self._anchor_image = packed(self._left[0]) if self._left else None
         beside = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         self._anchor_rays = np.stack([self._pair.left.unproject(self._last.pixels + step)[0] for step in beside])
+        right = self._pair.right
+        self._anchor_inverse_depths = surface_inverse_depths(
+            self._anchor_rays,
+            np.maximum(self._last.points[:, 2], 0.0),
+            self._last.slopes,
+            self._pair.right_T_left,
+            right.model_number,
+            right.intrinsics,
+            right.distortion,
+        )
 
     def drop(self, ids: Int) -> None:
         """Forget tracks, so that fresh corners may take their place."""
@@ -177,7 +189,7 @@ class PairTracker:
         camera = self._pair.left
         warps, usable = predict_warps(
             self._anchor_rays[:, rows],
-            np.maximum(anchor.points[rows, 2], 0.0),
+            self._anchor_inverse_depths[:, rows],
             left_T_left_anchor,
             camera.model_number,
             camera.intrinsics,
