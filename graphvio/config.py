@@ -94,7 +94,7 @@ class MotionConfig:
     """Standard deviation of a tracked corner's position in one image."""
     max_error_px: float = 3.0
     """Reprojection error beyond which a point is no inlier."""
-    sigma_inflation: float = 1.5
+    sigma_inflation: float = 1.2
     """Factor on a motion's standard deviations, for errors that residuals do not show: matches that share a patch."""
     min_inliers: int = 12
     """Motions that explain fewer points are refused."""

@@ -38,82 +38,104 @@ def predict_pixels(
 
 @kernel
 def predict_warps(
-    rays: Float, inverse_depths: Float, motion: Float, model: int, intrinsics: Float, distortion: Float
-) -> tuple[Float, Bool]:
+    rays: Float, inverse_depths: Float, step_px: float, motion: Float, model: int, intrinsics: Float, distortion: Float
+) -> tuple[Float, Float, Bool]:
     """How a motion deforms the surroundings of points.
 
+    The affine map that is nearest to the deformation over a whole patch is not the one that is right at its centre:
+    the deformation's curvature shifts the patch as a whole. A wall that one walks along has the same curvature all over,
+    so that all its points would move too far.
+
     Args:
-        rays: (3, N, 2) normalised coordinates before, of each point's pixel, the next to its right, the next below.
-        inverse_depths: (3, N) of what is seen there before, 1/m: where they differ, the surface is slanted.
+        rays: (5, N, 2) normalised coordinates before, see `around`.
+        inverse_depths: (5, N) of what is seen there, 1/m: where they differ, the surface is slanted.
+        step_px: of `around`.
         motion: (4, 4) maps points before to points after.
         model: of the camera, with its ``intrinsics`` (4,) and ``distortion`` (5,).
 
     Returns:
-        Derivatives (N, 2, 2) of the pixel before by the pixel after, and whether each exists (N,).
+        Derivatives (N, 2, 2) of the pixel before by the pixel after; where (N, 2) in the image before the affine map
+        has the point, from the point itself, pixels; and whether both exist (N,).
     """
     n = inverse_depths.shape[1]
-    warps, valid = np.zeros((n, 2, 2)), np.zeros(n, dtype=np.bool_)
+    warps, shifts, valid = np.zeros((n, 2, 2)), np.zeros((n, 2)), np.zeros(n, dtype=np.bool_)
     limit = fold_radius(model, distortion)
+    u, v = np.empty(5), np.empty(5)
     for i in range(n):
-        x, y, z = _moved(rays[0, i, 0], rays[0, i, 1], inverse_depths[0, i], motion)
-        u, v, ok = _project(x, y, z, limit, model, intrinsics, distortion)
-        x, y, z = _moved(rays[1, i, 0], rays[1, i, 1], inverse_depths[1, i], motion)
-        u_right, v_right, ok_right = _project(x, y, z, limit, model, intrinsics, distortion)
-        x, y, z = _moved(rays[2, i, 0], rays[2, i, 1], inverse_depths[2, i], motion)
-        u_below, v_below, ok_below = _project(x, y, z, limit, model, intrinsics, distortion)
-        a, b, c, d = u_right - u, u_below - u, v_right - v, v_below - v
+        all_ok = True
+        for k in range(5):
+            x, y, z = _moved(rays[k, i, 0], rays[k, i, 1], inverse_depths[k, i], motion)
+            u[k], v[k], ok = _project(x, y, z, limit, model, intrinsics, distortion)
+            all_ok &= ok
+        if not all_ok:
+            continue
+        a, b = (u[2] - u[1]) / (2.0 * step_px), (u[4] - u[3]) / (2.0 * step_px)
+        c, d = (v[2] - v[1]) / (2.0 * step_px), (v[4] - v[3]) / (2.0 * step_px)
         area = a * d - b * c
-        if ok and ok_right and ok_below and area > _MIN_AREA:
-            warps[i, 0, 0], warps[i, 0, 1] = d / area, -b / area
-            warps[i, 1, 0], warps[i, 1, 1] = -c / area, a / area
-            valid[i] = True
-    return warps, valid
+        if area < _MIN_AREA:
+            continue
+        warps[i, 0, 0], warps[i, 0, 1] = d / area, -b / area
+        warps[i, 1, 0], warps[i, 1, 1] = -c / area, a / area
+        mean_u, mean_v = 0.5 * (u[1] + u[2] + u[3] + u[4]) - 2.0 * u[0], 0.5 * (v[1] + v[2] + v[3] + v[4]) - 2.0 * v[0]
+        shifts[i, 0] = -warps[i, 0, 0] * mean_u - warps[i, 0, 1] * mean_v
+        shifts[i, 1] = -warps[i, 1, 0] * mean_u - warps[i, 1, 1] * mean_v
+        valid[i] = True
+    return warps, shifts, valid
+
+
+def around(pixels: Float, step_px: float) -> Float:
+    """Pixels (5, N, 2): those given (N, 2), and those a step to their left, right, above and below."""
+    steps = np.array([[0.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+    return np.asarray(pixels + step_px * steps[:, None])
 
 
 @kernel
-def surface_inverse_depths(
-    rays: Float, inverse_depths: Float, slopes: Float, right_T_left: Float, model: int, intrinsics: Float,
-    distortion: Float,
+def inverse_depths_around(
+    rays: Float, inverse_depths: Float, slopes: Float, step_px: float, right_T_left: Float, model: int,
+    intrinsics: Float, distortion: Float,
 ) -> Float:  # fmt: skip
-    """Inverse depths beside points, by what stereo matching says of the surface's slant.
+    """What surrounds points in depth, by what stereo matching says of their surface's slant.
 
     The right image shows a patch's surroundings shifted along the epipolar line, by the left pixel times the slope.
     The cameras' rotation and lenses make some of that shift; depth makes the rest.
 
     Args:
-        rays: (3, N, 2) normalised coordinates in the left camera, of each point's pixel, the next to its right, the
-            next below.
+        rays: (5, N, 2) normalised coordinates in the left camera, see `around`.
         inverse_depths: (N,) of the points, 1/m.
         slopes: (N, 2), see `graphvio.frontend.slanted`.
+        step_px: of `around`.
         right_T_left: (4, 4).
         model: of the right camera, with its ``intrinsics`` (4,) and ``distortion`` (5,).
 
     Returns:
-        Inverse depths (3, N) at the three pixels; the point's own where its place in the right image is not known.
+        Inverse depths (5, N) of the surface's plane; the point's own where the right image does not show it.
     """
     n = len(inverse_depths)
-    beside = np.empty((3, n))
+    depths = np.empty((5, n))
     limit = fold_radius(model, distortion)
+    u, v = np.empty(5), np.empty(5)
     for i in range(n):
         w = inverse_depths[i]
-        beside[:, i] = w
-        x, y, z = _moved(rays[0, i, 0], rays[0, i, 1], w, right_T_left)
-        u, v, ok = _project(x, y, z, limit, model, intrinsics, distortion)
+        depths[:, i] = w
         x, y, z = _moved(rays[0, i, 0], rays[0, i, 1], w + _NEARER, right_T_left)
-        u_near, v_near, ok_near = _project(x, y, z, limit, model, intrinsics, distortion)
-        along_u, along_v = (u_near - u) / _NEARER, (v_near - v) / _NEARER
-        length = np.hypot(along_u, along_v)
-        if not (ok and ok_near) or length < 1e-6:
+        near_u, near_v, all_ok = _project(x, y, z, limit, model, intrinsics, distortion)
+        for k in range(5):
+            x, y, z = _moved(rays[k, i, 0], rays[k, i, 1], w, right_T_left)
+            u[k], v[k], ok = _project(x, y, z, limit, model, intrinsics, distortion)
+            all_ok &= ok
+        along_u, along_v = (near_u - u[0]) / _NEARER, (near_v - v[0]) / _NEARER
+        length = np.hypot(along_u, along_v)  # pixels for an inverse depth of 1/m
+        if not all_ok or length < 1e-6:
             continue
         along_u, along_v = along_u / length, along_v / length
         for k in range(2):
-            x, y, z = _moved(rays[k + 1, i, 0], rays[k + 1, i, 1], w, right_T_left)
-            u_beside, v_beside, ok_beside = _project(x, y, z, limit, model, intrinsics, distortion)
-            if ok_beside:
-                by_lens = (u_beside - u) * along_u + (v_beside - v) * along_v
-                as_if_flat = along_u if k == 0 else along_v
-                beside[k + 1, i] += (slopes[i, k] + as_if_flat - by_lens) / length
-    return beside
+            left, right = 2 * k + 1, 2 * k + 2
+            flat = ((u[right] - u[left]) * along_u + (v[right] - v[left]) * along_v) / (2.0 * step_px)
+            seen = slopes[i, k] + (along_u if k == 0 else along_v)
+            change = step_px * (seen - flat) / length
+            depths[left, i] -= change
+            depths[right, i] += change
+    return depths
 
 
 @kernel

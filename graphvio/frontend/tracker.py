@@ -15,7 +15,7 @@ from graphvio.frontend.grain import noise_sigma
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, register, track
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.patches import packed
-from graphvio.frontend.prediction import predict_pixels, predict_warps, surface_inverse_depths
+from graphvio.frontend.prediction import around, inverse_depths_around, predict_pixels, predict_warps
 from graphvio.frontend.stopwatch import Stopwatch
 from graphvio.frontend.tracks import PairFrame, passes
 from graphvio.rig import Camera, StereoPair
@@ -42,9 +42,9 @@ class PairTracker:
         self._right: Pyramid = ()
         self._anchor = PairFrame.empty()
         self._anchor_image: AnyArray | None = None  # packed
-        # Of each of its tracks' pixels, and of the ones to the right and below:
-        self._anchor_rays = np.zeros((3, 0, 2))
-        self._anchor_inverse_depths = np.zeros((3, 0))
+        self._anchor_rays = np.zeros((5, 0, 2))  # of what is around each of its tracks
+        self._anchor_inverse_depths = np.zeros((5, 0))
+        self._step_px = float(np.sqrt((config.tracking.window_px**2 - 1) / 12.0))  # standard deviation of a patch
         self._noise_sigma = 0.0
 
     def observe(
@@ -109,13 +109,14 @@ class PairTracker:
         """Hold the tracks against the newest frame's own patches from here on."""
         self._anchor = self._last
         self._anchor_image = packed(self._left[0]) if self._left else None
-        beside = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        self._anchor_rays = np.stack([self._pair.left.unproject(self._last.pixels + step)[0] for step in beside])
+        pixels = around(self._last.pixels, self._step_px)
+        self._anchor_rays = self._pair.left.unproject(pixels.reshape(-1, 2))[0].reshape(pixels.shape)
         right = self._pair.right
-        self._anchor_inverse_depths = surface_inverse_depths(
+        self._anchor_inverse_depths = inverse_depths_around(
             self._anchor_rays,
             np.maximum(self._last.points[:, 2], 0.0),
             self._last.slopes,
+            self._step_px,
             self._pair.right_T_left,
             right.model_number,
             right.intrinsics,
@@ -187,9 +188,10 @@ class PairTracker:
         rows = np.minimum(np.searchsorted(anchor.ids, ids), len(anchor.ids) - 1)
         wanted = (anchor.ids[rows] == ids) & anchor.has_depth[rows]
         camera = self._pair.left
-        warps, usable = predict_warps(
+        warps, shifts, usable = predict_warps(
             self._anchor_rays[:, rows],
             self._anchor_inverse_depths[:, rows],
+            self._step_px,
             left_T_left_anchor,
             camera.model_number,
             camera.intrinsics,
@@ -198,7 +200,7 @@ class PairTracker:
         pixels, found, _, correlations = register(
             self._anchor_image,
             self._left[0],
-            anchor.pixels[rows],
+            anchor.pixels[rows] + shifts,
             warps,
             guess,
             wanted & usable,
