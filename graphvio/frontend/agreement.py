@@ -19,9 +19,11 @@ from graphvio.frontend.refinement import Refined, refine
 from graphvio.geometry import se3_inverse, se3_log
 
 _BEYOND_5_SIGMA = 40.0  # chi-square of 6 degrees of freedom that a normal error exceeds once in 2 million
+_BEYOND_2_SIGMA = 12.6  # once in 20: enough for pairs that contradicted each other a moment ago
 _POORLY_EXPLAINED = 0.5  # share of a pair's points below which the pair looks for a motion of its own
 _WELL_EXPLAINED = 0.9  # from there on its own motion is next to the joint one
 _RIVAL_POINTS = 12
+_COMPARABLE = 0.85  # support over that of the best supported: support alone does not tell who is right
 _UNEXPLAINED_SHARE = 0.12  # of all points, unexplained: from there on they may have a motion of their own
 
 
@@ -48,7 +50,8 @@ class Agreement:
     """What all pairs say.
 
     Attributes:
-        sides: one if all pairs that see enough agree; else one for each opinion, the best supported first.
+        sides: one if all pairs that see enough agree; else one for each opinion, the best supported first; of those
+            with about as much support the first pair's, which is the one that the others' places are told from.
         own: pair -> its own motion, of the pairs that see enough.
         tension: the largest squared Mahalanobis distance between two pairs of one side, 0 for a single pair.
     """
@@ -65,6 +68,7 @@ def agree(
     config: MotionConfig,
     rng: np.random.Generator,
     workers: Executor,
+    in_doubt: bool = False,
 ) -> Agreement:
     """Compare the pairs' own motions with each other.
 
@@ -75,6 +79,7 @@ def agree(
         config: of this stage.
         rng: source of random triples.
         workers: run the pairs side by side.
+        in_doubt: the pairs contradicted each other a moment ago, so that less is enough to tell them apart now.
     """
     everyone = tuple(int(j) for j in np.unique(observations.pair))
     together = Side(everyone, joint)
@@ -85,12 +90,13 @@ def agree(
             lambda j, source: _own_motion(rig, observations, j, joint, config, source), everyone, sources
         )
         own = {j: m for j, m in zip(everyone, motions, strict=True) if is_supported(m.inlier, config)}
+    limit = _BEYOND_2_SIGMA if in_doubt else _BEYOND_5_SIGMA
     camps: list[list[int]] = []
     tension = 0.0
     for j in sorted(own, key=lambda j: -int(own[j].inlier.sum())):
         for camp in camps:
             distance = disagreement(own[camp[0]], own[j])
-            if distance < _BEYOND_5_SIGMA:
+            if distance < limit:
                 camp.append(j)
                 tension = max(tension, distance)
                 break
@@ -100,7 +106,13 @@ def agree(
     if len(camps) > 1:
         sides = [_side(rig, observations, sorted(camp), own, config) for camp in camps]
     sides += _second_motion(rig, observations, sides, config, rng)
-    return Agreement(tuple(sorted(sides, key=lambda side: -side.support)), own, tension)
+    return Agreement(_in_order(sides), own, tension)
+
+
+def _in_order(sides: list[Side]) -> tuple[Side, ...]:
+    """The best supported first; but an error of P_12 puts no pair in the wrong, and to change sides would add it up."""
+    enough = _COMPARABLE * max(side.support for side in sides)
+    return tuple(sorted(sides, key=lambda side: (side.support < enough or side.pairs[0] != 0, -side.support)))
 
 
 def disagreement(one: Refined, other: Refined) -> float:

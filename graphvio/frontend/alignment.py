@@ -1,14 +1,15 @@
 """Watches P_12: whether two pairs' own motions can be those of one rigid body with the transfer that the rig file says.
 
-With a small error ``d`` of ``body_T_left`` (from the left, in body), a pair reports the motion ``exp(-d) M exp(d)``
-where the rig's is M: its difference from another pair's motion is ``(Ad_M - 1) d``, linear in d. Motions over whole
-keyframes, which share next to no noise, are collected, and d is their robust least-squares solution: section 4 in
-small.
+With an error ``d`` of ``body_T_left`` (from the left, in body), a pair reports the motion ``exp(-d) M exp(d)`` where
+the rig's is M. Motions over whole keyframes, which share next to no noise, are collected, and d is their robust
+least-squares solution, by Gauss-Newton: section 4 in small.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from scipy.stats import chi2
 from graphvio.arrays import Float
 from graphvio.frontend.refinement import Refined
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from graphvio.kernels import kernel
 
 _KEPT = 100
 _FEWEST = 6
@@ -54,7 +56,7 @@ class PairAlignment:
     """
 
     def __init__(self) -> None:
-        self._equations: deque[tuple[Float, Float]] = deque(maxlen=_KEPT)  # whitened A (6, 6) and y (6,)
+        self._motions: deque[tuple[Float, Float, Float]] = deque(maxlen=_KEPT)  # trusted, the pair's, whitener
         self.in_force: Misalignment | None = None
 
     @property
@@ -65,26 +67,69 @@ class PairAlignment:
     def add(self, trusted: Refined, pair: Refined) -> None:
         """Take two motions over the same keyframe, the pair's computed with the correction in force."""
         correction = self.correction
-        nominal = se3_inverse(correction) @ pair.cur_T_ref @ correction
-        y = se3_log(np.ascontiguousarray(nominal @ se3_inverse(trusted.cur_T_ref)))
-        a = se3_adjoint(trusted.cur_T_ref) - np.eye(6)
-        whiten = np.linalg.inv(np.linalg.cholesky(trusted.covariance + pair.covariance))
-        self._equations.append((whiten @ a, whiten @ y))
+        uncorrected = se3_inverse(correction) @ pair.cur_T_ref @ correction
+        whitener = np.linalg.inv(np.linalg.cholesky(trusted.covariance + pair.covariance))
+        self._motions.append((trusted.cur_T_ref, uncorrected, whitener))
 
     def solve(self) -> Misalignment | None:
         """The error of the rig file's extrinsics, or None while too few motions agree on one."""
-        if len(self._equations) < _FEWEST:
+        if len(self._motions) < _FEWEST:
             return None
-        a = np.array([equation[0] for equation in self._equations])
-        y = np.array([equation[1] for equation in self._equations])
+        trusted, pairs, whiteners = (np.array(column) for column in zip(*self._motions, strict=True))
         prior = np.diag(1.0 / _PRIOR_SIGMAS**2)
-        d, weights = np.zeros(6), np.ones(len(a))
+        d = np.zeros(6) if self.in_force is None else self.in_force.tangent
         information = prior
         for _ in range(_ROUNDS):
-            information = prior + np.einsum("n,nki,nkj->ij", weights, a, a)
-            d = np.linalg.solve(information, np.einsum("n,nki,nk->i", weights, a, y))
-            squared = np.sum((y - a @ d) ** 2, axis=1)
+            errors, derivatives = _linearised(se3_exp(d), trusted, pairs, whiteners)
+            squared = np.sum(errors**2, axis=1)
             weights = 1.0 / (1.0 + squared / _CAUCHY)
+            information = prior + np.einsum("n,nki,nkj->ij", weights, derivatives, derivatives)
+            gradient = prior @ d + np.einsum("n,nki,nk->i", weights, derivatives, errors)
+            d = d - np.linalg.solve(information, gradient)
         if np.mean(squared > 4.0 * _CAUCHY) > _MOST_OUTLIERS:
             return None
         return Misalignment(d, np.asarray(np.linalg.inv(information)), float(d @ (information - prior) @ d))
+
+
+def combined(joint: Refined, own: Mapping[int, Refined], misaligned: Mapping[int, Misalignment]) -> Refined:
+    """One motion of pairs of which some have been corrected, each weighed by its own covariance and by what is not
+    known of its place; points of all pairs together would be weighed as if the correction were exact.
+
+    Args:
+        joint: motion on all points, which tells the inliers.
+        own: pair -> its own motion.
+        misaligned: pair -> the error that its motion has been corrected for.
+    """
+    first = next(iter(own.values())).cur_T_ref
+    information, weighted = np.zeros((6, 6)), np.zeros(6)
+    through_points = np.zeros((6, 6))
+    for j, motion in own.items():
+        covariance = motion.covariance
+        if j in misaligned:
+            lever = np.eye(6) - se3_adjoint(motion.cur_T_ref)
+            covariance = covariance + lever @ misaligned[j].covariance @ lever.T
+        inverse = np.linalg.inv(covariance)
+        through_points += inverse @ motion.shared_covariance @ inverse
+        information += inverse
+        weighted += inverse @ se3_log(np.ascontiguousarray(motion.cur_T_ref @ se3_inverse(first)))
+    fused = np.asarray(np.linalg.inv(information))
+    return replace(
+        joint,
+        cur_T_ref=se3_exp(fused @ weighted) @ first,
+        covariance=fused,
+        shared_covariance=fused @ through_points @ fused,
+    )
+
+
+@kernel
+def _linearised(correction: Float, trusted: Float, pairs: Float, whiteners: Float) -> tuple[Float, Float]:
+    """Whitened differences (N, 6) of a pair's corrected motions from the trusted ones, and their derivatives (N, 6, 6)
+    by a further correction from the left."""
+    n = len(trusted)
+    errors, derivatives = np.empty((n, 6)), np.empty((n, 6, 6))
+    inverse = se3_inverse(correction)
+    for i in range(n):
+        corrected = correction @ pairs[i] @ inverse
+        errors[i] = whiteners[i] @ se3_log(corrected @ se3_inverse(trusted[i]))
+        derivatives[i] = whiteners[i] @ (np.eye(6) - se3_adjoint(corrected))
+    return errors, derivatives

@@ -43,8 +43,8 @@ def predict_warps(
     """How a motion deforms the surroundings of points.
 
     The affine map that is nearest to the deformation over a whole patch is not the one that is right at its centre:
-    the deformation's curvature shifts the patch as a whole. A wall that one walks along has the same curvature all over,
-    so that all its points would move too far.
+    the deformation's curvature shifts the patch as a whole. Along a wall that one walks by it has the same sign all
+    over, so that all points would seem to move too far.
 
     Args:
         rays: (5, N, 2) normalised coordinates before, see `around`.

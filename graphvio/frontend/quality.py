@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from graphvio.geometry import se3_inverse, se3_log
 _RIVAL_SHARE = 0.1  # of the best-supported side's points: from there on another side may be the right one
 _FEW_POINTS = 25  # fewer may agree by chance
 _USUAL_TENSION = 12.0  # beyond it the covariance grows in proportion: something small is wrong with one of the pairs
+_CONFIRMED = 0.25  # share of the corners that must be found in the right images, too
 _WEAK_ROTATION_RAD = 0.02
 _WEAK_TRANSLATION_M = 0.05
 _POSSIBLE_SPEEDS = np.repeat([0.5, 1.0], 3)  # rad/s and m/s that a rig may have where images say next to nothing
@@ -24,8 +26,40 @@ _REST_MEDIAN_PX = 0.15
 _REST_MOST_PX = 0.5
 
 
+class StereoShare(NamedTuple):
+    """How far the right images confirm what the left ones see.
+
+    Attributes:
+        share: of the corners that are found in the right image, the lower one of reference and newest frame, mean over
+            the points that the motion explains.
+        baseline_m: the longest baseline of the pairs.
+    """
+
+    share: float
+    baseline_m: float
+
+
+def stereo_share(
+    reference: Mapping[int, PairFrame],
+    current: Mapping[int, PairFrame],
+    correspondences: Correspondences,
+    inlier: Bool,
+    baselines_m: Sequence[float],
+) -> StereoShare:
+    """`StereoShare` of a motion that explains some points (N,); for the pairs' baselines see `graphvio.rig`."""
+    pair = correspondences.observations.pair
+    shares, weights = [], []
+    for j in correspondences.rows:
+        explained = np.count_nonzero(inlier[pair == j])
+        if explained:
+            shares.append(min(reference[j].has_depth.mean(), current[j].has_depth.mean()))
+            weights.append(explained)
+    share = float(np.average(shares, weights=weights)) if weights else 0.0
+    return StereoShare(share, max(baselines_m[j] for j in correspondences.rows))
+
+
 def graded(
-    motions: Sequence[RelativeMotion], tension: float, frozen_since_ns: int | None
+    motions: Sequence[RelativeMotion], tension: float, frozen_since_ns: int | None, stereo: StereoShare
 ) -> tuple[RelativeMotion, Quality, str]:
     """The best-supported motion, with a covariance that allows for what speaks against it, its quality, and why.
 
@@ -33,19 +67,26 @@ def graded(
         motions: of each side of the pairs, the best supported first.
         tension: squared Mahalanobis distance between pairs that are thought to agree.
         frozen_since_ns: stamp since which all images are the same, or None.
+        stereo: how far the right images confirm what the left ones see.
     """
     best = motions[0]
     covariance, reasons = best.covariance * max(1.0, tension / _USUAL_TENSION), []
     for rival in motions[1:]:
         if rival.inliers >= _RIVAL_SHARE * best.inliers:
             apart = se3_log(se3_inverse(best.reference_T_current) @ rival.reference_T_current)
-            covariance = covariance + rival.covariance + np.outer(apart, apart)
-            angle, distance = np.rad2deg(np.linalg.norm(apart[:3])), np.linalg.norm(apart[3:])
-            reasons.append(f"two motions are seen, {distance:.3f} m and {angle:.2f} deg apart")
+            angle, distance = np.linalg.norm(apart[:3]), np.linalg.norm(apart[3:])
+            # In all directions: what fills one view may fill part of the other, and then neither is right.
+            covariance = covariance + rival.covariance + np.diag(np.repeat([angle, distance], 3) ** 2)
+            reasons.append(f"two motions are seen, {distance:.3f} m and {np.rad2deg(angle):.2f} deg apart")
     if best.inliers < _FEW_POINTS:
         lacking = (_FEW_POINTS - best.inliers) / _FEW_POINTS
         covariance = covariance + np.diag((2.0 * lacking * _POSSIBLE_SPEEDS * best.duration_s) ** 2)
         reasons.append(f"only {best.inliers} points")
+    if stereo.share < _CONFIRMED:
+        # Cables that are swapped move a view by the baseline; what little is matched then may repeat by chance.
+        sigmas = _POSSIBLE_SPEEDS * best.duration_s + np.repeat([0.0, stereo.baseline_m], 3)
+        covariance = covariance + np.diag(sigmas**2)
+        reasons.append(f"only {100 * stereo.share:.0f} % of the corners are found in the right images")
     sigmas = np.sqrt([np.linalg.eigvalsh(covariance[block, block])[-1] for block in (slice(0, 3), slice(3, 6))])
     if frozen_since_ns is not None:
         elapsed_s = (best.stamp_ns - frozen_since_ns) * 1e-9

@@ -7,23 +7,21 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from graphvio.arrays import AnyArray, Bool, Float, Image, Int
+from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
 from graphvio.errors import RigError
+from graphvio.frontend.anchor import Anchor
 from graphvio.frontend.corners import find_corners, occupied_cells, thinned
 from graphvio.frontend.grain import noise_sigma
-from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, register, track
+from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
 from graphvio.frontend.matching import StereoMatcher
-from graphvio.frontend.patches import packed
-from graphvio.frontend.prediction import around, inverse_depths_around, predict_pixels, predict_warps
+from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.stopwatch import Stopwatch
 from graphvio.frontend.tracks import PairFrame, passes
 from graphvio.rig import Camera, StereoPair
 
 _MAX_TRACKS_PER_CELL = 2
 _MAX_FLAT_FRAMES = 3  # then another corner of the cell gets its chance
-_MAX_REGISTRATION_PX = 2.0
-_SAME_PATCH = 0.8  # correlation with the anchor's patch
 _LEVELS_AFTER_PREDICTION = 2  # are enough where the motion is known; tracks that fail are tried again with all
 
 
@@ -40,11 +38,7 @@ class PairTracker:
         self._last = PairFrame.empty()
         self._left: Pyramid = ()
         self._right: Pyramid = ()
-        self._anchor = PairFrame.empty()
-        self._anchor_image: AnyArray | None = None  # packed
-        self._anchor_rays = np.zeros((5, 0, 2))  # of what is around each of its tracks
-        self._anchor_inverse_depths = np.zeros((5, 0))
-        self._step_px = float(np.sqrt((config.tracking.window_px**2 - 1) / 12.0))  # standard deviation of a patch
+        self._anchor = Anchor(pair, config.tracking.window_px)
         self._noise_sigma = 0.0
 
     def observe(
@@ -107,21 +101,8 @@ class PairTracker:
 
     def anchor(self) -> None:
         """Hold the tracks against the newest frame's own patches from here on."""
-        self._anchor = self._last
-        self._anchor_image = packed(self._left[0]) if self._left else None
-        pixels = around(self._last.pixels, self._step_px)
-        self._anchor_rays = self._pair.left.unproject(pixels.reshape(-1, 2))[0].reshape(pixels.shape)
-        right = self._pair.right
-        self._anchor_inverse_depths = inverse_depths_around(
-            self._anchor_rays,
-            np.maximum(self._last.points[:, 2], 0.0),
-            self._last.slopes,
-            self._step_px,
-            self._pair.right_T_left,
-            right.model_number,
-            right.intrinsics,
-            right.distortion,
-        )
+        if self._left:
+            self._anchor.place(self._last, self._left[0])
 
     def drop(self, ids: Int) -> None:
         """Forget tracks, so that fresh corners may take their place."""
@@ -152,13 +133,12 @@ class PairTracker:
     ) -> tuple[Float, Bool]:
         """Where the tracks are now (N, 2), and which of them were found (N,).
 
-        Following a point from frame to frame adds up the errors of each step. The anchor's patch, deformed as the
-        predicted motion would have it, shows where the point really is: most tracks are found on it at once, near
-        their predicted place. The others go by way of the frame before.
+        Most are found on the anchor's patches at once, near their predicted place. The others go by way of the frame
+        before.
         """
         pixels, found = guess.copy(), np.zeros(len(guess), dtype=bool)
         if left_T_left_anchor is not None and left_T_left_prev is not None:
-            pixels, found = self._register(last.ids, guess, left_T_left_anchor)
+            pixels, found = self._anchor.find(last.ids, guess, self._left[0], left_T_left_anchor, self._min_gradient)
         watch.lap("register")
         rest, settings = np.flatnonzero(~found), self._config.tracking
         if len(rest):
@@ -176,40 +156,10 @@ class PairTracker:
         watch.lap("flow")
         if left_T_left_anchor is not None:
             rest = rest[found[rest]]
-            pixels[rest], _ = self._register(last.ids[rest], pixels[rest], left_T_left_anchor)
+            pixels[rest], _ = self._anchor.find(
+                last.ids[rest], pixels[rest], self._left[0], left_T_left_anchor, self._min_gradient
+            )
         watch.lap("register")
-        return pixels, found
-
-    def _register(self, ids: Int, guess: Float, left_T_left_anchor: Float) -> tuple[Float, Bool]:
-        """Pixels (N, 2) where the patches that the tracks had at the anchor are now, and whether they are (N,)."""
-        anchor = self._anchor
-        if self._anchor_image is None or not len(anchor.ids) or not len(ids):
-            return guess.copy(), np.zeros(len(ids), dtype=bool)
-        rows = np.minimum(np.searchsorted(anchor.ids, ids), len(anchor.ids) - 1)
-        wanted = (anchor.ids[rows] == ids) & anchor.has_depth[rows]
-        camera = self._pair.left
-        warps, shifts, usable = predict_warps(
-            self._anchor_rays[:, rows],
-            self._anchor_inverse_depths[:, rows],
-            self._step_px,
-            left_T_left_anchor,
-            camera.model_number,
-            camera.intrinsics,
-            camera.distortion,
-        )
-        pixels, found, _, correlations = register(
-            self._anchor_image,
-            self._left[0],
-            anchor.pixels[rows] + shifts,
-            warps,
-            guess,
-            wanted & usable,
-            self._config.tracking.window_px // 2,
-            _MAX_REGISTRATION_PX,
-            self._min_gradient,
-        )
-        found &= correlations > _SAME_PATCH
-        pixels[~found] = guess[~found]
         return pixels, found
 
     def _still_wanted(self, pixels: Float, found: Bool, rejected: dict[str, int]) -> Bool:

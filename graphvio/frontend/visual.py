@@ -13,11 +13,11 @@ from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.events import FrameSet, PairReport, Quality
 from graphvio.frontend.agreement import Agreement, Side, agree, is_supported
-from graphvio.frontend.alignment import Misalignment, PairAlignment
+from graphvio.frontend.alignment import Misalignment, PairAlignment, combined
 from graphvio.frontend.frozen import FrozenImages
 from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.frontend.observations import Correspondences, RigArrays, correspond
-from graphvio.frontend.quality import at_rest, graded
+from graphvio.frontend.quality import at_rest, graded, stereo_share
 from graphvio.frontend.references import References
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import best_pair_motion, joint_motion
@@ -30,6 +30,8 @@ from graphvio.rig import Rig
 MotionPredictor = Callable[[int], Float | None]
 """Takes an earlier stamp and returns the predicted ``cur_T_then`` (4, 4) of body, or None if unknown."""
 
+_DOUBT_NS = 1_000_000_000
+
 
 class VisualFrontend:
     """Tracks every pair and estimates the rig's motion since a reference frameset."""
@@ -39,10 +41,12 @@ class VisualFrontend:
         self._rig = rig
         self._arrays = RigArrays.of(rig)  # with the corrections that are in force
         self._trackers = [PairTracker(pair, config) for pair in rig.pairs]
+        self._baselines_m = [pair.baseline_m for pair in rig.pairs]
         self._frozen = FrozenImages()
         self._latest: dict[int, PairFrame] = {}
         self._references = References(config.motion)
         self._alignments = {j: PairAlignment() for j in range(1, len(rig.pairs))}
+        self._contradicted_ns = -_DOUBT_NS  # when the pairs were last found to contradict each other
         self._workers = ThreadPoolExecutor(len(rig.pairs), thread_name_prefix="graphvio-pair")
         if len(rig.pairs) > 1:
             cv2.setNumThreads(1)  # pairs run side by side; OpenCV's own threads would only compete with them
@@ -89,7 +93,8 @@ class VisualFrontend:
             return VisualResult(None, Quality.FAILED, reason, reports, frozen=frozen.pairs, stage_ms=watch.stage_ms)
         refined = agreement.sides[0].refined
         motions = [self._motion(reference_stamp_ns, stamp_ns, side.refined) for side in agreement.sides]
-        motion, quality, reason = graded(motions, agreement.tension, frozen.all_since_ns)
+        stereo = stereo_share(reference, frames, correspondences, refined.inlier, self._baselines_m)
+        motion, quality, reason = graded(motions, agreement.tension, frozen.all_since_ns, stereo)
         resting = at_rest(reference, frames, correspondences, refined.inlier)
         self._drop_outliers(frames, correspondences, agreement)
         watch.lap("judge")
@@ -166,12 +171,19 @@ class VisualFrontend:
         start = np.eye(4) if predicted is None else predicted
         if config.selection == "joint":
             refined = joint_motion(self._arrays, observations, start, config, rng)
-            agreement = agree(self._arrays, observations, refined, config, rng, self._workers)
+            in_doubt = 0 <= stamp_ns - self._contradicted_ns < _DOUBT_NS
+            agreement = agree(self._arrays, observations, refined, config, rng, self._workers, in_doubt)
+            if len(agreement.sides) > 1 and not in_doubt:
+                self._contradicted_ns = stamp_ns
         else:
             refined = best_pair_motion(self._arrays, observations, start, config, rng)
             everyone = tuple(int(j) for j in np.unique(observations.pair))
             agreement = Agreement((Side(everyone, refined),), {})
         best = agreement.sides[0]
+        if self.misaligned and len(best.pairs) > 1 and agreement.own.keys() >= set(best.pairs):
+            own = {j: agreement.own[j] for j in best.pairs}
+            best = replace(best, refined=combined(best.refined, own, self.misaligned))
+            agreement = replace(agreement, sides=(best, *agreement.sides[1:]))
         rows = np.isin(observations.pair, best.pairs)
         if not is_supported(best.refined.inlier[rows], config):
             return None, f"the best motion explains only {best.support} of {int(rows.sum())} points"

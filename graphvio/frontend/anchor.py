@@ -1,0 +1,98 @@
+"""The frame that tracks are registered on: its patches, and the surfaces that they show."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphvio.arrays import AnyArray, Bool, Float, Image, Int
+from graphvio.frontend.lucas_kanade import register
+from graphvio.frontend.patches import packed
+from graphvio.frontend.prediction import around, inverse_depths_around, predict_warps
+from graphvio.frontend.tracks import PairFrame
+from graphvio.rig import StereoPair
+
+_MAX_REGISTRATION_PX = 2.0
+_SAME_PATCH = 0.8  # correlation of the patches
+
+
+class Anchor:
+    """One frame's patches, which later images are held against.
+
+    Following a point from frame to frame adds up the errors of each step. The anchor's patch, deformed as a predicted
+    motion and the slant of its surface would have it, shows where the point really is.
+
+    Args:
+        pair: whose left images these are.
+        window_px: side of the patches, odd.
+    """
+
+    def __init__(self, pair: StereoPair, window_px: int) -> None:
+        self._pair = pair
+        self._half = window_px // 2
+        self._step_px = float(np.sqrt((window_px**2 - 1) / 12.0))  # standard deviation of a patch's pixels
+        self._frame = PairFrame.empty()
+        self._image: AnyArray | None = None  # packed
+        self._rays: Float = np.zeros((5, 0, 2))  # of what is around each of the tracks
+        self._inverse_depths: Float = np.zeros((5, 0))
+
+    def place(self, frame: PairFrame, image: Image) -> None:
+        """Take the patches of a frame's tracks, from its left image (height, width)."""
+        self._frame, self._image = frame, packed(image)
+        pixels = around(frame.pixels, self._step_px)
+        self._rays = self._pair.left.unproject(pixels.reshape(-1, 2))[0].reshape(pixels.shape)
+        right = self._pair.right
+        self._inverse_depths = inverse_depths_around(
+            self._rays,
+            np.maximum(frame.points[:, 2], 0.0),
+            frame.slopes,
+            self._step_px,
+            self._pair.right_T_left,
+            right.model_number,
+            right.intrinsics,
+            right.distortion,
+        )
+
+    def find(
+        self, ids: Int, guess: Float, image: Image, left_T_left_anchor: Float, min_gradient: float
+    ) -> tuple[Float, Bool]:
+        """Where the patches of tracks are in another image.
+
+        Args:
+            ids: (N,) the tracks.
+            guess: (N, 2) pixels, nearly right.
+            image: (height, width), left.
+            left_T_left_anchor: (4, 4) predicted motion of points since the anchor.
+            min_gradient: least rms gradient of a patch along its weaker direction, grey levels per pixel.
+
+        Returns:
+            Pixels (N, 2), those guessed where there is no patch or it is not found, and which were found (N,).
+        """
+        frame = self._frame
+        if self._image is None or not len(frame.ids) or not len(ids):
+            return guess.copy(), np.zeros(len(ids), dtype=bool)
+        rows = np.minimum(np.searchsorted(frame.ids, ids), len(frame.ids) - 1)
+        wanted = (frame.ids[rows] == ids) & frame.has_depth[rows]
+        camera = self._pair.left
+        warps, shifts, usable = predict_warps(
+            self._rays[:, rows],
+            self._inverse_depths[:, rows],
+            self._step_px,
+            left_T_left_anchor,
+            camera.model_number,
+            camera.intrinsics,
+            camera.distortion,
+        )
+        pixels, found, _, correlations = register(
+            self._image,
+            image,
+            frame.pixels[rows] + shifts,
+            warps,
+            guess,
+            wanted & usable,
+            self._half,
+            _MAX_REGISTRATION_PX,
+            min_gradient,
+        )
+        found &= correlations > _SAME_PATCH
+        pixels[~found] = guess[~found]
+        return pixels, found
