@@ -5,7 +5,7 @@ import pytest
 from synthetic import random_covariance, random_transform, transform
 
 from graphvio.arrays import Float
-from graphvio.frontend.alignment import PairAlignment
+from graphvio.frontend.alignment import Misalignment, PairAlignment, combined
 from graphvio.frontend.refinement import Refined
 from graphvio.geometry import se3_exp, se3_log
 
@@ -118,3 +118,26 @@ def test_pure_translation_shows_rotation_only(translation_only: bool) -> None:
     sigmas = np.sqrt(np.diag(found.covariance))
     assert sigmas[:3].max() < 1e-3
     assert (sigmas[3:].min() > 0.1) == translation_only
+
+
+@pytest.mark.parametrize(("known_to", "size"), [(1e-6, 0.5), (3e-4, None), (6e-3, 0.5 ** (1 / 3))])
+def test_a_corrected_pair_counts_for_what_is_known_of_its_place(known_to: float, size: float | None) -> None:
+    """With its place known exactly, both pairs count alike. With it hardly known, the first one alone tells the motion,
+    but for two of six directions: a turn about the axis of the motion's turn and a shift along it change nothing."""
+    rng, noise = np.random.default_rng(8), 1e-4
+    covariance = noise**2 * np.eye(6)
+    nees, sizes = [], []
+    for _ in range(400):
+        motion, d = random_transform(rng, 0.2, 0.3), known_to * rng.standard_normal(6)
+        reported = (motion, se3_exp(-d) @ motion @ se3_exp(d))
+        own = {}
+        for j in (0, 1):
+            noisy = np.ascontiguousarray(se3_exp(noise * rng.standard_normal(6)) @ reported[j])
+            own[j] = Refined(noisy, covariance, 0.5 * covariance, INLIER, ERRORS_PX)
+        told = combined(own[0], own, {1: Misalignment(d, known_to**2 * np.eye(6), 100.0)})
+        error = se3_log(np.ascontiguousarray(told.cur_T_ref @ np.linalg.inv(motion)))
+        nees.append(error @ np.linalg.solve(told.covariance, error))
+        sizes.append(np.linalg.det(told.covariance / noise**2) ** (1 / 6))
+        assert np.linalg.eigvalsh(told.covariance - told.shared_covariance).min() > 0.0
+    assert 5.5 < np.mean(nees) < 6.5  # 400 draws of 6 degrees of freedom: 6.0 +- 0.17
+    assert size is None or np.mean(sizes) == pytest.approx(size, rel=0.05)

@@ -47,6 +47,31 @@ def test_a_change_of_exposure_hardly_moves_a_point(gain: float, offset: float, w
     assert np.median(np.linalg.norm(moved - grid() - (1.3, 0.6), axis=1)[found]) < within_px
 
 
+def blurred(image: Image, length: int) -> Image:
+    return np.asarray(cv2.filter2D(image, -1, np.full((1, length), 1.0 / length)), dtype=np.uint8)
+
+
+def test_a_place_that_a_blur_leaves_open_is_refused() -> None:
+    """Along the blur an alignment ends where it starts; many points with one such error look like a motion."""
+    images = [picture(waves(*np.meshgrid(np.arange(320.0) - x, np.arange(240.0)))) for x in (0.0, 0.6)]
+    sharp, moved_by = build_pyramid(images[0], LEVELS), np.array([0.6, 0.0])
+    level, everything = np.tile(np.eye(2), (len(grid()), 1, 1)), np.ones(len(grid()), dtype=bool)
+    kept = []
+    for length in (1, 5, 41):
+        target = blurred(images[1], length)
+        flowed, found = track(
+            sharp, build_pyramid(target, LEVELS), grid(), grid(), window_px=15, levels=1, max_return_px=0.5
+        )
+        registered, there, _, _ = register(packed(sharp[0]), target, grid(), level, grid(), everything, 7, 2.0, 0.5)
+        kept.append((found.mean(), there.mean()))
+        for places, good in ((flowed, found), (registered, there)):
+            if good.sum() > 5:
+                assert np.abs(np.median((places - grid() - moved_by)[good], axis=0)).max() < 0.05
+    assert min(kept[0]) > 0.9
+    assert min(kept[1]) > 0.7
+    assert max(kept[2]) < 0.15
+
+
 def test_it_agrees_with_opencv() -> None:
     first, second = texture(), texture((4.2, -2.7))
     ours, found = track(
