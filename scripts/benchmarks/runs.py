@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from benchmarks.motions import BREAK_STATISTIC, EXACT, TruthNoise, motion_error, overhear, uses_vision
 from benchmarks.recordings import blocks
-from graphvio.arrays import Float, Int
+from graphvio.arrays import Bool, Float, Int
 from graphvio.config import Config
 from graphvio.errors import GraphvioError, TrajectoryError
 from graphvio.evaluation import MAX_GAP_S, Evaluation, evaluate
@@ -39,6 +40,7 @@ class Outcome:
     Attributes:
         estimate: causal poses of all epochs, ``nav_T_body``.
         epochs: (N,) epoch of each pose.
+        by_vision: (N,) whether vision took part in it; else the odometry says that it coasts or is lost.
         truth: of the recording.
         evaluation: of the estimate against the truth; None where too few poses could be compared.
         framesets: that the odometry answered.
@@ -50,6 +52,7 @@ class Outcome:
 
     estimate: Trajectory
     epochs: Int
+    by_vision: Bool
     truth: Trajectory
     evaluation: Evaluation | None
     framesets: int
@@ -62,6 +65,20 @@ class Outcome:
     def ate_m(self) -> float:
         """Rmse of the position after alignment, metres; infinite where there is none."""
         return self.evaluation.ate_position_m.rmse if self.evaluation is not None else np.inf
+
+    @cached_property
+    def epoch_ate_m(self) -> float:
+        """The same with each epoch aligned by itself, since between them lies a declared break, and of poses by vision
+        only: before a break the odometry coasts, and says so."""
+        squares, poses = 0.0, 0
+        for epoch in np.unique(self.epochs):
+            rows = (self.epochs == epoch) & self.by_vision
+            try:
+                errors_m = evaluate(self.estimate.select(rows), self.truth).position_error_m
+            except TrajectoryError:
+                continue  # too few poses to align
+            squares, poses = squares + float(errors_m @ errors_m), poses + len(errors_m)
+        return float(np.sqrt(squares / poses)) if poses else np.inf
 
     def cells(self) -> list[str]:
         """The cells of `HEAD`."""
@@ -158,9 +175,9 @@ def _judge(
     noise: TruthNoise,
     frameset_ms: list[float],
 ) -> Outcome:
-    posed = [(e.stamp_ns, e.nav_T_body, e.epoch) for e in estimates if e.nav_T_body is not None]
-    stamps_ns = np.array([stamp_ns for stamp_ns, _, _ in posed], dtype=np.int64)
-    estimate = Trajectory(stamps_ns, np.array([pose for _, pose, _ in posed]).reshape(-1, 4, 4))
+    posed = [e for e in estimates if e.nav_T_body is not None]
+    stamps_ns = np.array([e.stamp_ns for e in posed], dtype=np.int64)
+    estimate = Trajectory(stamps_ns, np.array([e.nav_T_body for e in posed]).reshape(-1, 4, 4))
     used_ns = {e.stamp_ns for e in estimates if e.nav_T_body is not None and uses_vision(e)}
     used = [motion for stamp_ns, motion in motions.items() if stamp_ns in used_ns]
     statistics = _statistics(used, truth, noise)
@@ -170,7 +187,8 @@ def _judge(
         evaluation = None
     return Outcome(
         estimate=estimate,
-        epochs=np.array([epoch for _, _, epoch in posed], dtype=np.int64),
+        epochs=np.array([e.epoch for e in posed], dtype=np.int64),
+        by_vision=np.array([uses_vision(e) for e in posed], dtype=bool),
         truth=truth,
         evaluation=evaluation,
         framesets=len(estimates),
