@@ -193,8 +193,8 @@ def _together_table(report: Report, bench: _Bench, cases: list[tuple[str, bool]]
     report.add(
         "#### All pairs and the better one",
         f"The same runs: ATE in cm by all pairs, beside the better pair alone, each epoch aligned by itself. The aim "
-        f"is a ratio of at most {AIM:g} everywhere; in a rich room, all pairs ought to be several times better (a ratio "
-        "of 0.33 is three times).",
+        f"is a ratio of at most {AIM:g} everywhere; in a rich room, all pairs ought to be several times better (a "
+        "ratio of 0.33 is three times).",
     )
     head = ["recording", "profile", "IMU", "all pairs", "better single", "which", "all / single", "aim"]
     report.table(head, rows)
