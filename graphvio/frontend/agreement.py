@@ -23,6 +23,7 @@ _BEYOND_2_SIGMA = 12.6  # once in 20: enough for pairs that contradicted each ot
 _POORLY_EXPLAINED = 0.5  # share of a pair's points below which the pair looks for a motion of its own
 _WELL_EXPLAINED = 0.9  # from there on its own motion is next to the joint one
 _RIVAL_POINTS = 12
+_UNLIKE_PX = 1.0  # less is a lens that is not quite known: such points are left out, but they are no second motion
 _COMPARABLE = 0.85  # support over that of the best supported: support alone does not tell who is right
 _UNEXPLAINED_SHARE = 0.12  # of all points, unexplained: from there on they may have a motion of their own
 
@@ -165,7 +166,8 @@ def _second_motion(
     rig: RigArrays, observations: Observations, sides: list[Side], config: MotionConfig, rng: np.random.Generator
 ) -> list[Side]:
     """At most one more rigid motion, of most points that no side explains: the world's, or what moves in it."""
-    rest = ~np.any([side.refined.inlier for side in sides], axis=0)
+    unlike = np.nan_to_num([side.refined.errors_px for side in sides], nan=np.inf).min(axis=0) > _UNLIKE_PX
+    rest = unlike & ~np.any([side.refined.inlier for side in sides], axis=0)
     if rest.sum() < max(_RIVAL_POINTS, _UNEXPLAINED_SHARE * len(rest)):
         return []
     seen = observations.of_rows(rest)
