@@ -124,7 +124,7 @@ class InitialisationConfig:
 class SmootherConfig:
     """The fixed-lag window, its gate and its limits (section 5)."""
 
-    lag_s: float = 2.0
+    lag_s: float = 1.0
     """Age at which a state leaves the window, unless later motions are measured from it."""
     gate_probability: float = 0.9999
     """Vision is refused where its innovation lies outside this share of the chi-square distribution."""

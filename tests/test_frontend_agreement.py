@@ -1,5 +1,6 @@
 """Pairs that contradict each other, points that move on their own, and what is then said of a motion."""
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -11,7 +12,8 @@ from synthetic import random_transform, seen_points, transform, two_pair_rig
 from graphvio.arrays import AnyArray, Float
 from graphvio.config import MotionConfig
 from graphvio.events import Quality
-from graphvio.frontend.agreement import Agreement, agree
+from graphvio.frontend.agreement import Agreement, Side, _in_order, agree
+from graphvio.frontend.alignment import Misalignment
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.frontend.observations import Correspondences, Observations, RigArrays
 from graphvio.frontend.quality import StereoShare, graded, stereo_share
@@ -19,7 +21,7 @@ from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import joint_motion
 from graphvio.frontend.tracks import PairFrame
 from graphvio.frontend.visual import _report
-from graphvio.geometry import se3_inverse, se3_log
+from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 
 RIG = two_pair_rig()
 ARRAYS = RigArrays.of(RIG)
@@ -36,11 +38,12 @@ def judged(
     arrays: RigArrays = ARRAYS,
     threads: ThreadPoolExecutor | None = None,
     in_doubt: bool = False,
+    misaligned: Mapping[int, Misalignment] | None = None,
 ) -> Agreement:
     rng = np.random.default_rng(seed)
     joint = joint_motion(arrays, seen, STILL, CONFIG, rng)
     with threads or ThreadPoolExecutor(2) as workers:
-        return agree(arrays, seen, joint, CONFIG, rng, workers, in_doubt)
+        return agree(arrays, seen, joint, CONFIG, rng, workers, misaligned or {}, in_doubt)
 
 
 def mixed(first: tuple[Float, int], second: tuple[Float, int], seed: int = 0) -> Observations:
@@ -92,9 +95,72 @@ def test_of_sides_with_about_the_same_support_the_first_pair_comes_first() -> No
 def test_pairs_that_contradicted_each_other_need_less_to_be_told_apart() -> None:
     off = transform([0.001, 0.0, 0.0], [0.0, 0.0, 0.0]) @ TRUTH  # between 2 and 5 sigma
     seen = mixed((TRUTH, 80), (off, 80))
-    assert 12.6 < judged(seen).tension < 40.0
-    assert len(judged(seen, in_doubt=True).sides) == 2
+    usual, doubtful = judged(seen), judged(seen, in_doubt=True)
+    assert 12.6 < usual.tension < 40.0
+    assert (len(usual.sides), len(doubtful.sides)) == (1, 2)
+    assert not usual.contradicts
+    assert not doubtful.contradicts  # or doubt would feed itself
+    assert judged(mixed((TRUTH, 80), (DOOR, 80)), in_doubt=True).contradicts
     assert len(judged(mixed((TRUTH, 80), (TRUTH, 80)), in_doubt=True).sides) == 1
+
+
+PLACE = Misalignment(np.full(6, 0.01), 0.1**2 * np.eye(6), 100.0)  # corrected, but hardly known
+
+
+def test_what_is_not_known_of_a_pairs_place_is_in_its_motions_covariance() -> None:
+    """Together with another pair, as a side of its own, and alone."""
+    seen = mixed((TRUTH, 80), (TRUTH, 80))
+    exact, corrected = judged(seen), judged(seen, misaligned={1: PLACE})
+    assert len(corrected.sides) == 1
+    weighed = corrected.sides[0].refined
+    trusted = corrected.own[0].cur_T_ref
+    assert distance(weighed.cur_T_ref, trusted) < distance(exact.sides[0].refined.cur_T_ref, trusted)
+    assert np.trace(weighed.covariance) > 1.2 * np.trace(exact.sides[0].refined.covariance)
+    np.testing.assert_array_equal(corrected.own[1].covariance, exact.own[1].covariance)  # watching P_12 needs it bare
+    contradicted = judged(mixed((TRUTH, 80), (DOOR, 80)), misaligned={1: PLACE}).sides[1]
+    assert contradicted.pairs == (1,)
+    alone = judged(seen.of_pair(1), misaligned={1: PLACE}).sides[0]
+    for side in (contradicted, alone):
+        lever = 0.1 * np.linalg.norm(se3_adjoint(side.refined.cur_T_ref) - np.eye(6), axis=1)
+        assert np.all(np.sqrt(np.diag(side.refined.covariance)) > lever)
+
+
+def test_an_error_of_p12_that_is_known_to_be_possible_is_no_contradiction() -> None:
+    off = np.array([0.05, 0.0, -0.05, 0.0, 0.0, 0.0])
+    seen = mixed((TRUTH, 80), (se3_exp(-off) @ TRUTH @ se3_exp(off), 80))
+    assert judged(seen).contradicts
+    assert not judged(seen, misaligned={1: PLACE}).contradicts
+
+
+def test_a_second_motion_of_all_pairs_is_not_mixed_with_what_the_pairs_say_alone() -> None:
+    """Each view has a door of its own that outnumbers the world: the world's motion is nobody's, and stays itself."""
+    world = mixed((TRUTH, 30), (TRUTH, 30), 3)
+    seen = joined(world, mixed((DOOR, 40), (OTHER_DOOR, 40), 4))
+    sides = judged(seen, misaligned={1: Misalignment(np.zeros(6), 1e-8 * np.eye(6), 100.0)}).sides
+    assert sides[0].pairs == (0, 1)
+    assert distance(sides[0].refined.cur_T_ref, TRUTH) < 5e-3
+
+
+def test_the_order_of_sides() -> None:
+    def order(*sides: tuple[tuple[int, ...], int]) -> list[tuple[int, ...]]:
+        refined = judged(mixed((TRUTH, 60), (TRUTH, 60))).sides[0].refined
+        return [
+            side.pairs for side in _in_order([Side(p, replace(refined, inlier=np.arange(200) < n)) for p, n in sides])
+        ]
+
+    assert order(((1,), 100), ((0,), 90)) == [(0,), (1,)]
+    assert order(((1,), 100), ((0,), 80)) == [(1,), (0,)]
+    assert order(((2,), 110), ((1,), 100)) == order(((1,), 110), ((2,), 100)) == [(1,), (2,)]
+    assert order(((0,), 40), ((2,), 60), ((1,), 50)) == [(2,), (1,), (0,)]
+
+
+def test_points_that_are_hardly_off_are_no_second_motion() -> None:
+    """A lens that is not quite known leaves tenths of a pixel; a person's steps leave more."""
+    for shift_px, motions in ((0.4, 1), (2.0, 2)):
+        seen = seen_points(RIG, TRUTH, 100, np.random.default_rng(7), sigma_px=0.04)
+        askew = np.arange(len(seen.pair)) % 4 == 0
+        off = np.where(askew[:, None], np.array([shift_px, 0.0]) / RIG.pairs[0].left.focal_px, 0.0)
+        assert len(judged(seen._replace(left=seen.left + off, right=seen.right + off)).sides) == motions
 
 
 def test_people_who_walk_through_all_views_are_a_second_motion() -> None:
@@ -276,4 +342,5 @@ def test_the_share_that_stereo_confirms_is_that_of_the_pairs_that_count() -> Non
     assert told.baseline_m == 0.2
     assert stereo_share(reference, current, both, seen.pair == 1, [0.1, 0.2]).share == pytest.approx(0.08)
     nothing = replace(both, rows={0: np.arange(60), 1: np.zeros(0, dtype=np.int64)})
+    assert graded([measured(TRUTH, 200)], 0.0, None, StereoShare(0.13, 0.12))[1] is Quality.GOOD
     assert stereo_share({**reference, 1: frame(0, 0)}, current, nothing, seen.pair == 0, [0.1, 0.2]).share == 0.6

@@ -5,7 +5,7 @@ import pytest
 from synthetic import random_covariance, random_transform, transform
 
 from graphvio.arrays import Float
-from graphvio.frontend.alignment import Misalignment, PairAlignment, combined
+from graphvio.frontend.alignment import Misalignment, PairAlignment, combined, placed
 from graphvio.frontend.refinement import Refined
 from graphvio.geometry import se3_exp, se3_log
 
@@ -130,11 +130,12 @@ def test_a_corrected_pair_counts_for_what_is_known_of_its_place(known_to: float,
     for _ in range(400):
         motion, d = random_transform(rng, 0.2, 0.3), known_to * rng.standard_normal(6)
         reported = (motion, se3_exp(-d) @ motion @ se3_exp(d))
-        own = {}
-        for j in (0, 1):
-            noisy = np.ascontiguousarray(se3_exp(noise * rng.standard_normal(6)) @ reported[j])
-            own[j] = Refined(noisy, covariance, 0.5 * covariance, INLIER, ERRORS_PX)
-        told = combined(own[0], own, {1: Misalignment(d, known_to**2 * np.eye(6), 100.0)})
+        own = []
+        for each in reported:
+            noisy = np.ascontiguousarray(se3_exp(noise * rng.standard_normal(6)) @ each)
+            own.append(Refined(noisy, covariance, 0.5 * covariance, INLIER, ERRORS_PX))
+        place = Misalignment(d, known_to**2 * np.eye(6), 100.0)
+        told = combined(own[0], [placed(own[0], None), placed(own[1], place)])
         error = se3_log(np.ascontiguousarray(told.cur_T_ref @ np.linalg.inv(motion)))
         nees.append(error @ np.linalg.solve(told.covariance, error))
         sizes.append(np.linalg.det(told.covariance / noise**2) ** (1 / 6))

@@ -6,6 +6,7 @@ is then a compromise that is right for nobody: each side's own motion is kept ap
 side comes first, as in eq. (4).
 """
 
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from graphvio.arrays import Bool
 from graphvio.config import MotionConfig
+from graphvio.frontend.alignment import Misalignment, combined, placed
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.ransac import search
 from graphvio.frontend.refinement import Refined, refine
@@ -26,6 +28,7 @@ _RIVAL_POINTS = 12
 _UNLIKE_PX = 1.0  # less is a lens that is not quite known: such points are left out, but they are no second motion
 _COMPARABLE = 0.85  # support over that of the best supported: support alone does not tell who is right
 _UNEXPLAINED_SHARE = 0.12  # of all points, unexplained: from there on they may have a motion of their own
+_NONE: Mapping[int, Misalignment] = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,15 +54,17 @@ class Agreement:
     """What all pairs say.
 
     Attributes:
-        sides: one if all pairs that see enough agree; else one for each opinion, the best supported first; of those
-            with about as much support the first pair's, which is the one that the others' places are told from.
-        own: pair -> its own motion, of the pairs that see enough.
+        sides: one if all pairs that see enough agree; else one for each opinion, the best supported first; of pairs
+            with about as much support the lowest in number, from which the others' places are told.
+        own: pair -> its own motion, of the pairs that see enough, as if the pair's place were known exactly.
         tension: the largest squared Mahalanobis distance between two pairs of one side, 0 for a single pair.
+        contradicts: whether two pairs are beyond 5 sigma of each other.
     """
 
     sides: tuple[Side, ...]
     own: dict[int, Refined]
     tension: float = 0.0
+    contradicts: bool = False
 
 
 def agree(
@@ -69,6 +74,7 @@ def agree(
     config: MotionConfig,
     rng: np.random.Generator,
     workers: Executor,
+    misaligned: Mapping[int, Misalignment] = _NONE,
     in_doubt: bool = False,
 ) -> Agreement:
     """Compare the pairs' own motions with each other.
@@ -80,10 +86,10 @@ def agree(
         config: of this stage.
         rng: source of random triples.
         workers: run the pairs side by side.
+        misaligned: pairs whose place has been corrected, which leaves it uncertain.
         in_doubt: the pairs contradicted each other a moment ago, so that less is enough to tell them apart now.
     """
     everyone = tuple(int(j) for j in np.unique(observations.pair))
-    together = Side(everyone, joint)
     own: dict[int, Refined] = {}
     if len(everyone) > 1:
         sources = rng.spawn(len(everyone))  # one each, so that the threads' timing changes nothing
@@ -91,29 +97,38 @@ def agree(
             lambda j, source: _own_motion(rig, observations, j, joint, config, source), everyone, sources
         )
         own = {j: m for j, m in zip(everyone, motions, strict=True) if is_supported(m.inlier, config)}
+    elif everyone:
+        joint = placed(joint, misaligned.get(everyone[0]))
+    opinions = {j: placed(motion, misaligned.get(j)) for j, motion in own.items()}
     limit = _BEYOND_2_SIGMA if in_doubt else _BEYOND_5_SIGMA
     camps: list[list[int]] = []
-    tension = 0.0
+    tension = farthest = 0.0
     for j in sorted(own, key=lambda j: -int(own[j].inlier.sum())):
         for camp in camps:
-            distance = disagreement(own[camp[0]], own[j])
+            distance = disagreement(opinions[camp[0]], opinions[j])
+            farthest = max(farthest, distance)
             if distance < limit:
                 camp.append(j)
                 tension = max(tension, distance)
                 break
         else:
             camps.append([j])
-    sides = [together]
     if len(camps) > 1:
-        sides = [_side(rig, observations, sorted(camp), own, config) for camp in camps]
-    sides += _second_motion(rig, observations, sides, config, rng)
-    return Agreement(_in_order(sides), own, tension)
+        sides = _in_order([_side(rig, observations, sorted(camp), own, opinions, misaligned, config) for camp in camps])
+    else:
+        if camps and not misaligned.keys().isdisjoint(camps[0]):
+            joint = combined(joint, [opinions[j] for j in sorted(camps[0])])
+        sides = [Side(everyone, joint)]
+    second = _second_motion(rig, observations, sides, config, rng)
+    if second is not None:
+        sides = [second, *sides] if second.support > max(side.support for side in sides) else [*sides, second]
+    return Agreement(tuple(sides), own, tension, farthest >= _BEYOND_5_SIGMA)
 
 
-def _in_order(sides: list[Side]) -> tuple[Side, ...]:
+def _in_order(sides: list[Side]) -> list[Side]:
     """The best supported first; but an error of P_12 puts no pair in the wrong, and to change sides would add it up."""
     enough = _COMPARABLE * max(side.support for side in sides)
-    return tuple(sorted(sides, key=lambda side: (side.support < enough or side.pairs[0] != 0, -side.support)))
+    return sorted(sides, key=lambda side: (-side.support, 0) if side.support < enough else (-np.inf, side.pairs[0]))
 
 
 def disagreement(one: Refined, other: Refined) -> float:
@@ -150,31 +165,36 @@ def _side(
     rig: RigArrays,
     observations: Observations,
     camp: list[int],
-    own: dict[int, Refined],
+    own: Mapping[int, Refined],
+    opinions: Mapping[int, Refined],
+    misaligned: Mapping[int, Misalignment],
     config: MotionConfig,
 ) -> Side:
     """The motion of pairs that agree."""
     rows = np.isin(observations.pair, camp)
-    first = own[max(camp, key=lambda j: int(own[j].inlier.sum()))]
-    refined = first
+    refined = opinions[camp[0]]
     if len(camp) > 1:
+        first = own[max(camp, key=lambda j: int(own[j].inlier.sum()))]
         refined = refine(rig, observations.of_rows(rows), first.cur_T_ref, config)
+        if not misaligned.keys().isdisjoint(camp):
+            refined = combined(refined, [opinions[j] for j in camp])
     return Side(tuple(camp), _spread_over(rows, refined))
 
 
 def _second_motion(
     rig: RigArrays, observations: Observations, sides: list[Side], config: MotionConfig, rng: np.random.Generator
-) -> list[Side]:
-    """At most one more rigid motion, of most points that no side explains: the world's, or what moves in it."""
-    unlike = np.nan_to_num([side.refined.errors_px for side in sides], nan=np.inf).min(axis=0) > _UNLIKE_PX
+) -> Side | None:
+    """One more rigid motion, of most points that no side explains: the world's, or what moves in it."""
+    errors_px = np.fmin.reduce([side.refined.errors_px for side in sides])  # of the side that likes a point best
+    unlike = ~(errors_px < _UNLIKE_PX)
     rest = unlike & ~np.any([side.refined.inlier for side in sides], axis=0)
     if rest.sum() < max(_RIVAL_POINTS, _UNEXPLAINED_SHARE * len(rest)):
-        return []
+        return None
     seen = observations.of_rows(rest)
     refined = refine(rig, seen, search(rig, seen, sides[0].refined.cur_T_ref, config, rng), config)
     if refined.inlier.sum() < max(_RIVAL_POINTS, _POORLY_EXPLAINED * rest.sum()):
-        return []
-    return [Side(tuple(int(j) for j in np.unique(seen.pair)), _spread_over(rest, refined))]
+        return None
+    return Side(tuple(int(j) for j in np.unique(seen.pair)), _spread_over(rest, refined))
 
 
 def _spread_over(rows: Bool, refined: Refined) -> Refined:

@@ -8,7 +8,7 @@ least-squares solution, by Gauss-Newton: section 4 in small.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -91,33 +91,35 @@ class PairAlignment:
         return Misalignment(d, np.asarray(np.linalg.inv(information)), float(d @ (information - prior) @ d))
 
 
-def combined(joint: Refined, own: Mapping[int, Refined], misaligned: Mapping[int, Misalignment]) -> Refined:
-    """One motion of pairs of which some have been corrected, each weighed by its own covariance and by what is not
-    known of its place; points of all pairs together would be weighed as if the correction were exact.
+def placed(motion: Refined, misalignment: Misalignment | None) -> Refined:
+    """A pair's motion, with what is not known of the pair's place in its covariance."""
+    if misalignment is None:
+        return motion
+    lever = np.eye(6) - se3_adjoint(motion.cur_T_ref)
+    return replace(motion, covariance=motion.covariance + lever @ misalignment.covariance @ lever.T)
+
+
+def combined(joint: Refined, motions: Sequence[Refined]) -> Refined:
+    """One motion of pairs of which some have been corrected, each weighed by its covariance, see `placed`; points of
+    all pairs together would be weighed as if the corrections were exact.
 
     Args:
         joint: motion on all points, which tells the inliers.
-        own: pair -> its own motion.
-        misaligned: pair -> the error that its motion has been corrected for.
+        motions: of each pair alone.
     """
-    first = next(iter(own.values())).cur_T_ref
-    information, weighted = np.zeros((6, 6)), np.zeros(6)
-    through_points = np.zeros((6, 6))
-    for j, motion in own.items():
-        covariance = motion.covariance
-        if j in misaligned:
-            lever = np.eye(6) - se3_adjoint(motion.cur_T_ref)
-            covariance = covariance + lever @ misaligned[j].covariance @ lever.T
-        inverse = np.linalg.inv(covariance)
-        through_points += inverse @ motion.shared_covariance @ inverse
+    first = motions[0].cur_T_ref
+    information, weighted, through_points = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
+    for motion in motions:
+        inverse = np.linalg.inv(motion.covariance)
         information += inverse
         weighted += inverse @ se3_log(np.ascontiguousarray(motion.cur_T_ref @ se3_inverse(first)))
-    fused = np.asarray(np.linalg.inv(information))
+        through_points += inverse @ motion.shared_covariance @ inverse
+    covariance = np.asarray(np.linalg.inv(information))
     return replace(
         joint,
-        cur_T_ref=se3_exp(fused @ weighted) @ first,
-        covariance=fused,
-        shared_covariance=fused @ through_points @ fused,
+        cur_T_ref=se3_exp(covariance @ weighted) @ first,
+        covariance=covariance,
+        shared_covariance=covariance @ through_points @ covariance,
     )
 
 

@@ -23,13 +23,14 @@ class Anchor:
 
     Args:
         pair: whose left images these are.
-        window_px: side of the patches, odd.
+        window_px: side of the patches; an even one counts as the next.
     """
 
     def __init__(self, pair: StereoPair, window_px: int) -> None:
         self._pair = pair
         self._half = window_px // 2
-        self._step_px = float(np.sqrt((window_px**2 - 1) / 12.0))  # standard deviation of a patch's pixels
+        side = 2 * self._half + 1
+        self._step_px = float(np.sqrt((side**2 - 1) / 12.0))  # standard deviation of a patch's pixels
         self._frame = PairFrame.empty()
         self._image: AnyArray | None = None  # packed
         self._rays: Float = np.zeros((5, 0, 2))  # of what is around each of the tracks

@@ -70,7 +70,7 @@ def track(
         first_levels: where the guess is good: levels that are tried first; what fails is tried again with all.
 
     Returns:
-        Pixels (N, 2) and whether each was found (N,).
+        Pixels (N, 2) and whether each was found (N,), also to a sigma of 0.2 px along its weaker direction.
     """
     half = window_px // 2
     few = levels if first_levels is None else min(first_levels, levels)
@@ -140,8 +140,9 @@ def register(
         min_gradient: least rms gradient of a patch along its weaker direction, grey levels per pixel.
 
     Returns:
-        Pixels (N, 2), equal to the guess where not found; whether each was found (N,); whether its patch is in the
-        source and has that gradient (N,); and the normalised cross-correlations at the places found (N,).
+        Pixels (N, 2), equal to the guess where not found; whether each was found (N,), also to a sigma of 0.2 px along
+        its weaker direction; whether its patch is in the source and has that gradient (N,); and the normalised
+        cross-correlations at the places found (N,).
     """
     n = len(pixels)
     moved, correlations = guess.copy(), np.full(n, -1.0)
@@ -165,7 +166,7 @@ def register(
             if not sample(target, u, v, half + 1, bordered):
                 continue
             xx, xy, yy = prepare(bordered, seen, gx, gy)
-            if localisation2(patch, seen, xx, xy, yy, side) > most2:
+            if not localisation2(patch, seen, xx, xy, yy, side) <= most2:
                 continue
             moved[i, 0], moved[i, 1], found[i] = u, v, True
             correlations[i] = correlation(patch, seen, side)

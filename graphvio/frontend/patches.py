@@ -11,6 +11,7 @@ from graphvio.kernels import fast_kernel, kernel
 
 _LANES = 16
 _HALF_LANES = 8
+_NOWHERE_PX2 = 1e6
 _MAX_ITERATIONS = 20
 _CONVERGED_PX = 0.03  # the step is still taken: what is left after it is several times smaller
 
@@ -276,5 +277,5 @@ def localisation2(patch: AnyArray, other: AnyArray, xx: float, xy: float, yy: fl
         square += b[k] * b[k]
     weaker = weaker2(xx, xy, yy)
     if own < 1e-3 or weaker < 1e-3:
-        return np.inf
+        return _NOWHERE_PX2
     return float(square - product * product / own) / (weaker * side * side)

@@ -6,7 +6,7 @@ from graphvio.arrays import Bool, Float
 from graphvio.cameras import distort, fold_radius
 from graphvio.kernels import kernel
 
-_NEARER = 0.01  # 1/m, a small step
+_NEARER = 0.01  # 1/m, a small step of inverse depth
 _MIN_AREA = 0.1  # a patch that has shrunk more than this is no longer comparable
 
 
@@ -54,8 +54,8 @@ def predict_warps(
         model: of the camera, with its ``intrinsics`` (4,) and ``distortion`` (5,).
 
     Returns:
-        Derivatives (N, 2, 2) of the pixel before by the pixel after; where (N, 2) in the image before the affine map
-        has the point, from the point itself, pixels; and whether both exist (N,).
+        Derivatives (N, 2, 2) of the pixel before by the pixel after; the shift (N, 2) of the affine map's centre from
+        the point, in the image before, pixels; and whether both exist (N,).
     """
     n = inverse_depths.shape[1]
     warps, shifts, valid = np.zeros((n, 2, 2)), np.zeros((n, 2)), np.zeros(n, dtype=np.bool_)

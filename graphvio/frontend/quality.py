@@ -30,9 +30,9 @@ class StereoShare(NamedTuple):
     """How far the right images confirm what the left ones see.
 
     Attributes:
-        share: of the corners that are found in the right image, the lower one of reference and newest frame, mean over
-            the points that the motion explains.
-        baseline_m: the longest baseline of the pairs.
+        share: of each pair's corners, the share found in the right image (the smaller one of reference and newest
+            frame), averaged over the pairs by the points that the motion explains.
+        baseline_m: the longest baseline of these pairs.
     """
 
     share: float
@@ -48,23 +48,22 @@ def stereo_share(
 ) -> StereoShare:
     """`StereoShare` of a motion that explains some points (N,); for the pairs' baselines see `graphvio.rig`."""
     pair = correspondences.observations.pair
-    shares, weights = [], []
-    for j in correspondences.rows:
-        explained = np.count_nonzero(inlier[pair == j])
-        if explained:
-            shares.append(min(reference[j].has_depth.mean(), current[j].has_depth.mean()))
-            weights.append(explained)
-    share = float(np.average(shares, weights=weights)) if weights else 0.0
-    return StereoShare(share, max(baselines_m[j] for j in correspondences.rows))
+    explained = {j: np.count_nonzero(inlier[pair == j]) for j in correspondences.rows}
+    explained = {j: count for j, count in explained.items() if count}
+    if not explained:
+        return StereoShare(0.0, max(baselines_m))
+    shares = [min(reference[j].has_depth.mean(), current[j].has_depth.mean()) for j in explained]
+    share = float(np.average(shares, weights=list(explained.values())))
+    return StereoShare(share, max(baselines_m[j] for j in explained))
 
 
 def graded(
     motions: Sequence[RelativeMotion], tension: float, frozen_since_ns: int | None, stereo: StereoShare
 ) -> tuple[RelativeMotion, Quality, str]:
-    """The best-supported motion, with a covariance that allows for what speaks against it, its quality, and why.
+    """The first motion, with a covariance that allows for what speaks against it, its quality, and why.
 
     Args:
-        motions: of each side of the pairs, the best supported first.
+        motions: of each side, as `graphvio.frontend.agreement.Agreement` has them in order.
         tension: squared Mahalanobis distance between pairs that are thought to agree.
         frozen_since_ns: stamp since which all images are the same, or None.
         stereo: how far the right images confirm what the left ones see.

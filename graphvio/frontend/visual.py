@@ -13,7 +13,7 @@ from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.events import FrameSet, PairReport, Quality
 from graphvio.frontend.agreement import Agreement, Side, agree, is_supported
-from graphvio.frontend.alignment import Misalignment, PairAlignment, combined
+from graphvio.frontend.alignment import Misalignment, PairAlignment
 from graphvio.frontend.frozen import FrozenImages
 from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.frontend.observations import Correspondences, RigArrays, correspond
@@ -46,7 +46,7 @@ class VisualFrontend:
         self._latest: dict[int, PairFrame] = {}
         self._references = References(config.motion)
         self._alignments = {j: PairAlignment() for j in range(1, len(rig.pairs))}
-        self._contradicted_ns = -_DOUBT_NS  # when the pairs were last found to contradict each other
+        self._contradicted_ns: int | None = None  # when the pairs last were beyond 5 sigma of each other
         self._workers = ThreadPoolExecutor(len(rig.pairs), thread_name_prefix="graphvio-pair")
         if len(rig.pairs) > 1:
             cv2.setNumThreads(1)  # pairs run side by side; OpenCV's own threads would only compete with them
@@ -171,23 +171,31 @@ class VisualFrontend:
         start = np.eye(4) if predicted is None else predicted
         if config.selection == "joint":
             refined = joint_motion(self._arrays, observations, start, config, rng)
-            in_doubt = 0 <= stamp_ns - self._contradicted_ns < _DOUBT_NS
-            agreement = agree(self._arrays, observations, refined, config, rng, self._workers, in_doubt)
-            if len(agreement.sides) > 1 and not in_doubt:
+            agreement = agree(
+                self._arrays,
+                observations,
+                refined,
+                config,
+                rng,
+                self._workers,
+                self.misaligned,
+                self._in_doubt(stamp_ns),
+            )
+            if agreement.contradicts:
                 self._contradicted_ns = stamp_ns
         else:
             refined = best_pair_motion(self._arrays, observations, start, config, rng)
             everyone = tuple(int(j) for j in np.unique(observations.pair))
             agreement = Agreement((Side(everyone, refined),), {})
         best = agreement.sides[0]
-        if self.misaligned and len(best.pairs) > 1 and agreement.own.keys() >= set(best.pairs):
-            own = {j: agreement.own[j] for j in best.pairs}
-            best = replace(best, refined=combined(best.refined, own, self.misaligned))
-            agreement = replace(agreement, sides=(best, *agreement.sides[1:]))
         rows = np.isin(observations.pair, best.pairs)
         if not is_supported(best.refined.inlier[rows], config):
             return None, f"the best motion explains only {best.support} of {int(rows.sum())} points"
         return agreement, ""
+
+    def _in_doubt(self, stamp_ns: int) -> bool:
+        """Whether the pairs contradicted each other a moment ago."""
+        return self._contradicted_ns is not None and 0 <= stamp_ns - self._contradicted_ns < _DOUBT_NS
 
     def _motion(self, reference_stamp_ns: int, stamp_ns: int, refined: Refined) -> RelativeMotion:
         used_once = self._config.motion.reference == "previous"  # nothing is shared with another motion
