@@ -80,6 +80,11 @@ class Outcome:
             squares, poses = squares + float(errors_m @ errors_m), poses + len(errors_m)
         return float(np.sqrt(squares / poses)) if poses else np.inf
 
+    @property
+    def by_vision_percent(self) -> float:
+        """Framesets in whose pose vision takes part, percent."""
+        return float(100.0 * np.count_nonzero(self.by_vision) / max(self.framesets, 1))
+
     def cells(self) -> list[str]:
         """The cells of `HEAD`."""
         done = f"{100 * len(self.estimate) / max(self.framesets, 1):.0f}"
