@@ -10,7 +10,7 @@ from dawdling import Dawdling
 from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import AnyArray, Float
-from graphvio.config import MotionConfig
+from graphvio.config import Config, MotionConfig
 from graphvio.events import Quality
 from graphvio.frontend.agreement import Agreement, Side, _in_order, agree
 from graphvio.frontend.alignment import Misalignment
@@ -20,7 +20,7 @@ from graphvio.frontend.quality import StereoShare, graded, stereo_share
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import joint_motion
 from graphvio.frontend.tracks import PairFrame
-from graphvio.frontend.visual import _report
+from graphvio.frontend.visual import VisualFrontend, _report
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 
 RIG = two_pair_rig()
@@ -102,6 +102,19 @@ def test_pairs_that_contradicted_each_other_need_less_to_be_told_apart() -> None
     assert not doubtful.contradicts  # or doubt would feed itself
     assert judged(mixed((TRUTH, 80), (DOOR, 80)), in_doubt=True).contradicts
     assert len(judged(mixed((TRUTH, 80), (TRUTH, 80)), in_doubt=True).sides) == 1
+
+
+def test_doubt_lasts_a_second() -> None:
+    off = transform([0.001, 0.0, 0.0], [0.0, 0.0, 0.0]) @ TRUTH
+    slightly, plainly = mixed((TRUTH, 80), (off, 80)), mixed((TRUTH, 80), (DOOR, 80))
+    frontend = VisualFrontend(RIG, Config())
+    sides = {}
+    for milliseconds, seen in ((0, slightly), (500, plainly), (1450, slightly), (1550, slightly)):
+        agreement, _ = frontend._estimate(Correspondences(seen, {}, {}), STILL, milliseconds * 1_000_000)
+        assert agreement is not None
+        sides[milliseconds] = len(agreement.sides)
+    frontend.close()
+    assert sides == {0: 1, 500: 2, 1450: 2, 1550: 1}
 
 
 PLACE = Misalignment(np.full(6, 0.01), 0.1**2 * np.eye(6), 100.0)  # corrected, but hardly known

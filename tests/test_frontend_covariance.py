@@ -189,4 +189,4 @@ def test_tracks_that_go_on_through_keyframes_make_the_covariance_too_large(condi
     by less than a factor of 1.8 in sigma."""
     some = replace(conditions, per_pair=(40, 40))
     _, high = band(CHAINS)
-    assert 2.0 < run_smoothed(some, CONFIG, CHAINS, seed=18, renewed=False).nees().mean() < high
+    assert 6.0 / 1.8**2 < run_smoothed(some, CONFIG, CHAINS, seed=18, renewed=False).nees().mean() < high

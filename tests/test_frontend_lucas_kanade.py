@@ -68,7 +68,7 @@ def test_a_place_that_a_blur_leaves_open_is_refused() -> None:
             if good.sum() > 5:
                 assert np.abs(np.median((places - grid() - moved_by)[good], axis=0)).max() < 0.05
     assert min(kept[0]) > 0.9
-    assert min(kept[1]) > 0.7
+    assert min(kept[1]) > 0.7  # little blur leaves most places as they are
     assert max(kept[2]) < 0.15
 
 

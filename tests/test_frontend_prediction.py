@@ -1,12 +1,24 @@
+"""Predicted places and deformations against the exact view of a plane through each camera model."""
+
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from synthetic import transform, two_pair_rig
 
 from graphvio.arrays import Float
 from graphvio.cameras import project_points
 from graphvio.frontend.prediction import around, inverse_depths_around, predict_pixels, predict_warps
-from graphvio.rig import Camera
+from graphvio.rig import Camera, StereoPair
 
-CAMERA = two_pair_rig().pairs[0].left
+PAIR = two_pair_rig().pairs[0]
+CAMERA = PAIR.left
+LENSES = [
+    ("radial-tangential", np.zeros(5)),
+    ("radial-tangential", np.array([-0.2, 0.05, 1e-3, -1e-3, 0.0])),
+    ("equidistant", np.array([0.03, -0.01, 0.004, -0.001])),
+]
+with_lenses = pytest.mark.parametrize("lens", LENSES, ids=["ideal", "barrel", "fisheye"])
 MODEL = (CAMERA.model_number, CAMERA.intrinsics, np.array([-0.2, 0.05, 1e-3, -1e-3, 0.0]))
 MOTION = transform([0.05, -0.1, 0.2], [0.2, -0.1, 0.3])
 
@@ -44,6 +56,13 @@ def pixels(n: int = 50) -> Float:
     return np.random.default_rng(2).uniform([150.0, 100.0], [500.0, 400.0], (n, 2))
 
 
+def through(lens: tuple[str, Float]) -> StereoPair:
+    """The pair with other lenses, not quite the same left and right."""
+    model, distortion = lens
+    right = replace(PAIR.right, model=model, distortion=0.9 * distortion)
+    return replace(PAIR, left=replace(CAMERA, model=model, distortion=distortion), right=right)
+
+
 def unprojected(at: Float, camera: Camera = CAMERA) -> Float:
     return np.asarray(camera.unproject(np.ascontiguousarray(at.reshape(-1, 2)))[0].reshape(at.shape))
 
@@ -52,26 +71,28 @@ def on_wall(rays: Float) -> Float:
     return np.asarray(rays @ WALL[:2] + WALL[2])
 
 
-def seen_after(at: Float, motion: Float, camera: Camera = CAMERA) -> Float:
-    """Where the wall's points at pixels (..., 2) are after a motion, by the exact homography."""
-    rays = unprojected(at).reshape(-1, 2)
+def seen_after(at: Float, motion: Float, camera: Camera = CAMERA, after: Camera | None = None) -> Float:
+    """Where the wall's points at pixels (..., 2) are after a motion, or in another camera, by the exact homography."""
+    rays = unprojected(at, camera).reshape(-1, 2)
     points = np.column_stack([rays, np.ones(len(rays))]) / on_wall(rays)[:, None] @ motion[:3, :3].T + motion[:3, 3]
-    return np.asarray(camera.project(np.ascontiguousarray(points))[0].reshape(at.shape))
+    return np.asarray((after or camera).project(np.ascontiguousarray(points))[0].reshape(at.shape))
 
 
-def test_warps_are_the_affine_maps_nearest_to_a_slanted_walls_deformation() -> None:
+@with_lenses
+def test_warps_are_the_affine_maps_nearest_to_a_slanted_walls_deformation(lens: tuple[str, Float]) -> None:
+    camera = through(lens).left
     motion = transform([0.01, -0.03, 0.02], [0.05, 0.05, -0.35])
     at = around(pixels(), STEP_PX)
-    rays = unprojected(at)
+    rays = unprojected(at, camera)
     warps, shifts, valid = predict_warps(
-        rays, on_wall(rays), STEP_PX, motion, CAMERA.model_number, CAMERA.intrinsics, CAMERA.distortion
+        rays, on_wall(rays), STEP_PX, motion, camera.model_number, camera.intrinsics, camera.distortion
     )
     assert valid.all()
     offsets = np.stack(np.meshgrid(np.arange(-7.0, 8.0), np.arange(-7.0, 8.0)), axis=-1).reshape(-1, 2)
     constants, by_centre = [], []
     for k in range(len(warps)):
         source = pixels()[k] + offsets
-        target = seen_after(source, motion) - seen_after(pixels()[k : k + 1], motion)
+        target = seen_after(source, motion, camera) - seen_after(pixels()[k : k + 1], motion, camera)
         mapped = target @ warps[k].T
         constants.append(np.mean(offsets - mapped - shifts[k], axis=0))
         by_centre.append(np.mean(offsets - mapped, axis=0))
@@ -99,27 +120,58 @@ def test_warps_need_a_visible_surface() -> None:
         assert not predict_warps(rays, depths, *arguments)[2].any()
 
 
-def test_the_slopes_of_stereo_matches_tell_the_wall() -> None:
-    pair = two_pair_rig().pairs[0]
+@with_lenses
+def test_the_slopes_of_stereo_matches_tell_the_wall(lens: tuple[str, Float]) -> None:
+    pair = through(lens)
     at = around(pixels(), STEP_PX)
-    rays = unprojected(at)
-    middle = rays[0]
-    along = _right_pixel(middle, on_wall(middle) + 0.01) - _right_pixel(middle, on_wall(middle))
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    slopes = np.empty((50, 2))
-    for k in range(2):
-        step = np.eye(2)[k]
-        ahead, behind = (seen_after(at[0] + sign * step, pair.right_T_left, pair.right) for sign in (1.0, -1.0))
-        slopes[:, k] = np.sum((0.5 * (ahead - behind) - step) * along, axis=1)
-    right = pair.right
-    arguments = (pair.right_T_left, right.model_number, right.intrinsics, right.distortion)
-    told = inverse_depths_around(rays, on_wall(middle), slopes, STEP_PX, *arguments)
+    rays = unprojected(at, pair.left)
+    told = inverse_depths_around(rays, on_wall(rays[0]), slopes(pair, at[0]), STEP_PX, *right_view(pair))
     np.testing.assert_allclose(told, on_wall(rays), rtol=5e-3)
-    assert np.ptp(on_wall(rays) / on_wall(middle), axis=0).min() > 0.01  # the wall is slanted, all over
+    assert np.ptp(on_wall(rays) / on_wall(rays[0]), axis=0).min() > 0.01  # the wall is slanted, all over
 
 
-def _right_pixel(rays: Float, inverse_depths: Float) -> Float:
-    pair = two_pair_rig().pairs[0]
-    points = np.column_stack([rays, np.ones(len(rays))]) / inverse_depths[:, None]
-    moved = points @ pair.right_T_left[:3, :3].T + pair.right_T_left[:3, 3]
+def test_what_the_right_image_does_not_show_is_taken_for_a_surface_that_faces_the_camera() -> None:
+    at = around(pixels(3), STEP_PX)
+    rays, steep = unprojected(at), np.full((3, 2), 0.3)
+    behind = transform([0.0, 0.0, 0.0], [0.0, 0.0, -50.0])  # of all points
+    told = inverse_depths_around(rays, on_wall(rays[0]), steep, STEP_PX, behind, *right_view(PAIR)[1:])
+    np.testing.assert_array_equal(told, np.tile(on_wall(rays[0]), (5, 1)))
+
+
+def test_far_surfaces_have_no_slant() -> None:
+    """At infinity the right image is the left one turned, and its slopes are those of the rotation."""
+    at = around(pixels(), STEP_PX)
+    rays, far = unprojected(at), np.zeros(50)
+    turned = np.empty((50, 2))
+    direction = along(PAIR, rays[0], far)
+    for k, step in enumerate(np.eye(2)):
+        ahead, behind = (right_pixel(PAIR, unprojected(at[0] + sign * step), far) for sign in (1.0, -1.0))
+        turned[:, k] = np.sum((0.5 * (ahead - behind) - step) * direction, axis=1)
+    told = inverse_depths_around(rays, far, turned, STEP_PX, *right_view(PAIR))
+    np.testing.assert_allclose(told, 0.0, atol=1e-4)  # 1/m
+
+
+def right_view(pair: StereoPair) -> tuple[Float, int, Float, Float]:
+    return pair.right_T_left, pair.right.model_number, pair.right.intrinsics, pair.right.distortion
+
+
+def slopes(pair: StereoPair, at: Float) -> Float:
+    """What stereo matching would measure on the wall: the shift's derivative by the left pixel."""
+    rays = unprojected(at, pair.left)
+    direction, measured = along(pair, rays, on_wall(rays)), np.empty((len(at), 2))
+    for k, step in enumerate(np.eye(2)):
+        ahead, behind = (seen_after(at + s * step, pair.right_T_left, pair.left, pair.right) for s in (1.0, -1.0))
+        measured[:, k] = np.sum((0.5 * (ahead - behind) - step) * direction, axis=1)
+    return measured
+
+
+def along(pair: StereoPair, rays: Float, inverse_depths: Float) -> Float:
+    """Directions (N, 2) of the epipolar lines in the right image, towards near points."""
+    direction = right_pixel(pair, rays, inverse_depths + 0.01) - right_pixel(pair, rays, inverse_depths)
+    return np.asarray(direction / np.linalg.norm(direction, axis=1, keepdims=True))
+
+
+def right_pixel(pair: StereoPair, rays: Float, inverse_depths: Float) -> Float:
+    moved = np.column_stack([rays, np.ones(len(rays))]) @ pair.right_T_left[:3, :3].T
+    moved += inverse_depths[:, None] * pair.right_T_left[:3, 3]
     return np.asarray(pair.right.project(np.ascontiguousarray(moved))[0])

@@ -1,0 +1,128 @@
+"""The anchor's patches, found again in views of a slanted wall whose places are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import transform
+from waves import picture, waves
+
+from graphvio.arrays import Float, Image
+from graphvio.frontend.anchor import Anchor
+from graphvio.frontend.tracks import PairFrame
+from graphvio.rig import Camera, StereoPair
+
+WIDTH, HEIGHT, FOCAL, BASELINE_M = 320, 240, 250.0, 0.1
+CENTRE = np.array([0.5 * WIDTH, 0.5 * HEIGHT])
+WALL = np.array([0.55, 0.15, 0.6])  # inverse depth of a ray [x, y, 1] is its product with this: a wall seen askew
+ALONG_WALL = np.linalg.svd(WALL[None])[2][1:]  # (2, 3) two directions in it
+X, Y = np.meshgrid(np.arange(float(WIDTH)), np.arange(float(HEIGHT)))
+MOTION = transform([0.01, 0.02, -0.03], [0.1, 0.02, -0.3])  # left_T_left_anchor
+WINDOW_PX, LEAST_GRADIENT = 15, 1.0
+
+
+def pair() -> StereoPair:
+    model = ("radial-tangential", (WIDTH, HEIGHT), np.array([FOCAL, FOCAL, *CENTRE]), np.zeros(5))
+    return StereoPair(
+        "pair", Camera("left", *model, np.eye(4)), Camera("right", *model, transform([0, 0, 0], [BASELINE_M, 0, 0]))
+    )
+
+
+def view(camera_T_first: Float) -> Image:
+    """The wall as a camera sees it."""
+    rays = np.column_stack([(X.ravel() - CENTRE[0]) / FOCAL, (Y.ravel() - CENTRE[1]) / FOCAL, np.ones(X.size)])
+    first_T_camera = np.linalg.inv(camera_T_first)
+    ahead = rays @ first_T_camera[:3, :3].T
+    depths = (1.0 - first_T_camera[:3, 3] @ WALL) / (ahead @ WALL)
+    places = (first_T_camera[:3, 3] + depths[:, None] * ahead) @ ALONG_WALL.T
+    u, v = 150.0 * places.T.reshape(2, HEIGHT, WIDTH)
+    return picture(waves(u, v) + 0.03 * np.random.default_rng(0).standard_normal(X.shape))
+
+
+def tracks() -> PairFrame:
+    """A grid of points on the wall, with what stereo matching would say of them."""
+    x, y = np.meshgrid(np.arange(110.0, 231.0, 15.0), np.arange(60.0, 181.0, 15.0))
+    pixels = np.column_stack([x.ravel(), y.ravel()]) + 0.3
+    n = len(pixels)
+    rays = (pixels - CENTRE) / FOCAL
+    return replace(
+        PairFrame.empty(),
+        ids=10 + 2 * np.arange(n),
+        ages=np.zeros(n, dtype=np.int64),
+        pixels=pixels,
+        left=rays,
+        right=rays,
+        points=np.column_stack([rays, rays @ WALL[:2] + WALL[2]]),
+        covariances=np.zeros((n, 3, 3)),
+        slopes=np.tile(BASELINE_M * WALL[:2], (n, 1)),
+        has_depth=np.ones(n, dtype=bool),
+        flat_for=np.zeros(n, dtype=np.int64),
+    )
+
+
+def seen_after(frame: PairFrame, left_T_left_anchor: Float) -> Float:
+    rays = np.column_stack([frame.left, np.ones(len(frame.ids))])
+    points = rays / (rays @ WALL)[:, None] @ left_T_left_anchor[:3, :3].T + left_T_left_anchor[:3, 3]
+    return np.asarray(FOCAL * points[:, :2] / points[:, 2:] + CENTRE)
+
+
+def placed(frame: PairFrame) -> Anchor:
+    anchor = Anchor(pair(), WINDOW_PX)
+    anchor.place(frame, view(np.eye(4)))
+    return anchor
+
+
+def errors_px(frame: PairFrame, slopes: Float) -> tuple[Float, float]:
+    """Errors of the patches that were found in a later view, and how many were."""
+    truth = seen_after(frame, MOTION)
+    guess = truth + np.random.default_rng(1).uniform(-0.5, 0.5, truth.shape)
+    pixels, found = placed(replace(frame, slopes=slopes)).find(frame.ids, guess, view(MOTION), MOTION, LEAST_GRADIENT)
+    np.testing.assert_array_equal(pixels[~found], guess[~found])
+    return np.linalg.norm(pixels - truth, axis=1)[found], float(found.mean())
+
+
+def test_patches_are_found_on_a_slanted_wall_by_its_slope() -> None:
+    frame = tracks()
+    told, found = errors_px(frame, frame.slopes)
+    untold, _ = errors_px(frame, np.zeros_like(frame.slopes))
+    assert found > 0.9
+    assert np.median(told) < 0.04
+    assert np.median(untold) > 3.0 * np.median(told)
+
+
+def test_what_the_anchor_does_not_know_is_not_found() -> None:
+    frame = tracks()
+    frame = replace(frame, has_depth=np.arange(len(frame.ids)) % 3 > 0)
+    strangers = np.concatenate([[3], frame.ids[:5] + 1, [10**9]])
+    ids = np.sort(np.concatenate([frame.ids, strangers]))
+    guess = np.full((len(ids), 2), 100.0)
+    own = np.isin(ids, frame.ids)
+    guess[own] = frame.pixels
+    pixels, found = placed(frame).find(ids, guess, view(np.eye(4)), np.eye(4), LEAST_GRADIENT)
+    assert not found[~own].any()
+    assert not found[own][~frame.has_depth].any()
+    assert found[own][frame.has_depth].mean() > 0.95
+    np.testing.assert_array_equal(pixels[~found], guess[~found])
+
+
+@pytest.mark.parametrize("frame", [None, PairFrame.empty()], ids=["never placed", "no tracks"])
+def test_an_anchor_without_tracks_finds_nothing(frame: PairFrame | None) -> None:
+    anchor = Anchor(pair(), WINDOW_PX) if frame is None else placed(frame)
+    guess = np.array([[100.0, 80.0]])
+    pixels, found = anchor.find(np.array([0]), guess, view(np.eye(4)), np.eye(4), LEAST_GRADIENT)
+    np.testing.assert_array_equal(pixels, guess)
+    assert not found.any()
+
+
+def test_no_tracks_are_asked_for() -> None:
+    none = np.zeros((0, 2))
+    pixels, found = placed(tracks()).find(np.zeros(0, dtype=np.int64), none, view(np.eye(4)), np.eye(4), LEAST_GRADIENT)
+    assert pixels.shape == (0, 2)
+    assert found.shape == (0,)
+
+
+def test_a_prediction_that_turns_the_wall_away_finds_nothing() -> None:
+    frame = tracks()
+    away = transform([0.0, 0.0, 0.0], [0.0, 0.0, -50.0])
+    _, found = placed(frame).find(frame.ids, frame.pixels, view(np.eye(4)), away, LEAST_GRADIENT)
+    assert not found.any()
