@@ -342,18 +342,15 @@ def test_what_the_right_images_do_not_confirm_may_be_off_by_the_baseline() -> No
     assert sigmas[:3].min() > 0.02
 
 
-def test_the_share_that_stereo_confirms_is_that_of_the_pairs_that_count() -> None:
+def test_the_share_that_stereo_confirms_is_that_of_all_corners() -> None:
     def frame(with_depth: int, of: int) -> PairFrame:
         return replace(PairFrame.empty(), ids=np.arange(of), has_depth=np.arange(of) < with_depth)
 
-    seen = mixed((TRUTH, 60), (TRUTH, 30))
-    both = Correspondences(seen, {0: np.arange(60), 1: np.arange(30)}, {0: 60, 1: 30})
-    reference, current = {0: frame(90, 100), 1: frame(80, 100)}, {0: frame(60, 100), 1: frame(8, 100)}
-    everyone = np.ones(90, dtype=bool)
-    told = stereo_share(reference, current, both, everyone, [0.1, 0.2])
-    assert told.share == pytest.approx((60 * 0.6 + 30 * 0.08) / 90)
+    reference, current = {0: frame(90, 100), 1: frame(80, 100)}, {0: frame(60, 100), 1: frame(4, 50)}
+    told = stereo_share(reference, current, [0.1, 0.2])
+    assert told.share == pytest.approx((100 * 0.6 + 50 * 0.08) / 150)
     assert told.baseline_m == 0.2
-    assert stereo_share(reference, current, both, seen.pair == 1, [0.1, 0.2]).share == pytest.approx(0.08)
-    nothing = replace(both, rows={0: np.arange(60), 1: np.zeros(0, dtype=np.int64)})
+    assert stereo_share({1: reference[1]}, current, [0.1, 0.2]).share == pytest.approx(0.08)
+    assert stereo_share({**reference, 1: frame(0, 0)}, current, [0.1, 0.2]).share == pytest.approx(100 * 0.6 / 150)
+    assert stereo_share({0: frame(0, 0)}, {0: frame(0, 0)}, [0.1, 0.2]).share == 0.0
     assert graded([measured(TRUTH, 200)], 0.0, None, StereoShare(0.13, 0.12))[1] is Quality.GOOD
-    assert stereo_share({**reference, 1: frame(0, 0)}, current, nothing, seen.pair == 0, [0.1, 0.2]).share == 0.6

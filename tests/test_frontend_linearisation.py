@@ -13,7 +13,7 @@ from graphvio.frontend.observations import Observations, RigArrays
 
 RIG = two_pair_rig()
 ARRAYS = RigArrays.of(RIG)
-SIGMA, SCALE = 0.3, 2.5
+SIGMAS, SCALE = np.array([0.3, 0.5]), 2.5  # of the pairs
 TRUTH = transform([0.02, -0.03, 0.05], [-0.06, 0.02, 0.01])  # cur_T_ref
 PAIRS_AND_RIGHTS = pytest.mark.parametrize(
     ("pairs", "share"), [((0,), 1.0), ((0,), 0.0), ((1,), 1.0), ((1,), 0.0), ((0, 1), 0.6)],
@@ -24,7 +24,7 @@ PAIRS_AND_RIGHTS = pytest.mark.parametrize(
 def scene(pairs: tuple[int, ...], share: float) -> tuple[Observations, Float]:
     """Points of some pairs, a share of them in the right image too, and a motion (4, 4) that is a little wrong."""
     rng = np.random.default_rng(len(pairs) + 10 * pairs[0])
-    seen = seen_points(RIG, TRUTH, 25, rng, sigma_px=SIGMA, outlier_share=0.1)
+    seen = seen_points(RIG, TRUTH, 25, rng, sigma_px=0.3, outlier_share=0.1)
     seen = seen.of_rows(np.isin(seen.pair, pairs))
     return seen._replace(has_right=rng.random(len(seen.pair)) < share), TRUTH @ random_transform(rng, 0.001, 0.003)
 
@@ -77,7 +77,7 @@ def linearised(seen: Observations, cur_T_ref: Float, at: Expansion) -> tuple[flo
 
 
 def expanded(seen: Observations, cur_T_ref: Float) -> Expansion:
-    return expand(left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS), ARRAYS, seen, SIGMA)
+    return expand(left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS), ARRAYS, seen, SIGMAS)
 
 
 @PAIRS_AND_RIGHTS
@@ -126,7 +126,8 @@ def test_points_are_whitened_where_both_instants_say_that_they_are(pairs: tuple[
     for i in range(len(seen.pair)):
         derivative = by_point(seen, i, at.points[i], cur_T_ref)
         n = len(derivative)
-        covariance = SIGMA**2 * (np.eye(n) + derivative @ seen.covariances[i] @ derivative.T)
+        sigma = SIGMAS[seen.pair[i]]
+        covariance = sigma**2 * (np.eye(n) + derivative @ seen.covariances[i] @ derivative.T)
         whitener = np.linalg.inv(np.linalg.cholesky(covariance))
         np.testing.assert_allclose(at.whiteners[i, :n, :n], whitener, rtol=1e-5, atol=1e-6 * np.abs(whitener).max())
         shift = at.points[i] - seen.points[i]
@@ -134,8 +135,8 @@ def test_points_are_whitened_where_both_instants_say_that_they_are(pairs: tuple[
         errors = errors_px(seen, i, at.points[i], cur_T_ref) + derivative @ shift
         e2 = float(errors @ np.linalg.solve(covariance, errors))
         if e2 < 16.0:  # farther errors move a point only in part
-            best = SIGMA**2 * seen.covariances[i] @ derivative.T @ np.linalg.solve(covariance, errors)
-            sigmas = SIGMA * np.sqrt(np.diag(seen.covariances[i]))
+            best = sigma**2 * seen.covariances[i] @ derivative.T @ np.linalg.solve(covariance, errors)
+            sigmas = sigma * np.sqrt(np.diag(seen.covariances[i]))
             np.testing.assert_allclose(shift / sigmas, best / sigmas, atol=0.02)
             followed += int(np.linalg.norm(shift / sigmas) > 0.3)
     assert followed > 0.3 * len(seen.pair)
@@ -147,13 +148,14 @@ def test_information_through_points_is_its_formula(pairs: tuple[int, ...], share
     at = expanded(seen, cur_T_ref)
     factors = np.random.default_rng(3).uniform(-0.2, 1.0, len(seen.pair)).clip(0.0)
     motions = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
-    found = information_through_points(motions, ARRAYS, seen, at, SIGMA, factors)
+    found = information_through_points(motions, ARRAYS, seen, at, SIGMAS, factors)
     expected = np.zeros((6, 6))
     for i, factor in enumerate(factors):
         derivative = by_motion(seen, i, at.points[i], cur_T_ref)
         through = by_point(seen, i, at.points[i], cur_T_ref)
-        inverse = np.linalg.inv(SIGMA**2 * (np.eye(len(through)) + through @ seen.covariances[i] @ through.T))
-        expected += factor * derivative.T @ (inverse - SIGMA**2 * inverse @ inverse) @ derivative
+        sigma = SIGMAS[seen.pair[i]]
+        inverse = np.linalg.inv(sigma**2 * (np.eye(len(through)) + through @ seen.covariances[i] @ through.T))
+        expected += factor * derivative.T @ (inverse - sigma**2 * inverse @ inverse) @ derivative
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-5)
 

@@ -10,6 +10,7 @@ from synthetic import random_transform, seen_points, transform, two_pair_rig
 from graphvio.arrays import AnyArray, Float, Int
 from graphvio.config import MotionConfig
 from graphvio.frontend.cost import left_motions, robust_cost
+from graphvio.frontend.noise import noise_by_pair
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.ransac import hypothesise, preempt
 from graphvio.frontend.refinement import explained, refine
@@ -163,8 +164,8 @@ def eliminated_cost(seen: Observations, cur_T_ref: Float, config: MotionConfig) 
 def test_the_refined_motion_is_a_minimum_of_the_cost() -> None:
     seen = seen_points(RIG, TRUTH, 25, seed(6), sigma_px=0.3)
     seen = seen._replace(has_right=seed(7).random(50) < 0.8)
-    refined = refine(ARRAYS, seen, TRUTH, CONFIG)
-    seen = take(seen, np.flatnonzero(refined.inlier))
+    everyone = np.ones(50, dtype=bool)  # known, so that both pairs count for the same
+    refined = refine(ARRAYS, seen, TRUTH, CONFIG, known=everyone)
     lowest = eliminated_cost(seen, refined.cur_T_ref, CONFIG)
     steps = 0.3 * np.sqrt(np.diag(refined.covariance))
     for axis in range(6):
@@ -246,6 +247,39 @@ def test_covariance_follows_the_noise_and_the_inflation() -> None:
     np.testing.assert_allclose(
         refine(ARRAYS, seen, TRUTH, replace(CONFIG, sigma_inflation=2.0)).covariance, 4.0 * plain
     )
+
+
+def pairs_of_unlike_noise(number: int, sigmas_px: tuple[float, float]) -> Observations:
+    parts = [
+        seen_points(RIG, TRUTH, 60, seed(2 * number + j), sigma_px=sigma).of_pair(j)
+        for j, sigma in enumerate(sigmas_px)
+    ]
+    return Observations(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def test_a_pair_with_noisier_images_counts_for_less() -> None:
+    """Each pair has a noise of its own: the sharper one leads, and the covariance stays honest."""
+    squares: dict[str, list[float]] = {"both": [], "sharper": []}
+    nees = []
+    for number in range(200):
+        seen = pairs_of_unlike_noise(number, (0.1, 0.4))
+        refined, alone = (refine(ARRAYS, of, TRUTH, CONFIG) for of in (seen, seen.of_pair(0)))
+        for name, motion in (("both", refined), ("sharper", alone)):
+            squares[name].append(float(np.sum((se3_inverse(TRUTH) @ motion.cur_T_ref)[:3, 3] ** 2)))
+        error = se3_log(refined.cur_T_ref @ np.linalg.inv(TRUTH))
+        nees.append(error @ np.linalg.solve(refined.covariance, error))
+    assert np.mean(squares["both"]) < 0.9 * np.mean(squares["sharper"])
+    assert 4.5 < np.mean(nees) < 8.0
+
+
+@pytest.mark.parametrize(("sigmas_px", "ratio"), [((0.2, 0.2), 1.0), ((0.15, 0.3), 4.0)])
+def test_each_pairs_noise_is_told_by_its_residuals(sigmas_px: tuple[float, float], ratio: float) -> None:
+    seen, px = pairs_of_unlike_noise(3, sigmas_px), CONFIG.pixel_sigma_px
+    _, errors_px = explained(ARRAYS, seen, TRUTH, CONFIG)
+    noise = noise_by_pair(4.0 * (errors_px / px) ** 2, seen.has_right, seen.pair, 2, 100.0)
+    assert noise[1] / noise[0] == pytest.approx(ratio, rel=0.4)
+    one = np.zeros(len(seen.pair), dtype=np.int64)
+    np.testing.assert_array_equal(noise_by_pair(errors_px, seen.has_right, one, 2, 100.0), 1.0)
 
 
 def test_directions_that_nothing_constrains_are_uncertain() -> None:

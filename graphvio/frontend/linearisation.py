@@ -1,6 +1,6 @@
 """Whitened reprojection errors of many points, and their normal equations for a step of the motion (section 3, 5).
 
-A point's error in both images is one vector of four. Its covariance is that of the pixels plus that of the
+A point's error in both images is one vector of four. Its covariance is that of its pair's pixels plus that of the
 triangulated point as it is seen from here, ``S = sigma^2 (1 + J_X C_X J_X^T)``: near points, whose depth is known
 well, count for more. Points are errors in variables: derivatives are taken where both instants together say that a
 point is, not where it was triangulated, whose noise is in the residual too and would bias the motion (maximum
@@ -38,12 +38,16 @@ class Expansion(NamedTuple):
 
 
 @kernel
-def expand(motions: Float, rig: RigArrays, observations: Observations, sigma: float) -> Expansion:
-    """Linearise all points at motions (P, 2, 4, 4), see `graphvio.frontend.cost.left_motions`."""
+def expand(motions: Float, rig: RigArrays, observations: Observations, sigmas_px: Float) -> Expansion:
+    """Linearise all points at motions (P, 2, 4, 4), see `graphvio.frontend.cost.left_motions`.
+
+    The pixels of each pair have a noise of their own (P,).
+    """
     n = len(observations.pair)
     points, offsets, whiteners = np.empty((n, 3)), np.empty((n, 4)), np.zeros((n, 4, 4))
     for i in range(n):
         j, covariance = observations.pair[i], observations.covariances[i]
+        sigma = sigmas_px[j]
         measured = observations.points[i, 0], observations.points[i, 1], observations.points[i, 2]
         shift, seen = (0.0, 0.0, 0.0), 1.0 if observations.has_right[i] else 0.0
         for repeat in range(_EXPANSIONS):
@@ -266,7 +270,7 @@ def linearise(
 
 @kernel
 def information_through_points(
-    motions: Float, rig: RigArrays, observations: Observations, at: Expansion, sigma: float, factors: Float
+    motions: Float, rig: RigArrays, observations: Observations, at: Expansion, sigmas_px: Float, factors: Float
 ) -> Float:
     """``sum f (J^T S^-1 J - sigma^2 J^T S^-2 J)`` (6, 6): the part of the score's variance that the points' own errors
     contribute, each point with a factor f (N,)."""
@@ -284,5 +288,5 @@ def information_through_points(
             twice[2, c] = l22 * d + l32 * e
             twice[3, c] = l33 * e
         _add_squares(rows, factors[i], normal)
-        _add_squares(twice, -sigma * sigma * factors[i], normal)
+        _add_squares(twice, -(sigmas_px[observations.pair[i]] ** 2) * factors[i], normal)
     return normal[:6, :6].copy()

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float
+from graphvio.arrays import Bool, Float, Int
 from graphvio.kernels import kernel
 
 _PRIOR_RESIDUALS = 3.0  # the noise model counts for so many, which helps where there are few points
@@ -16,6 +16,8 @@ _COUNTED_AT_NOISY_POINTS = 1.04  # normal matrices at noisy points promise that 
 _CUTOFF = 25.0  # squared error over the noise variance: one right point in 20,000 lies beyond (4 degrees of freedom)
 _MEDIAN_CHI2_OF_2, _MEDIAN_CHI2_OF_4 = 1.386, 3.357
 _LEAST_VARIANCE = 0.05
+_POINTS_OF_EQUAL_NOISE = 10.0  # a pair's noise is thought to be that of the others by so many points
+_MOST_UNLIKE = 4.0  # variance over that of all; more is no noise, but another motion
 
 
 class Influence(NamedTuple):
@@ -67,6 +69,21 @@ def noise_variance(errors2: Float, has_right: Bool, largest2: float) -> float:
         return 1.0
     medians = np.where(has_right[near], _MEDIAN_CHI2_OF_4, _MEDIAN_CHI2_OF_2)
     return max(float(np.median(errors2[near] / medians)), _LEAST_VARIANCE)
+
+
+@kernel
+def noise_by_pair(errors2: Float, has_right: Bool, pair: Int, pairs: int, largest2: float) -> Float:
+    """Variance of each pair's noise (P,), over that of all points together; near 1 for pairs with few points."""
+    ratios = np.ones(pairs)
+    usual = noise_variance(errors2, has_right, largest2)
+    for j in range(pairs):
+        of_pair = pair == j
+        fitting = np.sum(errors2[of_pair] < largest2)
+        if 0 < fitting < np.sum(errors2 < largest2):
+            own = noise_variance(errors2[of_pair], has_right[of_pair], largest2) / usual
+            ratio = (fitting * own + _POINTS_OF_EQUAL_NOISE) / (fitting + _POINTS_OF_EQUAL_NOISE)
+            ratios[j] = min(max(ratio, 1.0 / _MOST_UNLIKE), _MOST_UNLIKE)
+    return ratios
 
 
 @kernel

@@ -30,9 +30,8 @@ class StereoShare(NamedTuple):
     """How far the right images confirm what the left ones see.
 
     Attributes:
-        share: of each pair's corners, the share found in the right image (the smaller one of reference and newest
-            frame), averaged over the pairs by the points that the motion explains.
-        baseline_m: the longest baseline of these pairs.
+        share: of all corners, those found in the right image: the smaller one of reference and newest frame.
+        baseline_m: the longest baseline of the pairs in view.
     """
 
     share: float
@@ -40,21 +39,18 @@ class StereoShare(NamedTuple):
 
 
 def stereo_share(
-    reference: Mapping[int, PairFrame],
-    current: Mapping[int, PairFrame],
-    correspondences: Correspondences,
-    inlier: Bool,
-    baselines_m: Sequence[float],
+    reference: Mapping[int, PairFrame], current: Mapping[int, PairFrame], baselines_m: Sequence[float]
 ) -> StereoShare:
-    """`StereoShare` of a motion that explains some points (N,); for the pairs' baselines see `graphvio.rig`."""
-    pair = correspondences.observations.pair
-    explained = {j: np.count_nonzero(inlier[pair == j]) for j in correspondences.rows}
-    explained = {j: count for j, count in explained.items() if count}
-    if not explained:
-        return StereoShare(0.0, max(baselines_m))
-    shares = [min(reference[j].has_depth.mean(), current[j].has_depth.mean()) for j in explained]
-    share = float(np.average(shares, weights=list(explained.values())))
-    return StereoShare(share, max(baselines_m[j] for j in explained))
+    """`StereoShare` of a frameset. A pair counts by its corners, also if the motion explains none of them."""
+    pairs = sorted(reference.keys() & current.keys())
+    corners = [len(current[j].ids) for j in pairs]
+    shares = [min(_share(reference[j].has_depth), _share(current[j].has_depth)) for j in pairs]
+    share = float(np.average(shares, weights=corners)) if sum(corners) else 0.0
+    return StereoShare(share, max(baselines_m[j] for j in pairs))
+
+
+def _share(found: Bool) -> float:
+    return float(found.mean()) if len(found) else 0.0
 
 
 def graded(

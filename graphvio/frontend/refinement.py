@@ -13,7 +13,7 @@ from graphvio.arrays import Bool, Float, Int
 from graphvio.config import MotionConfig
 from graphvio.frontend.cost import left_motions
 from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise
-from graphvio.frontend.noise import influence, influence_slopes, inlier_cutoff, noise_variance
+from graphvio.frontend.noise import influence, influence_slopes, inlier_cutoff, noise_by_pair, noise_variance
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.geometry import se3_exp
 from graphvio.kernels import kernel
@@ -84,18 +84,23 @@ def _refined(
     widest, largest2 = scale_px / sigma, (max_error_px / sigma) ** 2
     has_right = observations.has_right
     pose, inlier = cur_T_ref, known
-    errors2 = _squared_errors(pose, rig, observations, sigma)
+    sigmas_px = np.full(len(rig.focal_px), sigma)
+    errors2 = _squared_errors(pose, rig, observations, sigmas_px)
     if len(inlier) == len(has_right):
         scale = _scale(errors2[inlier], has_right[inlier], widest, largest2)
     else:
         everything = np.ones(len(has_right), dtype=np.bool_)
         for _ in range(_ROUNDS_TO_FIND_INLIERS):
             scale = _scale(errors2, has_right, widest, largest2)
-            pose, _, errors2, _ = _levenberg_marquardt(pose, rig, observations, everything, sigma, scale, 1, _NEAR)
+            pose, _, errors2, _ = _levenberg_marquardt(pose, rig, observations, everything, sigmas_px, scale, 1, _NEAR)
+        # One pair's images may be blurred or dim: its points are then less certain than the others'.
+        noise = noise_by_pair(errors2, has_right, observations.pair, len(sigmas_px), largest2)
+        errors2 /= noise[observations.pair]
+        sigmas_px *= np.sqrt(noise)
         inlier = errors2 < inlier_cutoff(errors2, has_right, largest2)
         inlier &= _is_of_an_explained_pair(observations.pair, inlier)
     pose, hessian, errors2, at = _levenberg_marquardt(
-        pose, rig, observations, inlier, sigma, scale, _MOST_ROUNDS, _CONVERGED
+        pose, rig, observations, inlier, sigmas_px, scale, _MOST_ROUNDS, _CONVERGED
     )
     used = influence(errors2[inlier], has_right[inlier], scale)
     # Backward propagation of the reprojection covariance. The small prior keeps unconstrained directions finite.
@@ -103,10 +108,11 @@ def _refined(
     root = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(information)).T)
     covariance = root @ root.T
     factors = np.where(inlier, influence_slopes(errors2, has_right, scale) ** 2, 0.0)
-    through_points = information_through_points(left_motions(pose, rig), rig, observations, at, sigma, factors)
+    through_points = information_through_points(left_motions(pose, rig), rig, observations, at, sigmas_px, factors)
     gain = covariance / used.factor * (used.weight / used.slope)
     shared = _bounded(used.variance * gain @ through_points @ gain, root)
-    return pose, inflation * covariance, inflation * shared, inlier, _errors_px(errors2, has_right, sigma)
+    errors_px = _errors_px(errors2, has_right, sigmas_px[observations.pair])
+    return pose, inflation * covariance, inflation * shared, inlier, errors_px
 
 
 @kernel
@@ -141,7 +147,7 @@ def _levenberg_marquardt(
     rig: RigArrays,
     observations: Observations,
     active: Bool,
-    sigma: float,
+    sigmas_px: Float,
     scale: float,
     rounds: int,
     tolerance: float,
@@ -154,11 +160,11 @@ def _levenberg_marquardt(
     n = len(observations.pair)
     hessian, gradient, errors2 = np.zeros((6, 6)), np.zeros(6), np.empty(n)
     new_hessian, new_gradient, new_errors2 = np.zeros((6, 6)), np.zeros(6), np.empty(n)
-    at = expand(left_motions(pose, rig), rig, observations, sigma)
+    at = expand(left_motions(pose, rig), rig, observations, sigmas_px)
     for turn in range(rounds):
         motions = left_motions(pose, rig)
         if turn > 0:
-            at = expand(motions, rig, observations, sigma)
+            at = expand(motions, rig, observations, sigmas_px)
         moved = 0.0
         cost = linearise(motions, rig, observations, at, active, scale, hessian, gradient, errors2)
         damping = 1e-6
@@ -192,25 +198,26 @@ def _levenberg_marquardt(
 def explained(rig: RigArrays, observations: Observations, cur_T_ref: Float, config: MotionConfig) -> tuple[Bool, Float]:
     """Which points (N,) are inliers of a motion (4, 4), and the errors (N,) of all, see `Refined`."""
     sigma, has_right = config.pixel_sigma_px, observations.has_right
-    errors2 = _squared_errors(cur_T_ref, rig, observations, sigma)
-    largest2 = (config.max_error_px / sigma) ** 2
-    return np.asarray(errors2 < inlier_cutoff(errors2, has_right, largest2)), _errors_px(errors2, has_right, sigma)
+    sigmas_px = np.full(len(rig.focal_px), sigma)
+    errors2 = _squared_errors(cur_T_ref, rig, observations, sigmas_px)
+    inlier = errors2 < inlier_cutoff(errors2, has_right, (config.max_error_px / sigma) ** 2)
+    return np.asarray(inlier), _errors_px(errors2, has_right, sigmas_px[observations.pair])
 
 
 @kernel
-def _errors_px(errors2: Float, has_right: Bool, sigma: float) -> Float:
-    """Squared whitened errors (N,) as pixels in one direction."""
-    return sigma * np.sqrt(errors2 / np.where(has_right, 4.0, 2.0))
+def _errors_px(errors2: Float, has_right: Bool, sigmas_px: Float) -> Float:
+    """Squared whitened errors (N,) of points with a noise (N,), as pixels in one direction."""
+    return sigmas_px * np.sqrt(errors2 / np.where(has_right, 4.0, 2.0))
 
 
 @kernel
-def _squared_errors(cur_T_ref: Float, rig: RigArrays, observations: Observations, sigma: float) -> Float:
+def _squared_errors(cur_T_ref: Float, rig: RigArrays, observations: Observations, sigmas_px: Float) -> Float:
     """Squared whitened errors (N,)."""
     motions = left_motions(cur_T_ref, rig)
     n = len(observations.pair)
     errors2 = np.empty(n)
     linearise(
-        motions, rig, observations, expand(motions, rig, observations, sigma), np.zeros(n, dtype=np.bool_), 1.0,
+        motions, rig, observations, expand(motions, rig, observations, sigmas_px), np.zeros(n, dtype=np.bool_), 1.0,
         np.empty((6, 6)), np.empty(6), errors2,
     )  # fmt: skip
     return errors2

@@ -93,7 +93,7 @@ class VisualFrontend:
             return VisualResult(None, Quality.FAILED, reason, reports, frozen=frozen.pairs, stage_ms=watch.stage_ms)
         refined = agreement.sides[0].refined
         motions = [self._motion(reference_stamp_ns, stamp_ns, side.refined) for side in agreement.sides]
-        stereo = stereo_share(reference, frames, correspondences, refined.inlier, self._baselines_m)
+        stereo = stereo_share(reference, frames, self._baselines_m)
         motion, quality, reason = graded(motions, agreement.tension, frozen.all_since_ns, stereo)
         resting = at_rest(reference, frames, correspondences, refined.inlier)
         self._drop_outliers(frames, correspondences, agreement)
