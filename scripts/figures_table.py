@@ -40,10 +40,10 @@ def row(out: Path, recording: Path, title: str, pairs: list[int], name: str, *, 
     if summary.evaluation is None:
         raise SystemExit(f"{recording}: {summary.evaluation_error}")
     path_m, drift = summary.evaluation["path_length_m"], summary.evaluation["drift_percent"]
-    ate_cm = 100 * summary.evaluation["ate_position_m"]["rmse"]
+    ate_mm = 1e3 * summary.evaluation["ate_position_m"]["rmse"]
     done = "" if summary.completion == 1.0 else f" ({100 * summary.completion:.0f} % complete)"
     print(
-        f"| {title}, {path_m:.0f} m{done} | {name} | {'yes' if with_imu else 'no'} | {ate_cm:.1f} cm "
+        f"| {title}, {path_m:.0f} m{done} | {name} | {'yes' if with_imu else 'no'} | {ate_mm:.1f} mm "
         f"| {drift:.2f} % | {summary.realtime_factor:.1f} |",
         flush=True,
     )
