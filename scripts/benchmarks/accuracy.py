@@ -24,7 +24,7 @@ CLIP = DOCS.parents[1] / "shared" / "data" / "euroc_mh01_clip"
 CLIP_NAME = "EuRoC MH_01 clip"
 CLIP_TRUTH = TruthNoise(angle_rad=3e-4, position_m=1e-3)
 """Taken for a real recording: an assumption, about right for a laser tracker fused with an IMU."""
-_DRAWN = ("corridor", "stairs", CLIP_NAME)
+_DRAWN = (("corridor", True), ("corridor", False), ("stairs", False), (CLIP_NAME, False))  # with the IMU or without
 AIM = 1.05
 """All pairs' ATE over that of the better pair alone: together they are at least as good as either."""
 _ANGLE_DEG, _SHIFT_M = 1.0, 0.03
@@ -84,7 +84,7 @@ def run_all(args: argparse.Namespace) -> None:
     if _BLIND_SCENE in recordings:
         _blind_table(report, bench, args.duration)
     picture = args.out / "trajectories.png"
-    panels = [_panel(bench, name) for name in recordings if name in _DRAWN or name == args.clip.name]
+    panels = [_panel(bench, name, imu) for name, imu in (*_DRAWN, (args.clip.name, False)) if name in recordings]
     panels = [panel for panel in panels if panel.lines]
     link = ""
     if panels:
@@ -259,10 +259,10 @@ def _blind_span(duration_s: float | None) -> tuple[float, float]:
     return begin_s, begin_s + min(_BLIND_S, _BLIND_SHARE * duration_s)
 
 
-def _panel(bench: _Bench, name: str) -> Panel:
-    runs = {bench.pair_names(name, pairs): bench.outcome(name, DEFAULT, pairs, False) for pairs in bench.choices(name)}
+def _panel(bench: _Bench, name: str, imu: bool) -> Panel:
+    runs = {bench.pair_names(name, pairs): bench.outcome(name, DEFAULT, pairs, imu) for pairs in bench.choices(name)}
     lines = {pairs: outcome for pairs, outcome in runs.items() if outcome.evaluation is not None}
-    title = f"{_length(bench, name)}: default profile, vision only"
+    title = f"{_length(bench, name)}: default profile, {'with IMU' if imu else 'vision only'}"
     return Panel(title, lines)
 
 

@@ -38,7 +38,7 @@ class Panel:
 
 
 def draw_trajectories(path: Path, panels: Sequence[Panel]) -> None:
-    """Draw x-y plans below each other, each estimate laid onto the truth at its first pose and nowhere else.
+    """Draw x-y plans below each other, each epoch laid onto the truth at its first pose and nowhere else.
 
     Raises:
         GraphvioError: if the picture cannot be written.
@@ -55,9 +55,8 @@ def draw_trajectories(path: Path, panels: Sequence[Panel]) -> None:
         axes = figure.add_axes((left, (top_in - height_in) / total_in, width, height_in / total_in))
         view.draw(axes)
         top_in -= height_in + _BOTTOM_IN
-    figure.text(
-        _LEFT_IN / _WIDTH_IN, 0.12 / total_in, "seen from above; each line begins at the true first pose", fontsize=9
-    )
+    told = "seen from above; each line begins at the true first pose, and again at the true pose after a declared break"
+    figure.text(_LEFT_IN / _WIDTH_IN, 0.12 / total_in, told, fontsize=9)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, metadata={"Software": None} if path.suffix == ".png" else None)
@@ -73,7 +72,9 @@ class _Plan:
         self._lines = {}
         for name, outcome in panel.lines.items():
             line, end_m = _from_start(outcome)
-            self._lines[f"{name}, end off {100 * end_m:.1f} cm"] = line
+            count = len(np.unique(outcome.epochs)) - 1
+            breaks = f", {count} break{'s' if count > 1 else ''}" if count else ""
+            self._lines[f"{name}{breaks}, end off {100 * end_m:.1f} cm"] = line
         first = next(iter(panel.lines.values()))
         during = (first.truth.stamps_ns >= first.estimate.stamps_ns[0]) & (
             first.truth.stamps_ns <= first.estimate.stamps_ns[-1]
@@ -130,18 +131,21 @@ class _Plan:
 
 
 def _from_start(outcome: Outcome) -> tuple[Float, float]:
-    """What is drawn when the first pose is laid onto the true one.
+    """What is drawn when the first pose of each epoch is laid onto the true one.
 
     Returns:
         Positions (N, 2) in the truth's frame, NaN between epochs; and how far the last one is from the truth, in
         space, metres.
     """
-    true_poses, known = outcome.truth.at(outcome.estimate.stamps_ns, MAX_GAP_S)
-    if not known.any():
-        return np.full((1, 2), np.nan), np.nan
-    first, last = np.flatnonzero(known)[[0, -1]]
-    world_T_nav = true_poses.nav_T_body[0] @ se3_inverse(outcome.estimate.nav_T_body[first])
-    positions = outcome.estimate.transformed(world_T_nav).positions
-    end_m = float(np.linalg.norm(positions[last] - true_poses.positions[-1]))
-    breaks = np.flatnonzero(np.diff(outcome.epochs[first:])) + 1
-    return np.asarray(np.insert(positions[first:, :2], breaks, np.nan, axis=0)), end_m
+    drawn, end_m = [], np.nan
+    for epoch in np.unique(outcome.epochs):
+        poses = outcome.estimate.select(outcome.epochs == epoch)
+        true_poses, known = outcome.truth.at(poses.stamps_ns, MAX_GAP_S)
+        if not known.any():
+            continue
+        first, last = np.flatnonzero(known)[[0, -1]]
+        world_T_nav = true_poses.nav_T_body[0] @ se3_inverse(poses.nav_T_body[first])
+        positions = poses.transformed(world_T_nav).positions
+        end_m = float(np.linalg.norm(positions[last] - true_poses.positions[-1]))
+        drawn += [positions[first:, :2], np.full((1, 2), np.nan)]
+    return np.concatenate(drawn or [np.full((1, 2), np.nan)]), end_m
