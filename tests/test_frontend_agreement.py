@@ -1,6 +1,6 @@
 """Pairs that contradict each other, points that move on their own, and what is then said of a motion."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from graphvio.frontend.agreement import Agreement, Side, _in_order, agree
 from graphvio.frontend.alignment import Misalignment
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.frontend.observations import Correspondences, Observations, RigArrays
-from graphvio.frontend.quality import StereoShare, graded, stereo_share
+from graphvio.frontend.quality import StereoShare, doubted, graded, stereo_share
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import joint_motion
 from graphvio.frontend.tracks import PairFrame
@@ -282,8 +282,14 @@ def measured(cur_T_ref: Float, inliers: int, sigma: float = 1e-4) -> RelativeMot
     return RelativeMotion(0, 50_000_000, se3_inverse(cur_T_ref), covariance, 0.3 * covariance, inliers)
 
 
+def judgement(
+    motions: Sequence[RelativeMotion], tension: float, frozen_since_ns: int | None, stereo: StereoShare
+) -> tuple[RelativeMotion, Quality, str]:
+    return graded([doubted(motion, frozen_since_ns, stereo) for motion in motions], tension)
+
+
 def test_a_good_motion_is_left_as_it_is() -> None:
-    motion, quality, reason = graded([measured(TRUTH, 200)], 5.0, None, CONFIRMED)
+    motion, quality, reason = judgement([measured(TRUTH, 200)], 5.0, None, CONFIRMED)
     assert quality is Quality.GOOD
     assert reason == ""
     assert np.array_equal(motion.covariance, measured(TRUTH, 200).covariance)
@@ -291,7 +297,7 @@ def test_a_good_motion_is_left_as_it_is() -> None:
 
 def test_the_covariance_covers_the_rival() -> None:
     """Whichever of the two motions is right, its turn and its shift are each within about a sigma."""
-    motion, quality, reason = graded([measured(TRUTH, 100), measured(DOOR, 80)], 0.0, None, CONFIRMED)
+    motion, quality, reason = judgement([measured(TRUTH, 100), measured(DOOR, 80)], 0.0, None, CONFIRMED)
     assert quality is Quality.WEAK
     assert "two motions are seen" in reason
     for right in (TRUTH, DOOR):
@@ -302,22 +308,22 @@ def test_the_covariance_covers_the_rival() -> None:
         np.ascontiguousarray(transform([0.02, -0.03, 0.06], [0.02, -0.06, 0.05]) @ motion.reference_T_current)
     )
     assert error @ np.linalg.solve(motion.covariance, error) < 6.0
-    few = graded([measured(TRUTH, 200), measured(DOOR, 12)], 0.0, None, CONFIRMED)
+    few = judgement([measured(TRUTH, 200), measured(DOOR, 12)], 0.0, None, CONFIRMED)
     assert few[1] is Quality.GOOD  # somebody far away
 
 
 def test_few_points_are_believed_less_and_less() -> None:
     sigmas = [
-        np.sqrt(np.trace(graded([measured(TRUTH, n)], 0.0, None, CONFIRMED)[0].covariance)) for n in (40, 29, 20, 12)
+        np.sqrt(np.trace(judgement([measured(TRUTH, n)], 0.0, None, CONFIRMED)[0].covariance)) for n in (40, 29, 20, 12)
     ]
     assert sigmas == sorted(sigmas)
     assert sigmas[0] < 1e-3
     assert sigmas[-1] > 0.03  # as far as a person walks in the time
-    assert graded([measured(TRUTH, 20)], 0.0, None, CONFIRMED)[1:] == (Quality.WEAK, "only 20 points")
+    assert judgement([measured(TRUTH, 20)], 0.0, None, CONFIRMED)[1:] == (Quality.WEAK, "only 20 points")
 
 
 def test_images_that_all_repeat_say_nothing_for_sure() -> None:
-    motion, quality, reason = graded([measured(STILL, 300)], 0.0, -950_000_000, CONFIRMED)
+    motion, quality, reason = judgement([measured(STILL, 300)], 0.0, -950_000_000, CONFIRMED)
     assert quality is Quality.WEAK
     assert "repeats" in reason
     assert np.sqrt(motion.covariance[3, 3]) == pytest.approx(1.0, rel=0.01)  # a metre in a second
@@ -325,16 +331,16 @@ def test_images_that_all_repeat_say_nothing_for_sure() -> None:
 
 def test_tension_and_weak_directions_are_told() -> None:
     base = np.trace(measured(TRUTH, 200).covariance)
-    assert np.trace(graded([measured(TRUTH, 200)], 36.0, None, CONFIRMED)[0].covariance) == pytest.approx(3.0 * base)
+    assert np.trace(judgement([measured(TRUTH, 200)], 36.0, None, CONFIRMED)[0].covariance) == pytest.approx(3.0 * base)
     weak = replace(measured(TRUTH, 200), covariance=np.diag([1e-8] * 5 + [0.01]))
-    assert graded([weak], 0.0, None, CONFIRMED)[1] is Quality.WEAK
+    assert judgement([weak], 0.0, None, CONFIRMED)[1] is Quality.WEAK
     random = random_transform(np.random.default_rng(0), 0.01, 0.01)
-    assert graded([measured(random, 200)], 0.0, None, CONFIRMED)[1] is Quality.GOOD
+    assert judgement([measured(random, 200)], 0.0, None, CONFIRMED)[1] is Quality.GOOD
 
 
 def test_what_the_right_images_do_not_confirm_may_be_off_by_the_baseline() -> None:
     """As it is when the cables of left and right are swapped while the rig runs."""
-    motion, quality, reason = graded([measured(TRUTH, 200)], 0.0, None, StereoShare(0.1, 0.12))
+    motion, quality, reason = judgement([measured(TRUTH, 200)], 0.0, None, StereoShare(0.1, 0.12))
     assert quality is Quality.WEAK
     assert reason == "only 10 % of the corners are found in the right images"
     sigmas = np.sqrt(np.diag(motion.covariance))
@@ -353,4 +359,4 @@ def test_the_share_that_stereo_confirms_is_that_of_all_corners() -> None:
     assert stereo_share({1: reference[1]}, current, [0.1, 0.2]).share == pytest.approx(0.08)
     assert stereo_share({**reference, 1: frame(0, 0)}, current, [0.1, 0.2]).share == pytest.approx(100 * 0.6 / 150)
     assert stereo_share({0: frame(0, 0)}, {0: frame(0, 0)}, [0.1, 0.2]).share == 0.0
-    assert graded([measured(TRUTH, 200)], 0.0, None, StereoShare(0.13, 0.12))[1] is Quality.GOOD
+    assert judgement([measured(TRUTH, 200)], 0.0, None, StereoShare(0.13, 0.12))[1] is Quality.GOOD

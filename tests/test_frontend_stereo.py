@@ -108,7 +108,9 @@ def search(left: Image, right: Image, pixels: Float, nearest_m: float = 0.5) -> 
     bounds = np.column_stack([np.zeros(len(pixels)), np.full(len(pixels), 1.0 / nearest_m)])
     least = StereoConfig().min_correlation
     images = build_pyramid(left, 2), build_pyramid(right, 2)
-    return epipolar_search(*images, pixels, rays, bounds, RECTIFIED, RADIAL_TANGENTIAL, INTRINSICS, lens, least)
+    camera = (RECTIFIED, RADIAL_TANGENTIAL, INTRINSICS, lens)
+    inverse_depths, found = epipolar_search(images[0], images[1], pixels, rays, bounds, *camera, least)
+    return epipolar_lines(rays, inverse_depths, *camera)[0], found
 
 
 def grid() -> Float:
@@ -158,11 +160,36 @@ def test_the_search_follows_the_curve_of_a_distorted_lens() -> None:
     inside = (places.min(axis=1) > 12) & (places[:, 0] < 307) & (places[:, 1] < 227)
     bounds = np.column_stack([np.zeros(len(rays)), np.full(len(rays), 2.0)])
     images = build_pyramid(left, 2), build_pyramid(right, 2)
-    matches, found = epipolar_search(*images, pixels, rays, bounds, SKEWED, RADIAL_TANGENTIAL, INTRINSICS, lens, 0.7)
+    camera = (SKEWED, RADIAL_TANGENTIAL, INTRINSICS, lens)
+    inverse_depths, found = epipolar_search(images[0], images[1], pixels, rays, bounds, *camera, 0.7)
+    matches = epipolar_lines(rays, inverse_depths, *camera)[0]
     assert inside.sum() >= 10
     assert found[inside].mean() > 0.8
     good = inside & found
     assert np.abs(matches[good] - places[good]).max() < 1.5
+
+
+def test_of_a_curve_that_leaves_the_lens_the_rest_is_searched() -> None:
+    """Half a metre away the points would be beyond the radius at which this lens folds back."""
+    left, lens = textured(), np.array([-0.9, 0.0, 0.0, 0.0, 0.0])
+    pixels = grid()[::3]
+    rays, _ = unproject_pixels(RADIAL_TANGENTIAL, INTRINSICS, np.zeros(5), pixels)
+    camera = RECTIFIED, RADIAL_TANGENTIAL, INTRINSICS, lens
+    _, _, near = epipolar_lines(rays, np.full(len(rays), 8.0), *camera)
+    _, _, far = epipolar_lines(rays, np.full(len(rays), 0.2), *camera)
+    cut = far & ~near
+    assert cut.sum() >= 5
+    places = epipolar_lines(rays, np.full(len(rays), 0.2), *camera)[0]
+    right = textured(3)
+    for (x, y), (u, v) in zip(pixels[cut].astype(int), np.round(places[cut]).astype(int), strict=True):
+        if 12 <= u < 308 and 12 <= v < 228:
+            right[v - 11 : v + 12, u - 11 : u + 12] = left[y - 11 : y + 12, x - 11 : x + 12]
+    bounds = np.column_stack([np.zeros(len(rays)), np.full(len(rays), 8.0)])
+    images = build_pyramid(left, 2), build_pyramid(right, 2)
+    inverse_depths, found = epipolar_search(images[0], images[1], pixels, rays, bounds, *camera, 0.7)
+    assert (found & cut).sum() >= 3
+    seen = epipolar_lines(rays, inverse_depths, *camera)[0]
+    assert np.median(np.abs(seen - places)[found & cut]) < 1.5
 
 
 # ------------------------------------------------------------------ epipolar lines

@@ -11,7 +11,6 @@ from waves import picture, waves
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.config import Config, CornerConfig
-from graphvio.errors import RigError
 from graphvio.frontend.grain import noise_sigma
 from graphvio.frontend.lucas_kanade import build_pyramid
 from graphvio.frontend.matching import StereoMatcher
@@ -284,12 +283,3 @@ def test_noise_is_told_from_texture() -> None:
         assert noise_sigma(smooth) == pytest.approx(sigma, rel=0.5)
     assert noise_sigma(flat.astype(np.uint8)) == pytest.approx(1.0 / np.sqrt(12.0))  # rounding is noise
     assert noise_sigma(np.zeros((HEIGHT, WIDTH), dtype=np.uint8)) > 0.0
-
-
-def test_images_must_fit_the_rig() -> None:
-    tracker = PairTracker(rectified(), Config())
-    image = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
-    wrongs: list[AnyArray] = [image[:-1], image.astype(np.float64), np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)]
-    for wrong in wrongs:
-        with pytest.raises(RigError, match="the rig says"):
-            tracker.observe(0, image, wrong, None, None)

@@ -6,9 +6,10 @@ is then a compromise that is right for nobody: each side's own motion is kept ap
 side comes first, as in eq. (4).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -100,19 +101,9 @@ def agree(
     elif everyone:
         joint = placed(joint, misaligned.get(everyone[0]))
     opinions = {j: placed(motion, misaligned.get(j)) for j, motion in own.items()}
-    limit = _BEYOND_2_SIGMA if in_doubt else _BEYOND_5_SIGMA
-    camps: list[list[int]] = []
-    tension = farthest = 0.0
-    for j in sorted(own, key=lambda j: -int(own[j].inlier.sum())):
-        for camp in camps:
-            distance = disagreement(opinions[camp[0]], opinions[j])
-            farthest = max(farthest, distance)
-            if distance < limit:
-                camp.append(j)
-                tension = max(tension, distance)
-                break
-        else:
-            camps.append([j])
+    apart = {(i, j): disagreement(opinions[i], opinions[j]) for i, j in combinations(sorted(opinions), 2)}
+    camps = _camps(sorted(own, key=lambda j: -int(own[j].inlier.sum())), apart, in_doubt)
+    tension = max((apart[pair] for camp in camps for pair in combinations(sorted(camp), 2)), default=0.0)
     if len(camps) > 1:
         sides = _in_order([_side(rig, observations, sorted(camp), own, opinions, misaligned, config) for camp in camps])
     else:
@@ -122,7 +113,21 @@ def agree(
     second = _second_motion(rig, observations, sides, config, rng)
     if second is not None:
         sides = [second, *sides] if second.support > max(side.support for side in sides) else [*sides, second]
-    return Agreement(tuple(sides), own, tension, farthest >= _BEYOND_5_SIGMA)
+    return Agreement(tuple(sides), own, tension, max(apart.values(), default=0.0) >= _BEYOND_5_SIGMA)
+
+
+def _camps(pairs: Sequence[int], apart: Mapping[tuple[int, int], float], in_doubt: bool) -> list[list[int]]:
+    """Pairs, the best supported first, gathered so that within a camp each agrees with every other."""
+    limit = _BEYOND_2_SIGMA if in_doubt else _BEYOND_5_SIGMA
+    camps: list[list[int]] = []
+    for j in pairs:
+        for camp in camps:
+            if all(apart[min(i, j), max(i, j)] < limit for i in camp):
+                camp.append(j)
+                break
+        else:
+            camps.append([j])
+    return camps
 
 
 def _in_order(sides: list[Side]) -> list[Side]:

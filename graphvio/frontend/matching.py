@@ -102,15 +102,16 @@ class StereoMatcher:
         nearest = 1.0 / settings.min_depth_m
         expected = np.where(known, np.minimum(np.maximum(inverse_depths, 0.0), nearest), 0.0)
         camera = (pair.right_T_left, pair.right.model_number, pair.right.intrinsics, pair.right.distortion)
-        guess, directions, usable = epipolar_lines(rays, expected, *camera)
         unknown = np.flatnonzero(~known)
+        seen = np.ones(len(pixels), dtype=bool)
         if len(unknown):
             bounds = np.zeros((len(unknown), 2))
             bounds[:, 1] = nearest
-            guess[unknown], usable[unknown] = epipolar_search(
+            expected[unknown], seen[unknown] = epipolar_search(
                 left[:2], right[:2], pixels[unknown], rays[unknown], bounds, *camera, _SEARCH_CORRELATION
             )
-        found = passes(np.ones(len(pixels), dtype=bool), usable, "search", rejected)
+        guess, directions, in_reach = epipolar_lines(rays, expected, *camera)
+        found = passes(np.ones(len(pixels), dtype=bool), seen & in_reach, "search", rejected)
         half = tracking.window_px // 2
         pack(right[0], self._packed_right)
         matched, slopes, correlations, converged = align_slanted(

@@ -1,4 +1,4 @@
-"""How far a measured motion can be trusted, and standing still."""
+"""How far a measured motion can be trusted."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float
+from graphvio.arrays import Bool
 from graphvio.events import Quality
 from graphvio.frontend.motion import RelativeMotion
-from graphvio.frontend.observations import Correspondences
 from graphvio.frontend.tracks import PairFrame
 from graphvio.geometry import se3_inverse, se3_log
 
@@ -22,8 +21,6 @@ _CONFIRMED = 0.12  # share of the corners that the right images must show, too; 
 _WEAK_ROTATION_RAD = 0.02
 _WEAK_TRANSLATION_M = 0.05
 _POSSIBLE_SPEEDS = np.repeat([0.5, 1.0], 3)  # rad/s and m/s that a rig may have where images say next to nothing
-_REST_MEDIAN_PX = 0.15
-_REST_MOST_PX = 0.5
 
 
 class StereoShare(NamedTuple):
@@ -53,62 +50,61 @@ def _share(found: Bool) -> float:
     return float(found.mean()) if len(found) else 0.0
 
 
-def graded(
-    motions: Sequence[RelativeMotion], tension: float, frozen_since_ns: int | None, stereo: StereoShare
-) -> tuple[RelativeMotion, Quality, str]:
-    """The first motion, with a covariance that allows for what speaks against it, its quality, and why.
+class Doubted(NamedTuple):
+    """What one side says of the rig's motion.
+
+    Attributes:
+        motion: with a covariance that allows for what speaks against it.
+        reasons: what that is, in words.
+    """
+
+    motion: RelativeMotion
+    reasons: list[str]
+
+
+def doubted(motion: RelativeMotion, frozen_since_ns: int | None, stereo: StereoShare) -> Doubted:
+    """Allow for few points, images that repeat, and right images that do not confirm the left ones.
 
     Args:
-        motions: of each side, as `graphvio.frontend.agreement.Agreement` has them in order.
-        tension: squared Mahalanobis distance between pairs that are thought to agree.
+        motion: of one side, see `graphvio.frontend.agreement`.
         frozen_since_ns: stamp since which all images are the same, or None.
         stereo: how far the right images confirm what the left ones see.
     """
-    best = motions[0]
-    covariance, reasons = best.covariance * max(1.0, tension / _USUAL_TENSION), []
-    for rival in motions[1:]:
+    covariance, reasons = motion.covariance, []
+    if motion.inliers < _FEW_POINTS:
+        lacking = (_FEW_POINTS - motion.inliers) / _FEW_POINTS
+        covariance = covariance + np.diag((2.0 * lacking * _POSSIBLE_SPEEDS * motion.duration_s) ** 2)
+        reasons.append(f"only {motion.inliers} points")
+    if stereo.share < _CONFIRMED:
+        # Cables that are swapped move a view by the baseline; what little is matched then may repeat by chance.
+        sigmas = _POSSIBLE_SPEEDS * motion.duration_s + np.repeat([0.0, stereo.baseline_m], 3)
+        covariance = covariance + np.diag(sigmas**2)
+        reasons.append(f"only {100 * stereo.share:.0f} % of the corners are found in the right images")
+    if frozen_since_ns is not None:
+        elapsed_s = (motion.stamp_ns - frozen_since_ns) * 1e-9
+        covariance = covariance + np.diag((_POSSIBLE_SPEEDS * elapsed_s) ** 2)
+        reasons.append("every image repeats the one before")
+    return Doubted(replace(motion, covariance=covariance), reasons)
+
+
+def graded(sides: Sequence[Doubted], tension: float) -> tuple[RelativeMotion, Quality, str]:
+    """The first side's motion, with a covariance that covers the others, its quality, and why.
+
+    Args:
+        sides: in the order of `graphvio.frontend.agreement.Agreement`.
+        tension: squared Mahalanobis distance between pairs that are thought to agree.
+    """
+    best, reasons = sides[0].motion, list(sides[0].reasons)
+    covariance = best.covariance * max(1.0, tension / _USUAL_TENSION)
+    for rival, _ in sides[1:]:
         if rival.inliers >= _RIVAL_SHARE * best.inliers:
             apart = se3_log(se3_inverse(best.reference_T_current) @ rival.reference_T_current)
             angle, distance = np.linalg.norm(apart[:3]), np.linalg.norm(apart[3:])
             # In all directions: what fills one view may fill part of the other, and then neither is right.
             covariance = covariance + rival.covariance + np.diag(np.repeat([angle, distance], 3) ** 2)
             reasons.append(f"two motions are seen, {distance:.3f} m and {np.rad2deg(angle):.2f} deg apart")
-    if best.inliers < _FEW_POINTS:
-        lacking = (_FEW_POINTS - best.inliers) / _FEW_POINTS
-        covariance = covariance + np.diag((2.0 * lacking * _POSSIBLE_SPEEDS * best.duration_s) ** 2)
-        reasons.append(f"only {best.inliers} points")
-    if stereo.share < _CONFIRMED:
-        # Cables that are swapped move a view by the baseline; what little is matched then may repeat by chance.
-        sigmas = _POSSIBLE_SPEEDS * best.duration_s + np.repeat([0.0, stereo.baseline_m], 3)
-        covariance = covariance + np.diag(sigmas**2)
-        reasons.append(f"only {100 * stereo.share:.0f} % of the corners are found in the right images")
     sigmas = np.sqrt([np.linalg.eigvalsh(covariance[block, block])[-1] for block in (slice(0, 3), slice(3, 6))])
-    if frozen_since_ns is not None:
-        elapsed_s = (best.stamp_ns - frozen_since_ns) * 1e-9
-        covariance = covariance + np.diag((_POSSIBLE_SPEEDS * elapsed_s) ** 2)
-        reasons.append("every image repeats the one before")
-    elif not reasons and (sigmas[0] > _WEAK_ROTATION_RAD or sigmas[1] > _WEAK_TRANSLATION_M):
+    if not reasons and (sigmas[0] > _WEAK_ROTATION_RAD or sigmas[1] > _WEAK_TRANSLATION_M):
         reasons.append(f"hardly constrained: {sigmas[0]:.4f} rad, {sigmas[1]:.3f} m")
     quality = Quality.WEAK if reasons else Quality.GOOD
     return replace(best, covariance=covariance), quality, "; ".join(reasons)
-
-
-def at_rest(
-    reference: Mapping[int, PairFrame],
-    current: Mapping[int, PairFrame],
-    correspondences: Correspondences,
-    inlier: Bool,
-) -> bool:
-    """Whether no right point (of N) has moved in the left images since the reference."""
-    moved: list[Float] = []
-    for j, rows in correspondences.rows.items():
-        rows = rows[inlier[correspondences.observations.pair == j]]
-        at_reference = np.searchsorted(reference[j].ids, current[j].ids[rows])
-        shift = current[j].pixels[rows] - reference[j].pixels[at_reference]
-        moved.append(np.hypot(shift[:, 0], shift[:, 1]))
-        if len(rows) and np.median(moved[-1]) > _REST_MOST_PX:
-            return False  # as nearly always: no need to look at the other pairs
-    distance = np.concatenate(moved)
-    if len(distance) < _FEW_POINTS:
-        return False
-    return bool(np.median(distance) < _REST_MEDIAN_PX and np.quantile(distance, 0.9) < _REST_MOST_PX)

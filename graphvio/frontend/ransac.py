@@ -37,9 +37,11 @@ def search(
         )
         drawn += batch
         shares = _explained_shares(best, rig, observations, 2.0 * config.cauchy_scale_px)
+        shares = shares[[pair for pair, motions in zip(pairs, found, strict=True) if len(motions)]]
         with np.errstate(divide="ignore", invalid="ignore"):
-            needed = np.log1p(-min(config.confidence, 1.0 - 1e-12)) / np.log1p(-(shares[pairs] ** 3))
-        if len(pairs) == 0 or drawn >= np.max(np.where(shares[pairs] < 1.0, needed, 0.0)):
+            needed = np.log1p(-min(config.confidence, 1.0 - 1e-12)) / np.log1p(-(shares**3))
+        # One pair's right triple is enough: a pair that something stands in front of may have none.
+        if drawn >= np.min(np.where(shares < 1.0, needed, 0.0), initial=config.hypotheses):
             break
     return best
 

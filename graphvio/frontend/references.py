@@ -38,13 +38,23 @@ class References:
         """Forget all."""
         self._frames.clear()
 
+    def forget(self, pair: int) -> None:
+        """Forget a pair's reference."""
+        self._frames.pop(pair, None)
+
     def shared(self, frames: Mapping[int, PairFrame]) -> dict[int, PairFrame]:
-        """Reference frames of one instant: where pairs were keyed at different times, the larger group counts."""
+        """Reference frames of one instant: of several, those with most tracks in view."""
         groups: dict[int, dict[int, PairFrame]] = {}
         for j in frames:
             if j in self._frames:
                 groups.setdefault(self._frames[j].stamp_ns, {})[j] = self._frames[j]
-        return max(groups.values(), key=len, default={})
+        if len(groups) < 2:
+            return next(iter(groups.values()), {})
+
+        def in_view(stamp_ns: int) -> int:
+            return sum(np.isin(frame.ids, frames[j].ids).sum() for j, frame in groups[stamp_ns].items())
+
+        return groups[max(groups, key=lambda stamp_ns: (in_view(stamp_ns), stamp_ns))]
 
     def are_spent(
         self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined, contradicted: bool

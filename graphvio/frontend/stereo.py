@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
-from graphvio.cameras import distort
+from graphvio.cameras import distort, fold_radius
 from graphvio.kernels import fast_kernel, kernel
 
 _HALF_PATCH = 5
@@ -19,6 +19,10 @@ _MOST_STEPS = 400
 _FINE_STEPS = 2  # of the half-sized image, to either side
 _AMBIGUOUS = 0.97
 _GAUSS_NEWTON_STEPS = 4
+_HALVINGS = 6
+
+_Camera = tuple[Float, int, Float, Float, float]
+"""right_T_left; model, intrinsics and distortion of the right camera; and how far its model reaches."""
 
 
 @kernel
@@ -34,7 +38,7 @@ def epipolar_search(
     distortion: Float,
     min_correlation: float,
 ) -> tuple[Float, Bool]:
-    """The best place of each corner on its epipolar curve in the right image, to the pixel.
+    """The inverse depth at which each corner is seen best on its epipolar curve in the right image, to the pixel.
 
     The curve is searched in images of half the size; the whole image then decides around the best place there.
 
@@ -43,24 +47,26 @@ def epipolar_search(
         right: image (height, width), and the same in half the size.
         pixels: (N, 2) corners in the left image.
         rays: (N, 2) their normalised coordinates.
-        inverse_depths: (N, 2) range that is searched, 1/m.
+        inverse_depths: (N, 2) range that is searched, 1/m; near ends that the right camera's lens does not reach are
+            left out.
         right_T_left: (4, 4).
         model: of the right camera, with its ``intrinsics`` (4,) and ``distortion`` (5,).
         min_correlation: least normalised cross-correlation.
 
     Returns:
-        Pixels (N, 2) in the right image, and whether there is one clear best place (N,).
+        Inverse depths (N,), 1/m, and whether there is one clear best place (N,).
     """
     n = len(pixels)
-    matches = np.zeros((n, 2))
+    depths = np.zeros(n)
     found = np.zeros(n, dtype=np.bool_)
     coarse, fine = _square(_HALF_COARSE_PATCH), _square(_HALF_PATCH)
     scores = np.empty(_MOST_STEPS + 1)
-    camera = (right_T_left, model, intrinsics, distortion)
+    camera = (right_T_left, model, intrinsics, distortion, fold_radius(model, distortion))
     for i in range(n):
         x, y, w0, w1 = pixels[i, 0], pixels[i, 1], inverse_depths[i, 0], inverse_depths[i, 1]
         if not (_normalised_patch(left[1], 0.5 * x, 0.5 * y, coarse) and _normalised_patch(left[0], x, y, fine)):
             continue
+        w1 = _nearest_in_reach(rays[i], w0, w1, camera)
         best, steps = _scan(right[1], 0.5, coarse, rays[i], w0, w1, camera, scores)
         if steps == 0 or scores[best] < min_correlation or _is_ambiguous(scores[: steps + 1], best):
             continue
@@ -69,15 +75,23 @@ def epipolar_search(
         best, steps = _scan(right[0], 1.0, fine, rays[i], w0, w1, camera, scores)
         if steps == 0 or scores[best] < min_correlation:
             continue
-        w = w0 + (w1 - w0) * best / steps
-        matches[i, 0], matches[i, 1], found[i] = _on_curve(rays[i], w, right_T_left, model, intrinsics, distortion)
-    return matches, found
+        depths[i], found[i] = w0 + (w1 - w0) * best / steps, True
+    return depths, found
+
+
+@kernel
+def _nearest_in_reach(ray: Float, w0: float, w1: float, camera: _Camera) -> float:
+    """The largest inverse depth up to ``w1`` at which the right camera's model holds, about."""
+    for _ in range(_HALVINGS):
+        if _on_curve(ray, w1, camera)[2]:
+            break
+        w1 = 0.5 * (w0 + w1)
+    return w1
 
 
 @kernel
 def _scan(
-    image: Image, scale: float, patch: AnyArray, ray: Float, w0: float, w1: float,
-    camera: tuple[Float, int, Float, Float], scores: Float,
+    image: Image, scale: float, patch: AnyArray, ray: Float, w0: float, w1: float, camera: _Camera, scores: Float,
 ) -> tuple[int, int]:  # fmt: skip
     """Fill a patch's correlations along its epipolar curve, a pixel apart, in an image of so many times the size.
 
@@ -86,16 +100,15 @@ def _scan(
     """
     height, width = image.shape
     half = len(patch) // 2
-    right_T_left, model, intrinsics, distortion = camera
-    u0, v0, ok0 = _on_curve(ray, w0, right_T_left, model, intrinsics, distortion)
-    u1, v1, ok1 = _on_curve(ray, w1, right_T_left, model, intrinsics, distortion)
+    u0, v0, ok0 = _on_curve(ray, w0, camera)
+    u1, v1, ok1 = _on_curve(ray, w1, camera)
     if not (ok0 and ok1):
         return 0, 0
     steps = min(max(int(scale * np.hypot(u1 - u0, v1 - v0)) + 1, 2), _MOST_STEPS)
     best = 0
     for k in range(steps + 1):
         scores[k] = -1.0
-        u, v, ok = _on_curve(ray, w0 + (w1 - w0) * k / steps, right_T_left, model, intrinsics, distortion)
+        u, v, ok = _on_curve(ray, w0 + (w1 - w0) * k / steps, camera)
         x, y = round(scale * u), round(scale * v)
         if not ok or x < half or y < half or x >= width - half or y >= height - half:
             continue
@@ -125,10 +138,11 @@ def epipolar_lines(
     """
     n = len(rays)
     pixels, directions, valid = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n, dtype=np.bool_)
+    camera = (right_T_left, model, intrinsics, distortion, fold_radius(model, distortion))
     for i in range(n):
         w = inverse_depths[i]
-        u, v, ok = _on_curve(rays[i], w, right_T_left, model, intrinsics, distortion)
-        u1, v1, ok1 = _on_curve(rays[i], w + 0.01, right_T_left, model, intrinsics, distortion)
+        u, v, ok = _on_curve(rays[i], w, camera)
+        u1, v1, ok1 = _on_curve(rays[i], w + 0.01, camera)
         length = np.hypot(u1 - u, v1 - v)
         if ok and ok1 and length > 1e-9:
             pixels[i, 0], pixels[i, 1] = u, v
@@ -210,16 +224,15 @@ def _invert_symmetric(xx: float, xy: float, xz: float, yy: float, yz: float, zz:
 
 
 @kernel
-def _on_curve(
-    ray: Float, w: float, right_T_left: Float, model: int, intrinsics: Float, distortion: Float
-) -> tuple[float, float, bool]:
-    r = right_T_left
+def _on_curve(ray: Float, w: float, camera: _Camera) -> tuple[float, float, bool]:
+    """Pixel of a ray's point of some inverse depth in the right image, and whether the camera's model reaches it."""
+    r, model, intrinsics, distortion, limit = camera
     z = r[2, 0] * ray[0] + r[2, 1] * ray[1] + r[2, 2] + w * r[2, 3]
     if z < 1e-3:
         return 0.0, 0.0, False
     x = (r[0, 0] * ray[0] + r[0, 1] * ray[1] + r[0, 2] + w * r[0, 3]) / z
     y = (r[1, 0] * ray[0] + r[1, 1] * ray[1] + r[1, 2] + w * r[1, 3]) / z
-    if x * x + y * y > 9.0:
+    if x * x + y * y >= limit * limit:
         return 0.0, 0.0, False
     xd, yd, _, _, _, _ = distort(model, distortion, x, y)
     return intrinsics[0] * xd + intrinsics[2], intrinsics[1] * yd + intrinsics[3], True

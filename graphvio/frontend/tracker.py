@@ -53,15 +53,11 @@ class PairTracker:
 
         Args:
             stamp_ns: of these images.
-            left: (height, width).
-            right: (height, width).
+            left: (height, width), contiguous, of the size that the rig says.
+            right: likewise.
             left_T_left_prev: (4, 4) predicted motion of points since the images before, or None if unknown.
             left_T_left_anchor: (4, 4) the same since the anchor, or None.
-
-        Raises:
-            RigError: if an image is not what the rig says.
         """
-        left, right = _checked(left, self._pair.left), _checked(right, self._pair.right)
         watch = Stopwatch()
         before, levels = self._left, max(self._config.tracking.levels, 2)
         self._left, self._right = build_pyramid(left, levels), build_pyramid(right, 2)
@@ -219,17 +215,6 @@ class PairTracker:
         tracked, settled = np.concatenate([tracked, new]), np.concatenate([settled, np.ones(len(new), dtype=bool)])
         weak = find_corners(image, self._allowed, tracked, settled, cell_px, border_px, admitted)
         return np.concatenate([new, weak])
-
-
-def _checked(image: Image, camera: Camera) -> Image:
-    """The image, contiguous; the kernels trust its type and size."""
-    width, height = camera.size_px
-    if image.dtype != np.uint8 or image.shape != (height, width):
-        raise RigError(
-            f"camera {camera.name}: image has shape {image.shape} and type {image.dtype}; the rig says grey, "
-            f"({height}, {width}), uint8"
-        )
-    return np.ascontiguousarray(image)
 
 
 def _allowed(camera: Camera) -> Bool:

@@ -9,18 +9,20 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from graphvio.arrays import Bool, Float
+from graphvio.arrays import Bool, Float, Int
 from graphvio.config import Config
 from graphvio.events import FrameSet, PairReport, Quality
 from graphvio.frontend.agreement import Agreement, Side, agree, is_supported
 from graphvio.frontend.alignment import Misalignment, PairAlignment
 from graphvio.frontend.frozen import FrozenImages
+from graphvio.frontend.images import checked
 from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.frontend.observations import Correspondences, RigArrays, correspond
-from graphvio.frontend.quality import at_rest, graded, stereo_share
+from graphvio.frontend.quality import doubted, graded, stereo_share
 from graphvio.frontend.references import References
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import best_pair_motion, joint_motion
+from graphvio.frontend.standstill import Standstill
 from graphvio.frontend.stopwatch import Stopwatch
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import PairFrame
@@ -31,6 +33,7 @@ MotionPredictor = Callable[[int], Float | None]
 """Takes an earlier stamp and returns the predicted ``cur_T_then`` (4, 4) of body, or None if unknown."""
 
 _DOUBT_NS = 1_000_000_000
+_ABSENT_NS = 1_000_000_000  # after such an absence a pair starts anew
 
 
 class VisualFrontend:
@@ -45,6 +48,8 @@ class VisualFrontend:
         self._frozen = FrozenImages()
         self._latest: dict[int, PairFrame] = {}
         self._references = References(config.motion)
+        self._standstill = Standstill()
+        self._all_frozen = False
         self._alignments = {j: PairAlignment() for j in range(1, len(rig.pairs))}
         self._contradicted_ns: int | None = None  # when the pairs last were beyond 5 sigma of each other
         self._workers = ThreadPoolExecutor(len(rig.pairs), thread_name_prefix="graphvio-pair")
@@ -67,10 +72,15 @@ class VisualFrontend:
         Args:
             frameset: images of any subset of pairs.
             predict: the back-end's prediction, which starts the search.
+
+        Raises:
+            RigError: if an image is not what the rig says; nothing has changed then.
         """
         watch = Stopwatch()
+        frameset = checked(frameset, self._rig)
         stamp_ns = frameset.stamp_ns
         frozen = self._frozen.look(frameset)
+        self._all_frozen = frozen.all_since_ns is not None
         frames = self._observe(frameset, frozen.pairs, predict)
         watch.lap("track")
         for stage in ("pyramid", "register", "flow", "stereo"):
@@ -79,7 +89,7 @@ class VisualFrontend:
         if not reference:
             reports = {j: _report(frame) for j, frame in self._refer_to(frames).items()}
             watch.lap("renew")
-            reason = "first images" if frames else frozen.reason
+            reason = frozen.reason if self._all_frozen or not frames else "first images"
             return VisualResult(None, Quality.FAILED, reason, reports, frozen=frozen.pairs, stage_ms=watch.stage_ms)
         reference_stamp_ns = next(iter(reference.values())).stamp_ns
         correspondences = correspond(reference, frames)
@@ -92,10 +102,13 @@ class VisualFrontend:
             watch.lap("renew")
             return VisualResult(None, Quality.FAILED, reason, reports, frozen=frozen.pairs, stage_ms=watch.stage_ms)
         refined = agreement.sides[0].refined
-        motions = [self._motion(reference_stamp_ns, stamp_ns, side.refined) for side in agreement.sides]
         stereo = stereo_share(reference, frames, self._baselines_m)
-        motion, quality, reason = graded(motions, agreement.tension, frozen.all_since_ns, stereo)
-        resting = at_rest(reference, frames, correspondences, refined.inlier)
+        sides = [
+            doubted(self._motion(reference_stamp_ns, stamp_ns, side.refined), frozen.all_since_ns, stereo)
+            for side in agreement.sides
+        ]
+        motion, quality, reason = graded(sides, agreement.tension)
+        resting = self._standstill.look(frames, _explained(frames, correspondences, refined))
         self._drop_outliers(frames, correspondences, agreement)
         watch.lap("judge")
         if self._references.are_spent(frames, correspondences, refined, len(agreement.sides) > 1):
@@ -107,7 +120,7 @@ class VisualFrontend:
             quality,
             reason,
             reports,
-            alternatives=tuple(motions) if len(motions) > 1 else (),
+            alternatives=tuple(side.motion for side in sides) if len(sides) > 1 else (),
             at_rest=resting,
             frozen=frozen.pairs,
             stage_ms=watch.stage_ms,
@@ -115,10 +128,10 @@ class VisualFrontend:
 
     def rekey(self) -> None:
         """Measure the next motions from the newest frames."""
+        self._references.clear()
         if not self._latest:
             return  # no image has come yet
         newest_ns = max(frame.stamp_ns for frame in self._latest.values())
-        self._references.clear()
         self._refer_to({j: frame for j, frame in self._latest.items() if frame.stamp_ns == newest_ns})
 
     def close(self) -> None:
@@ -126,6 +139,10 @@ class VisualFrontend:
         self._workers.shutdown()
 
     def _observe(self, frameset: FrameSet, left_out: frozenset[int], predict: MotionPredictor) -> dict[int, PairFrame]:
+        for j in [j for j, frame in self._latest.items() if frameset.stamp_ns - frame.stamp_ns > _ABSENT_NS]:
+            del self._latest[j]
+            self._references.forget(j)
+
         def observe(j: int) -> PairFrame:
             left, right = frameset.images[j]
             since_latest = self._predicted(j, self._latest.get(j), predict)
@@ -152,7 +169,12 @@ class VisualFrontend:
         return np.asarray(se3_inverse(body_T_left) @ cur_T_then @ body_T_left)
 
     def _refer_to(self, frames: Mapping[int, PairFrame]) -> dict[int, PairFrame]:
-        """Measure the next motions from these frames, the newest of their pairs, with new corners beside the tracks."""
+        """Measure the next motions from these frames, the newest of their pairs, with new corners beside the tracks.
+
+        Images that all repeat are of an earlier instant than their stamp: nothing is measured from them.
+        """
+        if self._all_frozen:
+            return dict(frames)
         renewed = self._side_by_side(lambda j: self._trackers[j].renew(), frames)
         self._latest.update(renewed)
         self._references.replace(renewed)
@@ -229,6 +251,12 @@ class VisualFrontend:
             if misalignment is not None and misalignment.is_significant:
                 alignment.in_force = misalignment
                 self._arrays = self._arrays.corrected(RigArrays.of(self._rig), j, alignment.correction)
+
+
+def _explained(frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined) -> dict[int, Int]:
+    """Pair -> identities of the points that a motion explains."""
+    pair = correspondences.observations.pair
+    return {j: frames[j].ids[rows[refined.inlier[pair == j]]] for j, rows in correspondences.rows.items()}
 
 
 def _inliers_of(pair: int, correspondences: Correspondences, agreement: Agreement) -> Bool:
