@@ -120,44 +120,44 @@ class Belief:
         else:
             self._running.extend(stamp_ns, span)
 
-    def use(self, visual: VisualResult) -> bool:
+    def use(self, visual: VisualResult) -> RelativeMotion | None:
         """Gate a measured motion and insert it; a gate that refuses for too long is itself at fault.
 
         Returns:
-            Whether vision constrains the newest state.
+            The motion by which vision constrains the newest state, or None.
         """
         smoother, motion = self._running, visual.motion
         if motion is None:
-            return False
+            return None
         if not smoother.knows(motion.reference_stamp_ns):  # it started anew since then
             self._rekey()
-            return False
+            return None
         if self._lost and motion.reference_stamp_ns > self._tracked_ns:  # not from a state that was known
             self._recover(motion)
-            return True
+            return motion
         try:
             motion, verdict = self._judge(visual)
         except WindowError:
-            return False  # `update` meets the same error, and rebuilds
+            return None  # `update` meets the same error, and rebuilds
         if verdict.accepted:
             smoother.accept(motion)
             self._refused.clear()
             self._lost = False
-            return True
+            return motion
         self._report(
             motion.stamp_ns,
             "vision_gated",
             f"innovation {verdict.statistic:.1f} beyond chi-square {verdict.threshold:.1f}, {motion.inliers} inliers",
         )
         if visual.quality is not Quality.GOOD:
-            return False  # vision that contradicts itself cannot put the prediction in the wrong
+            return None  # vision that contradicts itself cannot put the prediction in the wrong
         reference_ns = motion.reference_stamp_ns
         nav_T_reference = self._refused[reference_ns] if reference_ns in self._refused else smoother.pose(reference_ns)
         self._refused[motion.stamp_ns] = nav_T_reference @ motion.reference_T_current
         if motion.stamp_ns - min(self._refused) > self._config.smoother.max_gated_s * 1e9:
             self._believe_vision(motion)
-            return True
-        return False
+            return motion
+        return None
 
     def update(self, stamp_ns: int, used: bool, keep: frozenset[int]) -> Status:
         """Optimise and marginalise; a window without a solution is rebuilt around the prediction.

@@ -105,7 +105,7 @@ class Odometry:
         measured = perf_counter()
         if not starting:
             self._tell_of_vision(stamp_ns, visual)
-        used = self._belief.use(visual)
+        used = self._belief.use(visual) is not None
         status = self._belief.update(stamp_ns, used or starting, self._frontend.reference_stamps_ns)
         self._synchroniser.forget_before(stamp_ns)
         stage_ms = {

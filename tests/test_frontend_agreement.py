@@ -12,7 +12,7 @@ from synthetic import random_transform, seen_points, transform, two_pair_rig
 from graphvio.arrays import AnyArray, Float
 from graphvio.config import Config, MotionConfig
 from graphvio.events import Quality
-from graphvio.frontend.agreement import Agreement, Side, _in_order, agree
+from graphvio.frontend.agreement import Agreement, Side, _camps, _in_order, agree
 from graphvio.frontend.alignment import Misalignment
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.frontend.observations import Correspondences, Observations, RigArrays
@@ -102,6 +102,15 @@ def test_pairs_that_contradicted_each_other_need_less_to_be_told_apart() -> None
     assert not doubtful.contradicts  # or doubt would feed itself
     assert judged(mixed((TRUTH, 80), (DOOR, 80)), in_doubt=True).contradicts
     assert len(judged(mixed((TRUTH, 80), (TRUTH, 80)), in_doubt=True).sides) == 1
+
+
+def test_in_a_camp_each_pair_agrees_with_every_other() -> None:
+    apart = {(0, 1): 30.0, (0, 2): 100.0, (1, 2): 30.0}  # a chain: the middle one agrees with both ends
+    assert _camps([1, 0, 2], apart, in_doubt=False) == [[1, 0], [2]]
+    assert _camps([2, 1, 0], apart, in_doubt=False) == [[2, 1], [0]]
+    assert _camps([0, 1, 2], apart, in_doubt=True) == [[0], [1], [2]]
+    assert _camps([0, 1, 2], dict.fromkeys(apart, 10.0), in_doubt=True) == [[0, 1, 2]]
+    assert _camps([], {}, in_doubt=False) == []
 
 
 def test_doubt_lasts_a_second() -> None:

@@ -1,5 +1,6 @@
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from graphvio.config import MotionConfig
 from graphvio.frontend.cost import left_motions, robust_cost
 from graphvio.frontend.noise import noise_by_pair
 from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.frontend.ransac import hypothesise, preempt
+from graphvio.frontend.ransac import hypothesise, preempt, search
 from graphvio.frontend.refinement import explained, refine
 from graphvio.frontend.selection import best_pair_motion, global_cost, joint_motion
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
@@ -123,6 +124,26 @@ def test_no_hypotheses_without_three_near_points() -> None:
     far = far._replace(points=far.points * [1.0, 1.0, 1e-4])
     assert hypothesise(ARRAYS, far, 0, 10, 0.3, seed()).shape == (0, 4, 4)
     assert np.array_equal(preempt(ARRAYS, far, TRUTH[None], 100, 1.5, seed()), TRUTH)
+
+
+def test_a_pair_that_something_stands_in_front_of_draws_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One pair's right triple is enough."""
+    drawn: list[int] = []
+
+    def counted(*arguments: Any) -> Float:
+        drawn.append(arguments[3])
+        return hypothesise(*arguments)
+
+    monkeypatch.setattr("graphvio.frontend.ransac.hypothesise", counted)
+    sound = seen_points(RIG, TRUTH, 60, seed(3), sigma_px=0.3)
+    blocked = seen_points(RIG, TRUTH, 60, seed(4), sigma_px=0.3, outlier_share=1.0)
+    seen = Observations(*(np.concatenate([a, b]) for a, b in zip(sound.of_pair(0), blocked.of_pair(1), strict=True)))
+    best = search(ARRAYS, seen, STILL, CONFIG, seed())
+    assert sum(drawn) <= 48  # of 1000
+    assert np.abs(best - TRUTH).max() < 0.02
+    drawn.clear()
+    search(ARRAYS, blocked, STILL, CONFIG, seed())
+    assert sum(drawn) == 1000
 
 
 @pytest.mark.parametrize("chunk_points", [1, 10, 1000])

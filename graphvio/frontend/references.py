@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -81,9 +81,28 @@ class References:
         support, offered = int(refined.inlier.sum()), sum(correspondences.offered[j] for j in explained)
         if support < overlap * offered or support < _FEWEST_POINTS:
             return True
+        if self._share_of_near_points(frames, correspondences, refined, explained) < 0.5 * overlap:
+            return True
         # One pair's keyframe may be spent long before all points together are few.
         for j, frame in frames.items():
             usable = refined.inlier[pair == j] if j in explained else pair == j
             if usable.sum() < 0.5 * overlap * frame.has_depth.sum():
                 return True
         return False
+
+    def _share_of_near_points(
+        self,
+        frames: Mapping[int, PairFrame],
+        correspondences: Correspondences,
+        refined: Refined,
+        pairs: Collection[int],
+    ) -> float:
+        """Share of the references' near points that are still explained: far ones stay in view for long, but tell no
+        translation."""
+        pair, offered, still = correspondences.observations.pair, 0, 0
+        for j in pairs:
+            near = self._frames[j].tells_translation(self._config.pixel_sigma_px)
+            ids = frames[j].ids[correspondences.rows[j][refined.inlier[pair == j]]]
+            offered += int(near.sum())
+            still += int(near[np.searchsorted(self._frames[j].ids, ids)].sum())
+        return still / offered if offered else 1.0

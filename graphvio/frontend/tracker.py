@@ -206,7 +206,7 @@ class PairTracker:
     def _new_corners(self, frame: PairFrame) -> Float:
         """Corners (M, 2) where no track of a frame gives geometry, weak ones too where there are few."""
         settings, image = self._config.corners, self._left[0]
-        tracked, settled = frame.pixels, frame.has_depth
+        tracked, settled = frame.pixels, frame.tells_translation(self._config.motion.pixel_sigma_px)
         cell_px, border_px = self._cell_px, settings.border_px
         new = find_corners(image, self._allowed, tracked, settled, cell_px, border_px, settings.min_response)
         admitted = settings.noise_factor * self._noise_sigma

@@ -10,6 +10,8 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 
+_NEAR_SIGMAS = 10.0  # a depth that is known to a tenth
+
 
 @dataclass(frozen=True, eq=False)
 class PairFrame:
@@ -44,6 +46,11 @@ class PairFrame:
     flat_for: Int
     rejected: Mapping[str, int] = field(default_factory=dict)
     stage_ms: Mapping[str, float] = field(default_factory=dict)
+
+    def tells_translation(self, sigma_px: float) -> Bool:
+        """Which tracks (N,) are near enough for their motion to tell more than rotation, with pixels so noisy."""
+        sigma_w = sigma_px * np.sqrt(self.covariances[:, 2, 2])
+        return np.asarray(self.has_depth & (self.points[:, 2] > _NEAR_SIGMAS * sigma_w))
 
     def keep(self, rows: Bool) -> PairFrame:
         """The same with only some of its tracks."""

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from benchmarks.motions import BREAK_STATISTIC, motion_error, overhear, uses_vision
+from benchmarks.motions import BREAK_STATISTIC, motion_error, overhear
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.events import Estimate, Event, FrameSet, Quality
+from graphvio.events import Event, FrameSet, Quality
 from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig
@@ -20,13 +19,12 @@ MATERIAL_M, MATERIAL_DEG = 0.01, 0.2
 
 @dataclass(frozen=True)
 class Judged:
-    """One motion that the front-end returned.
+    """One motion that the front-end returned, or that the odometry used.
 
     Attributes:
         since_s: since the first frameset.
         during: whether it ends while the fault lasts.
         quality: as the front-end says.
-        accepted: whether the odometry used it.
         nees: squared Mahalanobis distance from the truth, 6 degrees of freedom.
         error_m: of the translation.
         error_deg: of the rotation.
@@ -38,7 +36,6 @@ class Judged:
     since_s: float
     during: bool
     quality: Quality
-    accepted: bool
     nees: float
     error_m: float
     error_deg: float
@@ -67,6 +64,7 @@ class Outcome:
         failures: reason -> number of framesets without a motion.
         incidents: kind -> number.
         motions: all that were returned.
+        used: those that went into the estimate; where pairs contradict each other, one side's.
     """
 
     framesets: int = 0
@@ -74,6 +72,7 @@ class Outcome:
     failures: Counter[str] = field(default_factory=Counter)
     incidents: Counter[str] = field(default_factory=Counter)
     motions: list[Judged] = field(default_factory=list)
+    used: list[Judged] = field(default_factory=list)
 
     def add(self, other: Outcome) -> None:
         """Count another run in."""
@@ -82,6 +81,7 @@ class Outcome:
         self.failures.update(other.failures)
         self.incidents.update(other.incidents)
         self.motions += other.motions
+        self.used += other.used
 
 
 class Run:
@@ -96,9 +96,7 @@ class Run:
     def __init__(self, rig: Rig, config: Config, *, with_imu: bool) -> None:
         self._with_imu = with_imu
         self._odometry = Odometry(rig if with_imu else rig.without_imu(), config)
-        self._results: list[tuple[int, VisualResult]] = []
-        overhear(self._odometry, lambda stamp_ns, result: self._results.append((stamp_ns, result)))
-        self._used: dict[int, bool] = {}
+        self._overheard = overhear(self._odometry)
         self._during: dict[int, bool] = {}
 
     def feed(self, event: Event, during: bool) -> None:
@@ -107,19 +105,21 @@ class Run:
             self._during[event.stamp_ns] = during
         elif not self._with_imu:
             return
-        estimate = self._odometry.process(event)
-        self._note([estimate] if estimate is not None else [])
+        self._odometry.process(event)
 
     def finish(self, truth: dict[int, Float], start_ns: int) -> Outcome:
         """End the run and judge it by the truth, stamp -> ``world_T_body`` (4, 4)."""
-        self._note(self._odometry.finish())
-        outcome = Outcome(len(self._results), sum(self._during.values()))
+        self._odometry.finish()
+        results, used = self._overheard
+        outcome = Outcome(len(results), sum(self._during.values()))
         outcome.incidents.update(incident.kind for incident in self._odometry.take_incidents())
-        for stamp_ns, result in self._results:
+        for stamp_ns, result in results.items():
             if result.motion is None:
                 outcome.failures[re.sub(r"\d+", "N", result.reason) or "no reason given"] += 1
             else:
                 outcome.motions.append(self._judged(stamp_ns, result, result.motion, truth, start_ns))
+            if stamp_ns in used:
+                outcome.used.append(self._judged(stamp_ns, result, used[stamp_ns], truth, start_ns))
         return outcome
 
     def _judged(
@@ -130,7 +130,6 @@ class Run:
             since_s=(stamp_ns - start_ns) * 1e-9,
             during=self._during[stamp_ns],
             quality=result.quality,
-            accepted=self._used.get(stamp_ns, False),
             nees=error.statistic,
             error_m=error.error_m,
             error_deg=error.error_deg,
@@ -138,7 +137,3 @@ class Run:
             inliers={pair: report.inliers for pair, report in sorted(result.pairs.items())},
             points={pair: report.points for pair, report in sorted(result.pairs.items())},
         )
-
-    def _note(self, estimates: Iterable[Estimate]) -> None:
-        for estimate in estimates:
-            self._used[estimate.stamp_ns] = uses_vision(estimate)

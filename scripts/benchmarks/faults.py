@@ -150,7 +150,7 @@ def _folder(task: Task) -> Path:
 def _progress(task: Task, by_mode: Mapping[bool, Outcome]) -> str:
     parts = [
         f"{_MODES[mode].lower()}: {len(o.motions)} motions, {sum(m.wrong for m in o.motions)} wrong, "
-        f"{sum(m.wrong and m.accepted for m in o.motions)} of them used"
+        f"{sum(m.wrong for m in o.used)} of {len(o.used)} used"
         for mode, o in by_mode.items()
     ]
     return f"{task.case}, seed {task.seed}: {'; '.join(parts)}"
@@ -177,7 +177,8 @@ def _write(report: Report, outcomes: Mapping[str, Mapping[bool, Outcome]]) -> No
         "touched. *NEES* is the squared Mahalanobis distance of the "
         "motion from the truth (6 degrees of freedom: mean 6, median 5.3 where the covariance is honest). *> 5 sigma*: "
         f"NEES above {BREAK_STATISTIC:.1f}; *material*: and besides wrong by more than {100 * MATERIAL_M:g} cm or "
-        f"{MATERIAL_DEG:g} degrees. *Used*: the odometry's gate let it through."
+        f"{MATERIAL_DEG:g} degrees. *Used*: the odometry's gate let it through; where "
+        "pairs contradict each other, that side's motion which it took, with that side's own covariance."
     )
     for mode, name in _MODES.items():
         report.add(f"#### {name}")
@@ -195,7 +196,7 @@ def _write(report: Report, outcomes: Mapping[str, Mapping[bool, Outcome]]) -> No
 
 def _row(title: str, outcome: Outcome) -> list[str]:
     motions = outcome.motions
-    used = [m for m in motions if m.accepted]
+    used = outcome.used
     commonest = outcome.failures.most_common(1)
     nees = np.array([m.nees for m in motions])
     return [
@@ -229,8 +230,8 @@ def _shares(total: Outcome) -> list[str]:
         "of good quality": [m for m in total.motions if m.quality == Quality.GOOD],
         "of weak quality": [m for m in total.motions if m.quality == Quality.WEAK],
         "returned while a fault lasted": [m for m in total.motions if m.during],
-        "used by the odometry": [m for m in total.motions if m.accepted],
-        "used while a fault lasted": [m for m in total.motions if m.accepted and m.during],
+        "used by the odometry": total.used,
+        "used while a fault lasted": [m for m in total.used if m.during],
     }
     lines = []
     for name, motions in groups.items():
@@ -245,7 +246,7 @@ def _shares(total: Outcome) -> list[str]:
 
 
 def _verdict(total: Outcome) -> str:
-    used = [m for m in total.motions if m.accepted]
+    used = total.used
     aim = f"Aim: less than {100 * AIM_SHARE:g} % of the used motions beyond 5 sigma"
     if not used:
         return f"{aim}: cannot be told, none was used."
@@ -255,18 +256,19 @@ def _verdict(total: Outcome) -> str:
 
 
 def _list_motions(path: Path, outcomes: Mapping[str, Mapping[bool, Outcome]]) -> None:
-    """A line for each motion that was returned."""
+    """A line for each motion that was returned, and for each that was used."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(_COLUMNS)
         for case, by_mode in outcomes.items():
             for mode, outcome in by_mode.items():
-                table.writerows(_motion_row(case, mode, m) for m in outcome.motions)
+                for used, motions in ((False, outcome.motions), (True, outcome.used)):
+                    table.writerows(_motion_row(case, mode, m, used) for m in motions)
 
 
-def _motion_row(case: str, with_imu: bool, m: Judged) -> list[str]:
-    flags = (int(m.during), m.quality, int(m.accepted))
+def _motion_row(case: str, with_imu: bool, m: Judged, used: bool) -> list[str]:
+    flags = (int(m.during), m.quality, int(used))
     figures = (f"{m.nees:.1f}", f"{m.error_m:.4f}", f"{m.error_deg:.3f}", f"{m.span_s:.2f}")
     pairs = ("+".join(map(str, counts.values())) for counts in (m.inliers, m.points))
     return [case, f"{int(with_imu)}", f"{m.since_s:.2f}", *map(str, flags), *figures, *pairs]

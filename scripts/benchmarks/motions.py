@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -49,20 +48,40 @@ class MotionError(NamedTuple):
     error_deg: float
 
 
-def overhear(odometry: Odometry, hear: Callable[[int, VisualResult], None]) -> None:
-    """Have ``hear`` called with the stamp of each frameset and what the front-end made of it.
+class Overheard(NamedTuple):
+    """What vision said of a run.
+
+    Attributes:
+        results: stamp -> what the front-end made of a frameset.
+        used: stamp -> the motion that went into the estimate: that of the result, or one of its alternatives.
+    """
+
+    results: dict[int, VisualResult]
+    used: dict[int, RelativeMotion]
+
+
+def overhear(odometry: Odometry) -> Overheard:
+    """Have what vision says noted while an odometry runs.
 
     An estimate does not carry the motion that vision measured, only the pose that came of it, in which IMU and earlier
     motions hide an error; so the front-end's answers are overheard on their way to the odometry.
     """
-    process = odometry._frontend.process
+    process, use = odometry._frontend.process, odometry._belief.use
+    overheard = Overheard({}, {})
 
-    def overheard(frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
-        result = process(frameset, predict)
-        hear(frameset.stamp_ns, result)
+    def processed(frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
+        result = overheard.results[frameset.stamp_ns] = process(frameset, predict)
         return result
 
-    odometry._frontend.process = overheard  # type: ignore[method-assign]
+    def used(visual: VisualResult) -> RelativeMotion | None:
+        motion = use(visual)
+        if motion is not None:
+            overheard.used[motion.stamp_ns] = motion
+        return motion
+
+    odometry._frontend.process = processed  # type: ignore[method-assign]
+    odometry._belief.use = used  # type: ignore[method-assign]
+    return overheard
 
 
 def uses_vision(estimate: Estimate) -> bool:

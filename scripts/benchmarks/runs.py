@@ -11,14 +11,14 @@ from time import perf_counter
 import cv2
 import numpy as np
 
-from benchmarks.motions import BREAK_STATISTIC, EXACT, TruthNoise, motion_error, overhear, uses_vision
+from benchmarks.motions import BREAK_STATISTIC, EXACT, Overheard, TruthNoise, motion_error, overhear, uses_vision
 from benchmarks.recordings import blocks
 from graphvio.arrays import Bool, Float, Int
 from graphvio.config import Config
 from graphvio.errors import GraphvioError, TrajectoryError
 from graphvio.evaluation import MAX_GAP_S, Evaluation, evaluate
 from graphvio.events import Estimate, Event, FrameSet
-from graphvio.frontend.motion import RelativeMotion, VisualResult
+from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3, so3_exp
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig, StereoPair
@@ -137,7 +137,7 @@ def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, n
     warm_up(source.rig, config)
     cv2.setNumThreads(-1)  # as in a new process; the odometry then sets what it wants
     odometry = Odometry(source.rig, config)
-    motions = _motions_of(odometry)
+    overheard = overhear(odometry)
     estimates: list[Estimate] = []
     frameset_ms: list[float] = []
     for block in blocks(iter(source), _BLOCK):
@@ -152,19 +152,7 @@ def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, n
                 spent_s = 0.0
     estimates += odometry.finish()
     cv2.setNumThreads(-1)
-    return _judge(estimates, motions, truth, noise, frameset_ms)
-
-
-def _motions_of(odometry: Odometry) -> dict[int, RelativeMotion]:
-    """Stamp -> motion that vision measured, filled while the odometry runs."""
-    motions: dict[int, RelativeMotion] = {}
-
-    def keep(stamp_ns: int, result: VisualResult) -> None:
-        if result.motion is not None:
-            motions[stamp_ns] = result.motion
-
-    overhear(odometry, keep)
-    return motions
+    return _judge(estimates, overheard, truth, noise, frameset_ms)
 
 
 def _altered(block: list[Event], alter: Alter | None) -> list[Event]:
@@ -175,7 +163,7 @@ def _altered(block: list[Event], alter: Alter | None) -> list[Event]:
 
 def _judge(
     estimates: list[Estimate],
-    motions: dict[int, RelativeMotion],
+    overheard: Overheard,
     truth: Trajectory,
     noise: TruthNoise,
     frameset_ms: list[float],
@@ -183,9 +171,8 @@ def _judge(
     posed = [e for e in estimates if e.nav_T_body is not None]
     stamps_ns = np.array([e.stamp_ns for e in posed], dtype=np.int64)
     estimate = Trajectory(stamps_ns, np.array([e.nav_T_body for e in posed]).reshape(-1, 4, 4))
-    used_ns = {e.stamp_ns for e in estimates if e.nav_T_body is not None and uses_vision(e)}
-    used = [motion for stamp_ns, motion in motions.items() if stamp_ns in used_ns]
-    statistics = _statistics(used, truth, noise)
+    returned = sum(result.motion is not None for result in overheard.results.values())
+    statistics = _statistics(list(overheard.used.values()), truth, noise)
     try:
         evaluation = evaluate(estimate, truth)
     except TrajectoryError:
@@ -199,7 +186,7 @@ def _judge(
         framesets=len(estimates),
         motions=len(statistics),
         breaks=int(np.sum(statistics > BREAK_STATISTIC)),
-        refused=len(motions) - len(used),
+        refused=returned - len(overheard.used),
         frameset_ms=float(np.median(frameset_ms)) if frameset_ms else np.nan,
     )
 

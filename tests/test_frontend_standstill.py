@@ -1,0 +1,44 @@
+"""Standing still, told from the places of points in the images."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.frontend.standstill import Standstill
+from graphvio.frontend.tracks import PairFrame
+
+PERIOD_NS = 50_000_000
+PLACES = np.random.default_rng(0).uniform(0.0, 400.0, (60, 2))
+
+
+def told(shifts_px: Float, noise_px: float = 0.05, explained: int = 60) -> list[bool]:
+    """Verdicts on frames whose points have moved by so much (K,) along x."""
+    standstill, rng, verdicts = Standstill(), np.random.default_rng(1), []
+    for k, shift in enumerate(shifts_px):
+        pixels = PLACES + [shift, 0.0] + noise_px * rng.standard_normal((60, 2))
+        pixels[explained:] += 40.0 * k  # somebody walks by, whom the rig's motion does not explain
+        frame = replace(PairFrame.empty(k * PERIOD_NS), ids=np.arange(60), pixels=pixels)
+        verdicts.append(standstill.look({0: frame}, {0: np.arange(explained)}))
+    return verdicts
+
+
+def test_rest_is_told_after_a_quarter_of_a_second() -> None:
+    assert told(np.zeros(12)) == [False] * 5 + [True] * 7
+    assert told(np.zeros(12), explained=40) == [False] * 5 + [True] * 7
+
+
+def test_slow_motion_is_no_rest_however_little_it_is_in_a_frame() -> None:
+    assert not any(told(np.linspace(0.0, 4.7, 60)))
+
+
+def test_rest_ends_at_once_and_begins_anew() -> None:
+    verdicts = told(np.concatenate([np.zeros(10), np.arange(1.0, 6.0), np.full(10, 5.0)]))
+    assert verdicts[5:10] == [True] * 5
+    assert not any(verdicts[10:19])
+    assert all(verdicts[20:])
+
+
+def test_few_points_tell_nothing() -> None:
+    assert not any(told(np.zeros(12), explained=20))
+    assert not Standstill().look({}, {})
