@@ -94,9 +94,12 @@ def agree(
     own: dict[int, Refined] = {}
     if len(everyone) > 1:
         sources = rng.spawn(len(everyone))  # one each, so that the threads' timing changes nothing
-        motions = workers.map(
-            lambda j, source: _own_motion(rig, observations, j, joint, config, source), everyone, sources
-        )
+        others = [
+            workers.submit(_own_motion, rig, observations, j, joint, config, source)
+            for j, source in zip(everyone[1:], sources[1:], strict=True)
+        ]
+        motions = [_own_motion(rig, observations, everyone[0], joint, config, sources[0])]
+        motions += [other.result() for other in others]
         own = {j: m for j, m in zip(everyone, motions, strict=True) if is_supported(m.inlier, config)}
     elif everyone:
         joint = placed(joint, misaligned.get(everyone[0]))
