@@ -38,7 +38,9 @@ class FrameSet:
 
     Attributes:
         stamp_ns: camera clock, nanoseconds.
-        images: pair index -> (left, right), each (height, width) uint8. A pair that delivered nothing is absent.
+        images: pair index -> (left, right), each (height, width) uint8. A pair that delivered nothing is absent. They
+            are kept until the pair's next ones have come, and not copied: a driver that fills the same buffer again
+            has to hand over copies.
     """
 
     stamp_ns: int

@@ -243,7 +243,7 @@ def test_the_threads_timing_changes_nothing(doors: int) -> None:
     for seed in range(6):
         threads = Dawdling(2, seed)
         again = judged(seen, threads=threads)
-        assert len(threads.delays_ms) == 2
+        assert len(threads.delays_ms) == 1  # the first pair is worked on meanwhile
         assert [side.pairs for side in first.sides] == [side.pairs for side in again.sides]
         motions = [(first.own[j], again.own[j]) for j in first.own.keys() | again.own.keys()]
         motions += [(one.refined, other.refined) for one, other in zip(first.sides, again.sides, strict=True)]

@@ -44,7 +44,7 @@ class VisualResult:
         quality: how far the motion can be trusted.
         reason: why it is not good, or empty.
         alternatives: where pairs contradict each other, what each side says with its own covariance: one is right.
-        at_rest: the images show no motion since the reference.
+        at_rest: the images have shown no motion for a while.
         frozen: pairs that were left out because a camera of theirs repeats an image.
         pairs: pair index -> report.
         stage_ms: time by stage, milliseconds: ``track``, with all pairs side by side; its parts ``pyramid``,
