@@ -190,8 +190,10 @@ class Belief:
         assert visual.motion is not None
         verdicts = [(self._running.test(motion), motion) for motion in visual.alternatives]
         verdicts.sort(key=lambda judged: judged[0].statistic)
-        if verdicts and verdicts[0][0].accepted and not verdicts[1][0].accepted:
-            return verdicts[0][1], verdicts[0][0]
+        if verdicts:
+            (likely, motion), (unlikely, _) = verdicts[:2]
+            if likely.accepted and not unlikely.accepted and likely.is_clear and unlikely.is_clear:
+                return motion, likely
         return visual.motion, self._running.test(visual.motion)
 
     def _status(self, stamp_ns: int, used: bool) -> Status:

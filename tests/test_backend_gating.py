@@ -3,7 +3,7 @@ import pytest
 from scipy.stats import chi2
 from synthetic import random_covariance, random_transform, transform
 
-from graphvio.backend.gating import gate, relative_covariance
+from graphvio.backend.gating import Verdict, gate, relative_covariance
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 
 
@@ -65,3 +65,8 @@ def test_the_statistic_is_the_mahalanobis_distance() -> None:
     verdict = gate(measured, 0.04 * np.eye(6), predicted, 0.05 * np.eye(6), 0.95)
     assert verdict.statistic == pytest.approx(0.3**2 / 0.09)
     assert verdict.accepted
+
+
+def test_an_outcome_near_the_threshold_is_not_clear() -> None:
+    clear = [Verdict(statistic < 20.0, statistic, 20.0).is_clear for statistic in (0.0, 9.0, 11.0, 20.0, 39.0, 41.0)]
+    assert clear == [True, True, False, False, False, True]

@@ -12,6 +12,7 @@ from graphvio.arrays import Float
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 
 _DEGREES_OF_FREEDOM = 6
+_UNCLEAR = (0.5, 2.0)  # statistic over threshold
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,11 @@ class Verdict:
     accepted: bool
     statistic: float
     threshold: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the outcome is not a matter of a small difference."""
+        return not _UNCLEAR[0] < self.statistic / self.threshold < _UNCLEAR[1]
 
 
 def relative_covariance(a_T_b: Float, joint: Float) -> Float:
