@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, field
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.motions import BREAK_SIGMA, BREAK_STATISTIC, EXACT, TruthNoise
+from benchmarks.bench import CLIP_TRUTH, Bench
+from benchmarks.motions import BREAK_SIGMA, BREAK_STATISTIC
 from benchmarks.picture import Panel, draw_trajectories
 from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import DOCS, Report, machine, tell
-from benchmarks.runs import HEAD, Alter, Outcome, blinded, run, with_moved_pair
+from benchmarks.runs import HEAD, blinded, with_moved_pair
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
-from graphvio.rig import Rig
 from graphvio.simulation import SCENE_NAMES
 from graphvio.sources import open_source
 
 DEFAULT = "default"
+_FROM_PREVIOUS = "default, from the frame before"
 CLIP = DOCS.parents[1] / "shared" / "data" / "euroc_mh01_clip"
 CLIP_NAME = "EuRoC MH_01 clip"
-CLIP_TRUTH = TruthNoise(angle_rad=3e-4, position_m=1e-3)
-"""Taken for a real recording: an assumption, about right for a laser tracker fused with an IMU."""
 _DRAWN = (("corridor", True), ("corridor", False), ("stairs", False), (CLIP_NAME, False))  # with the IMU or without
 AIM = 1.05
 """All pairs' ATE over that of the better pair alone: together they are at least as good as either."""
@@ -67,6 +66,7 @@ def run_all(args: argparse.Namespace) -> None:
         if scene not in SCENE_NAMES:
             raise GraphvioError(f"there is no scene {scene!r}; choose from {', '.join(SCENE_NAMES)}")
     configs = {name: Config.load(name) for name in dict.fromkeys((DEFAULT, *args.profiles))}
+    configs[_FROM_PREVIOUS] = replace(configs[DEFAULT], motion=replace(configs[DEFAULT].motion, reference="previous"))
     recordings = {name: simulated(args.data, name, args.duration) for name in args.scenes}
     report = Report()
     report.add(machine())
@@ -76,10 +76,11 @@ def run_all(args: argparse.Namespace) -> None:
         report.add(f"The real clip is left out: the folder {args.clip.name} is not there.")
     if not recordings:
         raise GraphvioError("nothing to run: no scene is named and the clip is not there")
-    bench = _Bench(recordings, configs)
+    bench = Bench(recordings, configs)
     cases = _cases(args.profiles)
     _main_table(report, bench, cases)
     _together_table(report, bench, cases)
+    _reference_table(report, bench)
     _moved_table(report, bench)
     if _BLIND_SCENE in recordings:
         _blind_table(report, bench, args.duration)
@@ -98,63 +99,6 @@ def run_all(args: argparse.Namespace) -> None:
     tell(f"written to {args.out}")
 
 
-@dataclass
-class _Bench:
-    """The recordings and configurations, and what has been run already."""
-
-    recordings: dict[str, Path]
-    configs: dict[str, Config]
-    _rigs: dict[str, Rig] = field(default_factory=dict)
-    _done: dict[tuple[str, str, tuple[int, ...], bool], Outcome] = field(default_factory=dict)
-
-    def rig(self, recording: str) -> Rig:
-        """As the recording carries it."""
-        if recording not in self._rigs:
-            self._rigs[recording] = open_source(self.recordings[recording]).rig
-        return self._rigs[recording]
-
-    def choices(self, recording: str) -> list[tuple[int, ...]]:
-        """All pairs, then each alone."""
-        count = len(self.rig(recording).pairs)
-        return [tuple(range(count)), *((j,) for j in range(count) if count > 1)]
-
-    def pair_names(self, recording: str, pairs: tuple[int, ...]) -> str:
-        """The names of pairs."""
-        return " + ".join(self.rig(recording).pairs[j].name for j in pairs)
-
-    def better_single(self, recording: str, profile: str, imu: bool) -> tuple[str, Outcome]:
-        """The pair that does better alone by its ATE by epoch, and its run."""
-        _, *alone = self.choices(recording)
-        runs = {self.pair_names(recording, p): self.outcome(recording, profile, p, imu) for p in alone}
-        best = min(runs, key=lambda name: runs[name].epoch_ate_m)
-        return best, runs[best]
-
-    def least_ate_m(self, recording: str, profile: str, imu: bool) -> float:
-        """The least ATE of a single pair, all epochs aligned together."""
-        return min(self.outcome(recording, profile, pair, imu).ate_m for pair in self.choices(recording)[1:])
-
-    @property
-    def with_several_pairs(self) -> list[str]:
-        """The recordings of more than one pair."""
-        return [name for name in self.recordings if len(self.rig(name).pairs) > 1]
-
-    def outcome(self, recording: str, profile: str, pairs: tuple[int, ...], imu: bool) -> Outcome:
-        """The run of a case, which is made once."""
-        key = (recording, profile, pairs, imu)
-        if key not in self._done:
-            self._done[key] = self.special(recording, profile, self.rig(recording).with_pairs(pairs), imu)
-        return self._done[key]
-
-    def special(self, recording: str, profile: str, rig: Rig, imu: bool, alter: Alter | None = None) -> Outcome:
-        """A run with another rig or other images."""
-        used = rig if imu else rig.without_imu()
-        noise = EXACT if recording in SCENE_NAMES else CLIP_TRUTH
-        outcome = run(self.recordings[recording], used, self.configs[profile], alter, noise)
-        pairs = " + ".join(pair.name for pair in rig.pairs)
-        tell(f"  {recording}, {profile}, {pairs}, {_imu(imu)} IMU: ATE {100 * outcome.ate_m:.2f} cm")
-        return outcome
-
-
 def _cases(profiles: list[str]) -> list[tuple[str, bool]]:
     """Profiles, and whether the IMU takes part."""
     cases = [(profile, False) for profile in profiles]
@@ -163,7 +107,7 @@ def _cases(profiles: list[str]) -> list[tuple[str, bool]]:
     return cases
 
 
-def _main_table(report: Report, bench: _Bench, cases: list[tuple[str, bool]]) -> None:
+def _main_table(report: Report, bench: Bench, cases: list[tuple[str, bool]]) -> None:
     rows = [
         [name, profile, bench.pair_names(name, pairs), _yes_or_no(imu), *outcome.cells()]
         for name in bench.recordings
@@ -181,7 +125,7 @@ def _main_table(report: Report, bench: _Bench, cases: list[tuple[str, bool]]) ->
     )
 
 
-def _together_table(report: Report, bench: _Bench, cases: list[tuple[str, bool]]) -> None:
+def _together_table(report: Report, bench: Bench, cases: list[tuple[str, bool]]) -> None:
     """All pairs against the better one alone, by the runs of the main table."""
     rows = []
     for name in bench.with_several_pairs:
@@ -211,7 +155,23 @@ def _together_table(report: Report, bench: _Bench, cases: list[tuple[str, bool]]
     report.table([*head, "all by vision, %", "single by vision, %", "aim"], rows)
 
 
-def _moved_table(report: Report, bench: _Bench) -> None:
+def _reference_table(report: Report, bench: Bench) -> None:
+    rows = []
+    for name in bench.recordings:
+        pairs = bench.choices(name)[0]
+        kept, previous = (
+            bench.outcome(name, profile, pairs, False).epoch_ate_m for profile in (DEFAULT, _FROM_PREVIOUS)
+        )
+        rows.append([name, _cm(kept), _cm(previous), _ratio(kept, previous)])
+    report.add(
+        "#### Keyframe and previous frame",
+        "All pairs by vision alone, motion measured from a keyframe (`motion.reference: keyframe`, the default) and "
+        "from the frame before (`previous`); ATE in cm, each epoch aligned by itself.",
+    )
+    report.table(["recording", "keyframe", "previous", "keyframe / previous"], rows)
+
+
+def _moved_table(report: Report, bench: Bench) -> None:
     """The second pair is not where the calibration says; both pairs ought to be no worse than the better alone."""
     rows = []
     for name in bench.with_several_pairs:
@@ -236,7 +196,7 @@ def _moved_table(report: Report, bench: _Bench) -> None:
     report.table(["recording", "IMU", *errors_head, "breaks / motions", "refused"], rows)
 
 
-def _blind_table(report: Report, bench: _Bench, duration_s: float | None) -> None:
+def _blind_table(report: Report, bench: Bench, duration_s: float | None) -> None:
     rig = bench.rig(_BLIND_SCENE)
     if len(rig.pairs) < 2:
         return
@@ -266,14 +226,14 @@ def _blind_span(duration_s: float | None) -> tuple[float, float]:
     return begin_s, begin_s + min(_BLIND_S, _BLIND_SHARE * duration_s)
 
 
-def _panel(bench: _Bench, name: str, imu: bool) -> Panel:
+def _panel(bench: Bench, name: str, imu: bool) -> Panel:
     runs = {bench.pair_names(name, pairs): bench.outcome(name, DEFAULT, pairs, imu) for pairs in bench.choices(name)}
     lines = {pairs: outcome for pairs, outcome in runs.items() if outcome.evaluation is not None}
     title = f"{_length(bench, name)}: default profile, {'with IMU' if imu else 'vision only'}"
     return Panel(title, lines)
 
 
-def _length(bench: _Bench, name: str) -> str:
+def _length(bench: Bench, name: str) -> str:
     evaluation = bench.outcome(name, DEFAULT, bench.choices(name)[0], False).evaluation
     return name if evaluation is None else f"{name} {evaluation.path_length_m:.0f} m, {evaluation.duration_s:.0f} s"
 
