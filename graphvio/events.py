@@ -142,6 +142,8 @@ class Estimate:
         rates: angular rate of body (3,) rad/s by ``gyro``, ``vision`` and ``fused``, as far as known.
         vision: how far the motion that vision measured can be trusted.
         vision_reason: why that is not ``good``, or empty.
+        vision_sigmas: how well the geometry conditions that motion: its standard deviations in the directions that are
+            known least, of the rotation (radians) and the translation (metres); None without a motion.
         at_rest: images, and the IMU if there is one, show no motion.
         pairs: pair index -> what it contributed.
         stage_ms: processing time by stage, milliseconds: ``predict``; ``track``, with all pairs side by side; its parts
@@ -161,6 +163,7 @@ class Estimate:
     rates: Mapping[str, Float] = field(default_factory=dict)
     vision: Quality = Quality.FAILED
     vision_reason: str = ""
+    vision_sigmas: tuple[float, float] | None = None
     at_rest: bool = False
     pairs: Mapping[int, PairReport] = field(default_factory=dict)
     stage_ms: Mapping[str, float] = field(default_factory=dict)

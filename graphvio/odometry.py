@@ -176,6 +176,7 @@ class Odometry:
             rates=self._rates.update(visual.motion, span, state.gyro_bias, belief.latest_rate()),
             vision=visual.quality,
             vision_reason=visual.reason,
+            vision_sigmas=None if visual.motion is None else visual.motion.weakest_sigmas,
             at_rest=visual.at_rest and (span is None or is_at_rest(span, self.config.initialisation)),
             pairs=visual.pairs,
             stage_ms=stage_ms,

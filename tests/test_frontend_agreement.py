@@ -338,6 +338,14 @@ def test_images_that_all_repeat_say_nothing_for_sure() -> None:
     assert np.sqrt(motion.covariance[3, 3]) == pytest.approx(1.0, rel=0.01)  # a metre in a second
 
 
+def test_the_weakest_directions_of_a_motion_are_told() -> None:
+    turned = transform([0.3, -0.2, 0.5], [0.0, 0.0, 0.0])[:3, :3]
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = turned @ np.diag([1e-6, 4e-6, 2e-6]) @ turned.T
+    covariance[3:, 3:] = turned @ np.diag([9e-4, 1e-4, 1e-6]) @ turned.T
+    assert replace(measured(TRUTH, 50), covariance=covariance).weakest_sigmas == pytest.approx((2e-3, 0.03))
+
+
 def test_tension_and_weak_directions_are_told() -> None:
     base = np.trace(measured(TRUTH, 200).covariance)
     assert np.trace(judgement([measured(TRUTH, 200)], 36.0, None, CONFIRMED)[0].covariance) == pytest.approx(3.0 * base)

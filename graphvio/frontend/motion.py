@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from graphvio.arrays import Float
 from graphvio.events import PairReport, Quality
 
@@ -33,6 +35,14 @@ class RelativeMotion:
     def duration_s(self) -> float:
         """Time between the two instants."""
         return (self.stamp_ns - self.reference_stamp_ns) * 1e-9
+
+    @property
+    def weakest_sigmas(self) -> tuple[float, float]:
+        """Standard deviations in the directions that are known least: of the rotation, radians, and the translation,
+        metres."""
+        variances = (np.linalg.eigvalsh(self.covariance[block, block])[-1] for block in (slice(0, 3), slice(3, 6)))
+        rotation, translation = np.sqrt(list(variances))
+        return float(rotation), float(translation)
 
 
 @dataclass(frozen=True, eq=False)

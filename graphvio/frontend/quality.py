@@ -103,8 +103,8 @@ def graded(sides: Sequence[Doubted], tension: float) -> tuple[RelativeMotion, Qu
             # In all directions: what fills one view may fill part of the other, and then neither is right.
             covariance = covariance + rival.covariance + np.diag(np.repeat([angle, distance], 3) ** 2)
             reasons.append(f"two motions are seen, {distance:.3f} m and {np.rad2deg(angle):.2f} deg apart")
-    sigmas = np.sqrt([np.linalg.eigvalsh(covariance[block, block])[-1] for block in (slice(0, 3), slice(3, 6))])
-    if not reasons and (sigmas[0] > _WEAK_ROTATION_RAD or sigmas[1] > _WEAK_TRANSLATION_M):
-        reasons.append(f"hardly constrained: {sigmas[0]:.4f} rad, {sigmas[1]:.3f} m")
-    quality = Quality.WEAK if reasons else Quality.GOOD
-    return replace(best, covariance=covariance), quality, "; ".join(reasons)
+    motion = replace(best, covariance=covariance)
+    rotation_rad, translation_m = motion.weakest_sigmas
+    if not reasons and (rotation_rad > _WEAK_ROTATION_RAD or translation_m > _WEAK_TRANSLATION_M):
+        reasons.append(f"hardly constrained: {rotation_rad:.4f} rad, {translation_m:.3f} m")
+    return motion, Quality.WEAK if reasons else Quality.GOOD, "; ".join(reasons)
