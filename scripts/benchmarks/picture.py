@@ -123,10 +123,10 @@ class _Plan:
             bbox_to_anchor=(0.0, 1.0),
             ncols=len(names),
             frameon=False,
-            fontsize=8.5,
+            fontsize=8,
             borderaxespad=0.2,
-            handlelength=1.5,
-            columnspacing=1.2,
+            handlelength=1.2,
+            columnspacing=0.9,
         )
 
 
