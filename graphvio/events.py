@@ -7,7 +7,7 @@ differ by the rig's ``time_offset_s``.
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -63,13 +63,21 @@ def checked_event(event: Event) -> Event:
     except TypeError:
         raise EventError(f"stamp_ns is {event.stamp_ns!r}; give whole nanoseconds as an int") from None
     if isinstance(event, ImuSample):
-        vectors = [np.asarray(v, dtype=np.float64) for v in (event.angular_velocity, event.linear_acceleration)]
-        if any(vector.shape != (3,) for vector in vectors):
-            raise EventError(f"IMU sample at {stamp_ns}: both vectors must have three components")
+        try:
+            vectors = [np.asarray(v, dtype=np.float64) for v in (event.angular_velocity, event.linear_acceleration)]
+        except (TypeError, ValueError):
+            vectors = []
+        if not vectors or any(vector.shape != (3,) for vector in vectors):
+            raise EventError(f"IMU sample at {stamp_ns}: both vectors must have three components, and all be numbers")
         return ImuSample(stamp_ns, *vectors)
-    for pair, images in event.images.items():
-        if len(images) != 2:
-            raise EventError(f"frameset at {stamp_ns}: pair {pair} has {len(images)} images; give (left, right)")
+    pairs: object = event.images  # what callers without a type checker give
+    if not isinstance(pairs, Mapping):
+        raise EventError(f"frameset at {stamp_ns}: images is a {type(pairs).__name__}; map pairs to (left, right)")
+    for pair, images in pairs.items():
+        if not isinstance(images, Sequence) or len(images) != 2:
+            raise EventError(f"frameset at {stamp_ns}: pair {pair} has not two images; give (left, right)")
+        if not all(isinstance(image, np.ndarray) for image in images):
+            raise EventError(f"frameset at {stamp_ns}: pair {pair} has something else than arrays; give two images")
     return FrameSet(stamp_ns, event.images)
 
 

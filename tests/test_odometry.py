@@ -260,6 +260,16 @@ def test_malformed_events_are_refused(odometry: Odometry) -> None:
         odometry.process(ImuSample(1, np.zeros(2), np.zeros(3)))
     with pytest.raises(EventError, match=r"\(left, right\)"):
         odometry.process(FrameSet(1, {0: (np.zeros((480, 640), np.uint8),)}))  # type: ignore[dict-item]
+    image = np.zeros((480, 640), dtype=np.uint8)
+    for images, told in (
+        ([(image, image)], "images is a list"),
+        ({0: None}, "not two images"),
+        ({0: (image, [[1, 2], [3, 4]])}, "something else than arrays"),
+    ):
+        with pytest.raises(EventError, match=told):
+            odometry.process(FrameSet(0, images))  # type: ignore[arg-type]
+    with pytest.raises(EventError, match="all be numbers"):
+        odometry.process(ImuSample(0, "fast", np.zeros(3)))  # type: ignore[arg-type]
     with pytest.raises(EventError, match="not NoneType"):
         odometry.process(None)  # type: ignore[arg-type]
 
