@@ -74,7 +74,7 @@ def checked_event(event: Event) -> Event:
     if not isinstance(pairs, Mapping):
         raise EventError(f"frameset at {stamp_ns}: images is a {type(pairs).__name__}; map pairs to (left, right)")
     for pair, images in pairs.items():
-        if not isinstance(images, Sequence) or len(images) != 2:
+        if not isinstance(images, Sequence | np.ndarray) or len(images) != 2:
             raise EventError(f"frameset at {stamp_ns}: pair {pair} has not two images; give (left, right)")
         if not all(isinstance(image, np.ndarray) for image in images):
             raise EventError(f"frameset at {stamp_ns}: pair {pair} has something else than arrays; give two images")

@@ -133,6 +133,20 @@ def altered(pair: int, left: Callable[[Image], Image], right: Callable[[Image], 
     return change
 
 
+def frozen(pairs: tuple[int, ...], until_s: float) -> Change:
+    """These pairs deliver their images of 2 s again and again, each time in new memory."""
+    kept: dict[int, tuple[Image, Image]] = {}
+
+    def change(seconds: float, frameset: FrameSet) -> FrameSet:
+        if not 2.0 <= seconds < until_s:
+            return frameset
+        kept.update({} if kept else {j: frameset.images[j] for j in pairs})
+        again = {j: (left.copy(), right.copy()) for j, (left, right) in kept.items()}
+        return replace(frameset, images={**frameset.images, **again})
+
+    return change
+
+
 def noise_like(image: Image, level: float, seed: int) -> Image:
     return np.asarray(np.random.default_rng(seed).normal(level, 2.0, image.shape).clip(0, 255), dtype=np.uint8)
 
@@ -201,32 +215,15 @@ def test_a_blinded_pair_breaks_nothing(room_walk: Path, events: list[Event], pai
 
 @pytest.mark.parametrize("pair", [0, 1])
 def test_a_frozen_pair_is_left_out(room_walk: Path, events: list[Event], pair: int) -> None:
-    kept: dict[int, tuple[Image, Image]] = {}
-
-    def freeze(seconds: float, frameset: FrameSet) -> FrameSet:
-        if not 2.0 <= seconds < 4.0:
-            return frameset
-        kept.setdefault(pair, frameset.images[pair])
-        left, right = kept[pair]
-        return replace(frameset, images={**frameset.images, pair: (left.copy(), right.copy())})
-
-    walk = Walk(room_walk, events, freeze)
+    walk = Walk(room_walk, events, frozen((pair,), 4.0))
     assert walk.end_error_m < 0.02
     assert walk.worst < 45.0
-    frozen = [result for result in walk.results if pair not in result.pairs]
-    assert len(frozen) == 39  # the first of forty is new
+    left_out = [result for result in walk.results if pair not in result.pairs]
+    assert len(left_out) == 39  # the first of forty is new
 
 
 def test_all_frozen_is_never_sure(room_walk: Path, events: list[Event]) -> None:
-    kept: dict[int, tuple[Image, Image]] = {}
-
-    def freeze(seconds: float, frameset: FrameSet) -> FrameSet:
-        if not 2.0 <= seconds < 2.5:
-            return frameset
-        kept.update({} if kept else frameset.images)
-        return replace(frameset, images=dict(kept))
-
-    walk = Walk(room_walk, events, freeze)
+    walk = Walk(room_walk, events, frozen((0, 1), 2.5))
     during = [result for result in walk.results if "repeats" in result.reason]
     assert len(during) == 9
     assert all(result.quality is Quality.WEAK for result in during)
@@ -237,16 +234,8 @@ def test_all_frozen_is_never_sure(room_walk: Path, events: list[Event]) -> None:
 def test_what_is_measured_after_a_freeze_is_measured_from_before_it(
     room_walk: Path, events: list[Event], reference: Literal["keyframe", "previous"]
 ) -> None:
-    kept: dict[int, tuple[Image, Image]] = {}
-
-    def freeze(seconds: float, frameset: FrameSet) -> FrameSet:
-        if not 2.0 <= seconds < 2.3:
-            return frameset
-        kept.update({} if kept else frameset.images)
-        return replace(frameset, images=dict(kept))
-
     config = replace(Config(), motion=replace(Config().motion, reference=reference))
-    walk = Walk(room_walk, events, freeze, config=config)
+    walk = Walk(room_walk, events, frozen((0, 1), 2.3), config=config)
     assert walk.worst < 60.0  # one in 10,000,000; from frame to frame the covariances have longer tails
     frozen_ns = {e.stamp_ns for e in walk.estimates if "repeats" in e.vision_reason}
     assert len(frozen_ns) == 5

@@ -261,6 +261,7 @@ def test_malformed_events_are_refused(odometry: Odometry) -> None:
     with pytest.raises(EventError, match=r"\(left, right\)"):
         odometry.process(FrameSet(1, {0: (np.zeros((480, 640), np.uint8),)}))  # type: ignore[dict-item]
     image = np.zeros((480, 640), dtype=np.uint8)
+    odometry.process(FrameSet(0, {0: np.stack([image, image])}))  # type: ignore[dict-item]
     for images, told in (
         ([(image, image)], "images is a list"),
         ({0: None}, "not two images"),

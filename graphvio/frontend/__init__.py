@@ -12,8 +12,9 @@ follows, by the alignment of `patches`. `matching` finds corners in the right im
 (`refinement`, with the normal equations of `linearisation` and what `noise` reads from the residuals). `selection`
 joins the pairs or decides between them.
 
-*Judgement.* `agreement` keeps apart what contradicting pairs say, `quality` grades a motion and tells standstill,
-`alignment` watches the transfer between pairs, `frozen` notices cameras that repeat an image.
+*Judgement.* `agreement` keeps apart what contradicting pairs say, `quality` grades a motion, `standstill` tells rest,
+`alignment` watches the transfer between pairs, `frozen` notices cameras that repeat an image, `images` those of a wrong
+size.
 
 `visual` is the front-end as the odometry uses it: `references` are the framesets that it measures from, `motion` is
 what it answers, `stopwatch` takes the time.

@@ -136,7 +136,9 @@ def _camps(pairs: Sequence[int], apart: Mapping[tuple[int, int], float], in_doub
 def _in_order(sides: list[Side]) -> list[Side]:
     """The best supported first; but an error of P_12 puts no pair in the wrong, and to change sides would add it up."""
     enough = _COMPARABLE * max(side.support for side in sides)
-    return sorted(sides, key=lambda side: (-side.support, 0) if side.support < enough else (-np.inf, side.pairs[0]))
+    comparable = [side for side in sides if side.support >= enough]
+    others = [side for side in sides if side.support < enough]
+    return sorted(comparable, key=lambda side: side.pairs[0]) + sorted(others, key=lambda side: -side.support)
 
 
 def disagreement(one: Refined, other: Refined) -> float:

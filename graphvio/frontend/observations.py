@@ -93,6 +93,10 @@ class Correspondences:
     rows: Mapping[int, Int]
     offered: Mapping[int, int]
 
+    def identities(self, frames: Mapping[int, PairFrame], inlier: Bool) -> dict[int, Int]:
+        """Pair -> identities, increasing, of those of its current tracks that are inliers among all points (N,)."""
+        return {j: frames[j].ids[rows[inlier[self.observations.pair == j]]] for j, rows in self.rows.items()}
+
 
 def correspond(reference: Mapping[int, PairFrame], current: Mapping[int, PairFrame]) -> Correspondences:
     """Join the tracks of two instants by their identities; points without depth at the reference stay out."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
+from graphvio.arrays import Int
 from graphvio.config import MotionConfig
 from graphvio.frontend.observations import Correspondences
 from graphvio.frontend.refinement import Refined
@@ -81,7 +82,8 @@ class References:
         support, offered = int(refined.inlier.sum()), sum(correspondences.offered[j] for j in explained)
         if support < overlap * offered or support < _FEWEST_POINTS:
             return True
-        if self._share_of_near_points(frames, correspondences, refined, explained) < 0.5 * overlap:
+        seen = correspondences.identities(frames, refined.inlier)
+        if self._share_of_near_points({j: seen[j] for j in explained}) < 0.5 * overlap:
             return True
         # One pair's keyframe may be spent long before all points together are few.
         for j, frame in frames.items():
@@ -90,19 +92,12 @@ class References:
                 return True
         return False
 
-    def _share_of_near_points(
-        self,
-        frames: Mapping[int, PairFrame],
-        correspondences: Correspondences,
-        refined: Refined,
-        pairs: Collection[int],
-    ) -> float:
-        """Share of the references' near points that are still explained: far ones stay in view for long, but tell no
-        translation."""
-        pair, offered, still = correspondences.observations.pair, 0, 0
-        for j in pairs:
+    def _share_of_near_points(self, seen: Mapping[int, Int]) -> float:
+        """Share of the references' near points that are among those still seen, pair -> identities: far ones stay in
+        view for long, but tell no translation."""
+        offered = still = 0
+        for j, ids in seen.items():
             near = self._frames[j].tells_translation(self._config.pixel_sigma_px)
-            ids = frames[j].ids[correspondences.rows[j][refined.inlier[pair == j]]]
             offered += int(near.sum())
             still += int(near[np.searchsorted(self._frames[j].ids, ids)].sum())
         return still / offered if offered else 1.0

@@ -9,7 +9,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Int
+from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.events import FrameSet, PairReport, Quality
 from graphvio.frontend.agreement import Agreement, Side, agree, is_supported
@@ -108,7 +108,7 @@ class VisualFrontend:
             for side in agreement.sides
         ]
         motion, quality, reason = graded(sides, agreement.tension)
-        resting = self._standstill.look(frames, _explained(frames, correspondences, refined))
+        resting = self._standstill.look(frames, correspondences.identities(frames, refined.inlier))
         self._drop_outliers(frames, correspondences, agreement)
         watch.lap("judge")
         if self._references.are_spent(frames, correspondences, refined, len(agreement.sides) > 1):
@@ -251,12 +251,6 @@ class VisualFrontend:
             if misalignment is not None and misalignment.is_significant:
                 alignment.in_force = misalignment
                 self._arrays = self._arrays.corrected(RigArrays.of(self._rig), j, alignment.correction)
-
-
-def _explained(frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined) -> dict[int, Int]:
-    """Pair -> identities of the points that a motion explains."""
-    pair = correspondences.observations.pair
-    return {j: frames[j].ids[rows[refined.inlier[pair == j]]] for j, rows in correspondences.rows.items()}
 
 
 def _inliers_of(pair: int, correspondences: Correspondences, agreement: Agreement) -> Bool:

@@ -1,4 +1,4 @@
-"""Timing of several pipelines on the same framesets, in turns, so that the machine's load meets all of them alike."""
+"""Timing of several pipelines on the same framesets, in turns, so that all of them meet much the same load."""
 
 from __future__ import annotations
 
