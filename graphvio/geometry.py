@@ -145,6 +145,18 @@ def se3_inverse(a_T_b: Float) -> Float:
 
 
 @kernel
+def se3_compose(a_T_b: Float, b_T_c: Float) -> Float:
+    """``a_T_c`` (4, 4); in a kernel several times faster than ``@``, which calls a library for large matrices."""
+    a, b = a_T_b, b_T_c
+    product = np.zeros((4, 4))
+    for i in range(3):
+        for k in range(4):
+            product[i, k] = a[i, 0] * b[0, k] + a[i, 1] * b[1, k] + a[i, 2] * b[2, k] + a[i, 3] * b[3, k]
+    product[3, 3] = 1.0
+    return product
+
+
+@kernel
 def se3_exp(xi: Float) -> Float:
     """Transform (4, 4) of a tangent vector (6,) ``[rotation, translation]``."""
     phi = xi[:3]

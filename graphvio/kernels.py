@@ -24,6 +24,7 @@ R = TypeVar("R")
 
 _PACKAGE = Path(__file__).parent
 _IMPORT = re.compile(r"^from (graphvio[\w.]*) import", re.MULTILINE)
+_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
 _registered: list[Any] = []
 _log = logging.getLogger(__name__)
 
@@ -52,9 +53,18 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     return _compile(function, fastmath=False)
 
 
+def vector_kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """A kernel for sums over points, whose order is left to the compiler; NaN and infinity keep their meaning.
+
+    Equal inputs still give equal results on one machine.
+    """
+    return _compile(function, fastmath=_ANY_ORDER)
+
+
 def inner_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """A kernel that is called for each point of a loop: always made part of its caller, which saves the arguments."""
-    return _compile(function, fastmath=False, forceinline=True)
+    """A `vector_kernel` that is called for each point of a loop: always made part of its caller, so that the loop can
+    work on several points at once."""
+    return _compile(function, fastmath=_ANY_ORDER, forceinline=True)
 
 
 def fast_kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -65,7 +75,7 @@ def fast_kernel(function: Callable[P, R]) -> Callable[P, R]:
     return _compile(function, fastmath=True)
 
 
-def _compile(function: Callable[P, R], *, fastmath: bool, forceinline: bool = False) -> Callable[P, R]:
+def _compile(function: Callable[P, R], *, fastmath: bool | set[str], forceinline: bool = False) -> Callable[P, R]:
     callers_choice = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(cache_root() / _digest(function.__module__))  # read when the cache is attached
     try:

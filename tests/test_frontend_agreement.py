@@ -1,12 +1,10 @@
 """Pairs that contradict each other, points that move on their own, and what is then said of a motion."""
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from dawdling import Dawdling
 from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import AnyArray, Float
@@ -36,14 +34,12 @@ def judged(
     seen: Observations,
     seed: int = 0,
     arrays: RigArrays = ARRAYS,
-    threads: ThreadPoolExecutor | None = None,
     in_doubt: bool = False,
     misaligned: Mapping[int, Misalignment] | None = None,
 ) -> Agreement:
     rng = np.random.default_rng(seed)
     joint = joint_motion(arrays, seen, STILL, CONFIG, rng)
-    with threads or ThreadPoolExecutor(2) as workers:
-        return agree(arrays, seen, joint, CONFIG, rng, workers, misaligned or {}, in_doubt)
+    return agree(arrays, seen, joint, CONFIG, rng, misaligned or {}, in_doubt)
 
 
 def mixed(first: tuple[Float, int], second: tuple[Float, int], seed: int = 0) -> Observations:
@@ -230,26 +226,6 @@ def test_a_pair_that_the_chosen_motion_does_not_explain_has_no_error_under_it() 
     report = _report(frame, Correspondences(seen, rows, {0: 120, 1: 60}), 1, agreement)
     assert (report.inliers, report.rms_px) == (0, None)
     assert report.own_rms_px == pytest.approx(0.2, rel=0.15)
-
-
-@pytest.mark.parametrize("doors", [1, 2])
-def test_the_threads_timing_changes_nothing(doors: int) -> None:
-    """Also where a door in each view has both pairs search for a motion of their own at the same time."""
-    seen = mixed((TRUTH, 60), (DOOR, 60))
-    if doors == 2:
-        seen = joined(mixed((TRUTH, 40), (TRUTH, 40)), mixed((DOOR, 60), (OTHER_DOOR, 60)))
-    first = judged(seen)
-    assert len(first.sides) == doors + 1
-    for seed in range(6):
-        threads = Dawdling(2, seed)
-        again = judged(seen, threads=threads)
-        assert len(threads.delays_ms) == 1  # the first pair is worked on meanwhile
-        assert [side.pairs for side in first.sides] == [side.pairs for side in again.sides]
-        motions = [(first.own[j], again.own[j]) for j in first.own.keys() | again.own.keys()]
-        motions += [(one.refined, other.refined) for one, other in zip(first.sides, again.sides, strict=True)]
-        for one, other in motions:
-            for name, value in vars(one).items():
-                np.testing.assert_array_equal(getattr(other, name), value, err_msg=name)
 
 
 @pytest.mark.parametrize("second", [TRUTH, DOOR], ids=["one world", "a door"])

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import Float
+from graphvio.frontend.blocks import LANES, SIZE, in_blocks, lane_by_lane, point_by_point
 from graphvio.frontend.cost import left_motions
-from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise
+from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise, unexpanded
 from graphvio.frontend.observations import Observations, RigArrays
 
 RIG = two_pair_rig()
@@ -19,6 +24,35 @@ PAIRS_AND_RIGHTS = pytest.mark.parametrize(
     ("pairs", "share"), [((0,), 1.0), ((0,), 0.0), ((1,), 1.0), ((1,), 0.0), ((0, 1), 0.6)],
     ids=["first", "first, no right", "second", "second, no right", "both, some right"],
 )  # fmt: skip
+
+
+@dataclass
+class Places:
+    """An expansion point by point: points (N, 3), offsets (N, 4) and whiteners (N, 4, 4)."""
+
+    points: Float
+    offsets: Float
+    whiteners: Float
+
+    @staticmethod
+    def of(seen: Observations, at: Expansion) -> Places:
+        blocks, whiteners = in_blocks(seen), np.zeros((len(seen.pair), 4, 4))
+
+        def columns(rows: Float) -> Float:
+            return np.column_stack([point_by_point(blocks, row) for row in np.hsplit(rows, rows.shape[1] // LANES)])
+
+        whiteners[:, *np.tril_indices(4)] = columns(at.whiteners)
+        return Places(columns(at.points), columns(at.offsets), whiteners)
+
+    def expansion(self, seen: Observations) -> Expansion:
+        """The same as the kernels take it."""
+        blocks = in_blocks(seen)
+
+        def rows(columns: Float) -> Float:
+            return np.hstack([lane_by_lane(blocks, np.ascontiguousarray(column)) for column in columns.T])
+
+        shifts = self.points - seen.points
+        return Expansion(*map(rows, (shifts, self.points, self.offsets, self.whiteners[:, *np.tril_indices(4)])))
 
 
 def scene(pairs: tuple[int, ...], share: float) -> tuple[Observations, Float]:
@@ -67,17 +101,45 @@ def by_point(seen: Observations, i: int, point: Float, cur_T_ref: Float) -> Floa
     )
 
 
-def linearised(seen: Observations, cur_T_ref: Float, at: Expansion) -> tuple[float, Float, Float, Float]:
+def linearised(
+    seen: Observations, cur_T_ref: Float, at: Expansion, active: Float | None = None
+) -> tuple[float, Float, Float, Float]:
     """What `linearise` says: cost, normal matrix (6, 6), gradient (6,) and squared errors (N,)."""
-    hessian, gradient, errors2 = np.empty((6, 6)), np.empty(6), np.empty(len(seen.pair))
-    active = np.ones(len(seen.pair), dtype=bool)
+    blocks = in_blocks(seen)
+    hessian, gradient, errors2 = np.empty((6, 6)), np.empty(6), np.empty((len(blocks.pair), LANES))
+    counted = lane_by_lane(blocks, np.ones(len(seen.pair)) if active is None else active)
     motions = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
-    cost = linearise(motions, ARRAYS, seen, at, active, SCALE, hessian, gradient, errors2)
-    return cost, hessian, gradient, errors2
+    cost = linearise(motions, ARRAYS, blocks, at, counted, SCALE, hessian, gradient, errors2)
+    return cost, hessian, gradient, point_by_point(blocks, errors2)
 
 
 def expanded(seen: Observations, cur_T_ref: Float) -> Expansion:
-    return expand(left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS), ARRAYS, seen, SIGMAS)
+    blocks = in_blocks(seen)
+    at = unexpanded(blocks)
+    for _ in range(2):  # the second goes on where the first ended
+        expand(left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS), ARRAYS, blocks, SIGMAS, at)
+    return at
+
+
+@given(counts=st.lists(st.integers(0, 70), min_size=1, max_size=4))
+def test_blocks_hold_every_point_once(counts: list[int]) -> None:
+    rng = np.random.default_rng(sum(counts))
+    n = sum(counts)
+    points, covariances = rng.random((n, 3)), rng.random((n, 3, 3))
+    left, right = rng.random((n, 2)), rng.random((n, 2))
+    seen = Observations(np.repeat(np.arange(len(counts)), counts), points, covariances, left, right, left[:, 0] < 0.5)
+    blocks = in_blocks(seen)
+    assert blocks.size.sum() == n
+    assert len(blocks.pair) == sum(-(-count // LANES) for count in counts)
+    rows = blocks.values.reshape(len(blocks.pair), SIZE // LANES, LANES)
+    upper = seen.covariances[:, *np.triu_indices(3)]
+    expected = np.column_stack([seen.points, upper, seen.left, seen.right, seen.has_right])
+    for k, column in enumerate(expected.T):
+        np.testing.assert_array_equal(point_by_point(blocks, np.ascontiguousarray(rows[:, k])), column)
+    np.testing.assert_array_equal(
+        point_by_point(blocks, lane_by_lane(blocks, seen.points[:, 0].copy())), seen.points[:, 0]
+    )
+    np.testing.assert_array_equal(np.repeat(blocks.pair, blocks.size), seen.pair)
 
 
 @PAIRS_AND_RIGHTS
@@ -96,8 +158,9 @@ def test_the_gradient_is_the_costs_numerical_derivative(pairs: tuple[int, ...], 
 @PAIRS_AND_RIGHTS
 def test_the_normal_equations_are_those_of_numerical_derivatives(pairs: tuple[int, ...], share: float) -> None:
     seen, cur_T_ref = scene(pairs, share)
-    at = expanded(seen, cur_T_ref)
-    cost, hessian, gradient, errors2 = linearised(seen, cur_T_ref, at)
+    expansion = expanded(seen, cur_T_ref)
+    cost, hessian, gradient, errors2 = linearised(seen, cur_T_ref, expansion)
+    at = Places.of(seen, expansion)
     expected_hessian, expected_gradient = np.zeros((6, 6)), np.zeros(6)
     expected_cost = 0.0
     for i in range(len(seen.pair)):
@@ -121,7 +184,7 @@ def test_the_normal_equations_are_those_of_numerical_derivatives(pairs: tuple[in
 def test_points_are_whitened_where_both_instants_say_that_they_are(pairs: tuple[int, ...], share: float) -> None:
     """The covariance ``sigma^2 (1 + J C J^T)``, and the correction ``C J^T S^-1 r`` that leads to the same place."""
     seen, cur_T_ref = scene(pairs, share)
-    at = expanded(seen, cur_T_ref)
+    at = Places.of(seen, expanded(seen, cur_T_ref))
     followed = 0
     for i in range(len(seen.pair)):
         derivative = by_point(seen, i, at.points[i], cur_T_ref)
@@ -145,10 +208,11 @@ def test_points_are_whitened_where_both_instants_say_that_they_are(pairs: tuple[
 @PAIRS_AND_RIGHTS
 def test_information_through_points_is_its_formula(pairs: tuple[int, ...], share: float) -> None:
     seen, cur_T_ref = scene(pairs, share)
-    at = expanded(seen, cur_T_ref)
+    expansion = expanded(seen, cur_T_ref)
+    at, blocks = Places.of(seen, expansion), in_blocks(seen)
     factors = np.random.default_rng(3).uniform(-0.2, 1.0, len(seen.pair)).clip(0.0)
     motions = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
-    found = information_through_points(motions, ARRAYS, seen, at, SIGMAS, factors)
+    found = information_through_points(motions, ARRAYS, blocks, expansion, SIGMAS, lane_by_lane(blocks, factors))
     expected = np.zeros((6, 6))
     for i, factor in enumerate(factors):
         derivative = by_motion(seen, i, at.points[i], cur_T_ref)
@@ -162,18 +226,17 @@ def test_information_through_points_is_its_formula(pairs: tuple[int, ...], share
 
 def test_points_behind_a_camera_and_inactive_ones_give_no_equations() -> None:
     seen, cur_T_ref = scene((0, 1), 0.6)
-    at = expanded(seen, cur_T_ref)
+    at = Places.of(seen, expanded(seen, cur_T_ref))
     behind, n = 7, len(seen.pair)
     motions = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
-    places = at.points.copy()
-    places[behind, 2] = -2.0 / motions[0, 0, 2, 3]  # the motion takes its depth from 1 to about -1 of itself
-    at = at._replace(points=places)
+    at.points[behind, 2] = -2.0 / motions[0, 0, 2, 3]  # the motion takes its depth from 1 to about -1 of itself
     active = np.arange(n) != 3
-    hessian, gradient, errors2 = np.empty((6, 6)), np.empty(6), np.empty(n)
-    cost = linearise(motions, ARRAYS, seen, at, active, SCALE, hessian, gradient, errors2)
+    cost, hessian, gradient, errors2 = linearised(seen, cur_T_ref, at.expansion(seen), active.astype(float))
     assert np.flatnonzero(np.isinf(errors2)).tolist() == [behind]
     rest = active & (np.arange(n) != behind)
-    part = linearised(seen.of_rows(rest), cur_T_ref, Expansion(*(column[rest] for column in at)))
+    few = seen.of_rows(rest)
+    places = Places(at.points[rest], at.offsets[rest], at.whiteners[rest])
+    part = linearised(few, cur_T_ref, places.expansion(few))
     assert cost == pytest.approx(part[0] + np.log1p(1e6))
-    np.testing.assert_allclose(hessian, part[1], rtol=1e-12)
+    np.testing.assert_allclose(hessian, part[1], rtol=1e-11)
     np.testing.assert_allclose(gradient, part[2], rtol=1e-9, atol=1e-9)

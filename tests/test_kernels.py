@@ -114,7 +114,7 @@ def test_every_import_between_modules_of_kernels_is_of_the_form_that_the_digest_
     with_kernels = {
         path: text
         for path, text in texts.items()
-        if any(f"@{decorator}" in text for decorator in ("kernel", "fast_kernel", "inner_kernel"))
+        if any(f"@{decorator}" in text for decorator in ("kernel", "fast_kernel", "vector_kernel", "inner_kernel"))
     }
     assert len(with_kernels) > 10
     offenders = [

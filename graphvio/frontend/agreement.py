@@ -7,7 +7,6 @@ side comes first, as in eq. (4).
 """
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -74,7 +73,6 @@ def agree(
     joint: Refined,
     config: MotionConfig,
     rng: np.random.Generator,
-    workers: Executor,
     misaligned: Mapping[int, Misalignment] = _NONE,
     in_doubt: bool = False,
 ) -> Agreement:
@@ -86,21 +84,14 @@ def agree(
         joint: `graphvio.frontend.selection.joint_motion` of these.
         config: of this stage.
         rng: source of random triples.
-        workers: run the pairs side by side.
         misaligned: pairs whose place has been corrected, which leaves it uncertain.
         in_doubt: the pairs contradicted each other a moment ago, so that less is enough to tell them apart now.
     """
     everyone = tuple(int(j) for j in np.unique(observations.pair))
     own: dict[int, Refined] = {}
     if len(everyone) > 1:
-        sources = rng.spawn(len(everyone))  # one each, so that the threads' timing changes nothing
-        others = [
-            workers.submit(_own_motion, rig, observations, j, joint, config, source)
-            for j, source in zip(everyone[1:], sources[1:], strict=True)
-        ]
-        motions = [_own_motion(rig, observations, everyone[0], joint, config, sources[0])]
-        motions += [other.result() for other in others]
-        own = {j: m for j, m in zip(everyone, motions, strict=True) if is_supported(m.inlier, config)}
+        motions = {j: _own_motion(rig, observations, j, joint, config, rng) for j in everyone}
+        own = {j: motion for j, motion in motions.items() if is_supported(motion.inlier, config)}
     elif everyone:
         joint = placed(joint, misaligned.get(everyone[0]))
     opinions = {j: placed(motion, misaligned.get(j)) for j, motion in own.items()}
@@ -160,8 +151,7 @@ def _own_motion(
     config: MotionConfig,
     rng: np.random.Generator,
 ) -> Refined:
-    rows = observations.pair == pair
-    seen, inlier = observations.of_rows(rows), joint.inlier[rows]
+    seen, inlier = observations.of_pair(pair), joint.inlier[observations.pair == pair]
     share = float(inlier.mean())
     if share >= _WELL_EXPLAINED:
         return refine(rig, seen, joint.cur_T_ref, config, known=inlier)

@@ -4,13 +4,28 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.kernels import fast_kernel, kernel
+from graphvio.geometry import se3_compose
+from graphvio.kernels import fast_kernel, inner_kernel, kernel
 
 NEAREST = 1e-3
 """Depth over the reference depth, below which a point is behind the camera."""
 WORST = 1e6
 """Squared error that stands for a point behind the camera; no other counts for more."""
-_BLOCK = 48  # (1 + 1e6)^48 is below the largest float
+_BLOCK = 32  # (1 + 1e6)^32 is below the largest float
+
+Matrix = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+"""The upper three rows of a transform."""
+
+
+@inner_kernel
+def elements(transform: Float) -> Matrix:
+    """The upper three rows of a transform (4, 4), which a loop then holds in registers."""
+    t = transform
+    return (
+        t[0, 0], t[0, 1], t[0, 2], t[0, 3],
+        t[1, 0], t[1, 1], t[1, 2], t[1, 3],
+        t[2, 0], t[2, 1], t[2, 2], t[2, 3],
+    )  # fmt: skip
 
 
 @kernel
@@ -22,9 +37,9 @@ def left_motions(cur_T_ref: Float, rig: RigArrays) -> Float:
     n_pairs = len(rig.body_T_left)
     motions = np.empty((n_pairs, 2, 4, 4))
     for j in range(n_pairs):
-        body_T_left_ref = cur_T_ref @ rig.body_T_left[j]
+        body_T_left_ref = se3_compose(cur_T_ref, rig.body_T_left[j])
         for side in range(2):
-            motions[j, side] = np.ascontiguousarray(rig.cam_T_body[j, side]) @ body_T_left_ref
+            motions[j, side] = se3_compose(rig.cam_T_body[j, side], body_T_left_ref)
     return motions
 
 
@@ -65,21 +80,22 @@ def score_all(
         scale_left = rig.focal_px[j, 0] / cauchy_scale_px
         scale_right = rig.focal_px[j, 1] / cauchy_scale_px
         for h in range(len(hypotheses)):
-            body_T_left_ref = np.ascontiguousarray(hypotheses[h]) @ rig.body_T_left[j]
-            motion = np.ascontiguousarray(rig.cam_T_body[j, 0]) @ body_T_left_ref
-            scores[h] += _image_cost(motion, points, left, scale_left)
-            motion = np.ascontiguousarray(rig.cam_T_body[j, 1]) @ body_T_left_ref
-            scores[h] += _image_cost(motion, points, right, scale_right)
+            body_T_left_ref = se3_compose(hypotheses[h], rig.body_T_left[j])
+            scores[h] += _image_cost(se3_compose(rig.cam_T_body[j, 0], body_T_left_ref), points, left, scale_left)
+            scores[h] += _image_cost(se3_compose(rig.cam_T_body[j, 1], body_T_left_ref), points, right, scale_right)
     return scores
 
 
 @kernel
 def _columns_of_pair(observations: Observations, rows: Int, pair: int) -> tuple[Float, Float, Float, int]:
-    """One pair's points (3, n), and their left and right coordinates with weights (3, n), as columns in memory."""
+    """One pair's n points, and their left and right coordinates with weights, as columns in memory: (3, n) but for a
+    last block that is filled with points of no weight."""
     n = 0
     for i in rows:
         n += observations.pair[i] == pair
-    points, left, right = np.empty((3, n)), np.ones((3, n)), np.ones((3, n))
+    whole = (n + _BLOCK - 1) // _BLOCK * _BLOCK
+    points, left, right = np.zeros((3, whole)), np.zeros((3, whole)), np.zeros((3, whole))
+    left[2, :n] = right[2, :n] = 1.0
     k = 0
     for i in rows:
         if observations.pair[i] != pair:
@@ -90,7 +106,7 @@ def _columns_of_pair(observations: Observations, rows: Int, pair: int) -> tuple[
         if observations.has_right[i]:
             right[0, k], right[1, k] = observations.right[i, 0], observations.right[i, 1]
         else:
-            right[0, k] = right[1, k] = right[2, k] = 0.0
+            right[2, k] = 0.0
         k += 1
     return points, left, right, n
 
@@ -98,16 +114,15 @@ def _columns_of_pair(observations: Observations, rows: Int, pair: int) -> tuple[
 @fast_kernel
 def _image_cost(motion: Float, points: Float, seen: Float, scale: float) -> float:
     """Robust cost in one image; logarithms are taken of products, which fit into a float for a block of points."""
-    total = 0.0
-    n = points.shape[1]
+    m, total = elements(motion), 0.0
     a, b, w = points[0], points[1], points[2]
     u, v, weight = seen[0], seen[1], seen[2]
-    for start in range(0, n, _BLOCK):
+    for start in range(0, len(a), _BLOCK):
         product = 1.0
-        for i in range(start, min(start + _BLOCK, n)):
-            x = motion[0, 0] * a[i] + motion[0, 1] * b[i] + motion[0, 2] + w[i] * motion[0, 3]
-            y = motion[1, 0] * a[i] + motion[1, 1] * b[i] + motion[1, 2] + w[i] * motion[1, 3]
-            z = motion[2, 0] * a[i] + motion[2, 1] * b[i] + motion[2, 2] + w[i] * motion[2, 3]
+        for i in range(start, start + _BLOCK):
+            x = m[0] * a[i] + m[1] * b[i] + m[2] + w[i] * m[3]
+            y = m[4] * a[i] + m[5] * b[i] + m[6] + w[i] * m[7]
+            z = m[8] * a[i] + m[9] * b[i] + m[10] + w[i] * m[11]
             inverse_z = 1.0 / max(z, NEAREST)
             dx, dy = scale * (u[i] - x * inverse_z), scale * (v[i] - y * inverse_z)
             error = min(dx * dx + dy * dy, WORST) if z >= NEAREST else WORST

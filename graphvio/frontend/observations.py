@@ -68,11 +68,11 @@ class Observations(NamedTuple):
     has_right: Bool
 
     def of_pair(self, pair: int) -> Observations:
-        """Only one pair's points."""
-        return self.of_rows(self.pair == pair)
+        """Only one pair's points, not copied."""
+        return self.of_rows(slice(*np.searchsorted(self.pair, [pair, pair + 1])))
 
-    def of_rows(self, rows: Bool) -> Observations:
-        """Only some points (N,)."""
+    def of_rows(self, rows: Bool | slice) -> Observations:
+        """Only some points (N,), or those of a range."""
         return Observations(
             self.pair[rows], self.points[rows], self.covariances[rows], self.left[rows], self.right[rows],
             self.has_right[rows],

@@ -2,17 +2,17 @@
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Int
+from graphvio.arrays import Float, Int
 from graphvio.config import MotionConfig
 from graphvio.frontend.cost import WORST, left_motions, score_all, squared_error_px
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.resection import resect
-from graphvio.geometry import se3_inverse
+from graphvio.geometry import se3_compose, se3_inverse
 from graphvio.kernels import kernel
 
 _MIN_INVERSE_DEPTH = 0.005
 _MAX_RELATIVE_DEPTH_SIGMA = 0.3
-_FIRST_BATCH = 12
+_FIRST_BATCH = 6
 
 
 def search(
@@ -27,17 +27,15 @@ def search(
     For arguments see `graphvio.frontend.selection.joint_motion`.
     """
     best, drawn = predicted, 0
-    pairs = [int(pair) for pair in np.unique(observations.pair)]
     while drawn < config.hypotheses:
         batch = config.hypotheses if config.confidence >= 1.0 else max(_FIRST_BATCH, drawn)
         batch = min(batch, config.hypotheses - drawn)
-        found = [hypothesise(rig, observations, pair, batch, config.pixel_sigma_px, rng) for pair in pairs]
+        motions, sources = hypothesise(rig, observations, batch, config.pixel_sigma_px, rng)
         best = preempt(
-            rig, observations, np.concatenate([best[None], *found]), config.chunk_points, config.cauchy_scale_px, rng
+            rig, observations, np.concatenate([best[None], motions]), config.chunk_points, config.cauchy_scale_px, rng
         )
         drawn += batch
-        shares = _explained_shares(best, rig, observations, 2.0 * config.cauchy_scale_px)
-        shares = shares[[pair for pair, motions in zip(pairs, found, strict=True) if len(motions)]]
+        shares = _explained_shares(best, rig, observations, 2.0 * config.cauchy_scale_px)[np.unique(sources)]
         with np.errstate(divide="ignore", invalid="ignore"):
             needed = np.log1p(-min(config.confidence, 1.0 - 1e-12)) / np.log1p(-(shares**3))
         # One pair's right triple is enough: a pair that something stands in front of may have none.
@@ -47,25 +45,12 @@ def search(
 
 
 def hypothesise(
-    rig: RigArrays,
-    observations: Observations,
-    pair: int,
-    count: int,
-    pixel_sigma_px: float,
-    rng: np.random.Generator,
-) -> Float:
-    """Motions ``cur_T_ref`` (H, 4, 4) of body, by 3-point resection of one pair's random triples, H <= count."""
-    sigma_w = pixel_sigma_px * np.sqrt(observations.covariances[:, 2, 2])
-    w = observations.points[:, 2]
-    usable = (observations.pair == pair) & (w > _MIN_INVERSE_DEPTH) & (sigma_w < _MAX_RELATIVE_DEPTH_SIGMA * w)
-    rows = np.flatnonzero(usable)
-    if len(rows) < 3 or count == 0:
-        return np.zeros((0, 4, 4))
-    triples = rows[rng.integers(0, len(rows), size=(count, 3))]
-    distinct = (triples[:, 0] != triples[:, 1]) & (triples[:, 0] != triples[:, 2]) & (triples[:, 1] != triples[:, 2])
-    poses, found = _resect_triples(triples[distinct], rig, observations, pair)
-    body_T_left = rig.body_T_left[pair]
-    return np.ascontiguousarray(body_T_left @ poses[found] @ se3_inverse(body_T_left))
+    rig: RigArrays, observations: Observations, count: int, pixel_sigma_px: float, rng: np.random.Generator
+) -> tuple[Float, Int]:
+    """Motions ``cur_T_ref`` (H, 4, 4) of body, by 3-point resection of random triples, and the pair (H,) that each is
+    from; up to ``count`` of each pair."""
+    pairs = np.unique(observations.pair)
+    return _resect_triples(pairs, rng.random((len(pairs), count, 3)), rig, observations, pixel_sigma_px)
 
 
 def preempt(
@@ -81,20 +66,38 @@ def preempt(
     Every hypothesis is scored on a chunk of points of *each* pair; the scores cumulate. When the points are used up,
     the best score wins.
     """
-    order: list[Int] = [rng.permutation(np.flatnonzero(observations.pair == j)) for j in range(len(rig.body_T_left))]
-    alive = np.arange(len(hypotheses))
-    scores = np.zeros(len(hypotheses))
+    order = rng.permutation(len(observations.pair))
+    return _preempt(rig, observations, hypotheses, order, chunk_points, cauchy_scale_px)
+
+
+@kernel
+def _preempt(
+    rig: RigArrays, observations: Observations, hypotheses: Float, order: Int, chunk_points: int, cauchy_scale_px: float
+) -> Float:
+    """`preempt` with all points in a random order (N,)."""
+    place = _places_in_pair(observations.pair[order], len(rig.body_T_left))
+    alive, scores = np.arange(len(hypotheses)), np.zeros(len(hypotheses))
     start = 0
     while len(alive) > 1:
-        chunk = np.concatenate([rows[start : start + chunk_points] for rows in order])
+        chunk = order[(place >= start) & (place < start + chunk_points)]
         if len(chunk) == 0:
             break
         scores[alive] += score_all(hypotheses[alive], rig, observations, chunk, cauchy_scale_px)
-        ranked = alive[np.argsort(scores[alive], kind="stable")]
+        ranked = alive[np.argsort(scores[alive], kind="mergesort")]
         alive = ranked[: (len(ranked) + 1) // 2]
         start += chunk_points
-    best = alive[np.argmin(scores[alive])]
-    return np.asarray(hypotheses[best])
+    best: Float = hypotheses[alive[np.argmin(scores[alive])]].copy()
+    return best
+
+
+@kernel
+def _places_in_pair(pair: Int, pairs: int) -> Int:
+    """How many of the same pair come before each (N,)."""
+    before, places = np.zeros(pairs, dtype=np.int64), np.empty(len(pair), dtype=np.int64)
+    for i in range(len(pair)):
+        places[i] = before[pair[i]]
+        before[pair[i]] += 1
+    return places
 
 
 @kernel
@@ -114,35 +117,57 @@ def _explained_shares(cur_T_ref: Float, rig: RigArrays, observations: Observatio
 
 
 @kernel
-def _resect_triples(triples: Int, rig: RigArrays, observations: Observations, pair: int) -> tuple[Float, Bool]:
-    """For each triple of one pair's points the solution that the right image of the points likes best."""
-    n = len(triples)
-    best = np.zeros((n, 4, 4))
-    found = np.zeros(n, dtype=np.bool_)
-    corners = np.empty((3, 3))
-    rays = np.empty((3, 3))
-    points, left, right = observations.points, observations.left, observations.right
-    right_T_left = np.ascontiguousarray(rig.cam_T_body[pair, 1]) @ np.ascontiguousarray(rig.body_T_left[pair])
-    for i in range(n):
-        for k in range(3):
-            row = triples[i, k]
-            w = points[row, 2]
-            corners[k, 0], corners[k, 1], corners[k, 2] = points[row, 0] / w, points[row, 1] / w, 1.0 / w
-            x, y = left[row, 0], left[row, 1]
-            norm = np.sqrt(x * x + y * y + 1.0)
-            rays[k, 0], rays[k, 1], rays[k, 2] = x / norm, y / norm, 1.0 / norm
-        poses, count = resect(corners, rays)
-        least = np.inf
-        for c in range(count):
-            motion = right_T_left @ poses[c]
-            error = 0.0
+def _resect_triples(
+    pairs: Int, draws: Float, rig: RigArrays, observations: Observations, pixel_sigma_px: float
+) -> tuple[Float, Int]:
+    """Resect triples of points of some pairs (Q,), which random numbers (Q, H, 3) in [0, 1) tell; for each that has a
+    solution, the motion of body (K, 4, 4), and its pair (K,)."""
+    count = draws.shape[1]
+    motions, sources = np.empty((draws.shape[0] * count, 4, 4)), np.empty(draws.shape[0] * count, dtype=np.int64)
+    triple, found = np.empty(3, dtype=np.int64), 0
+    w, sigma_w = observations.points[:, 2], pixel_sigma_px * np.sqrt(observations.covariances[:, 2, 2])
+    usable = (w > _MIN_INVERSE_DEPTH) & (sigma_w < _MAX_RELATIVE_DEPTH_SIGMA * w)
+    for q, j in enumerate(pairs):
+        rows = np.flatnonzero(usable & (observations.pair == j))
+        if len(rows) < 3:
+            continue
+        body_T_left = rig.body_T_left[j]
+        left_T_body = se3_inverse(body_T_left)
+        right_T_left = se3_compose(rig.cam_T_body[j, 1], body_T_left)
+        for h in range(count):
             for k in range(3):
-                row = triples[i, k]
-                if observations.has_right[row]:
-                    e2 = squared_error_px(motion, points[row], right[row], rig.focal_px[pair, 1])
-                    error += min(e2, WORST)
-            if error < least:
-                least = error
-                best[i] = poses[c]
-                found[i] = True
-    return best, found
+                triple[k] = rows[int(draws[q, h, k] * len(rows))]
+            if triple[0] == triple[1] or triple[0] == triple[2] or triple[1] == triple[2]:
+                continue
+            left_cur_T_ref, solved = _resect_triple(triple, observations, right_T_left, rig.focal_px[j, 1])
+            if solved:
+                motions[found] = se3_compose(se3_compose(body_T_left, left_cur_T_ref), left_T_body)
+                sources[found] = j
+                found += 1
+    return motions[:found], sources[:found]
+
+
+@kernel
+def _resect_triple(triple: Int, observations: Observations, right_T_left: Float, focal_px: float) -> tuple[Float, bool]:
+    """The pose (4, 4) that the right image of the three points likes best, if there is one."""
+    corners, rays = np.empty((3, 3)), np.empty((3, 3))
+    points, left, right = observations.points, observations.left, observations.right
+    for k in range(3):
+        row = triple[k]
+        w = points[row, 2]
+        corners[k, 0], corners[k, 1], corners[k, 2] = points[row, 0] / w, points[row, 1] / w, 1.0 / w
+        x, y = left[row, 0], left[row, 1]
+        norm = np.sqrt(x * x + y * y + 1.0)
+        rays[k, 0], rays[k, 1], rays[k, 2] = x / norm, y / norm, 1.0 / norm
+    poses, count = resect(corners, rays)
+    best, least = 0, np.inf
+    for c in range(count):
+        motion = se3_compose(right_T_left, poses[c])
+        error = 0.0
+        for k in range(3):
+            row = triple[k]
+            if observations.has_right[row]:
+                error += min(squared_error_px(motion, points[row], right[row], focal_px), WORST)
+        if error < least:
+            best, least = c, error
+    return poses[best], count > 0

@@ -11,11 +11,12 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.config import MotionConfig
+from graphvio.frontend.blocks import LANES, Blocks, in_blocks, lane_by_lane, point_by_point
 from graphvio.frontend.cost import left_motions
-from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise
+from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise, unexpanded
 from graphvio.frontend.noise import influence, influence_slopes, inlier_cutoff, noise_by_pair, noise_variance
 from graphvio.frontend.observations import Observations, RigArrays
-from graphvio.geometry import se3_exp
+from graphvio.geometry import se3_compose, se3_exp
 from graphvio.kernels import kernel
 
 _MOST_ROUNDS = 3
@@ -82,33 +83,35 @@ def _refined(
 ) -> tuple[Float, Float, Float, Bool, Float]:  # fmt: skip
     """What `Refined` holds, in its order; inliers that are not known have no elements."""
     widest, largest2 = scale_px / sigma, (max_error_px / sigma) ** 2
-    has_right = observations.has_right
+    has_right, blocks = observations.has_right, in_blocks(observations)
+    at = unexpanded(blocks)
     pose, inlier = cur_T_ref, known
     sigmas_px = np.full(len(rig.focal_px), sigma)
-    errors2 = _squared_errors(pose, rig, observations, sigmas_px)
+    errors2 = _squared_errors(pose, rig, blocks, at, sigmas_px)
     if len(inlier) == len(has_right):
         scale = _scale(errors2[inlier], has_right[inlier], widest, largest2)
     else:
-        everything = np.ones(len(has_right), dtype=np.bool_)
+        everything = lane_by_lane(blocks, np.ones(len(has_right)))
         for _ in range(_ROUNDS_TO_FIND_INLIERS):
             scale = _scale(errors2, has_right, widest, largest2)
-            pose, _, errors2, _ = _levenberg_marquardt(pose, rig, observations, everything, sigmas_px, scale, 1, _NEAR)
+            pose, _, errors2 = _levenberg_marquardt(pose, rig, blocks, at, everything, sigmas_px, scale, 1, _NEAR)
         # One pair's images may be blurred or dim: its points are then less certain than the others'.
         noise = noise_by_pair(errors2, has_right, observations.pair, len(sigmas_px), largest2)
         errors2 /= noise[observations.pair]
         sigmas_px *= np.sqrt(noise)
         inlier = errors2 < inlier_cutoff(errors2, has_right, largest2)
         inlier &= _is_of_an_explained_pair(observations.pair, inlier)
-    pose, hessian, errors2, at = _levenberg_marquardt(
-        pose, rig, observations, inlier, sigmas_px, scale, _MOST_ROUNDS, _CONVERGED
+    active = lane_by_lane(blocks, inlier.astype(np.float64))
+    pose, hessian, errors2 = _levenberg_marquardt(
+        pose, rig, blocks, at, active, sigmas_px, scale, _MOST_ROUNDS, _CONVERGED
     )
     used = influence(errors2[inlier], has_right[inlier], scale)
     # Backward propagation of the reprojection covariance. The small prior keeps unconstrained directions finite.
     information = hessian / used.factor + np.eye(6) / _WEAK_DIRECTION_SIGMA**2
     root = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(information)).T)
     covariance = root @ root.T
-    factors = np.where(inlier, influence_slopes(errors2, has_right, scale) ** 2, 0.0)
-    through_points = information_through_points(left_motions(pose, rig), rig, observations, at, sigmas_px, factors)
+    factors = lane_by_lane(blocks, np.where(inlier, influence_slopes(errors2, has_right, scale) ** 2, 0.0))
+    through_points = information_through_points(left_motions(pose, rig), rig, blocks, at, sigmas_px, factors)
     gain = covariance / used.factor * (used.weight / used.slope)
     shared = _bounded(used.variance * gain @ through_points @ gain, root)
     errors_px = _errors_px(errors2, has_right, sigmas_px[observations.pair])
@@ -143,44 +146,34 @@ def _bounded(shared: Float, root: Float) -> Float:
 
 @kernel
 def _levenberg_marquardt(
-    cur_T_ref: Float,
-    rig: RigArrays,
-    observations: Observations,
-    active: Bool,
-    sigmas_px: Float,
-    scale: float,
-    rounds: int,
-    tolerance: float,
-) -> tuple[Float, Float, Float, Expansion]:
-    """Pose, normal matrix (6, 6), squared whitened errors (N,) and the points' linearisation at the minimum.
+    cur_T_ref: Float, rig: RigArrays, blocks: Blocks, at: Expansion, active: Float, sigmas_px: Float, scale: float,
+    rounds: int, tolerance: float,
+) -> tuple[Float, Float, Float]:  # fmt: skip
+    """Pose, normal matrix (6, 6) and squared whitened errors (N,) at the minimum; ``at`` is expanded there.
 
     In each round the places at which the points are linearised are found anew.
     """
     pose = cur_T_ref.copy()
-    n = len(observations.pair)
-    hessian, gradient, errors2 = np.zeros((6, 6)), np.zeros(6), np.empty(n)
-    new_hessian, new_gradient, new_errors2 = np.zeros((6, 6)), np.zeros(6), np.empty(n)
-    at = expand(left_motions(pose, rig), rig, observations, sigmas_px)
-    for turn in range(rounds):
+    hessian, gradient, errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), LANES))
+    new_hessian, new_gradient, new_errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), LANES))
+    for _ in range(rounds):
         motions = left_motions(pose, rig)
-        if turn > 0:
-            at = expand(motions, rig, observations, sigmas_px)
+        expand(motions, rig, blocks, sigmas_px, at)
         moved = 0.0
-        cost = linearise(motions, rig, observations, at, active, scale, hessian, gradient, errors2)
+        cost = linearise(motions, rig, blocks, at, active, scale, hessian, gradient, errors2)
         damping = 1e-6
         for _ in range(_STEPS_PER_ROUND):
             damped = hessian.copy()
             for k in range(6):
                 damped[k, k] += damping * hessian[k, k] + 1e-9
             step = np.linalg.solve(damped, gradient)
-            candidate = se3_exp(step) @ pose  # type: ignore[arg-type]
+            candidate = se3_compose(se3_exp(step), pose)  # type: ignore[arg-type]
             if np.max(np.abs(step)) < tolerance:
                 pose = candidate
                 break
             new_cost = linearise(
-                left_motions(candidate, rig), rig, observations, at, active, scale,
-                new_hessian, new_gradient, new_errors2,
-            )  # fmt: skip
+                left_motions(candidate, rig), rig, blocks, at, active, scale, new_hessian, new_gradient, new_errors2
+            )
             if new_cost <= cost:
                 pose, cost = candidate, new_cost
                 hessian, new_hessian = new_hessian, hessian
@@ -192,14 +185,15 @@ def _levenberg_marquardt(
                 damping = max(damping * 10.0, 1e-4)
         if moved < _NEAR:
             break  # the points' places and weights would not change any more
-    return pose, hessian, errors2, at
+    return pose, hessian, point_by_point(blocks, errors2)
 
 
 def explained(rig: RigArrays, observations: Observations, cur_T_ref: Float, config: MotionConfig) -> tuple[Bool, Float]:
     """Which points (N,) are inliers of a motion (4, 4), and the errors (N,) of all, see `Refined`."""
     sigma, has_right = config.pixel_sigma_px, observations.has_right
     sigmas_px = np.full(len(rig.focal_px), sigma)
-    errors2 = _squared_errors(cur_T_ref, rig, observations, sigmas_px)
+    blocks = in_blocks(observations)
+    errors2 = _squared_errors(cur_T_ref, rig, blocks, unexpanded(blocks), sigmas_px)
     inlier = errors2 < inlier_cutoff(errors2, has_right, (config.max_error_px / sigma) ** 2)
     return np.asarray(inlier), _errors_px(errors2, has_right, sigmas_px[observations.pair])
 
@@ -211,13 +205,10 @@ def _errors_px(errors2: Float, has_right: Bool, sigmas_px: Float) -> Float:
 
 
 @kernel
-def _squared_errors(cur_T_ref: Float, rig: RigArrays, observations: Observations, sigmas_px: Float) -> Float:
-    """Squared whitened errors (N,)."""
+def _squared_errors(cur_T_ref: Float, rig: RigArrays, blocks: Blocks, at: Expansion, sigmas_px: Float) -> Float:
+    """Squared whitened errors (N,) where ``at`` is expanded now."""
     motions = left_motions(cur_T_ref, rig)
-    n = len(observations.pair)
-    errors2 = np.empty(n)
-    linearise(
-        motions, rig, observations, expand(motions, rig, observations, sigmas_px), np.zeros(n, dtype=np.bool_), 1.0,
-        np.empty((6, 6)), np.empty(6), errors2,
-    )  # fmt: skip
-    return errors2
+    expand(motions, rig, blocks, sigmas_px, at)
+    errors2 = np.empty((len(blocks.pair), LANES))
+    linearise(motions, rig, blocks, at, np.zeros_like(errors2), 1.0, np.empty((6, 6)), np.empty(6), errors2)
+    return point_by_point(blocks, errors2)

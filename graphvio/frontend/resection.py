@@ -47,7 +47,9 @@ def resect(points: Float, rays: Float) -> tuple[Float, int]:
     coefficients[3] = 4.0 * (-p * (1.0 + p) * cos_b + 2.0 * a2 / b2 * cos_g**2 * cos_b - (1.0 - q) * cos_a * cos_g)
     coefficients[4] = (1.0 + p) ** 2 - 4.0 * a2 / b2 * cos_g**2
     roots, n_roots = real_quartic_roots(coefficients)
-    seen = np.empty((3, 3))
+    seen, axes_a, axes_cam = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    if not _triangle_axes(points, axes_a):
+        return poses, count
     for i in range(n_roots):
         v = roots[i]
         denominator = 2.0 * (cos_g - v * cos_a)
@@ -62,7 +64,8 @@ def resect(points: Float, rays: Float) -> tuple[Float, int]:
             continue
         s1 = np.sqrt(s1_squared)
         seen[0], seen[1], seen[2] = s1 * rays[0], u * s1 * rays[1], v * s1 * rays[2]
-        if _align_triangles(points, seen, poses[count]):
+        if _triangle_axes(seen, axes_cam):
+            _align_triangles(points, axes_a, seen, axes_cam, poses[count])
             count += 1
     return poses, count
 
@@ -81,12 +84,8 @@ def _side_ratio(v: float, cos_a: float, cos_b: float, cos_g: float, a2_b2: float
 
 
 @kernel
-def _align_triangles(points: Float, seen: Float, cam_T_a: Float) -> bool:
-    """Fill the transform that takes one triangle to a congruent one; False if the triangle is a line."""
-    axes_a = np.empty((3, 3))
-    axes_cam = np.empty((3, 3))
-    if not (_triangle_axes(points, axes_a) and _triangle_axes(seen, axes_cam)):
-        return False
+def _align_triangles(points: Float, axes_a: Float, seen: Float, axes_cam: Float, cam_T_a: Float) -> None:
+    """Fill the transform that takes one triangle to a congruent one, by the axes attached to each."""
     for i in range(3):
         for j in range(3):
             cam_T_a[i, j] = (
@@ -100,23 +99,36 @@ def _align_triangles(points: Float, seen: Float, cam_T_a: Float) -> bool:
                 middle -= cam_T_a[i, j] * points[k, j]
         cam_T_a[i, 3] = middle / 3.0
     cam_T_a[3, 3] = 1.0
-    return True
 
 
 @kernel
 def _triangle_axes(corners: Float, axes: Float) -> bool:
-    """Orthonormal axes (rows) attached to a triangle."""
-    first = corners[1] - corners[0]
-    second = corners[2] - corners[0]
-    length = np.sqrt(np.sum(first * first))
-    axes[0] = first / length
-    axes[2] = np.cross(first, second)
-    area = np.sqrt(np.sum(axes[2] * axes[2]))
-    if area < 1e-9 * length * length:
+    """Orthonormal axes (rows) attached to a triangle; False if it is a line."""
+    for c in range(3):
+        axes[0, c] = corners[1, c] - corners[0, c]
+        axes[1, c] = corners[2, c] - corners[0, c]
+    length = _normalise(axes[0])
+    _cross(axes[0], axes[1], axes[2])
+    if _normalise(axes[2]) < 1e-9 * length:
         return False
-    axes[2] /= area
-    axes[1] = np.cross(axes[2], axes[0])
+    _cross(axes[2], axes[0], axes[1])
     return True
+
+
+@kernel
+def _normalise(v: Float) -> float:
+    """Divide a vector (3,) by its length, which is returned."""
+    length = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    v /= length
+    return length
+
+
+@kernel
+def _cross(a: Float, b: Float, out: Float) -> None:
+    """Fill the cross product; ``np.cross`` makes a new array."""
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
 
 
 @kernel

@@ -199,7 +199,6 @@ class VisualFrontend:
                 refined,
                 config,
                 rng,
-                self._workers,
                 self.misaligned,
                 self._in_doubt(stamp_ns),
             )
