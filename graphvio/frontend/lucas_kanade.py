@@ -16,12 +16,13 @@ from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.frontend.patches import (
     align,
     correlation,
+    lattice,
     localisation2,
-    patches,
     prepare,
+    room,
     sample,
     sample_affine,
-    scratch,
+    scratch_room,
     weaker2,
 )
 from graphvio.kernels import fast_kernel
@@ -92,10 +93,8 @@ def _forth_and_back(
     n = len(pixels)
     moved = guess.copy()
     found = np.zeros(n, dtype=np.bool_)
-    bordered = np.empty((2 * half + 3, 2 * half + 3), dtype=np.float32)
-    buffers = patches(4, half)
-    patch, gx, gy, seen = buffers[0], buffers[1], buffers[2], buffers[3]
-    side, most2 = 2 * half + 1, _MOST_SIGMA_PX**2
+    bordered, patch, seen, gx, gy = room(half + 1), room(half), room(half), room(half), room(half)
+    inside, most2 = lattice(half).inside, _MOST_SIGMA_PX**2
     for i in range(n):
         for level in range(levels - 1, -1, -1):
             scale = 1.0 / (1 << level)
@@ -103,8 +102,8 @@ def _forth_and_back(
             u, v = moved[i, 0] * scale, moved[i, 1] * scale
             if not sample(source[level], x, y, half + 1, bordered):
                 continue  # near the edge of a coarse level: the finer ones may still see it
-            xx, xy, yy = prepare(bordered, patch, gx, gy)
-            u, v, converged = align(target[level], u, v, half, patch, gx, gy, xx, xy, yy, min_gradient)
+            xx, xy, yy = prepare(bordered, inside, patch, gx, gy)
+            u, v, converged = align(target[level], u, v, patch, gx, gy, xx, xy, yy, min_gradient)
             if converged or level > 0:
                 moved[i, 0], moved[i, 1] = u / scale, v / scale
             found[i] = converged and level == 0
@@ -112,11 +111,11 @@ def _forth_and_back(
             # The way back begins where it should end, so it needs no coarse levels.
             found[i] = sample(target[0], moved[i, 0], moved[i, 1], half + 1, bordered)
         if found[i]:
-            xx, xy, yy = prepare(bordered, seen, gx, gy)
-            found[i] = localisation2(patch, seen, xx, xy, yy, side) <= most2
+            xx, xy, yy = prepare(bordered, inside, seen, gx, gy)
+            found[i] = localisation2(patch, seen, xx, xy, yy) <= most2
         if found[i]:
             x, y = pixels[i, 0], pixels[i, 1]
-            u, v, converged = align(source[0], x, y, half, seen, gx, gy, xx, xy, yy, min_gradient)
+            u, v, converged = align(source[0], x, y, seen, gx, gy, xx, xy, yy, min_gradient)
             found[i] = converged and (u - x) ** 2 + (v - y) ** 2 <= max_return_px * max_return_px
     return moved, found
 
@@ -147,27 +146,26 @@ def register(
     n = len(pixels)
     moved, correlations = guess.copy(), np.full(n, -1.0)
     found, localised = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
-    bordered, row = patches(1, half + 1)[0], scratch(half + 1)
-    buffers = patches(4, half)
-    patch, gx, gy, seen = buffers[0], buffers[1], buffers[2], buffers[3]
-    side, most2 = 2 * half + 1, _MOST_SIGMA_PX**2
-    least2 = (min_gradient * side) ** 2
+    bordered, patch, seen, gx, gy = room(half + 1), room(half), room(half), room(half), room(half)
+    inside, inside_border, scratch = lattice(half).inside, lattice(half + 1).inside, scratch_room(half + 1)
+    most2 = _MOST_SIGMA_PX**2
+    least2 = (min_gradient * (2 * half + 1)) ** 2
     for i in range(n):
         x, y, warp = pixels[i, 0], pixels[i, 1], warps[i]
         if not wanted[i] or not sample_affine(
-            source, x, y, warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1], half + 1, row, bordered
+            source, x, y, warp[0, 0], warp[0, 1], warp[1, 0], warp[1, 1], inside_border, scratch, bordered
         ):
             continue
-        xx, xy, yy = prepare(bordered, patch, gx, gy)
+        xx, xy, yy = prepare(bordered, inside, patch, gx, gy)
         localised[i] = weaker2(xx, xy, yy) >= least2
         x, y = guess[i, 0], guess[i, 1]
-        u, v, converged = align(target, x, y, half, patch, gx, gy, xx, xy, yy, min_gradient)
+        u, v, converged = align(target, x, y, patch, gx, gy, xx, xy, yy, min_gradient)
         if converged and (u - x) ** 2 + (v - y) ** 2 <= max_shift_px * max_shift_px:
             if not sample(target, u, v, half + 1, bordered):
                 continue
-            xx, xy, yy = prepare(bordered, seen, gx, gy)
-            if not localisation2(patch, seen, xx, xy, yy, side) <= most2:
+            xx, xy, yy = prepare(bordered, inside, seen, gx, gy)
+            if not localisation2(patch, seen, xx, xy, yy) <= most2:
                 continue
             moved[i, 0], moved[i, 1], found[i] = u, v, True
-            correlations[i] = correlation(patch, seen, side)
+            correlations[i] = correlation(patch, seen)
     return moved, found, localised, correlations

@@ -1,46 +1,96 @@
 """Square patches of an image: sampled with sub-pixel precision, compared with each other, and aligned.
 
-A patch's rows are padded with zeros to a multiple of `_LANES`, so that loops over pixels run in whole vector
-registers. What stands in the padding of the image that it is compared with then has no weight.
+A patch of ``2 half + 1`` pixels on each side has rows that are padded with zeros to a multiple of `LANES`: loops over
+its pixels then run in whole vector registers, and what stands in the padding of the image that it is compared with
+has no weight.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
 from graphvio.arrays import AnyArray, Image
 from graphvio.kernels import fast_kernel, kernel
 
-_LANES = 16
-_HALF_LANES = 8
+LANES = 16
+"""Pixels that a vector register holds."""
+
 _NOWHERE_PX2 = 1e6
 _MAX_ITERATIONS = 20
 _CONVERGED_PX = 0.03  # the step is still taken: what is left after it is several times smaller
+_ONE, _ZERO, _HALF = np.float32(1.0), np.float32(0.0), np.float32(0.5)
+
+
+class Patch(NamedTuple):
+    """Numbers for each pixel of a patch.
+
+    Attributes:
+        rows: (side, padded side).
+        flat: the same numbers, row by row.
+    """
+
+    rows: AnyArray
+    flat: AnyArray
+
+
+class Lattice(NamedTuple):
+    """What is the same for all patches of one size: columns and rows, counted from the middle, and 1 for its own
+    pixels, 0 for the padding."""
+
+    columns: Patch
+    rows: Patch
+    inside: Patch
+
+
+class Scratch(NamedTuple):
+    """Where a deformed patch's pixels are in the image's memory, and between which of its pixels."""
+
+    places: Patch
+    right_of: Patch
+    below: Patch
 
 
 @fast_kernel
-def patches(count: int, half: int) -> AnyArray:
-    """Room for patches of ``2 half + 1`` pixels on each side (count, side, padded side), all zero."""
+def room(half: int) -> Patch:
+    """Room for a patch, all zero."""
     side = 2 * half + 1
-    return np.zeros((count, side, (side + _LANES - 1) // _LANES * _LANES), dtype=np.float32)
+    rows = np.zeros((side, (side + LANES - 1) // LANES * LANES), dtype=np.float32)
+    return Patch(rows, rows.reshape(-1))
 
 
 @fast_kernel
-def sample(image: Image, x: float, y: float, half: int, out: AnyArray) -> bool:
-    """Fill a patch around (x, y) by bilinear interpolation; False where it leaves the image."""
+def scratch_room(half: int) -> Scratch:
+    """Room for what `sample_affine` computes on the way."""
+    places = np.zeros(room(half).rows.shape, dtype=np.uint32)
+    return Scratch(Patch(places, places.reshape(-1)), room(half), room(half))
+
+
+@fast_kernel
+def lattice(half: int) -> Lattice:
+    """The lattice of patches of a size."""
+    columns, rows, inside = room(half), room(half), room(half)
+    for j in range(2 * half + 1):
+        for i in range(2 * half + 1):
+            columns.rows[j, i], rows.rows[j, i], inside.rows[j, i] = i - half, j - half, 1.0
+    return Lattice(columns, rows, inside)
+
+
+@fast_kernel
+def sample(image: Image, x: float, y: float, half: int, out: Patch) -> bool:
+    """Fill a patch around (x, y) by bilinear interpolation, but not its padding; False where it leaves the image."""
     height, width = image.shape
     if not (half <= x < width - half - 1 and half <= y < height - half - 1):
         return False
     x0, y0 = int(np.floor(x)), int(np.floor(y))
     ax, ay = np.float32(x - x0), np.float32(y - y0)
-    one = np.float32(1.0)
-    w00, w01, w10, w11 = (one - ax) * (one - ay), ax * (one - ay), (one - ax) * ay, ax * ay
+    w00, w01, w10, w11 = (_ONE - ax) * (_ONE - ay), ax * (_ONE - ay), (_ONE - ax) * ay, ax * ay
     side = 2 * half + 1
-    reach = side + 1
     left, top = x0 - half, y0 - half
     for j in range(side):
-        upper = image[top + j, left : left + reach]
-        lower = image[top + j + 1, left : left + reach]
+        upper = image[top + j, left : left + side + 1]
+        lower = image[top + j + 1, left : left + side + 1]
         for i in range(side):
-            out[j, i] = (
+            out.rows[j, i] = (
                 w00 * np.float32(upper[i])
                 + w01 * np.float32(upper[i + 1])
                 + w10 * np.float32(lower[i])
@@ -50,26 +100,26 @@ def sample(image: Image, x: float, y: float, half: int, out: AnyArray) -> bool:
 
 
 @fast_kernel
-def prepare(bordered: AnyArray, patch: AnyArray, gx: AnyArray, gy: AnyArray) -> tuple[float, float, float]:
+def prepare(bordered: Patch, inside: Patch, patch: Patch, gx: Patch, gy: Patch) -> tuple[float, float, float]:
     """Fill the patch and its gradients, all of zero mean, and return the normal matrix's xx, xy, yy.
 
     Args:
-        bordered: (side + 2, at least side + 2) the patch with one more pixel on each side.
-        patch: (side, padded side), as are the gradients.
+        bordered: the patch with one more pixel on each side.
+        inside: of the patch's `Lattice`.
+        patch: to fill, as are the gradients.
         gx: along the rows.
         gy: along the columns.
     """
-    side = patch.shape[0]
-    half = np.float32(0.5)
+    side, stride = patch.rows.shape
     for j in range(side):
-        above, at, below = bordered[j], bordered[j + 1], bordered[j + 2]
-        values, dx, dy = patch[j], gx[j], gy[j]
-        for i in range(side):
-            values[i] = at[i + 1]
-            dx[i] = half * (at[i + 2] - at[i])
-            dy[i] = half * (below[i + 1] - above[i + 1])
-    flat, flat_x, flat_y = patch.reshape(-1), gx.reshape(-1), gy.reshape(-1)
-    mean = mean_x = mean_y = xx = xy = yy = np.float32(0.0)
+        above, at, below, weights = bordered.rows[j], bordered.rows[j + 1], bordered.rows[j + 2], inside.rows[j]
+        values, dx, dy = patch.rows[j], gx.rows[j], gy.rows[j]
+        for i in range(stride):
+            values[i] = weights[i] * at[i + 1]
+            dx[i] = weights[i] * _HALF * (at[i + 2] - at[i])
+            dy[i] = weights[i] * _HALF * (below[i + 1] - above[i + 1])
+    mean = mean_x = mean_y = xx = xy = yy = _ZERO
+    flat, flat_x, flat_y, weights = patch.flat, gx.flat, gy.flat, inside.flat
     for k in range(flat.size):
         mean += flat[k]
         mean_x += flat_x[k]
@@ -81,12 +131,10 @@ def prepare(bordered: AnyArray, patch: AnyArray, gx: AnyArray, gy: AnyArray) -> 
     mean /= area
     mean_x /= area
     mean_y /= area
-    for j in range(side):
-        values, dx, dy = patch[j], gx[j], gy[j]
-        for i in range(side):
-            values[i] -= mean
-            dx[i] -= mean_x
-            dy[i] -= mean_y
+    for k in range(flat.size):
+        flat[k] -= weights[k] * mean
+        flat_x[k] -= weights[k] * mean_x
+        flat_y[k] -= weights[k] * mean_y
     return (
         float(xx - area * mean_x * mean_x),
         float(xy - area * mean_x * mean_y),
@@ -95,15 +143,14 @@ def prepare(bordered: AnyArray, patch: AnyArray, gx: AnyArray, gy: AnyArray) -> 
 
 
 @fast_kernel
-def mismatch(
-    image: Image, u: float, v: float, half: int, patch: AnyArray, gx: AnyArray, gy: AnyArray
-) -> tuple[float, float, bool]:
+def mismatch(image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patch) -> tuple[float, float, bool]:
     """Gradients times the difference between the image at (u, v) and the patch, summed; False outside the image.
 
     The gradients have zero mean, so a constant difference of brightness contributes nothing.
     """
     height, width = image.shape
-    side, stride = patch.shape
+    side, stride = patch.rows.shape
+    half = side // 2
     if not (half <= u < width - half - 1 and half <= v < height - half - 1):
         return 0.0, 0.0, False
     x0, y0 = int(np.floor(u)), int(np.floor(v))
@@ -111,17 +158,16 @@ def mismatch(
     if first + side * width + stride >= height * width:
         return 0.0, 0.0, False  # the padding of the lowest row would read on beyond the image's end
     ax, ay = np.float32(u - x0), np.float32(v - y0)
-    one = np.float32(1.0)
-    w00, w01, w10, w11 = (one - ax) * (one - ay), ax * (one - ay), (one - ax) * ay, ax * ay
+    w00, w01, w10, w11 = (_ONE - ax) * (_ONE - ay), ax * (_ONE - ay), (_ONE - ax) * ay, ax * ay
     flat = image.reshape(-1)
-    bx = by = np.float32(0.0)
+    bx = by = _ZERO
     for j in range(side):
-        for k in range(0, stride, _LANES):
+        for k in range(0, stride, LANES):
             start = first + j * width + k
-            upper, lower = flat[start : start + _LANES + 1], flat[start + width : start + width + _LANES + 1]
-            values, dx, dy = patch[j, k : k + _LANES], gx[j, k : k + _LANES], gy[j, k : k + _LANES]
-            row_x = row_y = np.float32(0.0)  # sums of their own: a row need not wait for the one before
-            for i in range(_LANES):
+            upper, lower = flat[start : start + LANES + 1], flat[start + width : start + width + LANES + 1]
+            values, dx, dy = patch.rows[j, k : k + LANES], gx.rows[j, k : k + LANES], gy.rows[j, k : k + LANES]
+            row_x = row_y = _ZERO  # sums of their own: a row need not wait for the one before
+            for i in range(LANES):
                 difference = (
                     w00 * np.float32(upper[i])
                     + w01 * np.float32(upper[i + 1])
@@ -138,18 +184,18 @@ def mismatch(
 
 @fast_kernel
 def align(
-    image: Image, u: float, v: float, half: int, patch: AnyArray, gx: AnyArray, gy: AnyArray,
+    image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patch,
     xx: float, xy: float, yy: float, min_gradient: float,
 ) -> tuple[float, float, bool]:  # fmt: skip
     """Gauss-Newton from (u, v): the patch's place in an image, and whether the iteration converged there.
 
     A patch whose rms gradient along the weaker direction is less than ``min_gradient`` is not localised.
     """
-    if weaker2(xx, xy, yy) < min_gradient * min_gradient * (2 * half + 1) ** 2:
+    if weaker2(xx, xy, yy) < min_gradient * min_gradient * len(patch.rows) ** 2:
         return u, v, False
     determinant = xx * yy - xy * xy
     for _ in range(_MAX_ITERATIONS):
-        bx, by, inside = mismatch(image, u, v, half, patch, gx, gy)
+        bx, by, inside = mismatch(image, u, v, patch, gx, gy)
         if not inside:
             break
         step_u = (yy * bx - xy * by) / determinant
@@ -191,86 +237,77 @@ def pack(image: Image, words: AnyArray) -> None:
 
 
 @fast_kernel
-def scratch(half: int) -> tuple[AnyArray, AnyArray]:
-    """Room for one row of `sample_affine`: places and fractions."""
-    lanes = patches(1, half).shape[2]
-    return np.zeros(lanes, dtype=np.uint32), np.zeros((2, lanes), dtype=np.float32)
-
-
-@fast_kernel
 def sample_affine(
-    image: AnyArray, x: float, y: float, xx: float, xy: float, yx: float, yy: float, half: int,
-    row: tuple[AnyArray, AnyArray], out: AnyArray,
+    image: AnyArray, x: float, y: float, xx: float, xy: float, yx: float, yy: float, inside: Patch, scratch: Scratch,
+    out: Patch,
 ) -> bool:  # fmt: skip
-    """Fill a patch around (x, y) of a `packed` image, by way of a row of `scratch`; False where it leaves the image.
+    """Fill a patch around (x, y) of a `packed` image; False where it leaves the image.
 
     Its pixels are the columns of ``[[xx, xy], [yx, yy]]`` apart, along its rows and along its columns.
     """
     height, width = image.shape
+    side, stride = out.rows.shape
+    half = side // 2
     reach_x, reach_y = half * (abs(xx) + abs(xy)), half * (abs(yx) + abs(yy))
     if not (reach_x + 1 <= x < width - 2 - reach_x and reach_y + 1 <= y < height - 2 - reach_y):
         return False  # with a pixel to spare for rounding
-    side = 2 * half + 1
-    lanes = (side + _HALF_LANES - 1) // _HALF_LANES * _HALF_LANES
     along_x, along_y = np.float32(xx), np.float32(yx)
     # Places are counted from the patch's own corner of the image, where single precision is fine enough.
     left, top = int(x - reach_x), int(y - reach_y)
     flat = image.reshape(-1)[top * width + left :]
-    stride, last = np.int32(width), np.int32(flat.size - 1)
-    places, right_of, below = row[0], row[1][0], row[1][1]
-    eight, byte = np.uint32(8), np.uint32(255)
+    pitch, last = np.int32(width), np.int32(flat.size - 1)
     for j in range(side):
-        values = out[j]
         px = np.float32(x - left - half * xx + xy * (j - half))
         py = np.float32(y - top - half * yx + yy * (j - half))
-        for i in range(lanes):
+        places, right_of, below = scratch.places.rows[j], scratch.right_of.rows[j], scratch.below.rows[j]
+        for i in range(stride):
             at_x, at_y = px + along_x * np.float32(i), py + along_y * np.float32(i)
             x0, y0 = np.int32(at_x), np.int32(at_y)
             right_of[i], below[i] = at_x - np.float32(x0), at_y - np.float32(y0)
-            places[i] = max(min(stride * y0 + x0, last), np.int32(0))  # lanes beyond the patch mean nothing
-        for i in range(lanes):
-            places[i] = flat[places[i]]
-        for i in range(lanes):
-            word = places[i]
-            a, b = np.float32(np.int32(word & byte)), np.float32(np.int32(word >> eight & byte))
-            c, d = np.float32(np.int32(word >> (eight + eight) & byte)), np.float32(np.int32(word >> np.uint32(24)))
-            upper, lower = a + right_of[i] * (b - a), c + right_of[i] * (d - c)
-            values[i] = upper + below[i] * (lower - upper)
-        values[side:] = np.float32(0.0)
+            places[i] = np.uint32(max(min(pitch * y0 + x0, last), np.int32(0)))  # in the padding they mean nothing
+    words, right_of, below = scratch.places.flat, scratch.right_of.flat, scratch.below.flat
+    for k in range(words.size):
+        words[k] = flat[words[k]]
+    weights, values, eight, byte = inside.flat, out.flat, np.uint32(8), np.uint32(255)
+    for k in range(words.size):
+        word = words[k]
+        a, b = np.float32(np.int32(word & byte)), np.float32(np.int32(word >> eight & byte))
+        c, d = np.float32(np.int32(word >> (eight + eight) & byte)), np.float32(np.int32(word >> np.uint32(24)))
+        upper, lower = a + right_of[k] * (b - a), c + right_of[k] * (d - c)
+        values[k] = weights[k] * (upper + below[k] * (lower - upper))
     return True
 
 
 @fast_kernel
-def correlation(patch: AnyArray, other: AnyArray, side: int) -> float:
-    """Normalised cross-correlation of a patch of zero mean with another, both padded with zeros."""
-    a, b = patch.reshape(-1), other.reshape(-1)
-    product = square = total = own = np.float32(0.0)
+def correlation(patch: Patch, other: Patch) -> float:
+    """Normalised cross-correlation of a patch of zero mean with another."""
+    a, b = patch.flat, other.flat
+    product = square = total = own = _ZERO
     for k in range(a.size):
         product += a[k] * b[k]
         square += b[k] * b[k]
         total += b[k]
         own += a[k] * a[k]
-    variance = square - total * total / np.float32(side * side)
+    variance = square - total * total / np.float32(len(patch.rows) ** 2)
     if variance < 1e-3 or own < 1e-3:
         return -1.0
     return float(product / np.sqrt(float(variance) * float(own)))
 
 
 @fast_kernel
-def localisation2(patch: AnyArray, other: AnyArray, xx: float, xy: float, yy: float, side: int) -> float:
+def localisation2(patch: Patch, other: Patch, xx: float, xy: float, yy: float) -> float:
     """Variance of a patch's place in an image along the weaker direction, square pixels.
 
     What differs between patch and image, but for contrast and brightness, is taken for white noise. A blurred image
     leaves a place free along the blur: an iteration that starts there ends there.
 
     Args:
-        patch: of zero mean, padded with zeros.
+        patch: of zero mean.
         other: the image at the patch's place, likewise.
         xx: normal matrix of ``other``, as are xy and yy.
-        side: of the patch.
     """
-    a, b = patch.reshape(-1), other.reshape(-1)
-    product = own = square = np.float32(0.0)
+    a, b = patch.flat, other.flat
+    product = own = square = _ZERO
     for k in range(a.size):
         product += a[k] * b[k]
         own += a[k] * a[k]
@@ -278,4 +315,4 @@ def localisation2(patch: AnyArray, other: AnyArray, xx: float, xy: float, yy: fl
     weaker = weaker2(xx, xy, yy)
     if own < 1e-3 or weaker < 1e-3:
         return _NOWHERE_PX2
-    return float(square - product * product / own) / (weaker * side * side)
+    return float(square - product * product / own) / (weaker * len(patch.rows) ** 2)

@@ -8,7 +8,19 @@ Inverse compositional Gauss-Newton, as in `graphvio.frontend.lucas_kanade`.
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
-from graphvio.frontend.patches import align, correlation, patches, prepare, sample, sample_affine, scratch
+from graphvio.frontend.patches import (
+    Lattice,
+    Patch,
+    Scratch,
+    align,
+    correlation,
+    lattice,
+    prepare,
+    room,
+    sample,
+    sample_affine,
+    scratch_room,
+)
 from graphvio.kernels import fast_kernel
 
 _MAX_ITERATIONS = 10
@@ -17,6 +29,9 @@ _CONVERGED_SLOPE = 0.003  # a slope from before must be free to change, or its e
 _MAX_SLOPE = 0.8
 _SLOPE_PRIOR = 100.0  # squared grey levels: a slope of 0.3 against noise of 3 grey levels; decides where nothing else
 _SHIFT_PRIOR = 1e-3  # keeps the normal matrix of a flat patch regular
+
+_Columns = tuple[Patch, Patch, Patch, Patch]
+"""A patch's derivatives by the shift and by the slopes."""
 
 
 @fast_kernel
@@ -45,26 +60,24 @@ def align_slanted(
     n = len(pixels)
     moved, found_slopes, correlations = guess.copy(), np.zeros((n, 2)), np.full(n, -1.0)
     found = np.zeros(n, dtype=np.bool_)
-    bordered = np.empty((2 * half + 3, 2 * half + 3), dtype=np.float32)
-    buffers = patches(6, half)
-    patch, sheared, columns = buffers[0], buffers[1], buffers[2:]
-    row = scratch(half)
+    bordered, patch, sheared = room(half + 1), room(half), room(half)
+    columns, grid, scratch = (room(half), room(half), room(half), room(half)), lattice(half), scratch_room(half)
     factor, parameters, step = np.empty((4, 4)), np.empty(4), np.empty(4)
     for i in range(n):
         if not wanted[i] or not sample(left, pixels[i, 0], pixels[i, 1], half + 1, bordered):
             continue
-        xx, xy, yy = prepare(bordered, patch, columns[0], columns[1])
+        xx, xy, yy = prepare(bordered, grid.inside, patch, columns[0], columns[1])
         ex, ey = directions[i, 0], directions[i, 1]
         parameters[0], parameters[1] = guess[i, 0], guess[i, 1]
         parameters[2], parameters[3] = slopes[i, 0], slopes[i, 1]
         if not known[i]:
             parameters[0], parameters[1], _ = align(
-                right, guess[i, 0], guess[i, 1], half, patch, columns[0], columns[1], xx, xy, yy, 0.0
+                right, guess[i, 0], guess[i, 1], patch, columns[0], columns[1], xx, xy, yy, 0.0
             )
-        _steepest_descent(columns, ex, ey, half)
+        _steepest_descent(columns, grid, ex, ey)
         _factorise(columns, xx, xy, yy, factor)
         for _ in range(_MAX_ITERATIONS):
-            if not _sample_sheared(packed_right, parameters, ex, ey, half, row, sheared):
+            if not _sample_sheared(packed_right, parameters, ex, ey, grid.inside, scratch, sheared):
                 break
             _project(columns, sheared, patch, step)
             _solve(factor, step)
@@ -75,43 +88,33 @@ def align_slanted(
         moved[i, 0], moved[i, 1] = parameters[0], parameters[1]
         found_slopes[i, 0], found_slopes[i, 1] = parameters[2], parameters[3]
         if found[i]:
-            correlations[i] = correlation(patch, sheared, 2 * half + 1)
+            correlations[i] = correlation(patch, sheared)
     return moved, found_slopes, correlations, found
 
 
 @fast_kernel
-def _steepest_descent(columns: AnyArray, ex: float, ey: float, half: int) -> None:
-    """Fill the last two of the patch's derivatives (4, side, padded side) by its parameters, of zero mean."""
-    side = 2 * half + 1
-    along_x, along_y = np.float32(ex), np.float32(ey)
-    mean2 = mean3 = np.float32(0.0)
-    for j in range(side):
-        gx, gy, by_x, by_y = columns[0, j], columns[1, j], columns[2, j], columns[3, j]
-        y = np.float32(j - half)
-        row2 = row3 = np.float32(0.0)
-        for i in range(side):
-            along = gx[i] * along_x + gy[i] * along_y
-            by_x[i] = along * np.float32(i - half)
-            by_y[i] = along * y
-            row2 += by_x[i]
-            row3 += by_y[i]
-        mean2 += row2
-        mean3 += row3
-    area = np.float32(side * side)
-    mean2 /= area
-    mean3 /= area
-    for j in range(side):
-        by_x, by_y = columns[2, j], columns[3, j]
-        for i in range(side):
-            by_x[i] -= mean2
-            by_y[i] -= mean3
+def _steepest_descent(columns: _Columns, grid: Lattice, ex: float, ey: float) -> None:
+    """Fill the derivatives by the slopes, of zero mean, from those by the shift."""
+    gx, gy, by_x, by_y = columns[0].flat, columns[1].flat, columns[2].flat, columns[3].flat
+    xs, ys, inside = grid.columns.flat, grid.rows.flat, grid.inside.flat
+    along_x, along_y, area = np.float32(ex), np.float32(ey), np.float32(len(grid.rows.rows) ** 2)
+    mean_x = mean_y = np.float32(0.0)
+    for k in range(gx.size):
+        along = gx[k] * along_x + gy[k] * along_y
+        by_x[k], by_y[k] = along * xs[k], along * ys[k]
+        mean_x += along * xs[k]
+        mean_y += along * ys[k]
+    mean_x /= area
+    mean_y /= area
+    for k in range(gx.size):
+        by_x[k] -= inside[k] * mean_x
+        by_y[k] -= inside[k] * mean_y
 
 
 @fast_kernel
-def _factorise(columns: AnyArray, xx: float, xy: float, yy: float, factor: Float) -> None:
+def _factorise(columns: _Columns, xx: float, xy: float, yy: float, factor: Float) -> None:
     """Fill the lower Cholesky factor (4, 4) of the normal matrix; its block of the shift alone is known."""
-    c0, c1 = columns[0].reshape(-1), columns[1].reshape(-1)
-    c2, c3 = columns[2].reshape(-1), columns[3].reshape(-1)
+    c0, c1, c2, c3 = columns[0].flat, columns[1].flat, columns[2].flat, columns[3].flat
     h02 = h03 = h12 = h13 = h22 = h23 = h33 = np.float32(0.0)
     for k in range(c0.size):
         h02 += c0[k] * c2[k]
@@ -155,11 +158,11 @@ def _is_small(step: Float) -> bool:
 
 @fast_kernel
 def _sample_sheared(
-    image: AnyArray, parameters: Float, ex: float, ey: float, half: int, row: tuple[AnyArray, AnyArray], out: AnyArray
+    image: AnyArray, parameters: Float, ex: float, ey: float, inside: Patch, scratch: Scratch, out: Patch
 ) -> bool:
     """Fill the patch that the parameters ``[u, v, slope x, slope y]`` point at; False where it leaves the image."""
     u, v, a, b = parameters[0], parameters[1], parameters[2], parameters[3]
-    return sample_affine(image, u, v, 1.0 + ex * a, ex * b, ey * a, 1.0 + ey * b, half, row, out)
+    return sample_affine(image, u, v, 1.0 + ex * a, ex * b, ey * a, 1.0 + ey * b, inside, scratch, out)
 
 
 @fast_kernel
@@ -174,11 +177,10 @@ def _compose(parameters: Float, step: Float, ex: float, ey: float) -> None:
 
 
 @fast_kernel
-def _project(columns: AnyArray, sheared: AnyArray, patch: AnyArray, out: Float) -> None:
+def _project(columns: _Columns, sheared: Patch, patch: Patch, out: Float) -> None:
     """Fill the derivatives times the difference of the patches (4,)."""
-    c0, c1 = columns[0].reshape(-1), columns[1].reshape(-1)
-    c2, c3 = columns[2].reshape(-1), columns[3].reshape(-1)
-    seen, expected = sheared.reshape(-1), patch.reshape(-1)
+    c0, c1, c2, c3 = columns[0].flat, columns[1].flat, columns[2].flat, columns[3].flat
+    seen, expected = sheared.flat, patch.flat
     b0 = b1 = b2 = b3 = np.float32(0.0)
     for k in range(seen.size):
         difference = seen[k] - expected[k]
