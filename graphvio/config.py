@@ -17,7 +17,8 @@ from graphvio.errors import ConfigError
 _LARGEST = 1e12
 _MAY_BE_ZERO = frozenset(
     ("seed", "border_px", "settle_s", "keyframe_overlap", "min_inliers", "min_inlier_share", "min_response",
-     "scarce_share", "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s")
+     "scarce_share", "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s",
+     "calibration_error_share")
 )  # fmt: skip
 _SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
 
@@ -96,6 +97,8 @@ class MotionConfig:
     """Reprojection error beyond which a point is no inlier."""
     sigma_inflation: float = 1.2
     """Factor on a motion's standard deviations, for errors that residuals do not show: matches that share a patch."""
+    calibration_error_share: float = 0.002
+    """What errors of the calibration may add to a motion, as a share of its angle and distance, one sigma."""
     min_inliers: int = 12
     """Motions that explain fewer points are refused."""
     min_inlier_share: float = 0.3

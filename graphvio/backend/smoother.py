@@ -23,6 +23,7 @@ from graphvio.rig import Imu
 
 _ACCEL_BIAS_SIGMA = 0.2
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
+_LEAST_OWN_SHARE = 0.1
 
 
 class Smoother:
@@ -36,7 +37,8 @@ class Smoother:
         self._stamps: list[int] = []
         self._index = 0
         self._index_of: dict[int, int] = {}
-        self._views: set[int] = set()  # stamps of references that have a variable of their own, see `_reference_key`
+        # References that have a variable of their own, see `_reference_key`: stamp -> its covariance (6, 6) there.
+        self._views: dict[int, Float] = {}
         self._previous_motion = np.zeros(6)  # tangent per second
         self._constrained_ns = 0  # stamp of the newest state whose motion was measured
         self._rate_sigmas = np.zeros(2)  # of `_previous_motion`: rad/s and m/s
@@ -54,7 +56,7 @@ class Smoother:
     def start(self, stamp_ns: int, state: RigState, uncertainty: StartUncertainty) -> None:
         """Begin, or begin anew, with one state."""
         self._window = Window()
-        self._stamps, self._index_of, self._views = [], {}, set()
+        self._stamps, self._index_of, self._views = [], {}, {}
         velocity_body = state.nav_T_body[:3, :3].T @ state.velocity_nav
         self._previous_motion = np.concatenate([np.zeros(3), velocity_body])
         self._rate_sigmas = np.array([_UNKNOWN_RATE_SIGMA_RAD_S, uncertainty.velocity_m_s])
@@ -136,7 +138,7 @@ class Smoother:
         newest = _x(self._index_of[motion.stamp_ns])
         reference, covariance = _x(self._index_of[motion.reference_stamp_ns]), motion.covariance
         if motion.reference_stamp_ns in self._views:
-            reference, covariance = self._reference_key(motion), motion.covariance - motion.shared_covariance
+            reference, covariance = self._reference_key(motion), self._own_covariance(motion)
         nav_T_reference = np.asarray(self._window.values.atPose3(reference).matrix())
         predicted = se3_inverse(nav_T_reference) @ self.pose(motion.stamp_ns)
         return gate(
@@ -151,12 +153,13 @@ class Smoother:
         """Insert a motion that ends in the newest state."""
         self._constrained_ns = motion.stamp_ns
         self._rate_sigmas = np.zeros(2)
+        reference = self._reference_key(motion)
         self._window.add(
             gtsam.BetweenFactorPose3(
-                self._reference_key(motion),
+                reference,
                 _x(self._index_of[motion.stamp_ns]),
                 gtsam.Pose3(motion.reference_T_current),
-                gtsam.noiseModel.Gaussian.Covariance(motion.covariance - motion.shared_covariance),
+                gtsam.noiseModel.Gaussian.Covariance(self._own_covariance(motion)),
             )
         )
 
@@ -171,12 +174,26 @@ class Smoother:
         if not motion.shared_covariance.any():
             return _x(k)
         if stamp_ns not in self._views:
-            self._views.add(stamp_ns)
             adjoint = se3_adjoint(motion.reference_T_current)  # takes the tangent from the current instant there
-            shared = gtsam.noiseModel.Gaussian.Covariance(adjoint @ motion.shared_covariance @ adjoint.T)
+            shared = adjoint @ motion.shared_covariance @ adjoint.T
+            self._views[stamp_ns] = shared
             self._window.values.insert(_r(k), gtsam.Pose3(self.pose(stamp_ns)))
-            self._window.add(gtsam.BetweenFactorPose3(_x(k), _r(k), gtsam.Pose3(), shared))
+            noise = gtsam.noiseModel.Gaussian.Covariance(shared)
+            self._window.add(gtsam.BetweenFactorPose3(_x(k), _r(k), gtsam.Pose3(), noise))
         return _r(k)
+
+    def _own_covariance(self, motion: RelativeMotion) -> Float:
+        """What a motion's covariance (6, 6) has beyond that of its reference as seen, which the first motion from there
+        told: the points' errors come to a little more as the rig moves on. Some of it is always the motion's own."""
+        if motion.reference_stamp_ns not in self._views:
+            return motion.covariance
+        adjoint = se3_adjoint(se3_inverse(motion.reference_T_current))
+        shared = adjoint @ self._views[motion.reference_stamp_ns] @ adjoint.T
+        root = np.linalg.cholesky(motion.covariance)
+        white = np.linalg.solve(root, np.linalg.solve(root, shared).T)
+        shares, axes = np.linalg.eigh(np.eye(6) - 0.5 * (white + white.T))
+        axes = root @ axes
+        return np.asarray((axes * np.maximum(shares, _LEAST_OWN_SHARE)) @ axes.T)
 
     def settle(self, keep: Iterable[int]) -> list[tuple[int, Float]]:
         """Optimise, then marginalise what is older than the lag, but for the stamps to keep.
@@ -254,7 +271,7 @@ class Smoother:
         self._window.marginalise(keys)
         for stamp in leaving:
             del self._index_of[stamp]
-            self._views.discard(stamp)
+            self._views.pop(stamp, None)
         self._stamps = [stamp for stamp in self._stamps if stamp in self._index_of]
         return finished
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import PairFrame, common_rows
 from graphvio.rig import Rig
 
 
@@ -106,7 +106,7 @@ def correspond(reference: Mapping[int, PairFrame], current: Mapping[int, PairFra
     for pair in sorted(reference.keys() & current.keys()):
         then, now = reference[pair], current[pair]
         offered[pair] = int(then.has_depth.sum())
-        _, at_then, at_now = np.intersect1d(then.ids, now.ids, assume_unique=True, return_indices=True)
+        at_then, at_now = common_rows(then.ids, now.ids)
         known = then.has_depth[at_then]
         at_then, at_now = at_then[known], at_now[known]
         rows[pair] = at_now

@@ -42,7 +42,7 @@ def stereo_share(
     pairs = sorted(reference.keys() & current.keys())
     corners = [len(current[j].ids) for j in pairs]
     shares = [min(_share(reference[j].has_depth), _share(current[j].has_depth)) for j in pairs]
-    share = float(np.average(shares, weights=corners)) if sum(corners) else 0.0
+    share = float(np.dot(shares, corners)) / max(sum(corners), 1)
     return StereoShare(share, max(baselines_m[j] for j in pairs))
 
 

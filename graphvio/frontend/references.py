@@ -10,7 +10,7 @@ from graphvio.arrays import Int
 from graphvio.config import MotionConfig
 from graphvio.frontend.observations import Correspondences
 from graphvio.frontend.refinement import Refined
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import PairFrame, common_rows
 
 _FEWEST_POINTS = 20
 
@@ -53,7 +53,7 @@ class References:
             return next(iter(groups.values()), {})
 
         def in_view(stamp_ns: int) -> int:
-            return sum(np.isin(frame.ids, frames[j].ids).sum() for j, frame in groups[stamp_ns].items())
+            return sum(len(common_rows(frame.ids, frames[j].ids)[0]) for j, frame in groups[stamp_ns].items())
 
         return groups[max(groups, key=lambda stamp_ns: (in_view(stamp_ns), stamp_ns))]
 
@@ -99,5 +99,5 @@ class References:
         for j, ids in seen.items():
             near = self._frames[j].tells_translation(self._config.pixel_sigma_px)
             offered += int(near.sum())
-            still += int(near[np.searchsorted(self._frames[j].ids, ids)].sum())
+            still += int(near[common_rows(self._frames[j].ids, ids)[0]].sum())
         return still / offered if offered else 1.0

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import PairFrame, common_rows
 
-_MOST_MEDIAN_PX = 0.15
+_USUAL_PX = 0.15  # half of the points must not have moved more
 _MOST_PX = 0.5
-_MOST = 0.9  # of the points must not have moved more
+_MOST = 0.9  # of the points must not have moved more than that
 _FEWEST_POINTS = 25
 _LEAST_S = 0.25  # a slow motion does not show at once
 
@@ -36,12 +36,12 @@ class Standstill:
             elapsed_s = min(elapsed_s, (frame.stamp_ns - since.stamp_ns) * 1e-9)
             if j not in explained:
                 continue
-            common = np.intersect1d(since.ids, explained[j], assume_unique=True)
-            now, then = (each.pixels[np.searchsorted(each.ids, common)] for each in (frame, since))
-            moved.append(np.hypot(*(now - then).T))
+            now, _ = common_rows(frame.ids, explained[j])
+            at_now, at_then = common_rows(frame.ids[now], since.ids)
+            moved.append(np.hypot(*(frame.pixels[now[at_now]] - since.pixels[at_then]).T))
         distance = np.concatenate(moved) if moved else np.zeros(0)
         unmoved = len(distance) >= _FEWEST_POINTS and bool(
-            np.median(distance) < _MOST_MEDIAN_PX and np.quantile(distance, _MOST) < _MOST_PX
+            np.mean(distance < _USUAL_PX) > 0.5 and np.mean(distance < _MOST_PX) >= _MOST
         )
         if not unmoved:
             self._since.update(frames)

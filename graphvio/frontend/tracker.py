@@ -17,7 +17,7 @@ from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid,
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.stopwatch import Stopwatch
-from graphvio.frontend.tracks import PairFrame, passes
+from graphvio.frontend.tracks import PairFrame, common_rows, passes
 from graphvio.rig import Camera, StereoPair
 
 _MAX_TRACKS_PER_CELL = 2
@@ -103,7 +103,9 @@ class PairTracker:
     def drop(self, ids: Int) -> None:
         """Forget tracks, so that fresh corners may take their place."""
         if len(ids):
-            self._last = self._last.keep(~np.isin(self._last.ids, ids))
+            stays = np.ones(len(self._last.ids), dtype=bool)
+            stays[common_rows(self._last.ids, ids)[0]] = False
+            self._last = self._last.keep(stays)
 
     def _predict(self, left_T_left_prev: Float | None) -> tuple[PairFrame, Float, Float]:
         """The tracks worth following, and their pixels (N, 2) and inverse depths (N,), or NaN, after a motion."""

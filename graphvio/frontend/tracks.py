@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
+from graphvio.kernels import kernel
 
 _NEAR_SIGMAS = 10.0  # a depth that is known to a tenth
 
@@ -93,6 +94,23 @@ _COLUMNS = tuple(f.name for f in fields(PairFrame) if f.name not in ("stamp_ns",
 
 def _added(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
     return {name: one.get(name, 0) + other.get(name, 0) for name in (*one, *(other.keys() - one.keys()))}
+
+
+@kernel
+def common_rows(first: Int, second: Int) -> tuple[Int, Int]:
+    """Where (K,) each of two columns of increasing identities, (N,) and (M,), holds those that are in both."""
+    at_first = np.empty(min(len(first), len(second)), dtype=np.int64)
+    at_second = np.empty_like(at_first)
+    i = j = k = 0
+    while i < len(first) and j < len(second):
+        if first[i] == second[j]:
+            at_first[k], at_second[k] = i, j
+            i, j, k = i + 1, j + 1, k + 1
+        elif first[i] < second[j]:
+            i += 1
+        else:
+            j += 1
+    return at_first[:k], at_second[:k]
 
 
 def passes(candidates: Bool, test: Bool, name: str, rejected: dict[str, int]) -> Bool:

@@ -26,7 +26,7 @@ from graphvio.frontend.standstill import Standstill
 from graphvio.frontend.stopwatch import Stopwatch
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import PairFrame
-from graphvio.geometry import se3_inverse
+from graphvio.geometry import se3_inverse, so3_log
 from graphvio.rig import Rig
 
 MotionPredictor = Callable[[int], Float | None]
@@ -219,12 +219,16 @@ class VisualFrontend:
         return self._contradicted_ns is not None and 0 <= stamp_ns - self._contradicted_ns < _DOUBT_NS
 
     def _motion(self, reference_stamp_ns: int, stamp_ns: int, refined: Refined) -> RelativeMotion:
+        ref_T_cur = se3_inverse(refined.cur_T_ref)
+        angle, distance = np.linalg.norm(so3_log(ref_T_cur[:3, :3])), np.linalg.norm(ref_T_cur[:3, 3])
+        # Focal lengths and baselines that are a little wrong scale the motion: no residual shows that.
+        scaled = np.diag(np.repeat([angle, distance], 3) ** 2 * self._config.motion.calibration_error_share**2)
         used_once = self._config.motion.reference == "previous"  # nothing is shared with another motion
         return RelativeMotion(
             reference_stamp_ns,
             stamp_ns,
-            se3_inverse(refined.cur_T_ref),
-            refined.covariance,
+            ref_T_cur,
+            refined.covariance + scaled,
             np.zeros((6, 6)) if used_once else refined.shared_covariance,
             int(refined.inlier.sum()),
         )
