@@ -24,9 +24,11 @@ KEYFRAMES = 5  # framesets from one to the next
 FIRST, FRAMES = 2, 20  # the pose is composed from the first of these over so many: between two that are no keyframes
 SEEDS = 100
 SCALE = np.diag(np.repeat([2e-3, 4e-3], 3))
-SHARED, OWN = (
-    SCALE @ random_covariance(np.random.default_rng(number), 6, sigma) @ SCALE for number, sigma in ((1, 1.0), (2, 0.4))
+SHARED, OTHER = (
+    SCALE @ random_covariance(np.random.default_rng(number), 6, sigma) @ SCALE
+    for number, sigma in ((1, 1.0), (2, 0.35))
 )
+OWN = OTHER + 0.15 * SHARED  # in every direction some of a motion's error is its own
 # Vision alone: what is foreseen counts for nothing.
 CONFIG = SmootherConfig(
     lag_s=10.0, imu_noise_scale=1.0, motion_accel_sigma_m_s2=1e3, motion_angular_accel_sigma_rad_s2=1e3
@@ -102,7 +104,10 @@ def runs(with_imu: bool, split: bool) -> list[Run]:
 
 
 def test_covariances_of_two_motions_from_one_keyframe() -> None:
-    """From the keyframe there is all of a motion's covariance; between their ends the shared part is gone."""
+    """From the keyframe there is all of a motion's covariance; between their ends the shared part is gone.
+
+    To a hundredth or two: covariances are taken from frame to frame by the measured motions, not by the true ones.
+    """
     rng = np.random.default_rng(0)
     stamps = (0, 1_000_000_000, 2_500_000_000)
     smoother = Smoother(CONFIG, None)
@@ -116,13 +121,13 @@ def test_covariances_of_two_motions_from_one_keyframe() -> None:
         smoother.settle({0})
         sigmas = np.sqrt(np.diag(motion.covariance))
         scale = np.outer(sigmas, sigmas)
-        np.testing.assert_allclose(smoother.covariance_since(0) / scale, motion.covariance / scale, atol=0.01)
+        np.testing.assert_allclose(smoother.covariance_since(0) / scale, motion.covariance / scale, atol=0.02)
     last_T_first = se3_inverse(smoother.pose(stamps[2])) @ smoother.pose(stamps[1])
     adjoint = se3_adjoint(np.ascontiguousarray(last_T_first))
     between = adjoint @ OWN @ adjoint.T + OWN
     sigmas = np.sqrt(np.diag(between))
     scale = np.outer(sigmas, sigmas)
-    np.testing.assert_allclose(smoother.covariance_since(stamps[1]) / scale, between / scale, atol=0.01)
+    np.testing.assert_allclose(smoother.covariance_since(stamps[1]) / scale, between / scale, atol=0.02)
 
 
 @pytest.mark.parametrize("with_imu", [False, True], ids=["vision", "imu"])

@@ -23,7 +23,7 @@ from graphvio.rig import Imu
 
 _ACCEL_BIAS_SIGMA = 0.2
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
-_LEAST_OWN_SHARE = 0.1
+_LEAST_OWN_SHARE = 0.02
 
 
 class Smoother:
