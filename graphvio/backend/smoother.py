@@ -14,6 +14,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.backend.gating import Verdict, gate, relative_covariance
 from graphvio.backend.inertial import ImuSpan, preintegrate, preintegration_params
+from graphvio.backend.noise import gaussian
 from graphvio.backend.states import RigState, StartUncertainty
 from graphvio.backend.window import Window
 from graphvio.config import SmootherConfig
@@ -62,7 +63,7 @@ class Smoother:
         self._rate_sigmas = np.array([_UNKNOWN_RATE_SIGMA_RAD_S, uncertainty.velocity_m_s])
         k = self._append(stamp_ns, state)
         self._constrained_ns = stamp_ns
-        pose_noise = gtsam.noiseModel.Gaussian.Covariance(uncertainty.pose)
+        pose_noise = gaussian(uncertainty.pose)
         self._window.add(gtsam.PriorFactorPose3(_x(k), gtsam.Pose3(state.nav_T_body), pose_noise))
         if self.has_imu:
             self._window.add(
@@ -159,7 +160,7 @@ class Smoother:
                 reference,
                 _x(self._index_of[motion.stamp_ns]),
                 gtsam.Pose3(motion.reference_T_current),
-                gtsam.noiseModel.Gaussian.Covariance(self._own_covariance(motion)),
+                gaussian(self._own_covariance(motion)),
             )
         )
 
@@ -178,7 +179,7 @@ class Smoother:
             shared = adjoint @ motion.shared_covariance @ adjoint.T
             self._views[stamp_ns] = shared
             self._window.values.insert(_r(k), gtsam.Pose3(self.pose(stamp_ns)))
-            noise = gtsam.noiseModel.Gaussian.Covariance(shared)
+            noise = gaussian(shared)
             self._window.add(gtsam.BetweenFactorPose3(_x(k), _r(k), gtsam.Pose3(), noise))
         return _r(k)
 
