@@ -144,6 +144,45 @@ class SmootherConfig:
 
 
 @dataclass(frozen=True)
+class FusionConfig:
+    """Which back-end makes estimates of motions and the IMU."""
+
+    estimator: Literal["smoother", "filter"] = "smoother"
+    """``smoother``: the fixed-lag window. ``filter``: the paper's, as a baseline; it needs ``motion.reference:
+    previous``, since it measures velocities over one step."""
+
+
+@dataclass(frozen=True)
+class FilterConfig:
+    """The paper's extended Kalman filter (section 5), where ``fusion.estimator`` is ``filter``."""
+
+    accel_sigma_m_s2: float = 5.0
+    """Standard deviation of the acceleration within a step, eq. (11)."""
+    angular_accel_sigma_rad_s2: float = 10.0
+    """Standard deviation of the angular acceleration within a step, eq. (11)."""
+    gyro_bias_walk_rad_s: float = 1e-4
+    """Standard deviation of the gyro bias's change in one second, eq. (11)."""
+    gyro_sigma_rad_s: float = 0.02
+    """Standard deviation of the gyro's mean rate over a step: much more than vision's when its poses are good."""
+    gravity_sigma_m_s2: float = 10.0
+    """Standard deviation of the accelerometer as a measurement of gravity: the rig's own acceleration, which lasts for
+    several steps, so that it must look larger than it is."""
+    gate_probability: float = 0.9999
+    """A measurement is refused where its innovation lies outside this share of the chi-square distribution."""
+    max_accel_m_s2: float = 30.0
+    """Vision is refused where it asks for a larger acceleration."""
+    max_gated_s: float = 1.0
+    """When the gates have refused vision for longer, the velocities are forgotten."""
+    reset_s: float = 10.0
+    """Time from one reset of the position's covariance to the next."""
+    bias: Literal["estimated", "none"] = "estimated"
+    """``none`` is the first approach: no gyro bias in the state, and the gyro is used only where it differs from
+    vision by more than ``gyro_threshold_rad_s``."""
+    gyro_threshold_rad_s: float = 0.1
+    """For the first approach: the largest difference, in each axis, at which vision alone is used."""
+
+
+@dataclass(frozen=True)
 class TimingConfig:
     """How long things are waited for."""
 
@@ -166,8 +205,22 @@ class Config:
     stereo: StereoConfig = field(default_factory=StereoConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     initialisation: InitialisationConfig = field(default_factory=InitialisationConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
     smoother: SmootherConfig = field(default_factory=SmootherConfig)
+    filter: FilterConfig = field(default_factory=FilterConfig)
     timing: TimingConfig = field(default_factory=TimingConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse stages that do not fit together.
+
+        Raises:
+            ConfigError: if they do not.
+        """
+        if self.fusion.estimator == "filter" and self.motion.reference != "previous":
+            raise ConfigError(
+                "fusion: estimator filter measures velocities over one step; set motion: {reference: previous}, or use "
+                "the profile paper"
+            )
 
     @staticmethod
     def load(name_or_path: str | Path) -> Config:

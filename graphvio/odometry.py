@@ -13,6 +13,7 @@ from graphvio.belief import Belief
 from graphvio.config import Config
 from graphvio.errors import EventError
 from graphvio.events import Estimate, Event, FrameSet, ImuSample, Incident, Quality, Status, checked_event
+from graphvio.filter_belief import FilterBelief
 from graphvio.frontend.motion import VisualResult
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.rates import AngularRates
@@ -36,7 +37,8 @@ class Odometry:
         self.config = config or Config()
         self._frontend = VisualFrontend(rig, self.config)
         self._synchroniser = Synchroniser(rig, self.config, self._report)
-        self._belief = Belief(rig, self.config, self._report, lambda: self._frontend.rekey())
+        kind = FilterBelief if self.config.fusion.estimator == "filter" else Belief
+        self._belief: Belief | FilterBelief = kind(rig, self.config, self._report, lambda: self._frontend.rekey())
         self._told_misaligned: set[int] = set()
         self._frozen: frozenset[int] = frozenset()
         self._rates = AngularRates()

@@ -122,14 +122,15 @@ def test_every_profile_loads() -> None:
 
 
 def test_sha256_tells_configurations_apart_by_what_they_do() -> None:
-    config = Config()
-    assert config.sha256() == Config().sha256()
-    assert config.sha256() == Config.from_yaml("motion: {min_inliers: 12.0, max_error_px: 3}").sha256()
+    config = Config.from_yaml("motion: {reference: previous}")  # suits both estimators
+    assert config.sha256() == Config.from_yaml("motion: {reference: previous}").sha256() != Config().sha256()
+    assert Config().sha256() == Config.from_yaml("motion: {min_inliers: 12.0, max_error_px: 3}").sha256()
+    others = {"joint": "best_pair", "previous": "keyframe", "smoother": "filter", "estimated": "none"}
     digests = {config.sha256()}
     for stage in fields(Config):
         settings = getattr(config, stage.name)
         for name, value in asdict(settings).items():
-            other = {"joint": "best_pair", "keyframe": "previous"}[value] if isinstance(value, str) else value + 1
+            other = others[value] if isinstance(value, str) else value + 1
             digests.add(replace(config, **{stage.name: replace(settings, **{name: other})}).sha256())
     values = [v for section in yaml.safe_load(config.to_yaml()).values() for v in section.values()]
     assert len(digests) == 1 + len(values)

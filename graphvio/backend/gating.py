@@ -52,10 +52,11 @@ def gate(
     innovation = se3_log(se3_inverse(measured) @ predicted)
     covariance = measured_covariance + predicted_covariance
     statistic = float(innovation @ np.linalg.solve(covariance, innovation))
-    threshold = _quantile(probability)
+    threshold = chi_square_quantile(probability, _DEGREES_OF_FREEDOM)
     return Verdict(statistic <= threshold, statistic, threshold)
 
 
 @cache
-def _quantile(probability: float) -> float:
-    return float(chi2.ppf(probability, _DEGREES_OF_FREEDOM))
+def chi_square_quantile(probability: float, degrees_of_freedom: int) -> float:
+    """The value below which a chi-square variable lies with a probability."""
+    return float(chi2.ppf(probability, degrees_of_freedom))

@@ -39,6 +39,11 @@ class ImuSpan:
         """Mean angular rate (3,) rad/s, bias included."""
         return np.asarray(self.steps_s @ self.angular_velocity / self.steps_s.sum())
 
+    @property
+    def mean_force(self) -> Float:
+        """Mean specific force (3,) m/s^2, bias included."""
+        return np.asarray(self.steps_s @ self.linear_acceleration / self.steps_s.sum())
+
 
 class ImuBuffer:
     """Samples in time order; what cannot be used is named and left out."""

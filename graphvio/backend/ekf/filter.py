@@ -1,0 +1,66 @@
+"""The paper's extended Kalman filter, in error-state form (section 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.ekf.measurements import Measurement
+from graphvio.backend.ekf.process import jacobians, propagated
+from graphvio.backend.ekf.state import ERRORS, POSITION, FilterState
+from graphvio.backend.gating import Verdict, chi_square_quantile
+
+
+@dataclass
+class ExtendedKalmanFilter:
+    """State and covariance.
+
+    Attributes:
+        state: the estimate.
+        covariance: (15, 15) of its error, see `FilterState.plus`.
+    """
+
+    state: FilterState
+    covariance: Float
+
+    def predict(self, dt: float, sigmas: Float) -> None:
+        """Go on by a time step in seconds with a process noise of standard deviations (9,)."""
+        by_error, by_noise = jacobians(self.state, dt)
+        noise = by_noise * sigmas
+        self.covariance = by_error @ self.covariance @ by_error.T + noise @ noise.T
+        self.state = propagated(self.state, dt)
+
+    def test(self, measurement: Measurement, probability: float) -> Verdict:
+        """Chi-square test of an innovation."""
+        innovation = measurement.innovation
+        statistic = float(innovation @ np.linalg.solve(self._spread(measurement), innovation))
+        threshold = chi_square_quantile(probability, len(innovation))
+        return Verdict(statistic <= threshold, statistic, threshold)
+
+    def update(self, measurement: Measurement) -> None:
+        """Kalman update, in Joseph's form."""
+        by_error = measurement.by_error
+        gain = np.linalg.solve(self._spread(measurement), by_error @ self.covariance).T
+        kept = np.eye(ERRORS) - gain @ by_error
+        covariance = kept @ self.covariance @ kept.T + gain @ measurement.covariance @ gain.T
+        self.covariance = 0.5 * (covariance + covariance.T)
+        self.state = self.state.plus(gain @ measurement.innovation)
+
+    def reset_position(self, sigma_m: float) -> Float:
+        """Forget what is not known of the position but through the other states, of which it keeps the correlation.
+
+        Returns:
+            What was forgotten, a covariance (3, 3) in nav.
+        """
+        rest = slice(POSITION.stop, ERRORS)
+        cross = self.covariance[POSITION, rest]
+        through_rest = cross @ np.linalg.pinv(self.covariance[rest, rest], hermitian=True) @ cross.T
+        forgotten = self.covariance[POSITION, POSITION] - through_rest
+        self.covariance[POSITION, POSITION] = through_rest + sigma_m**2 * np.eye(3)
+        return forgotten
+
+    def _spread(self, measurement: Measurement) -> Float:
+        """Covariance (M, M) of the innovation."""
+        return measurement.by_error @ self.covariance @ measurement.by_error.T + measurement.covariance

@@ -1,0 +1,98 @@
+"""What the filter measures (eq. 13): rates from vision, gyro, and the accelerometer as gravity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.ekf.state import ATTITUDE, ERRORS, GYRO_BIAS, RATE, VELOCITY, FilterState
+from graphvio.backend.inertial import GRAVITY_M_S2
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.geometry import skew, so3_log, so3_right_jacobian_inverse
+
+GRAVITY = np.array([0.0, 0.0, GRAVITY_M_S2])
+"""Specific force at rest, nav."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A measurement at a state.
+
+    Attributes:
+        name: what it can be counted by.
+        innovation: (M,) measured minus expected.
+        by_error: (M, 15) derivative of what is expected by the state's error.
+        covariance: (M, M) of the noise.
+    """
+
+    name: str
+    innovation: Float
+    by_error: Float
+    covariance: Float
+
+
+@dataclass(frozen=True, eq=False)
+class VisualRates:
+    """Velocity and angular rate by vision, each the mean over the step that ends in the state.
+
+    Attributes:
+        values: (6,) ``[v, omega]``, m/s and rad/s in body.
+        covariance: (6, 6).
+    """
+
+    values: Float
+    covariance: Float
+
+    @staticmethod
+    def of(motion: RelativeMotion) -> VisualRates:
+        """A measured motion over its time step: ``-R^T T`` and the rotation vector (section 5)."""
+        dt = motion.duration_s
+        rotation = np.ascontiguousarray(motion.reference_T_current[:3, :3])
+        turn = so3_log(rotation)
+        by_tangent = np.zeros((6, 6))
+        by_tangent[0:3, 3:6] = rotation / dt
+        by_tangent[3:6, 0:3] = so3_right_jacobian_inverse(turn) / dt
+        values = np.concatenate([motion.reference_T_current[:3, 3], turn]) / dt
+        return VisualRates(values, by_tangent @ motion.covariance @ by_tangent.T)
+
+
+def stacked(measurements: Sequence[Measurement]) -> Measurement:
+    """Several measurements of one state, independent of each other, as one."""
+    sizes = [len(measurement.innovation) for measurement in measurements]
+    covariance = np.zeros((sum(sizes), sum(sizes)))
+    start = 0
+    for measurement, size in zip(measurements, sizes, strict=True):
+        covariance[start : start + size, start : start + size] = measurement.covariance
+        start += size
+    return Measurement(
+        " and ".join(measurement.name for measurement in measurements),
+        np.concatenate([measurement.innovation for measurement in measurements]),
+        np.concatenate([measurement.by_error for measurement in measurements]),
+        covariance,
+    )
+
+
+def vision(state: FilterState, rates: VisualRates) -> Measurement:
+    """``v^vo = v + n`` and ``omega^vo = omega + n``, which are correlated with each other."""
+    by_error = np.zeros((6, ERRORS))
+    by_error[0:3, VELOCITY] = by_error[3:6, RATE] = np.eye(3)
+    expected = np.concatenate([state.velocity_body, state.rate_body])
+    return Measurement("vision", rates.values - expected, by_error, rates.covariance)
+
+
+def gyro(state: FilterState, rate: Float, sigma_rad_s: float) -> Measurement:
+    """``omega^imu = omega + b + n``."""
+    by_error = np.zeros((3, ERRORS))
+    by_error[:, RATE] = by_error[:, GYRO_BIAS] = np.eye(3)
+    return Measurement("gyro", rate - state.rate_body - state.gyro_bias, by_error, sigma_rad_s**2 * np.eye(3))
+
+
+def accelerometer(state: FilterState, force: Float, sigma_m_s2: float) -> Measurement:
+    """``a^imu = R(q) g + n``: what the rig's own acceleration adds is noise."""
+    expected = state.nav_R_body.T @ GRAVITY
+    by_error = np.zeros((3, ERRORS))
+    by_error[:, ATTITUDE] = skew(expected)
+    return Measurement("accelerometer", force - expected, by_error, sigma_m_s2**2 * np.eye(3))

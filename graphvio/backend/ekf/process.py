@@ -1,0 +1,50 @@
+"""The filter's process: constant velocity, constant angular velocity (eq. 11, 12)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.ekf.state import ATTITUDE, ERRORS, GYRO_BIAS, POSITION, RATE, VELOCITY, FilterState
+from graphvio.geometry import skew, so3_exp, so3_right_jacobian
+
+NOISES = 9
+"""Elements of the process noise: ``n_v`` (3), ``n_omega`` (3), ``n_b`` (3)."""
+
+
+def noise_sigmas(dt: float, accel_sigma_m_s2: float, angular_accel_sigma_rad_s2: float, gyro_bias_walk: float) -> Float:
+    """Standard deviations (9,) of the process noise over a time step in seconds.
+
+    Args:
+        dt: the step.
+        accel_sigma_m_s2: of the unknown acceleration, constant within a step.
+        angular_accel_sigma_rad_s2: likewise.
+        gyro_bias_walk: rad/s per root of a second.
+    """
+    return np.repeat([accel_sigma_m_s2 * dt, angular_accel_sigma_rad_s2 * dt, gyro_bias_walk * np.sqrt(dt)], 3)
+
+
+def propagated(state: FilterState, dt: float) -> FilterState:
+    """The state after a time step in seconds, without noise (eq. 11)."""
+    return FilterState(
+        state.position + state.nav_R_body @ state.velocity_body * dt,
+        state.nav_R_body @ so3_exp(state.rate_body * dt),
+        state.velocity_body,
+        state.rate_body,
+        state.gyro_bias,
+    )
+
+
+def jacobians(state: FilterState, dt: float) -> tuple[Float, Float]:
+    """Derivatives of the next state's error by this one's (15, 15), and by the noise (15, 9).
+
+    The same ``n_v`` and ``n_omega`` change the velocities and, through eq. (12), what is moved during the step.
+    """
+    by_error, by_noise = np.eye(ERRORS), np.zeros((ERRORS, NOISES))
+    turned = so3_right_jacobian(state.rate_body * dt) * dt
+    by_error[POSITION, ATTITUDE] = -state.nav_R_body @ skew(state.velocity_body * dt)
+    by_error[POSITION, VELOCITY] = by_noise[POSITION, 0:3] = state.nav_R_body * dt
+    by_error[ATTITUDE, ATTITUDE] = so3_exp(-state.rate_body * dt)
+    by_error[ATTITUDE, RATE] = by_noise[ATTITUDE, 3:6] = turned
+    by_noise[VELOCITY, 0:3] = by_noise[RATE, 3:6] = by_noise[GYRO_BIAS, 6:9] = np.eye(3)
+    return by_error, by_noise

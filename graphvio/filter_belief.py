@@ -1,0 +1,249 @@
+"""What the paper's filter believes of the rig (section 5): the baseline that the smoother is measured against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.ekf.filter import ExtendedKalmanFilter
+from graphvio.backend.ekf.measurements import Measurement, VisualRates, accelerometer, gyro, stacked, vision
+from graphvio.backend.ekf.process import noise_sigmas
+from graphvio.backend.ekf.state import ATTITUDE, ERRORS, GYRO_BIAS, POSITION, RATE, VELOCITY, FilterState
+from graphvio.backend.inertial import ImuSpan
+from graphvio.backend.starts import first_start
+from graphvio.backend.states import RigState
+from graphvio.config import Config
+from graphvio.events import Status
+from graphvio.frontend.motion import RelativeMotion, VisualResult
+from graphvio.geometry import se3_inverse
+from graphvio.rig import Rig
+from graphvio.synchroniser import Report
+
+_MAX_UNBRIDGED_S = 3.0
+_ANCHOR_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
+_UNKNOWN_RATE_SIGMA_RAD_S = 1.0
+_FORGOTTEN_SPEED_SIGMA_M_S = 2.0
+
+
+class FilterBelief:
+    """The rig's state by the filter: for each frameset `predict`, `use` and `update`, in this order.
+
+    It stands where `graphvio.belief.Belief` does, for whose arguments and attributes see there.
+    """
+
+    def __init__(self, rig: Rig, config: Config, report: Report, rekey: Callable[[], None]) -> None:
+        self.epoch = 0
+        self.covariance: Float = np.zeros((6, 6))
+        self._rig = rig
+        self._config = config
+        self._report = report
+        self._rekey = rekey
+        self._filter: ExtendedKalmanFilter | None = None
+        self._has_imu = False
+        self._latest_ns = self._tracked_ns = self._reset_ns = self._settled_ns = 0
+        self._span: ImuSpan | None = None
+        self._forgotten = np.zeros((3, 3))  # position covariance, nav, that resets took out of the filter
+        self._before_outage = np.zeros((3, 3))  # position covariance, nav, when vision was last used
+        self._lost = False
+        self._poses: dict[int, Float] = {}  # nav_T_body at stamps that motions are measured from
+        self._final: list[tuple[int, Float]] = []
+
+    # ------------------------------------------------------------------ what is known
+
+    @property
+    def has_started(self) -> bool:
+        """Whether there is a state."""
+        return self._filter is not None
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether it has started with an IMU."""
+        return self._has_imu
+
+    @property
+    def latest_ns(self) -> int:
+        """Stamp of the newest state."""
+        return self._latest_ns
+
+    def state(self) -> RigState:
+        """The newest state; the filter knows of no accelerometer bias."""
+        state = self._running.state
+        return RigState(state.nav_T_body, state.nav_R_body @ state.velocity_body, state.gyro_bias, np.zeros(3))
+
+    def latest_rate(self) -> Float | None:
+        """Angular rate (3,) rad/s of body over the newest step."""
+        return self._running.state.rate_body
+
+    def motion_since(self, then_ns: int) -> Float | None:
+        """``now_T_then`` (4, 4) of body from an earlier frameset to the newest state, or None if it is not known."""
+        if self._filter is None or then_ns not in self._poses:
+            return None
+        return se3_inverse(self._filter.state.nav_T_body) @ self._poses[then_ns]
+
+    def take_final(self) -> list[tuple[int, Float]]:
+        """Stamps and poses ``nav_T_body`` since the last call: a filter never corrects one later."""
+        taken, self._final = self._final, []
+        return taken
+
+    def end(self) -> None:
+        """Nothing more will come."""
+
+    # ------------------------------------------------------------------ one frameset
+
+    def start(self, stamp_ns: int, found: tuple[ImuSpan, float] | None) -> None:
+        """Begin at a frameset, as `graphvio.belief.Belief.start` does."""
+        position = np.zeros(3)
+        if self._filter is not None:
+            position = self._filter.state.position
+            self.epoch += 1
+            self._report(stamp_ns, "imu_came", f"the IMU has come: epoch {self.epoch} starts upright")
+        elif self._rig.imu is not None and found is None:
+            self._report(stamp_ns, "started_without_imu", "no IMU samples came: vision alone from here")
+        start = first_start(stamp_ns, position, found, self._rig, self._config.initialisation)
+        pose, uncertainty = start.state.nav_T_body, start.uncertainty
+        estimates_bias = self._config.filter.bias == "estimated"
+        bias = start.state.gyro_bias if estimates_bias else np.zeros(3)
+        covariance = np.zeros((ERRORS, ERRORS))
+        covariance[POSITION, POSITION] = pose[:3, :3] @ uncertainty.pose[3:, 3:] @ pose[:3, :3].T
+        covariance[ATTITUDE, ATTITUDE] = uncertainty.pose[:3, :3]
+        covariance[VELOCITY, VELOCITY] = uncertainty.velocity_m_s**2 * np.eye(3)
+        covariance[RATE, RATE] = _UNKNOWN_RATE_SIGMA_RAD_S**2 * np.eye(3)
+        covariance[GYRO_BIAS, GYRO_BIAS] = uncertainty.gyro_bias_rad_s**2 * estimates_bias * np.eye(3)
+        state = FilterState(pose[:3, 3], pose[:3, :3], np.zeros(3), np.zeros(3), bias)
+        self._filter = ExtendedKalmanFilter(state, covariance)
+        self._has_imu = found is not None
+        self._latest_ns = self._tracked_ns = self._reset_ns = stamp_ns
+        self._settled_ns, self._lost, self._span = start.settled_ns, False, None
+        self._poses.clear()
+
+    def predict(self, stamp_ns: int, span: ImuSpan | None) -> None:
+        """Go on to a frameset's instant by constant velocity; the IMU since the last one is measured there."""
+        config, dt = self._config.filter, (stamp_ns - self._latest_ns) * 1e-9
+        if dt > _MAX_UNBRIDGED_S:
+            self.epoch += 1
+            self._report(stamp_ns, "time_jump", f"{dt:.1f} s without data: epoch {self.epoch} starts at the last pose")
+            self._forget_velocities()
+            self._tracked_ns = stamp_ns
+            self._rekey()
+            dt = 0.0
+        walk = config.gyro_bias_walk_rad_s if config.bias == "estimated" else 0.0
+        sigmas = noise_sigmas(dt, config.accel_sigma_m_s2, config.angular_accel_sigma_rad_s2, walk)
+        self._running.predict(dt, sigmas)
+        self._span, self._latest_ns = span, stamp_ns
+
+    def use(self, visual: VisualResult) -> RelativeMotion | None:
+        """Test each measurement against the prediction, and update with those that pass.
+
+        Returns:
+            The motion that was used, or None.
+        """
+        motion, config = visual.motion, self._config.filter
+        if motion is not None and motion.reference_stamp_ns not in self._poses:
+            motion = None  # it is from before a break
+        rates = None if motion is None else VisualRates.of(motion)
+        offered: list[Measurement] = []
+        if motion is not None and rates is not None and self._passes_as_vision(motion, rates):
+            offered.append(vision(self._running.state, rates))
+        else:
+            motion = None
+        offered += [each for each in self._inertial(rates) if self._passes(each)]
+        if offered:
+            self._running.update(stacked(offered))
+        if (
+            motion is None
+            and self._latest_ns - self._tracked_ns > config.max_gated_s * 1e9
+            and visual.motion is not None
+        ):
+            self._forget_velocities()
+            self._report(self._latest_ns, "gate_reset", "refused for too long: the velocities are forgotten")
+        return motion
+
+    def update(self, stamp_ns: int, used: bool, keep: frozenset[int]) -> Status:
+        """Reset the position's covariance, if it is time to, and tell how well the newest pose is known.
+
+        Args:
+            stamp_ns: of the newest state.
+            used: whether vision constrains it, or it is a start.
+            keep: stamps of states that later motions will be measured from.
+        """
+        running = self._running
+        if stamp_ns - self._reset_ns >= self._config.filter.reset_s * 1e9:
+            self._forgotten = self._forgotten + running.reset_position(_ANCHOR_SIGMA_M)
+            self._reset_ns = stamp_ns
+        pose = running.state.nav_T_body
+        self._poses = {ns: known for ns, known in self._poses.items() if ns in keep} | {stamp_ns: pose}
+        self._final.append((stamp_ns, pose))
+        position = running.covariance[POSITION, POSITION] + self._forgotten
+        self.covariance = _of_pose(running, position)
+        if used:
+            if self._lost:
+                self.epoch += 1
+                self._report(stamp_ns, "new_epoch", f"vision is back: epoch {self.epoch} starts at the best guess")
+            self._lost, self._tracked_ns, self._before_outage = False, stamp_ns, position
+            return Status.INITIALISING if stamp_ns < self._settled_ns else Status.TRACKING
+        sigma = float(np.sqrt(max(np.linalg.eigvalsh(position - self._before_outage)[-1], 0.0)))
+        if not self._lost and sigma > self._config.smoother.lost_position_sigma_m:
+            self._lost = True
+            self._report(stamp_ns, "lost", f"position uncertain by {sigma:.2f} m since vision was last used")
+        return Status.LOST if self._lost else Status.COASTING
+
+    @property
+    def _running(self) -> ExtendedKalmanFilter:
+        assert self._filter is not None, "it has started"
+        return self._filter
+
+    def _inertial(self, rates: VisualRates | None) -> list[Measurement]:
+        """The gyro and the accelerometer over the newest step, as far as they are to be used."""
+        span, config, state = self._span, self._config.filter, self._running.state
+        if span is None:
+            return []
+        measured = [accelerometer(state, span.mean_force, config.gravity_sigma_m_s2)]
+        if config.bias == "estimated" or rates is None:
+            return [gyro(state, span.mean_rate, config.gyro_sigma_rad_s), *measured]
+        # The first approach: where gyro and vision agree, the gyro's bias must not spoil what vision says.
+        if np.abs(span.mean_rate - rates.values[3:]).max() > config.gyro_threshold_rad_s:
+            measured.append(gyro(state, span.mean_rate, config.gyro_sigma_rad_s))
+        return measured
+
+    def _passes_as_vision(self, motion: RelativeMotion, rates: VisualRates) -> bool:
+        """Whether vision passes the chi-square test and asks for no impossible acceleration."""
+        state, config = self._running.state, self._config.filter
+        accel = float(np.linalg.norm(rates.values[:3] - state.velocity_body)) / motion.duration_s
+        sigma = np.sqrt(np.linalg.eigvalsh(self._running.covariance[VELOCITY, VELOCITY])[-1])
+        is_known = sigma / motion.duration_s < config.max_accel_m_s2  # the velocity, well enough to tell
+        if is_known and accel > config.max_accel_m_s2:
+            self._report(motion.stamp_ns, "vision_gated", f"asks for an acceleration of {accel:.0f} m/s^2")
+            return False
+        return self._passes(vision(state, rates))
+
+    def _passes(self, measurement: Measurement) -> bool:
+        verdict = self._running.test(measurement, self._config.filter.gate_probability)
+        if not verdict.accepted:
+            self._report(
+                self._latest_ns,
+                f"{measurement.name}_gated",
+                f"innovation {verdict.statistic:.1f} beyond chi-square {verdict.threshold:.1f}",
+            )
+        return verdict.accepted
+
+    def _forget_velocities(self) -> None:
+        """What went on unseen, or was refused for long, tells nothing of how the rig moves now."""
+        running = self._running
+        for part, sigma in ((VELOCITY, _FORGOTTEN_SPEED_SIGMA_M_S), (RATE, _UNKNOWN_RATE_SIGMA_RAD_S)):
+            running.covariance[part, :] = running.covariance[:, part] = 0.0
+            running.covariance[part, part] = sigma**2 * np.eye(3)
+        running.state = replace(running.state, velocity_body=np.zeros(3), rate_body=np.zeros(3))
+
+
+def _of_pose(running: ExtendedKalmanFilter, position: Float) -> Float:
+    """Covariance (6, 6) of the pose, tangent ``[rotation, translation]`` in body, from that of the position in nav."""
+    body_R_nav = running.state.nav_R_body.T
+    covariance = np.empty((6, 6))
+    covariance[:3, :3] = running.covariance[ATTITUDE, ATTITUDE]
+    covariance[3:, :3] = body_R_nav @ running.covariance[POSITION, ATTITUDE]
+    covariance[:3, 3:] = covariance[3:, :3].T
+    covariance[3:, 3:] = body_R_nav @ position @ body_R_nav.T
+    return covariance
