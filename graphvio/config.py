@@ -218,8 +218,7 @@ class Config:
         """
         if self.fusion.estimator == "filter" and self.motion.reference != "previous":
             raise ConfigError(
-                "fusion: estimator filter measures velocities over one step; set motion: {reference: previous}, or use "
-                "the profile paper"
+                "fusion: estimator filter measures velocities over one step; set motion: {reference: previous}"
             )
 
     @staticmethod

@@ -87,7 +87,7 @@ def agree(
         misaligned: pairs whose place has been corrected, which leaves it uncertain.
         in_doubt: the pairs contradicted each other a moment ago, so that less is enough to tell them apart now.
     """
-    everyone = tuple(int(j) for j in np.unique(observations.pair))
+    everyone = observations.pairs
     own: dict[int, Refined] = {}
     if len(everyone) > 1:
         motions = {j: _own_motion(rig, observations, j, joint, config, rng) for j in everyone}
@@ -194,7 +194,7 @@ def _second_motion(
     refined = refine(rig, seen, search(rig, seen, sides[0].refined.cur_T_ref, config, rng), config)
     if refined.inlier.sum() < max(_RIVAL_POINTS, _POORLY_EXPLAINED * rest.sum()):
         return None
-    return Side(tuple(int(j) for j in np.unique(seen.pair)), _spread_over(rest, refined))
+    return Side(seen.pairs, _spread_over(rest, refined))
 
 
 def _spread_over(rows: Bool, refined: Refined) -> Refined:

@@ -12,7 +12,7 @@ from graphvio.frontend.lucas_kanade import Pyramid, register
 from graphvio.frontend.patches import pack
 from graphvio.frontend.slanted import align_slanted
 from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
-from graphvio.frontend.tracks import passes
+from graphvio.frontend.tracks import passes, usable_at
 from graphvio.rig import StereoPair
 
 _SEARCH_CORRELATION = 0.6  # of undeformed patches; aligned ones must reach `StereoConfig.min_correlation`
@@ -77,10 +77,9 @@ class StereoMatcher:
         matched_px, slopes, good = self._search(
             left, right, pixels, rays, inverse_depths, slopes, min_gradient, rejected
         )
-        inside = pair.right.contains(matched_px)
+        inside, usable = usable_at(matched_px, self._allowed, 0.0)
         good = passes(good, inside, "outside", rejected)
-        columns, rows = np.where(inside[:, None], matched_px, 0.0).round().astype(np.int64).T
-        good = passes(good, self._allowed[rows, columns], "masked", rejected)
+        good = passes(good, usable, "masked", rejected)
         normalised, has_ray = pair.right.unproject(matched_px)
         good &= has_ray
         points, covariances, errors = triangulate(

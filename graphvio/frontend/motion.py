@@ -40,8 +40,8 @@ class RelativeMotion:
     def weakest_sigmas(self) -> tuple[float, float]:
         """Standard deviations in the directions that are known least: of the rotation, radians, and the translation,
         metres."""
-        variances = (np.linalg.eigvalsh(self.covariance[block, block])[-1] for block in (slice(0, 3), slice(3, 6)))
-        rotation, translation = np.sqrt(list(variances))
+        blocks = np.stack([self.covariance[:3, :3], self.covariance[3:, 3:]])
+        rotation, translation = np.sqrt(np.linalg.eigvalsh(blocks)[:, -1])
         return float(rotation), float(translation)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.frontend.tracks import PairFrame, common_rows
+from graphvio.kernels import kernel
 from graphvio.rig import Rig
 
 
@@ -67,6 +68,11 @@ class Observations(NamedTuple):
     right: Float
     has_right: Bool
 
+    @property
+    def pairs(self) -> tuple[int, ...]:
+        """The pairs that have points, in order."""
+        return tuple(int(j) for j in np.flatnonzero(np.bincount(self.pair)))
+
     def of_pair(self, pair: int) -> Observations:
         """Only one pair's points, not copied."""
         return self.of_rows(slice(*np.searchsorted(self.pair, [pair, pair + 1])))
@@ -100,29 +106,39 @@ class Correspondences:
 
 def correspond(reference: Mapping[int, PairFrame], current: Mapping[int, PairFrame]) -> Correspondences:
     """Join the tracks of two instants by their identities; points without depth at the reference stay out."""
-    columns: list[list[np.ndarray]] = [[] for _ in range(6)]
     rows: dict[int, Int] = {}
     offered: dict[int, int] = {}
+    parts: list[Observations] = []
     for pair in sorted(reference.keys() & current.keys()):
         then, now = reference[pair], current[pair]
-        offered[pair] = int(then.has_depth.sum())
-        at_then, at_now = common_rows(then.ids, now.ids)
-        known = then.has_depth[at_then]
-        at_then, at_now = at_then[known], at_now[known]
-        rows[pair] = at_now
-        parts = (
-            np.full(len(at_now), pair, dtype=np.int64),
-            then.points[at_then],
-            then.covariances[at_then],
-            now.left[at_now],
-            np.where(now.has_depth[at_now, None], now.right[at_now], 0.0),
-            now.has_depth[at_now],
-        )
-        for column, part in zip(columns, parts, strict=True):
-            column.append(part)
-    if not rows:
+        offered[pair] = int(np.count_nonzero(then.has_depth))
+        joined, rows[pair] = _join(
+            pair, then.ids, then.has_depth, then.points, then.covariances,
+            now.ids, now.has_depth, now.left, now.right,
+        )  # fmt: skip
+        parts.append(joined)
+    if not parts:
         return Correspondences(_NOTHING, rows, offered)
-    return Correspondences(Observations(*(np.ascontiguousarray(np.concatenate(c)) for c in columns)), rows, offered)
+    return Correspondences(Observations(*(np.concatenate(c) for c in zip(*parts, strict=True))), rows, offered)
+
+
+@kernel
+def _join(
+    pair: int, ids_then: Int, known: Bool, points: Float, covariances: Float,
+    ids_now: Int, has_right: Bool, left: Float, right: Float,
+) -> tuple[Observations, Int]:  # fmt: skip
+    """One pair's observations of the tracks whose depth is known at the reference, and their rows (M,) now."""
+    at_then, at_now = common_rows(ids_then, ids_now)
+    of_known = known[at_then]
+    at_then, at_now = at_then[of_known], at_now[of_known]
+    n = len(at_now)
+    in_right, seen = np.zeros((n, 2)), has_right[at_now]
+    for i in range(n):
+        if seen[i]:
+            in_right[i] = right[at_now[i]]
+    return Observations(
+        np.full(n, pair, dtype=np.int64), points[at_then], covariances[at_then], left[at_now], in_right, seen
+    ), at_now
 
 
 _NOTHING = Observations(

@@ -35,7 +35,9 @@ def search(
             rig, observations, np.concatenate([best[None], motions]), config.chunk_points, config.cauchy_scale_px, rng
         )
         drawn += batch
-        shares = _explained_shares(best, rig, observations, 2.0 * config.cauchy_scale_px)[np.unique(sources)]
+        shares = _explained_shares(best, rig, observations, 2.0 * config.cauchy_scale_px)[
+            np.flatnonzero(np.bincount(sources))
+        ]
         with np.errstate(divide="ignore", invalid="ignore"):
             needed = np.log1p(-min(config.confidence, 1.0 - 1e-12)) / np.log1p(-(shares**3))
         # One pair's right triple is enough: a pair that something stands in front of may have none.
@@ -49,7 +51,7 @@ def hypothesise(
 ) -> tuple[Float, Int]:
     """Motions ``cur_T_ref`` (H, 4, 4) of body, by 3-point resection of random triples, and the pair (H,) that each is
     from; up to ``count`` of each pair."""
-    pairs = np.unique(observations.pair)
+    pairs = np.array(observations.pairs, dtype=np.int64)
     return _resect_triples(pairs, rng.random((len(pairs), count, 3)), rig, observations, pixel_sigma_px)
 
 

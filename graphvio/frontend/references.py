@@ -78,7 +78,7 @@ class References:
         if any(j not in correspondences.rows for j in frames):
             return True  # a pair that came back takes part again from the next frameset on
         pair, overlap = correspondences.observations.pair, self._config.keyframe_overlap
-        explained = {int(j) for j in np.unique(pair[refined.inlier])}
+        explained = {int(j) for j in np.flatnonzero(np.bincount(pair[refined.inlier]))}
         support, offered = int(refined.inlier.sum()), sum(correspondences.offered[j] for j in explained)
         if support < overlap * offered or support < _FEWEST_POINTS:
             return True

@@ -20,7 +20,7 @@ from graphvio.geometry import se3_compose, se3_exp
 from graphvio.kernels import kernel
 
 _MOST_ROUNDS = 3
-_ROUNDS_TO_FIND_INLIERS = 4
+_ROUNDS_TO_FIND_INLIERS = 2
 _STEPS_PER_ROUND = 6
 _CONVERGED = 1e-6  # radians and metres
 _NEAR = 1e-4  # enough to tell inliers

@@ -39,10 +39,7 @@ def best_pair_motion(
     rng: np.random.Generator,
 ) -> Refined:
     """Each pair estimates alone; the pose of least global cost wins, eq. (4). For arguments see `joint_motion`."""
-    candidates = [
-        joint_motion(rig, observations.of_pair(int(pair)), predicted, config, rng)
-        for pair in np.unique(observations.pair)
-    ]
+    candidates = [joint_motion(rig, observations.of_pair(pair), predicted, config, rng) for pair in observations.pairs]
     costs = [global_cost(rig, observations, candidate.cur_T_ref, config.cauchy_scale_px) for candidate in candidates]
     winner = candidates[int(np.argmin(costs))]
     inlier, errors_px = explained(rig, observations, winner.cur_T_ref, config)

@@ -17,7 +17,7 @@ from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid,
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.stopwatch import Stopwatch
-from graphvio.frontend.tracks import PairFrame, common_rows, passes
+from graphvio.frontend.tracks import PairFrame, common_rows, passes, usable_at
 from graphvio.rig import Camera, StereoPair
 
 _MAX_TRACKS_PER_CELL = 2
@@ -164,9 +164,9 @@ class PairTracker:
         """Which tracks (N,) stay: found, where the image may be used, and not crowded together."""
         corners = self._config.corners
         found = passes(np.ones(len(found), dtype=bool), found, "flow", rejected)
-        found = passes(found, self._pair.left.contains(pixels, corners.border_px), "edge", rejected)
-        columns, rows = np.where(found[:, None], pixels, 0.0).round().astype(np.int64).T
-        found = passes(found, self._allowed[rows, columns], "masked_left", rejected)
+        inside, usable = usable_at(pixels, self._allowed, corners.border_px)
+        found = passes(found, inside, "edge", rejected)
+        found = passes(found, usable, "masked_left", rejected)
         alone = thinned(pixels, found, self._cell_px, _MAX_TRACKS_PER_CELL)  # the oldest of a cell come first
         return passes(found, alone, "crowded", rejected)
 

@@ -113,7 +113,27 @@ def common_rows(first: Int, second: Int) -> tuple[Int, Int]:
     return at_first[:k], at_second[:k]
 
 
+@kernel
+def usable_at(pixels: Float, allowed: Bool, border_px: float) -> tuple[Bool, Bool]:
+    """Which pixels (N, 2) lie so far inside the image (N,), and which of these where it may be used (N,).
+
+    Args:
+        pixels: NaN is outside.
+        allowed: (height, width) where the image may be used.
+        border_px: distance from the edge.
+    """
+    height, width = allowed.shape
+    inside, usable = np.zeros(len(pixels), dtype=np.bool_), np.zeros(len(pixels), dtype=np.bool_)
+    for i in range(len(pixels)):
+        x, y = pixels[i, 0], pixels[i, 1]
+        inside[i] = border_px <= x <= width - 1 - border_px and border_px <= y <= height - 1 - border_px
+        if inside[i]:
+            usable[i] = allowed[int(np.rint(y)), int(np.rint(x))]
+    return inside, usable
+
+
 def passes(candidates: Bool, test: Bool, name: str, rejected: dict[str, int]) -> Bool:
     """Which candidates (N,) pass a test (N,); how many did not is noted under the test's name."""
-    rejected[name] = int((candidates & ~test).sum())
-    return np.asarray(candidates & test)
+    passed = candidates & test
+    rejected[name] = int(np.count_nonzero(candidates) - np.count_nonzero(passed))
+    return np.asarray(passed)

@@ -206,8 +206,7 @@ class VisualFrontend:
                 self._contradicted_ns = stamp_ns
         else:
             refined = best_pair_motion(self._arrays, observations, start, config, rng)
-            everyone = tuple(int(j) for j in np.unique(observations.pair))
-            agreement = Agreement((Side(everyone, refined),), {})
+            agreement = Agreement((Side(observations.pairs, refined),), {})
         best = agreement.sides[0]
         rows = np.isin(observations.pair, best.pairs)
         if not is_supported(best.refined.inlier[rows], config):

@@ -45,6 +45,12 @@ class Timings:
     total_ms: list[float] = field(default_factory=list)
     stage_ms: dict[str, list[float]] = field(default_factory=dict)
 
+    def add(self, other: Timings) -> None:
+        """Take another's framesets as well."""
+        self.total_ms += other.total_ms
+        for name, values in other.stage_ms.items():
+            self.stage_ms.setdefault(name, []).extend(values)
+
     @property
     def median_ms(self) -> float:
         """Median of the total."""
