@@ -10,7 +10,7 @@ from graphvio.arrays import Float
 from graphvio.backend.gating import Verdict
 from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.smoother import Smoother
-from graphvio.backend.starts import Start, after_failure, after_gap, after_lost, by_vision, first_start
+from graphvio.backend.starts import MAX_UNBRIDGED_S, Start, after_failure, after_gap, after_lost, by_vision, first_start
 from graphvio.backend.states import RigState
 from graphvio.backend.window import WindowError
 from graphvio.config import Config
@@ -19,8 +19,6 @@ from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.rig import Rig
 from graphvio.synchroniser import Report
-
-_MAX_UNBRIDGED_S = 3.0
 
 
 class Belief:
@@ -115,7 +113,7 @@ class Belief:
 
     def predict(self, stamp_ns: int, span: ImuSpan | None) -> None:
         """Go on to a frameset's instant by the IMU, or without a span of it by constant velocity."""
-        if span is None and stamp_ns - self.latest_ns > _MAX_UNBRIDGED_S * 1e9:
+        if span is None and stamp_ns - self.latest_ns > MAX_UNBRIDGED_S * 1e9:
             self._jump(stamp_ns)
         else:
             self._running.extend(stamp_ns, span)

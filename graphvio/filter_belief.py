@@ -13,7 +13,7 @@ from graphvio.backend.ekf.measurements import Measurement, VisualRates, accelero
 from graphvio.backend.ekf.process import noise_sigmas
 from graphvio.backend.ekf.state import ATTITUDE, ERRORS, GYRO_BIAS, POSITION, RATE, VELOCITY, FilterState
 from graphvio.backend.inertial import ImuSpan
-from graphvio.backend.starts import first_start
+from graphvio.backend.starts import AFTER_JUMP, MAX_UNBRIDGED_S, first_start
 from graphvio.backend.states import RigState
 from graphvio.config import Config
 from graphvio.events import Status
@@ -22,10 +22,9 @@ from graphvio.geometry import se3_inverse
 from graphvio.rig import Rig
 from graphvio.synchroniser import Report
 
-_MAX_UNBRIDGED_S = 3.0
 _ANCHOR_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
-_UNKNOWN_RATE_SIGMA_RAD_S = 1.0
-_FORGOTTEN_SPEED_SIGMA_M_S = 2.0
+_UNKNOWN_RATE_SIGMA_RAD_S = 3.0
+_FORGOTTEN_SPEED_SIGMA_M_S = 30.0  # on foot or on the road
 
 
 class FilterBelief:
@@ -44,6 +43,8 @@ class FilterBelief:
         self._filter: ExtendedKalmanFilter | None = None
         self._has_imu = False
         self._latest_ns = self._tracked_ns = self._reset_ns = self._settled_ns = 0
+        self._before_ns: int | None = None  # stamp at which the newest step began
+        self._refused_ns: int | None = None  # since when vision is refused
         self._span: ImuSpan | None = None
         self._forgotten = np.zeros((3, 3))  # position covariance, nav, that resets took out of the filter
         self._before_outage = np.zeros((3, 3))  # position covariance, nav, when vision was last used
@@ -74,8 +75,8 @@ class FilterBelief:
         return RigState(state.nav_T_body, state.nav_R_body @ state.velocity_body, state.gyro_bias, np.zeros(3))
 
     def latest_rate(self) -> Float | None:
-        """Angular rate (3,) rad/s of body over the newest step."""
-        return self._running.state.rate_body
+        """Angular rate (3,) rad/s of body over the newest step, or None at a start."""
+        return None if self._before_ns is None else self._running.state.rate_body
 
     def motion_since(self, then_ns: int) -> Float | None:
         """``now_T_then`` (4, 4) of body from an earlier frameset to the newest state, or None if it is not known."""
@@ -111,28 +112,27 @@ class FilterBelief:
         covariance[ATTITUDE, ATTITUDE] = uncertainty.pose[:3, :3]
         covariance[VELOCITY, VELOCITY] = uncertainty.velocity_m_s**2 * np.eye(3)
         covariance[RATE, RATE] = _UNKNOWN_RATE_SIGMA_RAD_S**2 * np.eye(3)
-        covariance[GYRO_BIAS, GYRO_BIAS] = uncertainty.gyro_bias_rad_s**2 * estimates_bias * np.eye(3)
+        if estimates_bias:
+            covariance[GYRO_BIAS, GYRO_BIAS] = uncertainty.gyro_bias_rad_s**2 * np.eye(3)
         state = FilterState(pose[:3, 3], pose[:3, :3], np.zeros(3), np.zeros(3), bias)
         self._filter = ExtendedKalmanFilter(state, covariance)
         self._has_imu = found is not None
         self._latest_ns = self._tracked_ns = self._reset_ns = stamp_ns
         self._settled_ns, self._lost, self._span = start.settled_ns, False, None
+        self._before_ns = self._refused_ns = None
+        self._forgotten = np.zeros((3, 3))
         self._poses.clear()
 
     def predict(self, stamp_ns: int, span: ImuSpan | None) -> None:
         """Go on to a frameset's instant by constant velocity; the IMU since the last one is measured there."""
         config, dt = self._config.filter, (stamp_ns - self._latest_ns) * 1e-9
-        if dt > _MAX_UNBRIDGED_S:
-            self.epoch += 1
-            self._report(stamp_ns, "time_jump", f"{dt:.1f} s without data: epoch {self.epoch} starts at the last pose")
-            self._forget_velocities()
-            self._tracked_ns = stamp_ns
-            self._rekey()
+        if span is None and dt > MAX_UNBRIDGED_S:
+            self._jump(stamp_ns, dt)
             dt = 0.0
         walk = config.gyro_bias_walk_rad_s if config.bias == "estimated" else 0.0
         sigmas = noise_sigmas(dt, config.accel_sigma_m_s2, config.angular_accel_sigma_rad_s2, walk)
         self._running.predict(dt, sigmas)
-        self._span, self._latest_ns = span, stamp_ns
+        self._span, self._before_ns, self._latest_ns = span, self._latest_ns, stamp_ns
 
     def use(self, visual: VisualResult) -> RelativeMotion | None:
         """Test each measurement against the prediction, and update with those that pass.
@@ -141,23 +141,25 @@ class FilterBelief:
             The motion that was used, or None.
         """
         motion, config = visual.motion, self._config.filter
-        if motion is not None and motion.reference_stamp_ns not in self._poses:
-            motion = None  # it is from before a break
+        if motion is not None and motion.reference_stamp_ns != self._before_ns:
+            motion = None  # its mean velocity is not that of the newest step
+        sees = motion is not None
         rates = None if motion is None else VisualRates.of(motion)
         offered: list[Measurement] = []
         if motion is not None and rates is not None and self._passes_as_vision(motion, rates):
             offered.append(vision(self._running.state, rates))
         else:
-            motion = None
+            motion = rates = None
         offered += [each for each in self._inertial(rates) if self._passes(each)]
         if offered:
             self._running.update(stacked(offered))
-        if (
-            motion is None
-            and self._latest_ns - self._tracked_ns > config.max_gated_s * 1e9
-            and visual.motion is not None
-        ):
+        if motion is not None or not sees:
+            self._refused_ns = None
+        elif self._refused_ns is None:
+            self._refused_ns = self._latest_ns
+        elif self._latest_ns - self._refused_ns > config.max_gated_s * 1e9:
             self._forget_velocities()
+            self._refused_ns = None
             self._report(self._latest_ns, "gate_reset", "refused for too long: the velocities are forgotten")
         return motion
 
@@ -228,6 +230,16 @@ class FilterBelief:
                 f"innovation {verdict.statistic:.1f} beyond chi-square {verdict.threshold:.1f}",
             )
         return verdict.accepted
+
+    def _jump(self, stamp_ns: int, gap_s: float) -> None:
+        """After a gap that nothing bridges: a new epoch at the last pose, as uncertain as after any such gap."""
+        self.epoch += 1
+        self._report(stamp_ns, "time_jump", f"{gap_s:.1f} s without data: epoch {self.epoch} starts at the last pose")
+        self._forget_velocities()
+        self._running.covariance[POSITION, POSITION] += AFTER_JUMP[3:, 3:]
+        self._running.covariance[ATTITUDE, ATTITUDE] += AFTER_JUMP[:3, :3]
+        self._lost, self._tracked_ns, self._refused_ns = False, stamp_ns, None
+        self._rekey()
 
     def _forget_velocities(self) -> None:
         """What went on unseen, or was refused for long, tells nothing of how the rig moves now."""

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import Float
-from graphvio.frontend.blocks import LANES, SIZE, in_blocks, lane_by_lane, point_by_point
+from graphvio.frontend.blocks import POINTS, SIZE, in_blocks, lane_by_lane, point_by_point
 from graphvio.frontend.cost import left_motions
 from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise, unexpanded
 from graphvio.frontend.observations import Observations, RigArrays
@@ -39,7 +39,7 @@ class Places:
         blocks, whiteners = in_blocks(seen), np.zeros((len(seen.pair), 4, 4))
 
         def columns(rows: Float) -> Float:
-            return np.column_stack([point_by_point(blocks, row) for row in np.hsplit(rows, rows.shape[1] // LANES)])
+            return np.column_stack([point_by_point(blocks, row) for row in np.hsplit(rows, rows.shape[1] // POINTS)])
 
         whiteners[:, *np.tril_indices(4)] = columns(at.whiteners)
         return Places(columns(at.points), columns(at.offsets), whiteners)
@@ -106,7 +106,7 @@ def linearised(
 ) -> tuple[float, Float, Float, Float]:
     """What `linearise` says: cost, normal matrix (6, 6), gradient (6,) and squared errors (N,)."""
     blocks = in_blocks(seen)
-    hessian, gradient, errors2 = np.empty((6, 6)), np.empty(6), np.empty((len(blocks.pair), LANES))
+    hessian, gradient, errors2 = np.empty((6, 6)), np.empty(6), np.empty((len(blocks.pair), POINTS))
     counted = lane_by_lane(blocks, np.ones(len(seen.pair)) if active is None else active)
     motions = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)
     cost = linearise(motions, ARRAYS, blocks, at, counted, SCALE, hessian, gradient, errors2)
@@ -130,8 +130,8 @@ def test_blocks_hold_every_point_once(counts: list[int]) -> None:
     seen = Observations(np.repeat(np.arange(len(counts)), counts), points, covariances, left, right, left[:, 0] < 0.5)
     blocks = in_blocks(seen)
     assert blocks.size.sum() == n
-    assert len(blocks.pair) == sum(-(-count // LANES) for count in counts)
-    rows = blocks.values.reshape(len(blocks.pair), SIZE // LANES, LANES)
+    assert len(blocks.pair) == sum(-(-count // POINTS) for count in counts)
+    rows = blocks.values.reshape(len(blocks.pair), SIZE // POINTS, POINTS)
     upper = seen.covariances[:, *np.triu_indices(3)]
     expected = np.column_stack([seen.points, upper, seen.left, seen.right, seen.has_right])
     for k, column in enumerate(expected.T):

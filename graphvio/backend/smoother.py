@@ -24,7 +24,7 @@ from graphvio.rig import Imu
 
 _ACCEL_BIAS_SIGMA = 0.2
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
-_LEAST_OWN_SHARE = 0.02
+_LEAST_OWN_SHARE = 0.02  # of each direction of a motion's covariance: keeps it positive definite
 
 
 class Smoother:
@@ -138,7 +138,7 @@ class Smoother:
         """Chi-square test of a motion that ends in the newest state, against the window's prediction."""
         newest = _x(self._index_of[motion.stamp_ns])
         reference, covariance = _x(self._index_of[motion.reference_stamp_ns]), motion.covariance
-        if motion.reference_stamp_ns in self._views:
+        if motion.reference_stamp_ns in self._views and motion.shared_covariance.any():
             reference, covariance = self._reference_key(motion), self._own_covariance(motion)
         nav_T_reference = np.asarray(self._window.values.atPose3(reference).matrix())
         predicted = se3_inverse(nav_T_reference) @ self.pose(motion.stamp_ns)
@@ -186,7 +186,7 @@ class Smoother:
     def _own_covariance(self, motion: RelativeMotion) -> Float:
         """What a motion's covariance (6, 6) has beyond that of its reference as seen, which the first motion from there
         told: the points' errors come to a little more as the rig moves on. Some of it is always the motion's own."""
-        if motion.reference_stamp_ns not in self._views:
+        if motion.reference_stamp_ns not in self._views or not motion.shared_covariance.any():
             return motion.covariance
         adjoint = se3_adjoint(se3_inverse(motion.reference_T_current))
         shared = adjoint @ self._views[motion.reference_stamp_ns] @ adjoint.T

@@ -22,7 +22,10 @@ _RESTART_SPEED_SIGMA = 1.0
 _GYRO_BIAS_SIGMA = 0.01
 _WIDE_GYRO_BIAS_SIGMA = 0.1
 _AFTER_REBUILD = np.diag([0.05] * 3 + [0.1] * 3) ** 2  # added to the pose's covariance, radians and metres
-_AFTER_JUMP = np.diag([0.2] * 3 + [1.0] * 3) ** 2
+AFTER_JUMP = np.diag([0.2] * 3 + [1.0] * 3) ** 2
+"""Added to a pose's covariance (6, 6) after a gap that nothing bridges."""
+MAX_UNBRIDGED_S = 3.0
+"""A longer gap without an IMU is not bridged by constant velocity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +84,7 @@ def after_failure(stamp_ns: int, state: RigState, pose_covariance: Float) -> Sta
 
 def after_gap(stamp_ns: int, state: RigState, pose_covariance: Float) -> Start:
     """A start at the last state, after a gap that nothing bridges. For arguments see `after_failure`."""
-    return _restart(stamp_ns, state, pose_covariance + _AFTER_JUMP)
+    return _restart(stamp_ns, state, pose_covariance + AFTER_JUMP)
 
 
 def after_lost(motion: RelativeMotion, state: RigState, pose_covariance: Float) -> Start:

@@ -12,12 +12,12 @@ from graphvio.arrays import Float, Int
 from graphvio.frontend.observations import Observations
 from graphvio.kernels import kernel
 
-LANES = 32
+POINTS = 32
 """Points of a block."""
 
 
 def _rows(count: int) -> tuple[int, ...]:
-    return tuple(LANES * k for k in range(count))
+    return tuple(POINTS * k for k in range(count))
 
 
 (
@@ -53,14 +53,14 @@ def in_blocks(observations: Observations) -> Blocks:
     n, blocks = len(pair), 0
     first = np.empty(n + 1, dtype=np.int64)  # more than enough
     for i in range(n):
-        if i == 0 or pair[i] != pair[i - 1] or i - first[blocks - 1] == LANES:
+        if i == 0 or pair[i] != pair[i - 1] or i - first[blocks - 1] == POINTS:
             first[blocks] = i
             blocks += 1
     first[blocks] = n
     values = np.empty((blocks, SIZE))
     for b in range(blocks):
         block = values[b]
-        for lane in range(LANES):
+        for lane in range(POINTS):
             i = min(first[b] + lane, first[b + 1] - 1)
             point, covariance = observations.points[i], observations.covariances[i]
             left, right = observations.left[i], observations.right[i]
@@ -83,7 +83,7 @@ def in_blocks(observations: Observations) -> Blocks:
 
 @kernel
 def point_by_point(blocks: Blocks, lanes: Float) -> Float:
-    """Values of the blocks' lanes (B, LANES), point by point (N,)."""
+    """Values of the blocks' lanes (B, POINTS), point by point (N,)."""
     values = np.empty(blocks.size.sum())
     for b in range(len(blocks.pair)):
         for lane in range(blocks.size[b]):
@@ -93,8 +93,8 @@ def point_by_point(blocks: Blocks, lanes: Float) -> Float:
 
 @kernel
 def lane_by_lane(blocks: Blocks, values: Float) -> Float:
-    """Values of points (N,), lane by lane (B, LANES); zero beyond the last point of a block."""
-    lanes = np.zeros((len(blocks.pair), LANES))
+    """Values of points (N,), lane by lane (B, POINTS); zero beyond the last point of a block."""
+    lanes = np.zeros((len(blocks.pair), POINTS))
     for b in range(len(blocks.pair)):
         for lane in range(blocks.size[b]):
             lanes[b, lane] = values[blocks.first[b] + lane]

@@ -11,7 +11,7 @@ NEAREST = 1e-3
 """Depth over the reference depth, below which a point is behind the camera."""
 WORST = 1e6
 """Squared error that stands for a point behind the camera; no other counts for more."""
-_BLOCK = 32  # (1 + 1e6)^32 is below the largest float
+_BLOCK = 32  # (1 + 1e6)^32 is below the largest float; so it is for the points of `graphvio.frontend.blocks`
 
 Matrix = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 """The upper three rows of a transform."""

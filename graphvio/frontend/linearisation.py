@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.frontend.blocks import LANES, LEFT_U, LEFT_V, RIGHT_U, RIGHT_V, SEEN, Blocks, W, X, Y
+from graphvio.frontend.blocks import LEFT_U, LEFT_V, POINTS, RIGHT_U, RIGHT_V, SEEN, Blocks, W, X, Y
 from graphvio.frontend.cost import WORST, elements
 from graphvio.frontend.observations import RigArrays
 from graphvio.frontend.point_errors import (
@@ -32,17 +32,17 @@ from graphvio.kernels import vector_kernel
 
 _EXPANSIONS = 2
 _FARTHEST = 16.0  # squared whitened error up to which a point may follow its residual; outliers would gain leverage
-_COLUMN = 4 * LANES  # of whitened derivatives: the four rows of each of a block's points
+_COLUMN = 4 * POINTS  # of whitened derivatives: the four rows of each of a block's points
 
 
 class Expansion(NamedTuple):
     """Where the errors of points are linearised, in blocks as `graphvio.frontend.blocks.Blocks`.
 
     Attributes:
-        shifts: (B, 3 LANES) by how much what both instants say corrects the points.
-        points: (B, 3 LANES) corrected, by the shifts of before.
-        offsets: (B, 4 LANES) what that correction is worth, pixels.
-        whiteners: (B, 10 LANES) inverse Cholesky factors of the covariances S, lower triangles row by row.
+        shifts: (B, 3 POINTS) by how much what both instants say corrects the points.
+        points: (B, 3 POINTS) corrected, by the shifts of before.
+        offsets: (B, 4 POINTS) what that correction is worth, pixels.
+        whiteners: (B, 10 POINTS) inverse Cholesky factors of the covariances S, lower triangles row by row.
     """
 
     shifts: Float
@@ -56,7 +56,7 @@ def unexpanded(blocks: Blocks) -> Expansion:
     """Room for an expansion, with no correction of the points."""
     n = len(blocks.pair)
     return Expansion(
-        np.zeros((n, 3 * LANES)), np.empty((n, 3 * LANES)), np.empty((n, 4 * LANES)), np.empty((n, 10 * LANES))
+        np.zeros((n, 3 * POINTS)), np.empty((n, 3 * POINTS)), np.empty((n, 4 * POINTS)), np.empty((n, 10 * POINTS))
     )
 
 
@@ -83,7 +83,7 @@ def _expand_block(
 ) -> None:  # fmt: skip
     """`expand` for one block."""
     left, right = elements(to_left), elements(to_right)
-    for i in range(LANES):
+    for i in range(POINTS):
         shift = shifts[X + i], shifts[Y + i], shifts[W + i]
         point = block[X + i] + shift[0], block[Y + i] + shift[1], block[W + i] + shift[2]
         # Derivatives of the four coordinates by the point, and their errors; zero where there is no right image.
@@ -129,18 +129,18 @@ def linearise(
         rig: of P pairs.
         blocks: of N points.
         at: where the points are linearised.
-        active: (B, LANES) 1 for points that count; the others, which are 0, only get their errors.
+        active: (B, POINTS) 1 for points that count; the others, which are 0, only get their errors.
         scale: of the Cauchy cost, in whitened units.
         hessian: (6, 6) output.
         gradient: (6,) output.
-        errors2: (B, LANES) output, squared whitened errors, infinite behind a camera.
+        errors2: (B, POINTS) output, squared whitened errors, infinite behind a camera.
     """
-    columns, weights, normal = np.empty(7 * _COLUMN), np.empty(LANES), np.zeros((7, 7))
+    columns, weights, normal = np.empty(7 * _COLUMN), np.empty(POINTS), np.zeros((7, 7))
     cost, inverse_scale2 = 0.0, 1.0 / (scale * scale)
     for b in range(len(blocks.pair)):
         _whiten_block(motions, rig, blocks, at, b, columns, errors2[b])
-        product = 1.0  # of at most 32 factors up to 1e6
-        for i in range(LANES):
+        product = 1.0  # see `graphvio.frontend.cost`
+        for i in range(POINTS):
             e2 = min(errors2[b, i] * inverse_scale2, WORST)
             product *= 1.0 + active[b, i] * e2
             weights[i] = active[b, i] / (1.0 + e2) if e2 < WORST else 0.0
@@ -156,8 +156,8 @@ def information_through_points(
     motions: Float, rig: RigArrays, blocks: Blocks, at: Expansion, sigmas_px: Float, factors: Float
 ) -> Float:
     """``sum f (J^T S^-1 J - sigma^2 J^T S^-2 J)`` (6, 6): the part of the score's variance that the points' own errors
-    contribute, each point with a factor f (B, LANES)."""
-    columns, weights, normal = np.empty(7 * _COLUMN), np.empty(LANES), np.zeros((7, 7))
+    contribute, each point with a factor f (B, POINTS)."""
+    columns, weights, normal = np.empty(7 * _COLUMN), np.empty(POINTS), np.zeros((7, 7))
     for b in range(len(blocks.pair)):
         _whiten_block(motions, rig, blocks, at, b, columns, weights)
         weights[:] = factors[b]
@@ -172,14 +172,14 @@ def information_through_points(
 def _whiten_block(
     motions: Float, rig: RigArrays, blocks: Blocks, at: Expansion, b: int, columns: Float, errors2: Float
 ) -> None:
-    """Fill a block's whitened derivatives (6, 4, LANES), behind them its errors (4, LANES), and the errors' squares."""
+    """Fill a block's whitened derivatives (6, 4, POINTS), behind them its errors (4, POINTS), and their squares."""
     j, block, points, offsets, whiteners = (
         blocks.pair[b], blocks.values[b], at.points[b], at.offsets[b], at.whiteners[b],
     )  # fmt: skip
     to_left, to_right = elements(motions[j, 0]), elements(motions[j, 1])
     left_T_body, right_T_body = elements(rig.cam_T_body[j, 0]), elements(rig.cam_T_body[j, 1])
     focal_left, focal_right = rig.focal_px[j, 0], rig.focal_px[j, 1]
-    for i in range(LANES):
+    for i in range(POINTS):
         point = points[X + i], points[Y + i], points[W + i]
         left_u, left_v, in_front = derivatives_by_motion(
             to_left, left_T_body, focal_left, point, block[LEFT_U + i], block[LEFT_V + i]
@@ -194,9 +194,9 @@ def _whiten_block(
             put4(columns, c * _COLUMN + i, whiten(lower, (left_u[c], left_v[c], right_u[c], right_v[c])))
         errors = whiten(lower, (
             left_u[6] - offsets[i],
-            left_v[6] - offsets[LANES + i],
-            right_u[6] - offsets[2 * LANES + i],
-            right_v[6] - offsets[3 * LANES + i],
+            left_v[6] - offsets[POINTS + i],
+            right_u[6] - offsets[2 * POINTS + i],
+            right_v[6] - offsets[3 * POINTS + i],
         ))  # fmt: skip
         put4(columns, 6 * _COLUMN + i, errors)
         e2 = errors[0] ** 2 + errors[1] ** 2 + errors[2] ** 2 + errors[3] ** 2
@@ -208,8 +208,8 @@ def _whiten_again(whiteners: Float, columns: Float) -> None:
     """Replace a block's whitened derivatives ``L^-1 J`` by ``L^-T L^-1 J``."""
     for c in range(6):
         column = columns[c * _COLUMN : (c + 1) * _COLUMN]
-        for i in range(LANES):
-            once = column[i], column[LANES + i], column[2 * LANES + i], column[3 * LANES + i]
+        for i in range(POINTS):
+            once = column[i], column[POINTS + i], column[2 * POINTS + i], column[3 * POINTS + i]
             put4(column, i, whiten_transposed(whitener_of(whiteners, i, 1.0), once))
 
 
@@ -218,8 +218,8 @@ def _add_squares(columns: Float, weights: Float, normal: Float) -> None:
     """Add a block's derivatives and errors, each times each and weighted, to the upper triangle of a matrix (7, 7)."""
     weighted = np.empty(_COLUMN)
     for c in range(7):
-        for start in range(0, _COLUMN, LANES):
-            for i in range(LANES):
+        for start in range(0, _COLUMN, POINTS):
+            for i in range(POINTS):
                 weighted[start + i] = weights[i] * columns[c * _COLUMN + start + i]
         for k in range(c, 7):
             column = columns[k * _COLUMN : (k + 1) * _COLUMN]

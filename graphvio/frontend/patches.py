@@ -111,10 +111,11 @@ def prepare(bordered: Patch, inside: Patch, patch: Patch, gx: Patch, gy: Patch) 
         gy: along the columns.
     """
     side, stride = patch.rows.shape
+    columns = min(stride, bordered.rows.shape[1] - 2)  # whole registers, as far as the bordered patch reaches
     for j in range(side):
         above, at, below, weights = bordered.rows[j], bordered.rows[j + 1], bordered.rows[j + 2], inside.rows[j]
         values, dx, dy = patch.rows[j], gx.rows[j], gy.rows[j]
-        for i in range(stride):
+        for i in range(columns):
             values[i] = weights[i] * at[i + 1]
             dx[i] = weights[i] * _HALF * (at[i + 2] - at[i])
             dy[i] = weights[i] * _HALF * (below[i + 1] - above[i + 1])

@@ -8,7 +8,7 @@ image's two and the right one's two.
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.frontend.blocks import C00, C01, C02, C11, C12, C22, LANES
+from graphvio.frontend.blocks import C00, C01, C02, C11, C12, C22, POINTS
 from graphvio.frontend.cost import NEAREST, Matrix
 from graphvio.kernels import inner_kernel
 
@@ -91,14 +91,15 @@ def inverse_cholesky(
     s00: float, s10: float, s11: float, s20: float, s21: float, s22: float,
     s30: float, s31: float, s32: float, s33: float, factor: float,
 ) -> Lower:  # fmt: skip
-    """A factor times the inverse of the lower Cholesky factor of a symmetric matrix (4, 4), element by element."""
+    """A factor times the inverse of the lower Cholesky factor of ``1 + A``, A positive semidefinite (4, 4), element by
+    element. Its pivots are at least 1; rounding takes them below where a point is next to the plane of the camera."""
     d0 = 1.0 / np.sqrt(s00)
     c10, c20, c30 = s10 * d0, s20 * d0, s30 * d0
-    d1 = 1.0 / np.sqrt(s11 - c10 * c10)
+    d1 = 1.0 / np.sqrt(max(s11 - c10 * c10, 1.0))
     c21, c31 = (s21 - c20 * c10) * d1, (s31 - c30 * c10) * d1
-    d2 = 1.0 / np.sqrt(s22 - c20 * c20 - c21 * c21)
+    d2 = 1.0 / np.sqrt(max(s22 - c20 * c20 - c21 * c21, 1.0))
     c32 = (s32 - c30 * c20 - c31 * c21) * d2
-    d3 = 1.0 / np.sqrt(s33 - c30 * c30 - c31 * c31 - c32 * c32)
+    d3 = 1.0 / np.sqrt(max(s33 - c30 * c30 - c31 * c31 - c32 * c32, 1.0))
     l10 = -c10 * d0 * d1
     l20, l21 = -(c20 * d0 + c21 * l10) * d2, -c21 * d1 * d2
     l30 = -(c30 * d0 + c31 * l10 + c32 * l20) * d3
@@ -130,26 +131,26 @@ def whitener_of(whiteners: Float, i: int, seen: float) -> Lower:
     """The whitener of a block's point, its last two rows times a factor."""
     w = whiteners
     return (
-        w[i], w[LANES + i], w[2 * LANES + i],
-        seen * w[3 * LANES + i], seen * w[4 * LANES + i], seen * w[5 * LANES + i],
-        seen * w[6 * LANES + i], seen * w[7 * LANES + i], seen * w[8 * LANES + i], seen * w[9 * LANES + i],
+        w[i], w[POINTS + i], w[2 * POINTS + i],
+        seen * w[3 * POINTS + i], seen * w[4 * POINTS + i], seen * w[5 * POINTS + i],
+        seen * w[6 * POINTS + i], seen * w[7 * POINTS + i], seen * w[8 * POINTS + i], seen * w[9 * POINTS + i],
     )  # fmt: skip
 
 
 @inner_kernel
 def put3(rows: Float, i: int, values: Vector) -> None:
     """Store a vector, an element a row."""
-    rows[i], rows[LANES + i], rows[2 * LANES + i] = values
+    rows[i], rows[POINTS + i], rows[2 * POINTS + i] = values
 
 
 @inner_kernel
 def put4(rows: Float, i: int, values: Four) -> None:
     """Store four numbers, one a row."""
-    rows[i], rows[LANES + i], rows[2 * LANES + i], rows[3 * LANES + i] = values
+    rows[i], rows[POINTS + i], rows[2 * POINTS + i], rows[3 * POINTS + i] = values
 
 
 @inner_kernel
 def put_whitener(rows: Float, i: int, values: Lower) -> None:
     """Store what `whitener_of` reads."""
     for k in range(10):
-        rows[k * LANES + i] = values[k]
+        rows[k * POINTS + i] = values[k]

@@ -11,7 +11,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.config import MotionConfig
-from graphvio.frontend.blocks import LANES, Blocks, in_blocks, lane_by_lane, point_by_point
+from graphvio.frontend.blocks import POINTS, Blocks, in_blocks, lane_by_lane, point_by_point
 from graphvio.frontend.cost import left_motions
 from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise, unexpanded
 from graphvio.frontend.noise import influence, influence_slopes, inlier_cutoff, noise_by_pair, noise_variance
@@ -149,13 +149,14 @@ def _levenberg_marquardt(
     cur_T_ref: Float, rig: RigArrays, blocks: Blocks, at: Expansion, active: Float, sigmas_px: Float, scale: float,
     rounds: int, tolerance: float,
 ) -> tuple[Float, Float, Float]:  # fmt: skip
-    """Pose, normal matrix (6, 6) and squared whitened errors (N,) at the minimum; ``at`` is expanded there.
+    """Pose, normal matrix (6, 6) and squared whitened errors (N,) at the minimum, but for the last step,
+    which is smaller than the tolerance; ``at`` is expanded where the last round began.
 
     In each round the places at which the points are linearised are found anew.
     """
     pose = cur_T_ref.copy()
-    hessian, gradient, errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), LANES))
-    new_hessian, new_gradient, new_errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), LANES))
+    hessian, gradient, errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), POINTS))
+    new_hessian, new_gradient, new_errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), POINTS))
     for _ in range(rounds):
         motions = left_motions(pose, rig)
         expand(motions, rig, blocks, sigmas_px, at)
@@ -209,6 +210,6 @@ def _squared_errors(cur_T_ref: Float, rig: RigArrays, blocks: Blocks, at: Expans
     """Squared whitened errors (N,) where ``at`` is expanded now."""
     motions = left_motions(cur_T_ref, rig)
     expand(motions, rig, blocks, sigmas_px, at)
-    errors2 = np.empty((len(blocks.pair), LANES))
+    errors2 = np.empty((len(blocks.pair), POINTS))
     linearise(motions, rig, blocks, at, np.zeros_like(errors2), 1.0, np.empty((6, 6)), np.empty(6), errors2)
     return point_by_point(blocks, errors2)

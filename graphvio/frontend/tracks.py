@@ -115,7 +115,7 @@ def common_rows(first: Int, second: Int) -> tuple[Int, Int]:
 
 @kernel
 def usable_at(pixels: Float, allowed: Bool, border_px: float) -> tuple[Bool, Bool]:
-    """Which pixels (N, 2) lie so far inside the image (N,), and which of these where it may be used (N,).
+    """Which pixels (N, 2) lie so far inside the image (N,), and which of these may be used (N,).
 
     Args:
         pixels: NaN is outside.

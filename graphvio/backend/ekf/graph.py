@@ -31,7 +31,7 @@ class PaperGraph:
     Args:
         state: the first one.
         covariance: (15, 15) of its error.
-        lag: how many states an update leaves in the window, besides those that it forgets exactly; at least one.
+        lag: how many states an update leaves in the window, at least one: the newest.
         iterations: of Gauss-Newton in each update.
     """
 

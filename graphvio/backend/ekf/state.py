@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.geometry import quat_wxyz_from_rotation, se3, so3_exp, so3_log
+from graphvio.geometry import se3, so3_exp, so3_log
 
 POSITION, ATTITUDE, VELOCITY, RATE, GYRO_BIAS = (slice(k, k + 3) for k in range(0, 15, 3))
 """Where each part of the error stands."""
@@ -36,11 +36,6 @@ class FilterState:
     def nav_T_body(self) -> Float:
         """Pose (4, 4)."""
         return se3(self.nav_R_body, self.position)
-
-    @property
-    def quat_wxyz(self) -> Float:
-        """Attitude as the paper's ``q`` (4,)."""
-        return quat_wxyz_from_rotation(self.nav_R_body)
 
     def plus(self, error: Float) -> FilterState:
         """The state whose error (15,) with respect to this one is given; attitude's is a rotation vector in body."""
