@@ -240,3 +240,22 @@ def test_points_behind_a_camera_and_inactive_ones_give_no_equations() -> None:
     assert cost == pytest.approx(part[0] + np.log1p(1e6))
     np.testing.assert_allclose(hessian, part[1], rtol=1e-11)
     np.testing.assert_allclose(gradient, part[2], rtol=1e-9, atol=1e-9)
+
+
+def test_points_next_to_the_plane_of_a_camera_leave_the_others_their_equations() -> None:
+    """The derivatives of such points are without bounds; what is made of them must stay a number."""
+    seen, cur_T_ref = scene((0, 1), 0.6)
+    depth = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)[0, 0, 2]
+    points, n = seen.points.copy(), len(seen.pair)
+    near = np.flatnonzero(seen.pair == 0)[:10]
+    for k, i in enumerate(near):  # depths over the reference depth of both signs, from nothing to a hundredth
+        points[i, 2] = (1e-3 * (k - 5) - depth[:3] @ [*points[i, :2], 1.0]) / depth[3]
+    seen = seen._replace(points=points, covariances=1e12 * seen.covariances)  # depths of which nothing is known
+    at = expanded(seen, cur_T_ref)
+    assert all(np.isfinite(rows).all() for rows in at)
+    active = np.ones(n)
+    active[near] = 0.0
+    cost, hessian, gradient, _ = linearised(seen, cur_T_ref, at, active)
+    assert np.isfinite(cost)
+    assert np.isfinite(hessian).all()
+    assert np.isfinite(gradient).all()

@@ -7,7 +7,7 @@ from waves import picture, waves
 
 from graphvio.arrays import Bool, Float, Image
 from graphvio.frontend.lucas_kanade import build_pyramid, register, track
-from graphvio.frontend.patches import lattice, packed, room, sample_affine, scratch_room
+from graphvio.frontend.patches import lattice, packed, prepare, room, sample_affine, scratch_room
 
 LEVELS = 4
 
@@ -243,3 +243,24 @@ def test_a_deformed_patch_is_interpolated_pixel_by_pixel(half: int) -> None:
     assert np.abs(rows[:, :side] - expected).mean() < 1.0
     assert not rows[:, side:].any()
     assert not sample_affine(packed(image), 5.0, 30.0, a, b, c, d, inside, scratch, out)
+
+
+@pytest.mark.parametrize("half", [3, 6, 7, 10, 15])
+def test_a_patch_of_any_size_has_its_gradients(half: int) -> None:
+    """Central differences of the patch with its border, all of zero mean, and zero in the padding."""
+    side = 2 * half + 1
+    bordered, patch, gx, gy = room(half + 1), room(half), room(half), room(half)
+    values = np.random.default_rng(half).random((side + 2, side + 2)).astype(np.float32)
+    bordered.rows[:, : side + 2] = values
+    bordered.rows[:, side + 2 :] = 1e30  # what `sample` leaves in its padding has no weight
+    xx, xy, yy = prepare(bordered, lattice(half).inside, patch, gx, gy)
+    expected = [
+        values[1:-1, 1:-1],
+        0.5 * (values[1:-1, 2:] - values[1:-1, :-2]),
+        0.5 * (values[2:, 1:-1] - values[:-2, 1:-1]),
+    ]
+    for found, plain in zip((patch, gx, gy), expected, strict=True):
+        np.testing.assert_allclose(found.rows[:, :side], plain - plain.mean(), atol=1e-5)
+        assert not found.rows[:, side:].any()
+    dx, dy = gx.rows[:, :side], gy.rows[:, :side]
+    np.testing.assert_allclose([xx, xy, yy], [(dx * dx).sum(), (dx * dy).sum(), (dy * dy).sum()], rtol=1e-3, atol=1e-3)
