@@ -3,6 +3,8 @@
 A state is three variables: position, attitude, and the rest together. The process, eq. (11) and (12), is one factor
 between consecutive states. The noise that changes the velocities is the noise of what is moved: position and attitude
 follow from the velocities without any noise of their own, so six of the factor's rows are constraints.
+
+No odometry runs on it: it shows what the filter is, and what a longer lag and more iterations would gain.
 """
 
 from __future__ import annotations
