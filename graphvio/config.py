@@ -98,7 +98,8 @@ class MotionConfig:
     sigma_inflation: float = 1.2
     """Factor on a motion's standard deviations, for errors that residuals do not show: matches that share a patch."""
     calibration_error_share: float = 0.002
-    """What errors of the calibration may add to a motion, as a share of its angle and distance, one sigma."""
+    """What errors of the calibration may add to a motion, as a share of its angle and distance, one sigma, where there
+    is an IMU to weigh it against."""
     min_inliers: int = 12
     """Motions that explain fewer points are refused."""
     min_inlier_share: float = 0.3

@@ -195,8 +195,7 @@ def test_an_error_of_p12_is_told_and_corrected(room_walk: Path, events: list[Eve
 
     alone = [Walk(room_walk, events, only(pair), rig=rig.with_pairs([pair])) for pair in (0, 1)]
     exact = Walk(room_walk, events, as_it_is)
-    # A quarter of a millimetre: less is not asked of motions that allow for an error of the calibration.
-    assert exact.error_over_1s_m < 0.95 * min(single.error_over_1s_m for single in alone)
+    assert exact.error_over_1s_m < 0.6 * min(single.error_over_1s_m for single in alone)
     assert exact.ate_m < 1.05 * min(single.ate_m for single in alone)
     assert walk.error_over_1s_m < 1.05 * min(single.error_over_1s_m for single in alone)
     assert walk.ate_m < 1.5 * min(single.ate_m for single in alone)

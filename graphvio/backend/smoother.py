@@ -24,7 +24,7 @@ from graphvio.rig import Imu
 
 _ACCEL_BIAS_SIGMA = 0.2
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
-_LEAST_OWN_SHARE = 0.02  # of each direction of a motion's covariance: keeps it positive definite
+_LEAST_OWN_SHARE = 0.001  # of each direction of a motion's covariance: keeps it positive definite
 
 
 class Smoother:

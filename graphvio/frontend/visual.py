@@ -48,6 +48,9 @@ class VisualFrontend:
         self._frozen = FrozenImages()
         self._latest: dict[int, PairFrame] = {}
         self._references = References(config.motion)
+        # Focal lengths and baselines that are a little wrong scale all motions alike. No residual shows that, and an
+        # IMU must not be corrected by it; without one nothing tells the scale, and as noise it would only be smoothed.
+        self._scale_sigma = 0.0 if rig.imu is None else config.motion.calibration_error_share
         self._standstill = Standstill()
         self._all_frozen = False
         self._alignments = {j: PairAlignment() for j in range(1, len(rig.pairs))}
@@ -220,8 +223,7 @@ class VisualFrontend:
     def _motion(self, reference_stamp_ns: int, stamp_ns: int, refined: Refined) -> RelativeMotion:
         ref_T_cur = se3_inverse(refined.cur_T_ref)
         angle, distance = np.linalg.norm(so3_log(ref_T_cur[:3, :3])), np.linalg.norm(ref_T_cur[:3, 3])
-        # Focal lengths and baselines that are a little wrong scale the motion: no residual shows that.
-        scaled = np.diag(np.repeat([angle, distance], 3) ** 2 * self._config.motion.calibration_error_share**2)
+        scaled = np.diag(np.repeat([angle, distance], 3) ** 2 * self._scale_sigma**2)
         used_once = self._config.motion.reference == "previous"  # nothing is shared with another motion
         return RelativeMotion(
             reference_stamp_ns,

@@ -126,24 +126,24 @@ def _state(values: gtsam.Values, keys: Sequence[int]) -> FilterState:
 
 
 def _prior(keys: Sequence[int], state: FilterState, covariance: Float) -> gtsam.CustomFactor:
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
+    def _error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
         if jacobians is not None:
             for i, part in enumerate(_PARTS):
                 jacobians[i] = np.asfortranarray(np.eye(ERRORS)[:, part])
         return _state(values, keys).minus(state)
 
-    return gtsam.CustomFactor(gaussian(covariance), keys, error)
+    return gtsam.CustomFactor(gaussian(covariance), keys, _error)
 
 
 def _measurement(keys: Sequence[int], expectation: Expectation, state: FilterState) -> gtsam.CustomFactor:
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
+    def _error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
         at = expectation(_state(values, keys))
         if jacobians is not None:
             for i, part in enumerate(_PARTS):
                 jacobians[i] = np.asfortranarray(at.by_error[:, part])
         return -at.innovation
 
-    return gtsam.CustomFactor(gaussian(expectation(state).covariance), keys, error)
+    return gtsam.CustomFactor(gaussian(expectation(state).covariance), keys, _error)
 
 
 def _process(before: Sequence[int], after: Sequence[int], dt: float, sigmas: Float) -> gtsam.CustomFactor:
@@ -151,7 +151,7 @@ def _process(before: Sequence[int], after: Sequence[int], dt: float, sigmas: Flo
     much the velocities and the bias change."""
     noise = gtsam.noiseModel.Constrained.MixedSigmas(1.0, np.concatenate([np.zeros(6), sigmas]))
 
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
+    def _error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
         then, now = _state(values, before), _state(values, after)
         body_R_nav = then.nav_R_body.T
         moved = body_R_nav @ (now.position - then.position)
@@ -173,4 +173,4 @@ def _process(before: Sequence[int], after: Sequence[int], dt: float, sigmas: Flo
         rest = now.minus(then)[6:]
         return np.concatenate([moved - now.velocity_body * dt, off, rest])
 
-    return gtsam.CustomFactor(noise, [*before, *after], error)
+    return gtsam.CustomFactor(noise, [*before, *after], _error)
