@@ -221,6 +221,17 @@ def test_truth_is_recovered_among_outliers(number: int) -> None:
         assert 0.6 < refined.inlier.mean() < 0.8
 
 
+@pytest.mark.parametrize("number", range(5))
+def test_the_answer_does_not_depend_on_the_start(number: int) -> None:
+    """So that which triples are drawn does not show in a trajectory."""
+    seen = seen_points(RIG, TRUTH, 80, seed(400 + number), sigma_px=0.3, outlier_share=0.3)
+    steps = 0.01 * seed(500 + number).normal(size=(4, 6))
+    ends = [refine(ARRAYS, seen, np.ascontiguousarray(se3_exp(step) @ TRUTH), CONFIG) for step in steps]
+    for end in ends[1:]:
+        np.testing.assert_allclose(end.cur_T_ref, ends[0].cur_T_ref, atol=1e-7)
+        np.testing.assert_array_equal(end.inlier, ends[0].inlier)
+
+
 @pytest.mark.parametrize("off_px", [2.0, 4.0, 8.0])
 def test_wrong_points_next_to_the_camera_have_no_leverage(off_px: float) -> None:
     """Where images are sharp, an error of a few pixels is many times the noise, and must count as such."""

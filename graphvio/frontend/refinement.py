@@ -20,7 +20,9 @@ from graphvio.geometry import se3_compose, se3_exp
 from graphvio.kernels import kernel
 
 _MOST_ROUNDS = 3
-_ROUNDS_TO_FIND_INLIERS = 2
+_ROUNDS_TO_FIND_INLIERS = 5
+_ROUNDS_WITH_ALL = 2
+_GROSS = 4.0  # over the cutoff of inliers: what one pair's noise may be, over that of all
 _STEPS_PER_ROUND = 6
 _CONVERGED = 1e-6  # radians and metres
 _NEAR = 1e-4  # enough to tell inliers
@@ -91,10 +93,15 @@ def _refined(
     if len(inlier) == len(has_right):
         scale = _scale(errors2[inlier], has_right[inlier], widest, largest2)
     else:
-        everything = lane_by_lane(blocks, np.ones(len(has_right)))
-        for _ in range(_ROUNDS_TO_FIND_INLIERS):
+        # Until the answer does not depend on the start. Gross errors are left out as soon as they can be told: near
+        # the camera, they would pull a bit farther in each round.
+        candidates = np.ones(len(has_right))
+        for number in range(_ROUNDS_TO_FIND_INLIERS):
             scale = _scale(errors2, has_right, widest, largest2)
-            pose, _, errors2 = _levenberg_marquardt(pose, rig, blocks, at, everything, sigmas_px, scale, 1, _NEAR)
+            if number >= _ROUNDS_WITH_ALL:
+                candidates[:] = errors2 < _GROSS * inlier_cutoff(errors2, has_right, largest2)
+            active = lane_by_lane(blocks, candidates)
+            pose, _, errors2 = _levenberg_marquardt(pose, rig, blocks, at, active, sigmas_px, scale, 1, _NEAR)
         # One pair's images may be blurred or dim: its points are then less certain than the others'.
         noise = noise_by_pair(errors2, has_right, observations.pair, len(sigmas_px), largest2)
         errors2 /= noise[observations.pair]
