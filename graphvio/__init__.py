@@ -11,7 +11,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from graphvio.config import Config
     from graphvio.errors import ConfigError, EventError, GraphvioError, MissingExtraError, RigError, SourceError
-    from graphvio.events import Estimate, FrameSet, ImuSample, Status
+    from graphvio.events import Estimate, FrameSet, ImuSample, Prediction, Status
     from graphvio.odometry import Odometry
     from graphvio.rig import Camera, Imu, Rig, StereoPair
     from graphvio.sources import open_source
@@ -28,6 +28,7 @@ _HOME_OF = {
     "ImuSample": "events",
     "MissingExtraError": "errors",
     "Odometry": "odometry",
+    "Prediction": "events",
     "Rig": "rig",
     "RigError": "errors",
     "SourceError": "errors",
@@ -48,6 +49,7 @@ __all__ = [
     "ImuSample",
     "MissingExtraError",
     "Odometry",
+    "Prediction",
     "Rig",
     "RigError",
     "SourceError",

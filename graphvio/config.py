@@ -193,6 +193,8 @@ class TimingConfig:
     """A frameset whose IMU samples have not come is held until one arrives that is newer by this much."""
     max_imu_gap_ms: float = 50.0
     """A longer gap between IMU samples is not integrated over."""
+    max_prediction_ms: float = 200.0
+    """Poses are predicted no farther beyond the newest IMU sample, or without an IMU beyond the newest frameset."""
     max_imu_start_wait_s: float = 2.0
     """When no IMU sample has come for this long, the odometry starts without."""
 

@@ -177,6 +177,25 @@ class Estimate:
     stage_ms: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """The rig between framesets, or beyond the newest one, from the newest estimate and the IMU since then.
+
+    Attributes:
+        stamp_ns: on the framesets' clock.
+        nav_T_body: (4, 4) pose.
+        velocity_nav: (3,) m/s in nav.
+        angular_velocity: (3,) rad/s in body, without the gyro's bias.
+        epoch: of the estimate that it goes on from.
+    """
+
+    stamp_ns: int
+    nav_T_body: Float
+    velocity_nav: Float
+    angular_velocity: Float
+    epoch: int
+
+
 @dataclass(frozen=True, slots=True)
 class Incident:
     """Something that a person would want to know of: a gate, a reset, a fault of the input.

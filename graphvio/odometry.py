@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from time import perf_counter
 
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import ImuSpan
+from graphvio.backend.inertial import NO_SAMPLES, ImuSpan
 from graphvio.backend.initialisation import is_at_rest
+from graphvio.backend.propagation import Propagator
 from graphvio.belief import Belief
 from graphvio.config import Config
 from graphvio.errors import EventError
-from graphvio.events import Estimate, Event, FrameSet, ImuSample, Incident, Quality, Status, checked_event
+from graphvio.events import (
+    Estimate,
+    Event,
+    FrameSet,
+    ImuSample,
+    Incident,
+    Prediction,
+    Quality,
+    Status,
+    checked_event,
+)
 from graphvio.filter_belief import FilterBelief
 from graphvio.frontend.motion import VisualResult
 from graphvio.frontend.visual import VisualFrontend
@@ -30,15 +42,20 @@ class Odometry:
     Args:
         rig: cameras and IMU; without an IMU, vision alone is used.
         config: of all stages.
+        on_prediction: is called with what is predicted at each sample of the IMU as it comes, within `process`.
     """
 
-    def __init__(self, rig: Rig, config: Config | None = None) -> None:
+    def __init__(
+        self, rig: Rig, config: Config | None = None, on_prediction: Callable[[Prediction], None] | None = None
+    ) -> None:
         self.rig = rig
         self.config = config or Config()
         self._frontend = VisualFrontend(rig, self.config)
         self._synchroniser = Synchroniser(rig, self.config, self._report)
         kind = FilterBelief if self.config.fusion.estimator == "filter" else Belief
         self._belief: Belief | FilterBelief = kind(rig, self.config, self._report, lambda: self._frontend.rekey())
+        self._propagator = Propagator(self.config.timing.max_prediction_ms)
+        self._on_prediction = on_prediction
         self._told_misaligned: set[int] = set()
         self._frozen: frozenset[int] = frozenset()
         self._rates = AngularRates()
@@ -61,7 +78,8 @@ class Odometry:
             raise EventError("the odometry has been finished; make a new one for more events")
         event = checked_event(event)
         if isinstance(event, ImuSample):
-            self._synchroniser.add_sample(event)
+            for sample in self._synchroniser.add_sample(event):
+                self._go_on(sample)
         else:
             self._synchroniser.add_frameset(event)
         frameset = self._synchroniser.next_due(started=self._belief.has_started)
@@ -78,6 +96,18 @@ class Odometry:
         self._frontend.close()
         self._finished = True
         return estimates
+
+    def predict(self, stamp_ns: int) -> Prediction | None:
+        """Where the rig is, by the newest estimate and the IMU since then; any thread may ask.
+
+        Args:
+            stamp_ns: on the framesets' clock: an IMU sample's stamp less the rig's time offset.
+
+        Returns:
+            None before the first pose and while lost, before the newest estimate's instant, and farther beyond the
+            newest sample (without an IMU, beyond the newest estimate) than ``timing.max_prediction_ms``.
+        """
+        return self._propagator.predict(stamp_ns)
 
     def take_incidents(self) -> list[Incident]:
         """What happened since the last call that a person would want to know of."""
@@ -110,6 +140,7 @@ class Odometry:
         used = self._belief.use(visual) is not None
         status = self._belief.update(stamp_ns, used or starting, self._frontend.reference_stamps_ns)
         self._synchroniser.forget_before(stamp_ns)
+        self._predict_from(stamp_ns, status)
         stage_ms = {
             "predict": 1e3 * (predicted - start),
             **visual.stage_ms,
@@ -131,6 +162,24 @@ class Odometry:
         if self._belief.has_imu:
             return False
         return not self._belief.has_started or self._synchroniser.initial_span(stamp_ns) is not None
+
+    def _predict_from(self, stamp_ns: int, status: Status) -> None:
+        """Predictions go on from a new estimate."""
+        if status is Status.LOST:
+            self._propagator.forget()
+            return
+        belief, rate = self._belief, self._belief.latest_rate()
+        samples = self._synchroniser.samples_since(stamp_ns) if belief.has_imu else NO_SAMPLES
+        self._propagator.restart(
+            stamp_ns, belief.state(), belief.epoch, np.zeros(3) if rate is None else rate, *samples
+        )
+
+    def _go_on(self, sample: ImuSample) -> None:
+        """Predictions go on by a sample."""
+        values = np.concatenate([sample.angular_velocity, sample.linear_acceleration])
+        prediction = self._propagator.add(sample.stamp_ns, values)
+        if prediction is not None and self._on_prediction is not None:
+            self._on_prediction(prediction)
 
     def _span(self, start_ns: int, end_ns: int) -> ImuSpan | None:
         """The IMU between two framesets, or None where it does not cover them."""

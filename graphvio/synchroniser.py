@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Generic, TypeVar
 
+from graphvio.arrays import Float, Int
 from graphvio.backend.inertial import ImuBuffer, ImuSpan
 from graphvio.config import Config
 from graphvio.events import FrameSet, ImuSample
@@ -42,12 +43,16 @@ class Synchroniser:
         self._sample_jumps: _JumpGuard[ImuSample] = _JumpGuard("imu_future_stamp", report)
         self._frameset_jumps: _JumpGuard[FrameSet] = _JumpGuard("frameset_future_stamp", report)
 
-    def add_sample(self, sample: ImuSample) -> None:
-        """Take a sample of the IMU."""
+    def add_sample(self, sample: ImuSample) -> list[ImuSample]:
+        """Take a sample of the IMU; the samples that may be used from now on, with stamps on the framesets' clock."""
+        usable = []
         for confirmed in self._sample_jumps.confirm(sample):
             fault = self._imu.add(confirmed)
             if fault:
                 self._report(confirmed.stamp_ns, fault, "sample left out")
+            else:
+                usable.append(replace(confirmed, stamp_ns=confirmed.stamp_ns - self._offset_ns))
+        return usable
 
     def add_frameset(self, frameset: FrameSet) -> None:
         """Take a frameset; time never goes back.
@@ -97,6 +102,11 @@ class Synchroniser:
     def span(self, start_ns: int, end_ns: int) -> ImuSpan | None:
         """The IMU between two framesets' stamps, or None where it does not cover them."""
         return self._imu.span(start_ns + self._offset_ns, end_ns + self._offset_ns)
+
+    def samples_since(self, stamp_ns: int) -> tuple[Int, Float]:
+        """The IMU from a frameset's stamp on, stamps on the framesets' clock; see `ImuBuffer.since`."""
+        stamps, values = self._imu.since(stamp_ns + self._offset_ns)
+        return stamps - self._offset_ns, values
 
     def initial_span(self, stamp_ns: int) -> tuple[ImuSpan, float] | None:
         """The IMU around a frameset, and the frameset's place in it in seconds, once it is long enough."""

@@ -5,7 +5,8 @@ from scipy.spatial.transform import Rotation
 from synthetic import UP, filled_buffer, pose_at, velocity_at
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import GRAVITY_M_S2, ImuBuffer, ImuSpan, preintegrate, preintegration_params
+from graphvio.backend.inertial import GRAVITY_M_S2, ImuBuffer, ImuSpan
+from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.events import ImuSample
 from graphvio.rig import Imu
 

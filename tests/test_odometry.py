@@ -10,7 +10,18 @@ import numpy as np
 import pytest
 from dawdling import Dawdling
 
-from graphvio import Config, Estimate, EventError, FrameSet, ImuSample, Odometry, RigError, Status, open_source
+from graphvio import (
+    Config,
+    Estimate,
+    EventError,
+    FrameSet,
+    ImuSample,
+    Odometry,
+    Prediction,
+    RigError,
+    Status,
+    open_source,
+)
 from graphvio.arrays import Image
 from graphvio.backend.window import Window, WindowError
 from graphvio.events import Event, Quality
@@ -238,6 +249,43 @@ def test_a_blackout_coasts_on_the_imu_with_growing_covariance(odometry: Odometry
     assert estimates[-1].status is Status.TRACKING
     steps = np.diff([e.nav_T_body[:3, 3] for e in estimates if e.nav_T_body is not None], axis=0)
     assert np.linalg.norm(steps, axis=1).max() < 0.12  # walking speed: at most 6 cm a frameset, and no jump
+
+
+def test_poses_are_told_at_the_imus_rate(room_walk: Path, events: list[Event], truth: Trajectory) -> None:
+    told: list[Prediction] = []
+    odometry = Odometry(open_source(room_walk).rig, on_prediction=told.append)
+    assert odometry.predict(events[0].stamp_ns) is None  # there is no pose yet
+    estimates = feed(odometry, events)
+    rate_hz = len(told) / (1e-9 * (told[-1].stamp_ns - told[0].stamp_ns))
+    assert rate_hz == pytest.approx(200.0, rel=0.01)
+    assert (np.diff([each.stamp_ns for each in told]) > 0).all()
+    true, _ = truth.at(np.array([each.stamp_ns for each in told]), 0.1)
+    assert estimates[0].nav_T_body is not None
+    first, _ = truth.at(np.array([estimates[0].stamp_ns]), 0.1)
+    true_T_nav_heading = first.rotations[0] @ estimates[0].nav_T_body[:3, :3].T
+    placed = np.array([true_T_nav_heading @ each.nav_T_body[:3, 3] for each in told]) + first.positions[0]
+    assert np.linalg.norm(placed - true.positions, axis=1).max() < 0.02
+    newest = estimates[-1]
+    again = odometry.predict(newest.stamp_ns)
+    assert again is not None
+    np.testing.assert_array_equal(again.nav_T_body, newest.nav_T_body)
+    assert odometry.predict(newest.stamp_ns - 1) is None
+
+
+def test_nothing_is_predicted_while_lost(room_walk: Path, events: list[Event]) -> None:
+    without_imu = [event for event in events if isinstance(event, FrameSet)]
+    black = np.zeros((480, 640), dtype=np.uint8)
+    dark = [replace(each, images=dict.fromkeys(each.images, (black, black))) for each in without_imu[10:]]
+    odometry = Odometry(
+        open_source(room_walk).rig.without_imu(), Config.from_yaml("smoother: {lost_position_sigma_m: 0.2}")
+    )
+    for frameset in [*without_imu[:10], *dark]:
+        estimate = odometry.process(frameset)
+        assert estimate is not None
+        told = odometry.predict(estimate.stamp_ns)
+        assert (told is None) == (estimate.status is Status.LOST)
+    assert estimate.status is Status.LOST
+    odometry.finish()
 
 
 def test_importing_the_package_and_its_command_line_loads_nothing_heavy() -> None:

@@ -1,23 +1,22 @@
-"""IMU samples by time, and their preintegration between framesets."""
+"""IMU samples by time, and what they are between framesets."""
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
-from itertools import pairwise
+from typing import Literal
 
-import gtsam
 import numpy as np
 
-from graphvio.arrays import Float
+from graphvio.arrays import Float, Int
 from graphvio.events import ImuSample
-from graphvio.geometry import so3_exp
-from graphvio.rig import Imu
+from graphvio.kernels import kernel
 
 GRAVITY_M_S2 = 9.81
 _MAX_RATE = 100.0  # rad/s and m/s^2: beyond what any inertial sensor for this use can read
 _MAX_FORCE = 1000.0
-_INTEGRATION_SIGMA = 1e-4  # m/s^2-like noise that stands for the error of integrating piecewise constant rates
+NO_SAMPLES = (np.empty(0, dtype=np.int64), np.empty((0, 6)))
+"""What `ImuBuffer.since` returns where it knows nothing."""
+_ROOM = 1024  # samples that the buffer has room for at first
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,15 +48,20 @@ class ImuBuffer:
     """Samples in time order; what cannot be used is named and left out."""
 
     def __init__(self, max_gap_ms: float) -> None:
-        self._stamps: list[int] = []
-        self._rates: list[Float] = []
-        self._forces: list[Float] = []
+        self._stamps = np.empty(_ROOM, dtype=np.int64)
+        self._values = np.empty((_ROOM, 6))  # angular velocity, linear acceleration
+        self._first, self._end = 0, 0  # the samples that are kept
         self._max_gap_ns = round(max_gap_ms * 1e6)
 
     @property
     def oldest_ns(self) -> int | None:
         """Stamp of the oldest sample, or None."""
-        return self._stamps[0] if self._stamps else None
+        return int(self._stamps[self._first]) if self._end > self._first else None
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest sample, or None."""
+        return int(self._stamps[self._end - 1]) if self._end > self._first else None
 
     def add(self, sample: ImuSample) -> str:
         """Take a sample; the name of its fault if it cannot be used, or an empty string."""
@@ -65,31 +69,32 @@ class ImuBuffer:
             return "imu_not_finite"
         if np.abs(sample.angular_velocity).max() > _MAX_RATE or np.abs(sample.linear_acceleration).max() > _MAX_FORCE:
             return "imu_out_of_range"
-        if self._stamps and sample.stamp_ns <= self._stamps[-1]:
-            return "imu_duplicate_stamp" if sample.stamp_ns == self._stamps[-1] else "imu_backward_stamp"
-        self._stamps.append(sample.stamp_ns)
-        self._rates.append(np.asarray(sample.angular_velocity, dtype=np.float64))
-        self._forces.append(np.asarray(sample.linear_acceleration, dtype=np.float64))
+        newest_ns = self.newest_ns
+        if newest_ns is not None and sample.stamp_ns <= newest_ns:
+            return "imu_duplicate_stamp" if sample.stamp_ns == newest_ns else "imu_backward_stamp"
+        if self._end == len(self._stamps):
+            self._make_room()
+        self._stamps[self._end] = sample.stamp_ns
+        self._values[self._end, :3] = sample.angular_velocity
+        self._values[self._end, 3:] = sample.linear_acceleration
+        self._end += 1
         return ""
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether a sample at or after an instant has come."""
-        return bool(self._stamps) and self._stamps[-1] >= stamp_ns
+        return self._end > self._first and bool(self._stamps[self._end - 1] >= stamp_ns)
 
     def span(self, start_ns: int, end_ns: int) -> ImuSpan | None:
         """The IMU between two instants, interpolated at both ends, or None where a gap makes it unknown."""
-        first = bisect_right(self._stamps, start_ns) - 1
-        last = bisect_left(self._stamps, end_ns)
-        if first < 0 or last >= len(self._stamps) or end_ns <= start_ns:
+        first = self._find(start_ns, "right") - 1
+        last = self._find(end_ns, "left")
+        if first < self._first or last >= self._end or end_ns <= start_ns:
             return None
         stamps = self._stamps[first : last + 1]
-        if max(b - a for a, b in pairwise(stamps)) > self._max_gap_ns:
+        if np.diff(stamps).max() > self._max_gap_ns:
             return None
-        at = np.array([s - start_ns for s in stamps], dtype=np.float64) * 1e-9
-        knots = np.concatenate([[0.0], at[1:-1], [(end_ns - start_ns) * 1e-9]])
-        rates = _interpolate(knots, at, np.array(self._rates[first : last + 1]))
-        forces = _interpolate(knots, at, np.array(self._forces[first : last + 1]))
-        return ImuSpan(np.diff(knots), 0.5 * (rates[1:] + rates[:-1]), 0.5 * (forces[1:] + forces[:-1]))
+        steps_s, means = _steps(stamps - start_ns, self._values[first : last + 1], end_ns - start_ns)
+        return ImuSpan(steps_s, means[:, :3], means[:, 3:])
 
     def stretch(self, start_ns: int, end_ns: int) -> tuple[ImuSpan, int] | None:
         """The longest gapless piece of the IMU that ends at the newest sample within two instants.
@@ -97,51 +102,56 @@ class ImuBuffer:
         Returns:
             The span and the stamp at which it starts, or None where there are not two samples.
         """
-        end = bisect_right(self._stamps, end_ns) - 1
-        first = end
-        while (
-            first > 0
-            and self._stamps[first - 1] >= start_ns
-            and self._stamps[first] - self._stamps[first - 1] <= self._max_gap_ns
-        ):
-            first -= 1
-        span = self.span(self._stamps[first], self._stamps[end]) if end > first else None
-        return None if span is None else (span, self._stamps[first])
+        stamps = self._stamps[self._find(start_ns, "left") : self._find(end_ns, "right")]
+        gaps = np.flatnonzero(np.diff(stamps) > self._max_gap_ns)
+        stamps = stamps[gaps[-1] + 1 :] if len(gaps) else stamps
+        span = self.span(int(stamps[0]), int(stamps[-1])) if len(stamps) > 1 else None
+        return None if span is None else (span, int(stamps[0]))
+
+    def since(self, stamp_ns: int) -> tuple[Int, Float]:
+        """The IMU at an instant and its samples after it.
+
+        Returns:
+            Stamps (N,) and values (N, 6), angular velocity and specific force; none where the instant is in a gap.
+        """
+        end = self._find(stamp_ns, "right")
+        first = end - 1
+        if first >= self._first and self._stamps[first] == stamp_ns:
+            return self._stamps[first : self._end].copy(), self._values[first : self._end].copy()
+        if first < self._first or end >= self._end or self._stamps[end] - self._stamps[first] > self._max_gap_ns:
+            return NO_SAMPLES
+        fraction = (stamp_ns - self._stamps[first]) / (self._stamps[end] - self._stamps[first])
+        at = self._values[first] + fraction * (self._values[end] - self._values[first])
+        stamps = np.concatenate([np.array([stamp_ns]), self._stamps[end : self._end]])
+        return stamps, np.vstack([at, self._values[end : self._end]])
 
     def discard_before(self, stamp_ns: int) -> None:
         """Forget samples that no later span can need."""
-        keep_from = max(bisect_right(self._stamps, stamp_ns) - 1, 0)
-        del self._stamps[:keep_from], self._rates[:keep_from], self._forces[:keep_from]
+        self._first = max(self._find(stamp_ns, "right") - 1, self._first)
+
+    def _find(self, stamp_ns: int, side: Literal["left", "right"]) -> int:
+        return self._first + int(np.searchsorted(self._stamps[self._first : self._end], stamp_ns, side))
+
+    def _make_room(self) -> None:
+        """Move the samples to the front, of twice the room if they fill half of it."""
+        kept = slice(self._first, self._end)
+        stamps, values = self._stamps[kept], self._values[kept]
+        room = len(self._stamps) * (2 if 2 * len(stamps) > len(self._stamps) else 1)
+        self._stamps, self._values = np.empty(room, dtype=np.int64), np.empty((room, 6))
+        self._stamps[: len(stamps)], self._values[: len(stamps)] = stamps, values
+        self._first, self._end = 0, len(stamps)
 
 
-def preintegration_params(imu: Imu, noise_scale: float) -> gtsam.PreintegrationCombinedParams:
-    """gtsam's parameters for nav z up, with the rig's noise densities times a factor."""
-    params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_M_S2)
-    params.setGyroscopeCovariance(np.eye(3) * (noise_scale * imu.gyro_noise_density) ** 2)
-    params.setAccelerometerCovariance(np.eye(3) * (noise_scale * imu.accel_noise_density) ** 2)
-    params.setBiasOmegaCovariance(np.eye(3) * (noise_scale * imu.gyro_random_walk) ** 2)
-    params.setBiasAccCovariance(np.eye(3) * (noise_scale * imu.accel_random_walk) ** 2)
-    params.setIntegrationCovariance(np.eye(3) * _INTEGRATION_SIGMA**2)
-    return params
-
-
-def preintegrate(
-    span: ImuSpan, params: gtsam.PreintegrationCombinedParams, bias: gtsam.imuBias.ConstantBias
-) -> gtsam.PreintegratedCombinedMeasurements:
-    """Preintegrate a span, linearised at a bias.
-
-    A step's mean force belongs to its middle, and gtsam takes it to be in the frame at the step's start: it is turned
-    there by half of the step's rotation.
-    """
-    measurements = gtsam.PreintegratedCombinedMeasurements(params, bias)
-    accel_bias, gyro_bias = bias.accelerometer(), bias.gyroscope()
-    for force, rate, step in zip(span.linear_acceleration, span.angular_velocity, span.steps_s, strict=True):
-        if step > 0.0:
-            start_R_middle = so3_exp(0.5 * step * (rate - gyro_bias))
-            at_start = start_R_middle @ (force - accel_bias) + accel_bias
-            measurements.integrateMeasurement(at_start, rate, step)
-    return measurements
-
-
-def _interpolate(knots: Float, at: Float, values: Float) -> Float:
-    return np.column_stack([np.interp(knots, at, values[:, axis]) for axis in range(3)])
+@kernel
+def _steps(stamps_ns: Int, values: Float, end_ns: int) -> tuple[Float, Float]:
+    """Durations (N - 1,) and mean values (N - 1, 6) between samples (N,), cut off at 0 and at an end."""
+    n = len(stamps_ns)
+    steps_s, means = np.empty(n - 1), np.empty((n - 1, 6))
+    for i in range(n - 1):
+        begin_ns, until_ns = max(stamps_ns[i], 0), min(stamps_ns[i + 1], end_ns)
+        whole_ns = stamps_ns[i + 1] - stamps_ns[i]
+        steps_s[i] = (until_ns - begin_ns) * 1e-9
+        middle = (0.5 * (begin_ns + until_ns) - stamps_ns[i]) / whole_ns
+        for c in range(6):
+            means[i, c] = values[i, c] + middle * (values[i + 1, c] - values[i, c])
+    return steps_s, means

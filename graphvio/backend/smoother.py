@@ -13,8 +13,9 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.gating import Verdict, gate, relative_covariance
-from graphvio.backend.inertial import ImuSpan, preintegrate, preintegration_params
+from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.noise import gaussian
+from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.states import RigState, StartUncertainty
 from graphvio.backend.window import Window
 from graphvio.config import SmootherConfig

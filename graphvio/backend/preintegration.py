@@ -1,0 +1,58 @@
+"""The IMU between two framesets as one measurement of the motion between them.
+
+C. Forster, L. Carlone, F. Dellaert, D. Scaramuzza, *On-Manifold Preintegration for Real-Time Visual-Inertial
+Odometry*, IEEE T-RO 33(1), 2017; in gtsam's form with the biases' random walks.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.inertial import GRAVITY_M_S2, ImuSpan
+from graphvio.geometry import so3_exp
+from graphvio.kernels import kernel
+from graphvio.rig import Imu
+
+_INTEGRATION_SIGMA = 1e-4  # m/s^2-like noise that stands for the error of integrating piecewise constant rates
+
+
+def preintegration_params(imu: Imu, noise_scale: float) -> gtsam.PreintegrationCombinedParams:
+    """gtsam's parameters for nav z up, with the rig's noise densities times a factor."""
+    params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_M_S2)
+    params.setGyroscopeCovariance(np.eye(3) * (noise_scale * imu.gyro_noise_density) ** 2)
+    params.setAccelerometerCovariance(np.eye(3) * (noise_scale * imu.accel_noise_density) ** 2)
+    params.setBiasOmegaCovariance(np.eye(3) * (noise_scale * imu.gyro_random_walk) ** 2)
+    params.setBiasAccCovariance(np.eye(3) * (noise_scale * imu.accel_random_walk) ** 2)
+    params.setIntegrationCovariance(np.eye(3) * _INTEGRATION_SIGMA**2)
+    return params
+
+
+def preintegrate(
+    span: ImuSpan, params: gtsam.PreintegrationCombinedParams, bias: gtsam.imuBias.ConstantBias
+) -> gtsam.PreintegratedCombinedMeasurements:
+    """Preintegrate a span, linearised at a bias.
+
+    A step's mean force belongs to its middle, and gtsam takes it to be in the frame at the step's start: it is turned
+    there by half of the step's rotation.
+    """
+    measurements = gtsam.PreintegratedCombinedMeasurements(params, bias)
+    forces = _at_start(span.steps_s, span.angular_velocity, span.linear_acceleration, bias.vector())
+    for force, rate, step in zip(forces, span.angular_velocity, span.steps_s.tolist(), strict=True):
+        if step > 0.0:
+            measurements.integrateMeasurement(force, rate, step)
+    return measurements
+
+
+@kernel
+def _at_start(steps_s: Float, rates: Float, forces: Float, bias: Float) -> Float:
+    """Mean forces (N, 3) of steps, in the frames at the steps' starts; bias (6,) of accelerometer and gyro."""
+    turned = np.empty_like(forces)
+    for i in range(len(steps_s)):
+        start_R_middle = so3_exp(0.5 * steps_s[i] * (rates[i] - bias[3:]))
+        for r in range(3):
+            turned[i, r] = bias[r]
+            for c in range(3):
+                turned[i, r] += start_R_middle[r, c] * (forces[i, c] - bias[c])
+    return turned

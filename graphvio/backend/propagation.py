@@ -1,0 +1,128 @@
+"""Poses between framesets and beyond the newest one: the newest state, carried on by each sample of the IMU.
+
+They cost some microseconds each. One thread may ask for them while another works on a frameset: what is known is
+replaced as a whole, and only grows at its end.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.backend.inertial import GRAVITY_M_S2
+from graphvio.backend.states import RigState
+from graphvio.events import Prediction
+from graphvio.geometry import se3_compose, se3_exp, so3_exp
+from graphvio.kernels import kernel
+
+
+class Propagator:
+    """What is predicted from the newest state, see `graphvio.odometry.Odometry.predict`.
+
+    Args:
+        longest_ms: how far it goes beyond the newest sample, or without samples beyond the newest frameset.
+    """
+
+    def __init__(self, longest_ms: float) -> None:
+        self._longest_ns = round(longest_ms * 1e6)
+        self._path: _Path | None = None
+
+    def forget(self) -> None:
+        """There is no state that anything could be predicted from."""
+        self._path = None
+
+    def restart(self, stamp_ns: int, state: RigState, epoch: int, rate: Float, stamps: Int, values: Float) -> None:
+        """Begin at a new state.
+
+        Args:
+            stamp_ns: of the state.
+            state: of the rig.
+            epoch: of the state.
+            rate: (3,) rad/s of body. Without samples, it and the velocity in body go on as they are.
+            stamps: (N,) of the IMU's samples on the framesets' clock; the first is the state's, or there are none.
+            values: (N, 6) of these: angular velocity and specific force.
+        """
+        path = _Path(stamp_ns, state, epoch, rate, values[0] if len(values) else None)
+        for stamp, sample in zip(stamps[1:].tolist(), values[1:], strict=True):
+            path.add(stamp, sample)
+        self._path = path
+
+    def add(self, stamp_ns: int, sample: Float) -> Prediction | None:
+        """Go on by a sample (6,) of the IMU, and tell what is predicted at its instant."""
+        path = self._path
+        if path is None or not path.samples or stamp_ns <= path.stamps[-1]:
+            return None
+        if stamp_ns - path.stamps[-1] > self._longest_ns:
+            self._path = None  # what happened in the gap is not known
+            return None
+        path.add(stamp_ns, sample)
+        return path.predict(stamp_ns, self._longest_ns)
+
+    def predict(self, stamp_ns: int) -> Prediction | None:
+        """What is predicted at an instant, or None where nothing is."""
+        path = self._path
+        return None if path is None else path.predict(stamp_ns, self._longest_ns)
+
+
+class _Path:
+    """A state, and what the IMU's samples since then make of it.
+
+    Poses, velocities and samples stand beside the stamps, which are appended last: all that belongs to a stamp is
+    there. Without an IMU there are no samples.
+    """
+
+    def __init__(self, stamp_ns: int, state: RigState, epoch: int, rate: Float, sample: Float | None) -> None:
+        self.poses, self.velocities = [state.nav_T_body], [state.velocity_nav]
+        self.samples = [] if sample is None else [sample]
+        self.stamps = [stamp_ns]
+        self._epoch = epoch
+        self._bias = np.concatenate([state.gyro_bias, state.accel_bias])
+        self._twist = np.concatenate([rate, state.nav_T_body[:3, :3].T @ state.velocity_nav])
+
+    def add(self, stamp_ns: int, sample: Float) -> None:
+        pose, velocity = self._after(-1, stamp_ns - self.stamps[-1], 0.5 * (self.samples[-1] + sample))
+        self.poses.append(pose)
+        self.velocities.append(velocity)
+        self.samples.append(sample)
+        self.stamps.append(stamp_ns)
+
+    def predict(self, stamp_ns: int, longest_ns: int) -> Prediction | None:
+        i = bisect_right(self.stamps, stamp_ns) - 1
+        if i < 0:
+            return None  # that is past: there is an estimate
+        is_newest = i == len(self.stamps) - 1
+        after_ns = stamp_ns - self.stamps[i]
+        if is_newest and after_ns > longest_ns:
+            return None
+        if not self.samples:
+            pose = se3_compose(self.poses[i], se3_exp(self._twist * (after_ns * 1e-9)))
+            return Prediction(stamp_ns, pose, pose[:3, :3] @ self._twist[3:], self._twist[:3], self._epoch)
+        sample = now = self.samples[i]
+        if not is_newest:
+            fraction = after_ns / (self.stamps[i + 1] - self.stamps[i])
+            now = sample + fraction * (self.samples[i + 1] - sample)
+        pose, velocity = self._after(i, after_ns, 0.5 * (sample + now))
+        return Prediction(stamp_ns, pose, velocity, now[:3] - self._bias[:3], self._epoch)
+
+    def _after(self, i: int, duration_ns: int, mean: Float) -> tuple[Float, Float]:
+        return advanced(self.poses[i], self.velocities[i], mean, self._bias, duration_ns * 1e-9)
+
+
+@kernel
+def advanced(
+    nav_T_body: Float, velocity_nav: Float, mean: Float, bias: Float, duration_s: float
+) -> tuple[Float, Float]:
+    """Pose (4, 4) and velocity (3,) after a step with a mean rate and specific force (6,), less the biases (6,).
+
+    The mean force is that of the step's middle, and so is the attitude that turns it.
+    """
+    turn = duration_s * (mean[:3] - bias[:3])
+    nav_R_body = np.ascontiguousarray(nav_T_body[:3, :3])
+    acceleration = nav_R_body @ so3_exp(0.5 * turn) @ (mean[3:] - bias[3:])
+    acceleration[2] -= GRAVITY_M_S2
+    pose = nav_T_body.copy()
+    pose[:3, :3] = nav_R_body @ so3_exp(turn)
+    pose[:3, 3] += duration_s * velocity_nav + 0.5 * duration_s**2 * acceleration
+    return pose, velocity_nav + duration_s * acceleration
