@@ -268,9 +268,13 @@ def measured(cur_T_ref: Float, inliers: int, sigma: float = 1e-4) -> RelativeMot
 
 
 def judgement(
-    motions: Sequence[RelativeMotion], tension: float, frozen_since_ns: int | None, stereo: StereoShare
+    motions: Sequence[RelativeMotion],
+    tension: float,
+    frozen_since_ns: int | None,
+    stereo: StereoShare,
+    noise: float = 0.5,
 ) -> tuple[RelativeMotion, Quality, str]:
-    return graded([doubted(motion, frozen_since_ns, stereo) for motion in motions], tension)
+    return graded([doubted(motion, frozen_since_ns, stereo, noise) for motion in motions], tension)
 
 
 def test_a_good_motion_is_left_as_it_is() -> None:
@@ -305,6 +309,14 @@ def test_few_points_are_believed_less_and_less() -> None:
     assert sigmas[0] < 1e-3
     assert sigmas[-1] > 0.03  # as far as a person walks in the time
     assert judgement([measured(TRUTH, 20)], 0.0, None, CONFIRMED)[1:] == (Quality.WEAK, "only 20 points")
+
+
+@pytest.mark.parametrize(("noise", "factor"), [(0.2, 1.0), (1.0, 1.0), (1.5, 2.25), (2.5, 6.25)])
+def test_errors_beyond_the_modelled_noise_count_twice(noise: float, factor: float) -> None:
+    motion, quality, reason = judgement([measured(TRUTH, 200)], 0.0, None, CONFIRMED, noise)
+    np.testing.assert_allclose(motion.covariance, factor * measured(TRUTH, 200).covariance)
+    assert quality is (Quality.WEAK if noise > 2.0 else Quality.GOOD)
+    assert ("2.5 times worse" in reason) == (noise > 2.0)
 
 
 def test_images_that_all_repeat_say_nothing_for_sure() -> None:

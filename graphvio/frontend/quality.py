@@ -18,6 +18,7 @@ _RIVAL_SHARE = 0.1  # of the best-supported side's points: from there on another
 _FEW_POINTS = 25  # fewer may agree by chance
 _USUAL_TENSION = 12.0  # beyond it the covariance grows in proportion: something small is wrong with one of the pairs
 _CONFIRMED = 0.12  # share of the corners that the right images must show, too; real ones show 16 % and more
+_BLURRED = 2.0  # pixel noise over the modelled one, beyond which a motion is weak
 _WEAK_ROTATION_RAD = 0.02
 _WEAK_TRANSLATION_M = 0.05
 _POSSIBLE_SPEEDS = np.repeat([0.5, 1.0], 3)  # rad/s and m/s that a rig may have where images say next to nothing
@@ -62,15 +63,21 @@ class Doubted(NamedTuple):
     reasons: list[str]
 
 
-def doubted(motion: RelativeMotion, frozen_since_ns: int | None, stereo: StereoShare) -> Doubted:
-    """Allow for few points, images that repeat, and right images that do not confirm the left ones.
+def doubted(motion: RelativeMotion, frozen_since_ns: int | None, stereo: StereoShare, noise: float) -> Doubted:
+    """Allow for few points, blur, images that repeat, and right images that do not confirm the left ones.
 
     Args:
         motion: of one side, see `graphvio.frontend.agreement`.
         frozen_since_ns: stamp since which all images are the same, or None.
         stereo: how far the right images confirm what the left ones see.
+        noise: root mean square error of the points that the motion explains, over that of the modelled noise.
     """
     covariance, reasons = motion.covariance, []
+    if noise > 1.0:
+        # Its mean is in the covariance. But errors beyond those of sharp corners are of blur, which all points share.
+        covariance = covariance * noise**2
+        if noise > _BLURRED:
+            reasons.append(f"points fit {noise:.1f} times worse than those of sharp images")
     if motion.inliers < _FEW_POINTS:
         lacking = (_FEW_POINTS - motion.inliers) / _FEW_POINTS
         covariance = covariance + np.diag((2.0 * lacking * _POSSIBLE_SPEEDS * motion.duration_s) ** 2)

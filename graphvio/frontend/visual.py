@@ -107,7 +107,12 @@ class VisualFrontend:
         refined = agreement.sides[0].refined
         stereo = stereo_share(reference, frames, self._baselines_m)
         sides = [
-            doubted(self._motion(reference_stamp_ns, stamp_ns, side.refined), frozen.all_since_ns, stereo)
+            doubted(
+                self._motion(reference_stamp_ns, stamp_ns, side.refined),
+                frozen.all_since_ns,
+                stereo,
+                (side.refined.rms_px() or 0.0) / self._config.motion.pixel_sigma_px,
+            )
             for side in agreement.sides
         ]
         motion, quality, reason = graded(sides, agreement.tension)
