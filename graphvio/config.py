@@ -132,8 +132,12 @@ class SmootherConfig:
     """Age at which a state leaves the window, unless later motions are measured from it."""
     gate_probability: float = 0.9999
     """Vision is refused where its innovation lies outside this share of the chi-square distribution."""
+    max_accel_m_s2: float = 50.0
+    """Vision is refused where it asks for a larger acceleration."""
     max_gated_s: float = 1.0
     """When the gate has refused for longer, the prediction is at fault and is started anew."""
+    reset_s: float = 60.0
+    """Time from one reset of the position's covariance to the next."""
     imu_noise_scale: float = 2.0
     """Factor on the rig's IMU noise densities, which data sheets state for a sensor that does not vibrate."""
     motion_accel_sigma_m_s2: float = 5.0

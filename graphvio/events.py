@@ -10,11 +10,15 @@ import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from graphvio.arrays import Float, Image, Int
 from graphvio.errors import EventError
+
+if TYPE_CHECKING:
+    from graphvio.backend.gating import Verdict
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,6 +151,11 @@ class Estimate:
         velocity_nav: (3,) m/s in nav, or None when not estimated.
         gyro_bias: (3,) rad/s, or None without an IMU.
         accel_bias: (3,) m/s^2, or None without an IMU.
+        velocity_covariance: (3, 3) of ``velocity_nav``, in nav, or None where it is not estimated.
+        gyro_bias_covariance: (3, 3), or None where the bias is not estimated.
+        accel_bias_covariance: (3, 3), or None where the bias is not estimated.
+        innovations: what was measured against what was expected, with the test's outcome: ``vision``, and ``rest``
+            where the rig stood still; with the paper's filter ``vision``, ``gyro`` and ``gravity``.
         rates: angular rate of body (3,) rad/s by ``gyro``, ``vision`` and ``fused``, as far as known.
         vision: how far the motion that vision measured can be trusted.
         vision_reason: why that is not ``good``, or empty.
@@ -168,6 +177,10 @@ class Estimate:
     velocity_nav: Float | None = None
     gyro_bias: Float | None = None
     accel_bias: Float | None = None
+    velocity_covariance: Float | None = None
+    gyro_bias_covariance: Float | None = None
+    accel_bias_covariance: Float | None = None
+    innovations: Mapping[str, Verdict] = field(default_factory=dict)
     rates: Mapping[str, Float] = field(default_factory=dict)
     vision: Quality = Quality.FAILED
     vision_reason: str = ""

@@ -14,11 +14,12 @@ from graphvio.backend.ekf.process import noise_sigmas
 from graphvio.backend.ekf.state import ATTITUDE, ERRORS, GYRO_BIAS, POSITION, RATE, VELOCITY, FilterState
 from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.starts import AFTER_JUMP, MAX_UNBRIDGED_S, first_start
-from graphvio.backend.states import RigState
+from graphvio.backend.states import RigState, StateCovariance
+from graphvio.belief import Belief
 from graphvio.config import Config
 from graphvio.events import Status
 from graphvio.frontend.motion import RelativeMotion, VisualResult
-from graphvio.geometry import se3_inverse
+from graphvio.geometry import se3_inverse, skew
 from graphvio.rig import Rig
 from graphvio.synchroniser import Report
 
@@ -27,46 +28,36 @@ _UNKNOWN_RATE_SIGMA_RAD_S = 3.0
 _FORGOTTEN_SPEED_SIGMA_M_S = 30.0  # on foot or on the road
 
 
-class FilterBelief:
-    """The rig's state by the filter: for each frameset `predict`, `use` and `update`, in this order.
-
-    It stands where `graphvio.belief.Belief` does, for whose arguments and attributes see there.
-    """
+class FilterBelief(Belief):
+    """The rig's state by the filter; for arguments and attributes see `Belief`."""
 
     def __init__(self, rig: Rig, config: Config, report: Report, rekey: Callable[[], None]) -> None:
-        self.epoch = 0
-        self.covariance: Float = np.zeros((6, 6))
-        self._rig = rig
-        self._config = config
-        self._report = report
-        self._rekey = rekey
+        super().__init__(rig, config, report, rekey)
         self._filter: ExtendedKalmanFilter | None = None
         self._has_imu = False
-        self._latest_ns = self._tracked_ns = self._reset_ns = self._settled_ns = 0
+        self._latest_ns = self._reset_ns = 0
         self._before_ns: int | None = None  # stamp at which the newest step began
         self._refused_ns: int | None = None  # since when vision is refused
         self._span: ImuSpan | None = None
         self._forgotten = np.zeros((3, 3))  # position covariance, nav, that resets took out of the filter
         self._before_outage = np.zeros((3, 3))  # position covariance, nav, when vision was last used
-        self._lost = False
         self._poses: dict[int, Float] = {}  # nav_T_body at stamps that motions are measured from
-        self._final: list[tuple[int, Float]] = []
 
     # ------------------------------------------------------------------ what is known
 
     @property
     def has_started(self) -> bool:
-        """Whether there is a state."""
+        """See `Belief`."""
         return self._filter is not None
 
     @property
     def has_imu(self) -> bool:
-        """Whether it has started with an IMU."""
+        """See `Belief`."""
         return self._has_imu
 
     @property
     def latest_ns(self) -> int:
-        """Stamp of the newest state."""
+        """See `Belief`."""
         return self._latest_ns
 
     def state(self) -> RigState:
@@ -75,34 +66,23 @@ class FilterBelief:
         return RigState(state.nav_T_body, state.nav_R_body @ state.velocity_body, state.gyro_bias, np.zeros(3))
 
     def latest_rate(self) -> Float | None:
-        """Angular rate (3,) rad/s of body over the newest step, or None at a start."""
+        """See `Belief`."""
         return None if self._before_ns is None else self._running.state.rate_body
 
     def motion_since(self, then_ns: int) -> Float | None:
-        """``now_T_then`` (4, 4) of body from an earlier frameset to the newest state, or None if it is not known."""
+        """See `Belief`."""
         if self._filter is None or then_ns not in self._poses:
             return None
         return se3_inverse(self._filter.state.nav_T_body) @ self._poses[then_ns]
 
-    def take_final(self) -> list[tuple[int, Float]]:
-        """Stamps and poses ``nav_T_body`` since the last call: a filter never corrects one later."""
-        taken, self._final = self._final, []
-        return taken
-
     def end(self) -> None:
-        """Nothing more will come."""
+        """See `Belief`: a filter never corrects a pose later."""
 
     # ------------------------------------------------------------------ one frameset
 
     def start(self, stamp_ns: int, found: tuple[ImuSpan, float] | None) -> None:
-        """Begin at a frameset, as `graphvio.belief.Belief.start` does."""
-        position = np.zeros(3)
-        if self._filter is not None:
-            position = self._filter.state.position
-            self.epoch += 1
-            self._report(stamp_ns, "imu_came", f"the IMU has come: epoch {self.epoch} starts upright")
-        elif self._rig.imu is not None and found is None:
-            self._report(stamp_ns, "started_without_imu", "no IMU samples came: vision alone from here")
+        """See `Belief`."""
+        position = self._position_to_start_at(stamp_ns, found)
         start = first_start(stamp_ns, position, found, self._rig, self._config.initialisation)
         pose, uncertainty = start.state.nav_T_body, start.uncertainty
         estimates_bias = self._config.filter.bias == "estimated"
@@ -125,6 +105,7 @@ class FilterBelief:
 
     def predict(self, stamp_ns: int, span: ImuSpan | None) -> None:
         """Go on to a frameset's instant by constant velocity; the IMU since the last one is measured there."""
+        self.verdicts = {}
         config, dt = self._config.filter, (stamp_ns - self._latest_ns) * 1e-9
         if span is None and dt > MAX_UNBRIDGED_S:
             self._jump(stamp_ns, dt)
@@ -134,12 +115,8 @@ class FilterBelief:
         self._running.predict(dt, sigmas)
         self._span, self._before_ns, self._latest_ns = span, self._latest_ns, stamp_ns
 
-    def use(self, visual: VisualResult) -> RelativeMotion | None:
-        """Test each measurement against the prediction, and update with those that pass.
-
-        Returns:
-            The motion that was used, or None.
-        """
+    def use(self, visual: VisualResult, at_rest: bool) -> RelativeMotion | None:
+        """Test each measurement against the prediction, and update with those that pass; rest is none of them."""
         motion, config = visual.motion, self._config.filter
         if motion is not None and motion.reference_stamp_ns != self._before_ns:
             motion = None  # its mean velocity is not that of the newest step
@@ -164,13 +141,7 @@ class FilterBelief:
         return motion
 
     def update(self, stamp_ns: int, used: bool, keep: frozenset[int]) -> Status:
-        """Reset the position's covariance, if it is time to, and tell how well the newest pose is known.
-
-        Args:
-            stamp_ns: of the newest state.
-            used: whether vision constrains it, or it is a start.
-            keep: stamps of states that later motions will be measured from.
-        """
+        """Reset the position's covariance, if it is time to, and tell how well the newest state is known."""
         running = self._running
         if stamp_ns - self._reset_ns >= self._config.filter.reset_s * 1e9:
             self._forgotten = self._forgotten + running.reset_position(_ANCHOR_SIGMA_M)
@@ -179,23 +150,35 @@ class FilterBelief:
         self._poses = {ns: known for ns, known in self._poses.items() if ns in keep} | {stamp_ns: pose}
         self._final.append((stamp_ns, pose))
         position = running.covariance[POSITION, POSITION] + self._forgotten
-        self.covariance = _of_pose(running, position)
+        self.covariance = self._state_covariance(position)
         if used:
             if self._lost:
                 self.epoch += 1
                 self._report(stamp_ns, "new_epoch", f"vision is back: epoch {self.epoch} starts at the best guess")
             self._lost, self._tracked_ns, self._before_outage = False, stamp_ns, position
-            return Status.INITIALISING if stamp_ns < self._settled_ns else Status.TRACKING
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(position - self._before_outage)[-1], 0.0)))
-        if not self._lost and sigma > self._config.smoother.lost_position_sigma_m:
-            self._lost = True
-            self._report(stamp_ns, "lost", f"position uncertain by {sigma:.2f} m since vision was last used")
-        return Status.LOST if self._lost else Status.COASTING
+        return self._status(stamp_ns, used, sigma)
 
     @property
     def _running(self) -> ExtendedKalmanFilter:
         assert self._filter is not None, "it has started"
         return self._filter
+
+    def _state_covariance(self, position: Float) -> StateCovariance:
+        """How well the newest state is known, if its position is to (3, 3) in nav."""
+        running = self._running
+        state, covariance = running.state, running.covariance
+        body_R_nav = state.nav_R_body.T
+        pose = np.empty((6, 6))
+        pose[:3, :3] = covariance[ATTITUDE, ATTITUDE]
+        pose[3:, :3] = body_R_nav @ covariance[POSITION, ATTITUDE]
+        pose[:3, 3:] = pose[3:, :3].T
+        pose[3:, 3:] = body_R_nav @ position @ body_R_nav.T
+        by_error = np.zeros((3, ERRORS))  # of the velocity in nav
+        by_error[:, VELOCITY] = state.nav_R_body
+        by_error[:, ATTITUDE] = -state.nav_R_body @ skew(state.velocity_body)
+        velocity = by_error @ covariance @ by_error.T
+        return StateCovariance(pose, velocity, covariance[GYRO_BIAS, GYRO_BIAS] if self._has_imu else None)
 
     def _inertial(self, rates: VisualRates | None) -> list[Measurement]:
         """The gyro and the accelerometer over the newest step, as far as they are to be used."""
@@ -223,6 +206,7 @@ class FilterBelief:
 
     def _passes(self, measurement: Measurement) -> bool:
         verdict = self._running.test(measurement, self._config.filter.gate_probability)
+        self.verdicts[measurement.name] = verdict
         if not verdict.accepted:
             self._report(
                 self._latest_ns,
@@ -248,14 +232,3 @@ class FilterBelief:
             running.covariance[part, :] = running.covariance[:, part] = 0.0
             running.covariance[part, part] = sigma**2 * np.eye(3)
         running.state = replace(running.state, velocity_body=np.zeros(3), rate_body=np.zeros(3))
-
-
-def _of_pose(running: ExtendedKalmanFilter, position: Float) -> Float:
-    """Covariance (6, 6) of the pose, tangent ``[rotation, translation]`` in body, from that of the position in nav."""
-    body_R_nav = running.state.nav_R_body.T
-    covariance = np.empty((6, 6))
-    covariance[:3, :3] = running.covariance[ATTITUDE, ATTITUDE]
-    covariance[3:, :3] = body_R_nav @ running.covariance[POSITION, ATTITUDE]
-    covariance[:3, 3:] = covariance[3:, :3].T
-    covariance[3:, 3:] = body_R_nav @ position @ body_R_nav.T
-    return covariance

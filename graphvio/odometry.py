@@ -30,6 +30,7 @@ from graphvio.frontend.motion import VisualResult
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.rates import AngularRates
 from graphvio.rig import Rig
+from graphvio.smoother_belief import SmootherBelief
 from graphvio.synchroniser import Synchroniser
 
 
@@ -52,8 +53,8 @@ class Odometry:
         self.config = config or Config()
         self._frontend = VisualFrontend(rig, self.config)
         self._synchroniser = Synchroniser(rig, self.config, self._report)
-        kind = FilterBelief if self.config.fusion.estimator == "filter" else Belief
-        self._belief: Belief | FilterBelief = kind(rig, self.config, self._report, lambda: self._frontend.rekey())
+        kind = FilterBelief if self.config.fusion.estimator == "filter" else SmootherBelief
+        self._belief: Belief = kind(rig, self.config, self._report, lambda: self._frontend.rekey())
         self._propagator = Propagator(self.config.timing.max_prediction_ms)
         self._on_prediction = on_prediction
         self._told_misaligned: set[int] = set()
@@ -137,7 +138,8 @@ class Odometry:
         measured = perf_counter()
         if not starting:
             self._tell_of_vision(stamp_ns, visual)
-        used = self._belief.use(visual) is not None
+        at_rest = visual.at_rest and (span is None or is_at_rest(span, self.config.initialisation))
+        used = self._belief.use(visual, at_rest) is not None
         status = self._belief.update(stamp_ns, used or starting, self._frontend.reference_stamps_ns)
         self._synchroniser.forget_before(stamp_ns)
         self._predict_from(stamp_ns, status)
@@ -146,7 +148,7 @@ class Odometry:
             **visual.stage_ms,
             "update": 1e3 * (perf_counter() - measured),
         }
-        return self._assemble(stamp_ns, status, visual, span, stage_ms)
+        return self._assemble(stamp_ns, status, visual, span, at_rest, stage_ms)
 
     def _must_wait_for_imu(self, stamp_ns: int) -> bool:
         """Before the IMU's first sample there is nothing to start from, unless it has been awaited for long."""
@@ -210,25 +212,30 @@ class Odometry:
         status: Status,
         visual: VisualResult,
         span: ImuSpan | None,
+        at_rest: bool,
         stage_ms: dict[str, float],
     ) -> Estimate:
         belief = self._belief
-        state = belief.state()
+        state, known = belief.state(), belief.covariance
         honest = status is not Status.LOST
         return Estimate(
             stamp_ns=stamp_ns,
             status=status,
             nav_T_body=state.nav_T_body if honest else None,
-            covariance=belief.covariance if honest else None,
+            covariance=known.pose if honest else None,
             epoch=belief.epoch,
             velocity_nav=state.velocity_nav if honest else None,
             gyro_bias=state.gyro_bias if belief.has_imu else None,
             accel_bias=state.accel_bias if belief.has_imu else None,
+            velocity_covariance=known.velocity if honest else None,
+            gyro_bias_covariance=known.gyro_bias,
+            accel_bias_covariance=known.accel_bias,
+            innovations=belief.verdicts,
             rates=self._rates.update(visual.motion, span, state.gyro_bias, belief.latest_rate()),
             vision=visual.quality,
             vision_reason=visual.reason,
             vision_sigmas=None if visual.motion is None else visual.motion.weakest_sigmas,
-            at_rest=visual.at_rest and (span is None or is_at_rest(span, self.config.initialisation)),
+            at_rest=at_rest,
             pairs=visual.pairs,
             stage_ms=stage_ms,
         )

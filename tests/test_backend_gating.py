@@ -68,5 +68,8 @@ def test_the_statistic_is_the_mahalanobis_distance() -> None:
 
 
 def test_an_outcome_near_the_threshold_is_not_clear() -> None:
-    clear = [Verdict(statistic < 20.0, statistic, 20.0).is_clear for statistic in (0.0, 9.0, 11.0, 20.0, 39.0, 41.0)]
+    clear = [
+        Verdict(statistic < 20.0, statistic, 20.0, np.zeros(6), np.eye(6)).is_clear
+        for statistic in (0.0, 9.0, 11.0, 20.0, 39.0, 41.0)
+    ]
     assert clear == [True, True, False, False, False, True]

@@ -3,13 +3,15 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from synthetic import filled_buffer, measured_motion, pose_at, stamps_ns, transform, velocity_at
+from synthetic import UP, filled_buffer, measured_motion, pose_at, stamps_ns, transform, velocity_at
 
 from graphvio.arrays import Float
 from graphvio.backend.inertial import ImuBuffer
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
 from graphvio.config import SmootherConfig
+from graphvio.events import ImuSample
+from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.rig import Imu
 
@@ -252,3 +254,124 @@ def test_tilt_is_uncertain_about_navs_axes_and_heading_is_not() -> None:
     run.smoother.start(0, RigState(leaning, np.zeros(3), np.zeros(3), np.zeros(3)), known_to(leaning))
     sigmas = np.sqrt(np.diag(run.smoother.covariance()))
     np.testing.assert_allclose(sigmas[:3], [1e-3, 0.01, 0.01], rtol=1e-6)
+
+
+# ------------------------------------------------------------------ what is told of velocity and biases
+
+
+def test_velocity_and_biases_are_as_certain_as_is_told() -> None:
+    squares: dict[str, list[float]] = {"velocity": [], "gyro_bias": [], "accel_bias": []}
+    for seed in range(20):
+        run = Run(100 + seed)
+        run.until(4.0)
+        state, known = run.smoother.state(), run.smoother.state_covariance()
+        np.testing.assert_array_equal(known.pose, run.smoother.covariance())
+        errors = {
+            "velocity": (state.velocity_nav - velocity_at(4.0), known.velocity),
+            "gyro_bias": (state.gyro_bias - run.gyro_bias, known.gyro_bias),
+            "accel_bias": (state.accel_bias - run.accel_bias, known.accel_bias),
+        }
+        for name, (error, covariance) in errors.items():
+            assert covariance is not None
+            squares[name].append(float(error @ np.linalg.solve(covariance, error)))
+    # Of 3, the mean of 20 known to 0.55; the biases drawn here are less than the window is prepared for.
+    assert 1.5 < np.mean(squares["velocity"]) < 5.0
+    assert 0.5 < np.mean(squares["gyro_bias"]) < 5.0
+    assert np.mean(squares["accel_bias"]) < 5.0
+    assert Run(0, with_imu=False).smoother.state_covariance().velocity is None
+
+
+# ------------------------------------------------------------------ rest
+
+
+def resting(seed: int, told: bool, duration_s: float = 4.0) -> Run:
+    """A rig that stands still from a start that does not know it."""
+    run = Run(seed, duration_s=0.0)
+    rng, pose = run.rng, np.eye(4)
+    run.smoother.start(0, RigState(pose, np.zeros(3), np.zeros(3), np.zeros(3)), known_to(pose))
+    run.imu = ImuBuffer(50.0)
+    root = np.sqrt(IMU.rate_hz)
+    for i in range(round(duration_s * IMU.rate_hz) + 1):
+        rate = run.gyro_bias + IMU.gyro_noise_density * root * rng.standard_normal(3)
+        force = UP + run.accel_bias + IMU.accel_noise_density * root * rng.standard_normal(3)
+        run.imu.add(ImuSample(round(i * 1e9 / IMU.rate_hz), rate, force))
+    for stamp in stamps_ns(duration_s):
+        if stamp == 0:
+            continue
+        run.predict(stamp)
+        noise = np.repeat([1e-3, 3e-3], 3)
+        motion = transform(*(noise * rng.standard_normal(6)).reshape(2, 3))
+        still = RelativeMotion(stamp - PERIOD_NS, stamp, motion, np.diag(noise**2), np.zeros((6, 6)), 100)
+        if run.smoother.test(still).accepted:
+            run.smoother.accept(still)
+        if told:
+            assert run.smoother.test_rest().accepted
+            run.smoother.accept_rest()
+        run.smoother.settle(())
+    return run
+
+
+def test_standing_still_the_velocity_is_known_and_the_pose_stays() -> None:
+    drifts: dict[bool, list[float]] = {False: [], True: []}
+    for told in drifts:
+        for seed in range(6):
+            run = resting(seed, told)
+            drifts[told].append(float(np.linalg.norm(run.smoother.state().nav_T_body[:3, 3])))
+    run = resting(0, True)
+    known = run.smoother.state_covariance().velocity
+    assert known is not None
+    assert np.sqrt(np.trace(known)) < 0.005
+    assert np.linalg.norm(run.smoother.state().velocity_nav) < 0.005
+    assert np.mean(drifts[True]) < 0.5 * np.mean(drifts[False])
+
+
+def test_a_velocity_that_is_surely_another_is_no_rest() -> None:
+    run = Run(8)
+    run.until(2.0)
+    run.predict(2_050_000_000)
+    assert np.linalg.norm(velocity_at(2.05)) > 0.3
+    assert not run.smoother.test_rest().accepted
+
+
+# ------------------------------------------------------------------ resets
+
+
+@pytest.mark.parametrize("with_imu", [True, False], ids=["imu", "vision"])
+def test_a_reset_changes_nothing_but_the_window(with_imu: bool) -> None:
+    """Estimates and what is told of them stay the same; the window's own position is certain again."""
+    never, often = (Run(9, with_imu=with_imu) for _ in range(2))
+    for end_s in (1.0, 2.0, 3.0, 4.0, 5.0):
+        for run in (never, often):
+            run.until(end_s)
+        one, other = never.smoother.state_covariance(), often.smoother.state_covariance()
+        for before, after in ((one.pose, other.pose), (one.velocity, other.velocity), (one.gyro_bias, other.gyro_bias)):
+            if before is not None and after is not None:
+                sigmas = np.sqrt(np.diag(before))
+                scale = np.outer(sigmas, sigmas)
+                np.testing.assert_allclose(after / scale, before / scale, atol=0.02)
+        apart = se3_log(se3_inverse(never.smoother.state().nav_T_body) @ often.smoother.state().nav_T_body)
+        assert np.abs(apart).max() < 1e-4
+        often.smoother.reset_position()
+        often.smoother.settle(())
+    assert np.trace(often.smoother._forgotten) > 0.5 * np.trace(never.smoother.covariance()[3:, 3:])
+
+
+# ------------------------------------------------------------------ accelerations
+
+
+def test_accelerations_that_no_rig_has_are_told() -> None:
+    run = Run(11, with_imu=False)
+    run.until(1.0)
+    stamp = run.smoother.latest_ns + PERIOD_NS
+    run.predict(stamp)
+    good = measured_motion(stamp - PERIOD_NS, stamp, run.rng)
+    assert run.smoother.excess_acceleration(good) is None
+    off = transform(np.zeros(3), [0.3, 0.0, 0.0])  # 0.3 m in a step of 50 ms: 120 m/s^2
+    wrong = replace(good, reference_T_current=good.reference_T_current @ off)
+    excess = run.smoother.excess_acceleration(wrong)
+    assert excess == pytest.approx(120.0, abs=15.0)
+    unsure = replace(wrong, covariance=wrong.covariance + np.diag([0, 0, 0, 1, 1, 1]) * 0.1**2)
+    assert run.smoother.excess_acceleration(unsure) is None
+    run.smoother.settle(())
+    run.predict(stamp + PERIOD_NS)  # the step before was not seen: where it ended is a guess
+    assert run.smoother.excess_acceleration(replace(wrong, stamp_ns=stamp + PERIOD_NS)) is None

@@ -11,11 +11,10 @@ from scipy.stats import chi2
 from graphvio.arrays import Float
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 
-_DEGREES_OF_FREEDOM = 6
 _UNCLEAR = (0.5, 2.0)  # statistic over threshold
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Verdict:
     """Outcome of a gate.
 
@@ -23,11 +22,15 @@ class Verdict:
         accepted: whether the measurement may be used.
         statistic: squared Mahalanobis distance of the innovation.
         threshold: the largest that is accepted.
+        innovation: (M,) what was measured, less what was expected.
+        covariance: (M, M) of it.
     """
 
     accepted: bool
     statistic: float
     threshold: float
+    innovation: Float
+    covariance: Float
 
     @property
     def is_clear(self) -> bool:
@@ -49,11 +52,15 @@ def gate(
     probability: float,
 ) -> Verdict:
     """Test a motion (4, 4) against a predicted one; covariances (6, 6) in the frame that it ends in."""
-    innovation = se3_log(se3_inverse(measured) @ predicted)
-    covariance = measured_covariance + predicted_covariance
+    innovation = se3_log(se3_inverse(predicted) @ measured)
+    return judged(innovation, measured_covariance + predicted_covariance, probability)
+
+
+def judged(innovation: Float, covariance: Float, probability: float) -> Verdict:
+    """Test an innovation (M,) with a covariance (M, M)."""
     statistic = float(innovation @ np.linalg.solve(covariance, innovation))
-    threshold = chi_square_quantile(probability, _DEGREES_OF_FREEDOM)
-    return Verdict(statistic <= threshold, statistic, threshold)
+    threshold = chi_square_quantile(probability, len(innovation))
+    return Verdict(statistic <= threshold, statistic, threshold, innovation, covariance)
 
 
 @cache

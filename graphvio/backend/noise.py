@@ -1,10 +1,13 @@
-"""Noise models of gtsam's factors."""
+"""Noise models of gtsam's factors, and what errors that motions share leave to each of them."""
 
 from __future__ import annotations
 
 import gtsam
+import numpy as np
 
 from graphvio.arrays import Float
+
+_LEAST_OWN_SHARE = 0.001  # of each direction of a motion's covariance: keeps it positive definite
 
 
 def gaussian(covariance: Float) -> gtsam.noiseModel.Gaussian:
@@ -14,3 +17,20 @@ def gaussian(covariance: Float) -> gtsam.noiseModel.Gaussian:
     rotations known to 0.03 mrad and of translations known to 0.03 mm would be lost.
     """
     return gtsam.noiseModel.Gaussian.Covariance(covariance, False)
+
+
+def isotropic(dimension: int, sigma: float) -> gtsam.noiseModel.Isotropic:
+    """A noise of one standard deviation in all of so many directions."""
+    return gtsam.noiseModel.Isotropic.Sigma(dimension, sigma)
+
+
+def own_covariance(covariance: Float, shared: Float) -> Float:
+    """What a motion's covariance (6, 6) has beyond the part that it shares with others, which was told before.
+
+    The points' errors come to a little more as the rig moves on. Some of it is always the motion's own.
+    """
+    root = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(root, np.linalg.solve(root, shared).T)
+    shares, axes = np.linalg.eigh(np.eye(6) - 0.5 * (white + white.T))
+    axes = root @ axes
+    return np.asarray((axes * np.maximum(shares, _LEAST_OWN_SHARE)) @ axes.T)

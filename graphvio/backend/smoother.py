@@ -12,20 +12,21 @@ import gtsam
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.gating import Verdict, gate, relative_covariance
+from graphvio.backend.factors import anchored_position, b, first_state, imu_without_samples, r, rest, rest_noise, v, x
+from graphvio.backend.gating import Verdict, gate, judged, relative_covariance
 from graphvio.backend.inertial import ImuSpan
-from graphvio.backend.noise import gaussian
+from graphvio.backend.noise import gaussian, own_covariance
 from graphvio.backend.preintegration import preintegrate, preintegration_params
-from graphvio.backend.states import RigState, StartUncertainty
+from graphvio.backend.states import RigState, StartUncertainty, StateCovariance
 from graphvio.backend.window import Window
 from graphvio.config import SmootherConfig
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.rig import Imu
 
-_ACCEL_BIAS_SIGMA = 0.2
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
-_LEAST_OWN_SHARE = 0.001  # of each direction of a motion's covariance: keeps it positive definite
+_ANCHOR_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
+_SURELY = 5.0  # standard deviations
 
 
 class Smoother:
@@ -43,6 +44,8 @@ class Smoother:
         self._views: dict[int, Float] = {}
         self._previous_motion = np.zeros(6)  # tangent per second
         self._constrained_ns = 0  # stamp of the newest state whose motion was measured
+        self._seen_ns: int | None = None  # the same, by vision
+        self._forgotten = np.zeros((3, 3))  # position covariance, nav, that resets took out of the window
         self._rate_sigmas = np.zeros(2)  # of `_previous_motion`: rad/s and m/s
 
     @property
@@ -63,16 +66,10 @@ class Smoother:
         self._previous_motion = np.concatenate([np.zeros(3), velocity_body])
         self._rate_sigmas = np.array([_UNKNOWN_RATE_SIGMA_RAD_S, uncertainty.velocity_m_s])
         k = self._append(stamp_ns, state)
-        self._constrained_ns = stamp_ns
-        pose_noise = gaussian(uncertainty.pose)
-        self._window.add(gtsam.PriorFactorPose3(_x(k), gtsam.Pose3(state.nav_T_body), pose_noise))
-        if self.has_imu:
-            self._window.add(
-                gtsam.PriorFactorVector(_v(k), state.velocity_nav, _isotropic(3, uncertainty.velocity_m_s))
-            )
-            sigmas = np.repeat([_ACCEL_BIAS_SIGMA, uncertainty.gyro_bias_rad_s], 3)
-            bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
-            self._window.add(gtsam.PriorFactorConstantBias(_b(k), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+        self._constrained_ns, self._seen_ns = stamp_ns, None
+        self._forgotten = np.zeros((3, 3))
+        for factor in first_state(k, state, uncertainty, self.has_imu):
+            self._window.add(factor)
 
     def extend(self, stamp_ns: int, span: ImuSpan | None) -> RigState:
         """Predict the next state and append it; without a span of the IMU, by constant velocity."""
@@ -93,7 +90,7 @@ class Smoother:
         )
         j = self._append(stamp_ns, state)
         self._constrained_ns = stamp_ns
-        self._window.add(gtsam.CombinedImuFactor(_x(i), _v(i), _x(j), _v(j), _b(i), _b(j), measurements))
+        self._window.add(gtsam.CombinedImuFactor(x(i), v(i), x(j), v(j), b(i), b(j), measurements))
         return state
 
     def knows(self, stamp_ns: int) -> bool:
@@ -102,19 +99,19 @@ class Smoother:
 
     def pose(self, stamp_ns: int) -> Float:
         """``nav_T_body`` (4, 4) of a state in the window."""
-        return np.asarray(self._window.values.atPose3(_x(self._index_of[stamp_ns])).matrix())
+        return np.asarray(self._window.values.atPose3(x(self._index_of[stamp_ns])).matrix())
 
     def state(self) -> RigState:
         """The newest state."""
         k = self._index_of[self.latest_ns]
         values = self._window.values
-        pose = np.asarray(values.atPose3(_x(k)).matrix())
+        pose = np.asarray(values.atPose3(x(k)).matrix())
         if not self.has_imu:
             return RigState(pose, pose[:3, :3] @ self._previous_motion[3:], np.zeros(3), np.zeros(3))
-        bias = values.atConstantBias(_b(k))
+        bias = values.atConstantBias(b(k))
         return RigState(
             pose,
-            np.asarray(values.atVector(_v(k))),
+            np.asarray(values.atVector(v(k))),
             np.asarray(bias.gyroscope()),
             np.asarray(bias.accelerometer()),
         )
@@ -125,7 +122,20 @@ class Smoother:
 
     def covariance(self) -> Float:
         """Covariance (6, 6) of the newest pose, tangent ``[rotation, translation]`` in body."""
-        return self._window.joint_covariance([_x(self._index_of[self.latest_ns])])
+        return self._with_forgotten(self._window.joint_covariance([x(self._index_of[self.latest_ns])]))
+
+    def state_covariance(self) -> StateCovariance:
+        """How well the newest state is known."""
+        k = self._index_of[self.latest_ns]
+        if not self.has_imu:
+            return StateCovariance(self.covariance())
+        joint = self._window.joint_covariance([x(k), v(k), b(k)])
+        return StateCovariance(
+            pose=self._with_forgotten(joint[:6, :6]),
+            velocity=joint[6:9, 6:9],
+            gyro_bias=joint[12:, 12:],
+            accel_bias=joint[9:12, 9:12],
+        )
 
     def covariance_since(self, stamp_ns: int) -> Float:
         """Covariance (6, 6) of the motion from a state in the window to the newest one, in the newest body frame."""
@@ -133,12 +143,12 @@ class Smoother:
         if i == j:
             return np.zeros((6, 6))
         relative = se3_inverse(self.pose(stamp_ns)) @ self.pose(self.latest_ns)
-        return relative_covariance(relative, self._window.joint_covariance([_x(i), _x(j)]))
+        return relative_covariance(relative, self._window.joint_covariance([x(i), x(j)]))
 
     def test(self, motion: RelativeMotion) -> Verdict:
         """Chi-square test of a motion that ends in the newest state, against the window's prediction."""
-        newest = _x(self._index_of[motion.stamp_ns])
-        reference, covariance = _x(self._index_of[motion.reference_stamp_ns]), motion.covariance
+        newest = x(self._index_of[motion.stamp_ns])
+        reference, covariance = x(self._index_of[motion.reference_stamp_ns]), motion.covariance
         if motion.reference_stamp_ns in self._views and motion.shared_covariance.any():
             reference, covariance = self._reference_key(motion), self._own_covariance(motion)
         nav_T_reference = np.asarray(self._window.values.atPose3(reference).matrix())
@@ -151,15 +161,59 @@ class Smoother:
             self._config.gate_probability,
         )
 
+    def test_rest(self) -> Verdict:
+        """Chi-square test of a velocity of zero."""
+        k = self._index_of[self.latest_ns]
+        covariance = self._window.joint_covariance([v(k)]) + rest_noise().covariance()
+        return judged(-self.state().velocity_nav, covariance, self._config.gate_probability)
+
+    def accept_rest(self) -> None:
+        """Insert that the newest state stands still."""
+        self._window.add(rest(self._index_of[self.latest_ns]))
+
+    def excess_acceleration(self, motion: RelativeMotion) -> float | None:
+        """The acceleration, m/s^2, that a motion which ends in the newest state asks for over the newest step, if it is
+        surely more than the rig can have; None where it is not, or the state before the step was not seen."""
+        if len(self._stamps) < 2 or self._seen_ns != self._stamps[-2]:
+            return None
+        before, dt = self.pose(self._stamps[-2]), (self._stamps[-1] - self._stamps[-2]) * 1e-9
+        measured = self.pose(motion.reference_stamp_ns) @ motion.reference_T_current
+        velocity = before[:3, :3] @ self._previous_motion[3:]  # mean of the step before
+        accel = float(np.linalg.norm((measured[:3, 3] - before[:3, 3]) / dt - velocity) / dt)
+        noise = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1])) / dt**2
+        return accel if accel - _SURELY * noise > self._config.max_accel_m_s2 else None
+
+    def reset_position(self) -> None:
+        """Forget what is not known of the position but through velocity, attitude and biases.
+
+        The position's own uncertainty grows without bound, which no state of the window can ever say less of
+        (section 5). It stays in what `covariance` tells.
+        """
+        k = self._index_of[self.latest_ns]
+        keys = [x(k), v(k), b(k)] if self.has_imu else [x(k)]
+        forgotten, factor = anchored_position(
+            keys, self._window.joint_covariance(keys), _ANCHOR_SIGMA_M, self._window.values
+        )
+        nav_R_body = self.pose(self.latest_ns)[:3, :3]
+        self._forgotten = self._forgotten + nav_R_body @ forgotten @ nav_R_body.T
+        self._window.add(factor)
+
+    def _with_forgotten(self, covariance: Float) -> Float:
+        """A pose's covariance (6, 6), newest body, with what resets took out of the window."""
+        nav_R_body = self.pose(self.latest_ns)[:3, :3]
+        covariance = covariance.copy()
+        covariance[3:, 3:] += nav_R_body.T @ self._forgotten @ nav_R_body
+        return covariance
+
     def accept(self, motion: RelativeMotion) -> None:
         """Insert a motion that ends in the newest state."""
-        self._constrained_ns = motion.stamp_ns
+        self._constrained_ns = self._seen_ns = motion.stamp_ns
         self._rate_sigmas = np.zeros(2)
         reference = self._reference_key(motion)
         self._window.add(
             gtsam.BetweenFactorPose3(
                 reference,
-                _x(self._index_of[motion.stamp_ns]),
+                x(self._index_of[motion.stamp_ns]),
                 gtsam.Pose3(motion.reference_T_current),
                 gaussian(self._own_covariance(motion)),
             )
@@ -174,28 +228,22 @@ class Smoother:
         stamp_ns = motion.reference_stamp_ns
         k = self._index_of[stamp_ns]
         if not motion.shared_covariance.any():
-            return _x(k)
+            return x(k)
         if stamp_ns not in self._views:
             adjoint = se3_adjoint(motion.reference_T_current)  # takes the tangent from the current instant there
             shared = adjoint @ motion.shared_covariance @ adjoint.T
             self._views[stamp_ns] = shared
-            self._window.values.insert(_r(k), gtsam.Pose3(self.pose(stamp_ns)))
+            self._window.values.insert(r(k), gtsam.Pose3(self.pose(stamp_ns)))
             noise = gaussian(shared)
-            self._window.add(gtsam.BetweenFactorPose3(_x(k), _r(k), gtsam.Pose3(), noise))
-        return _r(k)
+            self._window.add(gtsam.BetweenFactorPose3(x(k), r(k), gtsam.Pose3(), noise))
+        return r(k)
 
     def _own_covariance(self, motion: RelativeMotion) -> Float:
-        """What a motion's covariance (6, 6) has beyond that of its reference as seen, which the first motion from there
-        told: the points' errors come to a little more as the rig moves on. Some of it is always the motion's own."""
+        """What a motion's covariance (6, 6) has beyond that of its reference as seen."""
         if motion.reference_stamp_ns not in self._views or not motion.shared_covariance.any():
             return motion.covariance
         adjoint = se3_adjoint(se3_inverse(motion.reference_T_current))
-        shared = adjoint @ self._views[motion.reference_stamp_ns] @ adjoint.T
-        root = np.linalg.cholesky(motion.covariance)
-        white = np.linalg.solve(root, np.linalg.solve(root, shared).T)
-        shares, axes = np.linalg.eigh(np.eye(6) - 0.5 * (white + white.T))
-        axes = root @ axes
-        return np.asarray((axes * np.maximum(shares, _LEAST_OWN_SHARE)) @ axes.T)
+        return own_covariance(motion.covariance, adjoint @ self._views[motion.reference_stamp_ns] @ adjoint.T)
 
     def settle(self, keep: Iterable[int]) -> list[tuple[int, Float]]:
         """Optimise, then marginalise what is older than the lag, but for the stamps to keep.
@@ -224,10 +272,10 @@ class Smoother:
         self._stamps.append(stamp_ns)
         self._index_of[stamp_ns] = k
         values = self._window.values
-        values.insert(_x(k), gtsam.Pose3(state.nav_T_body))
+        values.insert(x(k), gtsam.Pose3(state.nav_T_body))
         if self.has_imu:
-            values.insert(_v(k), state.velocity_nav)
-            values.insert(_b(k), gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias))
+            values.insert(v(k), state.velocity_nav)
+            values.insert(b(k), gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias))
         return k
 
     def _link_by_constant_velocity(self, i: int, j: int, motion: Float, dt: float) -> None:
@@ -239,28 +287,20 @@ class Smoother:
         accelerations = [config.motion_angular_accel_sigma_rad_s2, config.motion_accel_sigma_m_s2]
         sigmas = np.repeat(np.hypot(np.array(accelerations) * growth, self._rate_sigmas * dt), 3)
         self._window.add(
-            gtsam.BetweenFactorPose3(_x(i), _x(j), gtsam.Pose3(motion), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+            gtsam.BetweenFactorPose3(x(i), x(j), gtsam.Pose3(motion), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
         )
-        if self._imu is None:
-            return
-        still = np.zeros(3)
-        self._window.add(
-            gtsam.BetweenFactorVector(_v(i), _v(j), still, _isotropic(3, config.motion_accel_sigma_m_s2 * dt))
-        )
-        walk = config.imu_noise_scale * np.sqrt(dt)
-        bias_sigmas = np.repeat([walk * self._imu.accel_random_walk, walk * self._imu.gyro_random_walk], 3)
-        self._window.add(
-            gtsam.BetweenFactorConstantBias(
-                _b(i), _b(j), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(bias_sigmas)
-            )
-        )
+        if self._imu is not None:
+            for factor in imu_without_samples(
+                i, j, dt, config.motion_accel_sigma_m_s2, self._imu, config.imu_noise_scale
+            ):
+                self._window.add(factor)
 
     def _followed(self, keep: frozenset[int]) -> list[int]:
         """Variables that the next motion and the next span of the IMU will be tied to."""
         references = [(self._index_of[ns], ns) for ns in sorted(keep & self._index_of.keys() - {self.latest_ns})]
-        keys = [_r(k) if ns in self._views else _x(k) for k, ns in references]
+        keys = [r(k) if ns in self._views else x(k) for k, ns in references]
         newest = self._index_of[self.latest_ns]
-        return [*keys, _x(newest), _v(newest), _b(newest)] if self.has_imu else [*keys, _x(newest)]
+        return [*keys, x(newest), v(newest), b(newest)] if self.has_imu else [*keys, x(newest)]
 
     def _forget(self, oldest_ns: int, keep: frozenset[int]) -> list[tuple[int, Float]]:
         leaving = [s for s in self._stamps[:-1] if s < oldest_ns and s not in keep]
@@ -268,31 +308,11 @@ class Smoother:
         keys: list[int] = []
         for stamp in leaving:
             k = self._index_of[stamp]
-            keys += [_x(k), _v(k), _b(k)] if self.has_imu else [_x(k)]
-            keys += [_r(k)] if stamp in self._views else []
+            keys += [x(k), v(k), b(k)] if self.has_imu else [x(k)]
+            keys += [r(k)] if stamp in self._views else []
         self._window.marginalise(keys)
         for stamp in leaving:
             del self._index_of[stamp]
             self._views.pop(stamp, None)
         self._stamps = [stamp for stamp in self._stamps if stamp in self._index_of]
         return finished
-
-
-def _x(k: int) -> int:
-    return int(gtsam.symbol("x", k))
-
-
-def _v(k: int) -> int:
-    return int(gtsam.symbol("v", k))
-
-
-def _b(k: int) -> int:
-    return int(gtsam.symbol("b", k))
-
-
-def _r(k: int) -> int:
-    return int(gtsam.symbol("r", k))
-
-
-def _isotropic(dimension: int, sigma: float) -> gtsam.noiseModel.Isotropic:
-    return gtsam.noiseModel.Isotropic.Sigma(dimension, sigma)

@@ -44,6 +44,23 @@ class StartUncertainty:
     gyro_bias_rad_s: float
 
 
+@dataclass(frozen=True, eq=False)
+class StateCovariance:
+    """How well the newest state is known; None for what is not estimated.
+
+    Attributes:
+        pose: (6, 6), tangent ``[rotation, translation]`` in body.
+        velocity: (3, 3) in nav.
+        gyro_bias: (3, 3).
+        accel_bias: (3, 3).
+    """
+
+    pose: Float
+    velocity: Float | None = None
+    gyro_bias: Float | None = None
+    accel_bias: Float | None = None
+
+
 def origin_covariance(nav_R_body: Float, tilt_sigma_rad: float) -> Float:
     """Covariance (6, 6) of a pose whose position and heading define nav, and whose roll and pitch are measured."""
     about_nav = np.diag([tilt_sigma_rad, tilt_sigma_rad, _HEADING_SIGMA_RAD]) ** 2

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 
 import gtsam
 import numpy as np
@@ -149,13 +150,27 @@ class Window:
             solution = graph.linearize(self.values).eliminateMultifrontal(ordering, gtsam.EliminateQR)
         except RuntimeError as error:
             raise WindowError(f"the window has no unique solution: {_one_line(error)}") from None
-        self._marginal, self._unknown = None, 0
-        for root in solution.roots():
-            if list(root.conditional().keys())[-len(last) :] == list(last):
-                # All states are tied to each other, so those that are eliminated last are the lower corner of the root.
-                columns, size = self._columns(last)
-                self._marginal = _Marginal(columns, np.array(root.conditional().R())[-size:, -size:])
+        self._marginal, self._unknown = self._root_marginal(solution, last), 0
         return solution
+
+    def _root_marginal(self, solution: gtsam.GaussianBayesTree, last: Sequence[int]) -> _Marginal | None:
+        """The marginal of the variables that were eliminated last, or None if some are not in a root.
+
+        As a rule all states are tied to each other, and they are the lower corner of the one root; just after a start
+        there may be several.
+        """
+        conditionals = [root.conditional() for root in solution.roots()]
+        ends = [list(takewhile(frozenset(last).__contains__, reversed(list(each.keys())))) for each in conditionals]
+        if sum(map(len, ends)) != len(last):
+            return None
+        columns, size = self._columns([key for end in ends for key in reversed(end)])
+        square_root, at = np.zeros((size, size)), 0
+        for conditional, end in zip(conditionals, ends, strict=True):
+            width = sum(columns[key].stop - columns[key].start for key in end)
+            corner = np.array(conditional.R())[-width:, -width:] if width else np.zeros((0, 0))
+            square_root[at : at + width, at : at + width] = corner
+            at += width
+        return _Marginal(columns, square_root)
 
     def _extended_marginal(self) -> _Marginal | None:
         """The marginal of the followed variables and those added since, or None if that cannot be told from them."""

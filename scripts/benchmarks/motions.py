@@ -73,8 +73,8 @@ def overhear(odometry: Odometry) -> Overheard:
         result = overheard.results[frameset.stamp_ns] = process(frameset, predict)
         return result
 
-    def used(visual: VisualResult) -> RelativeMotion | None:
-        motion = use(visual)
+    def used(visual: VisualResult, at_rest: bool) -> RelativeMotion | None:
+        motion = use(visual, at_rest)
         if motion is not None:
             overheard.used[motion.stamp_ns] = motion
         return motion

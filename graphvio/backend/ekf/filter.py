@@ -10,7 +10,7 @@ from graphvio.arrays import Float
 from graphvio.backend.ekf.measurements import Measurement
 from graphvio.backend.ekf.process import jacobians, propagated
 from graphvio.backend.ekf.state import ERRORS, POSITION, FilterState
-from graphvio.backend.gating import Verdict, chi_square_quantile
+from graphvio.backend.gating import Verdict, judged
 
 
 @dataclass
@@ -34,10 +34,7 @@ class ExtendedKalmanFilter:
 
     def test(self, measurement: Measurement, probability: float) -> Verdict:
         """Chi-square test of an innovation."""
-        innovation = measurement.innovation
-        statistic = float(innovation @ np.linalg.solve(self._spread(measurement), innovation))
-        threshold = chi_square_quantile(probability, len(innovation))
-        return Verdict(statistic <= threshold, statistic, threshold)
+        return judged(measurement.innovation, self._spread(measurement), probability)
 
     def update(self, measurement: Measurement) -> None:
         """Kalman update, in Joseph's form."""

@@ -1,0 +1,106 @@
+"""The smoother's factors besides those of vision, and the names of its variables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.noise import gaussian, isotropic
+from graphvio.backend.states import RigState, StartUncertainty
+from graphvio.rig import Imu
+
+_ACCEL_BIAS_SIGMA = 0.2
+_REST_SIGMA_M_S = 0.005  # of the velocity while the images do not move
+
+
+def x(k: int) -> int:
+    """The pose of state k, ``nav_T_body``."""
+    return int(gtsam.symbol("x", k))
+
+
+def v(k: int) -> int:
+    """The velocity of state k, in nav."""
+    return int(gtsam.symbol("v", k))
+
+
+def b(k: int) -> int:
+    """The biases of state k: accelerometer, gyro."""
+    return int(gtsam.symbol("b", k))
+
+
+def r(k: int) -> int:
+    """The pose of state k as vision sees it, see `graphvio.backend.smoother.Smoother`."""
+    return int(gtsam.symbol("r", k))
+
+
+def first_state(k: int, state: RigState, known: StartUncertainty, with_imu: bool) -> Iterator[gtsam.NonlinearFactor]:
+    """What is known of the first state."""
+    yield gtsam.PriorFactorPose3(x(k), gtsam.Pose3(state.nav_T_body), gaussian(known.pose))
+    if with_imu:
+        yield gtsam.PriorFactorVector(v(k), state.velocity_nav, isotropic(3, known.velocity_m_s))
+        sigmas = np.repeat([_ACCEL_BIAS_SIGMA, known.gyro_bias_rad_s], 3)
+        bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
+        yield gtsam.PriorFactorConstantBias(b(k), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+
+
+def imu_without_samples(
+    i: int, j: int, dt: float, accel_sigma_m_s2: float, imu: Imu, noise_scale: float
+) -> Iterator[gtsam.NonlinearFactor]:
+    """Velocity and biases go on as they are, but for a white acceleration and the biases' walk."""
+    yield gtsam.BetweenFactorVector(v(i), v(j), np.zeros(3), isotropic(3, accel_sigma_m_s2 * dt))
+    walk = noise_scale * np.sqrt(dt)
+    sigmas = np.repeat([walk * imu.accel_random_walk, walk * imu.gyro_random_walk], 3)
+    yield gtsam.BetweenFactorConstantBias(
+        b(i), b(j), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    )
+
+
+def rest(k: int) -> gtsam.NonlinearFactor:
+    """State k stands still."""
+    return gtsam.PriorFactorVector(v(k), np.zeros(3), rest_noise())
+
+
+def rest_noise() -> gtsam.noiseModel.Isotropic:
+    """Of a velocity that is thought to be zero."""
+    return isotropic(3, _REST_SIGMA_M_S)
+
+
+def anchored_position(
+    keys: list[int], covariance: Float, sigma_m: float, values: gtsam.Values
+) -> tuple[Float, gtsam.NonlinearFactor]:
+    """Make a pose's position certain but for what it has in common with the other variables.
+
+    Given these, the position is normally distributed about a linear function of them. The factor narrows that
+    distribution about its mean: what is known of the others stays the same, and the position keeps its correlation
+    with them.
+
+    Args:
+        keys: the pose, then the others.
+        covariance: (6 + M, 6 + M) of all of them, at their present values.
+        sigma_m: what is left of the position's own standard deviation.
+        values: present values.
+
+    Returns:
+        The part of the position's covariance (3, 3), in body, that is forgotten, and the factor.
+    """
+    order = np.concatenate([np.arange(3, 6), np.arange(3), np.arange(6, len(covariance))])
+    ordered = covariance[np.ix_(order, order)]
+    gain = np.linalg.solve(ordered[3:, 3:], ordered[3:, :3]).T
+    own = ordered[:3, :3] - gain @ ordered[3:, :3]
+    variances, axes = np.linalg.eigh(0.5 * (own + own.T))
+    variances = np.maximum(variances, sigma_m**2)
+    rows = np.sqrt(1.0 / sigma_m**2 - 1.0 / variances)[:, None] * axes.T
+    jacobian = np.empty((3, len(covariance)))
+    jacobian[:, order] = rows @ np.hstack([np.eye(3), -gain])
+    blocks: list[Any] = []
+    at, dims = 0, values.dims()
+    for key in keys:
+        blocks += [key, jacobian[:, at : at + dims[key]]]
+        at += dims[key]
+    linear = gtsam.JacobianFactor(*blocks, np.zeros(3), gtsam.noiseModel.Unit.Create(3))  # type: ignore[call-overload]
+    forgotten = (axes * (variances - sigma_m**2)) @ axes.T
+    return forgotten, gtsam.LinearContainerFactor(linear, values)

@@ -1,0 +1,230 @@
+"""What the smoother believes of the rig: predicted, corrected by what passes the gates, begun anew after breaks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.gating import Verdict
+from graphvio.backend.inertial import ImuSpan
+from graphvio.backend.smoother import Smoother
+from graphvio.backend.starts import MAX_UNBRIDGED_S, Start, after_failure, after_gap, after_lost, by_vision, first_start
+from graphvio.backend.states import RigState
+from graphvio.backend.window import WindowError
+from graphvio.belief import Belief
+from graphvio.config import Config
+from graphvio.events import Quality, Status
+from graphvio.frontend.motion import RelativeMotion, VisualResult
+from graphvio.geometry import se3_inverse, se3_log
+from graphvio.rig import Rig
+from graphvio.synchroniser import Report
+
+
+class SmootherBelief(Belief):
+    """The rig's state by the fixed-lag smoother; for arguments and attributes see `Belief`."""
+
+    def __init__(self, rig: Rig, config: Config, report: Report, rekey: Callable[[], None]) -> None:
+        super().__init__(rig, config, report, rekey)
+        self._smoother: Smoother | None = None
+        self._reset_ns = 0
+        self._refused: dict[int, Float] = {}  # stamp -> nav_T_body by the motions that the gate refused
+
+    # ------------------------------------------------------------------ what is known
+
+    @property
+    def has_started(self) -> bool:
+        """See `Belief`."""
+        return self._smoother is not None
+
+    @property
+    def has_imu(self) -> bool:
+        """See `Belief`."""
+        return self._smoother is not None and self._smoother.has_imu
+
+    @property
+    def latest_ns(self) -> int:
+        """See `Belief`."""
+        return self._running.latest_ns
+
+    def state(self) -> RigState:
+        """See `Belief`."""
+        return self._running.state()
+
+    def latest_rate(self) -> Float | None:
+        """See `Belief`."""
+        return self._running.latest_rate()
+
+    def motion_since(self, then_ns: int) -> Float | None:
+        """See `Belief`."""
+        smoother = self._smoother
+        if smoother is None or not smoother.knows(then_ns):
+            return None
+        return se3_inverse(smoother.pose(smoother.latest_ns)) @ smoother.pose(then_ns)
+
+    def end(self) -> None:
+        """See `Belief`."""
+        if self._smoother is not None:
+            self._final += self._smoother.all_poses()
+
+    # ------------------------------------------------------------------ one frameset
+
+    def start(self, stamp_ns: int, found: tuple[ImuSpan, float] | None) -> None:
+        """See `Belief`."""
+        position = self._position_to_start_at(stamp_ns, found)
+        if self._smoother is not None:
+            self._final += self._smoother.all_poses()
+        self._smoother = Smoother(self._config.smoother, self._rig.imu if found else None)
+        self._begin(first_start(stamp_ns, position, found, self._rig, self._config.initialisation))
+
+    def predict(self, stamp_ns: int, span: ImuSpan | None) -> None:
+        """See `Belief`."""
+        self.verdicts = {}
+        if span is None and stamp_ns - self.latest_ns > MAX_UNBRIDGED_S * 1e9:
+            self._jump(stamp_ns)
+        else:
+            self._running.extend(stamp_ns, span)
+
+    def use(self, visual: VisualResult, at_rest: bool) -> RelativeMotion | None:
+        """See `Belief`."""
+        motion = self._use_motion(visual)
+        if at_rest and self.has_imu:
+            self._use_rest()
+        return motion
+
+    def _use_rest(self) -> None:
+        """Standing still: a velocity of zero, unless the prediction is sure of another."""
+        try:
+            verdict = self._running.test_rest()
+        except WindowError:
+            return  # `update` meets the same error, and rebuilds
+        self.verdicts["rest"] = verdict
+        if verdict.accepted:
+            self._running.accept_rest()
+        else:
+            self._report(self.latest_ns, "rest_gated", _beyond(verdict))
+
+    def _use_motion(self, visual: VisualResult) -> RelativeMotion | None:
+        """Gate a measured motion and insert it."""
+        smoother, motion = self._running, visual.motion
+        if motion is None:
+            return None
+        if not smoother.knows(motion.reference_stamp_ns):  # it started anew since then
+            self._rekey()
+            return None
+        if self._lost and motion.reference_stamp_ns > self._tracked_ns:  # not from a state that was known
+            self._recover(motion)
+            return motion
+        try:
+            motion, verdict = self._judge(visual)
+        except WindowError:
+            return None  # `update` meets the same error, and rebuilds
+        self.verdicts["vision"] = verdict
+        excess = smoother.excess_acceleration(motion)
+        if verdict.accepted and excess is None:
+            smoother.accept(motion)
+            self._refused.clear()
+            self._lost = False
+            return motion
+        why = _beyond(verdict) if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
+        self._report(motion.stamp_ns, "vision_gated", f"{why}, {motion.inliers} inliers")
+        if visual.quality is not Quality.GOOD:
+            return None  # vision that contradicts itself cannot put the prediction in the wrong
+        reference_ns = motion.reference_stamp_ns
+        nav_T_reference = self._refused[reference_ns] if reference_ns in self._refused else smoother.pose(reference_ns)
+        self._refused[motion.stamp_ns] = nav_T_reference @ motion.reference_T_current
+        if motion.stamp_ns - min(self._refused) > self._config.smoother.max_gated_s * 1e9:
+            self._believe_vision(motion)
+            return motion
+        return None
+
+    def update(self, stamp_ns: int, used: bool, keep: frozenset[int]) -> Status:
+        """Optimise and marginalise; a window without a solution is rebuilt around the prediction. See `Belief`."""
+        smoother = self._running
+        if used:
+            self._tracked_ns = stamp_ns
+        predicted = smoother.state()
+        try:
+            self._final += smoother.settle(keep | {self._tracked_ns})
+            self._reset_position(stamp_ns)
+            self.covariance = smoother.state_covariance()
+            since = smoother.covariance_since(self._tracked_ns)
+        except WindowError as error:
+            self._report(stamp_ns, "window_rebuilt", str(error))
+            self._start_again(after_failure(stamp_ns, predicted, self.covariance.pose), stamp_ns - 1)
+            return Status.COASTING
+        return self._status(stamp_ns, used, float(np.sqrt(np.linalg.eigvalsh(since[3:, 3:])[-1])))
+
+    @property
+    def _running(self) -> Smoother:
+        assert self._smoother is not None, "it has started"
+        return self._smoother
+
+    def _judge(self, visual: VisualResult) -> tuple[RelativeMotion, Verdict]:
+        """The motion and its test; where pairs contradict each other, the side that the prediction clearly prefers."""
+        assert visual.motion is not None
+        verdicts = [(self._running.test(motion), motion) for motion in visual.alternatives]
+        verdicts.sort(key=lambda judged: judged[0].statistic)
+        if verdicts:
+            (likely, motion), (unlikely, _) = verdicts[:2]
+            if likely.accepted and not unlikely.accepted and likely.is_clear and unlikely.is_clear:
+                return motion, likely
+        return visual.motion, self._running.test(visual.motion)
+
+    def _reset_position(self, stamp_ns: int) -> None:
+        """From time to time: what is known of the absolute position gets no worse than the window can hold."""
+        if stamp_ns - self._reset_ns >= self._config.smoother.reset_s * 1e9:
+            self._running.reset_position()
+            self._reset_ns = stamp_ns
+
+    # ------------------------------------------------------------------ breaks
+
+    def _jump(self, stamp_ns: int) -> None:
+        """After a gap that nothing bridges, be it a pause or a jump of the clock: a new epoch at the last pose."""
+        last_ns = self.latest_ns
+        self._start_again(after_gap(stamp_ns, self.state(), self.covariance.pose), last_ns)
+        self.epoch += 1
+        gap_s = (stamp_ns - last_ns) * 1e-9
+        self._report(stamp_ns, "time_jump", f"{gap_s:.1f} s without data: epoch {self.epoch} starts at the last pose")
+
+    def _recover(self, motion: RelativeMotion) -> None:
+        """After lost: a new epoch that starts at the best guess, the prediction, with the velocity that vision sees."""
+        smoother = self._running
+        self._start_again(after_lost(motion, smoother.state(), smoother.covariance()), self._tracked_ns)
+        self.epoch += 1
+        self._report(motion.stamp_ns, "new_epoch", f"vision is back: epoch {self.epoch} starts at the best guess")
+
+    def _believe_vision(self, motion: RelativeMotion) -> None:
+        """Refused motions that go on agreeing with each other put the prediction in the wrong.
+
+        Their chain, which begins at a state that was accepted, is the pose from here on; by as much as it differs from
+        the prediction it is uncertain.
+        """
+        smoother, nav_T_body = self._running, self._refused[motion.stamp_ns]
+        predicted = smoother.state()
+        self._start_again(by_vision(motion, nav_T_body, predicted, smoother.covariance()), self._tracked_ns)
+        apart_m = np.linalg.norm(se3_log(se3_inverse(nav_T_body) @ predicted.nav_T_body)[3:])
+        self._report(
+            motion.stamp_ns,
+            "gate_reset",
+            f"refused for too long, vision is believed now, {apart_m:.3f} m from the prediction",
+        )
+
+    def _start_again(self, start: Start, last_final_ns: int) -> None:
+        """Begin anew; of the window's poses, those up to a stamp are final, and the later ones are given up."""
+        self._final += [(ns, pose) for ns, pose in self._running.all_poses() if ns <= last_final_ns]
+        self._begin(start)
+        self._rekey()
+
+    def _begin(self, start: Start) -> None:
+        self._running.start(start.stamp_ns, start.state, start.uncertainty)
+        self._reset_ns = start.stamp_ns
+        self._settled_ns = max(self._settled_ns, start.settled_ns)
+        self._tracked_ns = start.stamp_ns
+        self._refused.clear()
+        self._lost = False
+
+
+def _beyond(verdict: Verdict) -> str:
+    return f"innovation {verdict.statistic:.1f} beyond chi-square {verdict.threshold:.1f}"
