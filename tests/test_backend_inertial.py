@@ -49,6 +49,31 @@ def test_faulty_samples_are_named_and_left_out() -> None:
     assert not buffer.covers(20 * MS + 1)
 
 
+def test_an_axis_that_sticks_while_others_move_is_told() -> None:
+    rng, buffer = np.random.default_rng(0), ImuBuffer(50.0)
+    faults = []
+    for i in range(600):
+        t = 20e-3 * i
+        rate, force = np.array([np.sin(t), 0.3 * np.cos(t), 0.1]), np.array([np.sin(2.0 * t), 0.2, 9.8])
+        rate, force = rate + 0.01 * rng.standard_normal(3), force + 0.05 * rng.standard_normal(3)
+        if 200 <= i < 400:
+            rate[1] = 0.25  # the end of its range
+        faults.append(buffer.add(sample(5 * MS * i, rate, force)))
+    assert set(faults[:250]) == {""}
+    assert set(faults[300:400]) == {"imu_stuck"}  # once the others have moved enough
+    assert set(faults[400:]) == {""}
+
+
+def test_coarse_readings_at_rest_are_not_stuck() -> None:
+    """Also after a turn: an accelerometer that hardly sees it repeats its values from time to time."""
+    rng, buffer = np.random.default_rng(0), ImuBuffer(50.0)
+    for i in range(600):
+        turning = 200 <= i < 300
+        rate = np.round(0.3 * rng.standard_normal(3) + (500.0 if turning else 0.0)) * 1e-3
+        force = np.array([0.0, 0.0, 9.8]) + 0.01 * (i % 20 if turning else 0)
+        assert buffer.add(sample(5 * MS * i, rate, force)) == ""
+
+
 @pytest.mark.parametrize(("start", "end"), [(0, 20), (3, 17), (10, 20), (11, 13), (0, 11), (19, 40)])
 def test_a_span_of_linear_signals_is_exact(start: int, end: int) -> None:
     buffer = linear_buffer([0, 10 * MS, 15 * MS, 20 * MS, 40 * MS])

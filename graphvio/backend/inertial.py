@@ -16,6 +16,8 @@ _MAX_RATE = 100.0  # rad/s and m/s^2: beyond what any inertial sensor for this u
 _MAX_FORCE = 1000.0
 NO_SAMPLES = (np.empty(0, dtype=np.int64), np.empty((0, 6)))
 """What `ImuBuffer.since` returns where it knows nothing."""
+_STUCK_NS = 250_000_000  # for so long no living axis repeats one value while others change
+_MOVING = np.repeat([0.2, 1.0], 3)  # rad/s and m/s^2, by so much
 _ROOM = 1024  # samples that the buffer has room for at first
 
 
@@ -52,6 +54,7 @@ class ImuBuffer:
         self._values = np.empty((_ROOM, 6))  # angular velocity, linear acceleration
         self._first, self._end = 0, 0  # the samples that are kept
         self._max_gap_ns = round(max_gap_ms * 1e6)
+        self._stuck = _StuckAxes()
 
     @property
     def oldest_ns(self) -> int | None:
@@ -72,6 +75,8 @@ class ImuBuffer:
         newest_ns = self.newest_ns
         if newest_ns is not None and sample.stamp_ns <= newest_ns:
             return "imu_duplicate_stamp" if sample.stamp_ns == newest_ns else "imu_backward_stamp"
+        if self._stuck.shows(sample):
+            return "imu_stuck"
         if self._end == len(self._stamps):
             self._make_room()
         self._stamps[self._end] = sample.stamp_ns
@@ -140,6 +145,26 @@ class ImuBuffer:
         self._stamps, self._values = np.empty(room, dtype=np.int64), np.empty((room, 6))
         self._stamps[: len(stamps)], self._values[: len(stamps)] = stamps, values
         self._first, self._end = 0, len(stamps)
+
+
+class _StuckAxes:
+    """Finds axes that repeat one value while others move, as at the end of their range."""
+
+    def __init__(self) -> None:
+        self._before = np.full(6, np.nan)
+        self._low = self._high = np.zeros((6, 6))  # for each axis, the range of all axes since it has its value
+        self._since = np.zeros(6, dtype=np.int64)  # stamps since which each axis repeats its value and others moved
+
+    def shows(self, sample: ImuSample) -> bool:
+        """Whether a sample, the next in time, has a stuck axis."""
+        now = np.concatenate([sample.angular_velocity, sample.linear_acceleration])
+        repeats = (now == self._before)[:, None]
+        self._low = np.where(repeats, np.minimum(self._low, now), now)
+        self._high = np.where(repeats, np.maximum(self._high, now), now)
+        self._before = now
+        alone = (self._high - self._low > _MOVING).any(axis=1)
+        self._since = np.where(alone, self._since, sample.stamp_ns)
+        return bool(sample.stamp_ns - self._since.min() >= _STUCK_NS)
 
 
 @kernel

@@ -1,0 +1,1 @@
+"""Statistical claims by Monte Carlo: ``scripts/campaign``."""

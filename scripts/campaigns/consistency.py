@@ -1,0 +1,110 @@
+"""``scripts/campaign consistency``: is the smoother as certain as it may be, and no more?
+
+Walks of the simulator's scenes are estimated many times, each with another IMU, other biases, another start and other
+errors of vision. Vision's errors are drawn from the covariances that the front-end tells on rendered images of a room;
+in a second set the whole odometry runs on rendered images, and only the IMU is another one each time.
+"""
+
+from __future__ import annotations
+
+import argparse
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+from benchmarks.recordings import add_data_option
+from benchmarks.report import DOCS, Report, machine, tell
+
+from campaigns.drawn import Template, templates_of
+from campaigns.measures import HEAD, Squares, rows
+from campaigns.model_run import SCENES, model_run
+from campaigns.picture import draw_consistency
+from campaigns.rendered_run import rendered_run
+from graphvio.errors import GraphvioError
+
+NAMES = {
+    "pose over 1 s": "relative pose over 1 s",
+    "pose over 10 s": "relative pose over 10 s",
+    "velocity": "velocity",
+    "tilt": "roll and pitch",
+    "gyro bias": "gyro bias",
+    "accel bias": "accelerometer bias",
+    "vision": "NIS of vision's motions",
+}
+_WHERE = "room"  # whose images tell the covariances
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``consistency``."""
+    parser = subparsers.add_parser(
+        "consistency",
+        help="NEES and NIS over many runs",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--seeds", type=int, default=50, help="runs with drawn errors (default: 50)")
+    parser.add_argument("--rendered", type=int, default=3, help="runs of each rendered scene (default: 3)")
+    parser.add_argument("--duration", type=float, default=25.0, metavar="S", help="seconds of a run (default: 25)")
+    parser.add_argument("--jobs", type=int, default=2, help="runs side by side (default: 2)")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE.md", help="write the report to this file, a picture beside it"
+    )
+    parser.add_argument("--docs", action="store_true", help="write report and picture into docs/")
+    add_data_option(parser)
+    parser.set_defaults(run=main)
+
+
+def main(args: argparse.Namespace) -> None:
+    """Run the campaign and report."""
+    if args.seeds < 2 or args.rendered < 0 or args.jobs < 1 or args.duration < 12.0:
+        raise GraphvioError("--seeds wants 2 or more, --rendered 0, --jobs 1 and --duration 12 or more")
+    templates = templates_of(args.data, _WHERE)
+    drawn, rendered = Squares(), Squares()
+    with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
+        tasks = [pool.submit(model_run, seed, templates, args.duration) for seed in range(args.seeds)]
+        tasks += [
+            pool.submit(rendered_run, seed, scene, args.data, args.duration)
+            for scene in SCENES
+            for seed in range(args.rendered)
+        ]
+        for number, task in enumerate(tasks):
+            squares = drawn if number < args.seeds else rendered
+            for name, time_s, square, dimensions in task.result():
+                squares.add_square(name, number, time_s, square, dimensions)
+            tell(f"run {number + 1} of {len(tasks)}")
+    report = Report()
+    _write(report, args, drawn, rendered, templates)
+    if args.out is not None:
+        report.save(args.out)
+        draw_consistency(args.out.with_suffix(".png"), drawn, NAMES)
+    if args.docs:
+        report.save_to_docs("consistency", "![NEES over time](consistency.png)")
+        draw_consistency(DOCS / "consistency.png", drawn, NAMES)
+
+
+def _write(
+    report: Report, args: argparse.Namespace, drawn: Squares, rendered: Squares, templates: dict[int, Template]
+) -> None:
+    report.add(
+        machine(),
+        "",
+        f"`--seeds {args.seeds}`, `--rendered {args.rendered}`, `--duration {args.duration:g}`.",
+        "",
+        "Squared Mahalanobis distances: of an honest estimator the mean is the number of dimensions. The band is that "
+        "of the mean of all runs at one time; of the times, 95 % are expected in it.",
+    )
+    report.add(
+        "#### Errors drawn from the model",
+        f"{args.seeds} runs on the walks of {', '.join(SCENES)}. Vision's covariances are those that the front-end "
+        f"told for {len(templates)} motions in the rendered {_WHERE}; IMU, biases and the start's errors are drawn "
+        "from what the smoother is told of them (`smoother.imu_noise_scale` 1).",
+    )
+    report.table(HEAD, rows(drawn, NAMES))
+    if args.rendered:
+        report.add(
+            "#### Rendered images",
+            f"The whole odometry with its default configuration, {args.rendered} IMUs on each of {', '.join(SCENES)}. "
+            "The default counts the IMU's noise twofold, and does not know that biases are as small as these: less "
+            "than the number of dimensions is expected of velocity, tilt and biases.",
+        )
+        report.table(HEAD, rows(rendered, NAMES))

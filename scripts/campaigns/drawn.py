@@ -1,0 +1,97 @@
+"""Vision whose errors are drawn from the covariances that the front-end itself has told on images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from benchmarks.motions import overhear
+from benchmarks.recordings import simulated
+
+from graphvio.arrays import Float
+from graphvio.backend.noise import own_covariance
+from graphvio.events import FrameSet
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse
+from graphvio.odometry import Odometry
+from graphvio.sources import open_source
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """A motion that the front-end told: from which frameset to which, and how surely.
+
+    Attributes:
+        reference: number of the frameset that it is measured from.
+        covariance: (6, 6), tangent in the body frame at its end.
+        shared: (6, 6) the part of it that all motions from that frameset have in common.
+    """
+
+    reference: int
+    covariance: Float
+    shared: Float
+
+
+def templates_of(data: Path, scene: str) -> dict[int, Template]:
+    """Number of a frameset -> the motion that the front-end tells there, on a rendered scene."""
+    source = open_source(simulated(data, scene))
+    odometry = Odometry(source.rig.without_imu())
+    overheard = overhear(odometry)
+    for event in source:
+        if isinstance(event, FrameSet):
+            odometry.process(event)
+    odometry.finish()
+    number = {stamp_ns: k for k, stamp_ns in enumerate(sorted(overheard.results))}
+    motions = {stamp_ns: result.motion for stamp_ns, result in overheard.results.items()}
+    return {
+        number[stamp_ns]: Template(number[motion.reference_stamp_ns], motion.covariance, motion.shared_covariance)
+        for stamp_ns, motion in motions.items()
+        if motion is not None
+    }
+
+
+class DrawnVision:
+    """Motions with errors of their own and, for each reference, one that they share.
+
+    Args:
+        templates: number of a frameset -> its motion's covariances and reference.
+        nav_T_body: (N, 4, 4) true poses at the framesets.
+        stamps_ns: (N,) of these.
+        rng: source of the errors.
+    """
+
+    def __init__(
+        self, templates: dict[int, Template], nav_T_body: Float, stamps_ns: list[int], rng: np.random.Generator
+    ) -> None:
+        self._templates = templates
+        self._truth = nav_T_body
+        self._stamps_ns = stamps_ns
+        self._rng = rng
+        self._shared: dict[int, tuple[Float, Float]] = {}  # reference -> covariance there, and the error
+
+    def reference(self, number: int) -> int | None:
+        """Number of the frameset that the motion at a frameset is measured from, if there is one."""
+        return self._templates[number].reference if number in self._templates else None
+
+    def at(self, number: int) -> RelativeMotion | None:
+        """What vision says at a frameset."""
+        template = self._templates.get(number)
+        if template is None:
+            return None
+        start = template.reference
+        true = np.ascontiguousarray(np.linalg.inv(self._truth[start]) @ self._truth[number])
+        if start not in self._shared:
+            to_reference = se3_adjoint(true)
+            shared = to_reference @ template.shared @ to_reference.T
+            self._shared[start] = shared, self._drawn(shared)
+        shared, shared_error = self._shared[start]
+        to_current = se3_adjoint(se3_inverse(true))
+        own = own_covariance(template.covariance, to_current @ shared @ to_current.T)
+        measured = se3_exp(-shared_error) @ true @ se3_exp(self._drawn(own))
+        return RelativeMotion(
+            self._stamps_ns[start], self._stamps_ns[number], measured, template.covariance, template.shared, 300
+        )
+
+    def _drawn(self, covariance: Float) -> Float:
+        return np.linalg.cholesky(covariance) @ self._rng.standard_normal(6)

@@ -1,0 +1,76 @@
+"""NEES and NIS of many runs: their means, and the bands that an honest estimator keeps."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphvio.arrays import Float
+
+CONFIDENCE = 0.95
+
+
+class Squares:
+    """Squared Mahalanobis distances by what they are of, run and time."""
+
+    def __init__(self) -> None:
+        self._of: dict[str, dict[int, dict[float, float]]] = defaultdict(lambda: defaultdict(dict))
+        self.dimensions: dict[str, int] = {}
+
+    def add(self, name: str, run: int, time_s: float, error: Float, covariance: Float) -> None:
+        """An error (M,) and the covariance (M, M) that was told."""
+        self.add_square(name, run, time_s, float(error @ np.linalg.solve(covariance, error)), len(error))
+
+    def add_square(self, name: str, run: int, time_s: float, square: float, dimensions: int) -> None:
+        """A squared distance and its number of dimensions."""
+        self.dimensions[name] = dimensions
+        self._of[name][run][round(time_s, 3)] = square
+
+    def over_time(self, name: str) -> tuple[Float, Float]:
+        """Times (T,) that all runs have, and mean squares (T,) of the runs there."""
+        runs = list(self._of[name].values())
+        times = sorted(frozenset.intersection(*(frozenset(run) for run in runs)))
+        return np.array(times), np.array([np.mean([run[t] for run in runs]) for t in times])
+
+    def mean(self, name: str) -> float:
+        """Of all runs and times."""
+        return float(np.mean([square for run in self._of[name].values() for square in run.values()]))
+
+    def runs(self, name: str) -> int:
+        """How many there are."""
+        return len(self._of[name])
+
+    def band(self, name: str) -> tuple[float, float]:
+        """In which the mean over the runs lies at one time, of an honest estimator, with a probability of 95 %."""
+        return band(self.dimensions[name], self.runs(name))
+
+    def share_in_band(self, name: str) -> float:
+        """Of the times."""
+        low, high = self.band(name)
+        _, means = self.over_time(name)
+        return float(np.mean((means >= low) & (means <= high)))
+
+
+def band(dimensions: int, runs: int) -> tuple[float, float]:
+    """The 95 % band of the mean of so many independent chi-square variables."""
+    tail = 0.5 * (1.0 - CONFIDENCE)
+    low, high = chi2.ppf([tail, 1.0 - tail], dimensions * runs) / runs
+    return float(low), float(high)
+
+
+def rows(squares: Squares, names: Mapping[str, str]) -> list[list[str]]:
+    """Rows of a table: what, dimensions, mean, band, share of the times in it."""
+    made = []
+    for name, words in names.items():
+        low, high = squares.band(name)
+        made.append([
+            words, str(squares.dimensions[name]), f"{squares.mean(name):.2f}", f"{low:.2f} to {high:.2f}",
+            f"{100 * squares.share_in_band(name):.0f} %",
+        ])  # fmt: skip
+    return made
+
+
+HEAD = ("what", "dimensions", "mean", f"{100 * CONFIDENCE:.0f} % band", "times in band")

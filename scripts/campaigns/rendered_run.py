@@ -1,0 +1,113 @@
+"""One run of the whole odometry on rendered images, with an IMU that is drawn anew."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from benchmarks.recordings import simulated
+
+from campaigns.model_run import Square, tilt_error
+from graphvio.arrays import Float
+from graphvio.config import Config, SmootherConfig
+from graphvio.events import Estimate, Event, ImuSample
+from graphvio.geometry import se3_inverse, se3_log
+from graphvio.odometry import Odometry
+from graphvio.simulation import build_scene
+from graphvio.simulation.imu import ImuTrack, measure
+from graphvio.simulation.motion import MotionStates
+from graphvio.smoother_belief import SmootherBelief
+from graphvio.sources import open_source
+
+_SETTLED_S = 2.0
+_WINDOW_S = {1: 1.0, 10: 10.0}  # lag that still has the state from which the motion is told
+
+
+def rendered_run(seed: int, scene: str, data: Path, duration_s: float) -> list[Square]:
+    """One run, and its squares at each second."""
+    source = open_source(simulated(data, scene), to_s=duration_s)
+    assert source.rig.imu is not None
+    motion = build_scene(scene).motion
+    stamps = np.array([e.stamp_ns for e in source if isinstance(e, ImuSample)], dtype=np.int64)
+    times = np.clip((stamps - source.start_ns) * 1e-9, 0.0, motion.duration_s)
+    track = measure(motion, source.rig.imu, times, stamps, 1000 + seed)
+    events = [_redrawn(event, track) for event in source]
+    squares: list[Square] = []
+    for seconds, lag_s in _WINDOW_S.items():
+        config = Config(smoother=replace(SmootherConfig(), lag_s=lag_s))
+        squares += _Run(source.start_ns, Odometry(source.rig, config), track, motion.at(times)).squares(events, seconds)
+    return squares
+
+
+def _redrawn(event: Event, track: ImuTrack) -> Event:
+    if not isinstance(event, ImuSample):
+        return event
+    i = int(np.searchsorted(track.stamps_ns, event.stamp_ns))
+    return ImuSample(event.stamp_ns, track.angular_velocity[i], track.linear_acceleration[i])
+
+
+class _Run:
+    def __init__(self, start_ns: int, odometry: Odometry, track: ImuTrack, states: MotionStates) -> None:
+        self._start_ns, self._odometry, self._track, self._states = start_ns, odometry, track, states
+
+    def squares(self, events: list[Event], seconds: int) -> Iterator[Square]:
+        """Those of the motion over so many seconds; with one second, those of the states, too."""
+        for event in events:
+            estimate = self._odometry.process(event)
+            if estimate is None:
+                continue
+            time_s = (estimate.stamp_ns - self._start_ns) * 1e-9
+            if seconds == 1 and time_s > _SETTLED_S and "vision" in estimate.innovations:
+                yield "vision", time_s, estimate.innovations["vision"].statistic, 6
+            if abs(time_s - round(time_s)) > 1e-3 or time_s < _SETTLED_S:
+                continue
+            if seconds == 1:
+                yield from self._state_squares(estimate, time_s)
+            if round(time_s) % seconds == 0 and time_s - seconds >= _SETTLED_S:
+                yield from self._motion_square(estimate, time_s, seconds)
+
+    def _state_squares(self, estimate: Estimate, time_s: float) -> Iterator[Square]:
+        k = self._sample(estimate.stamp_ns)
+        if estimate.nav_T_body is None or estimate.velocity_nav is None or estimate.covariance is None:
+            return
+        # The heading and the place of nav are those of the first frameset.
+        nav_T_world = self._nav_T_world(estimate.nav_T_body, k)
+        known = self._odometry._belief.covariance
+        assert known.velocity is not None
+        assert known.gyro_bias is not None
+        assert known.accel_bias is not None
+        assert estimate.gyro_bias is not None
+        assert estimate.accel_bias is not None
+        true_velocity = nav_T_world[:3, :3] @ self._states.velocity[k]
+        for name, error, covariance in (
+            ("velocity", true_velocity - estimate.velocity_nav, known.velocity),
+            ("tilt", *tilt_error(estimate.nav_T_body, nav_T_world @ self._states.world_T_body[k], estimate.covariance)),
+            ("gyro bias", self._track.gyro_bias[k] - estimate.gyro_bias, known.gyro_bias),
+            ("accel bias", self._track.accel_bias[k] - estimate.accel_bias, known.accel_bias),
+        ):
+            yield name, time_s, float(error @ np.linalg.solve(covariance, error)), len(error)
+
+    def _motion_square(self, estimate: Estimate, time_s: float, seconds: int) -> Iterator[Square]:
+        belief = self._odometry._belief
+        assert isinstance(belief, SmootherBelief)
+        then_ns = estimate.stamp_ns - seconds * 1_000_000_000
+        now_T_then = belief.motion_since(then_ns)
+        if now_T_then is None:
+            return
+        start, end = (self._states.world_T_body[self._sample(ns)] for ns in (then_ns, estimate.stamp_ns))
+        error = se3_log(np.ascontiguousarray(now_T_then @ np.linalg.inv(start) @ end))
+        covariance = belief._running.covariance_since(then_ns)
+        yield f"pose over {seconds} s", time_s, float(error @ np.linalg.solve(covariance, error)), 6
+
+    def _sample(self, stamp_ns: int) -> int:
+        return int(np.searchsorted(self._track.stamps_ns, stamp_ns))
+
+    def _nav_T_world(self, nav_T_body: Float, k: int) -> Float:
+        """Nav against the simulator's world: upright, and turned so that the headings are the same."""
+        about = nav_T_body @ se3_inverse(np.ascontiguousarray(self._states.world_T_body[k]))
+        heading = np.arctan2(about[1, 0] - about[0, 1], about[0, 0] + about[1, 1])
+        turned = np.eye(4)
+        turned[:2, :2] = [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
+        return turned

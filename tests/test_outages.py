@@ -1,0 +1,288 @@
+"""Blackouts and faults of the data on a rendered walk: what is promised in them, and how it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from graphvio import Config, Estimate, FrameSet, ImuSample, Odometry, Status, open_source
+from graphvio.arrays import Float
+from graphvio.events import Event
+from graphvio.geometry import se3_inverse, se3_log
+from graphvio.simulation import simulate
+from graphvio.trajectory import Trajectory
+
+pytestmark = pytest.mark.xdist_group("outages")
+START_S = 3.0  # of what goes wrong
+PERIOD_S = 0.05
+DURATION_S = 10.0
+MS = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def walk_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("simulated") / "room"
+    simulate("room", out, duration_s=DURATION_S)
+    return out
+
+
+@pytest.fixture(scope="module")
+def events(walk_folder: Path) -> list[Event]:
+    return list(open_source(walk_folder))
+
+
+@dataclass
+class Outcome:
+    """One run.
+
+    Attributes:
+        estimates: of all framesets that were given.
+        given: number of framesets.
+        kinds: of incidents.
+        truth: (4, 4) by stamp.
+        start_ns: of the recording.
+    """
+
+    estimates: list[Estimate]
+    given: int
+    kinds: list[str]
+    truth: dict[int, Float]
+    start_ns: int
+
+    def at(self, time_s: float) -> Estimate:
+        return min(self.estimates, key=lambda e: abs(e.stamp_ns - self.start_ns - time_s * 1e9))
+
+    def between(self, start_s: float, end_s: float) -> list[Estimate]:
+        return [e for e in self.estimates if start_s - 1e-3 <= (e.stamp_ns - self.start_ns) * 1e-9 < end_s - 1e-3]
+
+    @property
+    def completion(self) -> float:
+        return sum(e.nav_T_body is not None for e in self.estimates) / self.given
+
+    def recovery_s(self, end_s: float) -> float:
+        """From the end of what went wrong until vision is used again."""
+        after = [e for e in self.estimates if (e.stamp_ns - self.start_ns) * 1e-9 >= end_s - 1e-3]
+        return next((e.stamp_ns - self.start_ns) * 1e-9 - end_s for e in after if e.status is Status.TRACKING)
+
+    def largest_jump_m(self) -> float:
+        """The most by which a step of one epoch is off the true one."""
+        jumps = []
+        for before, after in zip(self.estimates, self.estimates[1:], strict=False):
+            if before.epoch == after.epoch and before.nav_T_body is not None and after.nav_T_body is not None:
+                step = se3_inverse(before.nav_T_body) @ after.nav_T_body
+                true = np.linalg.inv(self.truth[before.stamp_ns]) @ self.truth[after.stamp_ns]
+                jumps.append(np.linalg.norm(se3_log(np.ascontiguousarray(np.linalg.inv(true) @ step))[3:]))
+        return float(max(jumps))
+
+    def error_m(self, start_s: float, end_s: float) -> float:
+        """Of the motion between two times of one epoch."""
+        start, end = self.at(start_s), self.at(end_s)
+        assert start.nav_T_body is not None
+        assert end.nav_T_body is not None
+        assert start.epoch == end.epoch
+        motion = se3_inverse(start.nav_T_body) @ end.nav_T_body
+        true = np.linalg.inv(self.truth[start.stamp_ns]) @ self.truth[end.stamp_ns]
+        return float(np.linalg.norm(se3_log(np.ascontiguousarray(np.linalg.inv(true) @ motion))[3:]))
+
+
+def outcome(folder: Path, events: list[Event], config: Config | None = None) -> Outcome:
+    source = open_source(folder)
+    odometry = Odometry(source.rig, config)
+    estimates = [estimate for event in events if (estimate := odometry.process(event)) is not None]
+    estimates += odometry.finish()
+    stamps = [e.stamp_ns for e in estimates]
+    assert stamps == sorted(set(stamps))  # time never goes back
+    assert source.truth is not None
+    truth = Trajectory.read(source.truth)
+    poses = dict(zip(truth.stamps_ns.tolist(), truth.nav_T_body, strict=True))
+    given = sum(isinstance(event, FrameSet) for event in events)
+    return Outcome(estimates, given, [i.kind for i in odometry.take_incidents()], poses, source.start_ns)
+
+
+def altered(
+    events: list[Event],
+    start_s: float,
+    end_s: float,
+    frameset: Callable[[FrameSet], FrameSet | None] | None = None,
+    sample: Callable[[ImuSample], ImuSample | None] | None = None,
+) -> list[Event]:
+    """The events, those between two times as given functions make them; None leaves one out."""
+    start_ns = next(e.stamp_ns for e in events if isinstance(e, FrameSet))
+    made: list[Event] = []
+    for event in events:
+        inside = start_s - 1e-3 <= (event.stamp_ns - start_ns) * 1e-9 < end_s - 1e-3
+        changed: Event | None = event
+        if inside and isinstance(event, FrameSet) and frameset is not None:
+            changed = frameset(event)
+        elif inside and isinstance(event, ImuSample) and sample is not None:
+            changed = sample(event)
+        if changed is not None:
+            made.append(changed)
+    return made
+
+
+def blackened(frameset: FrameSet) -> FrameSet:
+    black = np.zeros((480, 640), dtype=np.uint8)
+    return replace(frameset, images=dict.fromkeys(frameset.images, (black, black)))
+
+
+# ------------------------------------------------------------------ blackouts
+
+
+@pytest.mark.parametrize(("dark_s", "most_jump_m"), [(0.3, 0.01), (1.0, 0.03), (3.0, 0.15), (5.0, 0.4)])
+def test_a_blackout_is_coasted_through(
+    walk_folder: Path, events: list[Event], dark_s: float, most_jump_m: float
+) -> None:
+    end_s = START_S + dark_s
+    done = outcome(walk_folder, altered(events, START_S, end_s, blackened))
+    assert done.completion == 1.0
+    dark = done.between(START_S, end_s)
+    assert len(dark) == round(dark_s / PERIOD_S)
+    assert {e.status for e in dark} == {Status.COASTING}
+    sigmas = [float(np.trace(e.covariance[3:, 3:])) for e in dark if e.covariance is not None]
+    assert (np.diff(sigmas) > 0.0).all()
+    # No freeze: the path through the dark is that of the IMU, off by no more than it tells.
+    coasted, sigma = done.error_m(START_S - PERIOD_S, end_s - PERIOD_S), np.sqrt(sigmas[-1])
+    assert coasted < 3.0 * sigma
+    assert done.recovery_s(end_s) <= 0.15
+    assert done.largest_jump_m() < min(most_jump_m, 3.0 * sigma)
+    assert not {"lost", "new_epoch", "gate_reset", "window_rebuilt"} & set(done.kinds)
+
+
+def test_beyond_what_is_useful_a_new_epoch_begins(walk_folder: Path, events: list[Event]) -> None:
+    """Lost is told, nothing is claimed meanwhile, and the next epoch has a number and the best guess with its doubt."""
+    config = Config.from_yaml("smoother: {lost_position_sigma_m: 0.05}")
+    done = outcome(walk_folder, altered(events, START_S, START_S + 3.0, blackened), config)
+    lost = [e for e in done.estimates if e.status is Status.LOST]
+    assert lost
+    assert all(e.nav_T_body is None and e.covariance is None and e.velocity_nav is None for e in lost)
+    before, after = done.at(lost[0].stamp_ns * 1e-9 - done.start_ns * 1e-9 - PERIOD_S), done.at(8.0)
+    assert (before.epoch, after.epoch) == (0, 1)
+    first = next(e for e in done.estimates if e.epoch == 1)
+    assert first.status in (Status.TRACKING, Status.INITIALISING)
+    assert first.covariance is not None
+    assert np.sqrt(np.trace(first.covariance[3:, 3:])) > 0.05
+    assert [done.kinds.count(kind) for kind in ("lost", "new_epoch")] == [1, 1]
+    assert done.error_m(7.0, 9.0) < 0.03
+
+
+# ------------------------------------------------------------------ the IMU's data
+
+
+def left_out(_: ImuSample) -> None:
+    return None
+
+
+@pytest.mark.parametrize("gap_s", [0.2, 2.0])
+def test_a_gap_of_the_imu_is_bridged_by_vision(walk_folder: Path, events: list[Event], gap_s: float) -> None:
+    done = outcome(walk_folder, altered(events, START_S, START_S + gap_s, sample=left_out))
+    assert done.completion == 1.0
+    assert {e.status for e in done.between(1.0, 10.0)} == {Status.TRACKING}
+    assert done.largest_jump_m() < 0.01
+    assert done.error_m(2.0, 9.0) < 0.03
+    assert "imu_not_covering" in done.kinds
+
+
+def test_duplicates_and_backward_stamps_change_nothing(walk_folder: Path, events: list[Event]) -> None:
+    muddled: list[Event] = []
+    for event in events:
+        muddled.append(event)
+        if isinstance(event, ImuSample):
+            muddled += [event, replace(event, stamp_ns=event.stamp_ns - 20 * MS)]
+        else:
+            muddled += [event, replace(event, stamp_ns=event.stamp_ns - 200 * MS)]
+    clean, done = outcome(walk_folder, events), outcome(walk_folder, muddled)
+    assert len(done.estimates) == clean.given
+    for one, other in zip(clean.estimates, done.estimates, strict=True):
+        np.testing.assert_array_equal(one.nav_T_body, other.nav_T_body)
+    assert {"imu_duplicate_stamp", "imu_backward_stamp", "frameset_duplicate_stamp", "frameset_backward_stamp"} <= set(
+        done.kinds
+    )
+
+
+def test_nan_costs_only_its_samples(walk_folder: Path, events: list[Event]) -> None:
+    numbers = iter(range(100_000))
+
+    def spoiled(sample: ImuSample) -> ImuSample:
+        bad = np.array([np.nan, 0.0, 0.0])
+        return replace(sample, linear_acceleration=bad) if next(numbers) % 4 == 0 else sample
+
+    done = outcome(walk_folder, altered(events, START_S, 6.0, sample=spoiled))
+    assert done.completion == 1.0
+    assert {e.status for e in done.between(1.0, 10.0)} == {Status.TRACKING}
+    assert done.error_m(2.0, 9.0) < 0.03
+    assert done.kinds.count("imu_not_finite") == 150
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_an_axis_that_sticks_is_left_to_vision(walk_folder: Path, events: list[Event], axis: int) -> None:
+    def stuck(sample: ImuSample) -> ImuSample:
+        rate, force = sample.angular_velocity.copy(), sample.linear_acceleration.copy()
+        rate[axis], force[axis] = 0.1, 0.5
+        return ImuSample(sample.stamp_ns, rate, force)
+
+    done = outcome(walk_folder, altered(events, START_S, START_S + 2.0, sample=stuck))
+    assert done.completion == 1.0
+    assert done.kinds.count("imu_stuck") > 300
+    assert {e.status for e in done.between(START_S + 0.5, 10.0)} == {Status.TRACKING}
+    assert done.error_m(2.0, 9.0) < 0.05
+
+
+def test_a_gyro_at_the_end_of_its_range(walk_folder: Path, events: list[Event]) -> None:
+    """Cut off at less than the walk's turns: vision is not refused for long, and the path stays right."""
+
+    def cut(sample: ImuSample) -> ImuSample:
+        return replace(sample, angular_velocity=np.clip(sample.angular_velocity, -0.15, 0.15))
+
+    done = outcome(walk_folder, altered(events, START_S, 6.0, sample=cut))
+    assert done.completion == 1.0
+    assert sum(e.status is not Status.TRACKING for e in done.between(1.0, 10.0)) < 30
+    assert done.error_m(6.5, 9.5) < 0.03
+    assert done.largest_jump_m() < 0.1
+
+
+@pytest.mark.parametrize("jump_s", [7.0, 10_000.0])
+def test_a_jump_of_the_clock_opens_an_epoch(walk_folder: Path, events: list[Event], jump_s: float) -> None:
+    jump_ns = round(jump_s * 1e9)
+    jumped = altered(
+        events, START_S, 1e9,
+        lambda frameset: replace(frameset, stamp_ns=frameset.stamp_ns + jump_ns),
+        lambda sample: replace(sample, stamp_ns=sample.stamp_ns + jump_ns),
+    )  # fmt: skip
+    done = outcome(walk_folder, jumped)
+    assert len(done.estimates) == done.given
+    assert done.kinds.count("time_jump") == 1
+    assert [e.epoch for e in (done.estimates[0], done.estimates[-1])] == [0, 1]
+    assert done.estimates[-1].status is Status.TRACKING
+    start, end = (e for e in (done.at(jump_s + 5.0), done.at(jump_s + 9.0)))
+    assert start.nav_T_body is not None
+    assert end.nav_T_body is not None
+    motion = se3_inverse(start.nav_T_body) @ end.nav_T_body
+    true = np.linalg.inv(done.truth[start.stamp_ns - jump_ns]) @ done.truth[end.stamp_ns - jump_ns]
+    assert np.linalg.norm(se3_log(np.ascontiguousarray(np.linalg.inv(true) @ motion))[3:]) < 0.03
+
+
+# ------------------------------------------------------------------ vision's data
+
+
+def test_vision_that_comes_late_is_used_at_its_time(walk_folder: Path, events: list[Event]) -> None:
+    """Framesets that arrive 200 ms after the IMU of their instant give the same poses as those in time."""
+    late = sorted(events, key=lambda e: e.stamp_ns + (200 * MS if isinstance(e, FrameSet) else 0))
+    clean, done = outcome(walk_folder, events), outcome(walk_folder, late)
+    assert len(done.estimates) == clean.given
+    for one, other in zip(clean.estimates, done.estimates, strict=True):
+        assert one.nav_T_body is not None
+        assert other.nav_T_body is not None
+        np.testing.assert_allclose(one.nav_T_body, other.nav_T_body, atol=1e-9)
+
+
+def test_half_of_the_framesets_are_enough(walk_folder: Path, events: list[Event]) -> None:
+    rng = np.random.default_rng(0)
+    done = outcome(walk_folder, altered(events, 0.5, 1e9, lambda f: f if rng.random() < 0.5 else None))
+    assert done.completion == 1.0
+    assert {e.status for e in done.between(1.0, 10.0)} == {Status.TRACKING}
+    assert done.error_m(2.0, 9.0) < 0.03
