@@ -30,7 +30,7 @@ class Belief(ABC):
     Attributes:
         epoch: counts declared breaks.
         covariance: of the newest state.
-        verdicts: of the tests since the last prediction, by measurement: ``vision``, ``rest``, ``gyro``, ``gravity``.
+        verdicts: of the tests since the last prediction, by what was measured, see `graphvio.events.Estimate`.
     """
 
     def __init__(self, rig: Rig, config: Config, report: Report, rekey: Callable[[], None]) -> None:

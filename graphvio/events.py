@@ -155,7 +155,7 @@ class Estimate:
         gyro_bias_covariance: (3, 3), or None where the bias is not estimated.
         accel_bias_covariance: (3, 3), or None where the bias is not estimated.
         innovations: what was measured against what was expected, with the test's outcome: ``vision``, and ``rest``
-            where the rig stood still; with the paper's filter ``vision``, ``gyro`` and ``gravity``.
+            where the rig stood still; with the paper's filter ``vision``, ``gyro`` and ``accelerometer``.
         rates: angular rate of body (3,) rad/s by ``gyro``, ``vision`` and ``fused``, as far as known.
         vision: how far the motion that vision measured can be trusted.
         vision_reason: why that is not ``good``, or empty.

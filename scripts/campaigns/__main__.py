@@ -5,10 +5,10 @@ import sys
 
 from benchmarks.__main__ import EXIT_BAD_INPUT, EXIT_INTERRUPTED
 
-from campaigns import consistency
+from campaigns import consistency, lags
 from graphvio.errors import GraphvioError
 
-SUBCOMMANDS = (consistency,)
+SUBCOMMANDS = (consistency, lags)
 
 
 def main() -> int:

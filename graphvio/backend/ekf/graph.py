@@ -49,6 +49,11 @@ class PaperGraph:
         """The newest state."""
         return _state(self._values, _keys(self._newest))
 
+    @property
+    def oldest(self) -> FilterState:
+        """The oldest state of the window, which `lag` - 1 later updates have improved."""
+        return _state(self._values, _keys(self._oldest))
+
     def predict(self, dt: float, sigmas: Float) -> None:
         """Append a state a time step later, seconds, with a process noise of standard deviations (9,)."""
         before, after = _keys(self._newest), _keys(self._newest + 1)
