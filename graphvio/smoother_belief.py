@@ -30,6 +30,8 @@ class SmootherBelief(Belief):
         self._smoother: Smoother | None = None
         self._reset_ns = 0
         self._refused: dict[int, Float] = {}  # stamp -> nav_T_body by the motions that the gate refused
+        self._imu_failed = False  # since the first of these
+        self._tracked_covariance = np.zeros((6, 6))  # of the last pose that vision constrains
 
     # ------------------------------------------------------------------ what is known
 
@@ -84,6 +86,7 @@ class SmootherBelief(Belief):
         if span is None and stamp_ns - self.latest_ns > MAX_UNBRIDGED_S * 1e9:
             self._jump(stamp_ns)
         else:
+            self._imu_failed |= self.has_imu and span is None and bool(self._refused)
             self._running.extend(stamp_ns, span)
 
     def use(self, visual: VisualResult, at_rest: bool) -> RelativeMotion | None:
@@ -123,8 +126,14 @@ class SmootherBelief(Belief):
         self.verdicts["vision"] = verdict
         excess = smoother.excess_acceleration(motion)
         if verdict.accepted and excess is None:
+            if self._imu_failed and motion.reference_stamp_ns in self._refused:
+                # It agrees with the prediction only because both start from a state that vision was not heard on.
+                self._refused[motion.stamp_ns] = self._refused[motion.reference_stamp_ns] @ motion.reference_T_current
+                self._believe_vision(motion, "the IMU failed while vision was refused")
+                return motion
             smoother.accept(motion)
             self._refused.clear()
+            self._imu_failed = False
             self._lost = False
             return motion
         why = _beyond(verdict) if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
@@ -135,7 +144,7 @@ class SmootherBelief(Belief):
         nav_T_reference = self._refused[reference_ns] if reference_ns in self._refused else smoother.pose(reference_ns)
         self._refused[motion.stamp_ns] = nav_T_reference @ motion.reference_T_current
         if motion.stamp_ns - min(self._refused) > self._config.smoother.max_gated_s * 1e9:
-            self._believe_vision(motion)
+            self._believe_vision(motion, "refused for too long")
             return motion
         return None
 
@@ -150,6 +159,8 @@ class SmootherBelief(Belief):
             self._reset_position(stamp_ns)
             self.covariance = smoother.state_covariance()
             since = smoother.covariance_since(self._tracked_ns)
+            if used:
+                self._tracked_covariance = self.covariance.pose
         except WindowError as error:
             self._report(stamp_ns, "window_rebuilt", str(error))
             self._start_again(after_failure(stamp_ns, predicted, self.covariance.pose), stamp_ns - 1)
@@ -195,20 +206,21 @@ class SmootherBelief(Belief):
         self.epoch += 1
         self._report(motion.stamp_ns, "new_epoch", f"vision is back: epoch {self.epoch} starts at the best guess")
 
-    def _believe_vision(self, motion: RelativeMotion) -> None:
-        """Refused motions that go on agreeing with each other put the prediction in the wrong.
+    def _believe_vision(self, motion: RelativeMotion, why: str) -> None:
+        """Motions that were refused and go on agreeing with each other put the prediction in the wrong.
 
-        Their chain, which begins at a state that was accepted, is the pose from here on; by as much as it differs from
-        the prediction it is uncertain.
+        Their chain, which begins at a state that was accepted, is the pose from here on; unless the IMU is known to
+        have failed, it is uncertain by as much as it differs from the prediction.
         """
         smoother, nav_T_body = self._running, self._refused[motion.stamp_ns]
         predicted = smoother.state()
-        self._start_again(by_vision(motion, nav_T_body, predicted, smoother.covariance()), self._tracked_ns)
+        start = by_vision(motion, nav_T_body, predicted, self._tracked_covariance, self._imu_failed)
+        self._start_again(start, self._tracked_ns)
         apart_m = np.linalg.norm(se3_log(se3_inverse(nav_T_body) @ predicted.nav_T_body)[3:])
         self._report(
             motion.stamp_ns,
             "gate_reset",
-            f"refused for too long, vision is believed now, {apart_m:.3f} m from the prediction",
+            f"{why}: vision is believed now, {apart_m:.3f} m from the prediction",
         )
 
     def _start_again(self, start: Start, last_final_ns: int) -> None:
@@ -223,6 +235,7 @@ class SmootherBelief(Belief):
         self._settled_ns = max(self._settled_ns, start.settled_ns)
         self._tracked_ns = start.stamp_ns
         self._refused.clear()
+        self._imu_failed = False
         self._lost = False
 
 

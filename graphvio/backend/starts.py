@@ -84,7 +84,7 @@ def after_failure(stamp_ns: int, state: RigState, pose_covariance: Float) -> Sta
 
 def after_gap(stamp_ns: int, state: RigState, pose_covariance: Float) -> Start:
     """A start at the last state, after a gap that nothing bridges. For arguments see `after_failure`."""
-    return _restart(stamp_ns, state, pose_covariance + AFTER_JUMP)
+    return _restart(stamp_ns, state, _uncorrelated(pose_covariance) + AFTER_JUMP)
 
 
 def after_lost(motion: RelativeMotion, state: RigState, pose_covariance: Float) -> Start:
@@ -95,23 +95,41 @@ def after_lost(motion: RelativeMotion, state: RigState, pose_covariance: Float) 
         state: the prediction.
         pose_covariance: (6, 6) of it, tangent in body.
     """
-    return _restart(motion.stamp_ns, _with_velocity(state, motion), pose_covariance)
+    return _restart(motion.stamp_ns, _with_velocity(state, motion), _uncorrelated(pose_covariance))
 
 
-def by_vision(motion: RelativeMotion, nav_T_body: Float, state: RigState, pose_covariance: Float) -> Start:
-    """A start at the pose (4, 4) that vision has, as uncertain as it differs from the prediction.
+def by_vision(
+    motion: RelativeMotion, nav_T_body: Float, state: RigState, pose_covariance: Float, prediction_failed: bool
+) -> Start:
+    """A start at the pose (4, 4) that vision has.
 
-    For the other arguments see `after_lost`.
+    Args:
+        motion: the last one of a chain, it ends in the pose.
+        nav_T_body: the pose.
+        state: the prediction.
+        pose_covariance: (6, 6) of the pose that the chain begins at, tangent in body; the chain is better known.
+        prediction_failed: whether that is known; else vision may be wrong, too, and the pose is as uncertain as it
+            differs from the prediction.
     """
-    apart = se3_log(se3_inverse(nav_T_body) @ state.nav_T_body)
+    apart = np.zeros(6) if prediction_failed else se3_log(se3_inverse(nav_T_body) @ state.nav_T_body)
     state = _with_velocity(replace(state, nav_T_body=nav_T_body), motion)
-    return _restart(motion.stamp_ns, state, pose_covariance + np.diag(apart**2), _WIDE_GYRO_BIAS_SIGMA)
+    covariance = _uncorrelated(pose_covariance) + motion.covariance + np.diag(apart**2)
+    gyro_bias_sigma = _GYRO_BIAS_SIGMA if prediction_failed else _WIDE_GYRO_BIAS_SIGMA
+    return _restart(motion.stamp_ns, state, covariance, gyro_bias_sigma)
 
 
 def _restart(
     stamp_ns: int, state: RigState, pose_covariance: Float, gyro_bias_sigma: float = _GYRO_BIAS_SIGMA
 ) -> Start:
     return Start(stamp_ns, state, StartUncertainty(pose_covariance, _RESTART_SPEED_SIGMA, gyro_bias_sigma))
+
+
+def _uncorrelated(pose_covariance: Float) -> Float:
+    """A pose's covariance (6, 6) without what links place and attitude: that holds for the prediction's errors, and a
+    start's place must not move when its attitude becomes known better."""
+    covariance = pose_covariance.copy()
+    covariance[:3, 3:] = covariance[3:, :3] = 0.0
+    return covariance
 
 
 def _with_velocity(state: RigState, motion: RelativeMotion) -> RigState:

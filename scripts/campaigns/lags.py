@@ -1,0 +1,96 @@
+"""``scripts/campaign lags``: what a longer lag and more iterations gain over the paper's filter.
+
+The filter's model as a factor graph, with a lag of one step and one iteration, is the filter. Here both grow, on walks
+of the simulator with drawn errors of vision and IMU, which is blind for a second in every five; and the smoother that
+the odometry runs is held against them, on the same measurements.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import defaultdict
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from benchmarks.report import Report, machine, tell
+
+from campaigns.paper_run import PaperRun, Track
+from graphvio.arrays import Float
+from graphvio.errors import GraphvioError
+
+LAGS = ((1, 1), (1, 3), (5, 1), (5, 3), (20, 1), (20, 3))
+_HEAD = ("estimator", "lag, steps", "iterations", "position, cm", "velocity, cm/s", "roll, pitch, deg", "heading, deg",
+         "leaving: position, cm", "leaving: velocity, cm/s")  # fmt: skip
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add ``lags``."""
+    parser = subparsers.add_parser(
+        "lags",
+        help="the paper's filter against windows of its model",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--seeds", type=int, default=50, help="runs (default: 50)")
+    parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds of a run (default: 20)")
+    parser.add_argument("--jobs", type=int, default=2, help="runs side by side (default: 2)")
+    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
+    parser.add_argument("--docs", action="store_true", help="write the report into docs/benchmarks.md")
+    parser.set_defaults(run=main)
+
+
+def main(args: argparse.Namespace) -> None:
+    """Run the campaign and report."""
+    if args.seeds < 1 or args.jobs < 1 or args.duration < 6.0:
+        raise GraphvioError("--seeds and --jobs want 1 or more, --duration 6 or more")
+    tracks: dict[str, list[dict[str, Track]]] = defaultdict(list)
+    with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
+        for seed, result in enumerate(pool.map(one_run, range(args.seeds), [args.duration] * args.seeds)):
+            for name, track in result.items():
+                tracks[name].append(track)
+            tell(f"run {seed + 1} of {args.seeds}")
+    report = Report()
+    report.add(
+        machine(),
+        "",
+        f"`--seeds {args.seeds}`, `--duration {args.duration:g}`. Root mean square errors against the truth, the start "
+        "being known: of the newest state when it is told, and of a state as it leaves the window.",
+    )
+    rows = [_row("filter", "1", "1", tracks["filter"])]
+    rows += [_row("its graph", str(lag), str(n), tracks[f"{lag}, {n}"]) for lag, n in LAGS]
+    rows.append(_row("the odometry's smoother", "20", "to convergence", tracks["smoother"]))
+    report.table(_HEAD, rows)
+    if args.out is not None:
+        report.save(args.out)
+    if args.docs:
+        report.save_to_docs("lags")
+
+
+def one_run(seed: int, duration_s: float) -> dict[str, dict[str, Track]]:
+    """All estimators on the same measurements: name -> ``newest`` and ``leaving``."""
+    run = PaperRun(seed, duration_s)
+    made = {"filter": run.by_filter(), "smoother": run.by_smoother()}
+    return made | {f"{lag}, {iterations}": run.by_graph(lag, iterations) for lag, iterations in LAGS}
+
+
+def _row(name: str, lag: str, iterations: str, runs: list[dict[str, Track]]) -> list[str]:
+    newest, leaving = ([run[which] for run in runs] for which in ("newest", "leaving"))
+    return [
+        name,
+        lag,
+        iterations,
+        _rms([100.0 * track.position_m for track in newest]),
+        _rms([100.0 * track.velocity_m_s for track in newest]),
+        _rms([np.rad2deg(track.tilt_rad) for track in newest]),
+        _rms([np.rad2deg(track.heading_rad) for track in newest]),
+        _rms([100.0 * track.position_m for track in leaving]),
+        _rms([100.0 * track.velocity_m_s for track in leaving]),
+    ]
+
+
+def _rms(errors: list[Float]) -> str:
+    """Root mean square over all runs of the lengths of errors (N, M) or (N,), or nothing where they are not known."""
+    mean = float(np.mean([np.mean(np.sum(np.atleast_2d(each.T) ** 2, axis=0)) for each in errors]))
+    return "" if np.isnan(mean) else f"{np.sqrt(mean):.2f}"

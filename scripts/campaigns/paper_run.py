@@ -1,0 +1,170 @@
+"""One walk, measured as the paper's filter measures it, and estimated by filter, windows of its model, and smoother."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.ekf.filter import ExtendedKalmanFilter
+from graphvio.backend.ekf.graph import PaperGraph
+from graphvio.backend.ekf.measurements import Measurement, VisualRates, accelerometer, gyro, stacked, vision
+from graphvio.backend.ekf.process import noise_sigmas
+from graphvio.backend.ekf.state import FilterState
+from graphvio.backend.inertial import ImuBuffer, ImuSpan
+from graphvio.backend.smoother import Smoother
+from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
+from graphvio.config import FilterConfig, SmootherConfig
+from graphvio.events import ImuSample
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.geometry import se3_exp, se3_log
+from graphvio.rig import Imu
+from graphvio.simulation import build_scene
+from graphvio.simulation.imu import measure
+
+SCENES = ("room", "stairs", "calibration", "corridor")
+_RATE_HZ = 20
+_SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of vision: rad and metres from frame to frame
+_BLIND_EVERY_S, _BLIND_S = 5.0, 1.0
+_TILT_SIGMA, _SPEED_SIGMA, _RATE_SIGMA, _GYRO_BIAS_SIGMA = 0.01, 0.05, 0.1, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Errors over a run.
+
+    Attributes:
+        position_m: (N, 3).
+        velocity_m_s: (N, 3) in body.
+        tilt_rad: (N, 2) about nav's horizontal axes.
+        heading_rad: (N,).
+    """
+
+    position_m: Float
+    velocity_m_s: Float
+    tilt_rad: Float
+    heading_rad: Float
+
+
+class PaperRun:
+    """Measurements of a walk, a function of the seed."""
+
+    def __init__(self, seed: int, duration_s: float) -> None:
+        rng, imu = np.random.default_rng([seed, 11]), Imu()
+        motion = build_scene(SCENES[seed % len(SCENES)], duration_s + 1.0).motion
+        times = np.arange(round((duration_s + 0.5) * imu.rate_hz)) / imu.rate_hz
+        track = measure(motion, imu, times, np.round(times * 1e9).astype(np.int64), seed)
+        buffer = ImuBuffer(50.0)
+        for stamp, rate, force in zip(
+            track.stamps_ns.tolist(), track.angular_velocity, track.linear_acceleration, strict=True
+        ):
+            buffer.add(ImuSample(stamp, rate, force))
+        self._imu, count = imu, round(duration_s * _RATE_HZ)
+        self._stamps = [round(k * 1e9 / _RATE_HZ) for k in range(count + 1)]
+        states = motion.at(np.array(self._stamps) * 1e-9)
+        self._truth, self._rates = states.world_T_body, states.angular_velocity
+        self._velocities = np.einsum("nji,nj->ni", self._truth[:, :3, :3], states.velocity)
+        self._spans: list[ImuSpan] = []
+        self._motions: list[RelativeMotion | None] = []
+        for k in range(1, count + 1):
+            start_ns, end_ns = self._stamps[k - 1], self._stamps[k]
+            span = buffer.span(start_ns, end_ns)
+            assert span is not None
+            self._spans.append(span)
+            true = np.linalg.inv(self._truth[k - 1]) @ self._truth[k]
+            measured = true @ se3_exp(_SIGMAS * rng.standard_normal(6))
+            sees = (k / _RATE_HZ) % _BLIND_EVERY_S < _BLIND_EVERY_S - _BLIND_S
+            self._motions.append(
+                RelativeMotion(start_ns, end_ns, measured, np.diag(_SIGMAS**2), np.zeros((6, 6)), 300) if sees else None
+            )
+
+    def by_filter(self) -> dict[str, Track]:
+        """The paper's filter."""
+        running = ExtendedKalmanFilter(*self._start())
+        told = []
+        for k in range(1, len(self._stamps)):
+            running.predict(*self._process())
+            running.update(stacked([each(running.state) for each in self._expectations(k)]))
+            told.append((k, running.state))
+        return {"newest": self._track(told), "leaving": self._track(told)}
+
+    def by_graph(self, lag: int, iterations: int) -> dict[str, Track]:
+        """A window of the filter's model."""
+        graph = PaperGraph(*self._start(), lag, iterations)
+        newest, leaving = [], []
+        for k in range(1, len(self._stamps)):
+            graph.predict(*self._process())
+            for each in self._expectations(k):
+                graph.add(each)
+            graph.update()
+            newest.append((k, graph.state))
+            if k >= lag:
+                leaving.append((k - lag + 1, graph.oldest))
+        return {"newest": self._track(newest), "leaving": self._track(leaving)}
+
+    def by_smoother(self) -> dict[str, Track]:
+        """The odometry's smoother."""
+        smoother, (first, _) = Smoother(SmootherConfig(), self._imu), self._start()
+        pose = first.nav_T_body
+        known = StartUncertainty(origin_covariance(pose[:3, :3], _TILT_SIGMA), _SPEED_SIGMA, _GYRO_BIAS_SIGMA)
+        smoother.start(0, RigState(pose, pose[:3, :3] @ first.velocity_body, np.zeros(3), np.zeros(3)), known)
+        newest, leaving = [], []
+        for k in range(1, len(self._stamps)):
+            smoother.extend(self._stamps[k], self._spans[k - 1])
+            motion = self._motions[k - 1]
+            if motion is not None:
+                smoother.accept(motion)
+            for stamp_ns, nav_T_body in smoother.settle(()):
+                number = self._stamps.index(stamp_ns)
+                leaving.append((number, _posed(nav_T_body)))
+            state = smoother.state()
+            in_body = state.nav_T_body[:3, :3].T @ state.velocity_nav
+            newest.append((k, _posed(state.nav_T_body, in_body)))
+        return {"newest": self._track(newest, self._velocities), "leaving": self._track(leaving)}
+
+    def _start(self) -> tuple[FilterState, Float]:
+        pose = self._truth[0]
+        covariance = np.diag(np.repeat([1e-3, _TILT_SIGMA, _SPEED_SIGMA, _RATE_SIGMA, _GYRO_BIAS_SIGMA], 3) ** 2)
+        first = FilterState(pose[:3, 3].copy(), pose[:3, :3].copy(), self._velocities[0], self._rates[0], np.zeros(3))
+        return first, covariance
+
+    @staticmethod
+    def _process() -> tuple[float, Float]:
+        config, dt = FilterConfig(), 1.0 / _RATE_HZ
+        return dt, noise_sigmas(
+            dt, config.accel_sigma_m_s2, config.angular_accel_sigma_rad_s2, config.gyro_bias_walk_rad_s
+        )
+
+    def _expectations(self, k: int) -> list[Callable[[FilterState], Measurement]]:
+        config, span, motion = FilterConfig(), self._spans[k - 1], self._motions[k - 1]
+        made: list[Callable[[FilterState], Measurement]] = [
+            lambda state: gyro(state, span.mean_rate, config.gyro_sigma_rad_s),
+            lambda state: accelerometer(state, span.mean_force, config.gravity_sigma_m_s2),
+        ]
+        if motion is not None:
+            rates = VisualRates.of(motion)
+            made.append(lambda state: vision(state, rates))
+        return made
+
+    def _track(self, told: list[tuple[int, FilterState]], velocities: Float | None = None) -> Track:
+        """Errors of states. Velocities (N + 1, 3) are those that are meant: the filter's are means over the step that
+        ends in the state."""
+        if velocities is None:
+            velocities = np.vstack([self._velocities[:1], 0.5 * (self._velocities[1:] + self._velocities[:-1])])
+        errors = []
+        for k, state in told:
+            true = self._truth[k]
+            off = np.eye(4)
+            off[:3, :3] = true[:3, :3] @ state.nav_R_body.T
+            velocity = velocities[k] - state.velocity_body
+            errors.append(np.concatenate([true[:3, 3] - state.position, velocity, se3_log(off)[:3]]))
+        table = np.array(errors)
+        return Track(table[:, :3], table[:, 3:6], table[:, 6:8], table[:, 8])
+
+
+def _posed(nav_T_body: Float, velocity_body: Float | None = None) -> FilterState:
+    """A state of which only the pose, and perhaps the velocity, is known."""
+    velocity = np.full(3, np.nan) if velocity_body is None else velocity_body
+    return FilterState(nav_T_body[:3, 3], nav_T_body[:3, :3], velocity, np.zeros(3), np.zeros(3))
