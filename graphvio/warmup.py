@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 
+from graphvio.backend.inertial import GRAVITY_M_S2, NO_SAMPLES, ImuBuffer
+from graphvio.backend.preintegration import preintegrate, preintegration_params
+from graphvio.backend.propagation import Propagator
+from graphvio.backend.states import RigState
 from graphvio.config import Config
-from graphvio.frontend.observations import Observations, RigArrays
+from graphvio.events import ImuSample
+from graphvio.frontend.observations import Observations, RigArrays, correspond
 from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.tracker import PairTracker
+from graphvio.frontend.tracks import common_rows
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log, so3_log
-from graphvio.rig import Rig
+from graphvio.rig import Imu, Rig
 
 _POINTS = 20
 
@@ -22,8 +29,10 @@ def warm_up(rig: Rig, config: Config) -> None:
     tracker = PairTracker(pair, config)
     noise = rng.integers(0, 256, size=(height, width), dtype=np.uint8)
     for stamp_ns in range(2):
-        tracker.observe(stamp_ns, noise, noise, np.eye(4), np.eye(4))
+        frame = tracker.observe(stamp_ns, noise, noise, np.eye(4), np.eye(4))
         tracker.anchor()
+    correspond({0: frame}, {0: frame})
+    common_rows(frame.ids, frame.ids)
     points = np.column_stack([rng.uniform(-0.3, 0.3, (_POINTS, 2)), rng.uniform(0.1, 1.0, _POINTS)])
     observations = Observations(
         np.zeros(_POINTS, dtype=np.int64),
@@ -41,3 +50,20 @@ def warm_up(rig: Rig, config: Config) -> None:
         se3_inverse(pose)
         se3_adjoint(pose)
         so3_log(pose[:3, :3].copy(order="K"))
+    _warm_up_imu(rig.imu or Imu())
+
+
+def _warm_up_imu(imu: Imu) -> None:
+    """The same for what the IMU's samples go through."""
+    buffer, up = ImuBuffer(1e3), np.array([0.0, 0.0, GRAVITY_M_S2])
+    for stamp_ns in range(0, 40_000_000, 10_000_000):
+        buffer.add(ImuSample(stamp_ns, np.zeros(3), up))
+    span = buffer.span(0, 25_000_000)
+    assert span is not None
+    preintegrate(span, preintegration_params(imu, 1.0), gtsam.imuBias.ConstantBias())
+    for pose in (np.eye(4), np.asfortranarray(np.eye(4))):
+        state = RigState(pose, np.zeros(3), np.zeros(3), np.zeros(3))
+        for samples in (buffer.since(0), NO_SAMPLES):
+            propagator = Propagator(1e3)
+            propagator.restart(0, state, 0, np.zeros(3), *samples)
+            propagator.predict(35_000_000)

@@ -287,3 +287,36 @@ def test_half_of_the_framesets_are_enough(walk_folder: Path, events: list[Event]
     assert done.completion == 1.0
     assert {e.status for e in done.between(1.0, 10.0)} == {Status.TRACKING}
     assert done.error_m(2.0, 9.0) < 0.03
+
+
+# ------------------------------------------------------------------ standing still
+
+
+def test_ten_minutes_of_standing_drift_less_than_a_centimetre(walk_folder: Path, events: list[Event]) -> None:
+    """Images of the first second, which is at rest, in random order, two a second; an IMU that is drawn."""
+    source = open_source(walk_folder)
+    imu, rng, start_ns = source.rig.imu, np.random.default_rng(0), source.start_ns
+    assert imu is not None
+    still = [e for e in events if isinstance(e, FrameSet) and e.stamp_ns < start_ns + 900 * MS]
+    noise = [np.sqrt(imu.rate_hz) * density for density in (imu.gyro_noise_density, imu.accel_noise_density)]
+    gyro_bias, force = np.array([3e-3, -2e-3, 1e-3]), np.array([0.03, 0.02, 9.81])
+    odometry, estimates, last = Odometry(source.rig), [], 0
+    for i in range(-200, 600 * 200):
+        stamp_ns = start_ns + 5 * MS * i
+        rate = gyro_bias + noise[0] * rng.standard_normal(3)
+        told = [odometry.process(ImuSample(stamp_ns, rate, force + noise[1] * rng.standard_normal(3)))]
+        if i >= 0 and i % 100 == 0:
+            last = (last + 1 + int(rng.integers(len(still) - 1))) % len(still)  # never the same twice running
+            told.append(odometry.process(replace(still[last], stamp_ns=stamp_ns)))
+        estimates += [estimate for estimate in told if estimate is not None]
+    odometry.finish()
+    assert len(estimates) >= 1199
+    assert np.mean([e.at_rest for e in estimates]) > 0.9
+    positions = np.array([e.nav_T_body[:3, 3] for e in estimates if e.nav_T_body is not None])
+    assert len(positions) == len(estimates)
+    assert np.linalg.norm(positions, axis=1).max() < 0.01
+    newest = estimates[-1]
+    assert newest.gyro_bias is not None
+    assert newest.gyro_bias_covariance is not None
+    np.testing.assert_allclose(newest.gyro_bias, gyro_bias, atol=3e-4)
+    assert not [i.kind for i in odometry.take_incidents() if i.kind != "vision_weak"]

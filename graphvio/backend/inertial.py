@@ -152,19 +152,31 @@ class _StuckAxes:
 
     def __init__(self) -> None:
         self._before = np.full(6, np.nan)
-        self._low = self._high = np.zeros((6, 6))  # for each axis, the range of all axes since it has its value
-        self._since = np.zeros(6, dtype=np.int64)  # stamps since which each axis repeats its value and others moved
+        self._low, self._high = np.zeros((2, 6, 6))  # for each axis, the range of all axes since it has its value
+        self._since_ns = np.zeros(6, dtype=np.int64)  # since when each axis repeats its value though others moved
 
     def shows(self, sample: ImuSample) -> bool:
         """Whether a sample, the next in time, has a stuck axis."""
         now = np.concatenate([sample.angular_velocity, sample.linear_acceleration])
-        repeats = (now == self._before)[:, None]
-        self._low = np.where(repeats, np.minimum(self._low, now), now)
-        self._high = np.where(repeats, np.maximum(self._high, now), now)
-        self._before = now
-        alone = (self._high - self._low > _MOVING).any(axis=1)
-        self._since = np.where(alone, self._since, sample.stamp_ns)
-        return bool(sample.stamp_ns - self._since.min() >= _STUCK_NS)
+        since_ns = _note_repeats(sample.stamp_ns, now, self._before, self._low, self._high, self._since_ns)
+        return sample.stamp_ns - since_ns >= _STUCK_NS
+
+
+@kernel
+def _note_repeats(stamp_ns: int, now: Float, before: Float, low: Float, high: Float, since_ns: Int) -> int:
+    """Go on by a sample (6,), and tell since when some axis has repeated its value though others moved."""
+    for axis in range(6):
+        if now[axis] != before[axis]:
+            low[axis], high[axis] = now, now
+        moved = False
+        for other in range(6):
+            low[axis, other] = min(low[axis, other], now[other])
+            high[axis, other] = max(high[axis, other], now[other])
+            moved |= high[axis, other] - low[axis, other] > _MOVING[other]
+        if not moved:
+            since_ns[axis] = stamp_ns
+    before[:] = now
+    return int(since_ns.min())
 
 
 @kernel

@@ -227,7 +227,7 @@ class VisualFrontend:
 
     def _motion(self, reference_stamp_ns: int, stamp_ns: int, refined: Refined) -> RelativeMotion:
         ref_T_cur = se3_inverse(refined.cur_T_ref)
-        angle, distance = np.linalg.norm(so3_log(ref_T_cur[:3, :3])), np.linalg.norm(ref_T_cur[:3, 3])
+        angle, distance = np.linalg.norm(so3_log(ref_T_cur[:3, :3].copy())), np.linalg.norm(ref_T_cur[:3, 3])
         scaled = np.diag(np.repeat([angle, distance], 3) ** 2 * self._scale_sigma**2)
         used_once = self._config.motion.reference == "previous"  # nothing is shared with another motion
         return RelativeMotion(
