@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from graphvio.backend.gating import Verdict
 
 
+_LARGEST_STAMP = 2**62  # differences of two stamps are int64, too
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSample:
     """One reading of the IMU.
@@ -58,7 +61,7 @@ def checked_event(event: Event) -> Event:
     """The event with its stamp as an int and its vectors as float64 arrays.
 
     Raises:
-        EventError: if it is of another type, its stamp is no whole number, or a vector or pair is malformed.
+        EventError: if it is of another type, its stamp is no whole number or no time, or a vector or pair is malformed.
     """
     if not isinstance(event, ImuSample | FrameSet):
         raise EventError(f"an event is an ImuSample or a FrameSet, not {type(event).__name__}")
@@ -66,6 +69,8 @@ def checked_event(event: Event) -> Event:
         stamp_ns = operator.index(event.stamp_ns)
     except TypeError:
         raise EventError(f"stamp_ns is {event.stamp_ns!r}; give whole nanoseconds as an int") from None
+    if abs(stamp_ns) > _LARGEST_STAMP:
+        raise EventError(f"stamp_ns is {stamp_ns}, which is no time in nanoseconds; give at most {_LARGEST_STAMP}")
     if isinstance(event, ImuSample):
         try:
             vectors = [np.asarray(v, dtype=np.float64) for v in (event.angular_velocity, event.linear_acceleration)]

@@ -61,12 +61,6 @@ def vector_kernel(function: Callable[P, R]) -> Callable[P, R]:
     return _compile(function, fastmath=_ANY_ORDER)
 
 
-def inner_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """A `vector_kernel` that is called for each point of a loop: always made part of its caller, so that the loop can
-    work on several points at once."""
-    return _compile(function, fastmath=_ANY_ORDER, forceinline=True)
-
-
 def fast_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """The same for sums over pixels: their order is left to the compiler, so that it may use vector instructions.
 
@@ -75,12 +69,15 @@ def fast_kernel(function: Callable[P, R]) -> Callable[P, R]:
     return _compile(function, fastmath=True)
 
 
-def _compile(function: Callable[P, R], *, fastmath: bool | set[str], forceinline: bool = False) -> Callable[P, R]:
+def _compile(function: Callable[P, R], *, fastmath: bool | set[str]) -> Callable[P, R]:
     callers_choice = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(cache_root() / _digest(function.__module__))  # read when the cache is attached
     try:
-        options = {"forceinline": True} if forceinline else {}
-        compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=fastmath, **options)(function)
+        # What a kernel calls becomes part of it. Else the linker takes whichever copy of the callee it met first, and
+        # these differ by how often they were optimised: the run that compiles would not give what later ones give.
+        compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=fastmath, forceinline=True)(
+            function
+        )
     finally:
         numba.config.CACHE_DIR = callers_choice
     _registered.append(compiled)

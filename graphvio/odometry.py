@@ -55,7 +55,7 @@ class Odometry:
         self._synchroniser = Synchroniser(rig, self.config, self._report)
         kind = FilterBelief if self.config.fusion.estimator == "filter" else SmootherBelief
         self._belief: Belief = kind(rig, self.config, self._report, lambda: self._frontend.rekey())
-        self._propagator = Propagator(self.config.timing.max_prediction_ms)
+        self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._on_prediction = on_prediction
         self._told_misaligned: set[int] = set()
         self._frozen: frozenset[int] = frozenset()
@@ -106,7 +106,8 @@ class Odometry:
 
         Returns:
             None before the first pose and while lost, before the newest estimate's instant, and farther beyond the
-            newest sample (without an IMU, beyond the newest estimate) than ``timing.max_prediction_ms``.
+            newest sample (without an IMU, beyond the newest estimate) than ``timing.max_prediction_ms``; after a gap
+            of the samples and after 5 s without a frameset, until the next one.
         """
         return self._propagator.predict(stamp_ns)
 

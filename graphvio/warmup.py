@@ -64,6 +64,6 @@ def _warm_up_imu(imu: Imu) -> None:
     for pose in (np.eye(4), np.asfortranarray(np.eye(4))):
         state = RigState(pose, np.zeros(3), np.zeros(3), np.zeros(3))
         for samples in (buffer.since(0), NO_SAMPLES):
-            propagator = Propagator(1e3)
+            propagator = Propagator(1e3, 1e3)
             propagator.restart(0, state, 0, np.zeros(3), *samples)
             propagator.predict(35_000_000)

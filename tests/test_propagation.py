@@ -29,7 +29,7 @@ def samples(start_s: float, end_s: float) -> tuple[Int, Float]:
 
 
 def propagator(start_s: float = 1.0, end_s: float = 1.1) -> Propagator:
-    made = Propagator(200.0)
+    made = Propagator(200.0, 50.0)
     made.restart(round(start_s * 1e9), state_at(start_s), 3, np.zeros(3), *samples(start_s, end_s))
     return made
 
@@ -62,18 +62,45 @@ def test_beyond_the_newest_sample_it_goes_on_for_a_while() -> None:
     assert np.abs(se3_log(se3_inverse(pose_at(1.15)) @ told.nav_T_body)).max() < 2e-2
     assert propagator().predict(1301 * MS) is None
     assert propagator().predict(999 * MS) is None
-    assert Propagator(200.0).predict(0) is None
+    assert Propagator(200.0, 50.0).predict(0) is None
 
 
 def test_nothing_is_told_across_a_gap_or_once_forgotten() -> None:
     gap = propagator()
-    assert gap.add(1301 * MS, np.zeros(6)) is None
-    assert gap.predict(1302 * MS) is None
+    assert gap.add(1151 * MS, np.zeros(6)) is None
+    assert gap.predict(1152 * MS) is None
     assert gap.predict(1050 * MS) is None
     lost = propagator()
     lost.forget()
     assert lost.predict(1050 * MS) is None
     assert lost.add(1105 * MS, np.zeros(6)) is None
+
+
+def test_samples_behind_a_gap_are_not_reached() -> None:
+    stamps, values = samples(1.0, 1.1)
+    made = Propagator(200.0, 50.0)
+    made.restart(
+        1000 * MS,
+        state_at(1.0),
+        0,
+        np.zeros(3),
+        np.delete(stamps, range(3, 16)),
+        np.delete(values, range(3, 16), axis=0),
+    )
+    told, expected = made.predict(1100 * MS), Propagator(200.0, 50.0)
+    expected.restart(1000 * MS, state_at(1.0), 0, np.zeros(3), stamps[:3], values[:3])
+    held = expected.predict(1100 * MS)
+    assert told is not None
+    assert held is not None
+    np.testing.assert_array_equal(told.nav_T_body, held.nav_T_body)
+
+
+def test_an_imu_alone_is_not_believed_for_ever() -> None:
+    made = propagator(1.0, 1.0)
+    stamps, values = samples(1.0, 6.5)
+    told = [made.add(stamp, value) is not None for stamp, value in zip(stamps.tolist(), values, strict=True)]
+    assert told[1:1001] == [True] * 1000
+    assert not any(told[1001:])
 
 
 def test_a_sample_that_is_known_already_changes_nothing() -> None:
@@ -87,7 +114,7 @@ def test_a_sample_that_is_known_already_changes_nothing() -> None:
 
 
 def test_without_samples_velocity_and_rate_in_body_go_on() -> None:
-    made, rate = Propagator(200.0), np.array([0.1, -0.2, 0.5])
+    made, rate = Propagator(200.0, 50.0), np.array([0.1, -0.2, 0.5])
     state = RigState(pose_at(1.0), velocity_at(1.0), np.zeros(3), np.zeros(3))
     made.restart(1000 * MS, state, 0, rate, *NO_SAMPLES)
     assert made.add(1010 * MS, np.zeros(6)) is None  # the rig has no IMU that could be used

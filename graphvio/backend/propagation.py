@@ -17,16 +17,20 @@ from graphvio.events import Prediction
 from graphvio.geometry import se3_compose, se3_exp, so3_exp
 from graphvio.kernels import kernel
 
+_LONGEST_BLIND_NS = 5_000_000_000  # without a frameset
+
 
 class Propagator:
     """What is predicted from the newest state, see `graphvio.odometry.Odometry.predict`.
 
     Args:
         longest_ms: how far it goes beyond the newest sample, or without samples beyond the newest frameset.
+        max_gap_ms: between samples; it does not go on across longer ones.
     """
 
-    def __init__(self, longest_ms: float) -> None:
+    def __init__(self, longest_ms: float, max_gap_ms: float) -> None:
         self._longest_ns = round(longest_ms * 1e6)
+        self._max_gap_ns = round(max_gap_ms * 1e6)
         self._path: _Path | None = None
 
     def forget(self) -> None:
@@ -46,6 +50,8 @@ class Propagator:
         """
         path = _Path(stamp_ns, state, epoch, rate, values[0] if len(values) else None)
         for stamp, sample in zip(stamps[1:].tolist(), values[1:], strict=True):
+            if stamp - path.stamps[-1] > self._max_gap_ns:
+                break
             path.add(stamp, sample)
         self._path = path
 
@@ -54,8 +60,8 @@ class Propagator:
         path = self._path
         if path is None or not path.samples or stamp_ns <= path.stamps[-1]:
             return None
-        if stamp_ns - path.stamps[-1] > self._longest_ns:
-            self._path = None  # what happened in the gap is not known
+        if stamp_ns - path.stamps[-1] > self._max_gap_ns or stamp_ns - path.stamps[0] > _LONGEST_BLIND_NS:
+            self._path = None  # what happened in a gap is not known, nor where an IMU alone would be by now
             return None
         path.add(stamp_ns, sample)
         return path.predict(stamp_ns, self._longest_ns)

@@ -5,7 +5,7 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.geometry import se3_compose
-from graphvio.kernels import fast_kernel, inner_kernel, kernel
+from graphvio.kernels import fast_kernel, kernel, vector_kernel
 
 NEAREST = 1e-3
 """Depth over the reference depth, below which a point is behind the camera."""
@@ -17,7 +17,7 @@ Matrix = tuple[float, float, float, float, float, float, float, float, float, fl
 """The upper three rows of a transform."""
 
 
-@inner_kernel
+@vector_kernel
 def elements(transform: Float) -> Matrix:
     """The upper three rows of a transform (4, 4), which a loop then holds in registers."""
     t = transform

@@ -10,7 +10,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.frontend.blocks import C00, C01, C02, C11, C12, C22, POINTS
 from graphvio.frontend.cost import NEAREST, Matrix
-from graphvio.kernels import inner_kernel
+from graphvio.kernels import vector_kernel
 
 Row = tuple[float, float, float, float, float, float, float]
 Vector = tuple[float, float, float]
@@ -18,7 +18,7 @@ Four = tuple[float, float, float, float]
 Lower = tuple[float, float, float, float, float, float, float, float, float, float]
 
 
-@inner_kernel
+@vector_kernel
 def project(m: Matrix, point: Vector) -> tuple[float, float, float, bool]:
     """Normalised coordinates of a point ``[x, y, 1/Z]`` after a motion, its depth over the one before, at least what
     counts as in front of the camera, and whether it is there."""
@@ -30,7 +30,7 @@ def project(m: Matrix, point: Vector) -> tuple[float, float, float, bool]:
     return u, v, z, depth >= NEAREST
 
 
-@inner_kernel
+@vector_kernel
 def derivatives_by_point(
     m: Matrix, point: Vector, focal_px: float, at_u: float, at_v: float
 ) -> tuple[Vector, Vector, float, float]:
@@ -45,7 +45,7 @@ def derivatives_by_point(
     )
 
 
-@inner_kernel
+@vector_kernel
 def derivatives_by_motion(
     m: Matrix, cam_T_body: Matrix, focal_px: float, point: Vector, at_u: float, at_v: float
 ) -> tuple[Row, Row, bool]:
@@ -68,13 +68,13 @@ def derivatives_by_motion(
     )
 
 
-@inner_kernel
+@vector_kernel
 def dot(a: Vector, b: Vector) -> float:
     """Inner product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@inner_kernel
+@vector_kernel
 def covariance_times(block: Float, i: int, a: Vector) -> Vector:
     """Covariance of a block's point times a vector."""
     c00, c01, c02 = block[C00 + i], block[C01 + i], block[C02 + i]
@@ -86,7 +86,7 @@ def covariance_times(block: Float, i: int, a: Vector) -> Vector:
     )
 
 
-@inner_kernel
+@vector_kernel
 def inverse_cholesky(
     s00: float, s10: float, s11: float, s20: float, s21: float, s22: float,
     s30: float, s31: float, s32: float, s33: float, factor: float,
@@ -110,7 +110,7 @@ def inverse_cholesky(
     )  # fmt: skip
 
 
-@inner_kernel
+@vector_kernel
 def whiten(lower: Lower, errors: Four) -> Four:
     """A lower triangle (4, 4) times a vector."""
     l00, l10, l11, l20, l21, l22, l30, l31, l32, l33 = lower
@@ -118,7 +118,7 @@ def whiten(lower: Lower, errors: Four) -> Four:
     return l00 * a, l10 * a + l11 * b, l20 * a + l21 * b + l22 * d, l30 * a + l31 * b + l32 * d + l33 * e
 
 
-@inner_kernel
+@vector_kernel
 def whiten_transposed(lower: Lower, whitened: Four) -> Four:
     """The transpose of a lower triangle (4, 4) times a vector."""
     l00, l10, l11, l20, l21, l22, l30, l31, l32, l33 = lower
@@ -126,7 +126,7 @@ def whiten_transposed(lower: Lower, whitened: Four) -> Four:
     return l00 * a + l10 * b + l20 * d + l30 * e, l11 * b + l21 * d + l31 * e, l22 * d + l32 * e, l33 * e
 
 
-@inner_kernel
+@vector_kernel
 def whitener_of(whiteners: Float, i: int, seen: float) -> Lower:
     """The whitener of a block's point, its last two rows times a factor."""
     w = whiteners
@@ -137,19 +137,19 @@ def whitener_of(whiteners: Float, i: int, seen: float) -> Lower:
     )  # fmt: skip
 
 
-@inner_kernel
+@vector_kernel
 def put3(rows: Float, i: int, values: Vector) -> None:
     """Store a vector, an element a row."""
     rows[i], rows[POINTS + i], rows[2 * POINTS + i] = values
 
 
-@inner_kernel
+@vector_kernel
 def put4(rows: Float, i: int, values: Four) -> None:
     """Store four numbers, one a row."""
     rows[i], rows[POINTS + i], rows[2 * POINTS + i], rows[3 * POINTS + i] = values
 
 
-@inner_kernel
+@vector_kernel
 def put_whitener(rows: Float, i: int, values: Lower) -> None:
     """Store what `whitener_of` reads."""
     for k in range(10):
