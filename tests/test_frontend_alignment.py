@@ -89,6 +89,19 @@ def test_a_correction_in_force_goes_on_being_refined() -> None:
     np.testing.assert_allclose(found.tangent, OFF, atol=1e-3)
 
 
+def test_a_correction_that_the_motions_refute_is_withdrawn() -> None:
+    """Something in view misled the pair for a while; from then on its motions say that the rig file was right."""
+    alignment, rng = watch(OFF, 10, 6)
+    assert alignment.learn()
+    assert not np.array_equal(alignment.correction, np.eye(4))
+    changes = 0
+    for _ in range(460):
+        add_keyframe(alignment, NONE, rng)
+        changes += alignment.learn()
+    assert changes
+    np.testing.assert_array_equal(alignment.correction, np.eye(4))
+
+
 def test_what_no_motion_shows_is_not_made_up() -> None:
     """Turning about the vertical in a plane leaves the height difference open."""
     rng = np.random.default_rng(5)

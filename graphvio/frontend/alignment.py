@@ -47,6 +47,11 @@ class Misalignment(NamedTuple):
         """Whether chance explains it less than once in 10^9."""
         return self.statistic > _SIGNIFICANT
 
+    def refutes(self, other: Misalignment) -> bool:
+        """Whether it is surely not the other one."""
+        apart = self.tangent - other.tangent
+        return float(apart @ np.linalg.solve(self.covariance, apart)) > _SIGNIFICANT
+
 
 class PairAlignment:
     """Collects what one pair's motions say of its place relative to another pair.
@@ -70,6 +75,19 @@ class PairAlignment:
         uncorrected = se3_inverse(correction) @ pair.cur_T_ref @ correction
         whitener = np.linalg.inv(np.linalg.cholesky(trusted.covariance + pair.covariance))
         self._motions.append((trusted.cur_T_ref, uncorrected, whitener))
+
+    def learn(self) -> bool:
+        """Put what the motions say into force, or out of it once they refute it; whether that changes anything."""
+        found = self.solve()
+        if found is None:
+            return False
+        if found.is_significant:
+            self.in_force = found
+            return True
+        if self.in_force is not None and found.refutes(self.in_force):
+            self.in_force = None
+            return True
+        return False
 
     def solve(self) -> Misalignment | None:
         """The error of the rig file's extrinsics, or None while too few motions agree on one."""

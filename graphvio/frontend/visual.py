@@ -256,9 +256,7 @@ class VisualFrontend:
             if j not in own:
                 continue
             alignment.add(own[0], own[j])
-            misalignment = alignment.solve()
-            if misalignment is not None and misalignment.is_significant:
-                alignment.in_force = misalignment
+            if alignment.learn():
                 self._arrays = self._arrays.corrected(RigArrays.of(self._rig), j, alignment.correction)
 
 
