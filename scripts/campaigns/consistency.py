@@ -103,9 +103,8 @@ def _write(
     if args.rendered:
         report.add(
             "#### Rendered images",
-            f"The whole odometry, {args.rendered} IMUs on each of {', '.join(SCENES)}. IMU and calibration are exactly "
-            "what the rig file says, so that what the default allows for beyond it is off (`smoother.imu_noise_scale` "
-            "1, `motion.calibration_error_share` 0). The simulator's biases are a fifth of what the smoother is "
-            "prepared for at the start: less than the number of dimensions is expected of velocity, tilt and biases.",
+            f"The whole odometry with its default configuration, {args.rendered} IMUs on each of {', '.join(SCENES)}. "
+            "The default counts the IMU's noise twofold, and does not know that biases are as small as these: less "
+            "than the number of dimensions is expected of velocity, tilt and biases.",
         )
         report.table(HEAD, rows(rendered, NAMES))
