@@ -16,7 +16,7 @@ from graphvio.errors import ConfigError
 
 _LARGEST = 1e12
 _MAY_BE_ZERO = frozenset(
-    ("seed", "border_px", "settle_s", "keyframe_overlap", "min_inliers", "min_inlier_share", "min_response",
+    ("seed", "border_px", "settle_s", "keyframe_overlap", "min_inlier_share", "min_response",
      "scarce_share", "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s",
      "calibration_error_share")
 )  # fmt: skip

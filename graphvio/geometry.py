@@ -11,7 +11,7 @@ Reference: J. Sola, J. Deray, D. Atchuthan, *A micro Lie theory for state estima
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.kernels import kernel
+from graphvio.kernels import kernel, put
 
 _SMALL_ANGLE = 1e-5
 
@@ -127,8 +127,8 @@ def rotation_from_quat_wxyz(quat_wxyz: Float) -> Float:
 def se3(rotation: Float, translation: Float) -> Float:
     """Transform (4, 4) from its rotation (3, 3) and translation (3,)."""
     t = np.eye(4)
-    t[:3, :3] = rotation
-    t[:3, 3] = translation
+    put(t[:3, :3], rotation)
+    put(t[:3, 3], translation)
     return t
 
 
@@ -169,8 +169,8 @@ def se3_log(a_T_b: Float) -> Float:
     """Tangent vector (6,) ``[rotation, translation]`` of a transform (4, 4)."""
     phi = so3_log(np.ascontiguousarray(a_T_b[:3, :3]))
     xi = np.empty(6)
-    xi[:3] = phi
-    xi[3:] = so3_right_jacobian_inverse(-phi) @ np.ascontiguousarray(a_T_b[:3, 3])
+    put(xi[:3], phi)
+    put(xi[3:], so3_right_jacobian_inverse(-phi) @ np.ascontiguousarray(a_T_b[:3, 3]))
     return xi
 
 
@@ -179,9 +179,9 @@ def se3_adjoint(a_T_b: Float) -> Float:
     """Adjoint (6, 6): ``a_T_b exp(xi_b) = exp(Ad xi_b) a_T_b``."""
     rotation = np.ascontiguousarray(a_T_b[:3, :3])
     adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = rotation
-    adjoint[3:, 3:] = rotation
-    adjoint[3:, :3] = skew(a_T_b[:3, 3]) @ rotation
+    put(adjoint[:3, :3], rotation)
+    put(adjoint[3:, 3:], rotation)
+    put(adjoint[3:, :3], skew(a_T_b[:3, 3]) @ rotation)
     return adjoint
 
 
@@ -193,9 +193,9 @@ def se3_right_jacobian_inverse(xi: Float) -> Float:
     diagonal = so3_right_jacobian_inverse(phi)
     coupling = -_left_coupling(-phi, -rho)  # Q of the right Jacobian is Q of the left one at -xi
     inverse = np.zeros((6, 6))
-    inverse[:3, :3] = diagonal
-    inverse[3:, 3:] = diagonal
-    inverse[3:, :3] = diagonal @ coupling @ diagonal
+    put(inverse[:3, :3], diagonal)
+    put(inverse[3:, 3:], diagonal)
+    put(inverse[3:, :3], diagonal @ coupling @ diagonal)
     return inverse
 
 

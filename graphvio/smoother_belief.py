@@ -132,9 +132,7 @@ class SmootherBelief(Belief):
                 self._believe_vision(motion, "the IMU failed while vision was refused")
                 return motion
             smoother.accept(motion)
-            self._refused.clear()
-            self._imu_failed = False
-            self._lost = False
+            self._forget_troubles()
             return motion
         why = _beyond(verdict) if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
         self._report(motion.stamp_ns, "vision_gated", f"{why}, {motion.inliers} inliers")
@@ -184,7 +182,7 @@ class SmootherBelief(Belief):
         return visual.motion, self._running.test(visual.motion)
 
     def _reset_position(self, stamp_ns: int) -> None:
-        """From time to time: what is known of the absolute position gets no worse than the window can hold."""
+        """From time to time, see `Smoother.reset_position`."""
         if stamp_ns - self._reset_ns >= self._config.smoother.reset_s * 1e9:
             self._running.reset_position()
             self._reset_ns = stamp_ns
@@ -234,6 +232,9 @@ class SmootherBelief(Belief):
         self._reset_ns = start.stamp_ns
         self._settled_ns = max(self._settled_ns, start.settled_ns)
         self._tracked_ns = start.stamp_ns
+        self._forget_troubles()
+
+    def _forget_troubles(self) -> None:
         self._refused.clear()
         self._imu_failed = False
         self._lost = False

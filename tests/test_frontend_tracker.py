@@ -187,6 +187,26 @@ def test_a_wrong_prediction_costs_few_tracks() -> None:
     assert np.isin(first.ids, second.ids).mean() > 0.7
 
 
+def test_only_a_prediction_keeps_tracks_through_a_fast_turn() -> None:
+    """By 14 degrees from one image to the next, as a head may turn at 5 rad/s: 60 pixels, of 320."""
+    turned = transform([0.0, 0.24, 0.0], [0.0, 0.0, 0.0])
+    shares, errors_px = [], []
+    for predicted in (None, turned @ transform([0.01, -0.01, 0.01], [0.01, 0.0, 0.02])):  # not quite right
+        tracker = PairTracker(rectified(), Config())
+        first = tracker.observe(0, *views(np.eye(4)), None, None)
+        tracker.anchor()
+        second = tracker.observe(1, *views(turned, 1), predicted, predicted)
+        _, then, now = np.intersect1d(first.ids, second.ids, return_indices=True)
+        true = seen(on_wall(first.pixels, np.eye(4)), turned)
+        in_view = ((true > 15.0) & (true < [WIDTH - 15.0, HEIGHT - 15.0])).all(axis=1)
+        off_px = np.hypot(*(second.pixels[now] - true[then]).T)
+        shares.append(float(np.sum(off_px < 0.5) / in_view.sum()))
+        errors_px.append(float(np.median(off_px)) if len(off_px) else np.inf)
+    assert shares[0] < 0.3
+    assert shares[1] > 0.8
+    assert errors_px[1] < 0.2
+
+
 def mask_of(allowed: Bool, path: Path) -> Path:
     cv2.imwrite(str(path), 255 * allowed.astype(np.uint8))
     return path

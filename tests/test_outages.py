@@ -292,6 +292,27 @@ def test_half_of_the_framesets_are_enough(walk_folder: Path, events: list[Event]
 # ------------------------------------------------------------------ standing still
 
 
+def test_images_alone_do_not_make_a_standstill(walk_folder: Path, events: list[Event]) -> None:
+    """In a lift, or before a screen that moves with it, the images rest, and the IMU says that the rig does not."""
+    source = open_source(walk_folder)
+    start_ns, rng = source.start_ns, np.random.default_rng(0)
+    still = [e for e in events if isinstance(e, FrameSet) and e.stamp_ns < start_ns + 900 * MS]
+    for shaking, at_rest in ((0.0, True), (1.0, False)):
+        odometry = Odometry(source.rig)
+        estimates = []
+        for event in events:
+            if event.stamp_ns > still[-1].stamp_ns + 10 * MS:
+                break
+            if isinstance(event, ImuSample):
+                moving = shaking * rng.standard_normal(3) if event.stamp_ns > start_ns + 300 * MS else np.zeros(3)
+                event = replace(event, linear_acceleration=event.linear_acceleration + moving)
+            estimates.append(odometry.process(event))
+        estimates += odometry.finish()
+        last = [e for e in estimates if e is not None][-1]
+        assert last.at_rest is at_rest
+        assert ("rest" in last.innovations) is at_rest
+
+
 def test_ten_minutes_of_standing_drift_less_than_a_centimetre(walk_folder: Path, events: list[Event]) -> None:
     """Images of the first second, which is at rest, in random order, two a second; an IMU that is drawn."""
     source = open_source(walk_folder)

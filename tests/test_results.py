@@ -38,8 +38,9 @@ def reports(k: int) -> dict[int, PairReport]:
     """Both pairs, the rear one first; that has no images at every third frameset, and never a motion of its own."""
     nothing = np.zeros((0, 2)), np.zeros(0, dtype=bool)
     front = PairReport(
-        50, k, *nothing, rms_px=0.2 + 0.01 * k if k else None, own_inliers=k + 1, own_rms_px=0.1 + 0.003 * k
-    )
+        50, k, *nothing, rms_px=0.2 + 0.01 * k if k else None, own_inliers=k + 1, own_rms_px=0.1 + 0.003 * k,
+        rejected={"search": k, "epipolar": 1},
+    )  # fmt: skip
     rear = {1: PairReport(7, 0, *nothing)}
     return {**(rear if k % 3 else {}), 0: front}
 
@@ -172,6 +173,11 @@ def test_pair_medians(folder: Path) -> None:
         "front": {"inliers": 29.5, "rms_px": 0.5, "own_rms_px": 0.1885},
         "rear, low": {"inliers": 0.0, "rms_px": None, "own_rms_px": None},
     }
+
+
+def test_what_each_test_threw_out_is_counted(folder: Path) -> None:
+    rejected = json.loads((folder / "summary.json").read_text())["pair_rejected"]
+    assert rejected == {"front": {"epipolar": COUNT, "search": COUNT * (COUNT - 1) // 2}, "rear, low": {}}
 
 
 def test_a_residual_that_is_not_finite_spoils_no_summary(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.events import ImuSample
-from graphvio.kernels import kernel
+from graphvio.kernels import kernel, put
 
 GRAVITY_M_S2 = 9.81
 _MAX_RATE = 100.0  # rad/s and m/s^2: beyond what any inertial sensor for this use can read
@@ -175,7 +175,7 @@ def _note_repeats(stamp_ns: int, now: Float, before: Float, low: Float, high: Fl
             moved |= high[axis, other] - low[axis, other] > _MOVING[other]
         if not moved:
             since_ns[axis] = stamp_ns
-    before[:] = now
+    put(before, now)
     return int(since_ns.min())
 
 

@@ -15,7 +15,7 @@ from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.backend.states import RigState
 from graphvio.events import Prediction
 from graphvio.geometry import se3_compose, se3_exp, so3_exp
-from graphvio.kernels import kernel
+from graphvio.kernels import kernel, put
 
 _LONGEST_BLIND_NS = 5_000_000_000  # without a frameset
 
@@ -88,6 +88,7 @@ class _Path:
         self._twist = np.concatenate([rate, state.nav_T_body[:3, :3].T @ state.velocity_nav])
 
     def add(self, stamp_ns: int, sample: Float) -> None:
+        """Go on by a sample (6,)."""
         pose, velocity = self._after(-1, stamp_ns - self.stamps[-1], 0.5 * (self.samples[-1] + sample))
         self.poses.append(pose)
         self.velocities.append(velocity)
@@ -95,6 +96,7 @@ class _Path:
         self.stamps.append(stamp_ns)
 
     def predict(self, stamp_ns: int, longest_ns: int) -> Prediction | None:
+        """What is known or predicted at an instant, at most so long after the newest sample, or None."""
         i = bisect_right(self.stamps, stamp_ns) - 1
         if i < 0:
             return None  # that is past: there is an estimate
@@ -129,6 +131,6 @@ def advanced(
     acceleration = nav_R_body @ so3_exp(0.5 * turn) @ (mean[3:] - bias[3:])
     acceleration[2] -= GRAVITY_M_S2
     pose = nav_T_body.copy()
-    pose[:3, :3] = nav_R_body @ so3_exp(turn)
+    put(pose[:3, :3], nav_R_body @ so3_exp(turn))
     pose[:3, 3] += duration_s * velocity_nav + 0.5 * duration_s**2 * acceleration
     return pose, velocity_nav + duration_s * acceleration

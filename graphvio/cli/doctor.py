@@ -55,7 +55,7 @@ def _table(findings: dict[str, Any]) -> Any:
     cache = findings["kernel_cache"]
     table.add_row("kernel cache", f"{escape(cache['folder'])}, {cache['files']} files, {cache['megabytes']:.1f} MB")
     modules = cache["compiled_modules"]
-    rest = "" if all(modules.values()) else "; the rest compiles when first used, which may take a minute"
+    rest = "" if all(modules.values()) else "; the rest compiles when first used, which takes one to two minutes"
     table.add_row("modules compiled", f"{sum(modules.values())} of {len(modules)}{rest}")
     return table
 

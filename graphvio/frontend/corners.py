@@ -3,7 +3,7 @@
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
-from graphvio.kernels import fast_kernel, kernel
+from graphvio.kernels import fast_kernel, kernel, put
 
 _HARRIS_K = 0.04
 _RADIUS = 3  # of the 7x7 window over which gradients are summed
@@ -67,7 +67,7 @@ def find_corners(
     occupied = occupied_cells(tracked[settled], cell_px, rows, columns)
     margin = max(border_px, _RADIUS + _BORDER + 1)
     found = np.empty((rows * columns + len(tracked), 2))
-    found[: len(tracked)] = tracked
+    put(found[: len(tracked)], tracked)
     near = np.empty_like(found)
     count = len(tracked)
     side = cell_px + 2 * _BORDER

@@ -28,7 +28,7 @@ from graphvio.frontend.point_errors import (
     whiten_transposed,
     whitener_of,
 )
-from graphvio.kernels import vector_kernel
+from graphvio.kernels import put, vector_kernel
 
 _EXPANSIONS = 2
 _FARTHEST = 16.0  # squared whitened error up to which a point may follow its residual; outliers would gain leverage
@@ -146,8 +146,8 @@ def linearise(
             weights[i] = active[b, i] / (1.0 + e2) if e2 < WORST else 0.0
         cost += np.log(product)
         _add_squares(columns, weights, normal)
-    hessian[:] = _symmetric(normal)
-    gradient[:] = normal[:6, 6]
+    put(hessian, _symmetric(normal))
+    put(gradient, normal[:6, 6])
     return cost
 
 
@@ -160,7 +160,7 @@ def information_through_points(
     columns, weights, normal = np.empty(7 * _COLUMN), np.empty(POINTS), np.zeros((7, 7))
     for b in range(len(blocks.pair)):
         _whiten_block(motions, rig, blocks, at, b, columns, weights)
-        weights[:] = factors[b]
+        put(weights, factors[b])
         _add_squares(columns, weights, normal)
         _whiten_again(at.whiteners[b], columns)
         weights *= -(sigmas_px[blocks.pair[b]] ** 2)
@@ -234,5 +234,5 @@ def _symmetric(normal: Float) -> Float:
     """The matrix (6, 6) of which only the upper triangle is there."""
     whole = normal[:6, :6].copy()
     for c in range(6):
-        whole[c:, c] = whole[c, c:]
+        put(whole[c:, c], whole[c, c:])
     return whole

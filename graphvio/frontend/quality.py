@@ -74,7 +74,8 @@ def doubted(motion: RelativeMotion, frozen_since_ns: int | None, stereo: StereoS
     """
     covariance, reasons = motion.covariance, []
     if noise > 1.0:
-        # Its mean is in the covariance. But errors beyond those of sharp corners are of blur, which all points share.
+        # The residuals' mean square is in the covariance already. But motions from images that are blurred are worse
+        # than that: their squared errors over it grow about as fast as the mean square itself.
         covariance = covariance * noise**2
         if noise > _BLURRED:
             reasons.append(f"points fit {noise:.1f} times worse than those of sharp images")

@@ -99,7 +99,7 @@ def _refined(
         for number in range(_ROUNDS_TO_FIND_INLIERS):
             scale = _scale(errors2, has_right, widest, largest2)
             if number >= _ROUNDS_WITH_ALL:
-                candidates[:] = errors2 < _GROSS * inlier_cutoff(errors2, has_right, largest2)
+                candidates = (errors2 < _GROSS * inlier_cutoff(errors2, has_right, largest2)).astype(np.float64)
             active = lane_by_lane(blocks, candidates)
             pose, _, errors2 = _levenberg_marquardt(pose, rig, blocks, at, active, sigmas_px, scale, 1, _NEAR)
         # One pair's images may be blurred or dim: its points are then less certain than the others'.

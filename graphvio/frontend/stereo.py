@@ -11,7 +11,7 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.cameras import distort, fold_radius
-from graphvio.kernels import fast_kernel, kernel
+from graphvio.kernels import fast_kernel, kernel, put
 
 _HALF_PATCH = 5
 _HALF_COARSE_PATCH = 4
@@ -257,7 +257,7 @@ def _normalised_patch(image: Image, x: float, y: float, patch: AnyArray) -> bool
     norm = np.sqrt(np.sum(values * values))
     if norm < 1e-6:
         return False
-    patch[:] = values / norm
+    put(patch, values / norm)
     return True
 
 

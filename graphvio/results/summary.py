@@ -67,6 +67,8 @@ class Summary:
         incidents: kind -> count, of everything in ``events.jsonl``.
         status: status -> number of estimates.
         pair_medians: name of each of the rig's pairs -> its medians.
+        pair_rejected: name of each of the rig's pairs -> test of tracking and stereo matching -> how many corners and
+            tracks it threw out.
         epochs: for each epoch its number, first and last stamp in nanoseconds, and number of poses.
         graphvio_version: that made the run.
         config_sha256: of ``config.yaml``.
@@ -88,6 +90,7 @@ class Summary:
     incidents: Mapping[str, int]
     status: Mapping[str, int]
     pair_medians: Mapping[str, PairMedians]
+    pair_rejected: Mapping[str, Mapping[str, int]]
     epochs: Sequence[Mapping[str, int]]
     graphvio_version: str
     config_sha256: str

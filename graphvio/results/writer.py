@@ -83,6 +83,7 @@ class ResultWriter:
         self._pair_figures: dict[str, dict[str, array[float]]] = {
             name: {figure.name: array("d") for figure in fields(PairMedians)} for name in self._pair_names
         }
+        self._pair_rejected: dict[str, Counter[str]] = {name: Counter() for name in self._pair_names}
         self._status: Counter[str] = Counter()
         self._incidents: Counter[str] = Counter()
         self._stamps, self._epochs, self._lost = array("q"), array("q"), array("q")
@@ -217,6 +218,7 @@ class ResultWriter:
             incidents=dict(self._incidents),
             status=dict(self._status),
             pair_medians={name: PairMedians.of(figures) for name, figures in self._pair_figures.items()},
+            pair_rejected={name: dict(sorted(counts.items())) for name, counts in self._pair_rejected.items()},
             epochs=epoch_spans(trajectory, epochs),
             graphvio_version=__version__,
             config_sha256=self._config_sha256,
@@ -240,6 +242,7 @@ class ResultWriter:
 
     def _add_report(self, stamp_ns: int, name: str, report: PairReport) -> None:
         self._write("pairs.csv", _report_line(stamp_ns, name, report))
+        self._pair_rejected[name].update(report.rejected)
         for figure, values in self._pair_figures[name].items():
             value = getattr(report, figure)
             if value is not None:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.command_line import add_command
 from benchmarks.fault_cases import CASES, WALKS, Case, hard_events
 from benchmarks.fault_judging import MATERIAL_DEG, MATERIAL_M, Judged, Outcome, Run
 from benchmarks.fault_scenes import CORRIDOR_S, recording
@@ -56,12 +57,8 @@ class Task:
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``faults``."""
-    parser = subparsers.add_parser(
-        "faults",
-        help="hard scenes and faults: the share of motions that are confident and wrong",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    summary = "hard scenes and faults: the share of motions that are confident and wrong"
+    parser = add_command(subparsers, "faults", summary, __doc__)
     parser.add_argument("--seeds", type=int, default=1, help="runs of each case, each on another walk (default: 1)")
     parser.add_argument("--duration", type=float, default=12.0, metavar="S", help="seconds of a walk (default: 12)")
     parser.add_argument("--cases", nargs="+", metavar="CASE", choices=[c.name for c in CASES], help="only these")

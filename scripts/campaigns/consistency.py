@@ -12,14 +12,16 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
+from benchmarks.command_line import add_command
 from benchmarks.recordings import add_data_option
 from benchmarks.report import DOCS, Report, machine, tell
 
 from campaigns.drawn import Template, templates_of
 from campaigns.measures import HEAD, Squares, rows
-from campaigns.model_run import SCENES, model_run
+from campaigns.model_run import model_run
 from campaigns.picture import draw_consistency
 from campaigns.rendered_run import rendered_run
+from campaigns.walks import SCENES
 from graphvio.errors import GraphvioError
 
 NAMES = {
@@ -36,12 +38,7 @@ _WHERE = "room"  # whose images tell the covariances
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``consistency``."""
-    parser = subparsers.add_parser(
-        "consistency",
-        help="NEES and NIS over many runs",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = add_command(subparsers, "consistency", "NEES and NIS over many runs", __doc__)
     parser.add_argument("--seeds", type=int, default=50, help="runs with drawn errors (default: 50)")
     parser.add_argument("--rendered", type=int, default=3, help="runs of each rendered scene (default: 3)")
     parser.add_argument("--duration", type=float, default=25.0, metavar="S", help="seconds of a run (default: 25)")
@@ -56,8 +53,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def main(args: argparse.Namespace) -> None:
     """Run the campaign and report."""
-    if args.seeds < 2 or args.rendered < 0 or args.jobs < 1 or args.duration < 12.0:
-        raise GraphvioError("--seeds wants 2 or more, --rendered 0, --jobs 1 and --duration 12 or more")
+    if args.seeds < 2 or args.rendered < 0 or args.jobs < 1 or args.duration < 20.0:
+        raise GraphvioError("--seeds wants 2 or more, --rendered 0, --jobs 1 and --duration 20 or more")
     templates = templates_of(args.data, _WHERE)
     drawn, rendered = Squares(), Squares()
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:

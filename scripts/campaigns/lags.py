@@ -14,6 +14,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+from benchmarks.command_line import add_command
 from benchmarks.report import Report, machine, tell
 
 from campaigns.paper_run import PaperRun, Track
@@ -27,12 +28,7 @@ _HEAD = ("estimator", "lag, steps", "iterations", "position, cm", "velocity, cm/
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``lags``."""
-    parser = subparsers.add_parser(
-        "lags",
-        help="the paper's filter against windows of its model",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = add_command(subparsers, "lags", "the paper's filter against windows of its model", __doc__)
     parser.add_argument("--seeds", type=int, default=50, help="runs (default: 50)")
     parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds of a run (default: 20)")
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side (default: 2)")

@@ -7,25 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from campaigns.walks import FRAMES_HZ, Walk, buffer_of
 from graphvio.arrays import Float
 from graphvio.backend.ekf.filter import ExtendedKalmanFilter
 from graphvio.backend.ekf.graph import PaperGraph
 from graphvio.backend.ekf.measurements import Measurement, VisualRates, accelerometer, gyro, stacked, vision
 from graphvio.backend.ekf.process import noise_sigmas
 from graphvio.backend.ekf.state import FilterState
-from graphvio.backend.inertial import ImuBuffer, ImuSpan
+from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
 from graphvio.config import FilterConfig, SmootherConfig
-from graphvio.events import ImuSample
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_exp, se3_log
-from graphvio.rig import Imu
-from graphvio.simulation import build_scene
-from graphvio.simulation.imu import measure
 
-SCENES = ("room", "stairs", "calibration", "corridor")
-_RATE_HZ = 20
 _SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of vision: rad and metres from frame to frame
 _BLIND_EVERY_S, _BLIND_S = 5.0, 1.0
 _TILT_SIGMA, _SPEED_SIGMA, _RATE_SIGMA, _GYRO_BIAS_SIGMA = 0.01, 0.05, 0.1, 0.01
@@ -52,30 +47,21 @@ class PaperRun:
     """Measurements of a walk, a function of the seed."""
 
     def __init__(self, seed: int, duration_s: float) -> None:
-        rng, imu = np.random.default_rng([seed, 11]), Imu()
-        motion = build_scene(SCENES[seed % len(SCENES)], duration_s + 1.0).motion
-        times = np.arange(round((duration_s + 0.5) * imu.rate_hz)) / imu.rate_hz
-        track = measure(motion, imu, times, np.round(times * 1e9).astype(np.int64), seed)
-        buffer = ImuBuffer(50.0)
-        for stamp, rate, force in zip(
-            track.stamps_ns.tolist(), track.angular_velocity, track.linear_acceleration, strict=True
-        ):
-            buffer.add(ImuSample(stamp, rate, force))
-        self._imu, count = imu, round(duration_s * _RATE_HZ)
-        self._stamps = [round(k * 1e9 / _RATE_HZ) for k in range(count + 1)]
-        states = motion.at(np.array(self._stamps) * 1e-9)
-        self._truth, self._rates = states.world_T_body, states.angular_velocity
-        self._velocities = np.einsum("nji,nj->ni", self._truth[:, :3, :3], states.velocity)
+        rng, walk = np.random.default_rng([seed, 11]), Walk(seed, duration_s)
+        buffer = buffer_of(walk.track)
+        self._imu, self._stamps = walk.imu, walk.stamps_ns
+        self._truth, self._rates = walk.world_T_body, walk.angular_velocity
+        self._velocities = np.einsum("nji,nj->ni", self._truth[:, :3, :3], walk.velocity_world)
         self._spans: list[ImuSpan] = []
         self._motions: list[RelativeMotion | None] = []
-        for k in range(1, count + 1):
+        for k in range(1, len(self._stamps)):
             start_ns, end_ns = self._stamps[k - 1], self._stamps[k]
             span = buffer.span(start_ns, end_ns)
             assert span is not None
             self._spans.append(span)
             true = np.linalg.inv(self._truth[k - 1]) @ self._truth[k]
             measured = true @ se3_exp(_SIGMAS * rng.standard_normal(6))
-            sees = (k / _RATE_HZ) % _BLIND_EVERY_S < _BLIND_EVERY_S - _BLIND_S
+            sees = (k / FRAMES_HZ) % _BLIND_EVERY_S < _BLIND_EVERY_S - _BLIND_S
             self._motions.append(
                 RelativeMotion(start_ns, end_ns, measured, np.diag(_SIGMAS**2), np.zeros((6, 6)), 300) if sees else None
             )
@@ -132,7 +118,7 @@ class PaperRun:
 
     @staticmethod
     def _process() -> tuple[float, Float]:
-        config, dt = FilterConfig(), 1.0 / _RATE_HZ
+        config, dt = FilterConfig(), 1.0 / FRAMES_HZ
         return dt, noise_sigmas(
             dt, config.accel_sigma_m_s2, config.angular_accel_sigma_rad_s2, config.gyro_bias_walk_rad_s
         )

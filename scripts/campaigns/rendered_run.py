@@ -74,18 +74,17 @@ class _Run:
             return
         # The heading and the place of nav are those of the first frameset.
         nav_T_world = self._nav_T_world(estimate.nav_T_body, k)
-        known = self._odometry._belief.covariance
-        assert known.velocity is not None
-        assert known.gyro_bias is not None
-        assert known.accel_bias is not None
+        assert estimate.velocity_covariance is not None
         assert estimate.gyro_bias is not None
+        assert estimate.gyro_bias_covariance is not None
         assert estimate.accel_bias is not None
+        assert estimate.accel_bias_covariance is not None
         true_velocity = nav_T_world[:3, :3] @ self._states.velocity[k]
         for name, error, covariance in (
-            ("velocity", true_velocity - estimate.velocity_nav, known.velocity),
+            ("velocity", true_velocity - estimate.velocity_nav, estimate.velocity_covariance),
             ("tilt", *tilt_error(estimate.nav_T_body, nav_T_world @ self._states.world_T_body[k], estimate.covariance)),
-            ("gyro bias", self._track.gyro_bias[k] - estimate.gyro_bias, known.gyro_bias),
-            ("accel bias", self._track.accel_bias[k] - estimate.accel_bias, known.accel_bias),
+            ("gyro bias", self._track.gyro_bias[k] - estimate.gyro_bias, estimate.gyro_bias_covariance),
+            ("accel bias", self._track.accel_bias[k] - estimate.accel_bias, estimate.accel_bias_covariance),
         ):
             yield name, time_s, float(error @ np.linalg.solve(covariance, error)), len(error)
 

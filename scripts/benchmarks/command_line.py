@@ -1,0 +1,42 @@
+"""What the command lines of ``scripts/benchmark`` and ``scripts/campaign`` have in common."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+from graphvio.errors import GraphvioError
+
+EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
+
+
+Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+AddParser: TypeAlias = Callable[[Subparsers], None]
+"""Adds a subcommand's parser, whose default ``run`` takes the parsed arguments."""
+
+
+def add_command(subparsers: Subparsers, name: str, summary: str, description: str | None) -> argparse.ArgumentParser:
+    """A subcommand whose help tells a module's docstring, line by line as it is."""
+    return subparsers.add_parser(
+        name, help=summary, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+
+
+def run_command_line(prog: str, description: str, subcommands: Sequence[AddParser], epilog: str = "") -> int:
+    """Parse, run, and turn a user's mistake into one line and exit code 2."""
+    parser = argparse.ArgumentParser(prog=prog, description=description, epilog=epilog)
+    subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
+    for add_parser in subcommands:
+        add_parser(subparsers)
+    args = parser.parse_args()
+    try:
+        args.run(args)
+    except GraphvioError as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"{prog}: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    return 0
