@@ -148,7 +148,7 @@ class VisualFrontend:
 
     def _observe(self, frameset: FrameSet, left_out: frozenset[int], predict: MotionPredictor) -> dict[int, PairFrame]:
         for j in [j for j, frame in self._latest.items() if frameset.stamp_ns - frame.stamp_ns > _ABSENT_NS]:
-            del self._latest[j]
+            self._trackers[j].drop(self._latest.pop(j).ids)
             self._references.forget(j)
 
         def observe(j: int) -> PairFrame:
