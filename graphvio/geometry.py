@@ -11,7 +11,8 @@ Reference: J. Sola, J. Deray, D. Atchuthan, *A micro Lie theory for state estima
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.kernels import kernel, put
+from graphvio.copying import put
+from graphvio.kernels import kernel
 
 _SMALL_ANGLE = 1e-5
 

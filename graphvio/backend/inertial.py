@@ -8,8 +8,9 @@ from typing import Literal
 import numpy as np
 
 from graphvio.arrays import Float, Int
+from graphvio.copying import put
 from graphvio.events import ImuSample
-from graphvio.kernels import kernel, put
+from graphvio.kernels import kernel
 
 GRAVITY_M_S2 = 9.81
 _MAX_RATE = 100.0  # rad/s and m/s^2: beyond what any inertial sensor for this use can read

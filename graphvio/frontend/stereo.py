@@ -11,7 +11,8 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.cameras import distort, fold_radius
-from graphvio.kernels import fast_kernel, kernel, put
+from graphvio.copying import put
+from graphvio.kernels import fast_kernel, kernel
 
 _HALF_PATCH = 5
 _HALF_COARSE_PATCH = 4
