@@ -119,6 +119,7 @@ def test_every_profile_loads() -> None:
     loaded = {name: Config.load(name) for name in profiles()}
     assert loaded["default"] == Config()
     assert loaded["paper"].motion.selection == "best_pair"
+    assert loaded["paper"].fusion.estimator == "filter"
 
 
 def test_sha256_tells_configurations_apart_by_what_they_do() -> None:
