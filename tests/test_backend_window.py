@@ -190,3 +190,20 @@ def test_covariances_of_followed_variables_need_no_new_solution(monkeypatch: pyt
         window.add(gtsam.BetweenFactorVector(x(0), x(6), np.zeros(3), noise(np.eye(3) * 0.01)))
     expected = plain.joint_covariance([x(4), x(6)])
     np.testing.assert_allclose(followed.joint_covariance([x(4), x(6)]), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("walk", [1e-2, 1e-5, 1e-8, 1e-10])
+def test_values_that_hardly_change_lose_no_digits(walk: float) -> None:
+    """As biases of good sensors: the information of a step may exceed all that is known of the value itself."""
+    window, unit = Window(), np.eye(3)
+    for k in range(10):
+        window.values.insert(x(k), np.zeros(3))
+        window.add(
+            gtsam.PriorFactorVector(x(0), np.ones(3), noise(0.25 * unit))
+            if k == 0
+            else gtsam.BetweenFactorVector(x(k - 1), x(k), np.zeros(3), noise(walk**2 * unit))
+        )
+    window.optimise([x(9)])
+    np.testing.assert_allclose(window.values.atVector(x(9)), np.ones(3), rtol=1e-6)
+    np.testing.assert_allclose(window.joint_covariance([x(9)]), (0.25 + 9 * walk**2) * unit, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(window.joint_covariance([x(0)]), 0.25 * unit, rtol=1e-6, atol=1e-9)

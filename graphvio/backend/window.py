@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import takewhile
 
 import gtsam
@@ -34,11 +35,17 @@ class _Marginal:
     def covariance(self, keys: Sequence[int]) -> Float:
         """Covariance of some of the variables, in the order given. R is inverted, not its square: states far less
         certain than the poses relative to them do no harm."""
-        if np.abs(np.diag(self.square_root)).min() < _SINGULAR:
+        inverse = self._inverse
+        if inverse is None:
             raise WindowError(f"the window has no covariance of {_named(keys)}")
-        inverse = np.linalg.inv(self.square_root)
         rows = np.concatenate([inverse[self.columns[key]] for key in keys])
         return np.asarray(rows @ rows.T)
+
+    @cached_property
+    def _inverse(self) -> Float | None:
+        if np.abs(np.diag(self.square_root)).min() < _SINGULAR:
+            return None
+        return np.asarray(np.linalg.inv(self.square_root))
 
 
 class Window:
@@ -49,11 +56,14 @@ class Window:
         self.values = gtsam.Values()
         self._marginal: _Marginal | None = None  # of the variables that the last solution eliminated last
         self._unknown = 0  # how many factors, the newest, it does not know
+        self._cholesky_suffices = True
+        self._extended: _Marginal | None = None  # the same with these, once somebody has asked
 
     def add(self, factor: gtsam.NonlinearFactor) -> None:
         """Insert a factor; its variables must have values."""
         self._factors.append((frozenset(factor.keys()), factor))
         self._unknown += 1
+        self._extended = None
 
     def optimise(self, followed: Sequence[int] = ()) -> None:
         """Gauss-Newton from the present values.
@@ -77,10 +87,10 @@ class Window:
                 if largest < _CONVERGED:
                     break
         except RuntimeError as error:
-            self.values, self._marginal = values, None
+            self.values, self._marginal, self._extended = values, None, None
             raise WindowError(f"the window cannot be optimised: {_one_line(error)}") from None
         except WindowError:
-            self.values, self._marginal = values, None
+            self.values, self._marginal, self._extended = values, None, None
             raise
 
     def joint_covariance(self, keys: Sequence[int]) -> Float:
@@ -92,7 +102,9 @@ class Window:
         unknown = [key for key in keys if not self.values.exists(key)]
         if unknown:
             raise WindowError(f"the window has no variable {_named(unknown[:1])}")
-        marginal = self._extended_marginal()
+        if self._extended is None:
+            self._extended = self._extended_marginal()
+        marginal = self._extended
         if marginal is None or not marginal.columns.keys() >= set(keys):
             self._solve(keys)
             marginal = self._marginal
@@ -133,7 +145,7 @@ class Window:
             self.values.erase(key)
         self._factors = staying
         if self._unknown or (self._marginal is not None and self._marginal.columns.keys() & leaving):
-            self._marginal = None  # else it still tells the covariances of those that stay
+            self._marginal = self._extended = None  # else it still tells the covariances of those that stay
 
     def _solve(self, last: Sequence[int]) -> gtsam.GaussianBayesTree:
         """The window eliminated at its present values, some variables last; their marginal is kept."""
@@ -147,11 +159,21 @@ class Window:
             ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(
                 graph, gtsam.KeyVector(list(last)), True
             )
-            solution = graph.linearize(self.values).eliminateMultifrontal(ordering, gtsam.EliminateQR)
+            solution = self._eliminated(graph.linearize(self.values), ordering)
         except RuntimeError as error:
             raise WindowError(f"the window has no unique solution: {_one_line(error)}") from None
-        self._marginal, self._unknown = self._root_marginal(solution, last), 0
+        self._marginal, self._unknown, self._extended = self._root_marginal(solution, last), 0, None
         return solution
+
+    def _eliminated(self, graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.GaussianBayesTree:
+        """Cholesky takes half of the time. It refuses where its digits do not suffice, as with biases that hardly walk;
+        QR does it then, and from then on."""
+        if self._cholesky_suffices:
+            try:
+                return graph.eliminateMultifrontal(ordering)
+            except RuntimeError:
+                self._cholesky_suffices = False
+        return graph.eliminateMultifrontal(ordering, gtsam.EliminateQR)
 
     def _root_marginal(self, solution: gtsam.GaussianBayesTree, last: Sequence[int]) -> _Marginal | None:
         """The marginal of the variables that were eliminated last, or None if some are not in a root.
