@@ -1,0 +1,157 @@
+"""``scripts/benchmark backend``: what the back-end takes for a frameset, beside gtsam's own fixed-lag smoother.
+
+A recording is run once, and what its back-end was given is noted: samples of the IMU and motions by vision. Then the
+back-end works through that again, without a front-end beside it, and gtsam's IncrementalFixedLagSmoother is given the
+factors that it made, frameset by frameset in turns.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from benchmarks.backend_streams import Added, FactorLog, Stream, note_stream
+from benchmarks.command_line import Subparsers, add_command
+from benchmarks.recordings import add_data_option, simulated
+from benchmarks.report import Report, machine, tell
+from graphvio.arrays import Float
+from graphvio.backend.factors import r, x
+from graphvio.config import Config
+from graphvio.errors import GraphvioError
+from graphvio.smoother_belief import SmootherBelief
+
+AIM_MS, AIM_P99_MS = 1.5, 5.0
+LAGS_S = (0.5, 1.0, 2.0, 4.0)
+_WARM_UP = 20
+_FEWEST = 100
+_NS_PER_S = 1e9
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add ``backend``."""
+    parser = add_command(subparsers, "backend", "the back-end's time, beside gtsam's own fixed-lag smoother", __doc__)
+    parser.add_argument("--recording", type=Path, metavar="DIR", help="with an IMU (default: the simulated room)")
+    parser.add_argument("--framesets", type=int, default=800, metavar="N", help="at most so many (default: 800)")
+    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
+    parser.add_argument("--docs", action="store_true", help="put the report into docs/benchmarks.md")
+    add_data_option(parser)
+    parser.set_defaults(run=main)
+
+
+def main(args: argparse.Namespace) -> None:
+    """Measure and report."""
+    if args.framesets < _FEWEST:
+        raise GraphvioError(f"percentiles need framesets: give {_FEWEST} or more")
+    folder = simulated(args.data, "room") if args.recording is None else args.recording
+    tell("noting what the back-end is given")
+    stream = note_stream(folder, args.framesets)
+    if stream.rig.imu is None or len(stream.framesets) < _FEWEST:
+        raise GraphvioError(f"{folder}: needs an IMU and {_FEWEST} framesets or more")
+    report = Report()
+    title = "the simulated room" if args.recording is None else "a recording"
+    report.add(
+        machine(),
+        "",
+        f"{len(stream.framesets) - _WARM_UP} framesets of {title}, {len(stream.rig.pairs)} pairs and IMU.",
+    )
+    timings = {}
+    for lag_s in LAGS_S:
+        tell(f"lag {lag_s:g} s")
+        timings[lag_s] = _timed(stream, lag_s)
+    head = ["lag, s", "ours, median ms", "p95", "p99", "gtsam's, median ms", "p95", "p99", "with covariance",
+            "ours / gtsam's", "apart, mm"]  # fmt: skip
+    report.table(head, [_row(lag_s, timing) for lag_s, timing in timings.items()])
+    median_ms, _, p99_ms = _percentiles(timings[Config().smoother.lag_s].ours_ms)
+    report.table(
+        ["default lag", "ms", "aim"],
+        [
+            ["median", f"{median_ms:.2f}", f"{AIM_MS:g}: {'met' if median_ms <= AIM_MS else 'missed'}"],
+            ["99th percentile", f"{p99_ms:.2f}", f"{AIM_P99_MS:g}: {'met' if p99_ms <= AIM_P99_MS else 'missed'}"],
+        ],
+    )
+    if args.out is not None:
+        report.save(args.out)
+    if args.docs:
+        report.save_to_docs("backend")
+
+
+class _Timing(NamedTuple):
+    """Milliseconds for each counted frameset, and how far apart the two newest positions are, metres."""
+
+    ours_ms: Float
+    theirs_ms: Float
+    with_covariance_ms: Float
+    apart_m: Float
+
+
+def _timed(stream: Stream, lag_s: float) -> _Timing:
+    log, config = FactorLog(), Config()
+    belief = SmootherBelief(
+        stream.rig, replace(config, smoother=replace(config.smoother, lag_s=lag_s)), lambda *_: None, lambda: None
+    )
+    theirs = _Incremental(lag_s)
+    rows = []
+    for calls in stream.framesets:
+        start = perf_counter()
+        for name, arguments in calls:
+            getattr(belief, name)(*arguments)
+        ours_s = perf_counter() - start
+        stamp_ns, _, keep = calls[-1].arguments
+        index_of = belief._running._index_of
+        references = [index_of[ns] for ns in keep if ns in index_of]
+        spent_s, covariance_s, position = theirs.step(stamp_ns, index_of[stamp_ns], references, log.take())
+        apart_m = np.linalg.norm(position - belief.state().nav_T_body[:3, 3])
+        rows.append([1e3 * ours_s, 1e3 * spent_s, 1e3 * (spent_s + covariance_s), apart_m])
+    return _Timing(*np.array(rows[_WARM_UP:]).T)
+
+
+class _Incremental:
+    """gtsam's incremental fixed-lag smoother on the factors of ours."""
+
+    def __init__(self, lag_s: float) -> None:
+        params = gtsam.ISAM2Params()
+        params.setFactorization("QR")  # it throws on some graphs with its default
+        self._smoother = gtsam.IncrementalFixedLagSmoother(lag_s, params)
+        self._known: set[int] = set()
+
+    def step(self, stamp_ns: int, newest: int, references: list[int], added: Added) -> tuple[float, float, Float]:
+        """Seconds for the newest pose, and for its covariance; and its position (3,).
+
+        Args:
+            stamp_ns: of the newest state.
+            newest: number of that state.
+            references: numbers of the states that later motions are measured from: they must not leave.
+            added: factors and new variables.
+        """
+        now_s = stamp_ns / _NS_PER_S
+        new = list(added.values.keys())
+        self._known |= set(new)
+        kept = [key for k in references for key in (x(k), r(k)) if key in self._known]
+        stamps = dict.fromkeys([*new, *kept], now_s)
+        start = perf_counter()
+        self._smoother.update(added.factors, added.values, stamps)  # type: ignore[arg-type]
+        pose = self._smoother.calculateEstimatePose3(x(newest))
+        done = perf_counter()
+        self._smoother.marginalCovariance(x(newest))
+        return done - start, perf_counter() - done, np.asarray(pose.translation())
+
+
+def _row(lag_s: float, timing: _Timing) -> list[str]:
+    ours, theirs = _percentiles(timing.ours_ms), _percentiles(timing.theirs_ms)
+    return [
+        f"{lag_s:g}",
+        *(f"{ms:.2f}" for ms in (*ours, *theirs)),
+        f"{np.median(timing.with_covariance_ms):.2f}",
+        f"{ours[0] / np.median(timing.with_covariance_ms):.2f}",
+        f"{1e3 * np.median(timing.apart_m):.2f}",
+    ]
+
+
+def _percentiles(values: Float) -> list[float]:
+    return [float(value) for value in np.percentile(values, (50, 95, 99))]
