@@ -10,12 +10,15 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.backend.gating import Verdict
 from graphvio.backend.inertial import ImuSpan
+from graphvio.backend.starts import Start
 from graphvio.backend.states import RigState, StateCovariance
 from graphvio.config import Config
 from graphvio.events import Status
 from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.rig import Rig
 from graphvio.synchroniser import Report
+
+_INITIALISED_WITHIN_S = 2.0  # else it is told why not
 
 
 class Belief(ABC):
@@ -42,7 +45,9 @@ class Belief(ABC):
         self._report = report
         self._rekey = rekey
         self._lost = False
-        self._settled_ns = 0  # from this stamp on, a start in motion is over
+        self._unknown_since_ns: int | None = None  # stamp of a start that the first motions have not completed yet
+        self._is_completed = False  # whether they had, at the estimate before
+        self._is_told = False  # that this takes long
         self._tracked_ns = 0  # stamp of the last state that vision constrains
         self._final: list[tuple[int, Float]] = []
 
@@ -134,8 +139,44 @@ class Belief(ABC):
     def _status(self, stamp_ns: int, used: bool, sigma_m: float) -> Status:
         """Status of the newest state, whose position is uncertain by so much since vision was last used."""
         if used:
-            return Status.INITIALISING if stamp_ns < self._settled_ns else Status.TRACKING
+            return Status.INITIALISING if self._is_initialising(stamp_ns) else Status.TRACKING
         if not self._lost and sigma_m > self._config.smoother.lost_position_sigma_m:
             self._lost = True
             self._report(stamp_ns, "lost", f"position uncertain by {sigma_m:.2f} m since vision was last used")
         return Status.LOST if self._lost else Status.COASTING
+
+    def _note_start(self, start: Start) -> None:
+        """After a start in motion, status is ``initialising`` until the first motions have told what it lacks."""
+        if not start.is_known:
+            self._unknown_since_ns, self._is_completed, self._is_told = start.stamp_ns, False, False
+
+    def _is_initialising(self, stamp_ns: int) -> bool:
+        if self._unknown_since_ns is None:
+            return False
+        after_s = (stamp_ns - self._unknown_since_ns) * 1e-9
+        lacking = self._lacking() if after_s else "there is no motion yet"
+        was_completed, self._is_completed = self._is_completed, not lacking
+        if self._is_completed:
+            if was_completed:
+                self._unknown_since_ns = None
+            return not was_completed  # the estimate at which it becomes known is the last that may jump
+        if after_s > _INITIALISED_WITHIN_S and not self._is_told:
+            self._is_told = True
+            self._report(stamp_ns, "not_initialised", f"{after_s:.1f} s after the start {lacking}; go on moving")
+        return True
+
+    def _lacking(self) -> str:
+        """What is not known well enough yet for a start to be over, in words, or nothing."""
+        config, known = self._config.initialisation, self.covariance
+        if not self.has_imu or known.velocity is None:
+            return ""
+        nav_R_body = self.state().nav_T_body[:3, :3]
+        about_nav = nav_R_body @ known.pose[:3, :3] @ nav_R_body.T
+        tilt_deg = np.rad2deg(np.sqrt(np.linalg.eigvalsh(about_nav[:2, :2])[-1]))
+        speed_m_s = np.sqrt(np.linalg.eigvalsh(known.velocity)[-1])
+        reasons = []
+        if tilt_deg > config.tilt_sigma_deg:
+            reasons.append(f"roll and pitch are known to {tilt_deg:.1f} deg only")
+        if speed_m_s > config.velocity_sigma_m_s:
+            reasons.append(f"the velocity to {speed_m_s:.2f} m/s only")
+        return " and ".join(reasons)

@@ -16,7 +16,7 @@ from graphvio.errors import ConfigError
 
 _LARGEST = 1e12
 _MAY_BE_ZERO = frozenset(
-    ("seed", "border_px", "settle_s", "keyframe_overlap", "min_inlier_share", "min_response",
+    ("seed", "border_px", "keyframe_overlap", "min_inlier_share", "min_response",
      "scarce_share", "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s",
      "calibration_error_share")
 )  # fmt: skip
@@ -120,8 +120,10 @@ class InitialisationConfig:
     """Largest standard deviation of the angular rate that counts as rest."""
     static_accel_m_s2: float = 0.15
     """Largest standard deviation of the specific force that counts as rest."""
-    settle_s: float = 1.0
-    """After a start in motion, estimates are ``initialising`` for this long."""
+    tilt_sigma_deg: float = 3.0
+    """After a start in motion, estimates are ``initialising`` until the attitude is known this well,"""
+    velocity_sigma_m_s: float = 0.3
+    """and the velocity this well: one standard deviation of roll and pitch, and of each component."""
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,8 @@ class FilterBelief(Belief):
         self._filter = ExtendedKalmanFilter(state, covariance)
         self._has_imu = found is not None
         self._latest_ns = self._tracked_ns = self._reset_ns = stamp_ns
-        self._settled_ns, self._lost, self._span = start.settled_ns, False, None
+        self._note_start(start)
+        self._lost, self._span = False, None
         self._before_ns = self._refused_ns = None
         self._forgotten = np.zeros((3, 3))
         self._poses.clear()
@@ -158,6 +159,10 @@ class FilterBelief(Belief):
             self._lost, self._tracked_ns, self._before_outage = False, stamp_ns, position
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(position - self._before_outage)[-1], 0.0)))
         return self._status(stamp_ns, used, sigma)
+
+    def _lacking(self) -> str:
+        """Nothing but a first motion: to this filter, motion is no help to know the attitude better."""
+        return ""
 
     @property
     def _running(self) -> ExtendedKalmanFilter:

@@ -230,7 +230,7 @@ class SmootherBelief(Belief):
     def _begin(self, start: Start) -> None:
         self._running.start(start.stamp_ns, start.state, start.uncertainty)
         self._reset_ns = start.stamp_ns
-        self._settled_ns = max(self._settled_ns, start.settled_ns)
+        self._note_start(start)
         self._tracked_ns = start.stamp_ns
         self._forget_troubles()
 

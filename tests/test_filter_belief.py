@@ -131,7 +131,7 @@ def test_blind_the_gyro_holds_the_attitude_and_the_position_is_lost_in_the_end()
     before = walk.sigma_m()
     walk.steps(0.5, blind=True)
     assert set(walk.statuses[-10:]) == {Status.COASTING}
-    assert walk.sigma_m() > 2.0 * before
+    assert np.sqrt(walk.sigma_m() ** 2 - before**2) > 0.2  # of the blind half second alone
     pose = walk.belief.state().nav_T_body
     found, truth = moved([(3_000_000_000, walk.belief.take_final()[40][1]), (walk.now_ns, pose)])
     assert np.arccos(np.clip(0.5 * (np.trace(found[:3, :3].T @ truth[:3, :3]) - 1.0), -1.0, 1.0)) < 0.03

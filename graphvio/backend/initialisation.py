@@ -12,7 +12,7 @@ from graphvio.config import InitialisationConfig
 from graphvio.geometry import so3_exp
 
 _MIN_REST_S = 0.3
-_SPEED_CHANGE_SIGMA_M_S = 0.7
+_SPEED_CHANGE_SIGMA_M_S = 1.5  # a start may be anywhere in a take-off or a braking
 _ACCEL_BIAS_SIGMA_M_S2 = 0.15
 _UNKNOWN_GYRO_BIAS_SIGMA = 0.1
 _STEEP = 0.8

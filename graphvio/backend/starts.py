@@ -16,7 +16,7 @@ from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.rig import Rig
 
 _UNKNOWN_SPEED_SIGMA = 30.0  # without an IMU the first motion is believed whatever it is, on foot or on the road
-_MOVING_START_SPEED_SIGMA = 2.0
+_MOVING_START_SPEED_SIGMA = 5.0  # with one, too: the gate lets five times as much pass
 _RESTING_START_SPEED_SIGMA = 0.02
 _RESTART_SPEED_SIGMA = 1.0
 _GYRO_BIAS_SIGMA = 0.01
@@ -36,13 +36,13 @@ class Start:
         stamp_ns: of the first state.
         state: the rig then.
         uncertainty: how well it is known.
-        settled_ns: from this stamp on, a start in motion is over; 0 where there is nothing to settle.
+        is_known: whether nothing is left that the first motions must tell.
     """
 
     stamp_ns: int
     state: RigState
     uncertainty: StartUncertainty
-    settled_ns: int = 0
+    is_known: bool = True
 
 
 def first_start(
@@ -61,14 +61,12 @@ def first_start(
     if found is None:
         at = InitialAttitude(level(-rig.pairs[0].left.body_T_cam[:3, 1]), 1e-3, np.zeros(3), 1.0, False)
         speed_sigma = _UNKNOWN_SPEED_SIGMA
-        settled_ns = stamp_ns + 1  # the first frameset has no motion to track
     else:
         at = initial_attitude(*found, config)
         speed_sigma = _RESTING_START_SPEED_SIGMA if at.at_rest else _MOVING_START_SPEED_SIGMA
-        settled_ns = 0 if at.at_rest else stamp_ns + round(config.settle_s * 1e9)
     state = RigState(se3(at.nav_R_body, position), np.zeros(3), at.gyro_bias, np.zeros(3))
     pose_covariance = origin_covariance(at.nav_R_body, at.tilt_sigma_rad)
-    return Start(stamp_ns, state, StartUncertainty(pose_covariance, speed_sigma, at.gyro_bias_sigma), settled_ns)
+    return Start(stamp_ns, state, StartUncertainty(pose_covariance, speed_sigma, at.gyro_bias_sigma), at.at_rest)
 
 
 def after_failure(stamp_ns: int, state: RigState, pose_covariance: Float) -> Start:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from benchmarks.recordings import simulated
 
 from campaigns.model_run import Square, tilt_error
 from graphvio.arrays import Float
-from graphvio.config import Config, SmootherConfig
+from graphvio.config import Config, MotionConfig, SmootherConfig
 from graphvio.events import Estimate, Event, ImuSample
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.odometry import Odometry
@@ -36,7 +35,9 @@ def rendered_run(seed: int, scene: str, data: Path, duration_s: float) -> list[S
     events = [_redrawn(event, track) for event in source]
     squares: list[Square] = []
     for seconds, lag_s in _WINDOW_S.items():
-        config = Config(smoother=replace(SmootherConfig(), lag_s=lag_s))
+        config = Config(
+            motion=MotionConfig(calibration_error_share=0.0), smoother=SmootherConfig(lag_s=lag_s, imu_noise_scale=1.0)
+        )
         squares += _Run(source.start_ns, Odometry(source.rig, config), track, motion.at(times)).squares(events, seconds)
     return squares
 

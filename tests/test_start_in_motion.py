@@ -1,0 +1,150 @@
+"""Starts in the midst of motion: attitude, velocity and biases come from the first motions by vision and the IMU."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from graphvio.arrays import Float
+from graphvio.backend.inertial import GRAVITY_M_S2
+from graphvio.config import Config
+from graphvio.events import ImuSample, Quality, Status
+from graphvio.frontend.motion import RelativeMotion, VisualResult
+from graphvio.geometry import se3, se3_exp, so3_exp, so3_log
+from graphvio.rig import Imu
+from graphvio.simulation.default_rig import default_rig
+from graphvio.smoother_belief import SmootherBelief
+from graphvio.synchroniser import Synchroniser
+
+STEP_S = 0.05
+UP = np.array([0.0, 0.0, GRAVITY_M_S2])
+SIGMAS = np.repeat([1e-3, 2e-3], 3)
+BASE_NS = 10_000_000_000
+
+
+class Swing:
+    """A rig that swings in all directions about a steady course, tilted by some ten degrees."""
+
+    def __init__(self, rng: np.random.Generator, accel_m_s2: float, hertz: float) -> None:
+        self._rng = rng
+        self._w = 2.0 * np.pi * hertz * rng.uniform(0.7, 1.3, 3)
+        self._amplitude = accel_m_s2 / (2.0 * np.pi * hertz) ** 2 * rng.uniform(0.5, 1.0, 3)
+        self._phase, self._turn_phase = rng.uniform(0.0, 2.0 * np.pi, (2, 3))
+        self._course, self._tilt = rng.standard_normal(3), 0.3 * rng.standard_normal(3)
+        self.gyro_bias, self.accel_bias = 0.01 * rng.standard_normal(3), 0.1 * rng.standard_normal(3)
+
+    def pose(self, t: float) -> Float:
+        rotation = so3_exp(0.5 * np.sin(1.5 * t + self._turn_phase) + self._tilt)
+        return np.asarray(se3(rotation, self._amplitude * np.sin(self._w * t + self._phase) + self._course * t))
+
+    def velocity(self, t: float) -> Float:
+        return np.asarray(self._amplitude * self._w * np.cos(self._w * t + self._phase) + self._course)
+
+    def sample(self, t: float, imu: Imu) -> ImuSample:
+        rotation, h = self.pose(t)[:3, :3], 1e-4
+        accel = -self._amplitude * self._w**2 * np.sin(self._w * t + self._phase)
+        rate = so3_log(np.ascontiguousarray(self.pose(t - h)[:3, :3].T @ self.pose(t + h)[:3, :3])) / (2.0 * h)
+        noise = np.sqrt(imu.rate_hz) * self._rng.standard_normal((2, 3))
+        return ImuSample(
+            BASE_NS + round(t * 1e9),
+            rate + self.gyro_bias + imu.gyro_noise_density * noise[0],
+            rotation.T @ (accel + UP) + self.accel_bias + imu.accel_noise_density * noise[1],
+        )
+
+
+@dataclass
+class Outcome:
+    """Of a run of four seconds: a number for each frameset.
+
+    Attributes:
+        tilt_deg, speed_m_s: errors of roll and pitch, and of velocity in body.
+        tilt_sigma_deg, speed_sigma_m_s: as they are told.
+        step_m: how far the step to the frameset is from the true one, in the frame of the rig before it.
+    """
+
+    tilt_deg: list[float] = field(default_factory=list)
+    tilt_sigma_deg: list[float] = field(default_factory=list)
+    speed_m_s: list[float] = field(default_factory=list)
+    speed_sigma_m_s: list[float] = field(default_factory=list)
+    step_m: list[float] = field(default_factory=list)
+    status: list[Status] = field(default_factory=list)
+    incidents: list[tuple[float, str, str]] = field(default_factory=list)
+
+    @property
+    def initialised_s(self) -> float:
+        """From when on all is known."""
+        return STEP_S * self.status.index(Status.TRACKING)
+
+
+def run(seed: int, accel_m_s2: float, hertz: float, sigmas: Float | None = SIGMAS) -> Outcome:
+    """Vision has these errors, one sigma, or sees nothing."""
+    rng, rig, config = np.random.default_rng(seed), default_rig(), Config()
+    assert rig.imu is not None
+    swing, synchroniser, out = Swing(rng, accel_m_s2, hertz), Synchroniser(rig, config, lambda *_: None), Outcome()
+    for k in range(-round(rig.imu.rate_hz), round(4.1 * rig.imu.rate_hz)):
+        synchroniser.add_sample(swing.sample(k / rig.imu.rate_hz, rig.imu))
+    belief = SmootherBelief(
+        rig,
+        config,
+        lambda ns, kind, detail: out.incidents.append(((ns - BASE_NS) * 1e-9, kind, detail)),
+        lambda: None,
+    )
+    before_ns, before, true_before = BASE_NS, np.eye(4), swing.pose(0.0)
+    for n in range(80):
+        t = n * STEP_S
+        stamp_ns, true = BASE_NS + round(t * 1e9), swing.pose(t)
+        used = n == 0
+        if n == 0:
+            belief.start(stamp_ns, synchroniser.initial_span(stamp_ns))
+        else:
+            belief.predict(stamp_ns, synchroniser.span(before_ns, stamp_ns))
+            if sigmas is not None:
+                measured = np.linalg.inv(true_before) @ true @ se3_exp(sigmas * rng.standard_normal(6))
+                motion = RelativeMotion(before_ns, stamp_ns, measured, np.diag(sigmas**2), np.zeros((6, 6)), 200)
+                used = belief.use(VisualResult(motion, Quality.GOOD, "", {}), at_rest=False) is not None
+        out.status.append(belief.update(stamp_ns, used, frozenset()))
+        state, known = belief.state(), belief.covariance
+        rotation = state.nav_T_body[:3, :3]
+        out.tilt_deg.append(float(np.rad2deg(np.arccos(min(rotation[2] @ true[2, :3], 1.0)))))
+        about_nav = (rotation @ known.pose[:3, :3] @ rotation.T)[:2, :2]
+        out.tilt_sigma_deg.append(float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(about_nav)[-1]))))
+        error = rotation.T @ state.velocity_nav - true[:3, :3].T @ swing.velocity(t)
+        assert known.velocity is not None
+        out.speed_m_s.append(float(np.linalg.norm(error)))
+        out.speed_sigma_m_s.append(float(np.sqrt(np.linalg.eigvalsh(known.velocity)[-1])))
+        step, true_step = (np.linalg.inv(a) @ b for a, b in ((before, state.nav_T_body), (true_before, true)))
+        out.step_m.append(float(np.linalg.norm(step[:3, 3] - true_step[:3, 3])))
+        before_ns, before, true_before = stamp_ns, state.nav_T_body, true
+    return out
+
+
+@pytest.mark.parametrize(("accel_m_s2", "hertz"), [(1.0, 0.5), (5.0, 0.5), (5.0, 0.16), (15.0, 1.0)])
+def test_it_is_known_within_two_seconds_and_rightly(accel_m_s2: float, hertz: float) -> None:
+    """On foot, in a take-off or a braking of a second, and shaken; the mean force is up to 40 deg off the vertical."""
+    outcomes = [run(seed, accel_m_s2, hertz) for seed in range(8)]
+    for out in outcomes:
+        assert out.initialised_s <= 1.0  # asked for: 2 s
+        k = round(out.initialised_s / STEP_S)
+        assert max(out.tilt_deg[k:]) < 8.0
+        assert np.all(np.array(out.tilt_deg[k:]) < 4.0 * np.array(out.tilt_sigma_deg[k:]))
+        assert np.all(np.array(out.speed_m_s[k:]) < 4.5 * np.array(out.speed_sigma_m_s[k:]))
+        assert out.step_m[k] < 0.05  # the switch is no jump: 3 deg of half a metre are 2.6 cm
+        assert set(out.status[k:]) == {Status.TRACKING}
+        assert not out.incidents
+    assert np.median([out.tilt_deg[-1] for out in outcomes]) < 0.6
+    if accel_m_s2 > 1.0:  # where it began far off
+        assert max(out.tilt_deg[0] for out in outcomes) > 10.0
+
+
+def test_without_motions_it_is_never_known() -> None:
+    out = run(0, 1.0, 0.5, sigmas=None)
+    assert Status.TRACKING not in out.status
+
+
+def test_what_is_lacking_is_told_once() -> None:
+    """Of points that are all far away, vision tells the rotation alone."""
+    out = run(0, 1.0, 0.5, sigmas=np.repeat([1e-3, 5.0], 3))
+    assert set(out.status) <= {Status.INITIALISING, Status.COASTING}
+    ((told_s, _, detail),) = [incident for incident in out.incidents if incident[1] == "not_initialised"]
+    assert told_s == pytest.approx(2.05, abs=0.01)
+    assert "velocity" in detail
