@@ -118,6 +118,16 @@ def test_a_stretch_ends_at_the_newest_sample_and_at_a_gap() -> None:
     assert ImuBuffer(50.0).stretch(0, 10) is None
 
 
+def test_samples_without_framesets_do_not_fill_the_memory() -> None:
+    buffer = ImuBuffer(50.0)
+    for k in range(100_000):
+        assert buffer.add(sample(START_NS + 20 * MS * k)) == ""
+    assert buffer.oldest_ns is not None
+    assert buffer.newest_ns is not None
+    assert buffer.newest_ns - buffer.oldest_ns < 180_000 * MS  # of 2000 s
+    assert buffer.span(buffer.newest_ns - 50_000 * MS, buffer.newest_ns) is not None
+
+
 def test_discarding_keeps_what_a_later_span_needs() -> None:
     buffer = linear_buffer([i * 10 * MS for i in range(10)])
     before = buffer.span(START_NS + 35 * MS, START_NS + 60 * MS)

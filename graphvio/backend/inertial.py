@@ -19,6 +19,7 @@ NO_SAMPLES = (np.empty(0, dtype=np.int64), np.empty((0, 6)))
 """What `ImuBuffer.since` returns where it knows nothing."""
 _STUCK_NS = 250_000_000  # for so long no living axis repeats one value while others change
 _MOVING = np.repeat([0.2, 1.0], 3)  # rad/s and m/s^2, by so much
+_KEPT_NS = 60_000_000_000  # framesets do not come later than this after their samples
 _ROOM = 1024  # samples that the buffer has room for at first
 
 
@@ -139,7 +140,11 @@ class ImuBuffer:
         return self._first + int(np.searchsorted(self._stamps[self._first : self._end], stamp_ns, side))
 
     def _make_room(self) -> None:
-        """Move the samples to the front, of twice the room if they fill half of it."""
+        """Move the samples to the front, of twice the room if they fill half of it.
+
+        Those of long ago are dropped: an IMU without framesets must not fill the memory.
+        """
+        self.discard_before(int(self._stamps[self._end - 1]) - _KEPT_NS)
         kept = slice(self._first, self._end)
         stamps, values = self._stamps[kept], self._values[kept]
         room = len(self._stamps) * (2 if 2 * len(stamps) > len(self._stamps) else 1)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from graphvio.arrays import Float
+from graphvio.geometry import se3_inverse, se3_log
 
 CONFIDENCE = 0.95
 
@@ -74,3 +75,21 @@ def rows(squares: Squares, names: Mapping[str, str]) -> list[list[str]]:
 
 
 HEAD = ("what", "dimensions", "mean", f"{100 * CONFIDENCE:.0f} % band", "times in band")
+
+
+def tilt_error(nav_T_body: Float, true: Float, covariance: Float) -> tuple[Float, Float]:
+    """Error (2,) of roll and pitch about nav's horizontal axes, and its covariance (2, 2), from the pose's (6, 6)."""
+    rotation = nav_T_body[:3, :3]
+    off = np.eye(4)
+    off[:3, :3] = true[:3, :3] @ rotation.T
+    about_nav = rotation @ covariance[:3, :3] @ rotation.T
+    return se3_log(off)[:2], about_nav[:2, :2]
+
+
+def heading_aligned(nav_T_body: Float, world_T_body: Float) -> Float:
+    """``nav_T_world`` (4, 4) that is upright and gives both poses one heading: nav's is that of its first pose."""
+    about = nav_T_body @ se3_inverse(np.ascontiguousarray(world_T_body))
+    heading = np.arctan2(about[1, 0] - about[0, 1], about[0, 0] + about[1, 1])
+    turned = np.eye(4)
+    turned[:2, :2] = [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
+    return turned

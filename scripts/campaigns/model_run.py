@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from campaigns.drawn import DrawnVision, Template
+from campaigns.measures import tilt_error
 from campaigns.walks import FRAMES_HZ, Walk, buffer_of
-from graphvio.arrays import Float
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
 from graphvio.config import SmootherConfig
@@ -106,12 +106,3 @@ class _ModelRun:
         error = se3_log(np.ascontiguousarray(se3_inverse(estimated) @ true))
         covariance = smoother.covariance_since(self._stamps[start])
         return name, end / FRAMES_HZ, float(error @ np.linalg.solve(covariance, error)), 6
-
-
-def tilt_error(nav_T_body: Float, true: Float, covariance: Float) -> tuple[Float, Float]:
-    """Error (2,) of roll and pitch about nav's horizontal axes, and its covariance (2, 2), from the pose's (6, 6)."""
-    rotation = nav_T_body[:3, :3]
-    off = np.eye(4)
-    off[:3, :3] = true[:3, :3] @ rotation.T
-    about_nav = rotation @ covariance[:3, :3] @ rotation.T
-    return se3_log(off)[:2], about_nav[:2, :2]

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from benchmarks.recordings import simulated
 
-from campaigns.model_run import Square, tilt_error
-from graphvio.arrays import Float
+from campaigns.measures import heading_aligned, tilt_error
+from campaigns.model_run import Square
 from graphvio.config import Config, MotionConfig, SmootherConfig
 from graphvio.events import Estimate, Event, ImuSample
-from graphvio.geometry import se3_inverse, se3_log
+from graphvio.geometry import se3_log
 from graphvio.odometry import Odometry
 from graphvio.simulation import build_scene
 from graphvio.simulation.imu import ImuTrack, measure
@@ -74,7 +74,7 @@ class _Run:
         if estimate.nav_T_body is None or estimate.velocity_nav is None or estimate.covariance is None:
             return
         # The heading and the place of nav are those of the first frameset.
-        nav_T_world = self._nav_T_world(estimate.nav_T_body, k)
+        nav_T_world = heading_aligned(estimate.nav_T_body, self._states.world_T_body[k])
         assert estimate.velocity_covariance is not None
         assert estimate.gyro_bias is not None
         assert estimate.gyro_bias_covariance is not None
@@ -103,11 +103,3 @@ class _Run:
 
     def _sample(self, stamp_ns: int) -> int:
         return int(np.searchsorted(self._track.stamps_ns, stamp_ns))
-
-    def _nav_T_world(self, nav_T_body: Float, k: int) -> Float:
-        """Nav against the simulator's world: upright, and turned so that the headings are the same."""
-        about = nav_T_body @ se3_inverse(np.ascontiguousarray(self._states.world_T_body[k]))
-        heading = np.arctan2(about[1, 0] - about[0, 1], about[0, 0] + about[1, 1])
-        turned = np.eye(4)
-        turned[:2, :2] = [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
-        return turned

@@ -1,0 +1,144 @@
+"""``scripts/campaign endurance``: does the back-end stay as it is over an hour?
+
+Rounds through a room, with an IMU whose biases go on drifting and motions by vision that are drawn from the truth. What
+a frameset takes, the process's memory, what is known of the state and how wrong it is are told for each part.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from benchmarks.command_line import Subparsers, add_command
+from benchmarks.report import Report, machine, tell
+
+from campaigns.measures import heading_aligned, tilt_error
+from campaigns.walks import FRAMES_HZ
+from graphvio.arrays import Float
+from graphvio.backend.inertial import ImuBuffer
+from graphvio.config import Config
+from graphvio.errors import GraphvioError
+from graphvio.events import ImuSample, Quality
+from graphvio.frontend.motion import RelativeMotion, VisualResult
+from graphvio.geometry import se3_exp, se3_inverse
+from graphvio.rig import Imu
+from graphvio.simulation.default_rig import default_rig
+from graphvio.simulation.imu import measure
+from graphvio.simulation.walking import Walk
+from graphvio.smoother_belief import SmootherBelief
+
+_PARTS = 6
+_CORNERS_M = np.array([[2.6, 2.1, 1.45], [-2.6, 2.1, 1.45], [-2.6, -2.1, 1.45], [2.6, -2.1, 1.45]])
+_SPEED_M_S = 1.05
+_SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of vision: rad and metres from frame to frame
+_HEAD = ("minutes", "median ms", "99th percentile", "memory, MB", "variables", "gated", "position, m, sigma",
+         "tilt, deg", "sigma", "gyro bias, mrad/s", "sigma")  # fmt: skip
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add ``endurance``."""
+    parser = add_command(subparsers, "endurance", "memory, time and numerics of the back-end over an hour", __doc__)
+    parser.add_argument("--minutes", type=float, default=60.0, help="of the walk (default: 60)")
+    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
+    parser.add_argument("--docs", action="store_true", help="write the report into docs/benchmarks.md")
+    parser.set_defaults(run=main)
+
+
+def main(args: argparse.Namespace) -> None:
+    """Run and report."""
+    if args.minutes < 1.0:
+        raise GraphvioError("--minutes wants 1 or more")
+    report = Report()
+    report.add(
+        machine(),
+        "",
+        f"`--minutes {args.minutes:g}`. Errors are those at the end of each part. The position's sigma grows, as "
+        "nothing ever tells where the rig is.",
+    )
+    report.table(_HEAD, _parts(60.0 * args.minutes))
+    if args.out is not None:
+        report.save(args.out)
+    if args.docs:
+        report.save_to_docs("endurance")
+
+
+def _parts(duration_s: float) -> list[list[str]]:
+    rng, imu, rig = np.random.default_rng(0), Imu(), default_rig()
+    rounds = 1 + round(duration_s * _SPEED_M_S / np.linalg.norm(np.diff(_CORNERS_M, axis=0), axis=1).sum())
+    motion = Walk(np.tile(_CORNERS_M, (rounds, 1)), _SPEED_M_S, duration_s + 1.0).motion
+    times = np.arange(round((duration_s + 0.5) * imu.rate_hz)) / imu.rate_hz
+    track = measure(motion, imu, times, np.round(times * 1e9).astype(np.int64), 0)
+    framesets = round(duration_s * FRAMES_HZ)
+    stamps = [round(k * 1e9 / FRAMES_HZ) for k in range(framesets + 1)]
+    states = motion.at(np.array(stamps) * 1e-9)
+    gated: list[int] = []
+    belief = SmootherBelief(rig, Config(), lambda ns, *_: gated.append(ns), lambda: None)
+    buffer, added = ImuBuffer(50.0), 0
+    spent_ms: list[float] = []
+    rows = []
+    for k, stamp_ns in enumerate(stamps):
+        while added < len(track.stamps_ns) and (added == 0 or track.stamps_ns[added - 1] < stamp_ns + 1_000_000_000):
+            rate, force = track.angular_velocity[added], track.linear_acceleration[added]
+            buffer.add(ImuSample(int(track.stamps_ns[added]), rate, force))
+            added += 1
+        visual = VisualResult(_motion(states.world_T_body, stamps, k, rng) if k else None, Quality.GOOD, "", {})
+        start = perf_counter()
+        if k == 0:
+            found = buffer.stretch(0, stamps[0] + 500_000_000)
+            assert found is not None
+            belief.start(stamp_ns, (found[0], 0.0))
+        else:
+            belief.predict(stamp_ns, buffer.span(stamps[k - 1], stamp_ns))
+        used = belief.use(visual, at_rest=False) is not None
+        belief.update(stamp_ns, used or k == 0, frozenset())
+        belief.take_final()
+        spent_ms.append(1e3 * (perf_counter() - start))
+        buffer.discard_before(stamp_ns)
+        if k and k % (framesets // _PARTS) == 0:
+            rows.append(
+                [
+                    f"{(k - framesets // _PARTS) / FRAMES_HZ / 60.0:g} to {k / FRAMES_HZ / 60.0:g}",
+                    f"{np.median(spent_ms):.2f}",
+                    f"{np.percentile(spent_ms, 99):.2f}",
+                    f"{_memory_mb():.0f}",
+                    str(belief._running._window.values.size()),
+                    str(len(gated)),
+                    *_errors(belief, states.world_T_body[k], track.gyro_bias[round(k * imu.rate_hz / FRAMES_HZ)]),
+                ]
+            )
+            tell(" | ".join(rows[-1]))
+            spent_ms.clear()
+    return rows
+
+
+def _motion(world_T_body: Float, stamps: list[int], k: int, rng: np.random.Generator) -> RelativeMotion:
+    true = se3_inverse(world_T_body[k - 1]) @ world_T_body[k]
+    measured = true @ se3_exp(_SIGMAS * rng.standard_normal(6))
+    return RelativeMotion(stamps[k - 1], stamps[k], measured, np.diag(_SIGMAS**2), np.zeros((6, 6)), 300)
+
+
+def _errors(belief: SmootherBelief, world_T_body: Float, gyro_bias: Float) -> list[str]:
+    """Sigma of the position; error and sigma of the tilt; of the gyro's bias."""
+    state, known = belief.state(), belief.covariance
+    assert known.gyro_bias is not None
+    true = heading_aligned(state.nav_T_body, world_T_body) @ world_T_body
+    tilt, tilt_covariance = tilt_error(state.nav_T_body, true, known.pose)
+    return [
+        f"{_sigma(known.pose[3:, 3:]):.2f}",
+        f"{np.rad2deg(np.linalg.norm(tilt)):.3f}",
+        f"{np.rad2deg(_sigma(tilt_covariance)):.3f}",
+        f"{1e3 * np.abs(gyro_bias - state.gyro_bias).max():.3f}",
+        f"{1e3 * _sigma(known.gyro_bias):.3f}",
+    ]
+
+
+def _sigma(covariance: Float) -> float:
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+
+
+def _memory_mb() -> float:
+    """What the process holds in memory now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * 4096 / 2**20
