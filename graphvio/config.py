@@ -20,6 +20,7 @@ _MAY_BE_ZERO = frozenset(
      "scarce_share", "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s",
      "calibration_error_share")
 )  # fmt: skip
+_RANGES = {"cells_across": (2, 100), "window_px": (5, 63), "levels": (1, 8), "min_inliers": (3, 1000)}
 _SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
 
 
@@ -317,6 +318,9 @@ def _checked(hint: Any, value: object, where: str) -> object:
     name = where.rsplit(" ", 1)[-1]
     if value == 0 and name not in _MAY_BE_ZERO:
         raise ConfigError(f"{where}: is 0; it must be positive")
+    least, most = _RANGES.get(name, (0, _LARGEST))
+    if not least <= value <= most:
+        raise ConfigError(f"{where}: is {value!r}; choose from {least} to {most}")
     if name.endswith(_SHARES) and value > 1:
         raise ConfigError(f"{where}: is {value!r}; a share or probability is at most 1")
     if hint is float:

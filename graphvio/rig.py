@@ -215,11 +215,13 @@ class Rig:
         """The same rig with only some of its pairs, in the order given.
 
         Raises:
-            RigError: if an index does not exist.
+            RigError: if an index does not exist or is there twice.
         """
         for index in indices:
             if not 0 <= index < len(self.pairs):
                 raise RigError(f"{self.name}: there is no pair {index}; choose from 0 to {len(self.pairs) - 1}")
+        if len(set(indices)) < len(indices):
+            raise RigError(f"{self.name}: a pair is asked for twice; name each once")
         return replace(self, pairs=tuple(self.pairs[i] for i in indices))
 
     def without_imu(self) -> Rig:

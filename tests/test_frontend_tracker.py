@@ -216,7 +216,21 @@ def test_the_left_mask_keeps_corners_and_tracks_out(tmp_path: Path) -> None:
     pair = rectified(left_mask=mask_of(X < 200, tmp_path / "left.png"))
     for frame in followed(walk(4), anchored=True, tracker=PairTracker(pair, Config())):
         assert len(frame.ids) > 10
-        assert frame.pixels[:, 0].max() < 200.5
+        assert frame.pixels[:, 0].max() < 200.5 - 8.0  # no pixel of its patch of 15
+
+
+def test_what_a_mask_hides_changes_nothing(tmp_path: Path) -> None:
+    """Nor does the edge of what is hidden make corners."""
+    pair = rectified(mask_of(X < 200, tmp_path / "left.png"), mask_of(X < 200, tmp_path / "right.png"))
+    results = []
+    for grey in (0, 255):
+        images = [np.where(X < 200, image, grey).astype(np.uint8) for image in views(np.eye(4))]
+        results.append(PairTracker(pair, Config()).observe(0, images[0], images[1], None, None))
+    np.testing.assert_array_equal(results[0].pixels, results[1].pixels)
+    assert len(results[0].ids) > 10
+    both = results[0].has_depth & results[1].has_depth
+    assert both.mean() > 0.5
+    np.testing.assert_allclose(results[0].points[both], results[1].points[both], atol=1e-3)
 
 
 def test_the_right_mask_keeps_matches_out(tmp_path: Path) -> None:
@@ -225,8 +239,8 @@ def test_the_right_mask_keeps_matches_out(tmp_path: Path) -> None:
     frame = PairTracker(pair, Config()).observe(0, *images, None, None)
     whole = PairTracker(rectified(), Config()).observe(0, *images, None, None)
     np.testing.assert_array_equal(frame.pixels, whole.pixels)
-    hidden = frame.pixels[:, 0] - DISPARITY > 200.7
-    clear = frame.pixels[:, 0] - DISPARITY < 198.5
+    hidden = frame.pixels[:, 0] - DISPARITY > 200.7 - 8.0
+    clear = frame.pixels[:, 0] - DISPARITY < 198.5 - 8.0
     assert hidden.sum() > 5
     assert not frame.has_depth[hidden].any()
     np.testing.assert_array_equal(frame.has_depth[clear], whole.has_depth[clear])

@@ -1,9 +1,10 @@
 """What goes wrong in front of the cameras and behind them: vision alone, on rendered images of a walk in a room."""
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from graphvio import Config, Estimate, FrameSet, Odometry, Status, open_source
 from graphvio.arrays import Float, Image
 from graphvio.evaluation.measures import umeyama_se3
 from graphvio.events import Event, Incident, Quality
+from graphvio.frontend.matching import StereoMatcher, StereoMatches
 from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.rig import Rig
@@ -201,6 +203,28 @@ def test_an_error_of_p12_is_told_and_corrected(room_walk: Path, events: list[Eve
     assert walk.ate_m < 1.5 * min(single.ate_m for single in alone)
     assert walk.end_error_m < max(1.05 * min(single.end_error_m for single in alone), 0.004)
     assert all(estimate.epoch == 0 for estimate in walk.estimates)
+
+
+def test_all_that_stereo_matching_threw_out_is_reported(
+    room_walk: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also of the search for new corners, when the reference changes."""
+    thrown_out: Counter[str] = Counter()
+    match = StereoMatcher.match
+
+    def counted(self: StereoMatcher, *arguments: Any) -> StereoMatches:
+        matches = match(self, *arguments)
+        thrown_out.update(matches.rejected)
+        return matches
+
+    monkeypatch.setattr(StereoMatcher, "match", counted)
+    walk = Walk(room_walk, events, as_it_is)
+    reported: Counter[str] = Counter()
+    for estimate in walk.estimates:
+        for report in estimate.pairs.values():
+            reported.update(report.rejected)
+    assert sum(thrown_out.values()) > 1000
+    assert {name: reported[name] for name in thrown_out} == dict(thrown_out)
 
 
 @pytest.mark.parametrize("pair", [0, 1])

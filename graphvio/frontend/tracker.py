@@ -32,8 +32,8 @@ class PairTracker:
         self._pair = pair
         self._config = config
         self._cell_px = config.corners.cell_px(pair.left.size_px[0])
-        self._allowed = _allowed(pair.left)
-        self._matcher = StereoMatcher(pair, config, _allowed(pair.right))
+        self._allowed = _allowed(pair.left, config.tracking.window_px)
+        self._matcher = StereoMatcher(pair, config, _allowed(pair.right, config.tracking.window_px))
         self._next_id = 0
         self._last = PairFrame.empty()
         self._left: Pyramid = ()
@@ -219,12 +219,13 @@ class PairTracker:
         return np.concatenate([new, weak])
 
 
-def _allowed(camera: Camera) -> Bool:
-    """Where (height, width) a camera's image may be used: its mask, or everywhere."""
+def _allowed(camera: Camera, window_px: int) -> Bool:
+    """Where (height, width) points of a camera's image may be: where no pixel of their patch is masked, or anywhere."""
     width, height = camera.size_px
     if camera.mask is None:
         return np.ones((height, width), dtype=bool)
     mask = cv2.imread(str(camera.mask), cv2.IMREAD_GRAYSCALE)
     if mask is None or mask.shape != (height, width):
         raise RigError(f"camera {camera.name}: mask {camera.mask} is no image of {width}x{height} pixels")
-    return np.asarray(mask > 0)
+    reach = 2 * (window_px // 2 + 1) + 1  # a patch at any sub-pixel place
+    return np.asarray(cv2.erode(mask, np.ones((reach, reach), dtype=np.uint8), borderValue=(255,)) > 0)

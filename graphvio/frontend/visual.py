@@ -101,7 +101,7 @@ class VisualFrontend:
         watch.lap("motion")
         reports = {j: _report(frame, correspondences, j, agreement) for j, frame in frames.items()}
         if agreement is None:
-            self._refer_to(frames)
+            reports = _with_rejections(reports, self._refer_to(frames))
             watch.lap("renew")
             return VisualResult(None, Quality.FAILED, reason, reports, frozen=frozen.pairs, stage_ms=watch.stage_ms)
         refined = agreement.sides[0].refined
@@ -121,7 +121,7 @@ class VisualFrontend:
         watch.lap("judge")
         if self._references.are_spent(frames, correspondences, refined, len(agreement.sides) > 1):
             self._learn_alignments(agreement)
-            self._refer_to(frames)
+            reports = _with_rejections(reports, self._refer_to(frames))
         watch.lap("renew")
         return VisualResult(
             motion,
@@ -258,6 +258,11 @@ class VisualFrontend:
             alignment.add(own[0], own[j])
             if alignment.learn():
                 self._arrays = self._arrays.corrected(RigArrays.of(self._rig), j, alignment.correction)
+
+
+def _with_rejections(reports: Mapping[int, PairReport], renewed: Mapping[int, PairFrame]) -> dict[int, PairReport]:
+    """Reports with what the search for new corners threw out, too."""
+    return {j: replace(report, rejected=renewed[j].rejected) for j, report in reports.items()}
 
 
 def _inliers_of(pair: int, correspondences: Correspondences, agreement: Agreement) -> Bool:
