@@ -4,13 +4,13 @@ import sys
 
 from benchmarks.command_line import run_command_line
 
-from campaigns import consistency, endurance, lags
+from campaigns import consistency, endurance, lags, rates
 
 if __name__ == "__main__":
     sys.exit(
         run_command_line(
             "scripts/campaign",
             "Statistical claims by Monte Carlo. docs/benchmarks.md has their results.",
-            (consistency.add_parser, endurance.add_parser, lags.add_parser),
+            (consistency.add_parser, endurance.add_parser, lags.add_parser, rates.add_parser),
         )
     )
