@@ -1,7 +1,7 @@
 """``scripts/campaign rates``: the paper's figure 5, a blind turn as gyro, vision and estimate tell it.
 
-The bend of the simulated corridor, where both pairs see nothing but blank walls for a second: what the left cameras saw,
-and below it the angular rates in body. The estimate follows vision, then the gyro, then vision again.
+The bend of the simulated corridor, where both pairs see nothing but blank walls for a second: what the left cameras
+saw, and below it the angular rates in body. The estimate follows vision, then the gyro, then vision again.
 """
 
 from __future__ import annotations
@@ -79,7 +79,8 @@ def _draw(
 ) -> None:
     figure = Figure(figsize=(12.0, 9.0), dpi=_DPI, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
-    above, below = figure.subfigures(2, 1, height_ratios=(1.0, 2.6))
+    halves: Any = figure.subfigures(2, 1, height_ratios=(1.0, 2.6))
+    above, below = halves
     chosen = [images[i] for i in np.linspace(0, len(images) - 1, _THUMBNAILS).astype(int)]
     thumbnails = above.subplots(len(names), _THUMBNAILS, squeeze=False)
     for column, (time_s, views) in enumerate(chosen):
