@@ -5,7 +5,10 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -80,11 +83,11 @@ def run(args: argparse.Namespace) -> None:
     if len(footage.steps) < WARM_UP + _FEWEST:
         raise GraphvioError(f"{folder}: has {len(footage.steps)} framesets; {WARM_UP + _FEWEST} are needed")
     tell("compiling")
-    warm_up(footage.rig, config)
+    warm_up(footage.rig, config)  # for all processes
     report = Report()
     report.add(machine())
     title = "a simulated room" if args.recording is None else "a recording"
-    _stages(report, footage.first(count), config, title, args.rounds)
+    _stages(report, footage, folder, args, title)
     if not args.no_growth:
         add_growth(report, footage, config, args.growth_framesets)
     if args.out is not None:
@@ -93,26 +96,68 @@ def run(args: argparse.Namespace) -> None:
         report.save_to_docs("frontend")
 
 
-def _stages(report: Report, footage: Footage, config: Config, title: str, rounds: int) -> None:
-    whole, ours, theirs = Timings(), Timings(), Timings()
-    ratios: list[float] = []
-    for number in range(rounds):
-        tell(f"timing odometry, front-end and reference in turns, round {number + 1} of {rounds}")
-        frontend, reference = FrontendContender(footage, config), ReferenceContender(footage)
-        timed = take_turns([OdometryContender(footage, config), frontend, reference], len(footage.steps))
-        for all_rounds, one in zip((whole, ours, theirs), timed, strict=True):
-            all_rounds.add(one)
-        ratios.append(timed[1].median_ms / timed[2].median_ms)
+class _Round(NamedTuple):
+    """What one round tells.
+
+    Attributes:
+        whole, ours, theirs: times of the odometry, of the front-end alone and of the reference.
+        tracks, points: that the front-end has a pair, in the mean.
+        failures: framesets in which it found no motion.
+        offered, inliers: points that the reference has a pair, in the mean, and the share of them that fits.
+    """
+
+    whole: Timings
+    ours: Timings
+    theirs: Timings
+    tracks: float
+    points: float
+    failures: int
+    offered: float
+    inliers: float
+
+
+def _round(folder: Path, count: int, profile: str) -> _Round:
+    """Time the three pipelines in turns."""
+    footage, config = Footage.load(folder, count), Config.load(profile)
+    warm_up(footage.rig, config)
+    frontend, reference = FrontendContender(footage, config), ReferenceContender(footage)
+    contenders = [OdometryContender(footage, config), frontend, reference]
+    whole, ours, theirs = take_turns(contenders, len(footage.steps))
     pipeline = reference.pipeline
-    width, height = footage.rig.pairs[0].left.size_px
-    report.add(
-        f"{rounds} rounds of {len(whole.total_ms) // rounds} framesets of {title}, {len(footage.rig.pairs)} pairs of "
-        f"{width}x{height} pixels, "
-        f"{'with' if footage.rig.imu else 'without'} IMU. The front-end followed {np.mean(frontend.tracks):.0f} tracks "
-        f"a pair, {np.mean(frontend.points):.0f} of them with depth and in the reference frameset, and found no motion "
-        f"in {frontend.failures} framesets; the reference offered {np.mean(pipeline.tracked):.0f} points a pair, of "
-        f"which {100 * np.sum(pipeline.inliers) / max(np.sum(pipeline.tracked), 1):.0f} % were inliers."
+    return _Round(
+        whole,
+        ours,
+        theirs,
+        float(np.mean(frontend.tracks)),
+        float(np.mean(frontend.points)),
+        frontend.failures,
+        float(np.mean(pipeline.tracked)),
+        float(np.sum(pipeline.inliers) / max(np.sum(pipeline.tracked), 1)),
     )
+
+
+def _stages(report: Report, footage: Footage, folder: Path, args: argparse.Namespace, title: str) -> None:
+    whole, ours, theirs = Timings(), Timings(), Timings()
+    rounds: list[_Round] = []
+    # Each in a process of its own: how fast OpenCV's threads are depends on the process as much as on the moment.
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
+        for number in range(args.rounds):
+            tell(f"timing odometry, front-end and reference in turns, round {number + 1} of {args.rounds}")
+            rounds.append(pool.submit(_round, folder, WARM_UP + args.framesets, args.profile).result())
+    for one in rounds:
+        whole.add(one.whole)
+        ours.add(one.ours)
+        theirs.add(one.theirs)
+    last, (width, height) = rounds[-1], footage.rig.pairs[0].left.size_px
+    report.add(
+        f"{len(rounds)} rounds of {len(last.whole.total_ms)} framesets of {title}, {len(footage.rig.pairs)} pairs of "
+        f"{width}x{height} pixels, "
+        f"{'with' if footage.rig.imu else 'without'} IMU. The front-end followed {last.tracks:.0f} tracks "
+        f"a pair, {last.points:.0f} of them with depth and in the reference frameset, and found no motion "
+        f"in {last.failures} framesets; the reference offered {last.offered:.0f} points a pair, of "
+        f"which {100 * last.inliers:.0f} % were inliers."
+    )
+    ratios = [one.ours.median_ms / one.theirs.median_ms for one in rounds]
     rows = [
         *_rows("odometry", whole),
         *_rows("front-end alone", ours),
