@@ -17,6 +17,7 @@ from benchmarks.recordings import Footage, add_data_option, simulated
 from benchmarks.report import Report, machine, tell
 from benchmarks.timing import (
     WARM_UP,
+    Contender,
     FrontendContender,
     OdometryContender,
     ReferenceContender,
@@ -121,7 +122,7 @@ def _round(folder: Path, count: int, profile: str) -> _Round:
     footage, config = Footage.load(folder, count), Config.load(profile)
     warm_up(footage.rig, config)
     frontend, reference = FrontendContender(footage, config), ReferenceContender(footage)
-    contenders = [OdometryContender(footage, config), frontend, reference]
+    contenders: list[Contender] = [OdometryContender(footage, config), frontend, reference]
     whole, ours, theirs = take_turns(contenders, len(footage.steps))
     pipeline = reference.pipeline
     return _Round(
