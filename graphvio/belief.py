@@ -157,9 +157,11 @@ class Belief(ABC):
         lacking = self._lacking() if after_s else "there is no motion yet"
         was_completed, self._is_completed = self._is_completed, not lacking
         if self._is_completed:
-            if was_completed:
+            # With an IMU, the estimate at which attitude and velocity become known is the last that may jump.
+            is_over = was_completed or not self.has_imu
+            if is_over:
                 self._unknown_since_ns = None
-            return not was_completed  # the estimate at which it becomes known is the last that may jump
+            return not is_over
         if after_s > _INITIALISED_WITHIN_S and not self._is_told:
             self._is_told = True
             self._report(stamp_ns, "not_initialised", f"{after_s:.1f} s after the start {lacking}; go on moving")
