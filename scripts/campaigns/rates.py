@@ -97,7 +97,7 @@ def _draw(
     for i, axes in enumerate(plots):
         _draw_axis(axes, i, rates, blind_s)
     plots[-1].set_xlabel("seconds")
-    plots[0].legend(loc="upper right", fontsize=9, ncols=4)
+    below.legend(*plots[0].get_legend_handles_labels(), loc="outside upper center", fontsize=9, ncols=4)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path)
