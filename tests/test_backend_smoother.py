@@ -6,6 +6,7 @@ import pytest
 from synthetic import UP, filled_buffer, measured_motion, pose_at, stamps_ns, transform, velocity_at
 
 from graphvio.arrays import Float
+from graphvio.backend.factors import b, v, x
 from graphvio.backend.inertial import ImuBuffer
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
@@ -352,8 +353,21 @@ def test_a_reset_changes_nothing_but_the_window(with_imu: bool) -> None:
         apart = se3_log(se3_inverse(never.smoother.state().nav_T_body) @ often.smoother.state().nav_T_body)
         assert np.abs(apart / np.sqrt(np.diag(one.pose))).max() < 0.05
         often.smoother.reset_position()
+        assert own_position_sigma_m(often) == pytest.approx(1e-3, rel=1e-3)
         often.smoother.settle(())
-    assert np.trace(often.smoother._forgotten) > 0.25 * np.trace(never.smoother.covariance()[3:, 3:])
+    assert own_position_sigma_m(never) > 1e-2
+
+
+def own_position_sigma_m(run: Run) -> float:
+    """What the window does not know of the newest position though it were told all else of that state."""
+    smoother = run.smoother
+    k = smoother._index_of[smoother.latest_ns]
+    keys = [x(k), v(k), b(k)] if smoother.has_imu else [x(k)]
+    joint = smoother._window.joint_covariance(keys)
+    rest, position = np.delete(np.arange(len(joint)), slice(3, 6)), np.arange(3, 6)
+    gain = np.linalg.solve(joint[np.ix_(rest, rest)], joint[np.ix_(rest, position)])
+    own = joint[3:6, 3:6] - joint[np.ix_(position, rest)] @ gain
+    return float(np.sqrt(np.linalg.eigvalsh(own)[-1]))
 
 
 # ------------------------------------------------------------------ accelerations

@@ -88,11 +88,30 @@ def test_numbers_that_no_whole_number_or_float_holds(value: str) -> None:
         "motion: {sigma_inflation: 0}",
         "smoother: {gate_probability: 1.5}",
         "smoother: {imu_noise_scale: 0}",
+        "motion: {min_inliers: 0}",
     ],
 )
 def test_values_with_which_nothing_can_work_are_refused(value: str) -> None:
     with pytest.raises(ConfigError):
         Config.from_yaml(value)
+
+
+@pytest.mark.parametrize(
+    ("stage", "name", "least", "most"),
+    [
+        ("corners", "cells_across", 2, 100),
+        ("tracking", "window_px", 5, 63),
+        ("tracking", "levels", 1, 8),
+        ("motion", "min_inliers", 3, 1000),
+    ],
+)
+def test_ranges_are_told(stage: str, name: str, least: int, most: int) -> None:
+    for value in (least, most):
+        assert getattr(getattr(Config.from_yaml(f"{stage}: {{{name}: {value}}}"), stage), name) == value
+    for value in (least - 1, most + 1):
+        told = "it must be positive" if value == 0 else f"choose from {least} to {most}"
+        with pytest.raises(ConfigError, match=f"{name}: is {value}; {told}"):
+            Config.from_yaml(f"{stage}: {{{name}: {value}}}")
 
 
 @pytest.mark.parametrize("text", ["motion: {", "3", "- motion", "just words"])

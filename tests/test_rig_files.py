@@ -95,6 +95,15 @@ def test_round_trip_of_any_values(
     assert_same(rig, load_rig(path))
 
 
+def test_some_of_the_pairs() -> None:
+    rig = small_rig(3)
+    assert rig.with_pairs([2, 0]).pairs == (rig.pairs[2], rig.pairs[0])
+    with pytest.raises(RigError, match="a pair is asked for twice"):
+        rig.with_pairs([1, 1])
+    with pytest.raises(RigError, match="there is no pair 3; choose from 0 to 2"):
+        rig.with_pairs([0, 3])
+
+
 def test_mask_is_kept_relative_to_the_file(tmp_path: Path) -> None:
     write_image(tmp_path / "masks" / "cam0.png", np.zeros((48, 64), dtype=np.uint8))
     path = edited(tmp_path, lambda d: d["pairs"][0]["left"].update(mask="masks/cam0.png"))

@@ -54,16 +54,14 @@ class Window:
     def __init__(self) -> None:
         self._factors: list[tuple[frozenset[int], gtsam.NonlinearFactor]] = []
         self.values = gtsam.Values()
-        self._marginal: _Marginal | None = None  # of the variables that the last solution eliminated last
+        self._marginal: _Marginal | None = None  # of the variables that were eliminated last, and some added since
         self._unknown = 0  # how many factors, the newest, it does not know
         self._cholesky_suffices = True
-        self._extended: _Marginal | None = None  # the same with these, once somebody has asked
 
     def add(self, factor: gtsam.NonlinearFactor) -> None:
         """Insert a factor; its variables must have values."""
         self._factors.append((frozenset(factor.keys()), factor))
         self._unknown += 1
-        self._extended = None
 
     def optimise(self, followed: Sequence[int] = ()) -> None:
         """Gauss-Newton from the present values.
@@ -87,10 +85,10 @@ class Window:
                 if largest < _CONVERGED:
                     break
         except RuntimeError as error:
-            self.values, self._marginal, self._extended = values, None, None
+            self.values, self._marginal = values, None
             raise WindowError(f"the window cannot be optimised: {_one_line(error)}") from None
         except WindowError:
-            self.values, self._marginal, self._extended = values, None, None
+            self.values, self._marginal = values, None
             raise
 
     def joint_covariance(self, keys: Sequence[int]) -> Float:
@@ -102,15 +100,13 @@ class Window:
         unknown = [key for key in keys if not self.values.exists(key)]
         if unknown:
             raise WindowError(f"the window has no variable {_named(unknown[:1])}")
-        if self._extended is None:
-            self._extended = self._extended_marginal()
-        marginal = self._extended
-        if marginal is None or not marginal.columns.keys() >= set(keys):
+        if self._unknown:
+            self._marginal, self._unknown = self._extended_marginal(), 0
+        if self._marginal is None or not self._marginal.columns.keys() >= set(keys):
             self._solve(keys)
-            marginal = self._marginal
-        if marginal is None:
+        if self._marginal is None:
             raise WindowError(f"the window has no covariance of {_named(keys)}")
-        return marginal.covariance(keys)
+        return self._marginal.covariance(keys)
 
     def marginalise(self, keys: Iterable[int]) -> None:
         """Replace variables and their factors by the linear factor that says the same of the others.
@@ -145,7 +141,7 @@ class Window:
             self.values.erase(key)
         self._factors = staying
         if self._unknown or (self._marginal is not None and self._marginal.columns.keys() & leaving):
-            self._marginal = self._extended = None  # else it still tells the covariances of those that stay
+            self._marginal = None  # else it still tells the covariances of those that stay
 
     def _solve(self, last: Sequence[int]) -> gtsam.GaussianBayesTree:
         """The window eliminated at its present values, some variables last; their marginal is kept."""
@@ -162,7 +158,7 @@ class Window:
             solution = self._eliminated(graph.linearize(self.values), ordering)
         except RuntimeError as error:
             raise WindowError(f"the window has no unique solution: {_one_line(error)}") from None
-        self._marginal, self._unknown, self._extended = self._root_marginal(solution, last), 0, None
+        self._marginal, self._unknown = self._root_marginal(solution, last), 0
         return solution
 
     def _eliminated(self, graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.GaussianBayesTree:
@@ -195,9 +191,9 @@ class Window:
         return _Marginal(columns, square_root)
 
     def _extended_marginal(self) -> _Marginal | None:
-        """The marginal of the followed variables and those added since, or None if that cannot be told from them."""
-        if self._marginal is None or not self._unknown:
-            return self._marginal
+        """The marginal with the newest factors and their variables, or None if that cannot be told from it."""
+        if self._marginal is None:
+            return None
         followed = self._marginal.columns.keys()
         known, unknown = self._factors[: -self._unknown], self._factors[-self._unknown :]
         settled = frozenset().union(*(keys for keys, _ in known))

@@ -75,7 +75,7 @@ def doubted(motion: RelativeMotion, frozen_since_ns: int | None, stereo: StereoS
     covariance, reasons = motion.covariance, []
     if noise > 1.0:
         # The residuals' mean square is in the covariance already. But motions from images that are blurred are worse
-        # than that: their squared errors over it grow about as fast as the mean square itself.
+        # than that: the mean of their squared errors over it becomes a few times larger.
         covariance = covariance * noise**2
         if noise > _BLURRED:
             reasons.append(f"points fit {noise:.1f} times worse than those of sharp images")
