@@ -151,19 +151,20 @@ class SmootherBelief(Belief):
         smoother = self._running
         if used:
             self._tracked_ns = stamp_ns
-        predicted = smoother.state()
         try:
             self._final += smoother.settle(keep | {self._tracked_ns})
             self._reset_position(stamp_ns)
             self.covariance = smoother.state_covariance()
-            since = smoother.covariance_since(self._tracked_ns)
             if used:
-                self._tracked_covariance = self.covariance.pose
+                self._tracked_covariance, sigma_m = self.covariance.pose, 0.0
+            else:
+                since = smoother.covariance_since(self._tracked_ns)
+                sigma_m = float(np.sqrt(np.linalg.eigvalsh(since[3:, 3:])[-1]))
         except WindowError as error:
             self._report(stamp_ns, "window_rebuilt", str(error))
-            self._start_again(after_failure(stamp_ns, predicted, self.covariance.pose), stamp_ns - 1)
+            self._start_again(after_failure(stamp_ns, smoother.state(), self.covariance.pose), stamp_ns - 1)
             return Status.COASTING
-        return self._status(stamp_ns, used, float(np.sqrt(np.linalg.eigvalsh(since[3:, 3:])[-1])))
+        return self._status(stamp_ns, used, sigma_m)
 
     @property
     def _running(self) -> Smoother:

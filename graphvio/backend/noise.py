@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.kernels import kernel
 
 _LEAST_OWN_SHARE = 0.001  # of each direction of a motion's covariance: keeps it positive definite
 
@@ -24,6 +25,7 @@ def isotropic(dimension: int, sigma: float) -> gtsam.noiseModel.Isotropic:
     return gtsam.noiseModel.Isotropic.Sigma(dimension, sigma)
 
 
+@kernel
 def own_covariance(covariance: Float, shared: Float) -> Float:
     """What a motion's covariance (6, 6) has beyond the part that it shares with others, which was told before.
 
@@ -32,5 +34,6 @@ def own_covariance(covariance: Float, shared: Float) -> Float:
     root = np.linalg.cholesky(covariance)
     white = np.linalg.solve(root, np.linalg.solve(root, shared).T)
     shares, axes = np.linalg.eigh(np.eye(6) - 0.5 * (white + white.T))
-    axes = root @ axes
-    return np.asarray((axes * np.maximum(shares, _LEAST_OWN_SHARE)) @ axes.T)
+    axes = root @ np.ascontiguousarray(axes)
+    own: Float = (axes * np.maximum(shares, _LEAST_OWN_SHARE)) @ np.ascontiguousarray(axes.T)
+    return own

@@ -181,6 +181,8 @@ class Smoother:
         measured = self.pose(motion.reference_stamp_ns) @ motion.reference_T_current
         velocity = before[:3, :3] @ self._previous_motion[3:]  # mean of the step before
         accel = float(np.linalg.norm((measured[:3, 3] - before[:3, 3]) / dt - velocity) / dt)
+        if accel <= self._config.max_accel_m_s2:
+            return None
         noise = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1])) / dt**2
         return accel if accel - _SURELY * noise > self._config.max_accel_m_s2 else None
 
@@ -279,7 +281,8 @@ class Smoother:
         values.insert(x(k), gtsam.Pose3(state.nav_T_body))
         if self.has_imu:
             values.insert(v(k), state.velocity_nav)
-            values.insert(b(k), gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias))
+            bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
+            values.insert_or_assign(b(k), bias)  # `insert` looks for the type among more, and takes twice as long
         return k
 
     def _link_by_constant_velocity(self, i: int, j: int, motion: Float, dt: float) -> None:

@@ -12,6 +12,7 @@ from itertools import takewhile
 
 import gtsam
 import numpy as np
+from scipy.linalg import lapack
 
 from graphvio.arrays import Float
 from graphvio.errors import GraphvioError
@@ -43,25 +44,27 @@ class _Marginal:
 
     @cached_property
     def _inverse(self) -> Float | None:
-        if np.abs(np.diag(self.square_root)).min() < _SINGULAR:
+        if np.abs(self.square_root.diagonal()).min() < _SINGULAR:
             return None
-        return np.asarray(np.linalg.inv(self.square_root))
+        return np.asarray(lapack.dtrtri(self.square_root)[0])
 
 
 class Window:
     """Nonlinear factors and the present values of their variables."""
 
     def __init__(self) -> None:
-        self._factors: list[tuple[frozenset[int], gtsam.NonlinearFactor]] = []
         self.values = gtsam.Values()
+        self._graph = gtsam.NonlinearFactorGraph()
+        self._involved: dict[int, frozenset[int]] = {}  # slot of the graph -> variables of the factor in it
+        self._free: list[int] = []  # slots
         self._marginal: _Marginal | None = None  # of the variables that were eliminated last, and some added since
-        self._unknown = 0  # how many factors, the newest, it does not know
+        self._unknown: list[int] = []  # slots of the factors that it does not know
         self._cholesky_suffices = True
+        self._dims: dict[int, int] = {}  # of variables; to ask gtsam is slow
 
     def add(self, factor: gtsam.NonlinearFactor) -> None:
         """Insert a factor; its variables must have values."""
-        self._factors.append((frozenset(factor.keys()), factor))
-        self._unknown += 1
+        self._unknown.append(self._insert(factor))
 
     def optimise(self, followed: Sequence[int] = ()) -> None:
         """Gauss-Newton from the present values.
@@ -101,7 +104,7 @@ class Window:
         if unknown:
             raise WindowError(f"the window has no variable {_named(unknown[:1])}")
         if self._unknown:
-            self._marginal, self._unknown = self._extended_marginal(), 0
+            self._marginal, self._unknown = self._extended_marginal(), []
         if self._marginal is None or not self._marginal.columns.keys() >= set(keys):
             self._solve(keys)
         if self._marginal is None:
@@ -117,48 +120,54 @@ class Window:
         leaving = frozenset(keys)
         if not leaving:
             return
-        constrained = frozenset().union(*(involved for involved, _ in self._factors))
-        if not leaving <= constrained:
+        slots = [slot for slot, involved in self._involved.items() if involved & leaving]
+        if not leaving <= frozenset().union(*(self._involved[slot] for slot in slots)):
             raise WindowError("a state cannot be marginalised: no factor constrains it")
         graph = gtsam.NonlinearFactorGraph()
-        staying: list[tuple[frozenset[int], gtsam.NonlinearFactor]] = []
-        for involved, factor in self._factors:
-            if involved & leaving:
-                graph.push_back(factor)
-            else:
-                staying.append((involved, factor))
+        for slot in slots:
+            graph.push_back(self._graph.at(slot))
         ordering = gtsam.Ordering(sorted(leaving))
         try:
             _, remaining = graph.linearize(self.values).eliminatePartialMultifrontal(ordering, gtsam.EliminateQR)
         except RuntimeError as error:
             raise WindowError(f"a state cannot be marginalised: {_one_line(error)}") from None
+        if self._unknown or (self._marginal is not None and self._marginal.columns.keys() & leaving):
+            self._marginal, self._unknown = None, []  # else it still tells the covariances of those that stay
+        for slot in slots:
+            self._graph.remove(slot)
+            del self._involved[slot]
+            self._free.append(slot)
         for i in range(remaining.size()):
             marginal = remaining.at(i)
             if marginal is not None and len(marginal.keys()):
-                container = gtsam.LinearContainerFactor(marginal, self.values)
-                staying.append((frozenset(marginal.keys()), container))
+                self._insert(gtsam.LinearContainerFactor(marginal, self.values))
         for key in leaving:
             self.values.erase(key)
-        self._factors = staying
-        if self._unknown or (self._marginal is not None and self._marginal.columns.keys() & leaving):
-            self._marginal = None  # else it still tells the covariances of those that stay
+
+    def _insert(self, factor: gtsam.NonlinearFactor) -> int:
+        """Put a factor into a free slot of the graph, and tell which."""
+        if self._free:
+            slot = self._free.pop()
+            self._graph.replace(slot, factor)
+        else:
+            slot = self._graph.size()
+            self._graph.push_back(factor)
+        self._involved[slot] = frozenset(factor.keys())
+        return slot
 
     def _solve(self, last: Sequence[int]) -> gtsam.GaussianBayesTree:
         """The window eliminated at its present values, some variables last; their marginal is kept."""
-        loose = set(self.values.keys()).difference(*(involved for involved, _ in self._factors))
-        if loose:
+        if len(self._graph.keyVector()) < self.values.size():
+            loose = set(self.values.keys()).difference(*self._involved.values())
             raise WindowError(f"no factor constrains variable {_named([min(loose)])}")
-        graph = gtsam.NonlinearFactorGraph()
-        for _, factor in self._factors:
-            graph.push_back(factor)
         try:
             ordering = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(
-                graph, gtsam.KeyVector(list(last)), True
+                self._graph, gtsam.KeyVector(list(last)), True
             )
-            solution = self._eliminated(graph.linearize(self.values), ordering)
+            solution = self._eliminated(self._graph.linearize(self.values), ordering)
         except RuntimeError as error:
             raise WindowError(f"the window has no unique solution: {_one_line(error)}") from None
-        self._marginal, self._unknown = self._root_marginal(solution, last), 0
+        self._marginal, self._unknown = self._root_marginal(solution, last), []
         return solution
 
     def _eliminated(self, graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.GaussianBayesTree:
@@ -195,32 +204,37 @@ class Window:
         if self._marginal is None:
             return None
         followed = self._marginal.columns.keys()
-        known, unknown = self._factors[: -self._unknown], self._factors[-self._unknown :]
-        settled = frozenset().union(*(keys for keys, _ in known))
-        touched = frozenset().union(*(keys for keys, _ in unknown))
+        settled = frozenset().union(*(keys for slot, keys in self._involved.items() if slot not in self._unknown))
+        touched = frozenset().union(*(self._involved[slot] for slot in self._unknown))
         if touched & settled - followed:
             return None
         columns, size = self._columns([*followed, *sorted(touched - followed)])
         old = self._marginal.square_root
-        rows = [np.pad(old, ((0, 0), (0, size - len(old))))]
-        for _, factor in unknown:
-            linear = factor.linearize(self.values)
-            jacobian, at = linear.jacobian()[0], 0
-            block = np.zeros((len(jacobian), size))
-            for key in list(linear.keys()):
+        linear = [self._graph.at(slot).linearize(self.values) for slot in self._unknown]
+        jacobians = [each.jacobian()[0] for each in linear]
+        rows = np.zeros((len(old) + sum(map(len, jacobians)), size))
+        if len(rows) < size:
+            return None
+        rows[: len(old), : len(old)] = old
+        row = len(old)
+        for each, jacobian in zip(linear, jacobians, strict=True):
+            block, at = rows[row : row + len(jacobian)], 0
+            for key in list(each.keys()):
                 width = columns[key].stop - columns[key].start
                 block[:, columns[key]] = jacobian[:, at : at + width]
                 at += width
-            rows.append(block)
-        root = np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))
-        return _Marginal(columns, root) if len(root) == size else None
+            row += len(jacobian)
+        return _Marginal(columns, np.triu(lapack.dgeqrf(rows)[0][:size]))
 
     def _columns(self, keys: Iterable[int]) -> tuple[dict[int, slice], int]:
         """Where variables stand in a matrix that has them side by side, and how wide it is."""
-        dims, columns, size = self.values.dims(), {}, 0
+        columns, size = {}, 0
+        keys = list(keys)
+        if not self._dims.keys() >= set(keys):
+            self._dims = self.values.dims()
         for key in keys:
-            columns[key] = slice(size, size + dims[key])
-            size += dims[key]
+            columns[key] = slice(size, size + self._dims[key])
+            size += self._dims[key]
         return columns, size
 
 
