@@ -18,7 +18,7 @@ _LARGEST = 1e12
 _MAY_BE_ZERO = frozenset(
     ("seed", "border_px", "keyframe_overlap", "min_inlier_share", "min_response",
      "scarce_share", "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s",
-     "calibration_error_share")
+     "calibration_error_share", "huber_sigmas")
 )  # fmt: skip
 _RANGES = {"cells_across": (2, 100), "window_px": (5, 63), "levels": (1, 8), "min_inliers": (3, 1000)}
 _SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
@@ -131,10 +131,13 @@ class InitialisationConfig:
 class SmootherConfig:
     """The fixed-lag window, its gate and its limits (section 5)."""
 
-    lag_s: float = 1.0
+    lag_s: float = 0.75
     """Age at which a state leaves the window, unless later motions are measured from it."""
     gate_probability: float = 0.9999
     """Vision is refused where its innovation lies outside this share of the chi-square distribution."""
+    huber_sigmas: float = 3.0
+    """Motions that the gate let in and that the solution leaves farther off than this pull less, by Huber's kernel; 0
+    lets all pull by their covariance."""
     max_accel_m_s2: float = 50.0
     """Vision is refused where it asks for a larger acceleration."""
     max_gated_s: float = 1.0
@@ -158,6 +161,9 @@ class FusionConfig:
     estimator: Literal["smoother", "filter"] = "smoother"
     """``smoother``: the fixed-lag window. ``filter``: the paper's, as a baseline; it needs ``motion.reference:
     previous``, since it measures velocities over one step."""
+    estimate_time_offset: bool = False
+    """Whether the time offset between cameras and IMU is estimated from rotations and corrected as it runs; else the
+    rig's is taken as it is."""
 
 
 @dataclass(frozen=True)
@@ -310,6 +316,10 @@ def _checked(hint: Any, value: object, where: str) -> object:
     if choices:
         if value not in choices:
             raise ConfigError(f"{where}: is {value!r}; choose one of {', '.join(map(str, choices))}")
+        return value
+    if hint is bool:
+        if not isinstance(value, bool):
+            raise ConfigError(f"{where}: is {value!r}; it must be true or false")
         return value
     if not isinstance(value, int | float) or isinstance(value, bool):
         raise ConfigError(f"{where}: is {value!r}; it must be a number")

@@ -159,6 +159,9 @@ class Estimate:
         velocity_covariance: (3, 3) of ``velocity_nav``, in nav, or None where it is not estimated.
         gyro_bias_covariance: (3, 3), or None where the bias is not estimated.
         accel_bias_covariance: (3, 3), or None where the bias is not estimated.
+        time_offset_s: how much later than the framesets' the IMU's stamp of an instant is, as estimated, or None where
+            that is not estimated.
+        time_offset_sigma_s: its standard deviation, or None.
         innovations: what was measured against what was expected, with the test's outcome: ``vision``, and ``rest``
             where the rig stood still; with the paper's filter ``vision``, ``gyro`` and ``accelerometer``.
         rates: angular rate of body (3,) rad/s by ``gyro``, ``vision`` and ``fused``, as far as known.
@@ -185,6 +188,8 @@ class Estimate:
     velocity_covariance: Float | None = None
     gyro_bias_covariance: Float | None = None
     accel_bias_covariance: Float | None = None
+    time_offset_s: float | None = None
+    time_offset_sigma_s: float | None = None
     innovations: Mapping[str, Verdict] = field(default_factory=dict)
     rates: Mapping[str, Float] = field(default_factory=dict)
     vision: Quality = Quality.FAILED

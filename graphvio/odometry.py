@@ -11,6 +11,7 @@ from graphvio.arrays import Float
 from graphvio.backend.inertial import NO_SAMPLES, ImuSpan
 from graphvio.backend.initialisation import is_at_rest
 from graphvio.backend.propagation import Propagator
+from graphvio.backend.time_offset import TimeOffsetFilter
 from graphvio.belief import Belief
 from graphvio.config import Config
 from graphvio.errors import EventError
@@ -32,6 +33,9 @@ from graphvio.rates import AngularRates
 from graphvio.rig import Rig
 from graphvio.smoother_belief import SmootherBelief
 from graphvio.synchroniser import Synchroniser
+
+_NOTABLE_OFFSET_S = 1e-3
+_SURELY = 5.0  # standard deviations
 
 
 class Odometry:
@@ -57,6 +61,8 @@ class Odometry:
         self._belief: Belief = kind(rig, self.config, self._report, lambda: self._frontend.rekey())
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._on_prediction = on_prediction
+        self._time_offset = self._new_time_offset()
+        self._told_time_offset = False
         self._told_misaligned: set[int] = set()
         self._frozen: frozenset[int] = frozenset()
         self._rates = AngularRates()
@@ -142,6 +148,7 @@ class Odometry:
         at_rest = visual.at_rest and (span is None or is_at_rest(span, self.config.initialisation))
         used = self._belief.use(visual, at_rest) is not None
         status = self._belief.update(stamp_ns, used or starting, self._frontend.reference_stamps_ns)
+        self._correct_time_offset(stamp_ns, visual)
         self._synchroniser.forget_before(stamp_ns)
         self._predict_from(stamp_ns, status)
         stage_ms = {
@@ -150,6 +157,32 @@ class Odometry:
             "update": 1e3 * (perf_counter() - measured),
         }
         return self._assemble(stamp_ns, status, visual, span, at_rest, stage_ms)
+
+    def _new_time_offset(self) -> TimeOffsetFilter | None:
+        imu = self.rig.imu
+        if imu is None or not self.config.fusion.estimate_time_offset:
+            return None
+        return TimeOffsetFilter(imu, self.config.smoother.imu_noise_scale, self._synchroniser.span)
+
+    def _correct_time_offset(self, stamp_ns: int, visual: VisualResult) -> None:
+        """Later framesets take the IMU at their true instants, once the offset is known well enough."""
+        if self._time_offset is None or visual.motion is None or visual.quality is not Quality.GOOD:
+            return
+        self._time_offset.update(visual.motion)
+        if not self._time_offset.estimate.is_usable:
+            return
+        self._synchroniser.shift_imu(self._time_offset.corrected())
+        offset_s, sigma_s = self._synchroniser.time_offset_s, self._time_offset.estimate.sigma_s
+        assert self.rig.imu is not None
+        off_s = offset_s - self.rig.imu.time_offset_s
+        if not self._told_time_offset and abs(off_s) > max(_NOTABLE_OFFSET_S, _SURELY * sigma_s):
+            self._told_time_offset = True
+            self._report(
+                stamp_ns,
+                "time_offset_off",
+                f"the IMU's stamps are {1e3 * off_s:.1f} ms later than the rig says (sigma {1e3 * sigma_s:.1f} ms), as "
+                f"rotations tell; corrected for this run: set time_offset_s: {offset_s:.4f} in the rig",
+            )
 
     def _must_wait_for_imu(self, stamp_ns: int) -> bool:
         """Before the IMU's first sample there is nothing to start from, unless it has been awaited for long."""
@@ -231,6 +264,8 @@ class Odometry:
             velocity_covariance=known.velocity if honest else None,
             gyro_bias_covariance=known.gyro_bias,
             accel_bias_covariance=known.accel_bias,
+            time_offset_s=None if self._time_offset is None else self._synchroniser.time_offset_s,
+            time_offset_sigma_s=None if self._time_offset is None else self._time_offset.estimate.sigma_s,
             innovations=belief.verdicts,
             rates=self._rates.update(visual.motion, span, state.gyro_bias, belief.latest_rate()),
             vision=visual.quality,

@@ -10,7 +10,16 @@ from graphvio.arrays import Float
 from graphvio.backend.gating import Verdict
 from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.smoother import Smoother
-from graphvio.backend.starts import MAX_UNBRIDGED_S, Start, after_failure, after_gap, after_lost, by_vision, first_start
+from graphvio.backend.starts import (
+    MAX_UNBRIDGED_S,
+    Start,
+    after_failure,
+    after_gap,
+    after_lost,
+    by_vision,
+    doubtful,
+    first_start,
+)
 from graphvio.backend.states import RigState
 from graphvio.backend.window import WindowError
 from graphvio.belief import Belief
@@ -21,6 +30,8 @@ from graphvio.geometry import se3_inverse, se3_log
 from graphvio.rig import Rig
 from graphvio.synchroniser import Report
 
+_TRUSTED_AFTER = 20  # motions; what a start that ends sooner has found is not taken for known
+
 
 class SmootherBelief(Belief):
     """The rig's state by the fixed-lag smoother; for arguments and attributes see `Belief`."""
@@ -29,6 +40,7 @@ class SmootherBelief(Belief):
         super().__init__(rig, config, report, rekey)
         self._smoother: Smoother | None = None
         self._reset_ns = 0
+        self._accepted = 0  # motions since the start
         self._refused: dict[int, Float] = {}  # stamp -> nav_T_body by the motions that the gate refused
         self._imu_failed = False  # since the first of these
         self._tracked_covariance = np.zeros((6, 6))  # of the last pose that vision constrains
@@ -132,6 +144,7 @@ class SmootherBelief(Belief):
                 self._believe_vision(motion, "the IMU failed while vision was refused")
                 return motion
             smoother.accept(motion)
+            self._accepted += 1
             self._forget_troubles()
             return motion
         why = _beyond(verdict) if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
@@ -201,7 +214,10 @@ class SmootherBelief(Belief):
     def _recover(self, motion: RelativeMotion) -> None:
         """After lost: a new epoch that starts at the best guess, the prediction, with the velocity that vision sees."""
         smoother = self._running
-        self._start_again(after_lost(motion, smoother.state(), smoother.covariance()), self._tracked_ns)
+        start = after_lost(motion, smoother.state(), smoother.covariance())
+        if self.has_imu and self._accepted < _TRUSTED_AFTER:
+            start = doubtful(start)
+        self._start_again(start, self._tracked_ns)
         self.epoch += 1
         self._report(motion.stamp_ns, "new_epoch", f"vision is back: epoch {self.epoch} starts at the best guess")
 
@@ -229,6 +245,7 @@ class SmootherBelief(Belief):
         self._rekey()
 
     def _begin(self, start: Start) -> None:
+        self._accepted = 0
         self._running.start(start.stamp_ns, start.state, start.uncertainty)
         self._reset_ns = start.stamp_ns
         self._note_start(start)

@@ -122,6 +122,15 @@ class Synchroniser:
                 return found[0], (at_ns - found[1]) * 1e-9
         return None
 
+    def shift_imu(self, seconds: float) -> None:
+        """From now on the IMU's stamps are later than the framesets' by so much more than was thought."""
+        self._offset_ns += round(seconds * 1e9)
+
+    @property
+    def time_offset_s(self) -> float:
+        """Add it to a frameset's stamp to get the IMU's stamp of the same instant."""
+        return self._offset_ns * 1e-9
+
     def precedes_imu(self, stamp_ns: int) -> bool:
         """Whether the first sample of the IMU has not come yet, or is later than a frameset."""
         if not self._has_imu:

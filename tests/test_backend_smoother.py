@@ -210,6 +210,29 @@ def test_a_motion_that_the_imu_contradicts_is_refused(error: tuple[list[float], 
     assert np.array_equal(run.smoother.pose(2_050_000_000), untouched)
 
 
+def test_a_wrong_motion_that_passes_the_gate_pulls_less() -> None:
+    """A turn that is just small enough to be believed, and that the IMU and later motions contradict."""
+
+    def rotation_after(sigmas: float, turn: float) -> tuple[Float, bool]:
+        run = Run(4, config=replace(CONFIG, huber_sigmas=sigmas))
+        run.until(2.0)
+        run.predict(2_050_000_000)
+        good = measured_motion(2_000_000_000, 2_050_000_000, run.rng)
+        told = replace(good, reference_T_current=good.reference_T_current @ transform([0.0, 0.0, turn], np.zeros(3)))
+        accepted = run.smoother.test(told).accepted
+        run.smoother.accept(told)
+        run.smoother.settle(())
+        run.until(2.5)
+        return run.smoother.pose(run.smoother.latest_ns), accepted
+
+    pulled = {}
+    for sigmas in (0.0, 3.0):
+        (without, _), (with_it, accepted) = rotation_after(sigmas, 0.0), rotation_after(sigmas, 4.5e-3)
+        assert accepted  # its sigma is 1e-3
+        pulled[sigmas] = float(np.linalg.norm(se3_log(se3_inverse(without) @ with_it)))
+    assert pulled[3.0] < 0.6 * pulled[0.0]
+
+
 def test_good_motions_pass_the_gate_as_often_as_they_should() -> None:
     passed = []
     for seed in range(4):

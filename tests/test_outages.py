@@ -267,6 +267,34 @@ def test_a_jump_of_the_clock_opens_an_epoch(walk_folder: Path, events: list[Even
     assert np.linalg.norm(se3_log(np.ascontiguousarray(np.linalg.inv(true) @ motion))[3:]) < 0.03
 
 
+@pytest.mark.parametrize("offset_ms", [-10, 25])
+def test_an_unknown_time_offset_is_found(walk_folder: Path, events: list[Event], offset_ms: int) -> None:
+    """Of an IMU that stamps late or early. The first second is at rest, and tells nothing."""
+    shifted = [replace(e, stamp_ns=e.stamp_ns + offset_ms * MS) if isinstance(e, ImuSample) else e for e in events]
+    shifted.sort(key=lambda e: (e.stamp_ns, isinstance(e, FrameSet)))
+    config = Config.from_yaml("fusion: {estimate_time_offset: true}")
+    ignored, found = outcome(walk_folder, shifted), outcome(walk_folder, shifted, config)
+    assert all(e.time_offset_s is None for e in ignored.estimates)
+    told = [(e.time_offset_s, e.time_offset_sigma_s) for e in found.between(6.0, 10.0)]
+    for offset_s, sigma_s in told:
+        assert offset_s is not None
+        assert sigma_s is not None
+        assert sigma_s < 1e-3
+        assert abs(offset_s - 1e-3 * offset_ms) < 4.0 * sigma_s
+    assert found.kinds.count("time_offset_off") == 1
+    assert found.error_m(6.0, 9.0) < 0.03 < ignored.error_m(6.0, 9.0)
+    assert {e.status for e in found.between(6.0, 10.0)} == {Status.TRACKING}
+
+
+def test_a_time_offset_that_the_rig_has_is_confirmed(walk_folder: Path, events: list[Event]) -> None:
+    done = outcome(walk_folder, events, Config.from_yaml("fusion: {estimate_time_offset: true}"))
+    assert "time_offset_off" not in done.kinds
+    last = done.estimates[-1]
+    assert last.time_offset_s is not None
+    assert last.time_offset_sigma_s is not None
+    assert abs(last.time_offset_s) < 4.0 * last.time_offset_sigma_s < 4e-3
+
+
 # ------------------------------------------------------------------ vision's data
 
 

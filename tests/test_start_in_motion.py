@@ -1,12 +1,13 @@
 """Starts in the midst of motion: attitude, velocity and biases come from the first motions by vision and the IMU."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 
 from graphvio.arrays import Float
 from graphvio.backend.inertial import GRAVITY_M_S2
+from graphvio.backend.states import StartUncertainty, origin_covariance
 from graphvio.config import Config
 from graphvio.events import ImuSample, Quality, Status
 from graphvio.frontend.motion import RelativeMotion, VisualResult
@@ -76,12 +77,19 @@ class Outcome:
         return STEP_S * self.status.index(Status.TRACKING)
 
 
-def run(seed: int, accel_m_s2: float, hertz: float, sigmas: Float | None = SIGMAS) -> Outcome:
-    """Vision has these errors, one sigma, or sees nothing."""
+def run(
+    seed: int,
+    accel_m_s2: float,
+    hertz: float,
+    sigmas: Float | None = SIGMAS,
+    duration_s: float = 4.0,
+    bias_error: Float | None = None,
+) -> Outcome:
+    """Vision has these errors, one sigma, or sees nothing; the gyro's bias may be thought to be known, and be wrong."""
     rng, rig, config = np.random.default_rng(seed), default_rig(), Config()
     assert rig.imu is not None
     swing, synchroniser, out = Swing(rng, accel_m_s2, hertz), Synchroniser(rig, config, lambda *_: None), Outcome()
-    for k in range(-round(rig.imu.rate_hz), round(4.1 * rig.imu.rate_hz)):
+    for k in range(-round(rig.imu.rate_hz), round((duration_s + 0.1) * rig.imu.rate_hz)):
         synchroniser.add_sample(swing.sample(k / rig.imu.rate_hz, rig.imu))
     belief = SmootherBelief(
         rig,
@@ -90,12 +98,16 @@ def run(seed: int, accel_m_s2: float, hertz: float, sigmas: Float | None = SIGMA
         lambda: None,
     )
     before_ns, before, true_before = BASE_NS, np.eye(4), swing.pose(0.0)
-    for n in range(80):
+    for n in range(round(duration_s / STEP_S)):
         t = n * STEP_S
         stamp_ns, true = BASE_NS + round(t * 1e9), swing.pose(t)
         used = n == 0
         if n == 0:
             belief.start(stamp_ns, synchroniser.initial_span(stamp_ns))
+            if bias_error is not None:
+                state = replace(belief.state(), gyro_bias=swing.gyro_bias + bias_error)
+                known = StartUncertainty(origin_covariance(state.nav_T_body[:3, :3], 0.25), 0.3, 0.001)
+                belief._running.start(stamp_ns, state, known)
         else:
             belief.predict(stamp_ns, synchroniser.span(before_ns, stamp_ns))
             if sigmas is not None:
@@ -103,15 +115,15 @@ def run(seed: int, accel_m_s2: float, hertz: float, sigmas: Float | None = SIGMA
                 motion = RelativeMotion(before_ns, stamp_ns, measured, np.diag(sigmas**2), np.zeros((6, 6)), 200)
                 used = belief.use(VisualResult(motion, Quality.GOOD, "", {}), at_rest=False) is not None
         out.status.append(belief.update(stamp_ns, used, frozenset()))
-        state, known = belief.state(), belief.covariance
+        state, told = belief.state(), belief.covariance
         rotation = state.nav_T_body[:3, :3]
         out.tilt_deg.append(float(np.rad2deg(np.arccos(min(rotation[2] @ true[2, :3], 1.0)))))
-        about_nav = (rotation @ known.pose[:3, :3] @ rotation.T)[:2, :2]
+        about_nav = (rotation @ told.pose[:3, :3] @ rotation.T)[:2, :2]
         out.tilt_sigma_deg.append(float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(about_nav)[-1]))))
         error = rotation.T @ state.velocity_nav - true[:3, :3].T @ swing.velocity(t)
-        assert known.velocity is not None
+        assert told.velocity is not None
         out.speed_m_s.append(float(np.linalg.norm(error)))
-        out.speed_sigma_m_s.append(float(np.sqrt(np.linalg.eigvalsh(known.velocity)[-1])))
+        out.speed_sigma_m_s.append(float(np.sqrt(np.linalg.eigvalsh(told.velocity)[-1])))
         step, true_step = (np.linalg.inv(a) @ b for a, b in ((before, state.nav_T_body), (true_before, true)))
         out.step_m.append(float(np.linalg.norm(step[:3, 3] - true_step[:3, 3])))
         before_ns, before, true_before = stamp_ns, state.nav_T_body, true
@@ -148,3 +160,14 @@ def test_what_is_lacking_is_told_once() -> None:
     ((told_s, _, detail),) = [incident for incident in out.incidents if incident[1] == "not_initialised"]
     assert told_s == pytest.approx(2.05, abs=0.01)
     assert "velocity" in detail
+
+
+def test_what_is_wrong_and_taken_for_known_is_given_up() -> None:
+    """A bias of 10 deg/s too much, to a mrad/s: vision is refused, and would be in each epoch that takes it over."""
+    for seed in range(4):
+        out = run(seed, 1.0, 0.5, duration_s=8.0, bias_error=np.array([-0.1, 0.1, 0.1]))
+        kinds = [kind for _, kind, _ in out.incidents]
+        assert [kinds.count(kind) for kind in ("lost", "new_epoch")] == [1, 1]
+        assert set(out.status[-40:]) == {Status.TRACKING}
+        assert out.tilt_deg[-1] < 3.0
+        assert out.speed_m_s[-1] < 0.1

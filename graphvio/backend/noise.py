@@ -20,6 +20,13 @@ def gaussian(covariance: Float) -> gtsam.noiseModel.Gaussian:
     return gtsam.noiseModel.Gaussian.Covariance(covariance, False)
 
 
+def robust(noise: gtsam.noiseModel.Gaussian, sigmas: float) -> gtsam.noiseModel.Base:
+    """The noise with Huber's kernel: errors beyond so many standard deviations count linearly; with 0 as it is."""
+    if not sigmas:
+        return noise
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(sigmas), noise)
+
+
 def isotropic(dimension: int, sigma: float) -> gtsam.noiseModel.Isotropic:
     """A noise of one standard deviation in all of so many directions."""
     return gtsam.noiseModel.Isotropic.Sigma(dimension, sigma)

@@ -15,7 +15,7 @@ from graphvio.arrays import Float
 from graphvio.backend.factors import anchored_position, b, first_state, imu_without_samples, r, rest, rest_noise, v, x
 from graphvio.backend.gating import Verdict, gate, judged, relative_covariance
 from graphvio.backend.inertial import ImuSpan
-from graphvio.backend.noise import gaussian, own_covariance
+from graphvio.backend.noise import gaussian, own_covariance, robust
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.states import RigState, StartUncertainty, StateCovariance
 from graphvio.backend.window import Window
@@ -218,7 +218,7 @@ class Smoother:
                 reference,
                 x(self._index_of[motion.stamp_ns]),
                 gtsam.Pose3(motion.reference_T_current),
-                gaussian(self._own_covariance(motion)),
+                robust(gaussian(self._own_covariance(motion)), self._config.huber_sigmas),
             )
         )
 

@@ -21,6 +21,7 @@ _RESTING_START_SPEED_SIGMA = 0.02
 _RESTART_SPEED_SIGMA = 1.0
 _GYRO_BIAS_SIGMA = 0.01
 _WIDE_GYRO_BIAS_SIGMA = 0.1
+_DOUBTFUL_TILT_RAD = 0.3
 _AFTER_REBUILD = np.diag([0.05] * 3 + [0.1] * 3) ** 2  # added to the pose's covariance, radians and metres
 AFTER_JUMP = np.diag([0.2] * 3 + [1.0] * 3) ** 2
 """Added to a pose's covariance (6, 6) after a gap that nothing bridges."""
@@ -114,6 +115,18 @@ def by_vision(
     covariance = _uncorrelated(pose_covariance) + motion.covariance + np.diag(apart**2)
     gyro_bias_sigma = _GYRO_BIAS_SIGMA if prediction_failed else _WIDE_GYRO_BIAS_SIGMA
     return _restart(motion.stamp_ns, state, covariance, gyro_bias_sigma)
+
+
+def doubtful(start: Start) -> Start:
+    """The same start, but for what it takes over: attitude and gyro bias are as little known as at a first start.
+
+    For where a start soon leads to the next: then what was taken over is wrong.
+    """
+    nav_R_body = start.state.nav_T_body[:3, :3]
+    pose = start.uncertainty.pose.copy()
+    pose[:3, :3] += nav_R_body.T @ np.diag([_DOUBTFUL_TILT_RAD, _DOUBTFUL_TILT_RAD, 0.0]) ** 2 @ nav_R_body
+    known = StartUncertainty(pose, start.uncertainty.velocity_m_s, _WIDE_GYRO_BIAS_SIGMA)
+    return replace(start, uncertainty=known, is_known=False)
 
 
 def _restart(

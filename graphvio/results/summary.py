@@ -70,6 +70,8 @@ class Summary:
         pair_rejected: name of each of the rig's pairs -> test of tracking and stereo matching -> how many corners and
             tracks it threw out.
         epochs: for each epoch its number, first and last stamp in nanoseconds, and number of poses.
+        time_offset_s: between cameras and IMU as estimated at the end, or None where it was not.
+        time_offset_sigma_s: its standard deviation, or None.
         graphvio_version: that made the run.
         config_sha256: of ``config.yaml``.
         evaluation: figures against truth, or None.
@@ -92,6 +94,8 @@ class Summary:
     pair_medians: Mapping[str, PairMedians]
     pair_rejected: Mapping[str, Mapping[str, int]]
     epochs: Sequence[Mapping[str, int]]
+    time_offset_s: float | None
+    time_offset_sigma_s: float | None
     graphvio_version: str
     config_sha256: str
     evaluation: Mapping[str, Any] | None = None

@@ -78,6 +78,7 @@ class ResultWriter:
         self._config_sha256 = hashlib.sha256(config_yaml.encode()).hexdigest()
         self._first_ns: int | None = None
         self._last_ns = 0
+        self._time_offset: tuple[float | None, float | None] = (None, None)
         self._stage_ms: dict[str, array[float]] = {}
         self._pair_names = [pair.name for pair in rig.pairs]
         self._pair_figures: dict[str, dict[str, array[float]]] = {
@@ -142,6 +143,7 @@ class ResultWriter:
         stamp = int(estimate.stamp_ns)
         self._first_ns = stamp if self._first_ns is None else self._first_ns
         self._last_ns = stamp
+        self._time_offset = estimate.time_offset_s, estimate.time_offset_sigma_s
         self._status[str(estimate.status)] += 1
         for stage, spent_ms in estimate.stage_ms.items():
             self._stage_ms.setdefault(stage, array("d")).append(spent_ms)
@@ -220,6 +222,8 @@ class ResultWriter:
             pair_medians={name: PairMedians.of(figures) for name, figures in self._pair_figures.items()},
             pair_rejected={name: dict(sorted(counts.items())) for name, counts in self._pair_rejected.items()},
             epochs=epoch_spans(trajectory, epochs),
+            time_offset_s=self._time_offset[0],
+            time_offset_sigma_s=self._time_offset[1],
             graphvio_version=__version__,
             config_sha256=self._config_sha256,
             evaluation=evaluation.as_dict() if evaluation else None,

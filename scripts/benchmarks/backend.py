@@ -27,7 +27,7 @@ from graphvio.errors import GraphvioError
 from graphvio.smoother_belief import SmootherBelief
 
 AIM_MS, AIM_P99_MS = 1.5, 5.0
-LAGS_S = (0.5, 1.0, 2.0, 4.0)
+LAGS_S = (0.5, 0.75, 1.0, 2.0, 4.0)
 _WARM_UP = 20
 _FEWEST = 100
 _NS_PER_S = 1e9

@@ -1,0 +1,157 @@
+"""The time offset between cameras and IMU, from rotations by vision and by the gyro.
+
+A rotation that vision measures between two framesets is the gyro's, taken a little earlier or later. Over such an
+interval the two differ by the offset times the difference of the angular rates at its ends, and by the gyro's bias.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.gating import judged
+from graphvio.backend.inertial import ImuSpan
+from graphvio.backend.noise import own_covariance
+from graphvio.copying import put
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.geometry import so3_exp, so3_log
+from graphvio.kernels import kernel
+from graphvio.rig import Imu
+
+_START_SIGMA_S = 0.01
+_START_BIAS_SIGMA_RAD_S = 0.1
+_WALK_S = 5e-5  # by which the offset may change in a second
+_INTERVAL_NS = 250_000_000  # shorter ones tell less, and longer ones' samples may be gone
+_ANGULAR_ACCEL_RAD_S2 = 10.0
+_USABLE_SIGMA_S = 2e-3
+_GATE_PROBABILITY = 0.999
+
+
+@dataclass(frozen=True)
+class OffsetEstimate:
+    """How far the offset in use is believed to be off.
+
+    Attributes:
+        error_s: add it to the offset in use.
+        sigma_s: its standard deviation.
+    """
+
+    error_s: float
+    sigma_s: float
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether it is known well enough to correct by it."""
+        return self.sigma_s < _USABLE_SIGMA_S
+
+
+class TimeOffsetFilter:
+    """A Kalman filter over the offset's error, seconds, and the gyro's bias, rad/s.
+
+    Args:
+        imu: its noise densities.
+        noise_scale: factor on them.
+        imu_between: the IMU between two framesets' stamps by the offset in use, or None where it is not known.
+    """
+
+    def __init__(self, imu: Imu, noise_scale: float, imu_between: Callable[[int, int], ImuSpan | None]) -> None:
+        self._gyro_variance = (noise_scale * imu.gyro_noise_density) ** 2
+        self._walk_variance = np.array([_WALK_S**2, *3 * [(noise_scale * imu.gyro_random_walk) ** 2]])
+        self._imu_between = imu_between
+        self._mean = np.zeros(4)
+        self._covariance = np.diag([_START_SIGMA_S, *3 * [_START_BIAS_SIGMA_RAD_S]]) ** 2
+        self._starts: dict[
+            int, RelativeMotion | None
+        ] = {}  # reference -> the motion that ends where an interval begins
+        self._newest_ns: int | None = None
+
+    @property
+    def estimate(self) -> OffsetEstimate:
+        """What is known of the offset now."""
+        return OffsetEstimate(float(self._mean[0]), float(np.sqrt(self._covariance[0, 0])))
+
+    def update(self, motion: RelativeMotion) -> None:
+        """Take a motion by vision, once a frameset."""
+        reference_ns = motion.reference_stamp_ns
+        start = self._starts.get(reference_ns)
+        start_ns = reference_ns if start is None else start.stamp_ns
+        if reference_ns not in self._starts:
+            self._starts = {ns: begun for ns, begun in self._starts.items() if ns > reference_ns - 4 * _INTERVAL_NS}
+            self._starts[reference_ns] = None
+        if motion.stamp_ns - start_ns < _INTERVAL_NS:
+            return
+        self._starts[reference_ns] = motion
+        self._walk(motion.stamp_ns)
+        for error_s in (float(self._mean[0]), 0.0):  # where it is believed to be, if the samples there have come
+            shift_ns = round(error_s * 1e9)
+            span = self._imu_between(start_ns + shift_ns, motion.stamp_ns + shift_ns)
+            if span is not None:
+                self._measure(*_rotation_between(start, motion), span, error_s)
+                return
+
+    def corrected(self) -> float:
+        """The offset's error, seconds, which the caller takes into use: from here on it is believed to be none."""
+        error_s = float(self._mean[0])
+        self._mean[0] = 0.0
+        return error_s
+
+    def _walk(self, stamp_ns: int) -> None:
+        if self._newest_ns is not None:
+            seconds = max(stamp_ns - self._newest_ns, 0) * 1e-9
+            self._covariance += np.diag(seconds * self._walk_variance)
+        self._newest_ns = stamp_ns
+
+    def _measure(self, start_R_end: Float, covariance: Float, span: ImuSpan, error_s: float) -> None:
+        """A rotation (3, 3) by vision, its covariance (3, 3) in the frame at its end, the IMU for some error."""
+        by_gyro, by_bias = integrated_rates(span.steps_s, span.angular_velocity - self._mean[1:])
+        residual = so3_log(np.ascontiguousarray(by_gyro.T @ start_R_end))
+        rates = span.angular_velocity[[0, -1]] - self._mean[1:]
+        by_offset = rates[1] - by_gyro.T @ rates[0]
+        jacobian = np.hstack([by_offset[:, None], by_bias])
+        # The rates are not those of the true instants: they change with the angular acceleration.
+        change = _ANGULAR_ACCEL_RAD_S2 * self._covariance[0, 0]
+        covariance = covariance + (span.steps_s.sum() * self._gyro_variance + change**2) * np.eye(3)
+        innovation = residual - by_offset * (self._mean[0] - error_s)
+        spread = covariance + jacobian @ self._covariance @ jacobian.T
+        if not judged(innovation, spread, _GATE_PROBABILITY).accepted:
+            return
+        gain = np.linalg.solve(spread, jacobian @ self._covariance).T
+        self._mean = self._mean + gain @ innovation
+        rest = np.eye(4) - gain @ jacobian
+        self._covariance = rest @ self._covariance @ rest.T + gain @ covariance @ gain.T
+
+
+def _rotation_between(start: RelativeMotion | None, end: RelativeMotion) -> tuple[Float, Float]:
+    """The rotation (3, 3) from one motion's end to another's, and its covariance (3, 3) there.
+
+    Args:
+        start: from the same reference; None is the reference itself.
+        end: the later one.
+    """
+    if start is None:
+        return end.reference_T_current[:3, :3], end.covariance[:3, :3]
+    start_R_end = start.reference_T_current[:3, :3].T @ end.reference_T_current[:3, :3]
+    before = start_R_end.T @ _own_rotation_covariance(start) @ start_R_end
+    return start_R_end, before + _own_rotation_covariance(end)
+
+
+def _own_rotation_covariance(motion: RelativeMotion) -> Float:
+    """Covariance (3, 3) without the part that all motions from one reference share."""
+    return np.asarray(own_covariance(motion.covariance, motion.shared_covariance)[:3, :3])
+
+
+@kernel
+def integrated_rates(steps_s: Float, rates: Float) -> tuple[Float, Float]:
+    """The rotation (3, 3) by steps of constant rate (N, 3), and its derivative (3, 3) by a bias of the rates.
+
+    The derivative is that of the rotation's tangent in the frame at the end.
+    """
+    start_R_end, by_bias = np.eye(3), np.zeros((3, 3))
+    for i in range(len(steps_s)):
+        step = so3_exp(steps_s[i] * rates[i])
+        put(by_bias, step.T @ by_bias - steps_s[i] * np.eye(3))
+        put(start_R_end, start_R_end @ step)
+    return start_R_end, by_bias
