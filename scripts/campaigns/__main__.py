@@ -4,13 +4,19 @@ import sys
 
 from benchmarks.command_line import run_command_line
 
-from campaigns import consistency, endurance, lags, rates
+from campaigns import consistency, endurance, lags, outages, rates
 
 if __name__ == "__main__":
     sys.exit(
         run_command_line(
             "scripts/campaign",
-            "Statistical claims by Monte Carlo. docs/benchmarks.md has their results.",
-            (consistency.add_parser, endurance.add_parser, lags.add_parser, rates.add_parser),
+            "Statistical claims by Monte Carlo, and outages. docs/benchmarks.md has their results.",
+            (
+                consistency.add_parser,
+                endurance.add_parser,
+                outages.add_parser,
+                rates.add_parser,
+                lags.add_parser,
+            ),
         )
     )

@@ -1,0 +1,209 @@
+"""The cases of ``scripts/campaign outages``: what goes wrong with a recording's data, and what is promised then."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphvio.events import Event, FrameSet, ImuSample
+
+BEGIN_S = 3.0
+"""Of what goes wrong, after the recording's first frameset."""
+_LENGTH_S, _LONGER_S = 12.0, 16.0  # of the recording that is run
+_END_OF_VISION_S = 8.0
+_FOR_EVER_S = math.inf
+_MS = 1_000_000
+
+Change = Callable[[Event], list[Event]]
+"""What is delivered in place of an event; nothing where it stays away."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One thing, or two at once, that goes wrong.
+
+    Attributes:
+        name: for people.
+        promise: what is to happen, for people.
+        make: a fresh change, which is applied to the events from ``begin_s`` on and before ``end_s``.
+        begin_s: seconds after the first frameset; minus infinity for all that comes before it, too.
+        end_s: on the same scale; infinite where it never ends.
+        late_s: framesets are delivered so much later than the IMU's samples of their instant.
+        jump_s: by which the change moves the stamps.
+        length_s: of the recording that is run.
+    """
+
+    name: str
+    promise: str
+    make: Callable[[], Change]
+    begin_s: float = BEGIN_S
+    end_s: float = _FOR_EVER_S
+    late_s: float = 0.0
+    jump_s: float = 0.0
+    length_s: float = _LENGTH_S
+
+    @property
+    def over_s(self) -> float:
+        """When it is over: a jump of the clock is at once, and only its stamps stay."""
+        return self.begin_s if self.jump_s > 0.0 else self.end_s
+
+    def true_ns(self, stamp_ns: int, start_ns: int) -> int:
+        """The recording's stamp of what was delivered with a stamp, int64 nanoseconds."""
+        jumped = self.jump_s > 0.0 and (stamp_ns - start_ns) * 1e-9 > self.begin_s + 0.5 * self.jump_s
+        return stamp_ns - round(self.jump_s * 1e9) if jumped else stamp_ns
+
+
+class Delivery:
+    """The events of a recording as a case delivers them, one by one.
+
+    Attributes:
+        framesets: how many of the recording's were delivered so far, each counted once.
+    """
+
+    def __init__(self, case: Case, events: Iterable[Event], start_ns: int) -> None:
+        self.framesets = 0
+        self._case, self._events, self._start_ns = case, events, start_ns
+
+    def __iter__(self) -> Iterator[Event]:
+        late_ns, held = round(self._case.late_s * 1e9), deque[FrameSet]()
+        for event in self._changed():
+            while held and held[0].stamp_ns + late_ns < event.stamp_ns:
+                yield held.popleft()
+            if late_ns and isinstance(event, FrameSet):
+                held.append(event)
+            else:
+                yield event
+        yield from held
+
+    def _changed(self) -> Iterator[Event]:
+        case, change = self._case, self._case.make()
+        for event in self._events:
+            time_s = (event.stamp_ns - self._start_ns) * 1e-9
+            delivered = change(event) if case.begin_s - 1e-3 <= time_s < case.end_s - 1e-3 else [event]
+            self.framesets += isinstance(event, FrameSet) and bool(delivered)
+            yield from delivered
+
+
+# ------------------------------------------------------------------ changes
+
+
+def _unchanged() -> Change:
+    return lambda event: [event]
+
+
+def _of_framesets(change: Callable[[FrameSet], FrameSet | None]) -> Change:
+    return lambda event: _present(change(event)) if isinstance(event, FrameSet) else [event]
+
+
+def _of_samples(change: Callable[[ImuSample], ImuSample | None]) -> Change:
+    return lambda event: _present(change(event)) if isinstance(event, ImuSample) else [event]
+
+
+def _present(event: Event | None) -> list[Event]:
+    return [] if event is None else [event]
+
+
+def _black(*pairs: int) -> Callable[[], Change]:
+    """All pairs, or those that are named."""
+
+    def blackened(frameset: FrameSet) -> FrameSet:
+        dark = {j: (np.zeros_like(left), np.zeros_like(right)) for j, (left, right) in frameset.images.items()}
+        chosen = {j: images for j, images in dark.items() if not pairs or j in pairs}
+        return replace(frameset, images={**frameset.images, **chosen})
+
+    return lambda: _of_framesets(blackened)
+
+
+def _without_imu() -> Change:
+    return _of_samples(lambda _: None)
+
+
+def _stuck(axis: int) -> Callable[[], Change]:
+    def held(sample: ImuSample) -> ImuSample:
+        rate, force = sample.angular_velocity.copy(), sample.linear_acceleration.copy()
+        rate[axis], force[axis] = 0.1, 0.5
+        return ImuSample(sample.stamp_ns, rate, force)
+
+    return lambda: _of_samples(held)
+
+
+def _stuck_and_black() -> Change:
+    stick, blacken = _stuck(2)(), _black()()
+    return lambda event: blacken(event) if isinstance(event, FrameSet) else stick(event)
+
+
+def _cut_off() -> Change:
+    return _of_samples(lambda s: replace(s, angular_velocity=np.clip(s.angular_velocity, -0.15, 0.15)))
+
+
+def _not_a_number() -> Change:
+    numbers = iter(range(1_000_000))
+    bad = np.array([np.nan, 0.0, 0.0])
+    return _of_samples(lambda s: replace(s, linear_acceleration=bad) if next(numbers) % 4 == 0 else s)
+
+
+def _muddled() -> Change:
+    """Every event twice, and once with a stamp that lies back."""
+
+    def three(event: Event) -> list[Event]:
+        back_ms = 20 if isinstance(event, ImuSample) else 200
+        return [event, event, replace(event, stamp_ns=event.stamp_ns - back_ms * _MS)]
+
+    return three
+
+
+def _half() -> Change:
+    rng = np.random.default_rng(0)
+    return _of_framesets(lambda frameset: frameset if rng.random() < 0.5 else None)
+
+
+def _jumped(jump_s: float) -> Callable[[], Change]:
+    jump_ns = round(jump_s * 1e9)
+    return lambda: lambda event: [replace(event, stamp_ns=event.stamp_ns + jump_ns)]
+
+
+# ------------------------------------------------------------------ cases
+
+
+def _after(duration_s: float) -> float:
+    return BEGIN_S + duration_s
+
+
+_GOES_ON = "the same epoch goes on when images are back"
+_COASTED_ON = "coasts on the IMU with growing uncertainty"
+_COASTED = f"{_COASTED_ON}; {_GOES_ON}"
+_LOST = "coasts, then tells that it is lost and gives no pose; a new epoch when images are back"
+_VISION_GOES_ON = "vision goes on without the IMU"
+_LEFT_OUT = "the axis that sticks is told; vision goes on without the IMU"
+_NEW_EPOCH = "a new epoch at the last pose"
+
+CASES = (
+    Case("none", "tracks", _unchanged),
+    *(Case(f"all pairs black, {s:g} s", _COASTED, _black(), end_s=_after(s)) for s in (0.3, 1.0, 3.0, 5.0)),
+    Case("all pairs black, 8 s", _LOST, _black(), end_s=_after(8.0), length_s=_LONGER_S),
+    Case(f"all pairs black for good, the last {_LENGTH_S - _END_OF_VISION_S:g} s", _COASTED_ON, _black(),
+         begin_s=_END_OF_VISION_S),
+    Case("one pair black, 3 s", "the other pair goes on", _black(1), end_s=_after(3.0)),
+    Case("half of the framesets missing, throughout", "tracks", _half, begin_s=0.5),
+    Case("framesets 200 ms late, throughout", "are used at their instants: the same poses", _unchanged,
+         begin_s=-math.inf, late_s=0.2),
+    Case("no IMU, 0.2 s", _VISION_GOES_ON, _without_imu, end_s=_after(0.2)),
+    Case("no IMU, 2 s", _VISION_GOES_ON, _without_imu, end_s=_after(2.0)),
+    Case("no IMU for good", _VISION_GOES_ON, _without_imu),
+    Case("NaN in a quarter of the samples, 3 s", "these are left out", _not_a_number, end_s=_after(3.0)),
+    Case("axis 0 of gyro and accelerometer stuck, 2 s", _LEFT_OUT, _stuck(0), end_s=_after(2.0)),
+    Case("axis 2 of gyro and accelerometer stuck, 2 s", _LEFT_OUT, _stuck(2), end_s=_after(2.0)),
+    Case("gyro cut off at 0.15 rad/s, 3 s", "vision is refused for a second at most, then believed", _cut_off,
+         end_s=_after(3.0)),
+    Case("axis 2 stuck while all pairs are black, 0.5 s", "coasts with as much doubt as that deserves; " + _GOES_ON,
+         _stuck_and_black, end_s=_after(0.5)),
+    Case("all twice and with backward stamps, throughout", "both are left out: the same poses", _muddled,
+         begin_s=-math.inf),
+    Case("all clocks jump by 7 s", _NEW_EPOCH, _jumped(7.0), jump_s=7.0),
+    Case("all clocks jump by 10 000 s", _NEW_EPOCH, _jumped(10_000.0), jump_s=10_000.0),
+)  # fmt: skip
+"""Nothing at all first, to compare with."""

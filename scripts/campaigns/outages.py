@@ -1,0 +1,207 @@
+"""``scripts/campaign outages``: what becomes of the estimate when images or the IMU fail for a while, or for good?
+
+The whole odometry with its defaults runs on the simulated room, once for each case of what can go wrong. A table tells
+what the estimates claimed meanwhile, how far they jumped, when vision was used again and how wrong the motion is.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from benchmarks.command_line import Subparsers, add_command
+from benchmarks.recordings import add_data_option, simulated
+from benchmarks.report import Report, machine, tell
+from scipy.stats import chi2
+
+from campaigns.outage_cases import BEGIN_S, CASES, Case, Delivery
+from graphvio.arrays import Float
+from graphvio.errors import GraphvioError
+from graphvio.events import Estimate, Incident, Status
+from graphvio.geometry import se3_inverse, se3_log
+from graphvio.odometry import Odometry
+from graphvio.sources import open_source
+from graphvio.trajectory import Trajectory
+
+_SCENE = "room"
+_BEFORE_S, _AFTER_S = 1.0, 3.0
+_SETTLED_S = 2.0  # motions are measured from here on at the earliest: at first the tilt is known least
+_MOST_SIGMA = 3.0
+_MOST_STATISTIC = float(chi2.isf(chi2.sf(_MOST_SIGMA**2, 1), 6))  # as improbable of a pose, which has six numbers
+_BY_VISION = (Status.TRACKING, Status.INITIALISING)
+_HEAD = ("case", "poses, %", "while it lasts", "largest jump, mm", "at return", "recovery, s", "error, cm",
+         "epochs", "incidents")  # fmt: skip
+_EXPLANATION = (
+    f"What goes wrong begins after {BEGIN_S:g} s of the {_SCENE} where nothing else is said. Poses: of the delivered "
+    "framesets, those whose estimate has one. Largest jump: the most by which a step from one frameset to the next, "
+    "within an epoch, is off the true one, at return or elsewhere. At return: the Mahalanobis distance of such a step "
+    "from coasting to vision, rotation included, under the covariance of the pose before. Recovery: from the end of "
+    f"what goes wrong until vision is used. Error: of the position by the motion from {_BEFORE_S:g} s before to "
+    f"{_AFTER_S:g} s after, or to the end; where an epoch began meanwhile, from its first pose on."
+)
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add ``outages``."""
+    parser = add_command(subparsers, "outages", "blackouts and faults of the data, and how each ends", __doc__)
+    parser.add_argument("--jobs", type=int, default=2, help="runs side by side (default: 2)")
+    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
+    parser.add_argument("--docs", action="store_true", help="write the report into docs/benchmarks.md")
+    add_data_option(parser)
+    parser.set_defaults(run=main)
+
+
+def main(args: argparse.Namespace) -> None:
+    """Run all cases and report."""
+    if args.jobs < 1:
+        raise GraphvioError("--jobs wants 1 or more")
+    folder = simulated(args.data, _SCENE)
+    report = Report()
+    report.add(machine())
+    rows, broken = [], []
+    with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
+        tasks = [pool.submit(run_case, number, folder) for number in range(len(CASES))]
+        for number, (case, task) in enumerate(zip(CASES, tasks, strict=True)):
+            cells, claims = task.result()
+            rows.append([case.name, *cells])
+            broken += [f"- {case.name}: {claim}" for claim in claims]
+            tell(f"case {number + 1} of {len(CASES)}")
+    report.add("#### What is promised", "In all cases, time never goes back and there is no pose while lost.")
+    report.table(("case", "promised"), [(case.name, case.promise) for case in CASES])
+    report.add("#### What happened", _EXPLANATION)
+    report.table(_HEAD, rows)
+    report.add(
+        "Asked of every case: each delivered frameset has an estimate, stamps increase, there is no pose while lost, "
+        f"and no return within an epoch is beyond {np.sqrt(_MOST_STATISTIC):.1f}, which is as improbable of a pose as "
+        f"{_MOST_SIGMA:g} sigma are of a number: " + ("**missed**." if broken else "**met**.")
+    )
+    if broken:
+        report.add(*broken)
+    if args.out is not None:
+        report.save(args.out)
+    if args.docs:
+        report.save_to_docs("outages")
+
+
+def run_case(number: int, folder: Path) -> tuple[list[str], list[str]]:
+    """Run one of the cases on a recording: its cells of the table, and what did not hold."""
+    outcome = outcome_of(CASES[number], folder)
+    return outcome.cells(), outcome.broken()
+
+
+def outcome_of(case: Case, folder: Path) -> Outcome:
+    """What a case leads to on a recording."""
+    source = open_source(folder, to_s=case.length_s)
+    assert source.truth is not None
+    truth = Trajectory.read(source.truth)
+    odometry, delivery = Odometry(source.rig), Delivery(case, source, source.start_ns)
+    estimates = [estimate for event in delivery if (estimate := odometry.process(event)) is not None]
+    estimates += odometry.finish()
+    stamps = [case.true_ns(estimate.stamp_ns, source.start_ns) for estimate in estimates]
+    times_s = (np.array(stamps, dtype=np.int64) - source.start_ns) * 1e-9
+    at = np.searchsorted(truth.stamps_ns, stamps)
+    assert np.array_equal(truth.stamps_ns[at], stamps)
+    incidents = odometry.take_incidents()
+    return Outcome(case, estimates, np.asarray(times_s), truth.nav_T_body[at], delivery.framesets, incidents)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one case led to.
+
+    Attributes:
+        case: which.
+        estimates: N of them, in the order in which they were told.
+        times_s: (N,) of the images, seconds of the recording after its first frameset.
+        world_T_body: (N, 4, 4) true poses.
+        given: number of the framesets that were delivered.
+        incidents: all.
+    """
+
+    case: Case
+    estimates: list[Estimate]
+    times_s: Float
+    world_T_body: Float
+    given: int
+    incidents: list[Incident]
+
+    def cells(self) -> list[str]:
+        """Of the table, after the case's name."""
+        estimates = self.estimates
+        distances = self.return_distances()
+        lasts = (self.times_s >= self.case.begin_s - 1e-3) & (self.times_s < self.case.over_s - 1e-3)
+        statuses = Counter(str(e.status) for e, during in zip(estimates, lasts, strict=True) if during)
+        kinds = Counter(incident.kind for incident in self.incidents)
+        return [
+            f"{100 * sum(e.nav_T_body is not None for e in estimates) / self.given:.1f}",
+            _counts(statuses),
+            f"{1e3 * np.nanmax([np.linalg.norm(self._error(i, i + 1)[3:]) for i in range(len(estimates) - 1)]):.1f}",
+            f"{max(distances):.1f}" if distances else "-",
+            _figure(self.recovery_s(), 2),
+            _figure(100 * self.error_m(), 2),
+            str(len({e.epoch for e in estimates})),
+            _counts(kinds),
+        ]
+
+    def broken(self) -> list[str]:
+        """What did not hold of that which is asked of every case."""
+        stamps = [e.stamp_ns for e in self.estimates]
+        most = max(self.return_distances(), default=0.0)
+        asked = {
+            f"{len(stamps)} estimates of {self.given} framesets": len(stamps) == self.given,
+            "stamps do not increase": stamps == sorted(set(stamps)),
+            "a pose while lost": all(e.nav_T_body is None for e in self.estimates if e.status is Status.LOST),
+            f"a return by {most:.1f}": most**2 <= _MOST_STATISTIC,
+        }
+        return [words for words, held in asked.items() if not held]
+
+    def return_distances(self) -> list[float]:
+        """How far each step from coasting to vision is off, Mahalanobis under what was known of the pose before."""
+        distances = []
+        for i, (before, after) in enumerate(pairwise(self.estimates)):
+            returned = before.status is Status.COASTING and after.status in _BY_VISION
+            if returned and before.covariance is not None and before.epoch == after.epoch:
+                error = self._error(i, i + 1)
+                distances.append(float(np.sqrt(error @ np.linalg.solve(before.covariance, error))))
+        return distances
+
+    def recovery_s(self) -> float:
+        """From the end of what goes wrong until vision is used again; NaN where it does not end."""
+        after = self.times_s >= self.case.over_s - 1e-3
+        used = [e.status in _BY_VISION and e.nav_T_body is not None for e in self.estimates]
+        times_s = self.times_s[after & np.array(used)]
+        return float(times_s[0] - self.case.over_s) if len(times_s) else np.nan
+
+    def error_m(self) -> float:
+        """Of the motion from before to after what goes wrong; NaN where there is no pose at its end."""
+        end = int(np.searchsorted(self.times_s, self.case.over_s + _AFTER_S + 1e-3)) - 1
+        start_s = max(self.case.begin_s - _BEFORE_S, _SETTLED_S) - 1e-3
+        of_epoch = [e.epoch == self.estimates[end].epoch and e.nav_T_body is not None for e in self.estimates]
+        start = int(np.flatnonzero((self.times_s >= start_s) & np.array(of_epoch))[0])
+        return float(np.linalg.norm(self._error(start, end)[3:]))
+
+    def _error(self, i: int, j: int) -> Float:
+        """Tangent (6,) in the earlier body by which the motion between two estimates is off the true one.
+
+        NaN where they are not of one epoch or one has no pose.
+        """
+        start, end = self.estimates[i], self.estimates[j]
+        if start.nav_T_body is None or end.nav_T_body is None or start.epoch != end.epoch:
+            return np.full(6, np.nan)
+        motion = se3_inverse(start.nav_T_body) @ end.nav_T_body
+        true = se3_inverse(self.world_T_body[i]) @ self.world_T_body[j]
+        return np.asarray(se3_log(motion @ se3_inverse(true)))
+
+
+def _counts(counter: Counter[str]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counter.most_common()) or "-"
+
+
+def _figure(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if np.isfinite(value) else "-"
