@@ -18,7 +18,7 @@ _LARGEST = 1e12
 _MAY_BE_ZERO = frozenset(
     ("seed", "border_px", "keyframe_overlap", "min_inlier_share", "min_response",
      "scarce_share", "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s",
-     "calibration_error_share", "huber_sigmas")
+     "calibration_error_share")
 )  # fmt: skip
 _RANGES = {"cells_across": (2, 100), "window_px": (5, 63), "levels": (1, 8), "min_inliers": (3, 1000)}
 _SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
@@ -135,9 +135,9 @@ class SmootherConfig:
     """Age at which a state leaves the window, unless later motions are measured from it."""
     gate_probability: float = 0.9999
     """Vision is refused where its innovation lies outside this share of the chi-square distribution."""
-    huber_sigmas: float = 3.0
-    """Motions that the gate let in and that the solution leaves farther off than this pull less, by Huber's kernel; 0
-    lets all pull by their covariance."""
+    huber_probability: float = 0.99
+    """Motions that the gate let in pull less, by Huber's kernel, where the solution leaves them outside this share of
+    the chi-square distribution; 1 lets all pull by their covariance."""
     max_accel_m_s2: float = 50.0
     """Vision is refused where it asks for a larger acceleration."""
     max_gated_s: float = 1.0

@@ -6,9 +6,11 @@ import gtsam
 import numpy as np
 
 from graphvio.backend.inertial import GRAVITY_M_S2, NO_SAMPLES, ImuBuffer
+from graphvio.backend.noise import own_covariance
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.propagation import Propagator
 from graphvio.backend.states import RigState
+from graphvio.backend.time_offset import integrated_rates
 from graphvio.config import Config
 from graphvio.events import ImuSample
 from graphvio.frontend.observations import Observations, RigArrays, correspond
@@ -45,6 +47,7 @@ def warm_up(rig: Rig, config: Config) -> None:
     for solve in (joint_motion, best_pair_motion):
         solve(RigArrays.of(rig), observations, np.eye(4), config.motion, rng)
     se3_exp(np.zeros(6))
+    own_covariance(np.eye(6), np.eye(6))
     for pose in (np.eye(4), np.asfortranarray(np.eye(4))):  # gtsam's matrices are in Fortran's order
         se3_log(pose)
         se3_inverse(pose)
@@ -60,6 +63,7 @@ def _warm_up_imu(imu: Imu) -> None:
         buffer.add(ImuSample(stamp_ns, np.zeros(3), up))
     span = buffer.span(0, 25_000_000)
     assert span is not None
+    integrated_rates(span.steps_s, span.angular_velocity)
     preintegrate(span, preintegration_params(imu, 1.0), gtsam.imuBias.ConstantBias())
     for pose in (np.eye(4), np.asfortranarray(np.eye(4))):
         state = RigState(pose, np.zeros(3), np.zeros(3), np.zeros(3))

@@ -49,19 +49,32 @@ def test_faulty_samples_are_named_and_left_out() -> None:
     assert not buffer.covers(20 * MS + 1)
 
 
-def test_an_axis_that_sticks_while_others_move_is_told() -> None:
+@pytest.mark.parametrize(("step", "found"), [(0.0, slice(215, 400)), (0.02, slice(300, 400))], ids=["fine", "coarse"])
+def test_an_axis_that_sticks_while_others_live_is_told(step: float, found: slice) -> None:
+    """Of readings that change with every sample at once; of coarse ones when the others have moved enough."""
     rng, buffer = np.random.default_rng(0), ImuBuffer(50.0)
     faults = []
     for i in range(600):
         t = 20e-3 * i
         rate, force = np.array([np.sin(t), 0.3 * np.cos(t), 0.1]), np.array([np.sin(2.0 * t), 0.2, 9.8])
         rate, force = rate + 0.01 * rng.standard_normal(3), force + 0.05 * rng.standard_normal(3)
+        if step:
+            rate, force = step * np.round(rate / step), step * np.round(force / step)
         if 200 <= i < 400:
             rate[1] = 0.25  # the end of its range
         faults.append(buffer.add(sample(5 * MS * i, rate, force)))
-    assert set(faults[:250]) == {""}
-    assert set(faults[300:400]) == {"imu_stuck"}  # once the others have moved enough
+    assert set(faults[:201]) == {""}
+    assert set(faults[found]) == {"imu_stuck"}
     assert set(faults[400:]) == {""}
+
+
+def test_a_simulator_without_noise_is_not_stuck() -> None:
+    """A rig on wheels, straight ahead, then in a bend: most axes have one value all the time."""
+    buffer = ImuBuffer(50.0)
+    for i in range(2000):
+        bend = np.array([0.0, 0.0, 0.3 if 600 <= i < 900 else 0.0])
+        speeding_up = np.array([0.1 * np.sin(0.01 * i), 0.0, 9.81])
+        assert buffer.add(sample(5 * MS * i, bend, speeding_up)) == ""
 
 
 def test_coarse_readings_at_rest_are_not_stuck() -> None:

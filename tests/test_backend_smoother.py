@@ -213,8 +213,8 @@ def test_a_motion_that_the_imu_contradicts_is_refused(error: tuple[list[float], 
 def test_a_wrong_motion_that_passes_the_gate_pulls_less() -> None:
     """A turn that is just small enough to be believed, and that the IMU and later motions contradict."""
 
-    def rotation_after(sigmas: float, turn: float) -> tuple[Float, bool]:
-        run = Run(4, config=replace(CONFIG, huber_sigmas=sigmas))
+    def rotation_after(probability: float, turn: float) -> tuple[Float, bool]:
+        run = Run(4, config=replace(CONFIG, huber_probability=probability))
         run.until(2.0)
         run.predict(2_050_000_000)
         good = measured_motion(2_000_000_000, 2_050_000_000, run.rng)
@@ -226,11 +226,11 @@ def test_a_wrong_motion_that_passes_the_gate_pulls_less() -> None:
         return run.smoother.pose(run.smoother.latest_ns), accepted
 
     pulled = {}
-    for sigmas in (0.0, 3.0):
-        (without, _), (with_it, accepted) = rotation_after(sigmas, 0.0), rotation_after(sigmas, 4.5e-3)
+    for probability in (1.0, 0.99):
+        (without, _), (with_it, accepted) = rotation_after(probability, 0.0), rotation_after(probability, 4.5e-3)
         assert accepted  # its sigma is 1e-3
-        pulled[sigmas] = float(np.linalg.norm(se3_log(se3_inverse(without) @ with_it)))
-    assert pulled[3.0] < 0.6 * pulled[0.0]
+        pulled[probability] = float(np.linalg.norm(se3_log(se3_inverse(without) @ with_it)))
+    assert pulled[0.99] < 0.9 * pulled[1.0]
 
 
 def test_good_motions_pass_the_gate_as_often_as_they_should() -> None:

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from graphvio.arrays import Float, Int
+from graphvio.arrays import Bool, Float, Int
 from graphvio.copying import put
 from graphvio.events import ImuSample
 from graphvio.kernels import kernel
@@ -18,6 +18,11 @@ _MAX_FORCE = 1000.0
 NO_SAMPLES = (np.empty(0, dtype=np.int64), np.empty((0, 6)))
 """What `ImuBuffer.since` returns where it knows nothing."""
 _STUCK_NS = 250_000_000  # for so long no living axis repeats one value while others change
+_HISTORY = 100  # samples over which it is counted how often an axis repeats its value
+_SELDOM = 0.02  # an axis that has changed in a smaller share of the samples has no noise: nothing is known of it
+_LIVELIEST = 0.95  # share of the samples in which an axis changes that is believed at most
+_LIVING = 0.8  # share of the samples in which another axis of the sensor must go on changing
+_UNLIKELY = np.log(1e-9)  # chance that a living axis repeats its value so often
 _MOVING = np.repeat([0.2, 1.0], 3)  # rad/s and m/s^2, by so much
 _KEPT_NS = 60_000_000_000  # framesets do not come later than this after their samples
 _ROOM = 1024  # samples that the buffer has room for at first
@@ -154,22 +159,57 @@ class ImuBuffer:
 
 
 class _StuckAxes:
-    """Finds axes that repeat one value while others move, as at the end of their range."""
+    """Finds axes that repeat one value while others live, as at the end of their range.
+
+    An axis that used to change with every sample, as noise makes it, is found within some samples, if another axis of
+    the same sensor goes on changing. One that used to repeat its values is found once others have moved for a while.
+    """
 
     def __init__(self) -> None:
         self._before = np.full(6, np.nan)
         self._low, self._high = np.zeros((2, 6, 6))  # for each axis, the range of all axes since it has its value
         self._since_ns = np.zeros(6, dtype=np.int64)  # since when each axis repeats its value though others moved
+        self._change = np.zeros(6)  # how often each axis changes from one sample to the next, where it lives
+        self._repeats = np.zeros((6, 6))  # for each axis, how often each changed since it has its value; and of itself,
+        # how often it has repeated it
 
     def shows(self, sample: ImuSample) -> bool:
         """Whether a sample, the next in time, has a stuck axis."""
         now = np.concatenate([sample.angular_velocity, sample.linear_acceleration])
-        since_ns = _note_repeats(sample.stamp_ns, now, self._before, self._low, self._high, self._since_ns)
-        return sample.stamp_ns - since_ns >= _STUCK_NS
+        stopped = _note_stops(now, self._before, self._change, self._repeats)
+        since_ns = _note_repeats(
+            sample.stamp_ns, now, self._before, self._low, self._high, self._since_ns, self._change > _SELDOM
+        )
+        return stopped or sample.stamp_ns - since_ns >= _STUCK_NS
 
 
 @kernel
-def _note_repeats(stamp_ns: int, now: Float, before: Float, low: Float, high: Float, since_ns: Int) -> int:
+def _note_stops(now: Float, before: Float, change: Float, repeats: Float) -> bool:
+    """Go on by a sample (6,), and tell whether some axis repeats its value against all likelihood."""
+    stopped = False
+    for axis in range(6):
+        if now[axis] != before[axis]:
+            change[axis] += (1.0 - change[axis]) / _HISTORY
+            for other in range(6):
+                repeats[axis, other] = 0.0
+            continue
+        if repeats[axis, axis] == 0.0:
+            change[axis] -= change[axis] / _HISTORY
+        for other in range(6):
+            repeats[axis, other] += other == axis or now[other] != before[other]
+        count, first = repeats[axis, axis], 3 * (axis // 3)
+        others_live = False
+        for other in range(first, first + 3):
+            others_live |= other != axis and repeats[axis, other] > _LIVING * count
+        chance = count * np.log(1.0 - min(change[axis], _LIVELIEST))
+        stopped |= others_live and chance < _UNLIKELY
+    return stopped
+
+
+@kernel
+def _note_repeats(
+    stamp_ns: int, now: Float, before: Float, low: Float, high: Float, since_ns: Int, has_lived: Bool
+) -> int:
     """Go on by a sample (6,), and tell since when some axis has repeated its value though others moved."""
     for axis in range(6):
         if now[axis] != before[axis]:
@@ -179,7 +219,7 @@ def _note_repeats(stamp_ns: int, now: Float, before: Float, low: Float, high: Fl
             low[axis, other] = min(low[axis, other], now[other])
             high[axis, other] = max(high[axis, other], now[other])
             moved |= high[axis, other] - low[axis, other] > _MOVING[other]
-        if not moved:
+        if not (moved and has_lived[axis]):
             since_ns[axis] = stamp_ns
     put(before, now)
     return int(since_ns.min())

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.backend.gating import chi_square_quantile
 from graphvio.kernels import kernel
 
 _LEAST_OWN_SHARE = 0.001  # of each direction of a motion's covariance: keeps it positive definite
@@ -20,11 +21,12 @@ def gaussian(covariance: Float) -> gtsam.noiseModel.Gaussian:
     return gtsam.noiseModel.Gaussian.Covariance(covariance, False)
 
 
-def robust(noise: gtsam.noiseModel.Gaussian, sigmas: float) -> gtsam.noiseModel.Base:
-    """The noise with Huber's kernel: errors beyond so many standard deviations count linearly; with 0 as it is."""
-    if not sigmas:
+def robust(noise: gtsam.noiseModel.Gaussian, probability: float) -> gtsam.noiseModel.Base:
+    """The noise with Huber's kernel: errors outside this share of the chi-square distribution count linearly."""
+    if probability == 1.0:
         return noise
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(sigmas), noise)
+    distance = np.sqrt(chi_square_quantile(probability, noise.dim()))
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(distance), noise)
 
 
 def isotropic(dimension: int, sigma: float) -> gtsam.noiseModel.Isotropic:

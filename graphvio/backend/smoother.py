@@ -46,7 +46,7 @@ class Smoother:
         self._previous_motion = np.zeros(6)  # tangent per second
         self._constrained_ns = 0  # stamp of the newest state whose motion was measured
         self._seen_ns: int | None = None  # the same, by vision
-        self._forgotten = np.zeros((3, 3))  # position covariance, nav, that resets took out of the window
+        self._beside = np.zeros((6, 6))  # covariance of nav itself, left of its poses, that is told but not estimated
         self._rate_sigmas = np.zeros(2)  # of `_previous_motion`: rad/s and m/s
 
     @property
@@ -68,7 +68,8 @@ class Smoother:
         self._rate_sigmas = np.array([_UNKNOWN_RATE_SIGMA_RAD_S, uncertainty.velocity_m_s])
         k = self._append(stamp_ns, state)
         self._constrained_ns, self._seen_ns = stamp_ns, None
-        self._forgotten = np.zeros((3, 3))
+        to_nav = se3_adjoint(state.nav_T_body)
+        self._beside = to_nav @ uncertainty.beside @ to_nav.T
         for factor in first_state(k, state, uncertainty, self.has_imu):
             self._window.add(factor)
 
@@ -123,7 +124,7 @@ class Smoother:
 
     def covariance(self) -> Float:
         """Covariance (6, 6) of the newest pose, tangent ``[rotation, translation]`` in body."""
-        return self._with_forgotten(self._window.joint_covariance([x(self._index_of[self.latest_ns])]))
+        return self._with_beside(self._window.joint_covariance([x(self._index_of[self.latest_ns])]))
 
     def state_covariance(self) -> StateCovariance:
         """How well the newest state is known."""
@@ -132,7 +133,7 @@ class Smoother:
             return StateCovariance(self.covariance())
         joint = self._window.joint_covariance([x(k), v(k), b(k)])
         return StateCovariance(
-            pose=self._with_forgotten(joint[:6, :6]),
+            pose=self._with_beside(joint[:6, :6]),
             velocity=joint[6:9, 6:9],
             gyro_bias=joint[12:, 12:],
             accel_bias=joint[9:12, 9:12],
@@ -198,15 +199,13 @@ class Smoother:
             keys, self._window.joint_covariance(keys), _ANCHOR_SIGMA_M, self._window.values
         )
         nav_R_body = self.pose(self.latest_ns)[:3, :3]
-        self._forgotten = self._forgotten + nav_R_body @ forgotten @ nav_R_body.T
+        self._beside[3:, 3:] += nav_R_body @ forgotten @ nav_R_body.T
         self._window.add(factor)
 
-    def _with_forgotten(self, covariance: Float) -> Float:
-        """A pose's covariance (6, 6), newest body, with what resets took out of the window."""
-        nav_R_body = self.pose(self.latest_ns)[:3, :3]
-        covariance = covariance.copy()
-        covariance[3:, 3:] += nav_R_body.T @ self._forgotten @ nav_R_body
-        return covariance
+    def _with_beside(self, covariance: Float) -> Float:
+        """The newest pose's covariance (6, 6), in body, with what is told beside the window."""
+        from_nav = se3_adjoint(se3_inverse(self.pose(self.latest_ns)))
+        return np.asarray(covariance + from_nav @ self._beside @ from_nav.T)
 
     def accept(self, motion: RelativeMotion) -> None:
         """Insert a motion that ends in the newest state."""
@@ -218,7 +217,7 @@ class Smoother:
                 reference,
                 x(self._index_of[motion.stamp_ns]),
                 gtsam.Pose3(motion.reference_T_current),
-                robust(gaussian(self._own_covariance(motion)), self._config.huber_sigmas),
+                robust(gaussian(self._own_covariance(motion)), self._config.huber_probability),
             )
         )
 

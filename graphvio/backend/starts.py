@@ -9,7 +9,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.initialisation import InitialAttitude, initial_attitude, level
-from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
+from graphvio.backend.states import RigState, StartUncertainty, as_origin, origin_covariance
 from graphvio.config import InitialisationConfig
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3, se3_inverse, se3_log
@@ -83,7 +83,7 @@ def after_failure(stamp_ns: int, state: RigState, pose_covariance: Float) -> Sta
 
 def after_gap(stamp_ns: int, state: RigState, pose_covariance: Float) -> Start:
     """A start at the last state, after a gap that nothing bridges. For arguments see `after_failure`."""
-    return _restart(stamp_ns, state, _uncorrelated(pose_covariance) + AFTER_JUMP)
+    return _restart(stamp_ns, state, pose_covariance + AFTER_JUMP)
 
 
 def after_lost(motion: RelativeMotion, state: RigState, pose_covariance: Float) -> Start:
@@ -94,7 +94,7 @@ def after_lost(motion: RelativeMotion, state: RigState, pose_covariance: Float) 
         state: the prediction.
         pose_covariance: (6, 6) of it, tangent in body.
     """
-    return _restart(motion.stamp_ns, _with_velocity(state, motion), _uncorrelated(pose_covariance))
+    return _restart(motion.stamp_ns, _with_velocity(state, motion), pose_covariance)
 
 
 def by_vision(
@@ -112,7 +112,7 @@ def by_vision(
     """
     apart = np.zeros(6) if prediction_failed else se3_log(se3_inverse(nav_T_body) @ state.nav_T_body)
     state = _with_velocity(replace(state, nav_T_body=nav_T_body), motion)
-    covariance = _uncorrelated(pose_covariance) + motion.covariance + np.diag(apart**2)
+    covariance = pose_covariance + motion.covariance + np.diag(apart**2)
     gyro_bias_sigma = _GYRO_BIAS_SIGMA if prediction_failed else _WIDE_GYRO_BIAS_SIGMA
     return _restart(motion.stamp_ns, state, covariance, gyro_bias_sigma)
 
@@ -125,22 +125,17 @@ def doubtful(start: Start) -> Start:
     nav_R_body = start.state.nav_T_body[:3, :3]
     pose = start.uncertainty.pose.copy()
     pose[:3, :3] += nav_R_body.T @ np.diag([_DOUBTFUL_TILT_RAD, _DOUBTFUL_TILT_RAD, 0.0]) ** 2 @ nav_R_body
-    known = StartUncertainty(pose, start.uncertainty.velocity_m_s, _WIDE_GYRO_BIAS_SIGMA)
+    known = replace(start.uncertainty, pose=pose, gyro_bias_rad_s=_WIDE_GYRO_BIAS_SIGMA)
     return replace(start, uncertainty=known, is_known=False)
 
 
 def _restart(
     stamp_ns: int, state: RigState, pose_covariance: Float, gyro_bias_sigma: float = _GYRO_BIAS_SIGMA
 ) -> Start:
-    return Start(stamp_ns, state, StartUncertainty(pose_covariance, _RESTART_SPEED_SIGMA, gyro_bias_sigma))
-
-
-def _uncorrelated(pose_covariance: Float) -> Float:
-    """A pose's covariance (6, 6) without what links place and attitude: that holds for the prediction's errors, and a
-    start's place must not move when its attitude becomes known better."""
-    covariance = pose_covariance.copy()
-    covariance[:3, 3:] = covariance[3:, :3] = 0.0
-    return covariance
+    """A start's place and heading must not move when its attitude becomes known better: what they are uncertain by is
+    told, but not estimated."""
+    pose, beside = as_origin(state.nav_T_body[:3, :3], pose_covariance)
+    return Start(stamp_ns, state, StartUncertainty(pose, _RESTART_SPEED_SIGMA, gyro_bias_sigma, beside))
 
 
 def _with_velocity(state: RigState, motion: RelativeMotion) -> RigState:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -37,11 +37,14 @@ class StartUncertainty:
         pose: (6, 6) covariance of the pose, tangent ``[rotation, translation]`` in body.
         velocity_m_s: standard deviation of each component.
         gyro_bias_rad_s: standard deviation of each component.
+        beside: (6, 6) what is to be told of the pose beyond that, such as the doubt about where an epoch begins:
+            nothing that comes later can say more about it, so it is no part of the estimation.
     """
 
     pose: Float
     velocity_m_s: float
     gyro_bias_rad_s: float
+    beside: Float = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +66,26 @@ class StateCovariance:
 
 def origin_covariance(nav_R_body: Float, tilt_sigma_rad: float) -> Float:
     """Covariance (6, 6) of a pose whose position and heading define nav, and whose roll and pitch are measured."""
-    about_nav = np.diag([tilt_sigma_rad, tilt_sigma_rad, _HEADING_SIGMA_RAD]) ** 2
+    return _origin_covariance(nav_R_body, np.eye(2) * tilt_sigma_rad**2)
+
+
+def as_origin(nav_R_body: Float, covariance: Float) -> tuple[Float, Float]:
+    """A pose's covariance (6, 6) as that of a pose that defines nav, and what it has beside that.
+
+    Returns:
+        With its roll and pitch, and with its heading and position; what links the two is left out.
+    """
+    about_nav = nav_R_body @ covariance[:3, :3] @ nav_R_body.T
+    beside = np.zeros((6, 6))
+    beside[:3, :3] = about_nav[2, 2] * np.outer(nav_R_body[2], nav_R_body[2])
+    beside[3:, 3:] = covariance[3:, 3:]
+    return _origin_covariance(nav_R_body, about_nav[:2, :2]), beside
+
+
+def _origin_covariance(nav_R_body: Float, tilt: Float) -> Float:
+    """Tilt's covariance (2, 2) is about nav's horizontal axes."""
+    about_nav = np.diag([0.0, 0.0, _HEADING_SIGMA_RAD**2])
+    about_nav[:2, :2] = tilt
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = nav_R_body.T @ about_nav @ nav_R_body
     covariance[3:, 3:] = np.eye(3) * _POSITION_SIGMA_M**2
