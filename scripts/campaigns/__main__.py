@@ -4,19 +4,13 @@ import sys
 
 from benchmarks.command_line import run_command_line
 
-from campaigns import consistency, endurance, lags, outages, rates
+from campaigns import consistency, endurance, lags, outages, rates, real_imu
 
 if __name__ == "__main__":
     sys.exit(
         run_command_line(
             "scripts/campaign",
             "Statistical claims by Monte Carlo, and outages. docs/benchmarks.md has their results.",
-            (
-                consistency.add_parser,
-                endurance.add_parser,
-                outages.add_parser,
-                rates.add_parser,
-                lags.add_parser,
-            ),
+            tuple(module.add_parser for module in (consistency, real_imu, outages, endurance, rates, lags)),
         )
     )

@@ -1,0 +1,103 @@
+"""A recorded IMU with a truth beside it, in an EuRoC folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.backend.inertial import ImuBuffer, ImuSpan
+from graphvio.errors import GraphvioError
+from graphvio.events import ImuSample
+from graphvio.sources.faults import FaultLog
+from graphvio.sources.tables import ImuTable, read_imu_csv
+from graphvio.trajectory import Trajectory
+
+FRAMES_HZ = 20
+STEP_NS = 1_000_000_000 // FRAMES_HZ
+_MAX_GAP_S = 0.05
+_BIAS_COLUMNS = range(11, 17)  # gyro, accelerometer
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """States of the IMU.
+
+    Attributes:
+        world_T_body: (N, 4, 4).
+        velocity_world: (N, 3) m/s.
+        gyro_bias: (N, 3) rad/s.
+        accel_bias: (N, 3) m/s^2.
+    """
+
+    world_T_body: Float
+    velocity_world: Float
+    gyro_bias: Float
+    accel_bias: Float
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """The IMU in steps of 50 ms, and what the file tells of its states there.
+
+    Attributes:
+        stamps_ns: N of them.
+        spans: N - 1, the IMU from each stamp to the next.
+        told: by the file; the velocities are those of its positions.
+    """
+
+    stamps_ns: list[int]
+    spans: list[ImuSpan]
+    told: Truth
+
+    @staticmethod
+    def read(folder: Path) -> Flight:
+        """Read the IMU and the truth of an EuRoC folder.
+
+        Raises:
+            GraphvioError: if a file is missing or either of them has gaps.
+        """
+        if not folder.is_dir():
+            raise GraphvioError(f"{folder}: there is no such folder; give that of EuRoC's V1_01 with --recording")
+        table = read_imu_csv(folder / "mav0" / "imu0" / "data.csv", FaultLog(folder.name))
+        path = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+        truth = Trajectory.read(path)
+        columns = _bias_columns(path, len(truth))
+        first = max(truth.stamps_ns[0], table.stamps_ns[0])
+        stamps = np.arange(first, min(truth.stamps_ns[-1], table.stamps_ns[-1]) + 1, STEP_NS)
+        poses, known = truth.at(stamps, _MAX_GAP_S)
+        if not known.all() or len(stamps) < 2:
+            raise GraphvioError(f"{path}: has a gap of more than {_MAX_GAP_S:g} s; choose another recording")
+        seconds, at = (1e-9 * (each - first) for each in (truth.stamps_ns, stamps))
+        biases = np.stack([np.interp(at, seconds, column) for column in columns.T], axis=1)
+        velocity = np.gradient(poses.positions, 1e-9 * STEP_NS, axis=0)
+        told = Truth(poses.nav_T_body, velocity, biases[:, :3], biases[:, 3:])
+        return Flight(stamps.tolist(), list(_spans(table, stamps, folder)), told)
+
+
+def _bias_columns(path: Path, rows: int) -> Float:
+    """Biases (N, 6) of gyro and accelerometer."""
+    try:
+        columns = np.loadtxt(path, delimiter=",", comments="#", usecols=_BIAS_COLUMNS)
+    except (ValueError, IndexError) as error:
+        raise GraphvioError(f"{path}: holds no biases ({error}); give EuRoC's own file") from None
+    if columns.shape != (rows, len(_BIAS_COLUMNS)):
+        raise GraphvioError(f"{path}: holds biases of {len(columns)} rows of {rows}; give EuRoC's own file")
+    return columns
+
+
+def _spans(table: ImuTable, stamps_ns: Int, folder: Path) -> Iterator[ImuSpan]:
+    """The IMU between stamps (N,), as the odometry's own buffer gives it."""
+    buffer, added = ImuBuffer(1e3 * _MAX_GAP_S), 0
+    for start_ns, end_ns in zip(stamps_ns[:-1].tolist(), stamps_ns[1:].tolist(), strict=True):
+        while not buffer.covers(end_ns):
+            buffer.add(ImuSample(int(table.stamps_ns[added]), table.values[added, :3], table.values[added, 3:]))
+            added += 1
+        span = buffer.span(start_ns, end_ns)
+        if span is None:
+            raise GraphvioError(f"{folder}: its IMU has a gap of more than {_MAX_GAP_S:g} s; choose another recording")
+        yield span
+        buffer.discard_before(end_ns)

@@ -1,0 +1,154 @@
+"""The truth of a recorded IMU, found anew from the positions beside it and the IMU alone.
+
+The orientations of such a file need not be those of the IMU. A batch over all of the recording does not ask for them:
+its unknowns are the IMU's poses, velocities and biases, and where on the body the positions were measured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from campaigns.flight import STEP_NS, Flight, Truth
+from graphvio.arrays import Float, Int
+from graphvio.backend.factors import b, v, x
+from graphvio.backend.inertial import GRAVITY_M_S2
+from graphvio.backend.noise import isotropic
+from graphvio.backend.preintegration import preintegrate, preintegration_params
+from graphvio.backend.states import StateCovariance
+from graphvio.geometry import so3_log
+from graphvio.rig import Imu
+
+_POSITION_SIGMA_M, _LEVER_ARM_SIGMA_M, _BIAS_SIGMA = 1e-3, 0.1, 1.0
+_LEVER_ARM = int(gtsam.symbol("l", 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """What a batch finds of a flight.
+
+    Attributes:
+        truth: the states.
+        lever_arm: (3,) m, body: where the positions were measured.
+        chi_square: twice the cost that is left.
+        freedom: what that is expected to be: residuals less unknowns.
+    """
+
+    truth: Truth
+    lever_arm: Float
+    chi_square: float
+    freedom: int
+    _marginals: gtsam.Marginals
+
+    def covariances(self, numbers: Int) -> dict[int, StateCovariance]:
+        """How well some of the states (M,) are known, by number."""
+        known = {}
+        for k in numbers.tolist():
+            biases = self._marginals.marginalCovariance(b(k))
+            known[k] = StateCovariance(
+                pose=self._marginals.marginalCovariance(x(k)),
+                velocity=self._marginals.marginalCovariance(v(k)),
+                gyro_bias=biases[3:, 3:],
+                accel_bias=biases[:3, :3],
+            )
+        return known
+
+
+def reconstruct(flight: Flight, imu: Imu, noise_scale: float, rounds: int = 2) -> Reconstruction:
+    """Fit positions and IMU.
+
+    Args:
+        flight: whose positions are taken, and whose orientations are where the search begins.
+        imu: its noise densities.
+        noise_scale: factor on them.
+        rounds: each preintegrates the IMU at the biases that the one before has found, the first at zero.
+    """
+    told, zeros = flight.told, np.zeros_like(flight.told.gyro_bias)
+    truth, lever_arm = Truth(told.world_T_body, told.velocity_world, zeros, zeros), np.zeros(3)
+    params = preintegration_params(imu, noise_scale)
+    for _ in range(rounds):
+        graph = _graph(flight, truth, params)
+        values = gtsam.LevenbergMarquardtOptimizer(graph, _values(truth, lever_arm)).optimize()
+        truth, lever_arm = _truth(values, len(flight.stamps_ns)), np.asarray(values.atVector(_LEVER_ARM))
+    # A position has three residuals, a step as many as a state has unknowns; the first biases have a prior.
+    freedom = 3 * len(flight.stamps_ns) - 15 + 6
+    return Reconstruction(truth, lever_arm, 2.0 * graph.error(values), freedom, gtsam.Marginals(graph, values))
+
+
+def turns(told: Truth, found: Truth) -> Float:
+    """Rotation vectors (N, 3) rad, in body, from one truth's orientations to another's."""
+    told_R_found = np.swapaxes(told.world_T_body[:, :3, :3], 1, 2) @ found.world_T_body[:, :3, :3]
+    return np.array([so3_log(np.ascontiguousarray(turn)) for turn in told_R_found])
+
+
+def force_errors(flight: Flight, truth: Truth, imu: Imu) -> Float:
+    """Mean specific force (N - 1, 3) m/s^2 of each step as measured, less that of a truth; body, bias included."""
+    step_s, up = 1e-9 * STEP_NS, np.array([0.0, 0.0, GRAVITY_M_S2])
+    params, errors = preintegration_params(imu, 1.0), np.empty((len(flight.spans), 3))
+    for k, (span, bias) in enumerate(zip(flight.spans, _biases(truth)[:-1], strict=True)):
+        gained = truth.velocity_world[k + 1] - truth.velocity_world[k] + step_s * up
+        measured = preintegrate(span, params, bias).deltaVij()
+        errors[k] = truth.accel_bias[k] + (measured - truth.world_T_body[k, :3, :3].T @ gained) / step_s
+    return errors
+
+
+def with_drawn_forces(flight: Flight, errors: Float, density: float, seed: int) -> Flight:
+    """A flight whose forces differ from a truth's by a constant and white noise, not by what was measured.
+
+    Args:
+        flight: with the measured forces.
+        errors: (N - 1, 3) m/s^2, `force_errors` of that truth; their mean stays.
+        density: of the noise, m/s^2/sqrt(Hz).
+        seed: of the noise.
+    """
+    rng, spans = np.random.default_rng([seed, 13]), []
+    for span, off in zip(flight.spans, errors - errors.mean(axis=0), strict=True):
+        steps_s = np.maximum(span.steps_s, 1e-9)[:, None]
+        noise = density / np.sqrt(steps_s) * rng.standard_normal(span.linear_acceleration.shape)
+        spans.append(replace(span, linear_acceleration=span.linear_acceleration - off + noise))
+    return replace(flight, spans=spans)
+
+
+def allan_deviation(values: Float, steps: int) -> Float:
+    """Of the columns (M,) of values (N, M), between means over so many steps."""
+    sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+    means = (sums[steps:] - sums[:-steps]) / steps
+    return np.asarray(np.sqrt(0.5 * np.mean((means[steps:] - means[:-steps]) ** 2, axis=0)))
+
+
+def _graph(flight: Flight, around: Truth, params: gtsam.PreintegrationCombinedParams) -> gtsam.NonlinearFactorGraph:
+    graph, noise = gtsam.NonlinearFactorGraph(), isotropic(3, _POSITION_SIGMA_M)
+    for k, world_T_body in enumerate(flight.told.world_T_body):
+        graph.add(gtsam.GPSFactorArmCalib(x(k), _LEVER_ARM, world_T_body[:3, 3], noise))
+    for k, (span, bias) in enumerate(zip(flight.spans, _biases(around)[:-1], strict=True)):
+        measured = preintegrate(span, params, bias)
+        graph.add(gtsam.CombinedImuFactor(x(k), v(k), x(k + 1), v(k + 1), b(k), b(k + 1), measured))
+    graph.add(gtsam.PriorFactorConstantBias(b(0), gtsam.imuBias.ConstantBias(), isotropic(6, _BIAS_SIGMA)))
+    graph.add(gtsam.PriorFactorVector(_LEVER_ARM, np.zeros(3), isotropic(3, _LEVER_ARM_SIGMA_M)))
+    return graph
+
+
+def _values(truth: Truth, lever_arm: Float) -> gtsam.Values:
+    values = gtsam.Values()
+    for k, bias in enumerate(_biases(truth)):
+        values.insert(x(k), gtsam.Pose3(truth.world_T_body[k]))
+        values.insert(v(k), truth.velocity_world[k])
+        values.insert(b(k), bias)
+    values.insert(_LEVER_ARM, lever_arm)
+    return values
+
+
+def _truth(values: gtsam.Values, count: int) -> Truth:
+    biases = np.array([values.atConstantBias(b(k)).vector() for k in range(count)])
+    return Truth(
+        world_T_body=np.array([values.atPose3(x(k)).matrix() for k in range(count)]),
+        velocity_world=np.array([values.atVector(v(k)) for k in range(count)]),
+        gyro_bias=biases[:, 3:],
+        accel_bias=biases[:, :3],
+    )
+
+
+def _biases(truth: Truth) -> list[gtsam.imuBias.ConstantBias]:
+    return [gtsam.imuBias.ConstantBias(*both) for both in zip(truth.accel_bias, truth.gyro_bias, strict=True)]

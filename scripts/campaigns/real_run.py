@@ -1,0 +1,137 @@
+"""One run of the smoother alone on a recorded IMU, with motions of vision that are drawn from a truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from campaigns.flight import FRAMES_HZ, Flight, Truth
+from campaigns.measures import tilt_error
+from graphvio.arrays import Float
+from graphvio.backend.smoother import Smoother
+from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
+from graphvio.config import SmootherConfig
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.geometry import se3_exp, se3_inverse, se3_log
+from graphvio.rig import Imu
+
+_SETTLED_S = 2.0
+_SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of vision: rad and metres from frame to frame
+_TILT_SIGMA, _SPEED_SIGMA, _GYRO_BIAS_SIGMA = 0.05, 0.2, 0.1
+_SPANS_S = (1, 10)
+
+
+@dataclass(frozen=True, eq=False)
+class Miss:
+    """How far an estimate is from the truth, and how far it may be.
+
+    Attributes:
+        name: what it is of.
+        number: of the state.
+        error: (M,) truth less estimate.
+        covariance: (M, M) that was told.
+    """
+
+    name: str
+    number: int
+    error: Float
+    covariance: Float
+
+
+@dataclass(frozen=True, eq=False)
+class RealRun:
+    """What a run has told.
+
+    Attributes:
+        misses: of the states at each second, of motions and of vision's innovations.
+        gyro_biases: (N, 3) rad/s, of each state.
+        accel_biases: (N, 3) m/s^2.
+        refused: how many motions of vision.
+    """
+
+    misses: list[Miss]
+    gyro_biases: Float
+    accel_biases: Float
+    refused: int
+
+
+def real_run(seed: int, flight: Flight, truth: Truth, config: SmootherConfig, imu: Imu) -> RealRun:
+    """Go through a flight, with vision drawn from a truth; the biases are zero at the start."""
+    rng = np.random.default_rng([seed, 11])
+    smoother = _started(flight, truth, config, imu, rng)
+    misses: list[Miss] = []
+    states, refused = [smoother.state()], 0
+    anchors = dict.fromkeys(_SPANS_S, 0)  # seconds -> number of the state from which the motion is measured
+    for k in range(1, len(flight.stamps_ns)):
+        smoother.extend(flight.stamps_ns[k], flight.spans[k - 1])
+        motion = _drawn(flight, truth, k, rng)
+        verdict = smoother.test(motion)
+        settled = k >= _SETTLED_S * FRAMES_HZ
+        if settled:
+            misses.append(Miss("vision", k, verdict.innovation, verdict.covariance))
+        if verdict.accepted:
+            smoother.accept(motion)
+        else:
+            refused += 1
+        smoother.settle({flight.stamps_ns[k], *(flight.stamps_ns[number] for number in anchors.values())})
+        states.append(smoother.state())
+        if settled and k % FRAMES_HZ == 0:
+            misses += _misses_of_state(smoother, truth, k)
+        for seconds, anchor in anchors.items():
+            if k - anchor == seconds * FRAMES_HZ:
+                if anchor >= _SETTLED_S * FRAMES_HZ:
+                    error, covariance = _motion_error(smoother, flight, truth, anchor, k)
+                    misses.append(Miss(f"pose over {seconds} s", k, error, covariance))
+                anchors[seconds] = k
+    gyro_biases, accel_biases = (
+        np.array(each) for each in zip(*((state.gyro_bias, state.accel_bias) for state in states), strict=True)
+    )
+    return RealRun(misses, gyro_biases, accel_biases, refused)
+
+
+def _started(flight: Flight, truth: Truth, config: SmootherConfig, imu: Imu, rng: np.random.Generator) -> Smoother:
+    """At the truth, but for errors of the start."""
+    pose = np.ascontiguousarray(truth.world_T_body[0])
+    covariance = origin_covariance(pose[:3, :3], _TILT_SIGMA)
+    off = np.linalg.cholesky(covariance) @ rng.standard_normal(6)
+    velocity = truth.velocity_world[0] + _SPEED_SIGMA * rng.standard_normal(3)
+    smoother = Smoother(config, imu)
+    smoother.start(
+        flight.stamps_ns[0],
+        RigState(pose @ se3_exp(off), velocity, np.zeros(3), np.zeros(3)),
+        StartUncertainty(covariance, _SPEED_SIGMA, _GYRO_BIAS_SIGMA),
+    )
+    return smoother
+
+
+def _drawn(flight: Flight, truth: Truth, k: int, rng: np.random.Generator) -> RelativeMotion:
+    """The motion between two frames, as vision would see it."""
+    moved = _moved(truth, k - 1, k) @ se3_exp(_SIGMAS * rng.standard_normal(6))
+    stamps = flight.stamps_ns
+    return RelativeMotion(stamps[k - 1], stamps[k], moved, np.diag(_SIGMAS**2), np.zeros((6, 6)), 100)
+
+
+def _misses_of_state(smoother: Smoother, truth: Truth, k: int) -> Iterator[Miss]:
+    state, known = smoother.state(), smoother.state_covariance()
+    assert known.velocity is not None
+    assert known.gyro_bias is not None
+    assert known.accel_bias is not None
+    yield Miss("velocity", k, truth.velocity_world[k] - state.velocity_nav, known.velocity)
+    yield Miss("tilt", k, *tilt_error(state.nav_T_body, truth.world_T_body[k], known.pose))
+    yield Miss("gyro bias", k, truth.gyro_bias[k] - state.gyro_bias, known.gyro_bias)
+    yield Miss("accel bias", k, truth.accel_bias[k] - state.accel_bias, known.accel_bias)
+
+
+def _motion_error(smoother: Smoother, flight: Flight, truth: Truth, start: int, end: int) -> tuple[Float, Float]:
+    """Of the motion between two states: error (6,) and covariance (6, 6), in body at its end."""
+    start_ns, end_ns = flight.stamps_ns[start], flight.stamps_ns[end]
+    estimated = se3_inverse(smoother.pose(start_ns)) @ smoother.pose(end_ns)
+    return se3_log(se3_inverse(estimated) @ _moved(truth, start, end)), smoother.covariance_since(start_ns)
+
+
+def _moved(truth: Truth, start: int, end: int) -> Float:
+    """True ``start_T_end`` (4, 4) of body."""
+    poses = truth.world_T_body
+    return np.asarray(se3_inverse(np.ascontiguousarray(poses[start])) @ poses[end])
