@@ -135,7 +135,7 @@ class SmootherConfig:
     """Age at which a state leaves the window, unless later motions are measured from it."""
     gate_probability: float = 0.9999
     """Vision is refused where its innovation lies outside this share of the chi-square distribution."""
-    huber_probability: float = 0.99
+    huber_probability: float = 0.999
     """Motions that the gate let in pull less, by Huber's kernel, where the solution leaves them outside this share of
     the chi-square distribution; 1 lets all pull by their covariance."""
     max_accel_m_s2: float = 50.0
@@ -144,8 +144,9 @@ class SmootherConfig:
     """When the gate has refused for longer, the prediction is at fault and is started anew."""
     reset_s: float = 60.0
     """Time from one reset of the position's covariance to the next."""
-    imu_noise_scale: float = 2.0
-    """Factor on the rig's IMU noise densities, which data sheets state for a sensor that does not vibrate."""
+    imu_noise_scale: float = 3.0
+    """Factor on the rig's IMU noise densities, which data sheets state for a sensor that does not vibrate: what a real
+    flight needs to be told honestly."""
     motion_accel_sigma_m_s2: float = 5.0
     """Without an IMU: standard deviation of the acceleration, eq. (11)."""
     motion_angular_accel_sigma_rad_s2: float = 10.0

@@ -29,7 +29,7 @@ from graphvio.rig import Imu
 RECORDING = DOCS.parents[1] / "shared" / "data" / "euroc_v101_imu"
 _FACTOR = 2.0  # the aim for NEES and NIS
 _GYRO_BIAS_AIM, _AFTER_S = 2e-3, 10
-_OTHER_SCALE = 3.0
+_OTHER_SCALE = 2.0
 _ALLAN_S = (0.2, 0.5, 1, 2, 5, 10, 20)
 _AXES = "xyz"
 _OWN = ("velocity", "tilt", "gyro bias", "accel bias")  # whose truth has a covariance of its own
