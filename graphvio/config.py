@@ -164,7 +164,7 @@ class FusionConfig:
     previous``, since it measures velocities over one step."""
     estimate_time_offset: bool = False
     """Whether the time offset between cameras and IMU is estimated from rotations and corrected as it runs; else the
-    rig's is taken as it is."""
+    rig's is taken as it is. Needs ``motion.reference: keyframe``."""
 
 
 @dataclass(frozen=True)
@@ -236,6 +236,11 @@ class Config:
         if self.fusion.estimator == "filter" and self.motion.reference != "previous":
             raise ConfigError(
                 "fusion: estimator filter measures velocities over one step; set motion: {reference: previous}"
+            )
+        if self.fusion.estimate_time_offset and self.motion.reference == "previous":
+            raise ConfigError(
+                "fusion: estimate_time_offset compares rotations over a quarter of a second; set motion: "
+                "{reference: keyframe}"
             )
 
     @staticmethod

@@ -120,7 +120,14 @@ class FilterBelief(Belief):
         """Test each measurement against the prediction, and update with those that pass; rest is none of them."""
         motion, config = visual.motion, self._config.filter
         if motion is not None and motion.reference_stamp_ns != self._before_ns:
-            motion = None  # its mean velocity is not that of the newest step
+            if self._before_ns is not None and motion.reference_stamp_ns < self._before_ns:
+                self._report(
+                    motion.stamp_ns,
+                    "motion_over_several_steps",
+                    "left out: the paper's filter takes the mean velocity of the newest step; pairs whose images come "
+                    "in turns want the smoother",
+                )
+            motion = None
         sees = motion is not None
         rates = None if motion is None else VisualRates.of(motion)
         offered: list[Measurement] = []

@@ -145,18 +145,24 @@ class Odometry:
         measured = perf_counter()
         if not starting:
             self._tell_of_vision(stamp_ns, visual)
-        at_rest = visual.at_rest and (span is None or is_at_rest(span, self.config.initialisation))
+        at_rest = visual.at_rest and self._imu_is_at_rest(span)
         used = self._belief.use(visual, at_rest) is not None
         status = self._belief.update(stamp_ns, used or starting, self._frontend.reference_stamps_ns)
-        self._correct_time_offset(stamp_ns, visual)
         self._synchroniser.forget_before(stamp_ns)
         self._predict_from(stamp_ns, status)
+        self._correct_time_offset(stamp_ns, visual)
         stage_ms = {
             "predict": 1e3 * (predicted - start),
             **visual.stage_ms,
             "update": 1e3 * (perf_counter() - measured),
         }
         return self._assemble(stamp_ns, status, visual, span, at_rest, stage_ms)
+
+    def _imu_is_at_rest(self, span: ImuSpan | None) -> bool:
+        """What the IMU says of a standstill; it does not object where there is none, but where its samples lack."""
+        if span is None:
+            return not self._belief.has_imu
+        return is_at_rest(span, self.config.initialisation)
 
     def _new_time_offset(self) -> TimeOffsetFilter | None:
         imu = self.rig.imu

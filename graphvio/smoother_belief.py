@@ -21,7 +21,7 @@ from graphvio.backend.starts import (
     first_start,
 )
 from graphvio.backend.states import RigState
-from graphvio.backend.window import WindowError
+from graphvio.backend.window import SOLVER_ERRORS
 from graphvio.belief import Belief
 from graphvio.config import Config
 from graphvio.events import Quality, Status
@@ -44,6 +44,8 @@ class SmootherBelief(Belief):
         self._refused: dict[int, Float] = {}  # stamp -> nav_T_body by the motions that the gate refused
         self._imu_failed = False  # since the first of these
         self._tracked_covariance = np.zeros((6, 6))  # of the last pose that vision constrains
+        self._sigma_m = 0.0  # of the position since vision was last used
+        self._rebuilt_sigma_m = 0.0  # the same when the window was rebuilt since then
 
     # ------------------------------------------------------------------ what is known
 
@@ -97,23 +99,28 @@ class SmootherBelief(Belief):
         self.verdicts = {}
         if span is None and stamp_ns - self.latest_ns > MAX_UNBRIDGED_S * 1e9:
             self._jump(stamp_ns)
-        else:
-            self._imu_failed |= self.has_imu and span is None and bool(self._refused)
+            return
+        self._imu_failed |= self.has_imu and span is None and bool(self._refused)
+        before = self.state()
+        try:
             self._running.extend(stamp_ns, span)
+        except SOLVER_ERRORS as error:
+            self._rebuild(stamp_ns, before, error)
 
     def use(self, visual: VisualResult, at_rest: bool) -> RelativeMotion | None:
         """See `Belief`."""
-        motion = self._use_motion(visual)
-        if at_rest and self.has_imu:
-            self._use_rest()
+        try:
+            motion = self._use_motion(visual)
+            if at_rest and self.has_imu:
+                self._use_rest()
+        except SOLVER_ERRORS as error:
+            self._rebuild(self.latest_ns, self.state(), error)
+            return None
         return motion
 
     def _use_rest(self) -> None:
         """Standing still: a velocity of zero, unless the prediction is sure of another."""
-        try:
-            verdict = self._running.test_rest()
-        except WindowError:
-            return  # `update` meets the same error, and rebuilds
+        verdict = self._running.test_rest()
         self.verdicts["rest"] = verdict
         if verdict.accepted:
             self._running.accept_rest()
@@ -128,13 +135,11 @@ class SmootherBelief(Belief):
         if not smoother.knows(motion.reference_stamp_ns):  # it started anew since then
             self._rekey()
             return None
-        if self._lost and motion.reference_stamp_ns > self._tracked_ns:  # not from a state that was known
+        if self._lost and (motion.reference_stamp_ns > self._tracked_ns or self._rebuilt_sigma_m):
+            # It is not from a state that was known.
             self._recover(motion)
             return motion
-        try:
-            motion, verdict = self._judge(visual)
-        except WindowError:
-            return None  # `update` meets the same error, and rebuilds
+        motion, verdict = self._judge(visual)
         self.verdicts["vision"] = verdict
         excess = smoother.excess_acceleration(motion)
         if verdict.accepted and excess is None:
@@ -169,15 +174,15 @@ class SmootherBelief(Belief):
             self._reset_position(stamp_ns)
             self.covariance = smoother.state_covariance()
             if used:
-                self._tracked_covariance, sigma_m = self.covariance.pose, 0.0
+                self._tracked_covariance = self.covariance.pose
+                self._sigma_m = self._rebuilt_sigma_m = 0.0
             else:
                 since = smoother.covariance_since(self._tracked_ns)
-                sigma_m = float(np.sqrt(np.linalg.eigvalsh(since[3:, 3:])[-1]))
-        except WindowError as error:
-            self._report(stamp_ns, "window_rebuilt", str(error))
-            self._start_again(after_failure(stamp_ns, smoother.state(), self.covariance.pose), stamp_ns - 1)
-            return Status.COASTING
-        return self._status(stamp_ns, used, sigma_m)
+                self._sigma_m = float(np.hypot(np.sqrt(np.linalg.eigvalsh(since[3:, 3:])[-1]), self._rebuilt_sigma_m))
+        except SOLVER_ERRORS as error:
+            self._rebuild(stamp_ns, smoother.state(), error)
+            used = False
+        return self._status(stamp_ns, used, self._sigma_m)
 
     @property
     def _running(self) -> Smoother:
@@ -202,6 +207,16 @@ class SmootherBelief(Belief):
             self._reset_ns = stamp_ns
 
     # ------------------------------------------------------------------ breaks
+
+    def _rebuild(self, stamp_ns: int, state: RigState, error: Exception) -> None:
+        """Go on from a state, or from the one before the prediction, with a new window: nothing else is changed by it.
+
+        What is lost stays lost, and how long vision has been missed still counts.
+        """
+        self._report(stamp_ns, "window_rebuilt", str(error))
+        was_lost, sigma_m = self._lost, self._sigma_m
+        self._start_again(after_failure(stamp_ns, state, self.covariance.pose), stamp_ns - 1)
+        self._lost, self._sigma_m, self._rebuilt_sigma_m = was_lost, sigma_m, sigma_m
 
     def _jump(self, stamp_ns: int) -> None:
         """After a gap that nothing bridges, be it a pause or a jump of the clock: a new epoch at the last pose."""
@@ -250,6 +265,7 @@ class SmootherBelief(Belief):
         self._reset_ns = start.stamp_ns
         self._note_start(start)
         self._tracked_ns = start.stamp_ns
+        self._sigma_m = self._rebuilt_sigma_m = 0.0
         self._forget_troubles()
 
     def _forget_troubles(self) -> None:

@@ -68,6 +68,20 @@ def test_an_axis_that_sticks_while_others_live_is_told(step: float, found: slice
     assert set(faults[400:]) == {""}
 
 
+@pytest.mark.parametrize("noise", [0.2, 0.25, 0.3, 0.4])
+def test_one_coarse_axis_beside_fine_ones_is_not_stuck(noise: float) -> None:
+    """Its readings change with every second to hundredth sample; noise is in units of its last digit."""
+    rng, buffer, changes = np.random.default_rng(0), ImuBuffer(50.0), 0
+    before = 0.0
+    for i in range(8000):
+        rate, force = 0.01 * rng.standard_normal(3), np.array([0.0, 0.0, 9.8]) + 0.05 * rng.standard_normal(3)
+        rate[0] = 0.001 * np.round(noise * rng.standard_normal())
+        changes += rate[0] != before
+        before = rate[0]
+        assert buffer.add(sample(5 * MS * i, rate, force)) == ""
+    assert 80 < changes < 4000
+
+
 def test_a_simulator_without_noise_is_not_stuck() -> None:
     """A rig on wheels, straight ahead, then in a bend: most axes have one value all the time."""
     buffer = ImuBuffer(50.0)

@@ -141,6 +141,18 @@ def test_every_profile_loads() -> None:
     assert loaded["paper"].fusion.estimator == "filter"
 
 
+@pytest.mark.parametrize("text", ["{estimator: filter}", "{estimate_time_offset: true}\nmotion: {reference: previous}"])
+def test_stages_that_do_not_fit_together_are_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"set motion: {reference: (previous|keyframe)}"):
+        Config.from_yaml(f"fusion: {text}")
+
+
+@pytest.mark.parametrize("value", ["1", "yes please", "[true]"])
+def test_a_switch_is_true_or_false(value: str) -> None:
+    with pytest.raises(ConfigError, match="estimate_time_offset: is .*; it must be true or false"):
+        Config.from_yaml(f"fusion: {{estimate_time_offset: {value}}}")
+
+
 def test_sha256_tells_configurations_apart_by_what_they_do() -> None:
     config = Config.from_yaml("motion: {reference: previous}")  # suits both estimators
     assert config.sha256() == Config.from_yaml("motion: {reference: previous}").sha256() != Config().sha256()
@@ -151,6 +163,7 @@ def test_sha256_tells_configurations_apart_by_what_they_do() -> None:
         settings = getattr(config, stage.name)
         for name, value in asdict(settings).items():
             other = others[value] if isinstance(value, str) else value + 1
-            digests.add(replace(config, **{stage.name: replace(settings, **{name: other})}).sha256())
+            before = Config() if name == "estimate_time_offset" else config  # it needs keyframes
+            digests.add(replace(before, **{stage.name: replace(settings, **{name: other})}).sha256())
     values = [v for section in yaml.safe_load(config.to_yaml()).values() for v in section.values()]
     assert len(digests) == 1 + len(values)

@@ -23,6 +23,7 @@ from graphvio import (
     open_source,
 )
 from graphvio.arrays import Image
+from graphvio.backend.smoother import Smoother
 from graphvio.backend.window import Window, WindowError
 from graphvio.events import Event, Quality
 from graphvio.trajectory import Trajectory
@@ -378,17 +379,28 @@ def test_a_wild_imu_sample_leaves_an_error_that_the_covariance_admits(
     assert error < 3.0 * np.sqrt(np.linalg.eigvalsh(last.covariance[3:, 3:])[-1])
 
 
-@pytest.mark.parametrize("method", ["optimise", "joint_covariance", "marginalise"])
+@pytest.mark.parametrize("kind", [WindowError, RuntimeError, np.linalg.LinAlgError])
+@pytest.mark.parametrize(
+    ("owner", "method"),
+    [(Window, "optimise"), (Window, "joint_covariance"), (Window, "marginalise"), (Window, "add"),
+     (Smoother, "extend"), (Smoother, "test"), (Smoother, "state_covariance")],
+)  # fmt: skip
 def test_a_window_that_fails_is_rebuilt(
-    odometry: Odometry, events: list[Event], monkeypatch: pytest.MonkeyPatch, method: str
+    odometry: Odometry,
+    events: list[Event],
+    monkeypatch: pytest.MonkeyPatch,
+    owner: type,
+    method: str,
+    kind: type[Exception],
 ) -> None:
     def fail(*_: object) -> None:
-        raise WindowError("made to fail")
+        patch.undo()  # fails once, or the window could not be rebuilt either
+        raise kind("made to fail")
 
     half = next(i for i in range(len(events) - 150, len(events)) if isinstance(events[i], FrameSet))
     estimates = [e for event in events[:half] if (e := odometry.process(event)) is not None]
     with monkeypatch.context() as patch:
-        patch.setattr(Window, method, fail)
+        patch.setattr(owner, method, fail)
         estimates += [e for event in events[half : half + 1] if (e := odometry.process(event)) is not None]
     assert "window_rebuilt" in kinds(odometry)
     estimates += [e for event in events[half + 1 :] if (e := odometry.process(event)) is not None]

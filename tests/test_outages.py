@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import pytest
 
 from graphvio import Config, Estimate, FrameSet, ImuSample, Odometry, Status, open_source
 from graphvio.arrays import Float
+from graphvio.backend.window import Window, WindowError
 from graphvio.events import Event
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.simulation import simulate
@@ -169,6 +170,37 @@ def test_beyond_what_is_useful_a_new_epoch_begins(walk_folder: Path, events: lis
     assert np.sqrt(np.trace(first.covariance[3:, 3:])) > 0.05
     assert [done.kinds.count(kind) for kind in ("lost", "new_epoch")] == [1, 1]
     assert done.error_m(7.0, 9.0) < 0.03
+
+
+def test_a_window_that_fails_while_lost_glues_nothing(
+    walk_folder: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the dark and at the first images after it: lost stays lost, and what follows is another epoch."""
+    config = Config.from_yaml("smoother: {lost_position_sigma_m: 0.05}")
+    optimise, start_ns = Window.optimise, next(e.stamp_ns for e in events if isinstance(e, FrameSet))
+
+    def fails_now_and_then(window: Window, followed: Sequence[int] = ()) -> None:
+        if failing:
+            failing.pop()
+            raise WindowError("made to fail")
+        optimise(window, followed)
+
+    failing: list[int] = []
+    monkeypatch.setattr(Window, "optimise", fails_now_and_then)
+    odometry, estimates = Odometry(open_source(walk_folder).rig, config), []
+    for event in altered(events, START_S, START_S + 3.0, blackened):
+        if isinstance(event, FrameSet) and (event.stamp_ns - start_ns) // MS in (5500, 6000, 6050):
+            failing.append(0)
+        estimates.append(odometry.process(event))
+    estimates += odometry.finish()
+    told = [e for e in estimates if e is not None]
+    assert [i.kind for i in odometry.take_incidents()].count("window_rebuilt") == 3
+    lost = [k for k, e in enumerate(told) if e.status is Status.LOST]
+    assert lost == list(range(lost[0], lost[-1] + 1))
+    assert all(told[k].nav_T_body is None for k in lost)
+    assert (told[lost[0]].stamp_ns - start_ns) // MS < 5500
+    assert [e.epoch for e in told[lost[-1] + 1 :]] == [1] * (len(told) - lost[-1] - 1)
+    assert told[-1].status is Status.TRACKING
 
 
 # ------------------------------------------------------------------ the IMU's data

@@ -169,7 +169,7 @@ class _StuckAxes:
         self._before = np.full(6, np.nan)
         self._low, self._high = np.zeros((2, 6, 6))  # for each axis, the range of all axes since it has its value
         self._since_ns = np.zeros(6, dtype=np.int64)  # since when each axis repeats its value though others moved
-        self._change = np.zeros(6)  # how often each axis changes from one sample to the next, where it lives
+        self._change = np.zeros(6)  # share of the samples in which each axis changed, up to its last change
         self._repeats = np.zeros((6, 6))  # for each axis, how often each changed since it has its value; and of itself,
         # how often it has repeated it
 
@@ -189,12 +189,11 @@ def _note_stops(now: Float, before: Float, change: Float, repeats: Float) -> boo
     stopped = False
     for axis in range(6):
         if now[axis] != before[axis]:
+            change[axis] *= (1.0 - 1.0 / _HISTORY) ** repeats[axis, axis]
             change[axis] += (1.0 - change[axis]) / _HISTORY
             for other in range(6):
                 repeats[axis, other] = 0.0
             continue
-        if repeats[axis, axis] == 0.0:
-            change[axis] -= change[axis] / _HISTORY
         for other in range(6):
             repeats[axis, other] += other == axis or now[other] != before[other]
         count, first = repeats[axis, axis], 3 * (axis // 3)

@@ -26,6 +26,10 @@ class WindowError(GraphvioError):
     """The window's equations have no unique solution."""
 
 
+SOLVER_ERRORS = (WindowError, RuntimeError, np.linalg.LinAlgError)
+"""What a window, gtsam and numpy raise where equations have no solution."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Marginal:
     """What the window says of some variables together: the upper triangle R, where ``R^T R`` is their information."""
