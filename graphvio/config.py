@@ -135,9 +135,9 @@ class SmootherConfig:
     """Age at which a state leaves the window, unless later motions are measured from it."""
     gate_probability: float = 0.9999
     """Vision is refused where its innovation lies outside this share of the chi-square distribution."""
-    huber_probability: float = 0.999
+    huber_probability: float = 1.0
     """Motions that the gate let in pull less, by Huber's kernel, where the solution leaves them outside this share of
-    the chi-square distribution; 1 lets all pull by their covariance."""
+    the chi-square distribution; 1 lets all pull by their covariance. Below 1 the window is solved twice."""
     max_accel_m_s2: float = 50.0
     """Vision is refused where it asks for a larger acceleration."""
     max_gated_s: float = 1.0

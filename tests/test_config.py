@@ -149,7 +149,7 @@ def test_stages_that_do_not_fit_together_are_refused(text: str) -> None:
 
 @pytest.mark.parametrize("value", ["1", "yes please", "[true]"])
 def test_a_switch_is_true_or_false(value: str) -> None:
-    with pytest.raises(ConfigError, match="estimate_time_offset: is .*; it must be true or false"):
+    with pytest.raises(ConfigError, match=r"estimate_time_offset: is .*; it must be true or false"):
         Config.from_yaml(f"fusion: {{estimate_time_offset: {value}}}")
 
 

@@ -36,7 +36,7 @@ class Smoother:
         self._config = config
         self._imu = imu
         self._params = None if imu is None else preintegration_params(imu, config.imu_noise_scale)
-        self._window = Window()
+        self._window = self._new_window()
         self._stamps: list[int] = []
         self._index = 0
         self._index_of: dict[int, int] = {}
@@ -61,7 +61,7 @@ class Smoother:
 
     def start(self, stamp_ns: int, state: RigState, uncertainty: StartUncertainty) -> None:
         """Begin, or begin anew, with one state."""
-        self._window = Window()
+        self._window = self._new_window()
         self._stamps, self._index_of, self._views = [], {}, {}
         velocity_body = state.nav_T_body[:3, :3].T @ state.velocity_nav
         self._previous_motion = np.concatenate([np.zeros(3), velocity_body])
@@ -201,6 +201,9 @@ class Smoother:
         nav_R_body = self.pose(self.latest_ns)[:3, :3]
         self._beside[3:, 3:] += nav_R_body @ forgotten @ nav_R_body.T
         self._window.add(factor)
+
+    def _new_window(self) -> Window:
+        return Window(least_iterations=1 if self._config.huber_probability == 1.0 else 2)
 
     def _with_beside(self, covariance: Float) -> Float:
         """The newest pose's covariance (6, 6), in body, with what is told beside the window."""

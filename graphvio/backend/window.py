@@ -54,9 +54,15 @@ class _Marginal:
 
 
 class Window:
-    """Nonlinear factors and the present values of their variables."""
+    """Nonlinear factors and the present values of their variables.
 
-    def __init__(self) -> None:
+    Args:
+        least_iterations: in each optimisation; robust kernels need two, as the first weighs new factors by how far the
+            start is off.
+    """
+
+    def __init__(self, least_iterations: int = 1) -> None:
+        self._least_iterations = least_iterations
         self.values = gtsam.Values()
         self._graph = gtsam.NonlinearFactorGraph()
         self._involved: dict[int, frozenset[int]] = {}  # slot of the graph -> variables of the factor in it
@@ -83,13 +89,13 @@ class Window:
         """
         values = self.values
         try:
-            for _ in range(_MAX_ITERATIONS):
+            for iteration in range(1, _MAX_ITERATIONS + 1):
                 step = self._solve(followed).optimize()
                 largest = np.abs(step.vector()).max()
                 if not np.isfinite(largest):
                     raise WindowError("the window's solution is not finite")
                 self.values = self.values.retract(step)
-                if largest < _CONVERGED:
+                if largest < _CONVERGED and iteration >= self._least_iterations:
                     break
         except RuntimeError as error:
             self.values, self._marginal = values, None

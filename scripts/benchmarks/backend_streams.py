@@ -108,8 +108,8 @@ class FactorLog:
 
 
 class _NotedWindow(Window):
-    def __init__(self, log: FactorLog) -> None:
-        super().__init__()
+    def __init__(self, log: FactorLog, least_iterations: int = 1) -> None:
+        super().__init__(least_iterations)
         self._log = log
         self._noted: set[int] = set()
 
