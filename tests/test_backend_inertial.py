@@ -82,6 +82,17 @@ def test_one_coarse_axis_beside_fine_ones_is_not_stuck(noise: float) -> None:
     assert 80 < changes < 4000
 
 
+def test_an_imu_that_repeats_itself_is_stuck() -> None:
+    rng, buffer, faults = np.random.default_rng(0), ImuBuffer(50.0), []
+    for i in range(400):
+        if not 200 <= i < 300:
+            values = rng.standard_normal(3)
+        faults.append(buffer.add(sample(5 * MS * i, 0.01 * values, np.array([0.0, 0.0, 9.8]) + 0.05 * values)))
+    assert set(faults[:200]) == {""}
+    assert set(faults[206:300]) == {"imu_stuck"}
+    assert set(faults[300:]) == {""}
+
+
 def test_a_simulator_without_noise_is_not_stuck() -> None:
     """A rig on wheels, straight ahead, then in a bend: most axes have one value all the time."""
     buffer = ImuBuffer(50.0)

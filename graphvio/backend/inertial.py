@@ -22,6 +22,8 @@ _HISTORY = 100  # samples over which it is counted how often an axis repeats its
 _SELDOM = 0.02  # an axis that has changed in a smaller share of the samples has no noise: nothing is known of it
 _LIVELIEST = 0.95  # share of the samples in which an axis changes that is believed at most
 _LIVING = 0.8  # share of the samples in which another axis of the sensor must go on changing
+_FROZEN = 5  # times that all axes repeat their values; some drivers tell each sample twice
+_LIVELY = 0.5  # share of the samples in which each of them must have changed before
 _UNLIKELY = np.log(1e-9)  # chance that a living axis repeats its value so often
 _MOVING = np.repeat([0.2, 1.0], 3)  # rad/s and m/s^2, by so much
 _KEPT_NS = 60_000_000_000  # framesets do not come later than this after their samples
@@ -162,7 +164,7 @@ class _StuckAxes:
     """Finds axes that repeat one value while others live, as at the end of their range.
 
     An axis that used to change with every sample, as noise makes it, is found within some samples, if another axis of
-    the same sensor goes on changing. One that used to repeat its values is found once others have moved for a while.
+    the same sensor goes on changing; so is an IMU that repeats all of them. One that used to repeat its values is found once others have moved for a while.
     """
 
     def __init__(self) -> None:
@@ -186,13 +188,14 @@ class _StuckAxes:
 @kernel
 def _note_stops(now: Float, before: Float, change: Float, repeats: Float) -> bool:
     """Go on by a sample (6,), and tell whether some axis repeats its value against all likelihood."""
-    stopped = False
+    stopped, all_repeat = False, change.min() > _LIVELY
     for axis in range(6):
         if now[axis] != before[axis]:
             change[axis] *= (1.0 - 1.0 / _HISTORY) ** repeats[axis, axis]
             change[axis] += (1.0 - change[axis]) / _HISTORY
             for other in range(6):
                 repeats[axis, other] = 0.0
+            all_repeat = False
             continue
         for other in range(6):
             repeats[axis, other] += other == axis or now[other] != before[other]
@@ -202,7 +205,8 @@ def _note_stops(now: Float, before: Float, change: Float, repeats: Float) -> boo
             others_live |= other != axis and repeats[axis, other] > _LIVING * count
         chance = count * np.log(1.0 - min(change[axis], _LIVELIEST))
         stopped |= others_live and chance < _UNLIKELY
-    return stopped
+        all_repeat &= count >= _FROZEN
+    return stopped or all_repeat
 
 
 @kernel
