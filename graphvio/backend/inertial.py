@@ -164,7 +164,8 @@ class _StuckAxes:
     """Finds axes that repeat one value while others live, as at the end of their range.
 
     An axis that used to change with every sample, as noise makes it, is found within some samples, if another axis of
-    the same sensor goes on changing; so is an IMU that repeats all of them. One that used to repeat its values is found once others have moved for a while.
+    the same sensor goes on changing; so is an IMU that repeats all of them. One that used to repeat its values is found
+    once others have moved for a while.
     """
 
     def __init__(self) -> None:
