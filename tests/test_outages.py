@@ -267,6 +267,21 @@ def test_an_axis_that_sticks_is_left_to_vision(walk_folder: Path, events: list[E
     assert done.error_m(2.0, 9.0) < 0.03
 
 
+def test_an_imu_that_repeats_itself_is_left_to_vision(walk_folder: Path, events: list[Event]) -> None:
+    seen: list[ImuSample] = []
+
+    def frozen(sample: ImuSample) -> ImuSample:
+        seen.append(sample)
+        return replace(seen[0], stamp_ns=sample.stamp_ns)
+
+    done = outcome(walk_folder, altered(events, START_S, START_S + 2.0, sample=frozen))
+    assert done.completion == 1.0
+    assert done.kinds.count("imu_stuck") > 380
+    assert {e.status for e in done.between(1.0, 10.0)} == {Status.TRACKING}
+    assert done.largest_jump_m() < 0.01
+    assert done.error_m(2.0, 9.0) < 0.03
+
+
 def test_an_axis_that_sticks_in_the_dark_is_not_believed(walk_folder: Path, events: list[Event]) -> None:
     """Nothing but the last velocity is left to go on by, and the doubt is that of it."""
     end_s = START_S + 0.5

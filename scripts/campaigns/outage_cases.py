@@ -131,6 +131,16 @@ def _stuck(axis: int) -> Callable[[], Change]:
     return lambda: _of_samples(held)
 
 
+def _repeated() -> Change:
+    seen: list[ImuSample] = []
+
+    def first_again(sample: ImuSample) -> ImuSample:
+        seen.append(sample)
+        return replace(seen[0], stamp_ns=sample.stamp_ns)
+
+    return _of_samples(first_again)
+
+
 def _stuck_and_black() -> Change:
     stick, blacken = _stuck(2)(), _black()()
     return lambda event: blacken(event) if isinstance(event, FrameSet) else stick(event)
@@ -197,6 +207,7 @@ CASES = (
     Case("NaN in a quarter of the samples, 3 s", "these are left out", _not_a_number, end_s=_after(3.0)),
     Case("axis 0 of gyro and accelerometer stuck, 2 s", _LEFT_OUT, _stuck(0), end_s=_after(2.0)),
     Case("axis 2 of gyro and accelerometer stuck, 2 s", _LEFT_OUT, _stuck(2), end_s=_after(2.0)),
+    Case("one sample of the IMU repeated, 2 s", _LEFT_OUT, _repeated, end_s=_after(2.0)),
     Case("gyro cut off at 0.15 rad/s, 3 s", "vision is refused for a second at most, then believed", _cut_off,
          end_s=_after(3.0)),
     Case("axis 2 stuck while all pairs are black, 0.5 s", "coasts with as much doubt as that deserves; " + _GOES_ON,
