@@ -27,13 +27,9 @@ SCALE = np.diag(np.repeat([2e-3, 4e-3], 3))
 SHARED, OWN = (
     SCALE @ random_covariance(np.random.default_rng(number), 6, sigma) @ SCALE for number, sigma in ((1, 1.0), (2, 0.4))
 )
-# Vision alone: what is foreseen counts for nothing. Huber's kernel would take a little from each hundredth motion.
+# Vision alone: what is foreseen counts for nothing.
 CONFIG = SmootherConfig(
-    lag_s=10.0,
-    huber_probability=1.0,
-    imu_noise_scale=1.0,
-    motion_accel_sigma_m_s2=1e3,
-    motion_angular_accel_sigma_rad_s2=1e3,
+    lag_s=10.0, imu_noise_scale=1.0, motion_accel_sigma_m_s2=1e3, motion_angular_accel_sigma_rad_s2=1e3
 )
 
 

@@ -63,9 +63,8 @@ class TimeOffsetFilter:
         self._imu_between = imu_between
         self._mean = np.zeros(4)
         self._covariance = np.diag([_START_SIGMA_S, *3 * [_START_BIAS_SIGMA_RAD_S]]) ** 2
-        self._starts: dict[
-            int, RelativeMotion | None
-        ] = {}  # reference -> the motion that ends where an interval begins
+        # Reference -> the motion that ends where an interval begins; None is the reference itself.
+        self._starts: dict[int, RelativeMotion | None] = {}
         self._newest_ns: int | None = None
 
     @property

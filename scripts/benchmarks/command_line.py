@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TypeAlias
 
 from graphvio.errors import GraphvioError
@@ -40,3 +41,9 @@ def run_command_line(prog: str, description: str, subcommands: Sequence[AddParse
         print(f"{prog}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     return 0
+
+
+def add_report_options(parser: argparse.ArgumentParser) -> None:
+    """``--out`` and ``--docs``, where a report goes besides the screen."""
+    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
+    parser.add_argument("--docs", action="store_true", help="write the report into docs/benchmarks.md")

@@ -11,7 +11,7 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-from benchmarks.command_line import Subparsers, add_command
+from benchmarks.command_line import Subparsers, add_command, add_report_options
 from benchmarks.report import Report, machine, tell
 
 from campaigns.measures import heading_aligned, tilt_error
@@ -41,8 +41,7 @@ def add_parser(subparsers: Subparsers) -> None:
     """Add ``endurance``."""
     parser = add_command(subparsers, "endurance", "memory, time and numerics of the back-end over an hour", __doc__)
     parser.add_argument("--minutes", type=float, default=60.0, help="of the walk (default: 60)")
-    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
-    parser.add_argument("--docs", action="store_true", help="write the report into docs/benchmarks.md")
+    add_report_options(parser)
     parser.set_defaults(run=main)
 
 

@@ -11,10 +11,9 @@ import argparse
 from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from pathlib import Path
 
 import numpy as np
-from benchmarks.command_line import add_command
+from benchmarks.command_line import add_command, add_report_options
 from benchmarks.report import Report, machine, tell
 
 from campaigns.paper_run import PaperRun, Track
@@ -32,8 +31,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--seeds", type=int, default=50, help="runs (default: 50)")
     parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds of a run (default: 20)")
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side (default: 2)")
-    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
-    parser.add_argument("--docs", action="store_true", help="write the report into docs/benchmarks.md")
+    add_report_options(parser)
     parser.set_defaults(run=main)
 
 

@@ -15,7 +15,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-from benchmarks.command_line import Subparsers, add_command
+from benchmarks.command_line import Subparsers, add_command, add_report_options
 from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, machine, tell
 from scipy.stats import chi2
@@ -51,8 +51,7 @@ def add_parser(subparsers: Subparsers) -> None:
     """Add ``outages``."""
     parser = add_command(subparsers, "outages", "blackouts and faults of the data, and how each ends", __doc__)
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side (default: 2)")
-    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
-    parser.add_argument("--docs", action="store_true", help="write the report into docs/benchmarks.md")
+    add_report_options(parser)
     add_data_option(parser)
     parser.set_defaults(run=main)
 

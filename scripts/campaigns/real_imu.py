@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from benchmarks.command_line import Subparsers, add_command
+from benchmarks.command_line import Subparsers, add_command, add_report_options
 from benchmarks.report import DOCS, Report, machine, tell
 
 from campaigns.consistency import NAMES
@@ -46,8 +46,7 @@ def add_parser(subparsers: Subparsers) -> None:
         metavar="DIR",
         help="EuRoC's V1_01 (default: shared/data/euroc_v101_imu beside the project)",
     )
-    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
-    parser.add_argument("--docs", action="store_true", help="write the report into docs/benchmarks.md")
+    add_report_options(parser)
     parser.set_defaults(run=main)
 
 
