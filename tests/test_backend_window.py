@@ -17,16 +17,20 @@ def noise(covariance: Float) -> gtsam.noiseModel.Gaussian:
     return gtsam.noiseModel.Gaussian.Covariance(covariance)
 
 
-def add_point(windows: list[Window], k: int, rng: np.random.Generator) -> None:
+def add_point(windows: list[Window], k: int, rng: np.random.Generator, spread: float = 1.0) -> None:
     """A state of three numbers, tied to the one before and the one before that, to all windows alike."""
     for window in windows:
         window.values.insert(x(k), np.zeros(3))
     factors: list[gtsam.NonlinearFactor]
     if k == 0:
-        factors = [gtsam.PriorFactorVector(x(0), rng.standard_normal(3), noise(random_covariance(rng, 3, 0.5)))]
+        factors = [
+            gtsam.PriorFactorVector(x(0), spread * rng.standard_normal(3), noise(random_covariance(rng, 3, 0.5)))
+        ]
     else:
         factors = [
-            gtsam.BetweenFactorVector(x(j), x(k), rng.standard_normal(3), noise(random_covariance(rng, 3, 0.3)))
+            gtsam.BetweenFactorVector(
+                x(j), x(k), spread * rng.standard_normal(3), noise(random_covariance(rng, 3, 0.3))
+            )
             for j in range(max(k - 2, 0), k)
         ]
     for window in windows:
@@ -190,6 +194,62 @@ def test_covariances_of_followed_variables_need_no_new_solution(monkeypatch: pyt
         window.add(gtsam.BetweenFactorVector(x(0), x(6), np.zeros(3), noise(np.eye(3) * 0.01)))
     expected = plain.joint_covariance([x(4), x(6)])
     np.testing.assert_allclose(followed.joint_covariance([x(4), x(6)]), expected, atol=1e-12)
+
+
+def test_advancing_is_the_whole_solution_for_what_is_followed() -> None:
+    rng = np.random.default_rng(6)
+    quick, whole = Window(), Window()
+    for k in range(10):
+        add_point([quick, whole], k, rng, spread=1e-3)
+        whole.optimise()
+        if k == 5:
+            quick.optimise([x(4), x(5)])
+        if k > 5:  # each new state is tied to the two before it, which are followed
+            before = quick.values.atVector(x(3))
+            assert quick.advance([x(k - 1), x(k)])
+            pair = [x(k - 1), x(k)]
+            for key in pair:
+                np.testing.assert_allclose(quick.values.atVector(key), whole.values.atVector(key), atol=1e-12)
+            np.testing.assert_allclose(quick.joint_covariance(pair), whole.joint_covariance(pair), atol=1e-12)
+            assert np.array_equal(quick.values.atVector(x(3)), before)
+    quick.optimise()
+    for k in range(10):
+        np.testing.assert_allclose(quick.values.atVector(x(k)), whole.values.atVector(x(k)), atol=1e-12)
+
+
+def test_advancing_counts_what_a_covariance_was_asked_with() -> None:
+    """Factors that the marginal already knows of, since a gate asked for it, still correct the values."""
+    rng = np.random.default_rng(7)
+    asked, whole = Window(), Window()
+    for k in range(4):
+        add_point([asked, whole], k, rng, spread=1e-3)
+    asked.optimise([x(2), x(3)])
+    add_point([asked, whole], 4, rng, spread=1e-3)
+    asked.joint_covariance([x(4)])
+    assert asked.advance([x(4)])
+    whole.optimise()
+    np.testing.assert_allclose(asked.values.atVector(x(4)), whole.values.atVector(x(4)), atol=1e-12)
+
+
+@pytest.mark.parametrize("reason", ["new window", "not followed", "long step", "robust kernel", "unconstrained"])
+def test_where_advancing_is_impossible_nothing_changes(reason: str) -> None:
+    rng = np.random.default_rng(8)
+    window = Window(least_iterations=2 if reason == "robust kernel" else 1)
+    for k in range(5):
+        add_point([window], k, rng)
+    if reason != "new window":
+        window.optimise([x(3), x(4)])
+    window.values.insert(x(5), window.values.atVector(x(4)))
+    step, last = {"long step": np.full(3, 0.02)}.get(reason, np.full(3, 0.002)), 0 if reason == "not followed" else 4
+    if reason != "unconstrained":
+        window.add(gtsam.BetweenFactorVector(x(last), x(5), step, noise(np.eye(3) * 0.01)))
+    before = {key: window.values.atVector(key) for key in list(window.values.keys())}
+    assert not window.advance([x(5)])
+    assert all(np.array_equal(window.values.atVector(key), value) for key, value in before.items())
+    if reason != "unconstrained":
+        window.optimise([x(5)])
+        expected = window.values.atVector(x(last)) + step
+        np.testing.assert_allclose(window.values.atVector(x(5)), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("walk", [1e-2, 1e-5, 1e-8, 1e-10])

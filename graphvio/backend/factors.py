@@ -47,6 +47,26 @@ def first_state(k: int, state: RigState, known: StartUncertainty, with_imu: bool
         yield gtsam.PriorFactorConstantBias(b(k), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
 
+def constant_velocity(
+    i: int, j: int, motion: Float, dt: float, after_s: float, rate_sigmas: Float, accel_sigmas: Float
+) -> gtsam.NonlinearFactor:
+    """Velocity and rate go on, but for white accelerations (eq. 11).
+
+    Args:
+        i: a state.
+        j: the next one.
+        motion: from one to the other (4, 4).
+        dt: time between them, s.
+        after_s: time since velocity and rate were measured, s.
+        rate_sigmas: (2,) of rate and velocity when they were measured, rad/s and m/s.
+        accel_sigmas: (2,) rad/s^2 and m/s^2.
+    """
+    # An unknown constant acceleration moves by a t^2 / 2: the variance grows by steps of a^2 t^4 / 4.
+    growth = 0.5 * np.sqrt(after_s**4 - (after_s - dt) ** 4)
+    sigmas = np.repeat(np.hypot(accel_sigmas * growth, rate_sigmas * dt), 3)
+    return gtsam.BetweenFactorPose3(x(i), x(j), gtsam.Pose3(motion), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+
+
 def imu_without_samples(
     i: int, j: int, dt: float, accel_sigma_m_s2: float, imu: Imu, noise_scale: float
 ) -> Iterator[gtsam.NonlinearFactor]:

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from graphvio.arrays import Float
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 
+_SURELY = 5.0  # standard deviations
 _UNCLEAR = (0.5, 2.0)  # statistic over threshold
 
 
@@ -61,6 +62,15 @@ def judged(innovation: Float, covariance: Float, probability: float) -> Verdict:
     statistic = float(innovation @ np.linalg.solve(covariance, innovation))
     threshold = chi_square_quantile(probability, len(innovation))
     return Verdict(statistic <= threshold, statistic, threshold, innovation, covariance)
+
+
+def excess(value: Float, covariance: Float, most: float) -> float | None:
+    """The length of a vector (3,) with a covariance (3, 3), if it is surely more than it can be; else None."""
+    length = float(np.linalg.norm(value))
+    if length <= most:
+        return None
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    return length if length - _SURELY * sigma > most else None
 
 
 @cache

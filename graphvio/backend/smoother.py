@@ -12,11 +12,22 @@ import gtsam
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.factors import anchored_position, b, first_state, imu_without_samples, r, rest, rest_noise, v, x
-from graphvio.backend.gating import Verdict, gate, judged, relative_covariance
+from graphvio.backend.factors import (
+    anchored_position,
+    b,
+    constant_velocity,
+    first_state,
+    imu_without_samples,
+    rest,
+    rest_noise,
+    v,
+    x,
+)
+from graphvio.backend.gating import Verdict, excess, gate, judged, relative_covariance
 from graphvio.backend.inertial import ImuSpan
-from graphvio.backend.noise import gaussian, own_covariance, robust
+from graphvio.backend.noise import gaussian, robust
 from graphvio.backend.preintegration import preintegrate, preintegration_params
+from graphvio.backend.reference_views import ReferenceViews
 from graphvio.backend.states import RigState, StartUncertainty, StateCovariance
 from graphvio.backend.window import Window
 from graphvio.config import SmootherConfig
@@ -26,7 +37,7 @@ from graphvio.rig import Imu
 
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
 _ANCHOR_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
-_SURELY = 5.0  # standard deviations
+_MOST_ADVANCED = 2  # framesets in a row for which the window is not solved as a whole
 
 
 class Smoother:
@@ -38,11 +49,10 @@ class Smoother:
         self._params = None if imu is None else preintegration_params(imu, config.imu_noise_scale)
         self._window = self._new_window()
         self._stamps: list[int] = []
+        self._advanced = 0  # framesets since the window was solved as a whole
         self._index = 0
         self._index_of: dict[int, int] = {}
-        # References that have a variable of their own, see `_reference_key`: stamp -> its covariance (6, 6) there.
-        self._views: dict[int, Float] = {}
-        self._own: tuple[RelativeMotion, Float] | None = None  # see `_own_covariance`
+        self._views = ReferenceViews()
         self._previous_motion = np.zeros(6)  # tangent per second
         self._constrained_ns = 0  # stamp of the newest state whose motion was measured
         self._seen_ns: int | None = None  # the same, by vision
@@ -62,7 +72,7 @@ class Smoother:
     def start(self, stamp_ns: int, state: RigState, uncertainty: StartUncertainty) -> None:
         """Begin, or begin anew, with one state."""
         self._window = self._new_window()
-        self._stamps, self._index_of, self._views = [], {}, {}
+        self._stamps, self._index_of, self._views = [], {}, ReferenceViews()
         velocity_body = state.nav_T_body[:3, :3].T @ state.velocity_nav
         self._previous_motion = np.concatenate([np.zeros(3), velocity_body])
         self._rate_sigmas = np.array([_UNKNOWN_RATE_SIGMA_RAD_S, uncertainty.velocity_m_s])
@@ -150,9 +160,7 @@ class Smoother:
     def test(self, motion: RelativeMotion) -> Verdict:
         """Chi-square test of a motion that ends in the newest state, against the window's prediction."""
         newest = x(self._index_of[motion.stamp_ns])
-        reference, covariance = x(self._index_of[motion.reference_stamp_ns]), motion.covariance
-        if motion.reference_stamp_ns in self._views and motion.shared_covariance.any():
-            reference, covariance = self._reference_key(motion), self._own_covariance(motion)
+        reference, covariance = self._views.seen(self._index_of[motion.reference_stamp_ns], motion)
         nav_T_reference = np.asarray(self._window.values.atPose3(reference).matrix())
         predicted = se3_inverse(nav_T_reference) @ self.pose(motion.stamp_ns)
         return gate(
@@ -181,11 +189,8 @@ class Smoother:
         before, dt = self.pose(self._stamps[-2]), (self._stamps[-1] - self._stamps[-2]) * 1e-9
         measured = self.pose(motion.reference_stamp_ns) @ motion.reference_T_current
         velocity = before[:3, :3] @ self._previous_motion[3:]  # mean of the step before
-        accel = float(np.linalg.norm((measured[:3, 3] - before[:3, 3]) / dt - velocity) / dt)
-        if accel <= self._config.max_accel_m_s2:
-            return None
-        noise = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1])) / dt**2
-        return accel if accel - _SURELY * noise > self._config.max_accel_m_s2 else None
+        accel = (measured[:3, 3] - before[:3, 3] - velocity * dt) / dt**2
+        return excess(accel, motion.covariance[3:, 3:] / dt**4, self._config.max_accel_m_s2)
 
     def reset_position(self) -> None:
         """Forget what is not known of the position but through velocity, attitude and biases.
@@ -214,47 +219,24 @@ class Smoother:
         """Insert a motion that ends in the newest state."""
         self._constrained_ns = self._seen_ns = motion.stamp_ns
         self._rate_sigmas = np.zeros(2)
-        reference = self._reference_key(motion)
+        k = self._index_of[motion.reference_stamp_ns]
+        self._views.add(k, motion, self._window)
+        reference, covariance = self._views.seen(k, motion)
         self._window.add(
             gtsam.BetweenFactorPose3(
                 reference,
                 x(self._index_of[motion.stamp_ns]),
                 gtsam.Pose3(motion.reference_T_current),
-                robust(gaussian(self._own_covariance(motion)), self._config.huber_probability),
+                robust(gaussian(covariance), self._config.huber_probability),
             )
         )
 
-    def _reference_key(self, motion: RelativeMotion) -> int:
-        """The variable that motions are measured from: the reference as vision sees it.
-
-        All motions from one reference share the error of its triangulated points. The reference as seen differs from
-        the reference's pose by that error, so that it is one unknown for all of them.
-        """
-        stamp_ns = motion.reference_stamp_ns
-        k = self._index_of[stamp_ns]
-        if not motion.shared_covariance.any():
-            return x(k)
-        if stamp_ns not in self._views:
-            adjoint = se3_adjoint(motion.reference_T_current)  # takes the tangent from the current instant there
-            shared = adjoint @ motion.shared_covariance @ adjoint.T
-            self._views[stamp_ns] = shared
-            self._window.values.insert(r(k), gtsam.Pose3(self.pose(stamp_ns)))
-            noise = gaussian(shared)
-            self._window.add(gtsam.BetweenFactorPose3(x(k), r(k), gtsam.Pose3(), noise))
-        return r(k)
-
-    def _own_covariance(self, motion: RelativeMotion) -> Float:
-        """What a motion's covariance (6, 6) has beyond that of its reference as seen."""
-        if motion.reference_stamp_ns not in self._views or not motion.shared_covariance.any():
-            return motion.covariance
-        if self._own is None or self._own[0] is not motion:  # it is asked for by the test, and again to insert it
-            adjoint = se3_adjoint(se3_inverse(motion.reference_T_current))
-            shared = adjoint @ self._views[motion.reference_stamp_ns] @ adjoint.T
-            self._own = motion, own_covariance(motion.covariance, shared)
-        return self._own[1]
-
     def settle(self, keep: Iterable[int]) -> list[tuple[int, Float]]:
-        """Optimise, then marginalise what is older than the lag, but for the stamps to keep.
+        """Correct the newest states by the newest factors; every third time, or where they change by much, solve the
+        window as a whole and marginalise what is older than the lag.
+
+        Args:
+            keep: stamps of states that stay in the window, and whose covariance will be asked for.
 
         Returns:
             Stamps and final poses ``nav_T_body`` of the states that left the window, in time order.
@@ -263,12 +245,16 @@ class Smoother:
             WindowError: if the window cannot be solved; no state leaves it.
         """
         keep = frozenset(keep)
-        self._window.optimise(self._followed(keep))
+        followed = self._followed(keep)
+        advanced = self._advanced < _MOST_ADVANCED and self._window.advance(followed)
+        if not advanced:
+            self._window.optimise(followed)
+        self._advanced = self._advanced + 1 if advanced else 0
         if len(self._stamps) > 1:
             dt = (self._stamps[-1] - self._stamps[-2]) * 1e-9
             step = se3_inverse(self.pose(self._stamps[-2])) @ self.pose(self._stamps[-1])
             self._previous_motion = se3_log(step) / dt
-        return self._forget(self.latest_ns - round(self._config.lag_s * 1e9), keep)
+        return [] if advanced else self._forget(self.latest_ns - round(self._config.lag_s * 1e9), keep)
 
     def all_poses(self) -> list[tuple[int, Float]]:
         """Stamps and poses of the window, in time order."""
@@ -290,14 +276,9 @@ class Smoother:
     def _link_by_constant_velocity(self, i: int, j: int, motion: Float, dt: float) -> None:
         """Eq. (11): velocity and rate go on, but for white accelerations."""
         config = self._config
-        # An unknown constant acceleration moves by a t^2 / 2: the variance grows by steps of a^2 t^4 / 4.
-        after = (self.latest_ns - self._constrained_ns) * 1e-9
-        growth = 0.5 * np.sqrt(after**4 - (after - dt) ** 4)
-        accelerations = [config.motion_angular_accel_sigma_rad_s2, config.motion_accel_sigma_m_s2]
-        sigmas = np.repeat(np.hypot(np.array(accelerations) * growth, self._rate_sigmas * dt), 3)
-        self._window.add(
-            gtsam.BetweenFactorPose3(x(i), x(j), gtsam.Pose3(motion), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
-        )
+        after_s = (self.latest_ns - self._constrained_ns) * 1e-9
+        accelerations = np.array([config.motion_angular_accel_sigma_rad_s2, config.motion_accel_sigma_m_s2])
+        self._window.add(constant_velocity(i, j, motion, dt, after_s, self._rate_sigmas, accelerations))
         if self._imu is not None:
             for factor in imu_without_samples(
                 i, j, dt, config.motion_accel_sigma_m_s2, self._imu, config.imu_noise_scale
@@ -306,8 +287,8 @@ class Smoother:
 
     def _followed(self, keep: frozenset[int]) -> list[int]:
         """Variables that the next motion and the next span of the IMU will be tied to."""
-        references = [(self._index_of[ns], ns) for ns in sorted(keep & self._index_of.keys() - {self.latest_ns})]
-        keys = [r(k) if ns in self._views else x(k) for k, ns in references]
+        stamps = sorted(keep & self._index_of.keys() - {self.latest_ns})
+        keys = [self._views.key(self._index_of[stamp]) for stamp in stamps]
         newest = self._index_of[self.latest_ns]
         return [*keys, x(newest), v(newest), b(newest)] if self.has_imu else [*keys, x(newest)]
 
@@ -318,10 +299,9 @@ class Smoother:
         for stamp in leaving:
             k = self._index_of[stamp]
             keys += [x(k), v(k), b(k)] if self.has_imu else [x(k)]
-            keys += [r(k)] if stamp in self._views else []
+            keys += self._views.forget(k)
         self._window.marginalise(keys)
         for stamp in leaving:
             del self._index_of[stamp]
-            self._views.pop(stamp, None)
         self._stamps = [stamp for stamp in self._stamps if stamp in self._index_of]
         return finished

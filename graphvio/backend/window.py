@@ -6,20 +6,16 @@ Factors and values are kept here, outside gtsam's solvers, so that the window ca
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from itertools import takewhile
 
 import gtsam
 import numpy as np
-from scipy.linalg import lapack
 
 from graphvio.arrays import Float
+from graphvio.backend.marginal import Marginal, marginal_of_last
 from graphvio.errors import GraphvioError
 
 _MAX_ITERATIONS = 4
 _CONVERGED = 1e-2  # radians, metres...: what a further step would still change is of the order of its square
-_SINGULAR = 1e-9
 
 
 class WindowError(GraphvioError):
@@ -28,29 +24,6 @@ class WindowError(GraphvioError):
 
 SOLVER_ERRORS = (WindowError, RuntimeError, np.linalg.LinAlgError)
 """What a window, gtsam and numpy raise where equations have no solution."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Marginal:
-    """What the window says of some variables together: the upper triangle R, where ``R^T R`` is their information."""
-
-    columns: dict[int, slice]
-    square_root: Float
-
-    def covariance(self, keys: Sequence[int]) -> Float:
-        """Covariance of some of the variables, in the order given. R is inverted, not its square: states far less
-        certain than the poses relative to them do no harm."""
-        inverse = self._inverse
-        if inverse is None:
-            raise WindowError(f"the window has no covariance of {_named(keys)}")
-        rows = np.concatenate([inverse[self.columns[key]] for key in keys])
-        return np.asarray(rows @ rows.T)
-
-    @cached_property
-    def _inverse(self) -> Float | None:
-        if np.abs(self.square_root.diagonal()).min() < _SINGULAR:
-            return None
-        return np.asarray(lapack.dtrtri(self.square_root)[0])
 
 
 class Window:
@@ -67,7 +40,7 @@ class Window:
         self._graph = gtsam.NonlinearFactorGraph()
         self._involved: dict[int, frozenset[int]] = {}  # slot of the graph -> variables of the factor in it
         self._free: list[int] = []  # slots
-        self._marginal: _Marginal | None = None  # of the variables that were eliminated last, and some added since
+        self._marginal: Marginal | None = None  # of the variables that were eliminated last, and some added since
         self._unknown: list[int] = []  # slots of the factors that it does not know
         self._cholesky_suffices = True
         self._dims: dict[int, int] = {}  # of variables; to ask gtsam is slow
@@ -95,6 +68,7 @@ class Window:
                 if not np.isfinite(largest):
                     raise WindowError("the window's solution is not finite")
                 self.values = self.values.retract(step)
+                self._marginal = self._marginal and self._marginal.settled()
                 if largest < _CONVERGED and iteration >= self._least_iterations:
                     break
         except RuntimeError as error:
@@ -103,6 +77,29 @@ class Window:
         except WindowError:
             self.values, self._marginal = values, None
             raise
+
+    def advance(self, followed: Sequence[int]) -> bool:
+        """Let the newest factors correct what the last solution followed and the variables since then, all others
+        staying as they are: a step of a filter, whose prior is the window's exact marginal.
+
+        Args:
+            followed: the same as for `optimise`, some of these variables, for the next time.
+
+        Returns:
+            Whether that was possible. Where it was not, or the step is too long for a linear one, nothing has changed.
+        """
+        if self._least_iterations > 1:
+            return False
+        marginal = self._extended_marginal(followed)
+        step = None if marginal is None else marginal.step()
+        if marginal is None or step is None or not np.abs(step).max() < _CONVERGED:
+            return False
+        delta = gtsam.VectorValues()
+        for key, at in marginal.columns.items():
+            delta.insert(key, step[at])
+        self.values = self.values.retract(delta)
+        self._marginal, self._unknown = marginal.of_last(followed).settled(), []
+        return True
 
     def joint_covariance(self, keys: Sequence[int]) -> Float:
         """Covariance of some variables together, in the order given.
@@ -117,9 +114,10 @@ class Window:
             self._marginal, self._unknown = self._extended_marginal(), []
         if self._marginal is None or not self._marginal.columns.keys() >= set(keys):
             self._solve(keys)
-        if self._marginal is None:
+        covariance = None if self._marginal is None else self._marginal.covariance(keys)
+        if covariance is None:
             raise WindowError(f"the window has no covariance of {_named(keys)}")
-        return self._marginal.covariance(keys)
+        return covariance
 
     def marginalise(self, keys: Iterable[int]) -> None:
         """Replace variables and their factors by the linear factor that says the same of the others.
@@ -177,7 +175,7 @@ class Window:
             solution = self._eliminated(self._graph.linearize(self.values), ordering)
         except RuntimeError as error:
             raise WindowError(f"the window has no unique solution: {_one_line(error)}") from None
-        self._marginal, self._unknown = self._root_marginal(solution, last), []
+        self._marginal, self._unknown = marginal_of_last(solution, last, self._known_dims()), []
         return solution
 
     def _eliminated(self, graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.GaussianBayesTree:
@@ -190,62 +188,24 @@ class Window:
                 self._cholesky_suffices = False
         return graph.eliminateMultifrontal(ordering, gtsam.EliminateQR)
 
-    def _root_marginal(self, solution: gtsam.GaussianBayesTree, last: Sequence[int]) -> _Marginal | None:
-        """The marginal of the variables that were eliminated last, or None if some are not in a root.
-
-        As a rule all states are tied to each other, and they are the lower corner of the one root; just after a start
-        there may be several.
-        """
-        conditionals = [root.conditional() for root in solution.roots()]
-        ends = [list(takewhile(frozenset(last).__contains__, reversed(list(each.keys())))) for each in conditionals]
-        if sum(map(len, ends)) != len(last):
-            return None
-        columns, size = self._columns([key for end in ends for key in reversed(end)])
-        square_root, at = np.zeros((size, size)), 0
-        for conditional, end in zip(conditionals, ends, strict=True):
-            width = sum(columns[key].stop - columns[key].start for key in end)
-            corner = np.array(conditional.R())[-width:, -width:] if width else np.zeros((0, 0))
-            square_root[at : at + width, at : at + width] = corner
-            at += width
-        return _Marginal(columns, square_root)
-
-    def _extended_marginal(self) -> _Marginal | None:
-        """The marginal with the newest factors and their variables, or None if that cannot be told from it."""
+    def _extended_marginal(self, last: Sequence[int] = ()) -> Marginal | None:
+        """The marginal with the newest factors and their variables, some of which stand last, or None if that cannot be
+        told from it."""
         if self._marginal is None:
             return None
         followed = self._marginal.columns.keys()
         settled = frozenset().union(*(keys for slot, keys in self._involved.items() if slot not in self._unknown))
         touched = frozenset().union(*(self._involved[slot] for slot in self._unknown))
-        if touched & settled - followed:
+        if touched & settled - followed or not followed | touched >= set(last):
             return None
-        columns, size = self._columns([*followed, *sorted(touched - followed)])
-        old = self._marginal.square_root
         linear = [self._graph.at(slot).linearize(self.values) for slot in self._unknown]
-        jacobians = [each.jacobian()[0] for each in linear]
-        rows = np.zeros((len(old) + sum(map(len, jacobians)), size))
-        if len(rows) < size:
-            return None
-        rows[: len(old), : len(old)] = old
-        row = len(old)
-        for each, jacobian in zip(linear, jacobians, strict=True):
-            block, at = rows[row : row + len(jacobian)], 0
-            for key in list(each.keys()):
-                width = columns[key].stop - columns[key].start
-                block[:, columns[key]] = jacobian[:, at : at + width]
-                at += width
-            row += len(jacobian)
-        return _Marginal(columns, np.triu(lapack.dgeqrf(rows)[0][:size]))
+        return self._marginal.extended(linear, last, self._known_dims())
 
-    def _columns(self, keys: Iterable[int]) -> tuple[dict[int, slice], int]:
-        """Where variables stand in a matrix that has them side by side, and how wide it is."""
-        columns, size = {}, 0
-        keys = list(keys)
-        if not self._dims.keys() >= set(keys):
+    def _known_dims(self) -> dict[int, int]:
+        """The dimensions of all variables, and of some that were there before."""
+        if not all(map(self._dims.__contains__, self.values.keys())):
             self._dims = self.values.dims()
-        for key in keys:
-            columns[key] = slice(size, size + self._dims[key])
-            size += self._dims[key]
-        return columns, size
+        return self._dims
 
 
 def _named(keys: Iterable[int]) -> str:

@@ -1,0 +1,55 @@
+"""References as vision sees them: what all motions from one reference have in common."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.factors import r, x
+from graphvio.backend.noise import gaussian, own_covariance
+from graphvio.backend.window import Window
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.geometry import se3_adjoint, se3_inverse
+
+
+class ReferenceViews:
+    """The states that motions are measured from, each as vision sees it.
+
+    All motions from one reference share the error of its triangulated points. The reference as seen differs from the
+    reference's pose by that error, so that it is one unknown for all of them.
+    """
+
+    def __init__(self) -> None:
+        self._shared: dict[int, Float] = {}  # state -> covariance (6, 6) of its view about its pose, in body there
+        self._own: tuple[RelativeMotion, Float] | None = None  # of the motion asked for last
+
+    def add(self, k: int, motion: RelativeMotion, window: Window) -> None:
+        """Give a motion's reference, state k, an unknown of its own, if it needs one and has none."""
+        if k in self._shared or not motion.shared_covariance.any():
+            return
+        adjoint = se3_adjoint(motion.reference_T_current)  # takes the tangent from the current instant there
+        self._shared[k] = adjoint @ motion.shared_covariance @ adjoint.T
+        window.values.insert(r(k), window.values.atPose3(x(k)))
+        window.add(gtsam.BetweenFactorPose3(x(k), r(k), gtsam.Pose3(), gaussian(self._shared[k])))
+
+    def key(self, k: int) -> int:
+        """The variable that the next motion from state k will be measured from, as far as is known."""
+        return r(k) if k in self._shared else x(k)
+
+    def seen(self, k: int, motion: RelativeMotion) -> tuple[int, Float]:
+        """The variable that a motion from state k is measured from, and the motion's covariance (6, 6) from there."""
+        if k not in self._shared or not motion.shared_covariance.any():
+            return x(k), motion.covariance
+        if self._own is None or self._own[0] is not motion:  # it is asked for by the test, and again to insert it
+            adjoint = se3_adjoint(se3_inverse(motion.reference_T_current))
+            self._own = motion, own_covariance(motion.covariance, np.asarray(adjoint @ self._shared[k] @ adjoint.T))
+        return r(k), self._own[1]
+
+    def forget(self, k: int) -> list[int]:
+        """State k leaves the window.
+
+        Returns:
+            The unknown that must leave with it, if it has one.
+        """
+        return [] if self._shared.pop(k, None) is None else [r(k)]
