@@ -5,27 +5,17 @@ A profile is a YAML file in ``configs/`` that overrides some of the values; so i
 
 from __future__ import annotations
 
-import difflib
 import hashlib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args, get_type_hints
+from typing import Literal
 
+from graphvio.config_values import Stage, build, nearest
 from graphvio.errors import ConfigError
-
-_LARGEST = 1e12
-_MAY_BE_ZERO = frozenset(
-    ("seed", "border_px", "keyframe_overlap", "min_inlier_share", "min_response",
-     "scarce_share", "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s",
-     "calibration_error_share")
-)  # fmt: skip
-_RANGES = {"cells_across": (2, 100), "window_px": (5, 63), "levels": (1, 8), "min_inliers": (3, 1000)}
-_SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
 
 
 @dataclass(frozen=True)
-class CornerConfig:
+class CornerConfig(Stage):
     """Harris corners, one in each cell of the left image that has no track (section 3)."""
 
     cells_across: int = 18
@@ -46,7 +36,7 @@ class CornerConfig:
 
 
 @dataclass(frozen=True)
-class TrackingConfig:
+class TrackingConfig(Stage):
     """Temporal 2D-2D matching by Lucas-Kanade (section 3): each track is looked for on the keyframe's own patch at its
     predicted place, and through pyramids from the frame before where that fails."""
 
@@ -61,7 +51,7 @@ class TrackingConfig:
 
 
 @dataclass(frozen=True)
-class StereoConfig:
+class StereoConfig(Stage):
     """Left-right matching under the epipolar and disparity constraints, and triangulation (section 3)."""
 
     min_depth_m: float = 0.3
@@ -74,7 +64,7 @@ class StereoConfig:
 
 
 @dataclass(frozen=True)
-class MotionConfig:
+class MotionConfig(Stage):
     """Robust resection and refinement, and the choice between pairs (section 3, 3.1)."""
 
     selection: Literal["best_pair", "joint"] = "joint"
@@ -110,7 +100,7 @@ class MotionConfig:
 
 
 @dataclass(frozen=True)
-class InitialisationConfig:
+class InitialisationConfig(Stage):
     """The first pose: tilt from the accelerometer, at rest or in motion."""
 
     window_s: float = 1.0
@@ -128,7 +118,7 @@ class InitialisationConfig:
 
 
 @dataclass(frozen=True)
-class SmootherConfig:
+class SmootherConfig(Stage):
     """The fixed-lag window, its gate and its limits (section 5)."""
 
     lag_s: float = 0.75
@@ -156,7 +146,7 @@ class SmootherConfig:
 
 
 @dataclass(frozen=True)
-class FusionConfig:
+class FusionConfig(Stage):
     """Which back-end makes estimates of motions and the IMU."""
 
     estimator: Literal["smoother", "filter"] = "smoother"
@@ -168,7 +158,7 @@ class FusionConfig:
 
 
 @dataclass(frozen=True)
-class FilterConfig:
+class FilterConfig(Stage):
     """The paper's extended Kalman filter (section 5), where ``fusion.estimator`` is ``filter``."""
 
     accel_sigma_m_s2: float = 5.0
@@ -198,7 +188,7 @@ class FilterConfig:
 
 
 @dataclass(frozen=True)
-class TimingConfig:
+class TimingConfig(Stage):
     """How long things are waited for."""
 
     simultaneous_ms: float = 2.0
@@ -255,7 +245,7 @@ class Config:
             known = profiles()
             if str(name_or_path) not in known:
                 raise ConfigError(
-                    f"no profile {str(name_or_path)!r}{_nearest(str(name_or_path), known)}; profiles are "
+                    f"no profile {str(name_or_path)!r}{nearest(str(name_or_path), known)}; profiles are "
                     f"{', '.join(sorted(known))}, and a file ends in .yaml"
                 )
             path = known[str(name_or_path)]
@@ -278,7 +268,7 @@ class Config:
             data = yaml.safe_load(text)
         except yaml.YAMLError as error:
             raise ConfigError(f"{where}: is not valid YAML: {' '.join(str(error).split())}") from None
-        config: Config = _build(Config, {} if data is None else data, where)
+        config: Config = build(Config, {} if data is None else data, where)
         return config
 
     def to_yaml(self) -> str:
@@ -300,52 +290,3 @@ def profiles() -> dict[str, Path]:
         if folder.is_dir():
             return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
     return {}
-
-
-def _build(kind: type[Any], data: object, where: str) -> Any:
-    if not isinstance(data, Mapping):
-        raise ConfigError(f"{where}: must be a mapping of names to values, not {type(data).__name__}")
-    hints = get_type_hints(kind)
-    names = [f.name for f in fields(kind)]
-    values = {}
-    for key, value in data.items():
-        if key not in names:
-            raise ConfigError(f"{where}: unknown key {key!r}{_nearest(str(key), names)}")
-        values[key] = _checked(hints[key], value, f"{where}: {key}")
-    return kind(**values)
-
-
-def _checked(hint: Any, value: object, where: str) -> object:
-    if is_dataclass(hint):
-        return _build(hint, {} if value is None else value, where)  # type: ignore[arg-type]
-    choices = get_args(hint)
-    if choices:
-        if value not in choices:
-            raise ConfigError(f"{where}: is {value!r}; choose one of {', '.join(map(str, choices))}")
-        return value
-    if hint is bool:
-        if not isinstance(value, bool):
-            raise ConfigError(f"{where}: is {value!r}; it must be true or false")
-        return value
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        raise ConfigError(f"{where}: is {value!r}; it must be a number")
-    if not 0 <= value <= _LARGEST:  # also refuses NaN
-        raise ConfigError(f"{where}: is {value!r}; it must be finite and not negative")
-    name = where.rsplit(" ", 1)[-1]
-    if value == 0 and name not in _MAY_BE_ZERO:
-        raise ConfigError(f"{where}: is 0; it must be positive")
-    least, most = _RANGES.get(name, (0, _LARGEST))
-    if not least <= value <= most:
-        raise ConfigError(f"{where}: is {value!r}; choose from {least} to {most}")
-    if name.endswith(_SHARES) and value > 1:
-        raise ConfigError(f"{where}: is {value!r}; a share or probability is at most 1")
-    if hint is float:
-        return float(value)
-    if value != int(value):
-        raise ConfigError(f"{where}: is {value!r}; it must be a whole number")
-    return int(value)
-
-
-def _nearest(key: str, names: object) -> str:
-    close = difflib.get_close_matches(key, list(names), n=1, cutoff=0.3)  # type: ignore[call-overload]
-    return f"; did you mean {close[0]!r}?" if close else ""

@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cache
 
+import gtsam
 import numpy as np
 import pytest
 from monte_carlo import band
 from synthetic import filled_buffer, pose_at, random_covariance, transform, velocity_at
 
 from graphvio.arrays import Float
+from graphvio.backend.factors import x
+from graphvio.backend.noise import gaussian
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
 from graphvio.config import SmootherConfig
@@ -155,3 +158,25 @@ def test_keyframes_that_leave_the_window_take_nothing_along(with_imu: bool) -> N
     np.testing.assert_allclose(short.smoother.covariance() / scale, covariance / scale, atol=0.01)
     apart = se3_log(se3_inverse(long.smoother.pose(newest)) @ short.smoother.pose(newest))
     assert np.abs(apart / sigmas).max() < 0.1  # what is linearised too early
+
+
+def test_what_is_kept_goes_along_where_only_the_newest_states_are_corrected() -> None:
+    """The keyframe's pose, and not only its view."""
+    rng, shared_error = np.random.default_rng(5), np.zeros(6)
+    smoother = Smoother(CONFIG, None)
+    anywhere = StartUncertainty(np.eye(6), 10.0, 1.0)
+    smoother.start(0, RigState(pose_at(0.0), velocity_at(0.0), np.zeros(3), np.zeros(3)), anywhere)
+    for k in range(1, 5):
+        smoother.extend(k * PERIOD_NS, None)
+        smoother.accept(motion_from(0, k * PERIOD_NS, shared_error, rng))
+        smoother.settle({0})
+    before, newest = smoother.pose(0), smoother.pose(4 * PERIOD_NS)
+    found = gtsam.Pose3(transform(np.zeros(3), np.array([4e-3, -5e-3, 3e-3])) @ newest)
+    smoother._window.add(gtsam.PriorFactorPose3(x(4), found, gaussian(1e-10 * np.eye(6))))
+    smoother.settle({0})
+    assert smoother._advanced
+    assert np.linalg.norm(smoother.pose(0)[:3, 3] - before[:3, 3]) > 5e-3
+    told, covariance = (se3_inverse(smoother.pose(0)) @ smoother.pose(4 * PERIOD_NS)), smoother.covariance_since(0)
+    smoother._window.optimise()
+    whole = se3_inverse(smoother.pose(0)) @ smoother.pose(4 * PERIOD_NS)
+    assert np.abs(se3_log(se3_inverse(whole) @ told) / np.sqrt(np.diag(covariance))).max() < 0.01

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from graphvio.config import Config, MotionConfig, profiles
+from graphvio.config import Config, MotionConfig, SmootherConfig, profiles
 from graphvio.errors import ConfigError
 
 
@@ -153,17 +153,45 @@ def test_a_switch_is_true_or_false(value: str) -> None:
         Config.from_yaml(f"fusion: {{estimate_time_offset: {value}}}")
 
 
+def another(value: object) -> object:
+    """Another value in the same range."""
+    if isinstance(value, str):
+        return {"joint": "best_pair", "previous": "keyframe", "smoother": "filter", "estimated": "none"}[value]
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, int):
+        return value - 1 if value else 1
+    assert isinstance(value, float)
+    return 0.5 * value or 0.1
+
+
 def test_sha256_tells_configurations_apart_by_what_they_do() -> None:
     config = Config.from_yaml("motion: {reference: previous}")  # suits both estimators
     assert config.sha256() == Config.from_yaml("motion: {reference: previous}").sha256() != Config().sha256()
     assert Config().sha256() == Config.from_yaml("motion: {min_inliers: 12.0, max_error_px: 3}").sha256()
-    others = {"joint": "best_pair", "previous": "keyframe", "smoother": "filter", "estimated": "none"}
     digests = {config.sha256()}
     for stage in fields(Config):
         settings = getattr(config, stage.name)
         for name, value in asdict(settings).items():
-            other = others[value] if isinstance(value, str) else value + 1
+            other = another(value)
             before = Config() if name == "estimate_time_offset" else config  # it needs keyframes
             digests.add(replace(before, **{stage.name: replace(settings, **{name: other})}).sha256())
     values = [v for section in yaml.safe_load(config.to_yaml()).values() for v in section.values()]
     assert len(digests) == 1 + len(values)
+
+
+def test_values_are_checked_in_python_as_in_files() -> None:
+    with pytest.raises(ConfigError, match="SmootherConfig: lag_s: is 0; it must be positive"):
+        SmootherConfig(lag_s=0.0)
+    with pytest.raises(ConfigError, match=r"MotionConfig: selection: is 'bets_pair'; choose one of"):
+        MotionConfig(selection="bets_pair")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="must be a number"):
+        replace(SmootherConfig(), lag_s="long")  # type: ignore[arg-type]
+
+
+def test_numbers_without_a_point_before_the_exponent_are_numbers() -> None:
+    """YAML 1.1 takes them for text."""
+    config = Config.from_yaml("motion: {calibration_error_share: 1e-9}")
+    assert config.motion.calibration_error_share == 1e-9
+    with pytest.raises(ConfigError, match="is '1e-9x'; it must be a number"):
+        Config.from_yaml("motion: {calibration_error_share: 1e-9x}")

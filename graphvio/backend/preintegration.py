@@ -15,7 +15,7 @@ from graphvio.geometry import so3_exp
 from graphvio.kernels import kernel
 from graphvio.rig import Imu
 
-_INTEGRATION_SIGMA = 1e-4  # m/s^2-like noise that stands for the error of integrating piecewise constant rates
+_INTEGRATION_SIGMA = 3e-5  # m/s^2-like noise that stands for the error of integrating piecewise constant rates
 
 
 def preintegration_params(imu: Imu, noise_scale: float) -> gtsam.PreintegrationCombinedParams:
@@ -25,7 +25,7 @@ def preintegration_params(imu: Imu, noise_scale: float) -> gtsam.PreintegrationC
     params.setAccelerometerCovariance(np.eye(3) * (noise_scale * imu.accel_noise_density) ** 2)
     params.setBiasOmegaCovariance(np.eye(3) * (noise_scale * imu.gyro_random_walk) ** 2)
     params.setBiasAccCovariance(np.eye(3) * (noise_scale * imu.accel_random_walk) ** 2)
-    params.setIntegrationCovariance(np.eye(3) * _INTEGRATION_SIGMA**2)
+    params.setIntegrationCovariance(np.eye(3) * (noise_scale * _INTEGRATION_SIGMA) ** 2)
     return params
 
 

@@ -33,9 +33,9 @@ class ReferenceViews:
         window.values.insert(r(k), window.values.atPose3(x(k)))
         window.add(gtsam.BetweenFactorPose3(x(k), r(k), gtsam.Pose3(), gaussian(self._shared[k])))
 
-    def key(self, k: int) -> int:
-        """The variable that the next motion from state k will be measured from, as far as is known."""
-        return r(k) if k in self._shared else x(k)
+    def keys(self, k: int) -> list[int]:
+        """The pose of state k, and its view if it has one."""
+        return [x(k), r(k)] if k in self._shared else [x(k)]
 
     def seen(self, k: int, motion: RelativeMotion) -> tuple[int, Float]:
         """The variable that a motion from state k is measured from, and the motion's covariance (6, 6) from there."""

@@ -286,9 +286,9 @@ class Smoother:
                 self._window.add(factor)
 
     def _followed(self, keep: frozenset[int]) -> list[int]:
-        """Variables that the next motion and the next span of the IMU will be tied to."""
+        """Variables that the next motion and the next span of the IMU will be tied to, or that are asked for."""
         stamps = sorted(keep & self._index_of.keys() - {self.latest_ns})
-        keys = [self._views.key(self._index_of[stamp]) for stamp in stamps]
+        keys = [key for stamp in stamps for key in self._views.keys(self._index_of[stamp])]
         newest = self._index_of[self.latest_ns]
         return [*keys, x(newest), v(newest), b(newest)] if self.has_imu else [*keys, x(newest)]
 

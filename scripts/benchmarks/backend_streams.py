@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count, takewhile
 from pathlib import Path
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import gtsam
 
 from graphvio.backend import smoother
 from graphvio.backend.window import Window
-from graphvio.events import FrameSet
+from graphvio.events import Event, FrameSet, ImuSample
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig
 from graphvio.sources import open_source
@@ -33,10 +36,12 @@ class Stream:
     Attributes:
         rig: of the recording.
         framesets: the calls for each, the last of which is ``update``.
+        prediction_us: what `Odometry.predict` took at each sample of the IMU beyond the newest frameset.
     """
 
     rig: Rig
     framesets: list[list[Call]]
+    prediction_us: list[float]
 
 
 def note_stream(folder: Path, most: int) -> Stream:
@@ -47,14 +52,21 @@ def note_stream(folder: Path, most: int) -> Stream:
     belief: Any = odometry._belief
     for name in _STEPS:
         _note(belief, name, framesets)
-    count = 0
-    for event in source:
+    prediction_us = []
+    for event in list(takewhile(_before(most), source)):  # decoded before, so that no time is of the threads for that
         odometry.process(event)
-        count += isinstance(event, FrameSet)
-        if count > most:
-            break
+        if isinstance(event, ImuSample):
+            start = perf_counter()
+            if odometry.predict(event.stamp_ns) is not None:
+                prediction_us.append(1e6 * (perf_counter() - start))
     odometry.finish()
-    return Stream(source.rig, [calls for calls in framesets if calls][:most])
+    return Stream(source.rig, [calls for calls in framesets if calls][:most], prediction_us)
+
+
+def _before(most: int) -> Callable[[Event], bool]:
+    """Whether an event is one of the first framesets, or comes before the next one."""
+    framesets = count()
+    return lambda event: not isinstance(event, FrameSet) or next(framesets) < most
 
 
 def _note(belief: Any, name: str, framesets: list[list[Call]]) -> None:

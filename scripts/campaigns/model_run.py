@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 
 from campaigns.drawn import DrawnVision, Template
 from campaigns.measures import tilt_error
 from campaigns.walks import FRAMES_HZ, Walk, buffer_of
+from graphvio.backend.inertial import ImuSpan
+from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
 from graphvio.config import SmootherConfig
@@ -48,6 +51,7 @@ class _ModelRun:
         self._stamps, self._truth, self._velocities = walk.stamps_ns, walk.world_T_body, walk.velocity_world
         self._vision = DrawnVision(templates, self._truth, self._stamps, self._rng)
         self._smoother = Smoother(SmootherConfig(imu_noise_scale=1.0), walk.imu)
+        self._params = preintegration_params(walk.imu, 1.0)
 
     def squares(self) -> Iterator[Square]:
         """Go through the run."""
@@ -56,7 +60,10 @@ class _ModelRun:
         anchors = {1: 0, 10: 0}  # seconds -> frameset from which the motion is measured
         for k in range(1, len(self._stamps)):
             span = self._buffer.span(self._stamps[k - 1], self._stamps[k])
+            assert span is not None
             smoother.extend(self._stamps[k], span)
+            if k > _SETTLED_S * FRAMES_HZ:
+                yield "imu", k / FRAMES_HZ, self._imu_square(span, k), 15
             motion = self._vision.at(k)
             if motion is not None and smoother.knows(motion.reference_stamp_ns):
                 verdict = smoother.test(motion)
@@ -98,6 +105,21 @@ class _ModelRun:
             ("accel bias", self._track.accel_bias[sample] - state.accel_bias, known.accel_bias),
         ):
             yield name, time_s, float(error @ np.linalg.solve(covariance, error)), len(error)
+
+    def _imu_square(self, span: ImuSpan, k: int) -> float:
+        """How far the IMU from one frameset to the next, with the walk of its biases, is from the truth."""
+        biases = []
+        for number in (k - 1, k):
+            sample = round(number / FRAMES_HZ * self._imu_rate_hz)
+            biases.append(gtsam.imuBias.ConstantBias(self._track.accel_bias[sample], self._track.gyro_bias[sample]))
+        states = [(gtsam.Pose3(self._truth[number]), self._velocities[number]) for number in (k - 1, k)]
+        factor = gtsam.CombinedImuFactor(0, 1, 2, 3, 4, 5, preintegrate(span, self._params, biases[0]))
+        values = gtsam.Values()
+        for at, (pose, velocity) in enumerate(states):
+            values.insert(2 * at, pose)
+            values.insert(2 * at + 1, velocity)
+            values.insert(4 + at, biases[at])
+        return 2.0 * float(factor.error(values))
 
     def _motion_square(self, name: str, start: int, end: int) -> Square:
         smoother = self._smoother

@@ -1,0 +1,101 @@
+"""What a value of the configuration may be, and how mappings become dataclasses."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any, get_args, get_type_hints
+
+from graphvio.errors import ConfigError
+
+_LARGEST = 1e12
+_MAY_BE_ZERO = frozenset(
+    ("seed", "border_px", "keyframe_overlap", "min_inlier_share", "min_response",
+     "scarce_share", "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s",
+     "calibration_error_share")
+)  # fmt: skip
+_RANGES = {"cells_across": (2, 100), "window_px": (5, 63), "levels": (1, 8), "min_inliers": (3, 1000)}
+_WITHOUT_POINT = re.compile(r"\d+[eE][-+]?\d+")
+_SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
+
+
+class Stage:
+    """A part of the configuration, a frozen dataclass, whose values are checked however it is made."""
+
+    def __post_init__(self) -> None:
+        """Refuse values that nothing can work with.
+
+        Raises:
+            ConfigError: that names the value.
+        """
+        for name, hint in get_type_hints(type(self)).items():
+            checked(hint, getattr(self, name), f"{type(self).__name__}: {name}")
+
+
+def build(kind: type[Any], data: object, where: str) -> Any:
+    """A dataclass from a mapping of names to values; what it does not mention keeps its default.
+
+    Raises:
+        ConfigError: if it is no mapping, or a key or value is not valid.
+    """
+    if not isinstance(data, Mapping):
+        raise ConfigError(f"{where}: must be a mapping of names to values, not {type(data).__name__}")
+    hints = get_type_hints(kind)
+    names = [f.name for f in fields(kind)]
+    values = {}
+    for key, value in data.items():
+        if key not in names:
+            raise ConfigError(f"{where}: unknown key {key!r}{nearest(str(key), names)}")
+        hint, here = hints[key], f"{where}: {key}"
+        if is_dataclass(hint):
+            values[key] = build(hint, {} if value is None else value, here)  # type: ignore[arg-type]
+        else:
+            values[key] = checked(hint, _number_of_text(value) if hint is float else value, here)
+    return kind(**values)
+
+
+def checked(hint: Any, value: object, where: str) -> object:
+    """A value as the type that it should have.
+
+    Raises:
+        ConfigError: if it is none, or out of the range that its name asks for.
+    """
+    choices = get_args(hint)
+    if choices:
+        if value not in choices:
+            raise ConfigError(f"{where}: is {value!r}; choose one of {', '.join(map(str, choices))}")
+        return value
+    if hint is bool:
+        if not isinstance(value, bool):
+            raise ConfigError(f"{where}: is {value!r}; it must be true or false")
+        return value
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise ConfigError(f"{where}: is {value!r}; it must be a number")
+    if not 0 <= value <= _LARGEST:  # also refuses NaN
+        raise ConfigError(f"{where}: is {value!r}; it must be finite and not negative")
+    name = where.rsplit(" ", 1)[-1]
+    if value == 0 and name not in _MAY_BE_ZERO:
+        raise ConfigError(f"{where}: is 0; it must be positive")
+    least, most = _RANGES.get(name, (0, _LARGEST))
+    if not least <= value <= most:
+        raise ConfigError(f"{where}: is {value!r}; choose from {least} to {most}")
+    if name.endswith(_SHARES) and value > 1:
+        raise ConfigError(f"{where}: is {value!r}; a share or probability is at most 1")
+    if hint is float:
+        return float(value)
+    if value != int(value):
+        raise ConfigError(f"{where}: is {value!r}; it must be a whole number")
+    return int(value)
+
+
+def nearest(key: str, names: Iterable[str]) -> str:
+    """What to add to a message where a name is unknown: the known one that is most like it."""
+    close = difflib.get_close_matches(key, list(names), n=1, cutoff=0.3)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def _number_of_text(value: object) -> object:
+    """YAML takes 1e-9, which has no point, for text; numbers in quotes stay text."""
+    return float(value) if isinstance(value, str) and _WITHOUT_POINT.fullmatch(value) else value
