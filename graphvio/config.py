@@ -122,7 +122,8 @@ class SmootherConfig(Stage):
     """The fixed-lag window, its gate and its limits (section 5)."""
 
     lag_s: float = 0.75
-    """Age at which a state leaves the window, unless later motions are measured from it."""
+    """Age from which a state may leave the window, unless later motions are measured from it: when the window is next
+    solved as a whole, up to two framesets later."""
     gate_probability: float = 0.9999
     """Vision is refused where its innovation lies outside this share of the chi-square distribution."""
     huber_probability: float = 1.0

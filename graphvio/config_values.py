@@ -17,7 +17,7 @@ _MAY_BE_ZERO = frozenset(
      "calibration_error_share")
 )  # fmt: skip
 _RANGES = {"cells_across": (2, 100), "window_px": (5, 63), "levels": (1, 8), "min_inliers": (3, 1000)}
-_WITHOUT_POINT = re.compile(r"\d+[eE][-+]?\d+")
+_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 _SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
 
 
@@ -31,7 +31,8 @@ class Stage:
             ConfigError: that names the value.
         """
         for name, hint in get_type_hints(type(self)).items():
-            checked(hint, getattr(self, name), f"{type(self).__name__}: {name}")
+            value = checked(hint, getattr(self, name), f"{type(self).__name__}: {name}")
+            object.__setattr__(self, name, value)  # 12.0 as 12, so that what does the same is equal
 
 
 def build(kind: type[Any], data: object, where: str) -> Any:
@@ -52,7 +53,7 @@ def build(kind: type[Any], data: object, where: str) -> Any:
         if is_dataclass(hint):
             values[key] = build(hint, {} if value is None else value, here)  # type: ignore[arg-type]
         else:
-            values[key] = checked(hint, _number_of_text(value) if hint is float else value, here)
+            values[key] = checked(hint, _number_of_text(value), here)
     return kind(**values)
 
 
@@ -97,5 +98,5 @@ def nearest(key: str, names: Iterable[str]) -> str:
 
 
 def _number_of_text(value: object) -> object:
-    """YAML takes 1e-9, which has no point, for text; numbers in quotes stay text."""
-    return float(value) if isinstance(value, str) and _WITHOUT_POINT.fullmatch(value) else value
+    """YAML takes 1e-9 and 1.5e0 for text; numbers in quotes stay text."""
+    return float(value) if isinstance(value, str) and _EXPONENT.fullmatch(value) else value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 
@@ -181,6 +182,8 @@ class SmootherBelief(Belief):
                 self._sigma_m = float(np.hypot(np.sqrt(np.linalg.eigvalsh(since[3:, 3:])[-1]), self._rebuilt_sigma_m))
         except SOLVER_ERRORS as error:
             self._rebuild(stamp_ns, smoother.state(), error)
+            with suppress(*SOLVER_ERRORS):
+                self.covariance = self._running.state_covariance()
             used = False
         return self._status(stamp_ns, used, self._sigma_m)
 

@@ -387,7 +387,7 @@ def run_smoothed(
                         int(refined.inlier.sum()),
                     )
                 )  # fmt: skip
-                smoother.settle({stamps_ns[k // KEYFRAME * KEYFRAME]})
+                smoother.settle({stamps_ns[k // KEYFRAME * KEYFRAME], stamps_ns[FIRST]})
         estimate = motion_between(smoother.pose(stamps_ns[FIRST]), smoother.pose(stamps_ns[last]))
         campaign.errors.append(error_of(estimate, motion_between(poses[FIRST], poses[last])))
         campaign.covariances.append(smoother.covariance_since(stamps_ns[FIRST]))

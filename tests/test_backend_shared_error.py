@@ -89,7 +89,7 @@ class Run:
             if k > reference + 1:
                 self.statistics.append(self.smoother.test(motion).statistic)
             self.smoother.accept(motion)
-            self.smoother.settle({k // KEYFRAMES * KEYFRAMES * PERIOD_NS})
+            self.smoother.settle({k // KEYFRAMES * KEYFRAMES * PERIOD_NS, FIRST * PERIOD_NS})
 
     def nees(self) -> float:
         """Of the pose composed over twenty framesets."""

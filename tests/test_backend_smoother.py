@@ -148,6 +148,21 @@ def test_settled_poses_come_once_and_in_order() -> None:
         assert np.linalg.norm(pose[:3, 3] - pose_at(stamp * 1e-9)[:3, 3]) < 0.1
 
 
+def test_poses_of_the_window_are_those_of_the_whole_solution() -> None:
+    run = Run(3)
+    run.until(3.0)
+    while run.smoother._advanced < 2:
+        run.step(run.smoother.latest_ns + PERIOD_NS)
+    left = [run.smoother.pose(stamp) for stamp in run.smoother._stamps]
+    told = [pose for _, pose in run.smoother.all_poses()]
+    assert run.smoother._advanced == 0
+    run.smoother.solve()
+    whole = [pose for _, pose in run.smoother.all_poses()]
+    off_m, off_before_m = (np.abs(np.array(poses) - whole)[:, :3, 3].max() for poses in (told, left))
+    assert off_m < 5e-5
+    assert off_before_m > 5e-4
+
+
 def test_a_blackout_is_coasted_through_and_forgotten() -> None:
     run = Run(1)
     run.until(3.0)

@@ -187,6 +187,7 @@ def test_values_are_checked_in_python_as_in_files() -> None:
         MotionConfig(selection="bets_pair")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="must be a number"):
         replace(SmootherConfig(), lag_s="long")  # type: ignore[arg-type]
+    assert Config(motion=MotionConfig(min_inliers=12.0)).sha256() == Config().sha256()  # type: ignore[arg-type]
 
 
 def test_numbers_without_a_point_before_the_exponent_are_numbers() -> None:
@@ -195,3 +196,4 @@ def test_numbers_without_a_point_before_the_exponent_are_numbers() -> None:
     assert config.motion.calibration_error_share == 1e-9
     with pytest.raises(ConfigError, match="is '1e-9x'; it must be a number"):
         Config.from_yaml("motion: {calibration_error_share: 1e-9x}")
+    assert Config.from_yaml("smoother: {lag_s: 1.5e0}\ntracking: {levels: 3e0}").tracking.levels == 3

@@ -406,6 +406,11 @@ def test_a_window_that_fails_is_rebuilt(
             assert len(estimates) - before < 3, "every one of these is called for each third frameset"
             estimates += [e for event in events[half : half + 1] if (e := odometry.process(event)) is not None]
             half += 1
+    rebuilt, known = estimates[-1], estimates[-2]
+    assert rebuilt.covariance is not None
+    assert known.covariance is not None
+    assert rebuilt.covariance.trace() > known.covariance.trace()
+    assert rebuilt.velocity_covariance is not None
     estimates += [e for event in events[half:] if (e := odometry.process(event)) is not None]
     assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(events)]
     assert estimates[-1].status is Status.TRACKING

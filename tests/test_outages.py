@@ -14,6 +14,7 @@ from graphvio.arrays import Float
 from graphvio.backend.window import Window, WindowError
 from graphvio.events import Event
 from graphvio.geometry import se3_inverse, se3_log
+from graphvio.rig import Rig
 from graphvio.simulation import simulate
 from graphvio.trajectory import Trajectory
 
@@ -90,9 +91,9 @@ class Outcome:
         return float(np.linalg.norm(se3_log(np.ascontiguousarray(np.linalg.inv(true) @ motion))[3:]))
 
 
-def outcome(folder: Path, events: list[Event], config: Config | None = None) -> Outcome:
+def outcome(folder: Path, events: list[Event], config: Config | None = None, rig: Rig | None = None) -> Outcome:
     source = open_source(folder)
-    odometry = Odometry(source.rig, config)
+    odometry = Odometry(source.rig if rig is None else rig, config)
     estimates = [estimate for event in events if (estimate := odometry.process(event)) is not None]
     estimates += odometry.finish()
     stamps = [e.stamp_ns for e in estimates]
@@ -348,6 +349,23 @@ def test_an_unknown_time_offset_is_found(walk_folder: Path, events: list[Event],
     assert found.kinds.count("time_offset_off") == 1
     assert found.error_m(6.0, 9.0) < 0.03 < ignored.error_m(6.0, 9.0)
     assert {e.status for e in found.between(6.0, 10.0)} == {Status.TRACKING}
+
+
+@pytest.mark.parametrize("offset_ms", [-10, 25])
+def test_the_rigs_time_offset_is_taken_from_the_imus_stamps(
+    walk_folder: Path, events: list[Event], offset_ms: int
+) -> None:
+    """The same poses come of an IMU that stamps late, where the rig says so."""
+    shifted = [replace(e, stamp_ns=e.stamp_ns + offset_ms * MS) if isinstance(e, ImuSample) else e for e in events]
+    rig = open_source(walk_folder).rig
+    assert rig.imu is not None
+    late = replace(rig, imu=replace(rig.imu, time_offset_s=1e-3 * offset_ms))
+    clean, done = outcome(walk_folder, events), outcome(walk_folder, shifted, rig=late)
+    assert len(done.estimates) == clean.given
+    for one, other in zip(clean.estimates, done.estimates, strict=True):
+        assert one.nav_T_body is not None
+        assert other.nav_T_body is not None
+        np.testing.assert_allclose(one.nav_T_body, other.nav_T_body, atol=1e-9)
 
 
 def test_a_time_offset_that_the_rig_has_is_confirmed(walk_folder: Path, events: list[Event]) -> None:

@@ -33,7 +33,7 @@ def b(k: int) -> int:
 
 
 def r(k: int) -> int:
-    """The pose of state k as vision sees it, see `graphvio.backend.smoother.Smoother`."""
+    """The pose of state k as vision sees it, see `graphvio.backend.reference_views.ReferenceViews`."""
     return int(gtsam.symbol("r", k))
 
 

@@ -46,10 +46,6 @@ class ReferenceViews:
             self._own = motion, own_covariance(motion.covariance, np.asarray(adjoint @ self._shared[k] @ adjoint.T))
         return r(k), self._own[1]
 
-    def forget(self, k: int) -> list[int]:
-        """State k leaves the window.
-
-        Returns:
-            The unknown that must leave with it, if it has one.
-        """
-        return [] if self._shared.pop(k, None) is None else [r(k)]
+    def forget(self, k: int) -> None:
+        """State k has left the window."""
+        self._shared.pop(k, None)

@@ -7,6 +7,7 @@ is the chi-square test of a vision measurement's innovation; `accept` and `settl
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 
 import gtsam
 import numpy as np
@@ -29,7 +30,7 @@ from graphvio.backend.noise import gaussian, robust
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.reference_views import ReferenceViews
 from graphvio.backend.states import RigState, StartUncertainty, StateCovariance
-from graphvio.backend.window import Window
+from graphvio.backend.window import SOLVER_ERRORS, Window
 from graphvio.config import SmootherConfig
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
@@ -110,7 +111,7 @@ class Smoother:
         return stamp_ns in self._index_of
 
     def pose(self, stamp_ns: int) -> Float:
-        """``nav_T_body`` (4, 4) of a state in the window."""
+        """``nav_T_body`` (4, 4) of a state in the window; of one that was not kept, as when it was last solved."""
         return np.asarray(self._window.values.atPose3(x(self._index_of[stamp_ns])).matrix())
 
     def state(self) -> RigState:
@@ -150,7 +151,7 @@ class Smoother:
         )
 
     def covariance_since(self, stamp_ns: int) -> Float:
-        """Covariance (6, 6) of the motion from a state in the window to the newest one, in the newest body frame."""
+        """Covariance (6, 6) of the motion from a state that was kept to the newest one, in the newest body frame."""
         i, j = self._index_of[stamp_ns], self._index_of[self.latest_ns]
         if i == j:
             return np.zeros((6, 6))
@@ -256,8 +257,20 @@ class Smoother:
             self._previous_motion = se3_log(step) / dt
         return [] if advanced else self._forget(self.latest_ns - round(self._config.lag_s * 1e9), keep)
 
+    def solve(self) -> None:
+        """Solve the window as a whole, so that what is known now corrects every state in it.
+
+        Raises:
+            WindowError: if it cannot be solved.
+        """
+        self._window.optimise(self._followed(frozenset()))
+        self._advanced = 0
+
     def all_poses(self) -> list[tuple[int, Float]]:
-        """Stamps and poses of the window, in time order."""
+        """Stamps and poses of the window, in time order; where it can be solved, as they are by that."""
+        if self._advanced:
+            with suppress(*SOLVER_ERRORS):
+                self.solve()
         return [(stamp, self.pose(stamp)) for stamp in self._stamps]
 
     def _append(self, stamp_ns: int, state: RigState) -> int:
@@ -298,10 +311,9 @@ class Smoother:
         keys: list[int] = []
         for stamp in leaving:
             k = self._index_of[stamp]
-            keys += [x(k), v(k), b(k)] if self.has_imu else [x(k)]
-            keys += self._views.forget(k)
+            keys += [*self._views.keys(k), v(k), b(k)] if self.has_imu else self._views.keys(k)
         self._window.marginalise(keys)
         for stamp in leaving:
-            del self._index_of[stamp]
+            self._views.forget(self._index_of.pop(stamp))
         self._stamps = [stamp for stamp in self._stamps if stamp in self._index_of]
         return finished

@@ -67,12 +67,16 @@ def main(args: argparse.Namespace) -> None:
     head = ["lag, s", "ours, median ms", "p95", "p99", "gtsam's, median ms", "p95", "p99", "with covariance",
             "ours / gtsam's", "apart, mm"]  # fmt: skip
     report.table(head, [_row(lag_s, timing) for lag_s, timing in timings.items()])
-    median_ms, _, p99_ms = _percentiles(timings[Config().smoother.lag_s].ours_ms)
+    default = timings[Config().smoother.lag_s]
+    median_ms, _, p99_ms = _percentiles(default.ours_ms)
+    whole_ms = float(np.median(default.ours_ms[default.is_whole > 0.0]))
     report.table(
         ["default lag", "ms", "aim"],
         [
             ["median", f"{median_ms:.2f}", f"{AIM_MS:g}: {'met' if median_ms <= AIM_MS else 'missed'}"],
             ["99th percentile", f"{p99_ms:.2f}", f"{AIM_P99_MS:g}: {'met' if p99_ms <= AIM_P99_MS else 'missed'}"],
+            ["mean", f"{default.ours_ms.mean():.2f}", ""],
+            [f"median of the {np.mean(default.is_whole):.0%} that solve the whole window", f"{whole_ms:.2f}", ""],
         ],
     )
     median_us, _, p99_us = _percentiles(np.array(stream.prediction_us))
@@ -94,12 +98,14 @@ def main(args: argparse.Namespace) -> None:
 
 
 class _Timing(NamedTuple):
-    """Milliseconds for each counted frameset, and how far apart the two newest positions are, metres."""
+    """Milliseconds for each counted frameset, how far apart the two newest positions are, metres, and whether ours
+    solved the whole window."""
 
     ours_ms: Float
     theirs_ms: Float
     with_covariance_ms: Float
     apart_m: Float
+    is_whole: Float
 
 
 def _timed(stream: Stream, lag_s: float) -> _Timing:
@@ -119,7 +125,8 @@ def _timed(stream: Stream, lag_s: float) -> _Timing:
         references = [index_of[ns] for ns in keep if ns in index_of]
         spent_s, covariance_s, position = theirs.step(stamp_ns, index_of[stamp_ns], references, log.take())
         apart_m = np.linalg.norm(position - belief.state().nav_T_body[:3, 3])
-        rows.append([1e3 * ours_s, 1e3 * spent_s, 1e3 * (spent_s + covariance_s), apart_m])
+        is_whole = belief._running._advanced == 0
+        rows.append([1e3 * ours_s, 1e3 * spent_s, 1e3 * (spent_s + covariance_s), apart_m, is_whole])
     return _Timing(*np.array(rows[_WARM_UP:]).T)
 
 

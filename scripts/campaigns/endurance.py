@@ -33,7 +33,7 @@ _PARTS = 6
 _CORNERS_M = np.array([[2.6, 2.1, 1.45], [-2.6, 2.1, 1.45], [-2.6, -2.1, 1.45], [2.6, -2.1, 1.45]])
 _SPEED_M_S = 1.05
 _SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of vision: rad and metres from frame to frame
-_HEAD = ("minutes", "median ms", "99th percentile", "memory, MB", "variables", "gated", "position, m, sigma",
+_HEAD = ("minutes", "median ms", "99th percentile", "memory, MB", "variables", "incidents", "position, m, sigma",
          "tilt, deg", "sigma", "gyro bias, mrad/s", "sigma")  # fmt: skip
 
 
@@ -72,8 +72,8 @@ def _parts(duration_s: float) -> list[list[str]]:
     framesets = round(duration_s * FRAMES_HZ)
     stamps = [round(k * 1e9 / FRAMES_HZ) for k in range(framesets + 1)]
     states = motion.at(np.array(stamps) * 1e-9)
-    gated: list[int] = []
-    belief = SmootherBelief(rig, Config(), lambda ns, *_: gated.append(ns), lambda: None)
+    incidents: list[int] = []
+    belief = SmootherBelief(rig, Config(), lambda ns, *_: incidents.append(ns), lambda: None)
     buffer, added = ImuBuffer(50.0), 0
     spent_ms: list[float] = []
     rows = []
@@ -103,7 +103,7 @@ def _parts(duration_s: float) -> list[list[str]]:
                     f"{np.percentile(spent_ms, 99):.2f}",
                     f"{_memory_mb():.0f}",
                     str(belief._running._window.values.size()),
-                    str(len(gated)),
+                    str(len(incidents)),
                     *_errors(belief, states.world_T_body[k], track.gyro_bias[round(k * imu.rate_hz / FRAMES_HZ)]),
                 ]
             )

@@ -102,6 +102,7 @@ class _Run:
         belief = self._odometry._belief
         assert isinstance(belief, SmootherBelief)
         then_ns = estimate.stamp_ns - seconds * 1_000_000_000
+        belief._running.solve()  # that state was not kept
         now_T_then = belief.motion_since(then_ns)
         if now_T_then is None:
             return
