@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import takewhile
 
 import gtsam
@@ -88,7 +88,7 @@ class Marginal:
                 block[:, columns[key]] = jacobian[:, start : start + dims[key]]
                 start += dims[key]
         triangle = lapack.dgeqrf(rows)[0]
-        return Marginal(columns, np.triu(triangle[:size, :size]), triangle[:size, size])
+        return Marginal(columns, triangle[:size, :size] * _upper(size), triangle[:size, size])
 
     @cached_property
     def _inverse(self) -> Float | None:
@@ -123,6 +123,12 @@ def marginal_of_last(
             right_side[at : at + width] = conditional.d()[-width:]
             at += width
     return Marginal(columns, square_root, right_side)
+
+
+@cache
+def _upper(size: int) -> Float:
+    """Ones on and above the diagonal (size, size); `numpy.triu` would make them each time."""
+    return np.triu(np.ones((size, size)))
 
 
 def _columns(keys: Iterable[int], dims: Mapping[int, int]) -> tuple[dict[int, slice], int]:

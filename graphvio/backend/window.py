@@ -42,6 +42,7 @@ class Window:
         self._free: list[int] = []  # slots
         self._marginal: Marginal | None = None  # of the variables that were eliminated last, and some added since
         self._unknown: list[int] = []  # slots of the factors that it does not know
+        self._settled: frozenset[int] = frozenset()  # variables of all other factors
         self._cholesky_suffices = True
         self._dims: dict[int, int] = {}  # of variables; to ask gtsam is slow
 
@@ -98,7 +99,7 @@ class Window:
         for key, at in marginal.columns.items():
             delta.insert(key, step[at])
         self.values = self.values.retract(delta)
-        self._marginal, self._unknown = marginal.of_last(followed).settled(), []
+        self._take(marginal.of_last(followed).settled())
         return True
 
     def joint_covariance(self, keys: Sequence[int]) -> Float:
@@ -111,7 +112,7 @@ class Window:
         if unknown:
             raise WindowError(f"the window has no variable {_named(unknown[:1])}")
         if self._unknown:
-            self._marginal, self._unknown = self._extended_marginal(), []
+            self._take(self._extended_marginal())
         if self._marginal is None or not self._marginal.columns.keys() >= set(keys):
             self._solve(keys)
         covariance = None if self._marginal is None else self._marginal.covariance(keys)
@@ -140,7 +141,7 @@ class Window:
         except RuntimeError as error:
             raise WindowError(f"a state cannot be marginalised: {_one_line(error)}") from None
         if self._unknown or (self._marginal is not None and self._marginal.columns.keys() & leaving):
-            self._marginal, self._unknown = None, []  # else it still tells the covariances of those that stay
+            self._take(None)  # else it still tells the covariances of those that stay
         for slot in slots:
             self._graph.remove(slot)
             del self._involved[slot]
@@ -151,6 +152,7 @@ class Window:
                 self._insert(gtsam.LinearContainerFactor(marginal, self.values))
         for key in leaving:
             self.values.erase(key)
+        self._settled -= leaving
 
     def _insert(self, factor: gtsam.NonlinearFactor) -> int:
         """Put a factor into a free slot of the graph, and tell which."""
@@ -175,7 +177,7 @@ class Window:
             solution = self._eliminated(self._graph.linearize(self.values), ordering)
         except RuntimeError as error:
             raise WindowError(f"the window has no unique solution: {_one_line(error)}") from None
-        self._marginal, self._unknown = marginal_of_last(solution, last, self._known_dims()), []
+        self._take(marginal_of_last(solution, last, self._known_dims(last)))
         return solution
 
     def _eliminated(self, graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.GaussianBayesTree:
@@ -194,16 +196,20 @@ class Window:
         if self._marginal is None:
             return None
         followed = self._marginal.columns.keys()
-        settled = frozenset().union(*(keys for slot, keys in self._involved.items() if slot not in self._unknown))
         touched = frozenset().union(*(self._involved[slot] for slot in self._unknown))
-        if touched & settled - followed or not followed | touched >= set(last):
+        if touched & self._settled - followed or not followed | touched >= set(last):
             return None
         linear = [self._graph.at(slot).linearize(self.values) for slot in self._unknown]
-        return self._marginal.extended(linear, last, self._known_dims())
+        return self._marginal.extended(linear, last, self._known_dims(followed | touched))
 
-    def _known_dims(self) -> dict[int, int]:
-        """The dimensions of all variables, and of some that were there before."""
-        if not all(map(self._dims.__contains__, self.values.keys())):
+    def _take(self, marginal: Marginal | None) -> None:
+        """Keep a marginal that knows of all factors."""
+        self._settled |= frozenset().union(*(self._involved[slot] for slot in self._unknown))
+        self._marginal, self._unknown = marginal, []
+
+    def _known_dims(self, keys: Iterable[int]) -> dict[int, int]:
+        """Dimensions, of these variables among others."""
+        if not all(map(self._dims.__contains__, keys)):
             self._dims = self.values.dims()
         return self._dims
 
