@@ -30,3 +30,7 @@ class MissingExtraError(GraphvioError):
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         super().__init__(f"{purpose} needs {package}: install it with  pip install 'graphvio[{extra}]'")
+
+
+class CalibrationError(GraphvioError):
+    """Motions from which the cameras' places on the rig cannot be found."""

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from time import perf_counter
 
 import cv2
 import numpy as np
@@ -47,7 +46,6 @@ class Outcome:
         motions: motions by vision that the odometry used and whose truth is known.
         breaks: how many of them are off by more than 5 sigma of their own covariance.
         refused: motions of the front-end that the odometry did not use.
-        frameset_ms: median time of a frameset.
     """
 
     estimate: Trajectory
@@ -59,7 +57,6 @@ class Outcome:
     motions: int
     breaks: int
     refused: int
-    frameset_ms: float
 
     @property
     def ate_m(self) -> float:
@@ -89,7 +86,7 @@ class Outcome:
         """The cells of `HEAD`."""
         done = f"{100 * len(self.estimate) / max(self.framesets, 1):.0f}"
         epochs = f"{len(np.unique(self.epochs))}"
-        breaks = [f"{self.breaks} / {self.motions}", f"{self.refused}", done, epochs, f"{self.frameset_ms:.1f}"]
+        breaks = [f"{self.breaks} / {self.motions}", f"{self.refused}", done, epochs]
         if self.evaluation is None:
             return ["-", "-", "-", "-", *breaks]
         rpe = next((self.evaluation.rpe[d] for d in _RPE_METRES if d in self.evaluation.rpe), None)
@@ -111,7 +108,6 @@ HEAD = (
     "refused",
     "poses, %",
     "epochs",
-    "ms a frameset",
 )
 
 
@@ -139,20 +135,14 @@ def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, n
     odometry = Odometry(source.rig, config)
     overheard = overhear(odometry)
     estimates: list[Estimate] = []
-    frameset_ms: list[float] = []
     for block in blocks(iter(source), _BLOCK):
-        spent_s = 0.0
         for event in _altered(block, alter):
-            begin = perf_counter()
             estimate = odometry.process(event)
-            spent_s += perf_counter() - begin
             if estimate is not None:
                 estimates.append(estimate)
-                frameset_ms.append(1e3 * spent_s)
-                spent_s = 0.0
     estimates += odometry.finish()
     cv2.setNumThreads(-1)
-    return _judge(estimates, overheard, truth, noise, frameset_ms)
+    return _judge(estimates, overheard, truth, noise)
 
 
 def _altered(block: list[Event], alter: Alter | None) -> list[Event]:
@@ -161,13 +151,7 @@ def _altered(block: list[Event], alter: Alter | None) -> list[Event]:
     return [alter(event) if isinstance(event, FrameSet) else event for event in block]
 
 
-def _judge(
-    estimates: list[Estimate],
-    overheard: Overheard,
-    truth: Trajectory,
-    noise: TruthNoise,
-    frameset_ms: list[float],
-) -> Outcome:
+def _judge(estimates: list[Estimate], overheard: Overheard, truth: Trajectory, noise: TruthNoise) -> Outcome:
     posed = [e for e in estimates if e.nav_T_body is not None]
     stamps_ns = np.array([e.stamp_ns for e in posed], dtype=np.int64)
     estimate = Trajectory(stamps_ns, np.array([e.nav_T_body for e in posed]).reshape(-1, 4, 4))
@@ -187,7 +171,6 @@ def _judge(
         motions=len(statistics),
         breaks=int(np.sum(statistics > BREAK_STATISTIC)),
         refused=returned - len(overheard.used),
-        frameset_ms=float(np.median(frameset_ms)) if frameset_ms else np.nan,
     )
 
 

@@ -1,0 +1,82 @@
+"""The paper's method against the graph: do they differ by more than they may?
+
+Both are functions of the same noisy motions, so their errors have much in common: the covariance of their difference
+is found from what each pose pair's noise does to both of them, to first order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphvio.arrays import Float
+from graphvio.calibration.consistency import error_covariance, error_of
+from graphvio.calibration.graph import GraphSolution
+from graphvio.calibration.paper_method import PaperSolution, PoseParts, jacobians
+from graphvio.calibration.pose_pairs import PosePairs
+from graphvio.geometry import se3_adjoint, se3_inverse, se3_log, skew
+
+_CHANCE = 1e-3  # that honest solutions are called different
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two solutions of one calibration.
+
+    Attributes:
+        difference: (6,) tangent from the graph's solution to the paper's, ``[rotation, translation]`` in left1.
+        covariance: (6, 6) that the difference has where only the told noise makes it.
+        paper_covariance: (6, 6) of the paper's solution, which does not weigh the motions, by the same noise.
+    """
+
+    difference: Float
+    covariance: Float
+    paper_covariance: Float
+
+    @property
+    def statistic(self) -> float:
+        """Squared Mahalanobis distance between the two, 6 degrees of freedom."""
+        return float(self.difference @ np.linalg.pinv(self.covariance, hermitian=True) @ self.difference)
+
+    @property
+    def agrees(self) -> bool:
+        """Whether chance explains the difference."""
+        return self.statistic <= float(chi2.isf(_CHANCE, 6))
+
+
+def compare(pairs: PosePairs, paper: PaperSolution, graph: GraphSolution) -> Comparison:
+    """The two solutions for the same N pose pairs."""
+    by_paper = _influence_on_paper(pairs, paper)
+    by_graph = _influence_on_graph(pairs, graph)
+    noise = np.concatenate([pairs.covariance_1, pairs.covariance_2])
+    apart = by_paper - by_graph
+    return Comparison(
+        se3_log(se3_inverse(graph.left2_T_left1) @ np.ascontiguousarray(paper.left2_T_left1)),
+        np.einsum("nij,njk,nlk->il", apart, noise, apart),
+        np.einsum("nij,njk,nlk->il", by_paper, noise, by_paper),
+    )
+
+
+def _influence_on_paper(pairs: PosePairs, paper: PaperSolution) -> Float:
+    """Derivatives (2 N, 6, 6) of the solution by the errors of all first motions, and of all second ones."""
+    R = paper.left2_T_left1[:3, :3]
+    t = -R.T @ paper.left2_T_left1[:3, 3]
+    J = jacobians(PoseParts.of(pairs), R) * paper.inlier[:, None, None]
+    in_tangent = np.block([[np.zeros((3, 3)), 2.0 * R.T], [-np.eye(3), 2.0 * skew(t) @ R.T]])
+    gains = -in_tangent @ np.linalg.pinv(np.einsum("nki,nkj->ij", J, J), hermitian=True) @ np.swapaxes(J, 1, 2)
+    of_1 = pairs.motion_1[:, :3, :3] @ np.hstack([-skew(t), np.eye(3)])
+    of_2 = np.concatenate([np.zeros((len(pairs), 3, 3)), -R.T @ pairs.motion_2[:, :3, :3]], axis=2)
+    return np.concatenate([gains @ of_1, gains @ of_2])
+
+
+def _influence_on_graph(pairs: PosePairs, graph: GraphSolution) -> Float:
+    """The same for the graph's solution."""
+    pose = graph.left2_T_left1
+    gains = np.zeros((len(pairs), 6, 6))
+    for k in np.flatnonzero(graph.inlier):
+        _, jacobian = error_of(pose, pairs.motion_1[k], pairs.motion_2[k])
+        covariance = error_covariance(pose, pairs.covariance_1[k], pairs.covariance_2[k])
+        gains[k] = -graph.covariance @ np.linalg.solve(covariance, jacobian).T
+    return np.concatenate([gains @ se3_adjoint(pose), -gains])

@@ -1,0 +1,112 @@
+"""How well motions of two cameras fit a relative pose: errors, derivatives, outliers.
+
+A motion of the first camera, seen from the second, is ``left2_T_left1 motion_1 left1_T_left2``; it must be motion_2
+(section 4, eq. 1). Errors are weighed by the covariances of both motions.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphvio.arrays import Bool, Float
+from graphvio.calibration.pose_pairs import PosePairs
+from graphvio.copying import put
+from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log, se3_right_jacobian_inverse
+from graphvio.kernels import kernel
+
+_PROBABILITY = 0.999  # of an honest pose pair, to be within what is no outlier
+LIMIT = float(chi2.ppf(_PROBABILITY, 6))
+_MOST_ROUNDS = 100
+_STEPS_A_ROUND = 2
+_SHARPENING = 1.4  # of the cost from round to round, towards truncated least squares
+_CERTAIN = 1e-3  # weights this near to 0 or 1 are that
+_SETTLED = 1e-12
+
+
+def without_outliers(pairs: PosePairs, start: Float) -> tuple[Float, Bool]:
+    """The relative pose by truncated least squares, from a start that may be off, by graduated non-convexity.
+
+    H. Yang, P. Antonante, V. Tzoumas, L. Carlone, *Graduated Non-Convexity for Robust Spatial Perception: From
+    Non-Minimal Solvers to Global Outlier Rejection*, IEEE RA-L 5(2), 2020.
+
+    Returns:
+        ``left2_T_left1`` (4, 4), and the pose pairs (N,) that are no outliers.
+    """
+    left2_T_left1, squares = _solved(pairs, start, np.ones(len(pairs)), _MOST_ROUNDS)
+    sharpness = 1.0 / max(2.0 * squares.max() / LIMIT - 1.0, 1.0)
+    for _ in range(_MOST_ROUNDS):
+        weights = _weights(squares, sharpness)
+        left2_T_left1, squares = _solved(pairs, left2_T_left1, weights, _STEPS_A_ROUND)
+        if np.all((weights < _CERTAIN) | (weights > 1.0 - _CERTAIN)):
+            break
+        sharpness *= _SHARPENING
+    left2_T_left1, squares = _solved(pairs, left2_T_left1, (squares <= LIMIT).astype(np.float64), _MOST_ROUNDS)
+    return left2_T_left1, squares <= LIMIT
+
+
+def squared_distances(pairs: PosePairs, left2_T_left1: Float) -> Float:
+    """Squared Mahalanobis distances (N,) of the pose pairs' errors, 6 degrees of freedom each."""
+    errors, _ = whitened(pairs, left2_T_left1)
+    return np.asarray(np.sum(errors**2, axis=1))
+
+
+def information(pairs: PosePairs, left2_T_left1: Float) -> Float:
+    """What pose pairs tell of ``left2_T_left1`` (6, 6), tangent in left1."""
+    _, jacobians = whitened(pairs, left2_T_left1)
+    return np.asarray(np.einsum("nki,nkj->ij", jacobians, jacobians))
+
+
+def whitened(pairs: PosePairs, left2_T_left1: Float) -> tuple[Float, Float]:
+    """Errors (N, 6) of unit covariance, and derivatives (N, 6, 6) by the tangent of ``left2_T_left1`` in left1."""
+    return _whitened(left2_T_left1, pairs.motion_1, pairs.covariance_1, pairs.motion_2, pairs.covariance_2)
+
+
+@kernel
+def error_of(left2_T_left1: Float, motion_1: Float, motion_2: Float) -> tuple[Float, Float]:
+    """Error (6,) of a pose pair in left2 at the motion's end, and its derivative (6, 6)."""
+    seen = left2_T_left1 @ motion_1 @ se3_inverse(left2_T_left1)
+    error = se3_log(se3_inverse(motion_2) @ seen)
+    by_tangent = se3_adjoint(left2_T_left1) @ (se3_adjoint(se3_inverse(motion_1)) - np.eye(6))
+    return error, se3_right_jacobian_inverse(error) @ by_tangent
+
+
+@kernel
+def error_covariance(left2_T_left1: Float, covariance_1: Float, covariance_2: Float) -> Float:
+    """Covariance (6, 6) of a pose pair's error, from both motions'."""
+    adjoint = se3_adjoint(left2_T_left1)
+    return covariance_2 + adjoint @ covariance_1 @ adjoint.T
+
+
+def _solved(pairs: PosePairs, left2_T_left1: Float, weights: Float, most_steps: int) -> tuple[Float, Float]:
+    """Gauss-Newton with weighted pose pairs, and their squared distances at the solution."""
+    for _ in range(most_steps):
+        errors, jacobians = whitened(pairs, left2_T_left1)
+        normal = np.einsum("n,nki,nkj->ij", weights, jacobians, jacobians)
+        gradient = np.einsum("n,nki,nk->i", weights, jacobians, errors)
+        step = -np.linalg.lstsq(normal, gradient, rcond=1e-14)[0]
+        left2_T_left1 = left2_T_left1 @ se3_exp(step)
+        if np.abs(step).max() < _SETTLED:
+            break
+    return left2_T_left1, squared_distances(pairs, left2_T_left1)
+
+
+def _weights(squares: Float, sharpness: float) -> Float:
+    """Eq. (14) of the paper on graduated non-convexity."""
+    low, high = (LIMIT * bound for bound in (sharpness / (sharpness + 1.0), (sharpness + 1.0) / sharpness))
+    between = np.sqrt(LIMIT * sharpness * (sharpness + 1.0) / np.maximum(squares, low)) - sharpness
+    return np.where(squares <= low, 1.0, np.where(squares >= high, 0.0, between))
+
+
+@kernel
+def _whitened(
+    left2_T_left1: Float, motion_1: Float, covariance_1: Float, motion_2: Float, covariance_2: Float
+) -> tuple[Float, Float]:
+    n = len(motion_1)
+    errors, jacobians = np.empty((n, 6)), np.empty((n, 6, 6))
+    for i in range(n):
+        error, jacobian = error_of(left2_T_left1, motion_1[i], motion_2[i])
+        root = np.linalg.cholesky(error_covariance(left2_T_left1, covariance_1[i], covariance_2[i]))
+        put(errors[i], np.linalg.solve(root, error))
+        put(jacobians[i], np.linalg.solve(root, jacobian))
+    return errors, jacobians

@@ -1,0 +1,230 @@
+"""The paper's calibration of P_12 (section 4), step by step.
+
+``P_12 P_1(k) = P_2(k) P_12`` gives eq. (5) for the rotation and eq. (6) for the translation. RANSAC over minimal sets
+of three pose pairs finds the rotation as an eigenvector, eq. (8) and (9), then the translation by least squares, eq.
+(10); Levenberg-Marquardt minimises the alignment error, eq. (7), on the inliers.
+
+``R_1, T_1`` and ``R_2, T_2`` are the paper's: ``P_j(k)`` maps points from the start to the end of a motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphvio.arrays import Bool, Float, Int
+from graphvio.calibration.pose_pairs import FEWEST, PosePairs, inverses
+from graphvio.errors import CalibrationError
+from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3, skew, so3_exp
+
+_TRIPLES = 500
+_LIKELY = 10  # of the best triples, which are refined before one is chosen
+_LIMIT = float(chi2.isf(1e-3, 3))
+_TRIPLE_LIMIT = 9.0 * _LIMIT  # a solution from three pose pairs is off by itself
+_LEAST_TURN, _MOST_TURN = np.deg2rad([0.2, 170.0])  # of a pose pair in a triple: both signs of q fit a half turn
+_ROUNDS = 5
+_ITERATIONS = 50
+_FIRST_DAMPING, _STIFFER, _LOOSER = 1e-6, 10.0, 0.1
+_SMALLEST_STEP = 1e-14
+_TINY = 1e-12
+
+
+class PoseParts(NamedTuple):
+    """The paper's ``P_1(k)`` and ``P_2(k)``: rotations (N, 3, 3) and translations (N, 3), metres."""
+
+    R_1: Float
+    T_1: Float
+    R_2: Float
+    T_2: Float
+
+    @staticmethod
+    def of(pairs: PosePairs) -> PoseParts:
+        """Of N pose pairs."""
+        P_1, P_2 = inverses(pairs.motion_1), inverses(pairs.motion_2)
+        return PoseParts(P_1[:, :3, :3], P_1[:, :3, 3], P_2[:, :3, :3], P_2[:, :3, 3])
+
+    def chosen(self, rows: Bool | Int) -> PoseParts:
+        """Some of them."""
+        return PoseParts(*(part[rows] for part in self))
+
+
+@dataclass(frozen=True, eq=False)
+class PaperSolution:
+    """What the paper's method finds.
+
+    Attributes:
+        left2_T_left1: (4, 4), the paper's P_12.
+        inlier: (N,) pose pairs that it was refined on.
+        errors_m: (N, 3) alignment errors, eq. (7), of all pose pairs.
+    """
+
+    left2_T_left1: Float
+    inlier: Bool
+    errors_m: Float
+
+
+def calibrate(pairs: PosePairs, seed: int = 0) -> PaperSolution:
+    """RANSAC, then Levenberg-Marquardt on the inliers.
+
+    Args:
+        pairs: N pose pairs.
+        seed: of the random triples.
+
+    Raises:
+        CalibrationError: with fewer than three pose pairs, without rotation, or if no solution explains three of them.
+    """
+    if len(pairs) < FEWEST:
+        raise CalibrationError(f"calibration needs {FEWEST} pose pairs and has {len(pairs)}; record for longer")
+    weighed = _Weighed(pairs)
+    best = _best_triples(weighed, np.random.default_rng(seed))
+    _, R, t = min((_refined_on_inliers(weighed, R, t) for R, t in best), key=lambda found: found[0])
+    parts, inlier = weighed.parts, weighed.distances(R, t) < _LIMIT
+    if inlier.sum() < FEWEST:
+        raise CalibrationError(
+            f"the best relative pose of the cameras explains {inlier.sum()} of {len(pairs)} motions; are they on one "
+            "rig, and are their clocks the same?"
+        )
+    R, t = refine(parts.chosen(inlier), R, t)
+    return PaperSolution(se3(R, -R @ t), inlier, alignment_errors(parts, R, t))
+
+
+def rotation(R_1: Float, R_2: Float) -> tuple[Float, Float]:
+    """R(q) from rotations (N, 3, 3), eq. (8) and (9).
+
+    Returns:
+        R(q) (3, 3), and the eigenvalues (4,) of ``C^T C`` in ascending order; the second is zero where the rotations do
+        not determine q.
+    """
+    eigenvalues, vectors = np.linalg.eigh(_normal_matrices(R_1, R_2).sum(axis=0))
+    return rotation_from_quat_wxyz(np.ascontiguousarray(vectors[:, 0])), eigenvalues
+
+
+def translation(R: Float, parts: PoseParts) -> Float:
+    """T (3,) by least squares, eq. (10); the shortest where several serve as well."""
+    A = (np.eye(3) - parts.R_2).reshape(-1, 3)
+    b = (parts.T_2 - parts.T_1 @ R.T).ravel()  # eq. (10) has A T plus R T_1 - T_2: the paper's b lacks a sign
+    return np.asarray(np.linalg.lstsq(A, b, rcond=1e-9)[0])
+
+
+def alignment_errors(parts: PoseParts, R: Float, t: Float) -> Float:
+    """Eq. (7), (N, 3) metres: how far apart the two cameras' motions put the second camera's centre, in the frame of
+    the first camera at the start; ``t = -R^T T`` is that centre in the first camera's frame."""
+    by_2 = np.einsum("ji,nkj,nk->ni", R, parts.R_2, parts.T_2)
+    by_1 = np.einsum("nji,nj->ni", parts.R_1, t - parts.T_1)
+    return np.asarray(by_2 + by_1 - t)
+
+
+def jacobians(parts: PoseParts, R: Float) -> Float:
+    """Derivatives (N, 3, 6) of the alignment errors by ``[dt, dq]``; dq is half a rotation vector, from the left."""
+    made = np.empty((len(parts.R_1), 3, 6))
+    made[:, :, :3] = np.swapaxes(parts.R_1, 1, 2) - np.eye(3)
+    moved = np.einsum("nji,nj->ni", parts.R_2, parts.T_2)
+    made[:, :, 3:] = 2.0 * np.einsum("ji,njk->nik", R, _crosses(moved))
+    return made
+
+
+def refine(parts: PoseParts, R: Float, t: Float) -> tuple[Float, Float]:
+    """Levenberg-Marquardt on the sum of squared alignment errors, from R (3, 3) and t (3,)."""
+    damping = _FIRST_DAMPING
+    errors = alignment_errors(parts, R, t)
+    cost = float(np.sum(errors**2))
+    for _ in range(_ITERATIONS):
+        J = jacobians(parts, R).reshape(-1, 6)
+        normal, gradient = J.T @ J, J.T @ errors.ravel()
+        damped = normal + damping * np.diag(normal.diagonal() + _TINY * normal.trace())
+        step = -np.linalg.lstsq(damped, gradient, rcond=1e-15)[0]
+        next_R, next_t = so3_exp(np.asarray(2.0 * step[3:], dtype=np.float64)) @ R, t + step[:3]
+        next_errors = alignment_errors(parts, next_R, next_t)
+        next_cost = float(np.sum(next_errors**2))
+        if next_cost <= cost:
+            R, t, errors, cost = next_R, next_t, next_errors, next_cost
+            damping *= _LOOSER
+        else:
+            damping *= _STIFFER
+        if np.abs(step).max() < _SMALLEST_STEP:
+            break
+    return R, t
+
+
+class _Weighed:
+    """Pose pairs whose alignment errors are weighed by what the motions' covariances make of them."""
+
+    def __init__(self, pairs: PosePairs) -> None:
+        self.parts = PoseParts.of(pairs)
+        self.turns = np.linalg.norm(pairs.rotations_rad, axis=1)
+        self._R_1, self._covariance_1 = pairs.motion_1[:, :3, :3], pairs.covariance_1
+        R_2 = pairs.motion_2[:, :3, :3]
+        self._covariance_2 = R_2 @ pairs.covariance_2[:, 3:, 3:] @ np.swapaxes(R_2, 1, 2)
+
+    def distances(self, R: Float, t: Float) -> Float:
+        """Squared Mahalanobis distances (N,) of the alignment errors from zero."""
+        errors = alignment_errors(self.parts, R, t)
+        by_1 = self._R_1 @ np.hstack([-skew(t), np.eye(3)])
+        covariances = by_1 @ self._covariance_1 @ np.swapaxes(by_1, 1, 2) + R.T @ self._covariance_2 @ R
+        return np.asarray(np.einsum("ni,ni->n", errors, np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]))
+
+
+def _best_triples(weighed: _Weighed, rng: np.random.Generator) -> list[tuple[Float, Float]]:
+    """Rotations and t of the triples that explain most, the best first."""
+    parts, turns = weighed.parts, weighed.turns
+    normals, factors = _normal_matrices(parts.R_1, parts.R_2), np.eye(3) - parts.R_2
+    fit = np.flatnonzero((turns > _LEAST_TURN) & (turns < _MOST_TURN))
+    if len(fit) < FEWEST:
+        raise CalibrationError(
+            f"{len(fit)} of {len(turns)} motions turn by more than {np.rad2deg(_LEAST_TURN):g} degrees, and {FEWEST} "
+            "are needed: without rotation nothing tells where the cameras are on the rig; turn it about two axes"
+        )
+    triples = rng.permuted(np.broadcast_to(fit, (_TRIPLES, len(fit))), axis=1)[:, :FEWEST]
+    _, vectors = np.linalg.eigh(normals[triples].sum(axis=1))
+    scored = []
+    for triple, q in zip(triples, vectors[:, :, 0], strict=True):
+        R = rotation_from_quat_wxyz(np.ascontiguousarray(q))
+        A = factors[triple].reshape(-1, 3)
+        b = (parts.T_2[triple] - parts.T_1[triple] @ R.T).ravel()
+        t = -R.T @ np.linalg.lstsq(A, b, rcond=1e-6)[0]
+        cost = np.minimum(weighed.distances(R, t), _TRIPLE_LIMIT).sum()
+        scored.append((float(cost), R, t))
+    scored.sort(key=lambda each: each[0])
+    return [(R, t) for _, R, t in scored[:_LIKELY]]
+
+
+def _refined_on_inliers(weighed: _Weighed, R: Float, t: Float) -> tuple[float, Float, Float]:
+    """Inliers and solution in turns, until the inliers stay the same; with the cost that solutions are chosen by."""
+    before = None
+    for number in range(_ROUNDS):
+        inlier = weighed.distances(R, t) < (_TRIPLE_LIMIT if number == 0 else _LIMIT)
+        if inlier.sum() < FEWEST or (before is not None and np.array_equal(inlier, before)):
+            break
+        chosen, before = weighed.parts.chosen(inlier), inlier
+        start, _ = rotation(chosen.R_1, chosen.R_2)
+        R, t = refine(chosen, *((start, -start.T @ translation(start, chosen)) if number == 0 else (R, t)))
+    return float(np.minimum(weighed.distances(R, t), _LIMIT).sum()), R, t
+
+
+def _normal_matrices(R_1: Float, R_2: Float) -> Float:
+    """``C_k^T C_k`` (N, 4, 4) of eq. (9); with Hamilton's product eq. (5) reads ``q q_1 = q_2 q``.
+
+    Quaternions with a positive real part have signs that agree, as both rotations turn by the same angle.
+    """
+    q_1, q_2 = (np.array([quat_wxyz_from_rotation(np.ascontiguousarray(R)) for R in each]) for each in (R_1, R_2))
+    C = _product_matrices(q_1, -1.0) - _product_matrices(q_2, 1.0)
+    return np.asarray(np.swapaxes(C, 1, 2) @ C)
+
+
+def _product_matrices(quats_wxyz: Float, sign: float) -> Float:
+    """Matrices (N, 4, 4) of the product with quaternions from the left (sign 1) or from the right (sign -1)."""
+    made = np.empty((len(quats_wxyz), 4, 4))
+    w, v = quats_wxyz[:, 0], quats_wxyz[:, 1:]
+    made[:, 0, 0], made[:, 0, 1:], made[:, 1:, 0] = w, -v, v
+    made[:, 1:, 1:] = w[:, None, None] * np.eye(3) + sign * _crosses(v)
+    return made
+
+
+def _crosses(vectors: Float) -> Float:
+    """Matrices (N, 3, 3) of the cross products with vectors (N, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros(len(vectors))
+    return np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)

@@ -1,0 +1,86 @@
+"""Motions that two rigidly joined cameras made at the same time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float, Int
+from graphvio.errors import CalibrationError
+from graphvio.geometry import se3_inverse, se3_log
+
+FEWEST = 3
+"""Pose pairs from which the paper's method can start."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosePairs:
+    """Pose pairs ``(P_1, P_2)`` of section 4, as motions of the cameras.
+
+    A motion is the pose of the left camera at the end in its frame at the start, the inverse of the paper's
+    ``P_j(t_k, t_k+1)``, which maps points.
+
+    Attributes:
+        start_ns: (N,) int64.
+        end_ns: (N,) int64.
+        motion_1: (N, 4, 4) of the first pair's left camera.
+        covariance_1: (N, 6, 6) of it, tangent ``[rotation, translation]`` in the frame at its end.
+        motion_2: (N, 4, 4) of the other pair's left camera.
+        covariance_2: (N, 6, 6) of it.
+
+    Raises:
+        CalibrationError: if the shapes disagree, or a value is not finite.
+    """
+
+    start_ns: Int
+    end_ns: Int
+    motion_1: Float
+    covariance_1: Float
+    motion_2: Float
+    covariance_2: Float
+
+    def __post_init__(self) -> None:
+        count = len(self.start_ns)
+        shapes = {
+            "end_ns": (count,),
+            "motion_1": (count, 4, 4),
+            "covariance_1": (count, 6, 6),
+            "motion_2": (count, 4, 4),
+            "covariance_2": (count, 6, 6),
+        }
+        for name, shape in shapes.items():
+            values = getattr(self, name)
+            if values.shape != shape:
+                raise CalibrationError(f"pose pairs: {name} is {values.shape} for {count} pairs; it must be {shape}")
+            bad = np.flatnonzero(~np.isfinite(values).reshape(count, -1).all(axis=1))
+            if len(bad):
+                raise CalibrationError(f"pose pairs: {name} of pair {bad[0]} holds NaN or infinity; leave it out")
+
+    def __len__(self) -> int:
+        return len(self.start_ns)
+
+    def chosen(self, rows: Bool | Int) -> PosePairs:
+        """Some of them."""
+        return PosePairs(
+            self.start_ns[rows],
+            self.end_ns[rows],
+            self.motion_1[rows],
+            self.covariance_1[rows],
+            self.motion_2[rows],
+            self.covariance_2[rows],
+        )
+
+    def swapped(self) -> PosePairs:
+        """With the two cameras' parts exchanged."""
+        return PosePairs(self.start_ns, self.end_ns, self.motion_2, self.covariance_2, self.motion_1, self.covariance_1)
+
+    @property
+    def rotations_rad(self) -> Float:
+        """(N, 3) rotation vectors of the first camera, in its frame at the start (and at the end)."""
+        return np.array([se3_log(motion)[:3] for motion in self.motion_1]).reshape(-1, 3)
+
+
+def inverses(poses: Float) -> Float:
+    """Inverses (N, 4, 4) of poses (N, 4, 4)."""
+    return np.array([se3_inverse(pose) for pose in poses]).reshape(-1, 4, 4)

@@ -1,0 +1,107 @@
+"""Pose pairs of two cameras on one rig, and an independent closed form for their relative pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float
+from graphvio.calibration.pose_pairs import PosePairs
+from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3, se3_exp, se3_inverse
+
+PERIOD_NS = 50_000_000
+LEFT2_T_LEFT1 = se3_exp(np.array([0.05, 3.0, 0.1, 0.3345, 0.0667, -0.1138]))  # back to back, as the paper's
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Pose pairs and which of them are outliers (N,)."""
+
+    pairs: PosePairs
+    outlier: Bool
+
+
+def drawn(
+    count: int,
+    rng: np.random.Generator,
+    rotation_sigma: float = 0.0,
+    translation_sigma_m: float = 0.0,
+    outlier_share: float = 0.0,
+    left2_T_left1: Float = LEFT2_T_LEFT1,
+    turns: tuple[float, float, float] = (0.1, 0.1, 0.1),
+    steps: tuple[float, float, float] = (0.05, 0.05, 0.05),
+) -> Drawn:
+    """Random motions, of which both cameras see their part.
+
+    Args:
+        count: number of pose pairs.
+        rng: source of motions and errors.
+        rotation_sigma: of each motion's rotation, rad.
+        translation_sigma_m: of its translation.
+        outlier_share: of pose pairs whose second motion has nothing to do with the first.
+        left2_T_left1: (4, 4).
+        turns: standard deviations of the first camera's rotation about its axes, rad.
+        steps: of its translation along its axes, metres.
+    """
+    spread = np.array([*turns, *steps])
+    sigmas = np.repeat([max(rotation_sigma, 1e-4), max(translation_sigma_m, 1e-4)], 3)
+    noise = np.repeat([rotation_sigma, translation_sigma_m], 3)
+    one = [se3_exp(spread * rng.standard_normal(6)) for _ in range(count)]
+    outlier = rng.random(count) < outlier_share
+    other = [
+        se3_exp(np.repeat([0.15, 0.1], 3) * rng.standard_normal(6))
+        if is_outlier
+        else left2_T_left1 @ motion @ se3_inverse(left2_T_left1)
+        for motion, is_outlier in zip(one, outlier, strict=True)
+    ]
+    motion_1, motion_2 = (
+        np.array([motion @ se3_exp(noise * rng.standard_normal(6)) for motion in motions]) for motions in (one, other)
+    )
+    covariance = np.broadcast_to(np.diag(sigmas**2), (count, 6, 6)).copy()
+    start_ns = np.arange(count) * PERIOD_NS
+    return Drawn(PosePairs(start_ns, start_ns + PERIOD_NS, motion_1, covariance, motion_2, covariance), outlier)
+
+
+def by_dual_quaternions(pairs: PosePairs) -> Float:
+    """``left2_T_left1`` (4, 4) by K. Daniilidis, *Hand-Eye Calibration Using Dual Quaternions*, IJRR 18(3), 1999: with
+    ``A_i X = X B_i`` for motions A of the second and B of the first camera."""
+    rows = []
+    for motion_1, motion_2 in zip(pairs.motion_1, pairs.motion_2, strict=True):
+        (a, a_dual), (b, b_dual) = _dual(motion_2), _dual(motion_1)
+        block = np.zeros((6, 8))
+        block[:3, 0], block[:3, 1:4] = (a - b)[1:], _cross((a + b)[1:])
+        block[3:, 0], block[3:, 1:4] = (a_dual - b_dual)[1:], _cross((a_dual + b_dual)[1:])
+        block[3:, 4], block[3:, 5:8] = (a - b)[1:], _cross((a + b)[1:])
+        rows.append(block)
+    _, _, vectors = np.linalg.svd(np.concatenate(rows))
+    (u1, v1), (u2, v2) = ((v[:4], v[4:]) for v in vectors[-2:])
+    # lambda_1 (u1, v1) + lambda_2 (u2, v2) with a unit real part that is orthogonal to the dual one.
+    best: tuple[float, Float, Float] | None = None
+    quadratic = np.array([u1 @ v1, u1 @ v2 + u2 @ v1, u2 @ v2])
+    shares = [(ratio.real, 1.0) for ratio in np.roots(quadratic) if abs(ratio.imag) < 1e-6]
+    shares += [(1.0, 0.0)] if abs(quadratic[0]) < 1e-9 else []
+    for first, second in shares:
+        real, dual = first * u1 + second * u2, first * v1 + second * v2
+        norm = float(np.linalg.norm(real)) / float(np.hypot(first, second))
+        if best is None or norm > best[0]:
+            best = norm, real / np.linalg.norm(real), dual / np.linalg.norm(real)
+    assert best is not None
+    _, real, dual = best
+    translation = 2.0 * _product(dual, real * np.array([1.0, -1.0, -1.0, -1.0]))[1:]
+    return np.asarray(se3(rotation_from_quat_wxyz(real), np.ascontiguousarray(translation)))
+
+
+def _dual(motion: Float) -> tuple[Float, Float]:
+    """Real and dual part of a motion's dual quaternion."""
+    real = quat_wxyz_from_rotation(np.ascontiguousarray(motion[:3, :3]))
+    return real, 0.5 * _product(np.array([0.0, *motion[:3, 3]]), real)
+
+
+def _product(p: Float, q: Float) -> Float:
+    scalar = p[0] * q[0] - p[1:] @ q[1:]
+    return np.array([scalar, *(p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:]))])
+
+
+def _cross(v: Float) -> Float:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -1,0 +1,157 @@
+"""The paper's calibration and the graph, on pose pairs whose truth is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hand_eye import LEFT2_T_LEFT1, Drawn, by_dual_quaternions, drawn
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from monte_carlo import band
+
+from graphvio.arrays import Float
+from graphvio.calibration import graph, paper_method
+from graphvio.calibration.comparison import compare
+from graphvio.calibration.consistency import whitened
+from graphvio.calibration.paper_method import PoseParts
+from graphvio.calibration.pose_pairs import PosePairs
+from graphvio.errors import CalibrationError
+from graphvio.geometry import se3_exp, se3_inverse, se3_log, so3_exp
+
+ANGLE, STEP_M = 2e-3, 3e-3
+
+
+def error_of(found: Float, true: Float = LEFT2_T_LEFT1) -> Float:
+    """Tangent (6,) in left1."""
+    return np.asarray(se3_log(se3_inverse(np.ascontiguousarray(found)) @ true))
+
+
+def both(pairs: PosePairs) -> tuple[paper_method.PaperSolution, graph.GraphSolution]:
+    paper = paper_method.calibrate(pairs)
+    return paper, graph.solve(pairs, paper.left2_T_left1)
+
+
+@settings(deadline=None, max_examples=15)
+@given(
+    tangent=st.lists(st.floats(-2.5, 2.5), min_size=6, max_size=6), seed=st.integers(0, 2**31), count=st.integers(6, 60)
+)
+def test_without_noise_all_methods_are_exact(tangent: list[float], seed: int, count: int) -> None:
+    true = se3_exp(np.array(tangent))
+    pairs = drawn(count, np.random.default_rng(seed), left2_T_left1=true).pairs
+    paper, found = both(pairs)
+    assert np.abs(error_of(paper.left2_T_left1, true)).max() < 1e-9
+    assert np.abs(error_of(found.left2_T_left1, true)).max() < 1e-9
+    assert np.abs(error_of(by_dual_quaternions(pairs), true)).max() < 1e-6
+    assert paper.inlier.all()
+    assert found.inlier.all()
+
+
+def test_equation_5_holds_in_the_order_that_the_eigenvector_takes() -> None:
+    """With all axes turned about, so that no order of the products but the right one fits."""
+    parts = PoseParts.of(drawn(20, np.random.default_rng(1)).pairs)
+    R, eigenvalues = paper_method.rotation(parts.R_1, parts.R_2)
+    np.testing.assert_allclose(R @ parts.R_1, parts.R_2 @ R, atol=1e-12)
+    np.testing.assert_allclose(R, LEFT2_T_LEFT1[:3, :3], atol=1e-12)
+    assert eigenvalues[0] < 1e-12 < 1e-3 < eigenvalues[1]
+
+
+def test_signs_of_quaternions_do_not_matter() -> None:
+    """Turns of more than a half, whose quaternions change their sign."""
+    pairs = drawn(30, np.random.default_rng(2), turns=(1.2, 1.2, 1.2)).pairs
+    assert np.linalg.norm(pairs.rotations_rad, axis=1).max() > 2.5
+    assert np.abs(error_of(paper_method.calibrate(pairs).left2_T_left1)).max() < 1e-9
+
+
+def test_the_alignment_error_is_where_both_motions_put_the_second_camera() -> None:
+    pairs = drawn(10, np.random.default_rng(3), ANGLE, STEP_M).pairs
+    R = LEFT2_T_LEFT1[:3, :3]
+    t = -R.T @ LEFT2_T_LEFT1[:3, 3]
+    left1_T_left2 = np.linalg.inv(LEFT2_T_LEFT1)
+    by_1, by_2 = pairs.motion_1 @ left1_T_left2, left1_T_left2 @ pairs.motion_2
+    expected = by_1[:, :3, 3] - by_2[:, :3, 3]
+    np.testing.assert_allclose(paper_method.alignment_errors(PoseParts.of(pairs), R, t), expected, atol=1e-12)
+
+
+def test_the_papers_jacobian_is_the_derivative() -> None:
+    parts = PoseParts.of(drawn(10, np.random.default_rng(4), ANGLE, STEP_M).pairs)
+    R, t, h = LEFT2_T_LEFT1[:3, :3], np.array([0.1, -0.2, 0.3]), 1e-6
+    numeric = []
+    for axis in np.eye(3):
+        errors = [paper_method.alignment_errors(parts, R, t + sign * h * axis) for sign in (1.0, -1.0)]
+        numeric.append((errors[0] - errors[1]) / (2.0 * h))
+    for axis in np.eye(3):  # dq is half a rotation vector
+        errors = [paper_method.alignment_errors(parts, so3_exp(sign * 2.0 * h * axis) @ R, t) for sign in (1.0, -1.0)]
+        numeric.append((errors[0] - errors[1]) / (2.0 * h))
+    np.testing.assert_allclose(paper_method.jacobians(parts, R), np.stack(numeric, axis=2), atol=1e-8)
+
+
+def test_the_graphs_jacobian_is_the_derivative() -> None:
+    pairs, h = drawn(5, np.random.default_rng(5), ANGLE, STEP_M).pairs, 1e-6
+    flat = replace(pairs, covariance_1=1e-12 * pairs.covariance_1)  # else the whitener changes, too
+    _, jacobians = whitened(flat, LEFT2_T_LEFT1)
+    numeric = []
+    for axis in np.eye(6):
+        errors = [whitened(flat, LEFT2_T_LEFT1 @ se3_exp(sign * h * axis))[0] for sign in (1.0, -1.0)]
+        numeric.append((errors[0] - errors[1]) / (2.0 * h))
+    scale = np.abs(jacobians).max()
+    np.testing.assert_allclose(jacobians / scale, np.stack(numeric, axis=2) / scale, atol=1e-6)
+
+
+@pytest.mark.parametrize("outlier_share", [0.0, 0.3, 0.6])
+def test_errors_are_within_what_is_told(outlier_share: float) -> None:
+    runs = 40
+    squares, differences, kept, missed = [], [], 0, 0
+    for seed in range(runs):
+        made: Drawn = drawn(150, np.random.default_rng([seed, 1]), ANGLE, STEP_M, outlier_share)
+        paper, found = both(made.pairs)
+        error = error_of(found.left2_T_left1)
+        squares.append(error @ np.linalg.solve(found.covariance, error))
+        differences.append(compare(made.pairs, paper, found).agrees)
+        kept += int(np.sum(found.inlier & made.outlier))
+        missed += int(np.sum(~found.inlier & ~made.outlier))
+    low, high = band(runs)
+    assert low < np.mean(squares) < high
+    assert np.mean(differences) >= 0.95
+    assert kept <= 1
+    assert missed <= 0.005 * runs * 150
+
+
+def test_methods_that_differ_by_more_than_they_may_are_told() -> None:
+    pairs = drawn(100, np.random.default_rng(6), ANGLE, STEP_M).pairs
+    paper, found = both(pairs)
+    assert compare(pairs, paper, found).agrees
+    wrong = replace(paper, left2_T_left1=paper.left2_T_left1 @ se3_exp(np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.03])))
+    assert not compare(pairs, wrong, found).agrees
+
+
+def test_the_same_seed_gives_the_same_bits() -> None:
+    pairs = drawn(80, np.random.default_rng(7), ANGLE, STEP_M, 0.4).pairs
+    one, other = both(pairs), both(pairs)
+    assert np.array_equal(one[0].left2_T_left1, other[0].left2_T_left1)
+    assert np.array_equal(one[1].left2_T_left1, other[1].left2_T_left1)
+
+
+def test_too_few_pose_pairs_are_refused() -> None:
+    pairs = drawn(2, np.random.default_rng(8)).pairs
+    with pytest.raises(CalibrationError, match="needs 3 pose pairs and has 2"):
+        paper_method.calibrate(pairs)
+
+
+def test_motions_without_rotation_are_refused() -> None:
+    pairs = drawn(50, np.random.default_rng(9), turns=(0.0, 0.0, 0.0)).pairs
+    with pytest.raises(CalibrationError, match="without rotation"):
+        paper_method.calibrate(pairs)
+
+
+def test_motions_that_have_nothing_in_common_are_refused() -> None:
+    made = drawn(60, np.random.default_rng(10), ANGLE, STEP_M, outlier_share=1.0)
+    with pytest.raises(CalibrationError, match="one rig"):
+        both(made.pairs)
+
+
+def test_values_that_are_not_finite_are_refused() -> None:
+    pairs = drawn(5, np.random.default_rng(11)).pairs
+    broken = pairs.motion_2.copy()
+    broken[3, 0, 3] = np.nan
+    with pytest.raises(CalibrationError, match="motion_2 of pair 3 holds NaN"):
+        replace(pairs, motion_2=broken)
