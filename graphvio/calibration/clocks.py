@@ -1,0 +1,123 @@
+"""The offset between the clocks of two cameras on one rig: both turn at the same angular speed at the same time.
+
+The speed does not depend on where a camera sits on the rig, so the offset is found before anything else is known: at
+the maximum of the correlation of both speeds over time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import fftconvolve
+
+from graphvio.arrays import Float, Int
+from graphvio.errors import CalibrationError
+from graphvio.geometry import so3_log
+from graphvio.trajectory import Trajectory
+
+_RATE_HZ = 100.0
+_OVER_S = 0.15  # angular speeds are means over so long: less is noise
+_LEAST_OVERLAP_S = 5.0
+_LEAST_CORRELATION = 0.6
+_PERFECT = 0.9999
+_MOST_RIVALRY = 0.8  # of the likeliness of the second best offset over that of the best
+_APART_S = 1.0  # what counts as elsewhere
+_NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """How two clocks relate.
+
+    Attributes:
+        offset_ns: add it to a stamp of the first clock to get that of the second one at the same instant.
+        correlation: of the angular speeds there, at most 1.
+        rival: of the likeliest offset more than a second away from it.
+    """
+
+    offset_ns: int
+    correlation: float
+    rival: float
+
+
+def find_offset(one: Trajectory, other: Trajectory) -> ClockOffset:
+    """The offset at which both trajectories' angular speeds agree best.
+
+    Raises:
+        CalibrationError: if they are too short, do not turn, or no offset, or more than one, makes them agree.
+    """
+    speeds_1, speeds_2 = (_angular_speeds(each) for each in (one, other))
+    least = round(_LEAST_OVERLAP_S * _RATE_HZ)
+    for name, speeds in (("first", speeds_1), ("second", speeds_2)):
+        if len(speeds) < least:
+            raise CalibrationError(
+                f"the {name} trajectory is {len(speeds) / _RATE_HZ:.1f} s long; to find the clocks' offset takes "
+                f"{_LEAST_OVERLAP_S:g} s or more"
+            )
+    correlations, lags = _correlations(speeds_1, speeds_2, least)
+    overlaps = np.minimum(len(speeds_1), len(speeds_2) - lags) - np.maximum(0, -lags)
+    # Fisher's transform: a short overlap correlates well by chance.
+    likeliness = np.arctanh(np.clip(correlations, -_PERFECT, _PERFECT)) * np.sqrt(overlaps)
+    best = int(np.argmax(likeliness))
+    elsewhere = np.flatnonzero(np.abs(lags - lags[best]) > _APART_S * _RATE_HZ)
+    second = int(elsewhere[np.argmax(likeliness[elsewhere])]) if len(elsewhere) else best
+    correlation, rival = float(correlations[best]), float(correlations[second])
+    if correlation < _LEAST_CORRELATION:
+        raise CalibrationError(
+            f"no offset between the clocks makes both cameras turn alike (correlation of angular speeds "
+            f"{correlation:.2f} at best): are they on one rig, and do the trajectories overlap in time?"
+        )
+    if second != best and likeliness[second] > _MOST_RIVALRY * likeliness[best]:
+        raise CalibrationError(
+            f"the clocks' offset is ambiguous: angular speeds correlate by {correlation:.2f} at one and by {rival:.2f} "
+            "at another; turn the rig at changing speeds, not evenly"
+        )
+    start_1, start_2 = (int(each.stamps_ns[0]) for each in (one, other))
+    offset_ns = start_2 - start_1 + round((lags[best] + _vertex(correlations, best)) / _RATE_HZ * _NS_PER_S)
+    return ClockOffset(offset_ns, correlation, rival)
+
+
+def _angular_speeds(trajectory: Trajectory) -> Float:
+    """Mean angular speeds (N,), rad/s, around instants 1 / `_RATE_HZ` apart, as soon after the first stamp as they are
+    known."""
+    if trajectory.duration_s <= _OVER_S:
+        return np.zeros(0)
+    half_ns = round(0.5 * _OVER_S * _NS_PER_S)
+    count = int((trajectory.duration_s - _OVER_S) * _RATE_HZ)
+    stamps: Int = trajectory.stamps_ns[0] + half_ns + (np.arange(count) * (_NS_PER_S / _RATE_HZ)).astype(np.int64)
+    whatever_gaps_s = 2.0 * trajectory.duration_s
+    (one, _), (other, _) = (trajectory.at(at, whatever_gaps_s) for at in (stamps - half_ns, stamps + half_ns))
+    turned = np.einsum("nji,njk->nik", one.rotations, other.rotations)
+    angles = np.array([np.linalg.norm(so3_log(np.ascontiguousarray(turn))) for turn in turned])
+    return np.asarray(angles / _OVER_S)
+
+
+def _correlations(one: Float, other: Float, least: int) -> tuple[Float, Int]:
+    """Correlation coefficients where the second series begins so many samples later, for overlaps of at least so many
+    samples: (L,) and their lags (L,)."""
+
+    def summed(a: Float, b: Float) -> Float:
+        """Sums over the overlap of a(i) b(i + lag), for lags from 1 - len(a) on."""
+        return np.asarray(fftconvolve(b, a[::-1]))
+
+    ones_1, ones_2 = np.ones(len(one)), np.ones(len(other))
+    count = np.round(summed(ones_1, ones_2))
+    mean_1, mean_2 = summed(one, ones_2) / count, summed(ones_1, other) / count
+    covariance = summed(one, other) / count - mean_1 * mean_2
+    variance_1 = summed(one**2, ones_2) / count - mean_1**2
+    variance_2 = summed(ones_1, other**2) / count - mean_2**2
+    lags = np.arange(1 - len(one), len(other))
+    enough = count >= least
+    spread = np.sqrt(np.maximum(variance_1, 0.0) * np.maximum(variance_2, 0.0))
+    correlations = np.divide(covariance, spread, out=np.zeros_like(spread), where=spread > 1e-9)
+    return correlations[enough], lags[enough]
+
+
+def _vertex(values: Float, best: int) -> float:
+    """Where a parabola through a maximum and its neighbours has its vertex, in samples from the maximum."""
+    if not 0 < best < len(values) - 1:
+        return 0.0
+    left, top, right = values[best - 1 : best + 2]
+    curvature = left - 2.0 * top + right
+    return 0.5 * (left - right) / curvature if curvature < 0.0 else 0.0
