@@ -1,0 +1,147 @@
+"""What the motions of a recording can tell of the relative pose of two cameras, and what they cannot.
+
+Turning about one axis only, nothing tells how far apart the cameras are along it; without any turning, nothing tells
+their offset at all. The noise of the motions looks like a little turning about every axis, and so like information:
+what is not well above the noise counts as not known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eigh
+
+from graphvio.arrays import Float
+from graphvio.calibration.consistency import information
+from graphvio.calibration.pose_pairs import PosePairs
+from graphvio.geometry import se3_adjoint, se3_inverse
+
+_LEAST_LEAD = 4.0  # information over what noise alone would give
+_FLOOR = 1e-9  # of the noise's information over the largest, so that it can be divided by
+_UNKNOWN_SIGMAS = np.repeat([np.pi, 10.0], 3)  # radians and metres: of what nothing tells
+_ALONG = 0.9  # cosine from which an axis is called by the camera's own
+_AXES = ("x (right)", "y (down)", "z (forward)")
+
+
+@dataclass(frozen=True, eq=False)
+class Observability:
+    """How well a recording's motions suit the calibration.
+
+    Attributes:
+        rotation_singular_values: (3,) of the problem of the rotation, eq. (5): rms turning, rad, in descending order;
+            two of them must be well above the noise.
+        translation_singular_values: (3,) of the problem of the translation, eq. (6), likewise.
+        turning_axes: (3, 3) rows: principal axes of the turning, in left1.
+        turning_rad: (3,) rms turning about these.
+        undetermined: (K, 6) orthonormal directions, tangent in left1, of which the motions tell nothing.
+        covariance: (6, 6) of ``left2_T_left1``, tangent in left1; very large along what is not determined.
+        missing: what is not determined and what to do about it, a sentence each; none where all is.
+    """
+
+    rotation_singular_values: Float
+    translation_singular_values: Float
+    turning_axes: Float
+    turning_rad: Float
+    undetermined: Float
+    covariance: Float
+    missing: tuple[str, ...]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the motions determine all of the relative pose."""
+        return not len(self.undetermined)
+
+
+def observe(pairs: PosePairs, left2_T_left1: Float) -> Observability:
+    """What pose pairs tell, at a solution (4, 4)."""
+    told, by_noise = information(pairs, left2_T_left1), _noise_information(pairs, left2_T_left1)
+    scale = np.diag(_UNKNOWN_SIGMAS)  # so that radians and metres compare
+    told, by_noise = scale @ told @ scale, scale @ by_noise @ scale
+    floor = _FLOOR * np.trace(told) + 1.0  # 1: what is known before
+    leads, directions = eigh(told, by_noise + floor * np.eye(6))
+    weak = directions[:, leads < _LEAST_LEAD]
+    undetermined = np.linalg.qr(scale @ weak)[0].T if weak.size else np.zeros((0, 6))
+    # Of what is determined, the information without what is not; of the rest, nothing but that it is somewhere.
+    basis = np.linalg.qr(np.hstack([weak, np.eye(6)]))[0]
+    known = basis[:, weak.shape[1] :]
+    covariance = known @ np.linalg.inv(known.T @ told @ known) @ known.T
+    covariance = covariance + basis[:, : weak.shape[1]] @ basis[:, : weak.shape[1]].T
+    turning, axes = np.linalg.eigh(pairs.rotations_rad.T @ pairs.rotations_rad / len(pairs))
+    turning_rad, axes = np.sqrt(np.maximum(turning[::-1], 0.0)), axes[:, ::-1].T
+    lever = np.concatenate([np.eye(3) - motion[:3, :3] for motion in pairs.motion_2])
+    return Observability(
+        rotation_singular_values=turning_rad,
+        translation_singular_values=np.linalg.svd(lever / np.sqrt(len(pairs)), compute_uv=False),
+        turning_axes=axes,
+        turning_rad=turning_rad,
+        undetermined=undetermined,
+        covariance=scale @ covariance @ scale,
+        missing=tuple(_missing(undetermined, axes, turning_rad)),
+    )
+
+
+def _noise_information(pairs: PosePairs, left2_T_left1: Float) -> Float:
+    """What the noise of the motions adds to the information (6, 6), on average."""
+    total = np.zeros((6, 6))
+    adjoint = se3_adjoint(left2_T_left1)
+    for motion, noise_1, noise_2 in zip(pairs.motion_1, pairs.covariance_1, pairs.covariance_2, strict=True):
+        weight = np.linalg.inv(noise_2 + adjoint @ noise_1 @ adjoint.T)
+        weight = adjoint.T @ weight @ adjoint
+        back = se3_adjoint(se3_inverse(np.ascontiguousarray(motion)))
+        for direction in np.linalg.cholesky(noise_1).T:
+            change = _small_adjoint(direction) @ back
+            total += change.T @ weight @ change
+    return total
+
+
+def _small_adjoint(tangent: Float) -> Float:
+    """(6, 6) with ``Ad(exp(d)) = 1 + ad(d)`` to first order."""
+    wx, wy, wz, vx, vy, vz = tangent
+    turn = np.array([[0.0, -wz, wy], [wz, 0.0, -wx], [-wy, wx, 0.0]])
+    shift = np.array([[0.0, -vz, vy], [vz, 0.0, -vx], [-vy, vx, 0.0]])
+    return np.block([[turn, np.zeros((3, 3))], [shift, turn]])
+
+
+def _missing(undetermined: Float, axes: Float, turning_rad: Float) -> list[str]:
+    """What is not determined, in words."""
+    if not len(undetermined):
+        return []
+    turns = np.rad2deg(turning_rad)
+    rotations, translations = (_directions(undetermined[:, part]) for part in (slice(0, 3), slice(3, 6)))
+    if len(rotations) == 3:
+        return ["the rig hardly moved: nothing tells how the cameras are placed; walk, and turn it about two axes"]
+    told = []
+    if len(translations) == 3:
+        told.append(
+            f"the rig hardly turned ({turns[0]:.2g} degrees rms in a motion): the offset between the cameras cannot be "
+            "found; turn it about two axes"
+        )
+    elif len(translations):
+        along = " and ".join(map(_named, translations))
+        told.append(
+            f"rotation only about the axis {_named(axes[0])} of the first left camera ({turns[0]:.2g} degrees rms, "
+            f"{turns[1]:.2g} about others): the offset along {along} cannot be found; tilt the rig while turning"
+        )
+    if len(rotations):
+        about = " and ".join(map(_named, rotations))
+        told.append(
+            f"the angle between the cameras about {about} of the first left camera cannot be found; turn the rig about "
+            "another axis, or move it sideways"
+        )
+    return told
+
+
+def _directions(parts: Float) -> Float:
+    """An orthonormal basis (K, 3) of what vectors (N, 3) span, but for what is small."""
+    _, sizes, rows = np.linalg.svd(parts)
+    return np.asarray(rows[: int(np.sum(sizes > 0.3))])
+
+
+def _named(axis: Float) -> str:
+    """An axis by its name in the camera, or by its numbers."""
+    nearest = int(np.argmax(np.abs(axis)))
+    if abs(axis[nearest]) > _ALONG:
+        return _AXES[nearest]
+    turned = axis * np.sign(axis[nearest])
+    return "[" + ", ".join(f"{value:.2f}" for value in turned) + "]"

@@ -1,0 +1,96 @@
+"""What a recording's motions can tell of the cameras' relative pose, and the words for what they cannot."""
+
+import numpy as np
+import pytest
+from hand_eye import LEFT2_T_LEFT1, drawn
+
+from graphvio.calibration import graph, paper_method
+from graphvio.calibration.observability import Observability, observe
+from graphvio.geometry import se3_exp
+
+Three = tuple[float, float, float]
+ALL: Three = (0.1, 0.1, 0.1)
+SOME: Three = (0.05, 0.05, 0.05)
+NONE: Three = (0.0, 0.0, 0.0)
+
+
+def observed(turns: Three, steps: Three, noise: float) -> Observability:
+    return observe(drawn(400, np.random.default_rng(0), noise, noise, turns=turns, steps=steps).pairs, LEFT2_T_LEFT1)
+
+
+@pytest.mark.parametrize("noise", [2e-3, 1e-5])
+@pytest.mark.parametrize("turns", [ALL, (0.1, 0.1, 0.0), (0.01, 0.1, 0.01)])
+def test_turning_about_two_axes_is_enough(turns: Three, noise: float) -> None:
+    found = observed(turns, SOME, noise)
+    assert found.is_complete
+    assert found.missing == ()
+    sigmas = np.sqrt(np.diag(found.covariance))
+    assert sigmas[:3].max() < 0.01
+    assert sigmas[3:].max() < 0.015
+
+
+@pytest.mark.parametrize("noise", [2e-3, 1e-5])
+def test_planar_motion_leaves_the_offset_along_its_axis(noise: float) -> None:
+    found = observed((0.0, 0.1, 0.0), (0.05, 0.0, 0.05), noise)
+    assert len(found.undetermined) == 1
+    np.testing.assert_allclose(np.abs(found.undetermined[0]), [0, 0, 0, 0, 1, 0], atol=0.02)
+    (sentence,) = found.missing
+    assert "rotation only about the axis y (down)" in sentence
+    assert "offset along y (down) cannot be found; tilt the rig while turning" in sentence
+    sigmas = np.sqrt(np.diag(found.covariance))
+    assert sigmas[4] > 1.0
+    assert sigmas[[3, 5]].max() < 0.01
+    assert sigmas[:3].max() < 0.02
+
+
+@pytest.mark.parametrize("noise", [2e-3, 1e-5])
+def test_turning_on_the_spot_leaves_the_angle_about_the_axis_too(noise: float) -> None:
+    found = observed((0.0, 0.1, 0.0), NONE, noise)
+    assert len(found.undetermined) == 2
+    offset, angle = found.missing
+    assert "offset along y (down)" in offset
+    assert "angle between the cameras about y (down)" in angle
+    assert "move it sideways" in angle
+
+
+@pytest.mark.parametrize("noise", [2e-3, 1e-5])
+def test_without_turning_there_is_no_offset(noise: float) -> None:
+    found = observed(NONE, SOME, noise)
+    assert len(found.undetermined) == 3
+    (sentence,) = found.missing
+    assert "hardly turned" in sentence
+    assert np.sqrt(np.diag(found.covariance))[:3].max() < 0.02  # the directions of motion tell the rotation
+
+
+@pytest.mark.parametrize("noise", [2e-3, 1e-5])
+def test_a_straight_line_leaves_the_angle_about_it(noise: float) -> None:
+    found = observed(NONE, (0.05, 0.0, 0.0), noise)
+    assert len(found.undetermined) == 4
+    assert "angle between the cameras about x (right)" in found.missing[1]
+
+
+@pytest.mark.parametrize("noise", [2e-3, 1e-5])
+def test_a_rig_at_rest_tells_nothing(noise: float) -> None:
+    found = observed(NONE, NONE, noise)
+    assert len(found.undetermined) == 6
+    (sentence,) = found.missing
+    assert "hardly moved" in sentence
+
+
+def test_an_axis_that_is_none_of_the_cameras_is_told_by_its_numbers() -> None:
+    axis = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5)])
+    pairs = drawn(300, np.random.default_rng(1), turns=NONE, steps=NONE).pairs
+    angles = 0.1 * np.random.default_rng(2).standard_normal(300)
+    motion_1 = np.array([se3_exp(np.concatenate([angle * axis, np.zeros(3)])) for angle in angles])
+    motion_2 = LEFT2_T_LEFT1 @ motion_1 @ np.linalg.inv(LEFT2_T_LEFT1)
+    turned = type(pairs)(
+        pairs.start_ns, pairs.end_ns, motion_1, pairs.covariance_1, np.ascontiguousarray(motion_2), pairs.covariance_2
+    )
+    assert "[0.00, 0.71, 0.71]" in observe(turned, LEFT2_T_LEFT1).missing[0].replace("-0.00", "0.00")
+
+
+def test_where_all_is_determined_the_covariance_is_the_graphs() -> None:
+    pairs = drawn(200, np.random.default_rng(3), 1e-3, 2e-3).pairs
+    found = graph.solve(pairs, paper_method.calibrate(pairs).left2_T_left1)
+    told = observe(pairs, found.left2_T_left1).covariance
+    np.testing.assert_allclose(told, found.covariance, rtol=0.02, atol=1e-2 * np.abs(found.covariance).max())
