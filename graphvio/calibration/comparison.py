@@ -9,10 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import null_space
 from scipy.stats import chi2
 
 from graphvio.arrays import Float
-from graphvio.calibration.consistency import error_covariance, error_of
+from graphvio.calibration.consistency import error_covariance, error_of, information
 from graphvio.calibration.graph import GraphSolution
 from graphvio.calibration.paper_method import PaperSolution, PoseParts, jacobians
 from graphvio.calibration.pose_pairs import PosePairs
@@ -23,38 +24,48 @@ _CHANCE = 1e-3  # that honest solutions are called different
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two solutions of one calibration.
+    """Two solutions of one calibration, in the directions that the motions determine.
 
     Attributes:
         difference: (6,) tangent from the graph's solution to the paper's, ``[rotation, translation]`` in left1.
         covariance: (6, 6) that the difference has where only the told noise makes it.
+        determined: (K, 6) orthonormal directions in which they are compared.
         paper_covariance: (6, 6) of the paper's solution, which does not weigh the motions, by the same noise.
     """
 
     difference: Float
     covariance: Float
+    determined: Float
     paper_covariance: Float
 
     @property
     def statistic(self) -> float:
-        """Squared Mahalanobis distance between the two, 6 degrees of freedom."""
-        return float(self.difference @ np.linalg.pinv(self.covariance, hermitian=True) @ self.difference)
+        """Squared Mahalanobis distance between the two, K degrees of freedom."""
+        apart = self.determined @ self.difference
+        return float(apart @ np.linalg.solve(self.determined @ self.covariance @ self.determined.T, apart))
+
+    @property
+    def limit(self) -> float:
+        """The largest statistic that chance explains."""
+        return float(chi2.isf(_CHANCE, len(self.determined)))
 
     @property
     def agrees(self) -> bool:
         """Whether chance explains the difference."""
-        return self.statistic <= float(chi2.isf(_CHANCE, 6))
+        return self.statistic <= self.limit
 
 
 def compare(pairs: PosePairs, paper: PaperSolution, graph: GraphSolution) -> Comparison:
     """The two solutions for the same N pose pairs."""
     by_paper = _influence_on_paper(pairs, paper)
-    by_graph = _influence_on_graph(pairs, graph)
+    determined = null_space(graph.observability.undetermined).T if not graph.observability.is_complete else np.eye(6)
+    by_graph = _influence_on_graph(pairs, graph, determined)
     noise = np.concatenate([pairs.covariance_1, pairs.covariance_2])
     apart = by_paper - by_graph
     return Comparison(
         se3_log(se3_inverse(graph.left2_T_left1) @ np.ascontiguousarray(paper.left2_T_left1)),
         np.einsum("nij,njk,nlk->il", apart, noise, apart),
+        determined,
         np.einsum("nij,njk,nlk->il", by_paper, noise, by_paper),
     )
 
@@ -71,12 +82,14 @@ def _influence_on_paper(pairs: PosePairs, paper: PaperSolution) -> Float:
     return np.concatenate([gains @ of_1, gains @ of_2])
 
 
-def _influence_on_graph(pairs: PosePairs, graph: GraphSolution) -> Float:
+def _influence_on_graph(pairs: PosePairs, graph: GraphSolution, determined: Float) -> Float:
     """The same for the graph's solution."""
-    pose = graph.left2_T_left1
+    pose, chosen = graph.left2_T_left1, pairs.chosen(graph.inlier)
+    told = determined @ information(chosen, pose) @ determined.T
+    covariance = determined.T @ np.linalg.solve(told, determined)
     gains = np.zeros((len(pairs), 6, 6))
     for k in np.flatnonzero(graph.inlier):
         _, jacobian = error_of(pose, pairs.motion_1[k], pairs.motion_2[k])
-        covariance = error_covariance(pose, pairs.covariance_1[k], pairs.covariance_2[k])
-        gains[k] = -graph.covariance @ np.linalg.solve(covariance, jacobian).T
+        noise = error_covariance(pose, pairs.covariance_1[k], pairs.covariance_2[k])
+        gains[k] = -covariance @ np.linalg.solve(noise, jacobian).T
     return np.concatenate([gains @ se3_adjoint(pose), -gains])

@@ -22,26 +22,32 @@ _STEPS_A_ROUND = 2
 _SHARPENING = 1.4  # of the cost from round to round, towards truncated least squares
 _CERTAIN = 1e-3  # weights this near to 0 or 1 are that
 _SETTLED = 1e-12
+_NOTHING = np.zeros((0, 6))
 
 
-def without_outliers(pairs: PosePairs, start: Float) -> tuple[Float, Bool]:
+def without_outliers(pairs: PosePairs, start: Float, held: Float = _NOTHING) -> tuple[Float, Bool]:
     """The relative pose by truncated least squares, from a start that may be off, by graduated non-convexity.
 
     H. Yang, P. Antonante, V. Tzoumas, L. Carlone, *Graduated Non-Convexity for Robust Spatial Perception: From
     Non-Minimal Solvers to Global Outlier Rejection*, IEEE RA-L 5(2), 2020.
 
+    Args:
+        pairs: N pose pairs.
+        start: ``left2_T_left1`` (4, 4).
+        held: (K, 6) orthonormal directions, tangent in left1, in which the start is kept.
+
     Returns:
         ``left2_T_left1`` (4, 4), and the pose pairs (N,) that are no outliers.
     """
-    left2_T_left1, squares = _solved(pairs, start, np.ones(len(pairs)), _MOST_ROUNDS)
+    left2_T_left1, squares = _solved(pairs, start, np.ones(len(pairs)), _MOST_ROUNDS, held)
     sharpness = 1.0 / max(2.0 * squares.max() / LIMIT - 1.0, 1.0)
     for _ in range(_MOST_ROUNDS):
         weights = _weights(squares, sharpness)
-        left2_T_left1, squares = _solved(pairs, left2_T_left1, weights, _STEPS_A_ROUND)
+        left2_T_left1, squares = _solved(pairs, left2_T_left1, weights, _STEPS_A_ROUND, held)
         if np.all((weights < _CERTAIN) | (weights > 1.0 - _CERTAIN)):
             break
         sharpness *= _SHARPENING
-    left2_T_left1, squares = _solved(pairs, left2_T_left1, (squares <= LIMIT).astype(np.float64), _MOST_ROUNDS)
+    left2_T_left1, squares = _solved(pairs, left2_T_left1, (squares <= LIMIT).astype(np.float64), _MOST_ROUNDS, held)
     return left2_T_left1, squares <= LIMIT
 
 
@@ -78,10 +84,14 @@ def error_covariance(left2_T_left1: Float, covariance_1: Float, covariance_2: Fl
     return covariance_2 + adjoint @ covariance_1 @ adjoint.T
 
 
-def _solved(pairs: PosePairs, left2_T_left1: Float, weights: Float, most_steps: int) -> tuple[Float, Float]:
+def _solved(
+    pairs: PosePairs, left2_T_left1: Float, weights: Float, most_steps: int, held: Float
+) -> tuple[Float, Float]:
     """Gauss-Newton with weighted pose pairs, and their squared distances at the solution."""
+    free = np.eye(6) - held.T @ held
     for _ in range(most_steps):
         errors, jacobians = whitened(pairs, left2_T_left1)
+        jacobians = jacobians @ free
         normal = np.einsum("n,nki,nkj->ij", weights, jacobians, jacobians)
         gradient = np.einsum("n,nki,nk->i", weights, jacobians, errors)
         step = -np.linalg.lstsq(normal, gradient, rcond=1e-14)[0]

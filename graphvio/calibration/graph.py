@@ -9,20 +9,21 @@ import gtsam
 import numpy as np
 
 from graphvio.arrays import Bool, Float
-from graphvio.backend.noise import gaussian
+from graphvio.backend.noise import gaussian, isotropic
 from graphvio.calibration.consistency import (
     error_covariance,
     error_of,
-    information,
     squared_distances,
     without_outliers,
 )
+from graphvio.calibration.observability import Observability, observe
 from graphvio.calibration.pose_pairs import FEWEST, PosePairs
 from graphvio.errors import CalibrationError
+from graphvio.geometry import se3_inverse, se3_log, se3_right_jacobian_inverse
 
 _X = int(gtsam.symbol("X", 0))
 _ROUNDS = 3  # what is an outlier, and a little of the errors' covariances, depends on the solution
-_KNOWN = 1e-12  # smallest eigenvalue of the information over the largest
+_HELD_SIGMA = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,42 +32,63 @@ class GraphSolution:
 
     Attributes:
         left2_T_left1: (4, 4), the paper's P_12.
-        covariance: (6, 6) of it, tangent ``[rotation, translation]`` in left1.
+        covariance: (6, 6) of it, tangent ``[rotation, translation]`` in left1; very large where nothing tells.
         inlier: (N,) pose pairs that are no outliers.
         squares: (N,) squared Mahalanobis distances of all pose pairs' errors, 6 degrees of freedom each.
+        observability: what the inliers tell and what they do not.
     """
 
     left2_T_left1: Float
     covariance: Float
     inlier: Bool
     squares: Float
+    observability: Observability
 
 
 def solve(pairs: PosePairs, start: Float) -> GraphSolution:
-    """The most likely ``left2_T_left1``, from a start (4, 4).
+    """The most likely ``left2_T_left1``, from a start (4, 4), which is kept in directions that the motions do not tell.
 
     Raises:
-        CalibrationError: if fewer than three pose pairs agree, or they do not determine all of it.
+        CalibrationError: if fewer than three pose pairs agree.
     """
-    left2_T_left1, inlier = without_outliers(pairs, np.ascontiguousarray(start))
+    left2_T_left1 = np.ascontiguousarray(start)
+    held = observe(pairs, left2_T_left1).undetermined
+    left2_T_left1, inlier = without_outliers(pairs, left2_T_left1, held)
     if inlier.sum() < FEWEST:
         raise CalibrationError(
             f"{inlier.sum()} of {len(pairs)} motions agree on one relative pose of the cameras; are they on one rig?"
         )
     chosen = pairs.chosen(inlier)
-    eigenvalues = np.linalg.eigvalsh(information(chosen, left2_T_left1))
-    if eigenvalues[0] <= _KNOWN * eigenvalues[-1]:
-        raise CalibrationError("the motions do not determine the relative pose of the cameras: turn about two axes")
     for _ in range(_ROUNDS):
         graph = gtsam.NonlinearFactorGraph()
         for k in range(len(chosen)):
             graph.push_back(_factor(chosen, k, left2_T_left1))
+        if len(held):
+            graph.push_back(_holding(held, left2_T_left1))
         values = gtsam.Values()
         values.insert(_X, gtsam.Pose3(left2_T_left1))
         values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
         left2_T_left1 = np.ascontiguousarray(values.atPose3(_X).matrix())
-    covariance = np.asarray(gtsam.Marginals(graph, values).marginalCovariance(_X))
-    return GraphSolution(left2_T_left1, covariance, inlier, squared_distances(pairs, left2_T_left1))
+    observability = observe(chosen, left2_T_left1)
+    covariance = (
+        np.asarray(gtsam.Marginals(graph, values).marginalCovariance(_X))
+        if observability.is_complete
+        else observability.covariance
+    )
+    return GraphSolution(left2_T_left1, covariance, inlier, squared_distances(pairs, left2_T_left1), observability)
+
+
+def _holding(held: Float, left2_T_left1: Float) -> gtsam.NonlinearFactor:
+    """Keeps a pose in some directions (K, 6)."""
+    there = se3_inverse(left2_T_left1)
+
+    def error(_: Any, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
+        off = se3_log(there @ np.ascontiguousarray(values.atPose3(_X).matrix()))
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(held @ se3_right_jacobian_inverse(off))
+        return np.asarray(held @ off)
+
+    return gtsam.CustomFactor(isotropic(len(held), _HELD_SIGMA), [_X], error)
 
 
 def _factor(pairs: PosePairs, k: int, left2_T_left1: Float) -> gtsam.NonlinearFactor:

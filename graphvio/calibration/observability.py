@@ -19,7 +19,7 @@ from graphvio.geometry import se3_adjoint, se3_inverse
 
 _LEAST_LEAD = 4.0  # information over what noise alone would give
 _FLOOR = 1e-9  # of the noise's information over the largest, so that it can be divided by
-_UNKNOWN_SIGMAS = np.repeat([np.pi, 10.0], 3)  # radians and metres: of what nothing tells
+_UNKNOWN_SIGMAS = np.repeat([np.pi, 5.0], 3)  # radians and metres: of what nothing tells
 _ALONG = 0.9  # cosine from which an axis is called by the camera's own
 _AXES = ("x (right)", "y (down)", "z (forward)")
 

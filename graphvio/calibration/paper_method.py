@@ -25,6 +25,7 @@ _LIKELY = 10  # of the best triples, which are refined before one is chosen
 _LIMIT = float(chi2.isf(1e-3, 3))
 _TRIPLE_LIMIT = 9.0 * _LIMIT  # a solution from three pose pairs is off by itself
 _LEAST_TURN, _MOST_TURN = np.deg2rad([0.2, 170.0])  # of a pose pair in a triple: both signs of q fit a half turn
+_LEAST_TURNED = 3.0  # rms of the turning about an axis over the noise of a rotation
 _ROUNDS = 5
 _ITERATIONS = 50
 _FIRST_DAMPING, _STIFFER, _LOOSER = 1e-6, 10.0, 0.1
@@ -87,7 +88,7 @@ def calibrate(pairs: PosePairs, seed: int = 0) -> PaperSolution:
             f"the best relative pose of the cameras explains {inlier.sum()} of {len(pairs)} motions; are they on one "
             "rig, and are their clocks the same?"
         )
-    R, t = refine(parts.chosen(inlier), R, t)
+    R, t = refine(parts.chosen(inlier), R, t, weighed.noise_rad)
     return PaperSolution(se3(R, -R @ t), inlier, alignment_errors(parts, R, t))
 
 
@@ -102,11 +103,19 @@ def rotation(R_1: Float, R_2: Float) -> tuple[Float, Float]:
     return rotation_from_quat_wxyz(np.ascontiguousarray(vectors[:, 0])), eigenvalues
 
 
-def translation(R: Float, parts: PoseParts) -> Float:
-    """T (3,) by least squares, eq. (10); the shortest where several serve as well."""
+def translation(R: Float, parts: PoseParts, noise_rad: float = 0.0) -> Float:
+    """T (3,) by least squares, eq. (10); the shortest where several serve as well.
+
+    Args:
+        R: (3, 3).
+        parts: of N pose pairs.
+        noise_rad: of a rotation; an axis that the rig was turned about by no more counts as one that it was not.
+    """
     A = (np.eye(3) - parts.R_2).reshape(-1, 3)
     b = (parts.T_2 - parts.T_1 @ R.T).ravel()  # eq. (10) has A T plus R T_1 - T_2: the paper's b lacks a sign
-    return np.asarray(np.linalg.lstsq(A, b, rcond=1e-9)[0])
+    left, sizes, right = np.linalg.svd(A, full_matrices=False)
+    turned = sizes > _least_size(sizes, len(parts.R_2), noise_rad)
+    return np.asarray(right[turned].T @ ((left.T @ b)[turned] / sizes[turned]))
 
 
 def alignment_errors(parts: PoseParts, R: Float, t: Float) -> Float:
@@ -126,17 +135,20 @@ def jacobians(parts: PoseParts, R: Float) -> Float:
     return made
 
 
-def refine(parts: PoseParts, R: Float, t: Float) -> tuple[Float, Float]:
-    """Levenberg-Marquardt on the sum of squared alignment errors, from R (3, 3) and t (3,)."""
-    damping = _FIRST_DAMPING
+def refine(parts: PoseParts, R: Float, t: Float, noise_rad: float = 0.0) -> tuple[Float, Float]:
+    """Levenberg-Marquardt on the sum of squared alignment errors, from R (3, 3) and t (3,); what nothing tells of t
+    stays as it is, see `translation`."""
+    damping, turned = _FIRST_DAMPING, _turned_axes(parts, noise_rad)
     errors = alignment_errors(parts, R, t)
     cost = float(np.sum(errors**2))
     for _ in range(_ITERATIONS):
-        J = jacobians(parts, R).reshape(-1, 6)
+        J = jacobians(parts, R)
+        J = np.concatenate([J[:, :, :3] @ turned, J[:, :, 3:]], axis=2).reshape(-1, turned.shape[1] + 3)
         normal, gradient = J.T @ J, J.T @ errors.ravel()
         damped = normal + damping * np.diag(normal.diagonal() + _TINY * normal.trace())
         step = -np.linalg.lstsq(damped, gradient, rcond=1e-15)[0]
-        next_R, next_t = so3_exp(np.asarray(2.0 * step[3:], dtype=np.float64)) @ R, t + step[:3]
+        next_R = so3_exp(np.asarray(2.0 * step[-3:], dtype=np.float64)) @ R
+        next_t = t + turned @ step[:-3]
         next_errors = alignment_errors(parts, next_R, next_t)
         next_cost = float(np.sum(next_errors**2))
         if next_cost <= cost:
@@ -149,12 +161,25 @@ def refine(parts: PoseParts, R: Float, t: Float) -> tuple[Float, Float]:
     return R, t
 
 
+def _turned_axes(parts: PoseParts, noise_rad: float) -> Float:
+    """Orthonormal directions (3, K), in left1, in which t makes a difference."""
+    _, sizes, right = np.linalg.svd((np.swapaxes(parts.R_1, 1, 2) - np.eye(3)).reshape(-1, 3), full_matrices=False)
+    return np.asarray(right[sizes > _least_size(sizes, len(parts.R_1), noise_rad)].T)
+
+
+def _least_size(sizes: Float, count: int, noise_rad: float) -> float:
+    """The singular value of N rotations, less the identity, that noise does not explain."""
+    return max(_LEAST_TURNED * noise_rad * float(np.sqrt(count)), _TINY * float(sizes[0]))
+
+
 class _Weighed:
     """Pose pairs whose alignment errors are weighed by what the motions' covariances make of them."""
 
     def __init__(self, pairs: PosePairs) -> None:
         self.parts = PoseParts.of(pairs)
         self.turns = np.linalg.norm(pairs.rotations_rad, axis=1)
+        variances = [np.trace(each[:, :3, :3], axis1=1, axis2=2) for each in (pairs.covariance_1, pairs.covariance_2)]
+        self.noise_rad = float(np.sqrt(np.median(variances) / 3.0))
         self._R_1, self._covariance_1 = pairs.motion_1[:, :3, :3], pairs.covariance_1
         R_2 = pairs.motion_2[:, :3, :3]
         self._covariance_2 = R_2 @ pairs.covariance_2[:, 3:, 3:] @ np.swapaxes(R_2, 1, 2)
@@ -170,7 +195,7 @@ class _Weighed:
 def _best_triples(weighed: _Weighed, rng: np.random.Generator) -> list[tuple[Float, Float]]:
     """Rotations and t of the triples that explain most, the best first."""
     parts, turns = weighed.parts, weighed.turns
-    normals, factors = _normal_matrices(parts.R_1, parts.R_2), np.eye(3) - parts.R_2
+    normals = _normal_matrices(parts.R_1, parts.R_2)
     fit = np.flatnonzero((turns > _LEAST_TURN) & (turns < _MOST_TURN))
     if len(fit) < FEWEST:
         raise CalibrationError(
@@ -182,9 +207,7 @@ def _best_triples(weighed: _Weighed, rng: np.random.Generator) -> list[tuple[Flo
     scored = []
     for triple, q in zip(triples, vectors[:, :, 0], strict=True):
         R = rotation_from_quat_wxyz(np.ascontiguousarray(q))
-        A = factors[triple].reshape(-1, 3)
-        b = (parts.T_2[triple] - parts.T_1[triple] @ R.T).ravel()
-        t = -R.T @ np.linalg.lstsq(A, b, rcond=1e-6)[0]
+        t = -R.T @ translation(R, parts.chosen(triple), weighed.noise_rad)
         cost = np.minimum(weighed.distances(R, t), _TRIPLE_LIMIT).sum()
         scored.append((float(cost), R, t))
     scored.sort(key=lambda each: each[0])
@@ -199,8 +222,10 @@ def _refined_on_inliers(weighed: _Weighed, R: Float, t: Float) -> tuple[float, F
         if inlier.sum() < FEWEST or (before is not None and np.array_equal(inlier, before)):
             break
         chosen, before = weighed.parts.chosen(inlier), inlier
-        start, _ = rotation(chosen.R_1, chosen.R_2)
-        R, t = refine(chosen, *((start, -start.T @ translation(start, chosen)) if number == 0 else (R, t)))
+        if number == 0:
+            R, _ = rotation(chosen.R_1, chosen.R_2)
+            t = -R.T @ translation(R, chosen, weighed.noise_rad)
+        R, t = refine(chosen, R, t, weighed.noise_rad)
     return float(np.minimum(weighed.distances(R, t), _LIMIT).sum()), R, t
 
 

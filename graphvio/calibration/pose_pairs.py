@@ -53,7 +53,7 @@ class PosePairs:
             values = getattr(self, name)
             if values.shape != shape:
                 raise CalibrationError(f"pose pairs: {name} is {values.shape} for {count} pairs; it must be {shape}")
-            bad = np.flatnonzero(~np.isfinite(values).reshape(count, -1).all(axis=1))
+            bad = np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
             if len(bad):
                 raise CalibrationError(f"pose pairs: {name} of pair {bad[0]} holds NaN or infinity; leave it out")
 
