@@ -72,7 +72,7 @@ class Smoother:
 
     def start(self, stamp_ns: int, state: RigState, uncertainty: StartUncertainty) -> None:
         """Begin, or begin anew, with one state."""
-        self._window = self._new_window()
+        self._window, self._advanced = self._new_window(), 0
         self._stamps, self._index_of, self._views = [], {}, ReferenceViews()
         velocity_body = state.nav_T_body[:3, :3].T @ state.velocity_nav
         self._previous_motion = np.concatenate([np.zeros(3), velocity_body])
