@@ -44,37 +44,34 @@ def test_planar_motion_leaves_the_offset_along_its_axis(noise: float) -> None:
 
 
 @pytest.mark.parametrize("noise", [2e-3, 1e-5])
-def test_turning_on_the_spot_leaves_the_angle_about_the_axis_too(noise: float) -> None:
-    found = observed((0.0, 0.1, 0.0), NONE, noise)
-    assert len(found.undetermined) == 2
-    offset, angle = found.missing
-    assert "offset along y (down)" in offset
-    assert "angle between the cameras about y (down)" in angle
-    assert "move it sideways" in angle
+@pytest.mark.parametrize(
+    ("turns", "steps", "undetermined", "words"),
+    [
+        (
+            (0.0, 0.1, 0.0),
+            NONE,
+            2,
+            [
+                "offset along y (down)",
+                "about y (down) of the first left camera cannot be found; turn the rig about another axis, or move it side",
+            ],
+        ),
+        (NONE, SOME, 3, ["hardly turned"]),
+        (NONE, (0.05, 0.0, 0.0), 4, ["hardly turned", "angle between the cameras about x (right)"]),
+        (NONE, NONE, 6, ["hardly moved"]),
+    ],
+    ids=["on the spot", "without turning", "straight", "at rest"],
+)
+def test_what_is_missing_is_told(turns: Three, steps: Three, undetermined: int, words: list[str], noise: float) -> None:
+    found = observed(turns, steps, noise)
+    assert len(found.undetermined) == undetermined
+    for expected, sentence in zip(words, found.missing, strict=True):
+        assert expected in sentence
 
 
 @pytest.mark.parametrize("noise", [2e-3, 1e-5])
-def test_without_turning_there_is_no_offset(noise: float) -> None:
-    found = observed(NONE, SOME, noise)
-    assert len(found.undetermined) == 3
-    (sentence,) = found.missing
-    assert "hardly turned" in sentence
-    assert np.sqrt(np.diag(found.covariance))[:3].max() < 0.02  # the directions of motion tell the rotation
-
-
-@pytest.mark.parametrize("noise", [2e-3, 1e-5])
-def test_a_straight_line_leaves_the_angle_about_it(noise: float) -> None:
-    found = observed(NONE, (0.05, 0.0, 0.0), noise)
-    assert len(found.undetermined) == 4
-    assert "angle between the cameras about x (right)" in found.missing[1]
-
-
-@pytest.mark.parametrize("noise", [2e-3, 1e-5])
-def test_a_rig_at_rest_tells_nothing(noise: float) -> None:
-    found = observed(NONE, NONE, noise)
-    assert len(found.undetermined) == 6
-    (sentence,) = found.missing
-    assert "hardly moved" in sentence
+def test_directions_of_motion_tell_the_rotation_where_nothing_turns(noise: float) -> None:
+    assert np.sqrt(np.diag(observed(NONE, SOME, noise).covariance))[:3].max() < 0.02
 
 
 def test_an_axis_that_is_none_of_the_cameras_is_told_by_its_numbers() -> None:

@@ -15,7 +15,7 @@ from scipy.linalg import eigh
 from graphvio.arrays import Float
 from graphvio.calibration.consistency import information
 from graphvio.calibration.pose_pairs import PosePairs
-from graphvio.geometry import se3_adjoint, se3_inverse
+from graphvio.geometry import se3_adjoint, se3_inverse, skew
 
 _LEAST_LEAD = 4.0  # information over what noise alone would give
 _FLOOR = 1e-9  # of the noise's information over the largest, so that it can be divided by
@@ -29,17 +29,15 @@ class Observability:
     """How well a recording's motions suit the calibration.
 
     Attributes:
-        rotation_singular_values: (3,) of the problem of the rotation, eq. (5): rms turning, rad, in descending order;
-            two of them must be well above the noise.
-        translation_singular_values: (3,) of the problem of the translation, eq. (6), likewise.
+        translation_singular_values: (3,) of the problem of the translation, eq. (6), as rms turning, rad, in descending
+            order; two of them must be well above the noise.
         turning_axes: (3, 3) rows: principal axes of the turning, in left1.
-        turning_rad: (3,) rms turning about these.
+        turning_rad: (3,) rms turning about these, the singular values of the problem of the rotation, eq. (5).
         undetermined: (K, 6) orthonormal directions, tangent in left1, of which the motions tell nothing.
         covariance: (6, 6) of ``left2_T_left1``, tangent in left1; very large along what is not determined.
         missing: what is not determined and what to do about it, a sentence each; none where all is.
     """
 
-    rotation_singular_values: Float
     translation_singular_values: Float
     turning_axes: Float
     turning_rad: Float
@@ -71,7 +69,6 @@ def observe(pairs: PosePairs, left2_T_left1: Float) -> Observability:
     turning_rad, axes = np.sqrt(np.maximum(turning[::-1], 0.0)), axes[:, ::-1].T
     lever = np.concatenate([np.eye(3) - motion[:3, :3] for motion in pairs.motion_2])
     return Observability(
-        rotation_singular_values=turning_rad,
         translation_singular_values=np.linalg.svd(lever / np.sqrt(len(pairs)), compute_uv=False),
         turning_axes=axes,
         turning_rad=turning_rad,
@@ -97,9 +94,7 @@ def _noise_information(pairs: PosePairs, left2_T_left1: Float) -> Float:
 
 def _small_adjoint(tangent: Float) -> Float:
     """(6, 6) with ``Ad(exp(d)) = 1 + ad(d)`` to first order."""
-    wx, wy, wz, vx, vy, vz = tangent
-    turn = np.array([[0.0, -wz, wy], [wz, 0.0, -wx], [-wy, wx, 0.0]])
-    shift = np.array([[0.0, -vz, vy], [vz, 0.0, -vx], [-vy, vx, 0.0]])
+    turn, shift = skew(tangent[:3]), skew(tangent[3:])
     return np.block([[turn, np.zeros((3, 3))], [shift, turn]])
 
 

@@ -71,10 +71,6 @@ class PosePairs:
             self.covariance_2[rows],
         )
 
-    def swapped(self) -> PosePairs:
-        """With the two cameras' parts exchanged."""
-        return PosePairs(self.start_ns, self.end_ns, self.motion_2, self.covariance_2, self.motion_1, self.covariance_1)
-
     @property
     def rotations_rad(self) -> Float:
         """(N, 3) rotation vectors of the first camera, in its frame at the start (and at the end)."""
