@@ -12,6 +12,10 @@ Three = tuple[float, float, float]
 ALL: Three = (0.1, 0.1, 0.1)
 SOME: Three = (0.05, 0.05, 0.05)
 NONE: Three = (0.0, 0.0, 0.0)
+ON_THE_SPOT = (
+    "the angle between the cameras about y (down) of the first left camera cannot be found; turn the rig about "
+    "another axis, or move it sideways"
+)
 
 
 def observed(turns: Three, steps: Three, noise: float) -> Observability:
@@ -53,7 +57,7 @@ def test_planar_motion_leaves_the_offset_along_its_axis(noise: float) -> None:
             2,
             [
                 "offset along y (down)",
-                "about y (down) of the first left camera cannot be found; turn the rig about another axis, or move it side",
+                ON_THE_SPOT,
             ],
         ),
         (NONE, SOME, 3, ["hardly turned"]),
