@@ -11,7 +11,7 @@ from synthetic import pose_at, random_covariance, transform
 from graphvio.arrays import Float
 from graphvio.calibration.camera_motions import CameraMotions
 from graphvio.calibration.consistency import information
-from graphvio.calibration.spans import LONGEST_S, all_stretches, most_telling, of_one_length
+from graphvio.calibration.spans import LENGTHS_S, all_stretches, most_telling, of_one_length, worth
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 
@@ -85,25 +85,25 @@ def test_no_instant_is_used_twice_and_the_choice_tells_more_than_any_length(gap_
     stamps, motions = steady(PERIOD_NS, gap_at)
     other = CameraMotions(stamps, [], BODY_T_LEFT)
     other._edge, other._reference = motions._edge, motions._reference
-    stretches = all_stretches(stamps, motions.between, other.between)
-    first = stretches.chosen(of_one_length(stretches))
+    stretches = all_stretches(stamps, [motions.between, other.between])
+    first = stretches.chosen(of_one_length(stretches)).pairs
     covariance = np.asarray(np.linalg.inv(information(first, LEFT2_T_LEFT1)))
-    rows = most_telling(stretches, LEFT2_T_LEFT1, covariance)
-    pairs = stretches.chosen(rows)
+    rows = most_telling(stretches, worth(stretches.pairs, LEFT2_T_LEFT1, covariance))
+    pairs = stretches.chosen(rows).pairs
     assert np.all(pairs.start_ns[1:] >= pairs.end_ns[:-1])
-    assert np.all(pairs.end_ns - pairs.start_ns <= LONGEST_S * 1e9)
+    assert np.all(pairs.end_ns - pairs.start_ns <= LENGTHS_S[-1] * 1e9)
     if gap_at is not None:
         across = (pairs.start_ns < gap_at * PERIOD_NS) & (pairs.end_ns >= gap_at * PERIOD_NS)
         assert not across.any()
 
-    def worth(chosen: list[int]) -> float:
-        told = information(stretches.chosen(chosen), LEFT2_T_LEFT1)
+    def gained(chosen: list[int]) -> float:
+        told = information(stretches.chosen(chosen).pairs, LEFT2_T_LEFT1)
         return float(np.trace(covariance @ told))
 
     for length in (1, 2, 7, 20):
         of_length = [
             row
-            for row in range(len(stretches.pairs))
+            for row in range(len(stretches))
             if stretches.last[row] - stretches.first[row] == length and stretches.first[row] % length == 0
         ]
-        assert worth(rows) >= worth(of_length)
+        assert gained(rows) >= gained(of_length)

@@ -61,7 +61,7 @@ def motions(walk: Walk, to_camera: Float, rng: np.random.Generator, moved: Float
 def stretches(walk: Walk, seed: int, moved: Float | None = None) -> Stretches:
     rng = np.random.default_rng(seed)
     one, other = motions(walk, np.eye(4), rng), motions(walk, se3_inverse(LEFT2_T_LEFT1), rng, moved)
-    return all_stretches(one.stamps_ns.tolist(), one.between, other.between)
+    return all_stretches(one.stamps_ns.tolist(), [one.between, other.between])
 
 
 def calibrated(walk: Walk, seed: int) -> PairCalibration:
@@ -113,4 +113,4 @@ def test_without_common_instants_there_is_nothing_to_calibrate_from() -> None:
     rng = np.random.default_rng(2)
     one = motions(turning, np.eye(4), rng)
     with pytest.raises(CalibrationError, match="needs 3 pose pairs and has 0"):
-        calibrate_pair(all_stretches([], one.between, one.between))
+        calibrate_pair(all_stretches([], [one.between, one.between]))

@@ -55,12 +55,19 @@ class Comparison:
         return self.statistic <= self.limit
 
 
-def compare(pairs: PosePairs, paper: PaperSolution, graph: GraphSolution) -> Comparison:
-    """The two solutions for the same N pose pairs."""
+def compare(pairs: PosePairs, paper: PaperSolution, graph: GraphSolution, dispersion: float = 1.0) -> Comparison:
+    """The two solutions for the same N pose pairs.
+
+    Args:
+        pairs: the pose pairs.
+        paper: the paper's solution.
+        graph: the graph's, at further unknowns that are about zero.
+        dispersion: factor on the noise that the pose pairs tell.
+    """
     by_paper = _influence_on_paper(pairs, paper)
     determined = null_space(graph.observability.undetermined).T if not graph.observability.is_complete else np.eye(6)
     by_graph = _influence_on_graph(pairs, graph, determined)
-    noise = np.concatenate([pairs.covariance_1, pairs.covariance_2])
+    noise = dispersion * np.concatenate([pairs.covariance_1, pairs.covariance_2])
     apart = by_paper - by_graph
     return Comparison(
         se3_log(se3_inverse(graph.left2_T_left1) @ np.ascontiguousarray(paper.left2_T_left1)),

@@ -6,10 +6,12 @@ A motion of the first camera, seen from the second, is ``left2_T_left1 motion_1 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.stats import chi2
 
-from graphvio.arrays import Bool, Float
+from graphvio.arrays import Bool, Float, Int
 from graphvio.calibration.pose_pairs import PosePairs
 from graphvio.copying import put
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log, se3_right_jacobian_inverse
@@ -22,10 +24,62 @@ _STEPS_A_ROUND = 2
 _SHARPENING = 1.4  # of the cost from round to round, towards truncated least squares
 _CERTAIN = 1e-3  # weights this near to 0 or 1 are that
 _SETTLED = 1e-12
+_LONGEST_STEP = 0.5  # radians and metres: from few motions the first steps may lead anywhere
 _NOTHING = np.zeros((0, 6))
 
 
-def without_outliers(pairs: PosePairs, start: Float, held: Float = _NOTHING) -> tuple[Float, Bool]:
+class Further(NamedTuple):
+    """Further unknowns, on which the pose pairs' errors depend linearly: an offset between clocks, a scale.
+
+    Attributes:
+        derivatives: (N, 6, M) of the errors, see `error_of`.
+        sigmas: (M,) of what is known of them beforehand, around zero.
+    """
+
+    derivatives: Float
+    sigmas: Float
+
+    def chosen(self, rows: Bool | Int) -> Further:
+        """Those of some pose pairs."""
+        return Further(self.derivatives[rows], self.sigmas)
+
+    def beside(self, other: Further | None) -> Further:
+        """With some more unknowns, before these."""
+        if other is None:
+            return self
+        return Further(
+            np.concatenate([other.derivatives, self.derivatives], axis=2),
+            np.concatenate([other.sigmas, self.sigmas]),
+        )
+
+    @staticmethod
+    def none(pairs: PosePairs) -> Further:
+        """No further unknowns."""
+        return Further(np.zeros((len(pairs), 6, 0)), np.zeros(0))
+
+
+class Consensus(NamedTuple):
+    """What most pose pairs agree on.
+
+    Attributes:
+        left2_T_left1: (4, 4).
+        further: (M,) further unknowns.
+        squares: (N,) squared Mahalanobis distances of the errors there.
+    """
+
+    left2_T_left1: Float
+    further: Float
+    squares: Float
+
+    @property
+    def inlier(self) -> Bool:
+        """(N,) pose pairs that are no outliers."""
+        return np.asarray(self.squares <= LIMIT)
+
+
+def without_outliers(
+    pairs: PosePairs, start: Float, held: Float = _NOTHING, further: Further | None = None
+) -> Consensus:
     """The relative pose by truncated least squares, from a start that may be off, by graduated non-convexity.
 
     H. Yang, P. Antonante, V. Tzoumas, L. Carlone, *Graduated Non-Convexity for Robust Spatial Perception: From
@@ -35,20 +89,19 @@ def without_outliers(pairs: PosePairs, start: Float, held: Float = _NOTHING) -> 
         pairs: N pose pairs.
         start: ``left2_T_left1`` (4, 4).
         held: (K, 6) orthonormal directions, tangent in left1, in which the start is kept.
-
-    Returns:
-        ``left2_T_left1`` (4, 4), and the pose pairs (N,) that are no outliers.
+        further: unknowns besides.
     """
-    left2_T_left1, squares = _solved(pairs, start, np.ones(len(pairs)), _MOST_ROUNDS, held)
-    sharpness = 1.0 / max(2.0 * squares.max() / LIMIT - 1.0, 1.0)
+    further = Further.none(pairs) if further is None else further
+    found = Consensus(start, np.zeros(len(further.sigmas)), np.empty(0))
+    found = solved(pairs, found, np.ones(len(pairs)), _MOST_ROUNDS, held, further)
+    sharpness = 1.0 / max(2.0 * found.squares.max() / LIMIT - 1.0, 1.0)
     for _ in range(_MOST_ROUNDS):
-        weights = _weights(squares, sharpness)
-        left2_T_left1, squares = _solved(pairs, left2_T_left1, weights, _STEPS_A_ROUND, held)
+        weights = _weights(found.squares, sharpness)
+        found = solved(pairs, found, weights, _STEPS_A_ROUND, held, further)
         if np.all((weights < _CERTAIN) | (weights > 1.0 - _CERTAIN)):
             break
         sharpness *= _SHARPENING
-    left2_T_left1, squares = _solved(pairs, left2_T_left1, (squares <= LIMIT).astype(np.float64), _MOST_ROUNDS, held)
-    return left2_T_left1, squares <= LIMIT
+    return solved(pairs, found, found.inlier.astype(np.float64), _MOST_ROUNDS, held, further)
 
 
 def squared_distances(pairs: PosePairs, left2_T_left1: Float) -> Float:
@@ -63,9 +116,38 @@ def information(pairs: PosePairs, left2_T_left1: Float) -> Float:
     return np.asarray(np.einsum("nki,nkj->ij", jacobians, jacobians))
 
 
-def whitened(pairs: PosePairs, left2_T_left1: Float) -> tuple[Float, Float]:
-    """Errors (N, 6) of unit covariance, and derivatives (N, 6, 6) by the tangent of ``left2_T_left1`` in left1."""
-    return _whitened(left2_T_left1, pairs.motion_1, pairs.covariance_1, pairs.motion_2, pairs.covariance_2)
+def whitened(
+    pairs: PosePairs, left2_T_left1: Float, further: Further | None = None, values: Float | None = None
+) -> tuple[Float, Float]:
+    """Errors (N, 6) of unit covariance, and derivatives (N, 6, 6 + M) by the tangent of ``left2_T_left1`` in left1 and
+    by further unknowns, at some values (M,) of these."""
+    if further is None or values is None:
+        further, values = Further.none(pairs), np.empty(0)
+    motions = pairs.motion_1, pairs.covariance_1, pairs.motion_2, pairs.covariance_2
+    return _whitened(left2_T_left1, *motions, np.ascontiguousarray(further.derivatives), values)
+
+
+def solved(
+    pairs: PosePairs, start: Consensus, weights: Float, most_steps: int, held: Float, further: Further
+) -> Consensus:
+    """Gauss-Newton with weighted pose pairs (N,) from a start, of which some directions (K, 6) are kept."""
+    left2_T_left1, values = start.left2_T_left1, start.further
+    free = np.eye(6 + len(values))
+    free[:6, :6] -= held.T @ held
+    known = np.diag(np.concatenate([np.zeros(6), further.sigmas**-2]))
+    for _ in range(most_steps):
+        errors, jacobians = whitened(pairs, left2_T_left1, further, values)
+        jacobians = jacobians @ free
+        normal = np.einsum("n,nki,nkj->ij", weights, jacobians, jacobians) + known
+        gradient = np.einsum("n,nki,nk->i", weights, jacobians, errors) + known[:, 6:] @ values
+        step = -np.linalg.lstsq(normal, gradient, rcond=1e-14)[0]
+        step /= max(np.abs(step).max() / _LONGEST_STEP, 1.0)
+        left2_T_left1 = left2_T_left1 @ se3_exp(step[:6])
+        values = values + step[6:]
+        if np.abs(step).max() < _SETTLED:
+            break
+    errors, _ = whitened(pairs, left2_T_left1, further, values)
+    return Consensus(left2_T_left1, values, np.sum(errors**2, axis=1))
 
 
 @kernel
@@ -84,23 +166,6 @@ def error_covariance(left2_T_left1: Float, covariance_1: Float, covariance_2: Fl
     return covariance_2 + adjoint @ covariance_1 @ adjoint.T
 
 
-def _solved(
-    pairs: PosePairs, left2_T_left1: Float, weights: Float, most_steps: int, held: Float
-) -> tuple[Float, Float]:
-    """Gauss-Newton with weighted pose pairs, and their squared distances at the solution."""
-    free = np.eye(6) - held.T @ held
-    for _ in range(most_steps):
-        errors, jacobians = whitened(pairs, left2_T_left1)
-        jacobians = jacobians @ free
-        normal = np.einsum("n,nki,nkj->ij", weights, jacobians, jacobians)
-        gradient = np.einsum("n,nki,nk->i", weights, jacobians, errors)
-        step = -np.linalg.lstsq(normal, gradient, rcond=1e-14)[0]
-        left2_T_left1 = left2_T_left1 @ se3_exp(step)
-        if np.abs(step).max() < _SETTLED:
-            break
-    return left2_T_left1, squared_distances(pairs, left2_T_left1)
-
-
 def _weights(squares: Float, sharpness: float) -> Float:
     """Eq. (14) of the paper on graduated non-convexity."""
     low, high = (LIMIT * bound for bound in (sharpness / (sharpness + 1.0), (sharpness + 1.0) / sharpness))
@@ -110,13 +175,22 @@ def _weights(squares: Float, sharpness: float) -> Float:
 
 @kernel
 def _whitened(
-    left2_T_left1: Float, motion_1: Float, covariance_1: Float, motion_2: Float, covariance_2: Float
+    left2_T_left1: Float,
+    motion_1: Float,
+    covariance_1: Float,
+    motion_2: Float,
+    covariance_2: Float,
+    derivatives: Float,
+    values: Float,
 ) -> tuple[Float, Float]:
-    n = len(motion_1)
-    errors, jacobians = np.empty((n, 6)), np.empty((n, 6, 6))
+    n, further = len(motion_1), len(values)
+    errors, jacobians = np.empty((n, 6)), np.empty((n, 6, 6 + further))
     for i in range(n):
         error, jacobian = error_of(left2_T_left1, motion_1[i], motion_2[i])
         root = np.linalg.cholesky(error_covariance(left2_T_left1, covariance_1[i], covariance_2[i]))
+        put(jacobians[i, :, :6], np.linalg.solve(root, jacobian))
+        if further:
+            error = error + derivatives[i] @ values
+            put(jacobians[i, :, 6:], np.linalg.solve(root, derivatives[i]))
         put(errors[i], np.linalg.solve(root, error))
-        put(jacobians[i], np.linalg.solve(root, jacobian))
     return errors, jacobians

@@ -7,74 +7,134 @@ most one stretch, so that no noise is counted twice.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
-from graphvio.arrays import Float
+from graphvio.arrays import Bool, Float, Int
 from graphvio.calibration.consistency import whitened
 from graphvio.calibration.pose_pairs import PosePairs
 
-LONGEST_S = 1.0
-_LENGTHS_S = (0.0, 0.1, 0.2, 0.35, 0.6, LONGEST_S)  # 0: one frame
+LENGTHS_S = (0.0, 0.1, 0.2, 0.35, 0.6, 1.0)
+"""Lengths of the stretches that are tried; 0 is one frame."""
+
 _FIRST_S = 0.35
 _NS_PER_S = 1e9
 
 
-class Stretches(NamedTuple):
-    """Pose pairs over any stretches, and between which of T instants each lies."""
+@dataclass(frozen=True, eq=False)
+class Stretches:
+    """Motions of J cameras over N stretches of time, which may overlap.
 
-    pairs: PosePairs
-    first: list[int]
-    last: list[int]
+    Attributes:
+        start_ns: (N,) int64.
+        end_ns: (N,) int64.
+        first: (N,) which of the instants each begins at.
+        last: (N,) which of them it ends at.
+        motions: (N, J, 4, 4) pose of each camera at the end in its frame at the start.
+        covariances: (N, J, 6, 6), tangent in the frame at the end.
+        known: (N, J) where a camera tells its motion.
+    """
 
-    def chosen(self, rows: Sequence[int]) -> PosePairs:
-        """The pose pairs of some stretches."""
-        return self.pairs.chosen(np.array(rows, dtype=np.int64))
+    start_ns: Int
+    end_ns: Int
+    first: Int
+    last: Int
+    motions: Float
+    covariances: Float
+    known: Bool
+
+    def __len__(self) -> int:
+        return len(self.start_ns)
+
+    @property
+    def cameras(self) -> int:
+        """J."""
+        return int(self.known.shape[1])
+
+    def chosen(self, rows: Bool | Int | Sequence[int]) -> Stretches:
+        """Some of them."""
+        which = np.asarray(rows, dtype=None if isinstance(rows, np.ndarray) else np.int64)
+        return Stretches(
+            self.start_ns[which],
+            self.end_ns[which],
+            self.first[which],
+            self.last[which],
+            self.motions[which],
+            self.covariances[which],
+            self.known[which],
+        )
+
+    def of_both(self, one: int, other: int) -> Stretches:
+        """Those over which two cameras tell their motions, and these two only, in this order."""
+        both = self.chosen(self.known[:, one] & self.known[:, other])
+        columns = [one, other]
+        return Stretches(
+            both.start_ns,
+            both.end_ns,
+            both.first,
+            both.last,
+            both.motions[:, columns],
+            both.covariances[:, columns],
+            both.known[:, columns],
+        )
+
+    @property
+    def pairs(self) -> PosePairs:
+        """Pose pairs of the first two cameras, which must know all their motions."""
+        told = [np.ascontiguousarray(each[:, j]) for j in (0, 1) for each in (self.motions, self.covariances)]
+        return PosePairs(self.start_ns, self.end_ns, *told)
 
 
 Between = Callable[[int, int], "tuple[Float, Float] | None"]
 """Motion (4, 4) and covariance (6, 6) from one stamp to another, or None."""
 
 
-def all_stretches(stamps_ns: Sequence[int], between_1: Between, between_2: Between) -> Stretches:
-    """Pose pairs over stretches of several lengths, from every instant on.
+def all_stretches(stamps_ns: Sequence[int], betweens: Sequence[Between]) -> Stretches:
+    """Stretches of several lengths from every instant on, over which the first camera and another one tell.
 
     Args:
         stamps_ns: T instants in order.
-        between_1: of the first camera.
-        between_2: of the other one.
+        betweens: of each camera.
     """
     stamps = np.array(stamps_ns, dtype=np.int64)
-    rows, first, last = [], [], []
-    for i, start_ns in enumerate(stamps_ns):
-        ends = np.searchsorted(stamps, start_ns + np.round(np.array(_LENGTHS_S) * _NS_PER_S), "right") - 1
+    places, told = [], []
+    for i, j in zip(*(ends.tolist() for ends in ends_of(stamps)), strict=True):
+        motions = [between(stamps_ns[i], stamps_ns[j]) for between in betweens]
+        if motions[0] is not None and sum(motion is not None for motion in motions) > 1:
+            places.append((i, j))
+            told.append(motions)
+    nothing = np.full((4, 4), np.nan), np.full((6, 6), np.nan)
+    count, cameras = len(told), len(betweens)
+    first, last = np.array(places, dtype=np.int64).reshape(-1, 2).T
+    return Stretches(
+        stamps[first],
+        stamps[last],
+        first,
+        last,
+        np.array([[(each or nothing)[0] for each in row] for row in told]).reshape(count, cameras, 4, 4),
+        np.array([[(each or nothing)[1] for each in row] for row in told]).reshape(count, cameras, 6, 6),
+        np.array([[each is not None for each in row] for row in told], dtype=np.bool_).reshape(count, cameras),
+    )
+
+
+def ends_of(stamps_ns: Int) -> tuple[Int, Int]:
+    """Between which of T instants stretches of all lengths lie, from every instant on: first (N,) and last (N,)."""
+    first, last = [], []
+    for i, start in enumerate(stamps_ns.tolist()):
+        ends = np.searchsorted(stamps_ns, start + np.round(np.array(LENGTHS_S) * _NS_PER_S), "right") - 1
         for j in np.unique(np.maximum(ends, i + 1)).tolist():
-            if j >= len(stamps) or stamps[j] - start_ns > 1.5 * LONGEST_S * _NS_PER_S:
-                continue
-            one, other = between_1(start_ns, stamps_ns[j]), between_2(start_ns, stamps_ns[j])
-            if one is not None and other is not None:
-                rows.append((start_ns, stamps_ns[j], *one, *other))
+            if j < len(stamps_ns) and stamps_ns[j] - start <= round(1.5 * LENGTHS_S[-1] * _NS_PER_S):
                 first.append(i)
                 last.append(j)
-    columns = zip(*rows, strict=True) if rows else ((),) * 6
-    start, end, motion_1, covariance_1, motion_2, covariance_2 = (np.array(column) for column in columns)
-    pairs = PosePairs(
-        start.astype(np.int64),
-        end.astype(np.int64),
-        motion_1.reshape(-1, 4, 4),
-        covariance_1.reshape(-1, 6, 6),
-        motion_2.reshape(-1, 4, 4),
-        covariance_2.reshape(-1, 6, 6),
-    )
-    return Stretches(pairs, first, last)
+    return np.array(first, dtype=np.int64), np.array(last, dtype=np.int64)
 
 
 def of_one_length(stretches: Stretches) -> list[int]:
     """Stretches of some tenths of a second, one after the other: to begin with, as nothing is known."""
-    duration = (stretches.pairs.end_ns - stretches.pairs.start_ns) / _NS_PER_S
+    duration = (stretches.end_ns - stretches.start_ns) / _NS_PER_S
     nearest: dict[int, int] = {}
-    for row, i in enumerate(stretches.first):
+    for row, i in enumerate(stretches.first.tolist()):
         if i not in nearest or abs(duration[row] - _FIRST_S) < abs(duration[nearest[i]] - _FIRST_S):
             nearest[i] = row
     chosen: list[int] = []
@@ -82,33 +142,41 @@ def of_one_length(stretches: Stretches) -> list[int]:
     for i in sorted(nearest):
         if i >= free:
             chosen.append(nearest[i])
-            free = stretches.last[nearest[i]]
+            free = int(stretches.last[nearest[i]])
     return chosen
 
 
-def most_telling(stretches: Stretches, left2_T_left1: Float, covariance: Float) -> list[int]:
-    """Stretches that do not overlap and from which the unknown gains most.
-
-    What a stretch is worth is the trace of its information times the covariance that is known so far: by how much it
-    lowers the logarithm of the volume of what is possible.
+def worth(pairs: PosePairs, left2_T_left1: Float, covariance: Float) -> Float:
+    """What each of N pose pairs is worth (N,): by how much it lowers the logarithm of the volume of what is possible,
+    to first order.
 
     Args:
-        stretches: to choose from.
+        pairs: to judge.
         left2_T_left1: about where the solution is (4, 4).
         covariance: (6, 6) of it, by a first choice.
     """
-    _, jacobians = whitened(stretches.pairs, left2_T_left1)
-    worth = np.einsum("nki,ij,nkj->n", jacobians, covariance, jacobians)
+    _, jacobians = whitened(pairs, left2_T_left1)
+    return np.asarray(np.einsum("nki,ij,nkj->n", jacobians, covariance, jacobians))
+
+
+def most_telling(stretches: Stretches, worths: Float) -> list[int]:
+    """Stretches that do not overlap and together are worth most, by dynamic programming over the instants.
+
+    Args:
+        stretches: N to choose from.
+        worths: (N,) of each.
+    """
     ending: dict[int, list[int]] = {}
-    for row, j in enumerate(stretches.last):
+    for row, j in enumerate(stretches.last.tolist()):
         ending.setdefault(j, []).append(row)
-    count = max(stretches.last, default=0) + 1
+    first = stretches.first.tolist()
+    count = int(stretches.last.max(initial=0)) + 1
     best = np.zeros(count)  # worth of all stretches that end by then
     by: list[int | None] = [None] * count
     for j in range(1, count):
         best[j] = best[j - 1]
         for row in ending.get(j, ()):
-            total = best[stretches.first[row]] + worth[row]
+            total = best[first[row]] + worths[row]
             if total > best[j]:
                 best[j], by[j] = total, row
     chosen = []
@@ -119,5 +187,5 @@ def most_telling(stretches: Stretches, left2_T_left1: Float, covariance: Float) 
             j -= 1
         else:
             chosen.append(ended)
-            j = stretches.first[ended]
+            j = first[ended]
     return chosen[::-1]

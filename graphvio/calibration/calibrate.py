@@ -1,0 +1,168 @@
+"""Calibration of a rig from a recording, or of cameras from trajectories that others' software made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.calibration.camera_motions import CameraMotions
+from graphvio.calibration.imu_alignment import ImuAlignment, align
+from graphvio.calibration.pair_calibration import PairCalibration, calibrate_pair
+from graphvio.calibration.result import Calibration, Clock, rig_warnings
+from graphvio.calibration.scale import ScaleMode
+from graphvio.calibration.separate_motions import SeparateMotions
+from graphvio.calibration.several import pairwise, place_all
+from graphvio.calibration.spans import Stretches, all_stretches
+from graphvio.calibration.trajectory_motions import TwoTrajectories, aligned, of_all
+from graphvio.config import Config
+from graphvio.errors import CalibrationError
+from graphvio.events import FrameSet, ImuSample
+from graphvio.rig import Rig
+from graphvio.sources import Source, open_source
+from graphvio.trajectory import Trajectory
+
+_EXACT = np.zeros((6, 6))
+
+
+def calibrate_pairs(
+    source: Source | str | Path,
+    *,
+    config: Config | None = None,
+    seed: int = 0,
+    scale_mode: ScaleMode = "auto",
+    on_frameset: Callable[[int, SeparateMotions], bool | None] | None = None,
+) -> Calibration:
+    """Find where the stereo pairs of a rig are relative to each other, from a recording of its motion (section 4).
+
+    Every pair tracks by itself; where the rig file has the pairs does not matter, nor whether they see the same. Pairs
+    must have one clock but need not be triggered together.
+
+    Args:
+        source: a recording, or its folder.
+        config: of the front-ends.
+        seed: of all random choices.
+        scale_mode: whether lengths that a pair measures may be wrong by a factor.
+        on_frameset: called after each with its number and all that the pairs have told; True ends the recording there.
+
+    Raises:
+        CalibrationError: if the rig has one pair only, or the recording does not tell where the pairs are.
+        SourceError: if the recording cannot be read.
+        RigError: if it carries no usable calibration of the cameras themselves.
+    """
+    opened = open_source(source) if isinstance(source, str | Path) else source
+    rig = opened.rig
+    if len(rig.pairs) < 2:
+        raise CalibrationError(f"{rig.name} has one stereo pair; there is no other whose place could be found")
+    separate = SeparateMotions(rig, config or Config())
+    stamps_ns: list[int] = []
+    gyro: list[Float] = []
+    number = 0
+    try:
+        for event in opened:
+            if isinstance(event, ImuSample):
+                stamps_ns.append(event.stamp_ns)
+                gyro.append(event.angular_velocity)
+            elif isinstance(event, FrameSet):
+                separate.add(event)
+                number += 1
+                if on_frameset is not None and on_frameset(number, separate):
+                    break
+    finally:
+        separate.close()
+    stretches = stretches_of_motions(separate.motions())
+    names = tuple(pair.name for pair in rig.pairs)
+    _check(stretches, names)
+    found, missing = pairwise(stretches, names, seed, scale_mode=scale_mode)
+    places = place_all(found, names, stretches)
+    imu, unchecked = _imu(rig, stretches, np.array(stamps_ns, dtype=np.int64), np.array(gyro).reshape(-1, 3))
+    made = Calibration(names, places, rig, imu)
+    return replace(made, warnings=(*places.warnings, *missing, *rig_warnings(made), *unchecked))
+
+
+def calibrate_trajectories(
+    trajectories: Sequence[Trajectory],
+    names: Sequence[str] | None = None,
+    *,
+    same_clock: bool = False,
+    seed: int = 0,
+    scale_mode: ScaleMode = "auto",
+) -> Calibration:
+    """Find where cameras are relative to each other, from what any odometry has made of their motion (section 4).
+
+    Args:
+        trajectories: J of them, ``world_T_camera`` each in a world frame of its own, on a clock of its own.
+        names: (J) of the cameras.
+        same_clock: whether all stamps are of one clock; else offsets are found, and drifts.
+        seed: of all random choices.
+        scale_mode: whether lengths that an odometry measures may be wrong by a factor.
+
+    Raises:
+        CalibrationError: if there are fewer than two, their clocks cannot be related, or they do not tell where the
+            cameras are.
+    """
+    if len(trajectories) < 2:
+        raise CalibrationError(f"{len(trajectories)} trajectories; to relate cameras takes two or more")
+    if names is None:
+        names = [f"camera {j}" for j in range(len(trajectories))]
+    two: dict[tuple[int, int], TwoTrajectories] = {}
+    found: dict[tuple[int, int], PairCalibration] = {}
+    missing: list[str] = []
+    for i, j in combinations(range(len(trajectories)), 2):
+        try:
+            both = aligned(trajectories[i], trajectories[j], same_clock, seed)
+            found[i, j] = calibrate_pair(
+                both.stretches, seed, further=both.further, scale_mode=scale_mode, seen_from=_EXACT
+            )
+            two[i, j] = both
+        except CalibrationError as error:
+            told = f"{names[i]} and {names[j]}: {error}"
+            if i == 0:
+                raise CalibrationError(told) from None
+            missing.append(told)
+    places = place_all(found, names, of_all(trajectories, two), _EXACT)
+    clocks = None if same_clock else {each: _clock(two[each], found[each]) for each in found}
+    drifts = [
+        f"the clocks of {names[i]} and {names[j]} drift apart by {1e6 * clock.relation.drift:.0f} (+- "
+        f"{1e6 * clock.drift_sigma:.0f}) microseconds a second; it is corrected here"
+        for (i, j), clock in (clocks or {}).items()
+        if clock.drifts
+    ]
+    return Calibration(tuple(names), places, clocks=clocks, warnings=(*places.warnings, *missing, *drifts))
+
+
+def stretches_of_motions(motions: Sequence[CameraMotions]) -> Stretches:
+    """Stretches between the first camera's instants, of all cameras."""
+    return all_stretches(motions[0].stamps_ns.tolist(), [each.between for each in motions])
+
+
+def _check(stretches: Stretches, names: Sequence[str]) -> None:
+    for j, name in enumerate(names):
+        others = stretches.known[:, 0] & stretches.known[:, j] if j else stretches.known[:, 1:].any(axis=1)
+        if not others.any():
+            raise CalibrationError(
+                f"{name} and {names[0] if j else 'the others'} never told their motions at the same time: do both see "
+                "texture, are left and right images of each in this order, and is each pair's own calibration right?"
+            )
+
+
+def _imu(rig: Rig, stretches: Stretches, stamps_ns: Int, gyro: Float) -> tuple[dict[int, ImuAlignment], list[str]]:
+    """All left cameras against the IMU, and why some could not be compared."""
+    if rig.imu is None or not len(stamps_ns):
+        return {}, []
+    found, missing = {}, []
+    for j, pair in enumerate(rig.pairs):
+        try:
+            found[j] = align(stretches, j, stamps_ns, gyro, rig.imu, pair.left.body_T_cam[:3, :3])
+        except CalibrationError as error:
+            missing.append(f"{pair.name}: {error}")
+    return found, missing
+
+
+def _clock(both: TwoTrajectories, found: PairCalibration) -> Clock:
+    sigmas = np.sqrt(found.dispersion * np.diag(found.solution.further_covariance))
+    return Clock(both.clock, float(sigmas[0]), float(sigmas[1]))

@@ -1,0 +1,240 @@
+"""How a camera is turned against the IMU, and the offset of their clocks, from rotations by gyro and vision.
+
+With ``R`` the camera's rotation in body, body turns by ``R turn R^T`` where the camera turns by ``turn``; the gyro,
+less its bias, must have measured that over the same time by its own clock. Unknowns are a small rotation of ``R``, the
+bias, and a correction of the offset; where the gyro sits does not matter, nor where the camera is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphvio.arrays import Float, Int
+from graphvio.calibration import paper_method
+from graphvio.calibration.spans import Stretches, of_one_length
+from graphvio.errors import CalibrationError
+from graphvio.geometry import skew, so3_exp, so3_log
+from graphvio.kernels import kernel
+from graphvio.rig import Imu
+
+_LIMIT = float(chi2.isf(1e-3, 3))
+_SIGMAS = 4.0
+_FLOOR_RAD = 1e-3  # a gyro's scale and axes are no better
+_FLOOR_S = 2e-4
+_FEWEST = 10
+_ROUNDS = 20
+_STEP_S = 1e-3
+_WIDEST_S, _COARSE_S = 0.1, 0.005  # offsets that are tried at first
+_BIAS_SIGMA = 0.1  # rad/s, beforehand
+_NS_PER_S = 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class ImuAlignment:
+    """A left camera against the IMU.
+
+    Attributes:
+        body_R_left: (3, 3).
+        misrotation: (3,) rotation vector, radians in body, from the rig's rotation to this one.
+        covariance: (3, 3) of it.
+        time_offset_s: add it to the camera's stamps to get the IMU's.
+        time_offset_sigma_s: of it.
+        rig_time_offset_s: what the rig says of it.
+        gyro_bias: (3,) rad/s.
+        stretches: number of motions that agree.
+    """
+
+    body_R_left: Float
+    misrotation: Float
+    covariance: Float
+    time_offset_s: float
+    time_offset_sigma_s: float
+    rig_time_offset_s: float
+    gyro_bias: Float
+    stretches: int
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether the rig's rotation is wrong beyond doubt."""
+        return float(self.misrotation @ np.linalg.solve(self.covariance, self.misrotation)) > _LIMIT
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the rig's time offset is wrong beyond doubt."""
+        return abs(self.time_offset_s - self.rig_time_offset_s) > _SIGMAS * self.time_offset_sigma_s
+
+    def warnings(self, name: str) -> list[str]:
+        """A sentence for each of both."""
+        told = []
+        if self.is_turned:
+            angle, sigma = np.linalg.norm(self.misrotation), np.sqrt(np.linalg.eigvalsh(self.covariance)[-1])
+            told.append(
+                f"{name} is turned by {np.rad2deg(angle):.2f} degrees (+- {np.rad2deg(sigma):.2f}) from where the rig "
+                "has it against the IMU"
+            )
+        if self.is_late:
+            told.append(
+                f"{name}: the time offset between cameras and IMU is {1e3 * self.time_offset_s:.2f} ms (+- "
+                f"{1e3 * self.time_offset_sigma_s:.2f}), and {1e3 * self.rig_time_offset_s:.2f} ms in the rig"
+            )
+        return told
+
+
+def align(stretches: Stretches, camera: int, stamps_ns: Int, gyro: Float, imu: Imu, body_R_left: Float) -> ImuAlignment:
+    """Find rotation and time offset of one camera.
+
+    Args:
+        stretches: of all cameras.
+        camera: which of them.
+        stamps_ns: (S,) of the gyro, increasing.
+        gyro: (S, 3) rad/s in body.
+        imu: its noise, and the time offset that the rig says.
+        body_R_left: (3, 3) that the rig says.
+
+    Raises:
+        CalibrationError: if gyro and vision do not overlap in time, or the rig hardly turned.
+    """
+    of_camera = stretches.chosen(stretches.known[:, camera])
+    chosen = of_camera.chosen(of_one_length(of_camera))
+    turned = _Turned(chosen, camera, stamps_ns, gyro, imu)
+    if len(turned.turns) < _FEWEST:
+        raise CalibrationError("gyro and camera have less than a few seconds in common: the IMU cannot be checked")
+    offset_s = turned.likeliest_offset(imu.time_offset_s)
+    by_gyro = turned.by_gyro(offset_s, np.zeros(3))
+    closed_form, eigenvalues = paper_method.rotation(np.swapaxes(turned.turns, 1, 2), np.swapaxes(by_gyro, 1, 2))
+    if eigenvalues[1] < _FEWEST * _FLOOR_RAD**2:
+        raise CalibrationError("the rig hardly turned, so the camera's rotation against the IMU cannot be checked")
+    starts = (np.ascontiguousarray(body_R_left), closed_form)
+    found = min((turned.solve(start, offset_s) for start in starts), key=lambda each: each.cost)
+    covariance = found.covariance
+    return ImuAlignment(
+        body_R_left=found.rotation,
+        misrotation=so3_log(np.ascontiguousarray(found.rotation @ body_R_left.T)),
+        covariance=covariance[:3, :3] + np.eye(3) * _FLOOR_RAD**2,
+        time_offset_s=found.offset_s,
+        time_offset_sigma_s=float(np.hypot(np.sqrt(covariance[6, 6]), _FLOOR_S)),
+        rig_time_offset_s=imu.time_offset_s,
+        gyro_bias=found.bias,
+        stretches=found.agreeing,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    rotation: Float
+    bias: Float
+    offset_s: float
+    covariance: Float  # (7, 7) of rotation, bias, offset
+    agreeing: int
+    cost: float
+
+
+class _Turned:
+    """Rotations of a camera, and of body as the gyro has them over the same time."""
+
+    def __init__(self, stretches: Stretches, camera: int, stamps_ns: Int, gyro: Float, imu: Imu) -> None:
+        self._origin_ns = int(stamps_ns[0])
+        self._times_s = (stamps_ns - self._origin_ns) / _NS_PER_S
+        self._gyro = np.ascontiguousarray(gyro)
+        self._gyro_variance = imu.gyro_noise_density**2
+        margin_s = abs(imu.time_offset_s) + _WIDEST_S
+        start, end = ((each - self._origin_ns) / _NS_PER_S for each in (stretches.start_ns, stretches.end_ns))
+        inside = (start > margin_s) & (end < self._times_s[-1] - margin_s)
+        self._start_s, self._end_s = start[inside], end[inside]
+        self.turns = np.ascontiguousarray(stretches.motions[inside, camera, :3, :3])
+        self._covariances = stretches.covariances[inside, camera, :3, :3]
+
+    def by_gyro(self, offset_s: float, bias: Float) -> Float:
+        """Rotations (N, 3, 3) of body from start to end, by the gyro."""
+        start, end = self._start_s + offset_s, self._end_s + offset_s
+        return np.asarray(_integrated(self._times_s, self._gyro - bias, start, end))
+
+    def likeliest_offset(self, around_s: float) -> float:
+        """The offset at which both turn by angles that are most alike: these do not depend on the rotation."""
+        angles = np.array([np.linalg.norm(so3_log(turn)) for turn in self.turns])
+        tried = around_s + np.arange(-_WIDEST_S, _WIDEST_S + 1e-9, _COARSE_S)
+
+        def misfit(offset_s: float) -> float:
+            by_gyro = self.by_gyro(offset_s, np.zeros(3))
+            return float(np.median(np.abs(angles - [np.linalg.norm(so3_log(turn)) for turn in by_gyro])))
+
+        return float(min(tried.tolist(), key=misfit))
+
+    def solve(self, rotation: Float, offset_s: float) -> _Found:
+        """Gauss-Newton on those that agree, from a start."""
+        bias = np.zeros(3)
+        normal, cost, weight = np.eye(7), np.inf, np.zeros(0)
+        duration = self._end_s - self._start_s
+        for number in range(_ROUNDS):
+            errors, jacobians = self._linearised(rotation, bias, offset_s)
+            noise = rotation @ self._covariances @ rotation.T
+            noise = noise + (self._gyro_variance * duration)[:, None, None] * np.eye(3)
+            information = np.linalg.inv(noise)
+            squares = np.einsum("ni,nij,nj->n", errors, information, errors)
+            scale = max(float(np.median(squares)) / float(chi2.median(3)), 1.0)  # of a noise that is told too small
+            weight = (squares < scale * _LIMIT).astype(np.float64)
+            cost = float(np.minimum(squares, _LIMIT).sum())
+            weighted = np.einsum("n,nki,nkl->nil", weight, jacobians, information)
+            normal = np.einsum("nil,nlj->ij", weighted, jacobians)
+            normal[3:6, 3:6] += np.eye(3) / _BIAS_SIGMA**2
+            gradient = np.einsum("nil,nl->i", weighted, errors)
+            gradient[3:6] += bias / _BIAS_SIGMA**2
+            step = -np.linalg.lstsq(normal, gradient, rcond=1e-12)[0]
+            rotation = so3_exp(np.ascontiguousarray(step[:3])) @ rotation
+            bias, offset_s = bias + step[3:6], offset_s + float(np.clip(step[6], -_WIDEST_S, _WIDEST_S))
+            if number > 2 and np.abs(step).max() < 1e-9:
+                break
+        used = weight > 0.0
+        factor = max(float(np.mean(squares[used])) / 3.0, 1.0) if used.any() else 1.0
+        covariance = np.asarray(factor * np.linalg.pinv(normal, hermitian=True), dtype=np.float64)
+        return _Found(rotation, bias, offset_s, covariance, int(used.sum()), cost)
+
+    def _linearised(self, rotation: Float, bias: Float, offset_s: float) -> tuple[Float, Float]:
+        """Errors (N, 3) in body at the end, and derivatives (N, 3, 7) by rotation (from the left), bias, offset."""
+        by_vision = rotation @ self.turns @ rotation.T
+        by_gyro = self.by_gyro(offset_s, bias)
+        later = self.by_gyro(offset_s + _STEP_S, bias)
+        errors = _logs(np.swapaxes(by_gyro, 1, 2) @ by_vision)
+        jacobians = np.empty((len(errors), 3, 7))
+        jacobians[:, :, :3] = np.swapaxes(by_vision, 1, 2) - np.eye(3)
+        halfway = np.array([np.eye(3) - 0.5 * skew(turn) for turn in _logs(by_gyro)])
+        jacobians[:, :, 3:6] = (self._end_s - self._start_s)[:, None, None] * halfway
+        jacobians[:, :, 6] = (_logs(np.swapaxes(later, 1, 2) @ by_vision) - errors) / _STEP_S
+        return errors, jacobians
+
+
+def _logs(rotations: Float) -> Float:
+    return np.array([so3_log(np.ascontiguousarray(each)) for each in rotations]).reshape(-1, 3)
+
+
+@kernel
+def _integrated(times_s: Float, rates: Float, start_s: Float, end_s: Float) -> Float:
+    """Rotations (N, 3, 3) from start to end of a body that turns at rates (S, 3), linear between times (S,)."""
+    out = np.empty((len(start_s), 3, 3))
+    for k in range(len(start_s)):
+        turned = np.eye(3)
+        at, i = start_s[k], np.searchsorted(times_s, start_s[k])
+        rate = _rate_at(times_s, rates, i, at)
+        while at < end_s[k]:
+            until = min(times_s[i], end_s[k]) if i < len(times_s) else end_s[k]
+            next_rate = _rate_at(times_s, rates, i, until)
+            turned = turned @ so3_exp(0.5 * (rate + next_rate) * (until - at))
+            at, rate = until, next_rate
+            i += 1
+        out[k] = turned
+    return out
+
+
+@kernel
+def _rate_at(times_s: Float, rates: Float, after: int, at: float) -> Any:
+    """The rate at a time between two samples, of which the later one is known; at the ends, that of the last."""
+    if after <= 0:
+        return rates[0].copy()
+    if after >= len(times_s):
+        return rates[-1].copy()
+    share = (at - times_s[after - 1]) / (times_s[after] - times_s[after - 1])
+    return (1.0 - share) * rates[after - 1] + share * rates[after]

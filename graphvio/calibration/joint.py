@@ -1,0 +1,136 @@
+"""All pairs at once: one graph, whose relative poses close every loop.
+
+For each stretch of time the first camera's true motion is an unknown, of which every camera's own motion is a
+measurement through that camera's place on the rig. With two cameras this is the graph of `calibration.graph`; with
+more, no motion's noise is counted twice, as it would be by an average of results for two at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphvio.arrays import Bool, Float
+from graphvio.backend.noise import gaussian
+from graphvio.calibration.consistency import LIMIT, error_covariance, error_of
+from graphvio.calibration.graph import holding
+from graphvio.calibration.pose_pairs import FEWEST
+from graphvio.calibration.spans import Stretches
+from graphvio.errors import CalibrationError
+from graphvio.geometry import se3_adjoint, se3_inverse, se3_right_jacobian_inverse
+from graphvio.kernels import kernel
+
+_ROUNDS = 3  # what is an outlier depends on the solution
+_AGREEING = 0.5  # of the other cameras that tell a motion, so that it counts
+
+
+@dataclass(frozen=True, eq=False)
+class JointSolution:
+    """Places of J cameras in the first one.
+
+    Attributes:
+        left_T_left1: (J, 4, 4) pose of the first left camera in each; the first is the identity.
+        covariance: (6 (J - 1), 6 (J - 1)) of the others', tangents ``[rotation, translation]`` in left1.
+        used: (N, J) motions that agree with the others'.
+    """
+
+    left_T_left1: Float
+    covariance: Float
+    used: Bool
+
+    def between(self, one: int, other: int) -> Float:
+        """``left_other_T_left_one`` (4, 4)."""
+        return np.asarray(self.left_T_left1[other] @ se3_inverse(np.ascontiguousarray(self.left_T_left1[one])))
+
+
+def solve(stretches: Stretches, start: Float, held: Sequence[Float]) -> JointSolution:
+    """The most likely places of all cameras.
+
+    Args:
+        stretches: N that do not overlap, of J cameras.
+        start: ``left_T_left1`` (J, 4, 4).
+        held: for each camera but the first, directions (K, 6) in which the start is kept.
+
+    Raises:
+        CalibrationError: if a camera agrees with the others in fewer than three motions.
+    """
+    left_T_left1 = np.array(start)
+    cameras = range(1, stretches.cameras)
+    for _ in range(_ROUNDS):
+        used = _agreeing(stretches, left_T_left1)
+        if used[:, 1:].sum(axis=0).min() < FEWEST:
+            worst = int(np.argmin(used[:, 1:].sum(axis=0))) + 1
+            raise CalibrationError(f"camera {worst} agrees with the others in fewer than {FEWEST} motions")
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for j in cameras:
+            values.insert(_place(j), gtsam.Pose3(left_T_left1[j]))
+            if len(held[j - 1]):
+                graph.push_back(holding(_place(j), held[j - 1], left_T_left1[j]))
+        for k in np.flatnonzero(used.sum(axis=1) > 1).tolist():
+            j = int(np.argmax(used[k]))  # the first that is used
+            there = left_T_left1[j]
+            values.insert(_motion(k), gtsam.Pose3(se3_inverse(there) @ stretches.motions[k, j] @ there))
+            for j in np.flatnonzero(used[k]).tolist():
+                graph.push_back(_factor(k, j, stretches.motions[k, j], stretches.covariances[k, j]))
+        values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        for j in cameras:
+            left_T_left1[j] = values.atPose3(_place(j)).matrix()
+    joint = gtsam.Marginals(graph, values).jointMarginalCovariance(gtsam.KeyVector([_place(j) for j in cameras]))
+    covariance = np.block([[joint.at(_place(i), _place(j)) for j in cameras] for i in cameras])
+    return JointSolution(left_T_left1, covariance, used)
+
+
+def _place(camera: int) -> int:
+    return int(gtsam.symbol("X", camera))
+
+
+def _motion(stretch: int) -> int:
+    return int(gtsam.symbol("M", stretch))
+
+
+def _factor(stretch: int, camera: int, measured: Float, covariance: Float) -> gtsam.NonlinearFactor:
+    """A camera's motion as a measurement of the first one's, which alone is known for the first itself."""
+    noise, measured = gaussian(covariance), np.ascontiguousarray(measured)
+    if camera == 0:
+        return gtsam.PriorFactorPose3(_motion(stretch), gtsam.Pose3(measured), noise)
+
+    def error(_: Any, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
+        place, motion = (np.ascontiguousarray(values.atPose3(key).matrix()) for key in keys)
+        off, by_place = error_of(place, motion, measured)
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(by_place)
+            jacobians[1] = np.asfortranarray(se3_right_jacobian_inverse(off) @ se3_adjoint(place))
+        return off
+
+    keys = [_place(camera), _motion(stretch)]
+    return gtsam.CustomFactor(noise, keys, error)
+
+
+def _agreeing(stretches: Stretches, left_T_left1: Float) -> Bool:
+    """(N, J) motions that agree with at least half of the others over the same stretch."""
+    agree = _agreements(stretches.motions, stretches.covariances, stretches.known, left_T_left1, LIMIT)
+    others = stretches.known.sum(axis=1, keepdims=True) - 1
+    return np.asarray(stretches.known & (agree > 0) & (agree >= _AGREEING * others))
+
+
+@kernel
+def _agreements(motions: Float, covariances: Float, known: Bool, left_T_left1: Float, limit: float) -> Float:
+    """(N, J) with how many others each motion agrees."""
+    stretches, cameras = known.shape
+    agree = np.zeros((stretches, cameras))
+    for k in range(stretches):
+        for i in range(cameras):
+            for j in range(i + 1, cameras):
+                if not (known[k, i] and known[k, j]):
+                    continue
+                place = left_T_left1[j] @ se3_inverse(left_T_left1[i])
+                off, _ = error_of(place, motions[k, i], motions[k, j])
+                covariance = error_covariance(place, covariances[k, i], covariances[k, j])
+                if off @ np.linalg.solve(covariance, off) <= limit:
+                    agree[k, i] += 1
+                    agree[k, j] += 1
+    return agree

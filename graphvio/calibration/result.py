@@ -1,0 +1,183 @@
+"""The result of a calibration: places of all pairs, what they were before, and the rig that follows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphvio.arrays import Bool, Float
+from graphvio.calibration.imu_alignment import ImuAlignment
+from graphvio.calibration.pair_calibration import PairCalibration, size_in_words
+from graphvio.calibration.several import Places
+from graphvio.calibration.trajectory_motions import ClockRelation
+from graphvio.errors import CalibrationError
+from graphvio.geometry import se3, se3_inverse, se3_log
+from graphvio.rig import Rig, StereoPair
+
+_CHANCE = 1e-3
+_SIGNIFICANT = 4.0  # sigmas of a drift of clocks
+_SWAPPED = 0.2  # of the distance from the rig's value, that of its inverse is
+
+
+@dataclass(frozen=True, eq=False)
+class Present:
+    """What a rig file says of a pair's place, against the calibration.
+
+    Attributes:
+        tangent: (6,) from the calibration to the file's ``left2_T_left1``, ``[rotation, translation]`` in left1.
+        sigmas: the same in standard deviations: the root of the squared Mahalanobis distance.
+        is_off: whether chance does not explain it.
+        is_swapped: whether the file's would be right if both pairs changed places.
+    """
+
+    tangent: Float
+    sigmas: float
+    is_off: bool
+    is_swapped: bool
+
+    @property
+    def angle_deg(self) -> float:
+        """Size of the rotation."""
+        return float(np.rad2deg(np.linalg.norm(self.tangent[:3])))
+
+    @property
+    def distance_m(self) -> float:
+        """Size of the translation."""
+        return float(np.linalg.norm(self.tangent[3:]))
+
+
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """How a camera's clock relates to the first one's.
+
+    Attributes:
+        relation: offset and drift.
+        offset_sigma_s: of the offset.
+        drift_sigma: of the drift, seconds a second.
+    """
+
+    relation: ClockRelation
+    offset_sigma_s: float
+    drift_sigma: float
+
+    @property
+    def drifts(self) -> bool:
+        """Whether the drift is there beyond doubt."""
+        return abs(self.relation.drift) > _SIGNIFICANT * self.drift_sigma
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Where all stereo pairs, or cameras with trajectories, are on a rig.
+
+    Attributes:
+        names: (J) of the pairs.
+        places: of all, with what was found for two at a time.
+        rig: that was calibrated; None for trajectories.
+        imu: each left camera against the IMU, where both were recorded and could be compared.
+        clocks: (first, second) -> how their clocks relate, for trajectories.
+        warnings: a sentence for everything that a person should know before using the result.
+    """
+
+    names: tuple[str, ...]
+    places: Places
+    rig: Rig | None = None
+    imu: Mapping[int, ImuAlignment] | None = None
+    clocks: Mapping[tuple[int, int], Clock] | None = None
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def pair(self) -> PairCalibration:
+        """The first two, by themselves: all details."""
+        return self.places.pairwise[0, 1]
+
+    @property
+    def left2_T_left1(self) -> Float:
+        """(4, 4), the paper's P_12 of the first two."""
+        return np.ascontiguousarray(self.places.left_T_left1[1])
+
+    @property
+    def covariance(self) -> Float:
+        """(6, 6) of it, tangent ``[rotation, translation]`` in left1."""
+        return self.places.covariance[:6, :6]
+
+    @property
+    def inliers(self) -> Bool:
+        """(N,) pose pairs of the first two that are no outliers."""
+        return self.pair.inlier
+
+    @property
+    def alignment_errors_m(self) -> Float:
+        """(N,) lengths of the paper's alignment errors, eq. (7), of the first two."""
+        return self.pair.alignment_errors_m
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the motions tell all of every place."""
+        return all(each.observability.is_complete for each in self.places.pairwise.values())
+
+    def present(self, one: int = 0, other: int = 1) -> Present | None:
+        """The rig's own value against the calibration; None without a rig."""
+        if self.rig is None:
+            return None
+        found = self.places.left_T_left1[other] @ se3_inverse(self.places.left_T_left1[one])
+        given = self.rig.left2_T_left1(one, other)
+        covariance = self.places.covariance_between(one, other)
+        tangent = se3_log(se3_inverse(found) @ given)
+        swapped = se3_log(se3_inverse(found) @ se3_inverse(np.ascontiguousarray(given)))
+        square, other_square = (float(each @ np.linalg.solve(covariance, each)) for each in (tangent, swapped))
+        is_off = square > chi2.isf(_CHANCE, 6)
+        is_swapped = bool(is_off and other_square < _SWAPPED**2 * square)
+        return Present(tangent, float(np.sqrt(square)), bool(is_off), is_swapped)
+
+    def calibrated_rig(self, correct_imu: bool = False) -> Rig:
+        """The rig with all pairs where the calibration has them; the first left camera keeps its place.
+
+        Args:
+            correct_imu: whether the cameras are turned against the IMU, and the time offset is set, as the first left
+                camera's comparison with the IMU says; its position in body stays, which rotations do not tell.
+
+        Raises:
+            CalibrationError: if there is no rig, the motions do not tell all, or there was no IMU to correct by.
+        """
+        if self.rig is None:
+            raise CalibrationError("trajectories were calibrated, not a rig: there is no rig to correct")
+        if not self.is_complete:
+            raise CalibrationError(f"the rig is not written, as not all is known: {self.warnings[0]}")
+        body_T_left1 = np.ascontiguousarray(self.rig.pairs[0].left.body_T_cam)
+        imu = self.rig.imu
+        if correct_imu:
+            if not self.imu or 0 not in self.imu or imu is None:
+                raise CalibrationError("the recording has no IMU that the first pair could be compared with")
+            body_T_left1 = se3(self.imu[0].body_R_left, body_T_left1[:3, 3].copy())
+            imu = replace(imu, time_offset_s=self.imu[0].time_offset_s)
+        pairs = [
+            _placed(pair, body_T_left1 @ se3_inverse(np.ascontiguousarray(left_T_left1)))
+            for pair, left_T_left1 in zip(self.rig.pairs, self.places.left_T_left1, strict=True)
+        ]
+        return replace(self.rig, pairs=tuple(pairs), imu=imu)
+
+
+def rig_warnings(found: Calibration) -> list[str]:
+    """What is wrong with the rig file, a sentence each."""
+    told = []
+    for j in range(1, len(found.names)):
+        present = found.present(0, j)
+        if present is None or not present.is_off:
+            continue
+        where = f"the rig has {found.names[j]} {size_in_words(present.tangent)} from where it is relative to "
+        where += f"{found.names[0]} ({present.sigmas:.0f} sigma)"
+        if present.is_swapped:
+            where += "; it would be right if both pairs changed places: are their images, or their cables, swapped?"
+        told.append(where)
+    for j, alignment in (found.imu or {}).items():
+        told += alignment.warnings(found.names[j])
+    return told
+
+
+def _placed(pair: StereoPair, body_T_left: Float) -> StereoPair:
+    right = body_T_left @ se3_inverse(np.ascontiguousarray(pair.right_T_left))
+    return replace(pair, left=replace(pair.left, body_T_cam=body_T_left), right=replace(pair.right, body_T_cam=right))

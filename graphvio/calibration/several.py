@@ -1,0 +1,199 @@
+"""Any number of pairs: two at a time, and all at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphvio.arrays import Float
+from graphvio.calibration import joint
+from graphvio.calibration.pair_calibration import SEEN_FROM, PairCalibration, calibrate_pair, size_in_words
+from graphvio.calibration.scale import ScaleMode
+from graphvio.calibration.spans import Stretches, most_telling, worth
+from graphvio.errors import CalibrationError
+from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
+
+_CHANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """Results for two at a time around three cameras, which should lead back to where they began.
+
+    Attributes:
+        cameras: their numbers.
+        error: (6,) tangent ``[rotation, translation]`` in the first of the three.
+        covariance: (6, 6) of it, were the three results independent.
+    """
+
+    cameras: tuple[int, int, int]
+    error: Float
+    covariance: Float
+
+    @property
+    def statistic(self) -> float:
+        """Squared Mahalanobis distance from zero, 6 degrees of freedom."""
+        return float(self.error @ np.linalg.solve(self.covariance, self.error))
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where all cameras are.
+
+    Attributes:
+        left_T_left1: (J, 4, 4) pose of the first left camera in each; the first is the identity.
+        covariance: (6 (J - 1), 6 (J - 1)) of the others', tangents ``[rotation, translation]`` in left1.
+        pairwise: (first, second) -> two at a time.
+        loops: how well these close; none for two cameras.
+        distances: (first, second) -> squared Mahalanobis distance (6 degrees of freedom) of the result for all from
+            that for two at a time, by the latter's covariance.
+        warnings: a sentence each.
+    """
+
+    left_T_left1: Float
+    covariance: Float
+    pairwise: Mapping[tuple[int, int], PairCalibration]
+    loops: tuple[Loop, ...]
+    distances: Mapping[tuple[int, int], float]
+    warnings: tuple[str, ...]
+
+    def covariance_between(self, one: int, other: int) -> Float:
+        """Covariance (6, 6) of ``left_other_T_left_one``, tangent in the camera ``one``."""
+        # X_ij = X_j X_i^-1: changes d_j of X_j and d_i of X_i, in left1, make Ad(X_i) (d_j - d_i).
+        apart = np.zeros((6, len(self.covariance)))
+        for camera, sign in ((other, 1.0), (one, -1.0)):
+            if camera:
+                apart[:, 6 * (camera - 1) : 6 * camera] += sign * np.eye(6)
+        apart = se3_adjoint(np.ascontiguousarray(self.left_T_left1[one])) @ apart
+        return np.asarray(apart @ self.covariance @ apart.T)
+
+
+def pairwise(
+    stretches: Stretches, names: Sequence[str], seed: int = 0, *, scale_mode: ScaleMode = "auto"
+) -> tuple[dict[tuple[int, int], PairCalibration], list[str]]:
+    """Results for two at a time, and what was wrong with those that are missing.
+
+    Args:
+        stretches: all that may be chosen from, of J cameras.
+        names: (J) of the cameras.
+        seed: of all random choices.
+        scale_mode: see `calibrate_pair`.
+
+    Raises:
+        CalibrationError: if one of the cameras cannot be placed relative to the first.
+    """
+    found: dict[tuple[int, int], PairCalibration] = {}
+    missing: list[str] = []
+    for one, other in combinations(range(len(names)), 2):
+        try:
+            found[one, other] = calibrate_pair(stretches.of_both(one, other), seed, scale_mode=scale_mode)
+        except CalibrationError as error:
+            told = f"{names[one]} and {names[other]}: {error}"
+            if one == 0:
+                raise CalibrationError(told) from None
+            missing.append(told)
+    return found, missing
+
+
+def place_all(
+    found: Mapping[tuple[int, int], PairCalibration],
+    names: Sequence[str],
+    stretches: Stretches,
+    seen_from: Float = SEEN_FROM,
+) -> Places:
+    """Places that fit all motions at once.
+
+    Args:
+        found: results for two at a time, among them those of the first camera and each other one.
+        names: (J) of the cameras.
+        stretches: all that may be chosen from, of J cameras.
+        seen_from: covariance (6, 6) of where each camera is, as its images have it.
+
+    Raises:
+        CalibrationError: if a camera agrees with the others in too few motions.
+    """
+    warnings = [f"{names[i]} and {names[j]}: {told}" for (i, j), each in found.items() for told in each.warnings]
+    warnings += [
+        f"{names[i]} and {names[j]}: {each.scale.told(names[i], names[j])}"
+        for (i, j), each in found.items()
+        if each.scale.is_wrong
+    ]
+    count = len(names)
+    start = np.array([np.eye(4), *(found[0, j].left2_T_left1 for j in range(1, count))])
+    if count == 2:
+        return Places(start, found[0, 1].covariance, found, (), {}, tuple(warnings))
+    stretches = _rescaled(stretches, found)
+    chosen = stretches.chosen(most_telling(stretches, _worths(stretches, found, count)))
+    held = [found[0, j].observability.undetermined for j in range(1, count)]
+    solution = joint.solve(chosen, start, held)
+    covariance = max(each.dispersion for each in found.values()) * solution.covariance
+    covariance = covariance + _seen_from(solution.left_T_left1, seen_from) + _unknown(found, count)
+    distances = {(i, j): each.distance(solution.between(i, j)) for (i, j), each in found.items()}
+    for (i, j), distance in distances.items():
+        if distance > chi2.isf(_CHANCE, 6):
+            apart = size_in_words(found[i, j].apart(solution.between(i, j)))
+            warnings.append(
+                f"{names[i]} and {names[j]}: all cameras together put them {apart} from where these two alone do, more "
+                f"than the noise explains (chi-square {distance:.0f} of 6)"
+            )
+    loops = tuple(_loop(found, three) for three in combinations(range(count), 3) if _closed(found, three))
+    return Places(solution.left_T_left1, covariance, found, loops, distances, tuple(warnings))
+
+
+def _rescaled(stretches: Stretches, found: Mapping[tuple[int, int], PairCalibration]) -> Stretches:
+    """Stretches on which all cameras measure lengths as the first does, where that was an unknown."""
+    motions = stretches.motions.copy()
+    for j in range(1, stretches.cameras):
+        if found[0, j].scale_estimated:
+            motions[:, j, :3, 3] *= np.exp(-found[0, j].scale.log_ratio)
+    return replace(stretches, motions=motions)
+
+
+def _worths(stretches: Stretches, found: Mapping[tuple[int, int], PairCalibration], count: int) -> Float:
+    """What stretches (N,) tell of all places, to first order."""
+    worths = np.zeros(len(stretches))
+    for j in range(1, count):
+        both = stretches.known[:, 0] & stretches.known[:, j]
+        each = found[0, j]
+        worths[both] += worth(stretches.of_both(0, j).pairs, each.left2_T_left1, each.covariance)
+    return worths
+
+
+def _seen_from(left_T_left1: Float, seen_from: Float) -> Float:
+    """What all cameras' own errors make of their places: the first's is common to all."""
+    others = len(left_T_left1) - 1
+    covariance = np.tile(seen_from, (others, others))
+    for j in range(others):
+        adjoint = se3_adjoint(se3_inverse(np.ascontiguousarray(left_T_left1[j + 1])))
+        covariance[6 * j : 6 * j + 6, 6 * j : 6 * j + 6] += adjoint @ seen_from @ adjoint.T
+    return covariance
+
+
+def _unknown(found: Mapping[tuple[int, int], PairCalibration], count: int) -> Float:
+    """Covariance of what the motions do not tell at all, of each camera's place."""
+    covariance = np.zeros((6 * (count - 1), 6 * (count - 1)))
+    for j in range(1, count):
+        each = found[0, j]
+        across = each.observability.undetermined.T @ each.observability.undetermined
+        covariance[6 * j - 6 : 6 * j, 6 * j - 6 : 6 * j] = across @ each.covariance @ across
+    return covariance
+
+
+def _closed(found: Mapping[tuple[int, int], PairCalibration], three: tuple[int, ...]) -> bool:
+    return all(two in found for two in combinations(three, 2))
+
+
+def _loop(found: Mapping[tuple[int, int], PairCalibration], three: tuple[int, int, int]) -> Loop:
+    i, j, k = three
+    one, other, both = found[i, j], found[j, k], found[i, k]
+    second = other.left2_T_left1.copy()
+    if one.scale_estimated:  # its lengths are the second camera's, all others the first's
+        second[:3, 3] *= np.exp(-one.scale.log_ratio)
+    around = se3_inverse(both.left2_T_left1) @ second @ one.left2_T_left1
+    adjoint = se3_adjoint(se3_inverse(one.left2_T_left1))
+    covariance = one.covariance + adjoint @ other.covariance @ adjoint.T + both.covariance
+    return Loop(three, se3_log(around), covariance)
