@@ -9,14 +9,26 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from graphvio.calibration.calibrate import calibrate_pairs, calibrate_trajectories
+    from graphvio.calibration.result import Calibration
     from graphvio.config import Config
-    from graphvio.errors import ConfigError, EventError, GraphvioError, MissingExtraError, RigError, SourceError
+    from graphvio.errors import (
+        CalibrationError,
+        ConfigError,
+        EventError,
+        GraphvioError,
+        MissingExtraError,
+        RigError,
+        SourceError,
+    )
     from graphvio.events import Estimate, FrameSet, ImuSample, Prediction, Status
     from graphvio.odometry import Odometry
     from graphvio.rig import Camera, Imu, Rig, StereoPair
     from graphvio.sources import open_source
 
 _HOME_OF = {
+    "Calibration": "calibration.result",
+    "CalibrationError": "errors",
     "Camera": "rig",
     "Config": "config",
     "ConfigError": "errors",
@@ -34,10 +46,14 @@ _HOME_OF = {
     "SourceError": "errors",
     "Status": "events",
     "StereoPair": "rig",
+    "calibrate_pairs": "calibration.calibrate",
+    "calibrate_trajectories": "calibration.calibrate",
     "open_source": "sources",
 }
 
 __all__ = [
+    "Calibration",
+    "CalibrationError",
     "Camera",
     "Config",
     "ConfigError",
@@ -56,6 +72,8 @@ __all__ = [
     "Status",
     "StereoPair",
     "__version__",
+    "calibrate_pairs",
+    "calibrate_trajectories",
     "open_source",
 ]
 

@@ -1,7 +1,8 @@
 """A sequence of stamped poses, and the text formats in which they are exchanged.
 
-TUM: ``stamp_s x y z q_x q_y q_z q_w``, separated by blanks. EuRoC: ``stamp_ns,x,y,z,q_w,q_x,q_y,q_z,...``,
-separated by commas. Stamps are converted exactly: float64 keeps only 0.2 microseconds of a Unix time.
+TUM: ``stamp_s x y z q_x q_y q_z q_w``, separated by blanks, or by commas where stamps have a decimal point. EuRoC:
+``stamp_ns,x,y,z,q_w,q_x,q_y,q_z,...``, separated by commas. Stamps are converted exactly: float64 keeps only 0.2
+microseconds of a Unix time.
 """
 
 from __future__ import annotations
@@ -195,6 +196,8 @@ def _read(path: Path) -> Trajectory:
     for number, fields, is_euroc in rows:
         where = f"{path}, line {number}"
         stamp, pose = _pose(fields, is_euroc, where)
+        if stamps and stamp == stamps[-1] and np.array_equal(pose, poses[-1]):
+            continue  # loggers that poll an odometry write a pose twice
         if stamps and stamp <= stamps[-1]:
             raise TrajectoryError(f"{where}: its stamp does not come after the one before it; sort the file by time")
         stamps.append(stamp)
@@ -226,8 +229,9 @@ def _rows(text: str) -> Iterator[tuple[int, Sequence[str], bool]]:
         line = line.strip()
         if not line or line.startswith("#"):
             continue
-        is_euroc = "," in line
-        fields = [field.strip() for field in line.split(",")] if is_euroc else line.split()
+        has_commas = "," in line
+        fields = [field.strip() for field in line.split(",")] if has_commas else line.split()
+        is_euroc = has_commas and "." not in fields[0]
         if first and fields[0][:1].isalpha() and fields[0].lower() not in ("nan", "inf"):
             first = False
             continue  # a header without a comment sign

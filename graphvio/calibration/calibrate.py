@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +25,9 @@ from graphvio.rig import Rig
 from graphvio.sources import Source, open_source
 from graphvio.trajectory import Trajectory
 
+OnFrameset = Callable[[int, SeparateMotions], bool]
+"""Called after each frameset with how many there were, and all that the pairs have told; True ends the recording."""
+
 _EXACT = np.zeros((6, 6))
 
 
@@ -35,7 +37,7 @@ def calibrate_pairs(
     config: Config | None = None,
     seed: int = 0,
     scale_mode: ScaleMode = "auto",
-    on_frameset: Callable[[int, SeparateMotions], bool | None] | None = None,
+    on_frameset: OnFrameset | None = None,
 ) -> Calibration:
     """Find where the stereo pairs of a rig are relative to each other, from a recording of its motion (section 4).
 
@@ -47,7 +49,7 @@ def calibrate_pairs(
         config: of the front-ends.
         seed: of all random choices.
         scale_mode: whether lengths that a pair measures may be wrong by a factor.
-        on_frameset: called after each with its number and all that the pairs have told; True ends the recording there.
+        on_frameset: follows the recording, and may end it.
 
     Raises:
         CalibrationError: if the rig has one pair only, or the recording does not tell where the pairs are.
@@ -77,7 +79,11 @@ def calibrate_pairs(
     stretches = stretches_of_motions(separate.motions())
     names = tuple(pair.name for pair in rig.pairs)
     _check(stretches, names)
-    found, missing = pairwise(stretches, names, seed, scale_mode=scale_mode)
+
+    def calibrate(one: int, other: int, mode: ScaleMode) -> PairCalibration:
+        return calibrate_pair(stretches.of_both(one, other), seed, scale_mode=mode)
+
+    found, missing = pairwise(names, calibrate, scale_mode)
     places = place_all(found, names, stretches)
     imu, unchecked = _imu(rig, stretches, np.array(stamps_ns, dtype=np.int64), np.array(gyro).reshape(-1, 3))
     made = Calibration(names, places, rig, imu)
@@ -110,21 +116,15 @@ def calibrate_trajectories(
     if names is None:
         names = [f"camera {j}" for j in range(len(trajectories))]
     two: dict[tuple[int, int], TwoTrajectories] = {}
-    found: dict[tuple[int, int], PairCalibration] = {}
-    missing: list[str] = []
-    for i, j in combinations(range(len(trajectories)), 2):
-        try:
-            both = aligned(trajectories[i], trajectories[j], same_clock, seed)
-            found[i, j] = calibrate_pair(
-                both.stretches, seed, further=both.further, scale_mode=scale_mode, seen_from=_EXACT
-            )
-            two[i, j] = both
-        except CalibrationError as error:
-            told = f"{names[i]} and {names[j]}: {error}"
-            if i == 0:
-                raise CalibrationError(told) from None
-            missing.append(told)
-    places = place_all(found, names, of_all(trajectories, two), _EXACT)
+
+    def calibrate(one: int, other: int, mode: ScaleMode) -> PairCalibration:
+        if (one, other) not in two:
+            two[one, other] = aligned(trajectories[one], trajectories[other], same_clock, seed)
+        both = two[one, other]
+        return calibrate_pair(both.stretches, seed, further=both.further, scale_mode=mode, seen_from=_EXACT)
+
+    found, missing = pairwise(names, calibrate, scale_mode)
+    places = place_all(found, names, of_all(trajectories, {each: two[each] for each in found}), _EXACT)
     clocks = None if same_clock else {each: _clock(two[each], found[each]) for each in found}
     drifts = [
         f"the clocks of {names[i]} and {names[j]} drift apart by {1e6 * clock.relation.drift:.0f} (+- "

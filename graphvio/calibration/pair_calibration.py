@@ -164,7 +164,7 @@ def calibrate_pair(
     with_scale = _with_scale(pairs, further) if estimate_scale else further
     found = graph.solve(pairs, paper.left2_T_left1, with_scale)
     factor = _dispersion(pairs, found, with_scale)
-    floor = _floor(found.left2_T_left1, seen_from)
+    floor = allowance(found.left2_T_left1, seen_from)
     frames = stretches.pairs.chosen(stretches.last - stretches.first == 1)
     return PairCalibration(
         left2_T_left1=found.left2_T_left1,
@@ -220,8 +220,8 @@ def _dispersion(pairs: PosePairs, found: GraphSolution, further: Further | None)
     return dispersion(some, errors, jacobians, determined)
 
 
-def _floor(left2_T_left1: Float, seen_from: Float) -> Float:
-    """What both cameras' own errors make of the relative pose, tangent in left1."""
+def allowance(left2_T_left1: Float, seen_from: Float) -> Float:
+    """What both cameras' own errors, see `SEEN_FROM`, make of the relative pose (6, 6), tangent in left1."""
     adjoint = se3_adjoint(se3_inverse(left2_T_left1))
     return np.asarray(seen_from + adjoint @ seen_from @ adjoint.T)
 

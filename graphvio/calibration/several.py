@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from graphvio.arrays import Float
 from graphvio.calibration import joint
-from graphvio.calibration.pair_calibration import SEEN_FROM, PairCalibration, calibrate_pair, size_in_words
+from graphvio.calibration.pair_calibration import SEEN_FROM, PairCalibration, size_in_words
 from graphvio.calibration.scale import ScaleMode
 from graphvio.calibration.spans import Stretches, most_telling, worth
 from graphvio.errors import CalibrationError
@@ -73,15 +73,14 @@ class Places:
 
 
 def pairwise(
-    stretches: Stretches, names: Sequence[str], seed: int = 0, *, scale_mode: ScaleMode = "auto"
+    names: Sequence[str], calibrate: Callable[[int, int, ScaleMode], PairCalibration], scale_mode: ScaleMode
 ) -> tuple[dict[tuple[int, int], PairCalibration], list[str]]:
     """Results for two at a time, and what was wrong with those that are missing.
 
     Args:
-        stretches: all that may be chosen from, of J cameras.
         names: (J) of the cameras.
-        seed: of all random choices.
-        scale_mode: see `calibrate_pair`.
+        calibrate: does it for two cameras.
+        scale_mode: see `calibrate_pair`; where the scale of one is wrong beyond doubt, that of all is estimated.
 
     Raises:
         CalibrationError: if one of the cameras cannot be placed relative to the first.
@@ -90,12 +89,17 @@ def pairwise(
     missing: list[str] = []
     for one, other in combinations(range(len(names)), 2):
         try:
-            found[one, other] = calibrate_pair(stretches.of_both(one, other), seed, scale_mode=scale_mode)
+            found[one, other] = calibrate(one, other, scale_mode)
         except CalibrationError as error:
             told = f"{names[one]} and {names[other]}: {error}"
             if one == 0:
                 raise CalibrationError(told) from None
             missing.append(told)
+    if any(each.scale_estimated for each in found.values()):
+        found = {
+            cameras: each if each.scale_estimated else calibrate(*cameras, "estimate")
+            for cameras, each in found.items()
+        }
     return found, missing
 
 
@@ -132,13 +136,16 @@ def place_all(
     solution = joint.solve(chosen, start, held)
     covariance = max(each.dispersion for each in found.values()) * solution.covariance
     covariance = covariance + _seen_from(solution.left_T_left1, seen_from) + _unknown(found, count)
-    distances = {(i, j): each.distance(solution.between(i, j)) for (i, j), each in found.items()}
+    apart = {(i, j): se3_log(se3_inverse(_in_first_lengths(found, i, j)) @ solution.between(i, j)) for i, j in found}
+    distances = {
+        cameras: float(apart[cameras] @ np.linalg.solve(each.covariance, apart[cameras]))
+        for cameras, each in found.items()
+    }
     for (i, j), distance in distances.items():
         if distance > chi2.isf(_CHANCE, 6):
-            apart = size_in_words(found[i, j].apart(solution.between(i, j)))
             warnings.append(
-                f"{names[i]} and {names[j]}: all cameras together put them {apart} from where these two alone do, more "
-                f"than the noise explains (chi-square {distance:.0f} of 6)"
+                f"{names[i]} and {names[j]}: all cameras together put them {size_in_words(apart[i, j])} from where "
+                f"these two alone do, more than the noise explains (chi-square {distance:.0f} of 6)"
             )
     loops = tuple(_loop(found, three) for three in combinations(range(count), 3) if _closed(found, three))
     return Places(solution.left_T_left1, covariance, found, loops, distances, tuple(warnings))
@@ -183,6 +190,14 @@ def _unknown(found: Mapping[tuple[int, int], PairCalibration], count: int) -> Fl
     return covariance
 
 
+def _in_first_lengths(found: Mapping[tuple[int, int], PairCalibration], one: int, other: int) -> Float:
+    """``left_other_T_left_one`` (4, 4), measured with the first camera's lengths where cameras differ in them."""
+    place = np.array(found[one, other].left2_T_left1)
+    if one and found[0, one].scale_estimated:
+        place[:3, 3] *= np.exp(-found[0, one].scale.log_ratio)
+    return place
+
+
 def _closed(found: Mapping[tuple[int, int], PairCalibration], three: tuple[int, ...]) -> bool:
     return all(two in found for two in combinations(three, 2))
 
@@ -190,10 +205,8 @@ def _closed(found: Mapping[tuple[int, int], PairCalibration], three: tuple[int, 
 def _loop(found: Mapping[tuple[int, int], PairCalibration], three: tuple[int, int, int]) -> Loop:
     i, j, k = three
     one, other, both = found[i, j], found[j, k], found[i, k]
-    second = other.left2_T_left1.copy()
-    if one.scale_estimated:  # its lengths are the second camera's, all others the first's
-        second[:3, 3] *= np.exp(-one.scale.log_ratio)
-    around = se3_inverse(both.left2_T_left1) @ second @ one.left2_T_left1
+    first, second, across = (_in_first_lengths(found, *two) for two in ((i, j), (j, k), (i, k)))
+    around = se3_inverse(across) @ second @ first
     adjoint = se3_adjoint(se3_inverse(one.left2_T_left1))
     covariance = one.covariance + adjoint @ other.covariance @ adjoint.T + both.covariance
     return Loop(three, se3_log(around), covariance)

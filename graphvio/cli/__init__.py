@@ -5,6 +5,7 @@ from typing import NoReturn
 
 import typer
 
+from graphvio.cli.calibrate import calibrate, calibrate_trajectories
 from graphvio.cli.doctor import doctor
 from graphvio.cli.dump_config import dump_config
 from graphvio.cli.evaluate import evaluate
@@ -25,6 +26,8 @@ app = typer.Typer(
     epilog="Examples:  graphvio simulate room --out room  |  graphvio run room  |  graphvio doctor",
 )
 app.command()(run)
+app.command()(calibrate)
+app.command(name="calibrate-trajectories")(calibrate_trajectories)
 app.command()(evaluate)
 app.command()(simulate)
 app.command()(view)

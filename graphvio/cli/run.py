@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from graphvio.config import Config
     from graphvio.pipeline import Progress
     from graphvio.results import Summary
     from graphvio.rig import Rig
+    from graphvio.sources import Source
 
 EXIT_INCOMPLETE = 3
 EXIT_INTERRUPTED = 130
@@ -58,18 +60,11 @@ def run(
     from graphvio.config import Config
     from graphvio.pipeline import run as run_pipeline
     from graphvio.results import ResultWriter
-    from graphvio.rig import Rig
-    from graphvio.sources import open_source
     from graphvio.viewer import Viewer
     from graphvio.warmup import warm_up
 
     settings = Config.load(config)
-    tolerance_ms = settings.timing.simultaneous_ms
-    loaded = None if rig is None else Rig.load(rig)
-    opened = open_source(source, loaded, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms)
-    chosen = _choose(opened.rig, pairs, no_imu)
-    if chosen is not opened.rig:
-        opened = open_source(source, chosen, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms)
+    opened = open_recording(source, rig, settings, pairs=pairs, no_imu=no_imu, from_s=from_s, to_s=to_s)
     folder = out if out is not None else ResultWriter.new_folder(Path("results"), opened.name)
     with ExitStack() as stack:
         writer = stack.enter_context(ResultWriter(folder, opened.rig, settings.to_yaml()))
@@ -89,6 +84,29 @@ def run(
             err=True,
         )
         raise typer.Exit(EXIT_INCOMPLETE)
+
+
+def open_recording(
+    source: Path,
+    rig: Path | None,
+    settings: Config,
+    *,
+    pairs: str | None,
+    no_imu: bool,
+    from_s: float | None,
+    to_s: float | None,
+) -> Source:
+    """A recording as the options of a command ask for it."""
+    from graphvio.rig import Rig
+    from graphvio.sources import open_source
+
+    tolerance_ms = settings.timing.simultaneous_ms
+    loaded = None if rig is None else Rig.load(rig)
+    opened = open_source(source, loaded, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms)
+    chosen = _choose(opened.rig, pairs, no_imu)
+    if chosen is opened.rig:
+        return opened
+    return open_source(source, chosen, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms)
 
 
 def _choose(rig: Rig, pairs: str | None, no_imu: bool) -> Rig:

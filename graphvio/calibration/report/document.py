@@ -1,0 +1,145 @@
+"""All numbers of a calibration as plain lists, to the last digit, and the file that holds them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphvio.calibration.pair_calibration import PairCalibration
+from graphvio.calibration.result import Calibration
+from graphvio.errors import CalibrationError
+
+VERSION = 1
+
+
+def document(found: Calibration) -> dict[str, Any]:
+    """All numbers, as YAML and JSON can hold them. Metres, radians, seconds; transforms are ``a_T_b``, 4x4 by rows;
+    covariances have the tangent ``[rotation, translation]`` in the frame b."""
+    made: dict[str, Any] = {
+        "graphvio_calibration": VERSION,
+        "names": list(found.names),
+        "complete": found.is_complete,
+        "left_T_left1": {
+            name: pose.tolist() for name, pose in zip(found.names, found.places.left_T_left1, strict=True)
+        },
+        "covariance": found.places.covariance.tolist(),
+        "two_at_a_time": [
+            {
+                "first": found.names[i],
+                "second": found.names[j],
+                **_pair(each),
+                **({"squared_distance_of_all": found.places.distances[i, j]} if found.places.distances else {}),
+            }
+            for (i, j), each in found.places.pairwise.items()
+        ],
+        "loops": [
+            {
+                "names": [found.names[k] for k in loop.cameras],
+                "rotation_rad": float(np.linalg.norm(loop.error[:3])),
+                "translation_m": float(np.linalg.norm(loop.error[3:])),
+                "squared_distance": loop.statistic,
+            }
+            for loop in found.places.loops
+        ],
+        "warnings": list(found.warnings),
+    }
+    if found.rig is not None:
+        made["rig_before"] = [_present(found, j) for j in range(1, len(found.names))]
+    if found.imu:
+        made["imu"] = [
+            {
+                "name": found.names[j],
+                "body_R_left": each.body_R_left.tolist(),
+                "misrotation_rad": each.misrotation.tolist(),
+                "misrotation_covariance": each.covariance.tolist(),
+                "time_offset_s": each.time_offset_s,
+                "time_offset_sigma_s": each.time_offset_sigma_s,
+                "gyro_bias_rad_s": each.gyro_bias.tolist(),
+            }
+            for j, each in found.imu.items()
+        ]
+    if found.clocks:
+        made["clocks"] = [
+            {
+                "first": found.names[i],
+                "second": found.names[j],
+                "offset_ns": clock.relation.offset_ns,
+                "at_ns": clock.relation.at_ns,
+                "offset_sigma_s": clock.offset_sigma_s,
+                "drift": clock.relation.drift,
+                "drift_sigma": clock.drift_sigma,
+            }
+            for (i, j), clock in found.clocks.items()
+        ]
+    return made
+
+
+def write_document(found: Calibration, path: Path) -> None:
+    """Write `document` as YAML.
+
+    Raises:
+        CalibrationError: if the file cannot be written.
+    """
+    import yaml
+
+    text = (
+        "# Metres, radians, seconds. A transform a_T_b is the pose of b in a, by rows; covariances have the tangent\n"
+    )
+    text += "# [rotation, translation] in b.\n"
+    text += yaml.safe_dump(document(found), sort_keys=False, width=110, default_flow_style=None)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+
+
+def _pair(each: PairCalibration) -> dict[str, Any]:
+    return {
+        "left2_T_left1": each.left2_T_left1.tolist(),
+        "covariance": each.covariance.tolist(),
+        "motions": len(each.pairs),
+        "inliers": int(each.inlier.sum()),
+        "mean_alignment_error_m": float(each.alignment_errors_m[each.inlier].mean()),
+        "frame_to_frame": {
+            "motions": len(each.frames),
+            "inliers": int(each.frame_inlier.sum()),
+            "mean_alignment_error_m": float(each.frame_errors_m.mean()) if len(each.frames) else None,
+        },
+        "dispersion": each.dispersion,
+        "by_the_papers_method": {
+            "left2_T_left1": each.paper_left2_T_left1.tolist(),
+            "chi_square": each.comparison.statistic,
+            "limit": each.comparison.limit,
+            "agrees": each.comparison.agrees,
+        },
+        "log_scale_ratio": each.scale.log_ratio,
+        "log_scale_ratio_sigma": each.scale.sigma,
+        "scale_estimated": each.scale_estimated,
+        "bootstrap_covariance": each.resampled_covariance.tolist(),
+        "halves": None
+        if each.halves is None
+        else {
+            "own_mean_alignment_error_m": list(each.halves.own_m),
+            "crossed_mean_alignment_error_m": list(each.halves.crossed_m),
+            "chi_square": each.halves.statistic,
+            "agree": each.halves.agree,
+        },
+        "translation_singular_values": each.observability.translation_singular_values.tolist(),
+        "turning_rad": each.observability.turning_rad.tolist(),
+        "missing": list(each.observability.missing),
+    }
+
+
+def _present(found: Calibration, j: int) -> dict[str, Any]:
+    present = found.present(0, j)
+    assert present is not None
+    return {
+        "name": found.names[j],
+        "rotation_rad": float(np.linalg.norm(present.tangent[:3])),
+        "translation_m": present.distance_m,
+        "sigmas": present.sigmas,
+        "off": present.is_off,
+        "swapped": present.is_swapped,
+    }

@@ -1,0 +1,226 @@
+"""A page about a calibration, for a person who does not know the algorithm: one file of HTML with its pictures."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.calibration.pair_calibration import PairCalibration, size_in_words
+from graphvio.calibration.result import Calibration
+from graphvio.geometry import so3_log
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 860px; margin: 2em auto; padding: 0 1em; }
+h1 { font-size: 1.5em; } h2 { font-size: 1.2em; margin-top: 2em; border-top: 1px solid #ddd; padding-top: 1em; }
+table { border-collapse: collapse; margin: 0.8em 0; } th { text-align: left; font-weight: 600; }
+td, th { padding: 0.25em 0.9em 0.25em 0; border-bottom: 1px solid #eee; vertical-align: top; }
+td { font-variant-numeric: tabular-nums; } img { max-width: 100%; } figure { margin: 1em 0; }
+figcaption { color: #555; font-size: 0.92em; } .good { color: #1a7f37; } .doubt { color: #b35900; }
+pre { background: #f6f6f6; padding: 0.7em; overflow-x: auto; font-size: 0.85em; }
+"""
+_CAPTIONS = {
+    "alignment_errors": "Both cameras tell where the second one went. This is how far apart their answers are, for "
+    "every single motion: a narrow heap near zero is good. (Figure 4 of Oskiper et al., CVPR 2007, is the same; theirs "
+    "has a mean of 3.29 mm.)",
+    "residuals": "The same over time, weighed by what each motion can be expected to be wrong by. Points should lie "
+    "around 1 from beginning to end. Crosses were left out; many at one time mean that a camera was disturbed there.",
+    "turning": "About which axes the rig was turned, as directions seen from the first left camera, and how fast. "
+    "Turning about one axis only leaves the offset along it unknown: there should be points in two regions that "
+    "are not opposite to each other.",
+    "growth": "The result as the recording grew, against the result of all of it. The lines should settle within "
+    "their bands, and the bands shrink; where they no longer do, a longer recording would not help.",
+}
+
+
+def page(found: Calibration, pictures: Mapping[tuple[int, int], Mapping[str, bytes]], source: str) -> str:
+    """The page.
+
+    Args:
+        found: the calibration.
+        pictures: (first, second) -> name -> PNG.
+        source: what was calibrated from, for the title.
+    """
+    parts = [
+        f"<h1>Where the cameras are: {escape(source)}</h1>",
+        _verdict(found),
+        "<h2>Result</h2>",
+        _places(found),
+    ]
+    if found.warnings:
+        parts += ["<h2>What to know before using it</h2>", _list(found.warnings)]
+    for (i, j), each in found.places.pairwise.items():
+        parts.append(f"<h2>{escape(found.names[i])} and {escape(found.names[j])}</h2>")
+        parts += [_picture(name, png) for name, png in pictures[i, j].items()]
+        parts.append(_details(each))
+    if found.places.loops:
+        parts += ["<h2>All cameras together</h2>", _together(found)]
+    if found.imu:
+        parts += ["<h2>Cameras and IMU</h2>", _imu(found)]
+    if found.clocks:
+        parts += ["<h2>Clocks</h2>", _clocks(found)]
+    parts += ["<h2>Numbers</h2>", _numbers(found)]
+    body = "\n".join(parts)
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(source)}: calibration</title>'
+        f"<style>{_STYLE}</style></head><body>\n{body}\n</body></html>\n"
+    )
+
+
+def _verdict(found: Calibration) -> str:
+    if not found.is_complete:
+        return (
+            '<p class="doubt"><b>Part of the answer only.</b> The rig did not move in a way that tells everything; '
+            "what is missing, and how to record it, is below.</p>"
+        )
+    if found.warnings:
+        return '<p class="doubt"><b>A result with reservations.</b> Read below what they are.</p>'
+    return '<p class="good"><b>A sound result.</b> All checks below were passed.</p>'
+
+
+def _places(found: Calibration) -> str:
+    rows = []
+    for j in range(1, len(found.names)):
+        place = found.places.left_T_left1[j]
+        sigmas = np.sqrt(np.diag(found.places.covariance)[6 * j - 6 : 6 * j])
+        turned = np.rad2deg(so3_log(np.ascontiguousarray(place[:3, :3])))
+        rows.append(
+            (
+                f"{found.names[0]} as seen from {found.names[j]}",
+                _vector(place[:3, 3] * 1e3, sigmas[3:] * 1e3, "mm", 2),
+                _vector(turned, np.rad2deg(sigmas[:3]), "degrees", 3),
+                _present(found, j),
+            )
+        )
+    head = ("", "offset x, y, z", "rotation vector", "in the rig file" if found.rig is not None else "")
+    note = "<p>Camera axes: x right, y down, z forward. After +- stands one standard deviation.</p>"
+    return _table(rows, head) + note
+
+
+def _present(found: Calibration, j: int) -> str:
+    present = found.present(0, j)
+    if present is None:
+        return ""
+    verdict = "agrees" if not present.is_off else "is off"
+    return f"{verdict}: {size_in_words(present.tangent)} away ({present.sigmas:.1f} sigma)"
+
+
+def _details(each: PairCalibration) -> str:
+    told = np.sqrt(np.diag(each.covariance))
+    bootstrap = np.sqrt(np.diag(each.resampled_covariance))
+    comparison, halves = each.comparison, each.halves
+    rows = [
+        ("motions used", f"{len(each.pairs)}, of which {int(each.inlier.sum())} fit"),
+        ("motions from frame to frame", f"{len(each.frames)}, of which {int(each.frame_inlier.sum())} fit"),
+        ("two independent methods", f"{size_in_words(comparison.difference)} apart: " + _chance(comparison.agrees)),
+        (
+            "first half of the recording against the second",
+            "one of them does not tell enough"
+            if halves is None
+            else f"{size_in_words(halves.difference)} apart: {_chance(halves.agree)}; mean alignment error "
+            f"{1e3 * halves.own_m[0]:.2f} and {1e3 * halves.own_m[1]:.2f} mm by its own result, "
+            f"{1e3 * halves.crossed_m[0]:.2f} and {1e3 * halves.crossed_m[1]:.2f} mm by the other half's",
+        ),
+        (
+            "sigmas, as told and by resampling the recording",
+            f"{np.rad2deg(told[:3].max()):.4f} and {np.rad2deg(bootstrap[:3].max()):.4f} degrees, "
+            f"{1e3 * told[3:].max():.2f} and {1e3 * bootstrap[3:].max():.2f} mm (largest of three)",
+        ),
+        ("errors that last, factor on the variance", f"{each.dispersion:.2f}"),
+        (
+            "lengths of the second over those of the first",
+            f"{np.exp(each.scale.log_ratio):.5f} +- {each.scale.sigma:.5f}"
+            + (" (estimated and corrected)" if each.scale_estimated else ""),
+        ),
+        (
+            "turning about principal axes",
+            ", ".join(f"{value:.2f}" for value in np.rad2deg(each.observability.turning_rad)) + " degrees rms a motion",
+        ),
+    ]
+    return _table(rows)
+
+
+def _together(found: Calibration) -> str:
+    loops = [
+        (" - ".join(found.names[k] for k in loop.cameras), size_in_words(loop.error), f"{loop.statistic:.1f} of 6")
+        for loop in found.places.loops
+    ]
+    apart = [
+        (f"{found.names[i]} and {found.names[j]}", f"{distance:.1f} of 6")
+        for (i, j), distance in found.places.distances.items()
+    ]
+    return (
+        "<p>Results for two at a time, one after the other around three cameras, should lead back to the beginning.</p>"
+        + _table(loops, ("around", "misses by", "chi-square"))
+        + "<p>The result above is for all motions at once. How far it is from results for two at a time:</p>"
+        + _table(apart, ("", "chi-square"))
+    )
+
+
+def _imu(found: Calibration) -> str:
+    rows = [
+        (
+            found.names[j],
+            f"{np.rad2deg(np.linalg.norm(each.misrotation)):.3f} +- "
+            f"{np.rad2deg(np.sqrt(np.linalg.eigvalsh(each.covariance)[-1])):.3f} degrees",
+            f"{1e3 * each.time_offset_s:.2f} +- {1e3 * each.time_offset_sigma_s:.2f} ms "
+            f"(rig: {1e3 * each.rig_time_offset_s:.2f})",
+        )
+        for j, each in (found.imu or {}).items()
+    ]
+    return _table(rows, ("", "turned from where the rig has it", "time offset, camera to IMU"))
+
+
+def _clocks(found: Calibration) -> str:
+    rows = [
+        (
+            f"{found.names[i]} to {found.names[j]}",
+            f"{1e-9 * clock.relation.offset_ns:.6f} +- {clock.offset_sigma_s:.6f} s",
+            f"{1e6 * clock.relation.drift:.0f} +- {1e6 * clock.drift_sigma:.0f} microseconds a second",
+        )
+        for (i, j), clock in (found.clocks or {}).items()
+    ]
+    return _table(rows, ("", "add to a stamp", "drift"))
+
+
+def _numbers(found: Calibration) -> str:
+    blocks = []
+    for j in range(1, len(found.names)):
+        name = f"{found.names[j]}_T_{found.names[0]} (left cameras)"
+        blocks.append(f"{name}\n{_matrix(found.places.left_T_left1[j])}")
+    return "".join(f"<pre>{escape(block)}</pre>" for block in blocks)
+
+
+def _matrix(values: Float) -> str:
+    return "\n".join("  ".join(f"{value: .12f}" for value in row) for row in values)
+
+
+def _vector(values: Float, sigmas: Float, unit: str, digits: int) -> str:
+    told = ", ".join(
+        f"{value:.{digits}f} +- {sigma:.{digits}f}" if sigma < 1e3 else "unknown"
+        for value, sigma in zip(values, sigmas, strict=True)
+    )
+    return f"{told} {unit}"
+
+
+def _chance(agrees: bool) -> str:
+    return "agree" if agrees else "more than chance explains"
+
+
+def _picture(name: str, png: bytes) -> str:
+    data = b64encode(png).decode("ascii")
+    caption = _CAPTIONS[name]
+    return f'<figure><img alt="{name}" src="data:image/png;base64,{data}"><figcaption>{caption}</figcaption></figure>'
+
+
+def _list(items: Iterable[str]) -> str:
+    return "<ul>" + "".join(f"<li>{escape(item)}</li>" for item in items) + "</ul>"
+
+
+def _table(rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
+    lines = ["".join(f"<th>{escape(cell)}</th>" for cell in head)] if head else []
+    lines += ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"

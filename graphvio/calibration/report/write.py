@@ -1,0 +1,59 @@
+"""Writes the report of a calibration into a folder."""
+
+from __future__ import annotations
+
+from io import BytesIO
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from graphvio.calibration.report import figures
+from graphvio.calibration.report.document import write_document
+from graphvio.calibration.report.page import page
+from graphvio.calibration.result import Calibration
+from graphvio.errors import CalibrationError
+
+PAGE, NUMBERS = "report.html", "calibration.yaml"
+
+
+def write_report(found: Calibration, folder: Path, source: str, framesets: int) -> Path:
+    """Write ``report.html`` with everything in it, its pictures as PNGs, and all numbers as ``calibration.yaml``.
+
+    Args:
+        found: the calibration.
+        folder: is made if it is missing.
+        source: what was calibrated from, for the title.
+        framesets: that the recording has, or the first trajectory's poses.
+
+    Returns:
+        The page.
+
+    Raises:
+        CalibrationError: if the folder cannot be written.
+    """
+    pictures: dict[tuple[int, int], dict[str, bytes]] = {}
+    for cameras, each in found.places.pairwise.items():
+        drawn = {
+            "alignment_errors": figures.alignment_errors(each),
+            "residuals": figures.residuals(each),
+            "turning": figures.turning(each),
+        }
+        if len(each.growth) > 1:
+            drawn["growth"] = figures.growth(each, framesets)
+        pictures[cameras] = {name: _png(figure) for name, figure in drawn.items()}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for (i, j), named in pictures.items():
+            for name, png in named.items():
+                (folder / f"{name}-{i}-{j}.png").write_bytes(png)
+        (folder / PAGE).write_text(page(found, pictures, source), encoding="utf-8")
+    except OSError as error:
+        raise CalibrationError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
+    write_document(found, folder / NUMBERS)
+    return folder / PAGE
+
+
+def _png(figure: Figure) -> bytes:
+    held = BytesIO()
+    figure.savefig(held, format="png", metadata={"Software": None})
+    return held.getvalue()

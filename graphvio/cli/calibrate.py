@@ -1,0 +1,275 @@
+"""``graphvio calibrate`` and ``graphvio calibrate-trajectories``: where the pairs of a rig are, from their motion."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from graphvio.arrays import Float
+    from graphvio.calibration.guide import Advice
+    from graphvio.calibration.result import Calibration
+    from graphvio.calibration.scale import ScaleMode
+    from graphvio.calibration.separate_motions import SeparateMotions
+
+EXIT_PARTIAL = 3
+_UNKNOWN = 50.0  # millimetres or degrees: nothing tells, then
+
+
+def calibrate(
+    source: Annotated[Path, typer.Argument(help="Folder of a recording: EuRoC/ASL, TUM-VI, KITTI odometry or raw.")],
+    rig: Annotated[
+        Path | None, typer.Option("--rig", help="Rig or calibration file.  [default: what the recording carries]")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Write the corrected rig here (.yaml).", metavar="FILE")
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", help="Folder for a report: page, pictures, all numbers.", metavar="DIR")
+    ] = None,
+    correct_imu: Annotated[
+        bool, typer.Option("--correct-imu", help="Also correct the rotation against the IMU and the time offset.")
+    ] = False,
+    guide: Annotated[
+        bool, typer.Option("--guide", help="Tell all along which motions are still needed, and when it is enough.")
+    ] = False,
+    scale: Annotated[
+        str, typer.Option("--scale", help="A pair's lengths may be wrong by a factor: auto, estimate or fixed.")
+    ] = "auto",
+    config: Annotated[
+        str, typer.Option("--config", help="Profile, or a YAML file with the values to change.")
+    ] = "default",
+    pairs: Annotated[
+        str | None, typer.Option("--pairs", help="Only these stereo pairs, such as 0,1.  [default: all]")
+    ] = None,
+    from_s: Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.")] = None,
+    to_s: Annotated[float | None, typer.Option("--to", help="End at this second of the recording.")] = None,
+    seed: Annotated[int, typer.Option("--seed", help="Of all random choices.")] = 0,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+) -> None:
+    """Find where a rig's stereo pairs are relative to each other, from a recording; they need not share a view.
+
+    Turn the rig about two axes while you walk, in a place with texture; half a minute is enough. The rig file must be
+    right about each pair's own two cameras; where it has the pairs does not matter. Each pair is compared with the IMU,
+    too, if there is one.
+
+    Ends with exit code 0; with 2 where nothing can be found; with 3 where the motions tell a part only.
+
+    Examples:
+
+        graphvio calibrate walk --out rig-calibrated.yaml --report calibration
+
+        graphvio calibrate walk --rig rig.yaml --guide
+    """
+    from graphvio.calibration.calibrate import calibrate_pairs
+    from graphvio.cli.run import open_recording
+    from graphvio.config import Config
+    from graphvio.warmup import warm_up
+
+    settings = Config.load(config)
+    opened = open_recording(source, rig, settings, pairs=pairs, no_imu=False, from_s=from_s, to_s=to_s)
+    mode = _scale_mode(scale)
+    warm_up(opened.rig.with_pairs([0]).without_imu(), settings)
+    names = [pair.name for pair in opened.rig.pairs]
+    with _Following(opened.frameset_count, names if guide else None) as following:
+        found = calibrate_pairs(opened, config=settings, seed=seed, scale_mode=mode, on_frameset=following.on_frameset)
+    _tell(found)
+    if report is not None:
+        _report(found, report, opened.name, following.framesets)
+    if out is not None:
+        if found.is_complete:
+            found.calibrated_rig(correct_imu).save(out)
+            typer.echo(f"wrote {out}")
+        else:
+            typer.echo(f"graphvio: {out} is not written: the motions tell a part only", err=True)
+    _end(found)
+
+
+def calibrate_trajectories(
+    trajectories: Annotated[list[Path], typer.Argument(help="Two or more: TUM, EuRoC, or csv with TUM's columns.")],
+    same_clock: Annotated[
+        bool, typer.Option("--same-clock", help="All stamps are of one clock: no offset is looked for.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="Write all numbers here (.yaml).", metavar="FILE")] = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", help="Folder for a report: page, pictures, all numbers.", metavar="DIR")
+    ] = None,
+    scale: Annotated[
+        str, typer.Option("--scale", help="Lengths may be wrong by a factor: auto, estimate or fixed.")
+    ] = "auto",
+    seed: Annotated[int, typer.Option("--seed", help="Of all random choices.")] = 0,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+) -> None:
+    """Find where cameras are relative to each other from their trajectories, whatever odometry made them.
+
+    Each trajectory may have a world frame and a clock of its own: offsets between clocks are found from the angular
+    speeds, and drifts.
+
+    Examples:
+
+        graphvio calibrate-trajectories front.txt back.txt
+
+        graphvio calibrate-trajectories a.csv b.csv c.csv --report calibration
+    """
+    from graphvio.calibration.calibrate import calibrate_trajectories as calibrate_all
+    from graphvio.calibration.report.document import write_document
+    from graphvio.trajectory import Trajectory
+
+    mode = _scale_mode(scale)
+    read = [Trajectory.read(path) for path in trajectories]
+    names = _names(trajectories)
+    found = calibrate_all(read, names, same_clock=same_clock, seed=seed, scale_mode=mode)
+    _tell(found)
+    if report is not None:
+        _report(found, report, ", ".join(names), len(read[0]))
+    if out is not None:
+        write_document(found, out)
+        typer.echo(f"wrote {out}")
+    _end(found)
+
+
+class _Following:
+    """A bar on a terminal while the recording is read, or with a guide what to do next; Ctrl-C ends the recording."""
+
+    _GUIDE_EVERY = 20  # framesets
+    _PLAIN_EVERY = 100  # framesets, where there is no terminal
+
+    def __init__(self, total: int, guided: list[str] | None) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        from graphvio.calibration.guide import Guide
+
+        self.framesets = 0
+        self._console = Console(stderr=True)
+        columns = (BarColumn(20), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+        self._bar = Progress(*columns, console=self._console, transient=True)
+        self._task = self._bar.add_task("each pair alone", total=total)
+        self._guide = None if guided is None else Guide(guided)
+        self._was_enough = False
+        self._interrupted = False
+
+    def __enter__(self) -> _Following:
+        self._before = signal.signal(signal.SIGINT, self._interrupt)
+        if self._console.is_terminal:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGINT, self._before)
+        if self._console.is_terminal:
+            self._bar.stop()
+
+    def on_frameset(self, number: int, separate: SeparateMotions) -> bool:
+        """Show how far it is; whether to end."""
+        self.framesets = number
+        self._bar.update(self._task, completed=number)
+        if self._guide is not None and number % self._GUIDE_EVERY == 0:
+            self._show(self._guide.advise(separate.motions()), number)
+        return self._interrupted
+
+    def _show(self, advice: Advice, number: int) -> None:
+        self._bar.update(self._task, description=advice.text)
+        newly_enough = advice.is_enough and not self._was_enough
+        self._was_enough = advice.is_enough
+        if newly_enough or (not self._console.is_terminal and number % self._PLAIN_EVERY == 0):
+            self._console.print(f"frameset {number}: {advice.text}", soft_wrap=True, highlight=False)
+
+    def _interrupt(self, *_: object) -> None:
+        self._interrupted = True
+
+
+def _scale_mode(text: str) -> ScaleMode:
+    from typing import get_args
+
+    from graphvio.calibration.scale import ScaleMode
+    from graphvio.errors import ConfigError
+
+    for mode in get_args(ScaleMode):
+        if text == mode:
+            return mode  # type: ignore[no-any-return]
+    raise ConfigError(f"--scale {text}: give one of {', '.join(get_args(ScaleMode))}")
+
+
+def _names(paths: list[Path]) -> list[str]:
+    """Names of files, with their folders' where these are the same."""
+    stems = [path.stem for path in paths]
+    return stems if len(set(stems)) == len(stems) else [str(path) for path in paths]
+
+
+def _tell(found: Calibration) -> None:
+    from rich.console import Console
+
+    console = Console(soft_wrap=True)
+    console.print(_table(found))
+    for (i, j), each in found.places.pairwise.items():
+        errors = each.frame_errors_m if len(each.frames) else each.alignment_errors_m
+        fits = each.frame_inlier if len(each.frames) else each.inlier
+        typer.echo(
+            f"{found.names[i]}, {found.names[j]}: {int(fits.sum())} of {len(fits)} motions fit, mean alignment error "
+            f"{1e3 * errors[fits].mean():.2f} mm"
+        )
+    for loop in found.places.loops:
+        around = ", ".join(found.names[k] for k in loop.cameras)
+        typer.echo(f"around {around}: two at a time miss by {_size(loop.error)}")
+    for (i, j), clock in (found.clocks or {}).items():
+        typer.echo(
+            f"{found.names[i]} to {found.names[j]}: add {1e-9 * clock.relation.offset_ns:.6f} s to a stamp "
+            f"(+- {1e3 * clock.offset_sigma_s:.2f} ms)"
+        )
+    for warning in found.warnings:
+        typer.echo(f"graphvio: {warning}", err=True)
+
+
+def _size(apart: Float) -> str:
+    from graphvio.calibration.pair_calibration import size_in_words
+
+    return size_in_words(apart)
+
+
+def _table(found: Calibration) -> Table:
+    import numpy as np
+    from rich.table import Table
+
+    from graphvio.geometry import so3_log
+
+    table = Table(title=f"Pose of {found.names[0]} (left camera) in", title_justify="left")
+    table.add_column("")
+    for column in ("x", "y", "z"):
+        table.add_column(column, justify="right")
+    table.add_column("rig file")
+    for j in range(1, len(found.names)):
+        place = found.places.left_T_left1[j]
+        sigmas = np.sqrt(np.diag(found.places.covariance)[6 * j - 6 : 6 * j])
+        turned = so3_log(np.ascontiguousarray(place[:3, :3]))
+        present = found.present(0, j)
+        before = (
+            ("", "")
+            if present is None
+            else (f"{1e3 * present.distance_m:.1f} mm", f"{present.angle_deg:.3f} deg away, {present.sigmas:.1f} sigma")
+        )
+        table.add_row(f"{found.names[j]}, mm", *map(_with_sigma, 1e3 * place[:3, 3], 1e3 * sigmas[3:]), before[0])
+        degrees, spread = np.rad2deg(turned), np.rad2deg(sigmas[:3])
+        table.add_row("rotation vector, deg", *map(_with_sigma, degrees, spread), before[1], end_section=True)
+    return table
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    digits = 2 if sigma > 0.05 else 3
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}" if sigma < _UNKNOWN else "unknown"
+
+
+def _report(found: Calibration, folder: Path, source: str, count: int) -> None:
+    from graphvio.calibration.report.write import write_report
+
+    typer.echo(f"report: {write_report(found, folder, source, count)}")
+
+
+def _end(found: Calibration) -> None:
+    if not found.is_complete:
+        raise typer.Exit(EXIT_PARTIAL)
