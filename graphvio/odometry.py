@@ -301,8 +301,8 @@ class Odometry:
                 stamp_ns,
                 "extrinsics_off",
                 f"pair {self.rig.pairs[j].name} is {np.rad2deg(np.linalg.norm(d[:3])):.2f} deg and "
-                f"{np.linalg.norm(d[3:]):.3f} m from where the rig has it, as its motion against the first pair's "
-                f"tells (chi-square {misalignment.statistic:.0f}); corrected for this run: calibrate the rig",
+                f"{100 * np.linalg.norm(d[3:]):.1f} cm from where the rig file has it, as its motion against the first "
+                f"pair's tells (chi-square {misalignment.statistic:.0f}); corrected for this run: calibrate the rig",
             )
 
     def _report(self, stamp_ns: int, kind: str, detail: str) -> None:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from graphvio.arrays import Bool, Float
+from graphvio.calibration.camera_motions import CameraMotions
 from graphvio.calibration.pose_pairs import PosePairs
+from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3, se3_exp, se3_inverse
 
 PERIOD_NS = 50_000_000
+FRAMES = 240
+SIGMAS = np.repeat([3e-4, 5e-4], 3)
+Walk = Callable[[float], Float]
 LEFT2_T_LEFT1 = se3_exp(np.array([0.05, 3.0, 0.1, 0.3345, 0.0667, -0.1138]))  # back to back, as the paper's
 
 
@@ -61,6 +67,44 @@ def drawn(
     covariance = np.broadcast_to(np.diag(sigmas**2), (count, 6, 6)).copy()
     start_ns = np.arange(count) * PERIOD_NS
     return Drawn(PosePairs(start_ns, start_ns + PERIOD_NS, motion_1, covariance, motion_2, covariance), outlier)
+
+
+def turning(time_s: float) -> Float:
+    """A walk with turns about all axes."""
+    waves = np.sin(np.array([1.1, 0.7, 0.4, 0.5, 0.3, 0.6]) * time_s + np.arange(6))
+    return se3_exp(np.array([0.3, 0.5, 0.8, 0.4, 0.8, 0.6]) * waves)
+
+
+def planar(time_s: float) -> Float:
+    """A cart: it turns about the camera's y axis, which is vertical, and moves on the floor."""
+    turned = se3_exp(np.array([0.0, 0.9 * np.sin(0.5 * time_s), 0.0, 0.0, 0.0, 0.0]))
+    turned[:3, 3] = [np.sin(0.4 * time_s), 0.0, 0.5 * np.cos(0.3 * time_s)]
+    return turned
+
+
+def straight(time_s: float) -> Float:
+    moved = np.eye(4)
+    moved[:3, 3] = [0.3 * np.sin(time_s), 0.2 * np.cos(0.7 * time_s), 0.5 * time_s]
+    return moved
+
+
+def motions(walk: Walk, to_camera: Float, rng: np.random.Generator, moved: Float | None = None) -> CameraMotions:
+    """What a camera on the walk tells of itself from frame to frame.
+
+    Args:
+        walk: poses of the first camera at times.
+        to_camera: pose of the camera in the first one.
+        rng: source of errors.
+        moved: pose in the first camera from the middle of the walk on, if it was knocked.
+    """
+    stamps = [k * PERIOD_NS for k in range(FRAMES)]
+    told = []
+    for k in range(1, FRAMES):
+        place = to_camera if moved is None or k < FRAMES // 2 else moved
+        one, other = (walk(stamps[i] * 1e-9) @ place for i in (k - 1, k))
+        measured = np.linalg.inv(one) @ other @ se3_exp(SIGMAS * rng.standard_normal(6))
+        told.append(RelativeMotion(stamps[k - 1], stamps[k], measured, np.diag(SIGMAS**2), np.zeros((6, 6)), 200))
+    return CameraMotions(stamps, told, np.eye(4))
 
 
 def by_dual_quaternions(pairs: PosePairs) -> Float:

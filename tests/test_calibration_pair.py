@@ -1,61 +1,17 @@
 """Two pairs calibrated from what each tells of its own motion."""
 
-from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
-from hand_eye import LEFT2_T_LEFT1, PERIOD_NS
+from hand_eye import FRAMES, LEFT2_T_LEFT1, PERIOD_NS, Walk, motions, planar, straight, turning
 from monte_carlo import band
 
 from graphvio.arrays import Float
-from graphvio.calibration.camera_motions import CameraMotions
 from graphvio.calibration.pair_calibration import PairCalibration, calibrate_pair
 from graphvio.calibration.spans import Stretches, all_stretches
 from graphvio.errors import CalibrationError
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
-
-FRAMES = 240
-SIGMAS = np.repeat([3e-4, 5e-4], 3)
-Walk = Callable[[float], Float]
-
-
-def turning(time_s: float) -> Float:
-    """A walk with turns about all axes."""
-    waves = np.sin(np.array([1.1, 0.7, 0.4, 0.5, 0.3, 0.6]) * time_s + np.arange(6))
-    return se3_exp(np.array([0.3, 0.5, 0.8, 0.4, 0.8, 0.6]) * waves)
-
-
-def planar(time_s: float) -> Float:
-    """A cart: it turns about the camera's y axis, which is vertical, and moves on the floor."""
-    turned = se3_exp(np.array([0.0, 0.9 * np.sin(0.5 * time_s), 0.0, 0.0, 0.0, 0.0]))
-    turned[:3, 3] = [np.sin(0.4 * time_s), 0.0, 0.5 * np.cos(0.3 * time_s)]
-    return turned
-
-
-def straight(time_s: float) -> Float:
-    moved = np.eye(4)
-    moved[:3, 3] = [0.3 * np.sin(time_s), 0.2 * np.cos(0.7 * time_s), 0.5 * time_s]
-    return moved
-
-
-def motions(walk: Walk, to_camera: Float, rng: np.random.Generator, moved: Float | None = None) -> CameraMotions:
-    """What a camera on the walk tells of itself from frame to frame.
-
-    Args:
-        walk: poses of the first camera at times.
-        to_camera: pose of the camera in the first one.
-        rng: source of errors.
-        moved: pose in the first camera from the middle of the walk on, if it was knocked.
-    """
-    stamps = [k * PERIOD_NS for k in range(FRAMES)]
-    told = []
-    for k in range(1, FRAMES):
-        place = to_camera if moved is None or k < FRAMES // 2 else moved
-        one, other = (walk(stamps[i] * 1e-9) @ place for i in (k - 1, k))
-        measured = np.linalg.inv(one) @ other @ se3_exp(SIGMAS * rng.standard_normal(6))
-        told.append(RelativeMotion(stamps[k - 1], stamps[k], measured, np.diag(SIGMAS**2), np.zeros((6, 6)), 200))
-    return CameraMotions(stamps, told, np.eye(4))
 
 
 def stretches(walk: Walk, seed: int, moved: Float | None = None) -> Stretches:
@@ -69,17 +25,61 @@ def calibrated(walk: Walk, seed: int) -> PairCalibration:
 
 
 def test_errors_are_within_what_is_told() -> None:
-    runs = 24
+    runs = 16
     found = [calibrated(turning, seed) for seed in range(runs)]
     low, high = band(runs)
     assert low < np.mean([each.distance(LEFT2_T_LEFT1) for each in found]) < high
     for each in found:
-        assert each.warnings == ()
+        assert each.dispersion == 1.0
+        assert not each.scale.is_wrong
         sigmas = np.sqrt(np.diag(each.covariance))
         assert sigmas[:3].max() < 2e-3
         assert sigmas[3:].max() < 6e-3
         assert each.inlier.mean() > 0.98
         assert each.alignment_errors_m.mean() < 5e-3
+
+
+def test_checks_that_a_sound_recording_passes() -> None:
+    found = calibrated(turning, 3)
+    assert found.warnings == ()
+    assert found.halves is not None
+    assert found.halves.agree
+    own, crossed = found.halves.own_m, found.halves.crossed_m
+    assert max(crossed) < 1.3 * max(own)
+    told, resampled = (np.sqrt(np.diag(each)) for each in (found.covariance, found.resampled_covariance))
+    assert np.all(resampled < 2.0 * told)
+    assert np.all(resampled > 0.3 * told)
+    sizes = [np.trace(grown.covariance) for grown in found.growth]
+    assert len(sizes) > 3
+    assert all(later < earlier for earlier, later in pairwise(sizes))
+    np.testing.assert_allclose(found.growth[-1].left2_T_left1, found.left2_T_left1, atol=1e-9)
+
+
+@pytest.mark.parametrize("wrong_by", [0.02, -0.03])
+def test_a_wrong_baseline_is_found_and_put_right(wrong_by: float) -> None:
+    made = stretches(turning, 5)
+    made.motions[:, 1, :3, 3] *= 1.0 + wrong_by
+    found = calibrate_pair(made)
+    assert found.scale.is_wrong
+    assert found.scale_estimated
+    assert abs(found.scale.log_ratio - np.log1p(wrong_by)) < 4.0 * found.scale.sigma
+    assert found.scale.sigma < 0.005
+    assert found.distance(LEFT2_T_LEFT1) < 22.5
+    as_it_is = calibrate_pair(made, scale_mode="fixed")
+    assert not as_it_is.scale_estimated
+    assert as_it_is.scale.is_wrong
+    assert as_it_is.distance(LEFT2_T_LEFT1) > found.distance(LEFT2_T_LEFT1)
+
+
+def test_errors_that_last_make_the_covariance_larger() -> None:
+    """One camera's scale wanders in time: what no single motion's covariance can tell."""
+    made = stretches(turning, 6)
+    wandering = 1.0 + 0.06 * np.sin(made.start_ns * 1e-9)
+    made.motions[:, 1, :3, 3] *= wandering[:, None]
+    found = calibrate_pair(made, scale_mode="fixed")
+    assert found.dispersion > 1.5
+    sound = calibrated(turning, 6)
+    assert np.trace(found.covariance[3:, 3:]) > 1.4 * np.trace(sound.covariance[3:, 3:])
 
 
 def test_planar_motion_gives_a_partial_answer_that_says_so() -> None:

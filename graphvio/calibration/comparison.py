@@ -20,6 +20,7 @@ from graphvio.calibration.pose_pairs import PosePairs
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log, skew
 
 _CHANCE = 1e-3  # that honest solutions are called different
+_LINEARISATION = 0.1  # of the solution's sigmas: differences that influences of first order leave
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +68,12 @@ def compare(pairs: PosePairs, paper: PaperSolution, graph: GraphSolution, disper
     by_paper = _influence_on_paper(pairs, paper)
     determined = null_space(graph.observability.undetermined).T if not graph.observability.is_complete else np.eye(6)
     by_graph = _influence_on_graph(pairs, graph, determined)
+    first_order = _LINEARISATION**2 * dispersion * graph.covariance  # what it does not explain
     noise = dispersion * np.concatenate([pairs.covariance_1, pairs.covariance_2])
     apart = by_paper - by_graph
     return Comparison(
         se3_log(se3_inverse(graph.left2_T_left1) @ np.ascontiguousarray(paper.left2_T_left1)),
-        np.einsum("nij,njk,nlk->il", apart, noise, apart),
+        np.einsum("nij,njk,nlk->il", apart, noise, apart) + first_order,
         determined,
         np.einsum("nij,njk,nlk->il", by_paper, noise, by_paper),
     )

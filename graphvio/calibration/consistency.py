@@ -160,6 +160,16 @@ def error_of(left2_T_left1: Float, motion_1: Float, motion_2: Float) -> tuple[Fl
 
 
 @kernel
+def errors_of(left2_T_left1: Float, motions_1: Float, motions_2: Float) -> Float:
+    """Errors (N, 6) of N pose pairs, see `error_of`."""
+    errors = np.empty((len(motions_1), 6))
+    for i in range(len(motions_1)):
+        error, _ = error_of(left2_T_left1, motions_1[i], motions_2[i])
+        put(errors[i], error)
+    return errors
+
+
+@kernel
 def error_covariance(left2_T_left1: Float, covariance_1: Float, covariance_2: Float) -> Float:
     """Covariance (6, 6) of a pose pair's error, from both motions'."""
     adjoint = se3_adjoint(left2_T_left1)

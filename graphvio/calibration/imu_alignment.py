@@ -26,6 +26,7 @@ _SIGMAS = 4.0
 _FLOOR_RAD = 1e-3  # a gyro's scale and axes are no better
 _FLOOR_S = 2e-4
 _FEWEST = 10
+_LEAST_TURNED = 3.0  # rms about the second axis over the noise
 _ROUNDS = 20
 _STEP_S = 1e-3
 _WIDEST_S, _COARSE_S = 0.1, 0.005  # offsets that are tried at first
@@ -105,9 +106,12 @@ def align(stretches: Stretches, camera: int, stamps_ns: Int, gyro: Float, imu: I
         raise CalibrationError("gyro and camera have less than a few seconds in common: the IMU cannot be checked")
     offset_s = turned.likeliest_offset(imu.time_offset_s)
     by_gyro = turned.by_gyro(offset_s, np.zeros(3))
-    closed_form, eigenvalues = paper_method.rotation(np.swapaxes(turned.turns, 1, 2), np.swapaxes(by_gyro, 1, 2))
-    if eigenvalues[1] < _FEWEST * _FLOOR_RAD**2:
-        raise CalibrationError("the rig hardly turned, so the camera's rotation against the IMU cannot be checked")
+    if not turned.is_about_two_axes:
+        raise CalibrationError(
+            "the rig turned about one axis only, or hardly at all, so the camera's rotation against the IMU cannot be "
+            "checked; turn it about two axes"
+        )
+    closed_form, _ = paper_method.rotation(np.swapaxes(turned.turns, 1, 2), np.swapaxes(by_gyro, 1, 2))
     starts = (np.ascontiguousarray(body_R_left), closed_form)
     found = min((turned.solve(start, offset_s) for start in starts), key=lambda each: each.cost)
     covariance = found.covariance
@@ -147,6 +151,14 @@ class _Turned:
         self._start_s, self._end_s = start[inside], end[inside]
         self.turns = np.ascontiguousarray(stretches.motions[inside, camera, :3, :3])
         self._covariances = stretches.covariances[inside, camera, :3, :3]
+
+    @property
+    def is_about_two_axes(self) -> bool:
+        """Whether the camera turned about a second axis by more than its noise."""
+        turns = _logs(self.turns)
+        second = np.linalg.eigvalsh(turns.T @ turns / len(turns))[1]
+        noise = np.median(np.trace(self._covariances, axis1=1, axis2=2)) / 3.0
+        return bool(second > _LEAST_TURNED**2 * noise)
 
     def by_gyro(self, offset_s: float, bias: Float) -> Float:
         """Rotations (N, 3, 3) of body from start to end, by the gyro."""

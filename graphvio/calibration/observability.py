@@ -16,6 +16,7 @@ from graphvio.arrays import Float
 from graphvio.calibration.consistency import information
 from graphvio.calibration.pose_pairs import PosePairs
 from graphvio.geometry import se3_adjoint, se3_inverse, skew
+from graphvio.kernels import kernel
 
 _LEAST_LEAD = 4.0  # information over what noise alone would give
 _FLOOR = 1e-9  # of the noise's information over the largest, so that it can be divided by
@@ -80,22 +81,32 @@ def observe(pairs: PosePairs, left2_T_left1: Float) -> Observability:
 
 def _noise_information(pairs: PosePairs, left2_T_left1: Float) -> Float:
     """What the noise of the motions adds to the information (6, 6), on average."""
+    return np.asarray(_added_by_noise(left2_T_left1, pairs.motion_1, pairs.covariance_1, pairs.covariance_2))
+
+
+@kernel
+def _added_by_noise(left2_T_left1: Float, motion_1: Float, covariance_1: Float, covariance_2: Float) -> Float:
     total = np.zeros((6, 6))
     adjoint = se3_adjoint(left2_T_left1)
-    for motion, noise_1, noise_2 in zip(pairs.motion_1, pairs.covariance_1, pairs.covariance_2, strict=True):
-        weight = np.linalg.inv(noise_2 + adjoint @ noise_1 @ adjoint.T)
-        weight = adjoint.T @ weight @ adjoint
-        back = se3_adjoint(se3_inverse(np.ascontiguousarray(motion)))
-        for direction in np.linalg.cholesky(noise_1).T:
-            change = _small_adjoint(direction) @ back
+    for k in range(len(motion_1)):
+        weight = adjoint.T @ np.linalg.inv(covariance_2[k] + adjoint @ covariance_1[k] @ adjoint.T) @ adjoint
+        back = se3_adjoint(se3_inverse(motion_1[k]))
+        root = np.linalg.cholesky(covariance_1[k])
+        for column in range(6):
+            change = _small_adjoint(root[:, column].copy()) @ back
             total += change.T @ weight @ change
     return total
 
 
+@kernel
 def _small_adjoint(tangent: Float) -> Float:
     """(6, 6) with ``Ad(exp(d)) = 1 + ad(d)`` to first order."""
+    small = np.zeros((6, 6))
     turn, shift = skew(tangent[:3]), skew(tangent[3:])
-    return np.block([[turn, np.zeros((3, 3))], [shift, turn]])
+    for i in range(3):
+        for j in range(3):
+            small[i, j], small[3 + i, 3 + j], small[3 + i, j] = turn[i, j], turn[i, j], shift[i, j]
+    return small
 
 
 def _missing(undetermined: Float, axes: Float, turning_rad: Float) -> list[str]:

@@ -120,14 +120,15 @@ def all_stretches(stamps_ns: Sequence[int], betweens: Sequence[Between]) -> Stre
 
 def ends_of(stamps_ns: Int) -> tuple[Int, Int]:
     """Between which of T instants stretches of all lengths lie, from every instant on: first (N,) and last (N,)."""
-    first, last = [], []
-    for i, start in enumerate(stamps_ns.tolist()):
-        ends = np.searchsorted(stamps_ns, start + np.round(np.array(LENGTHS_S) * _NS_PER_S), "right") - 1
-        for j in np.unique(np.maximum(ends, i + 1)).tolist():
-            if j < len(stamps_ns) and stamps_ns[j] - start <= round(1.5 * LENGTHS_S[-1] * _NS_PER_S):
-                first.append(i)
-                last.append(j)
-    return np.array(first, dtype=np.int64), np.array(last, dtype=np.int64)
+    count = len(stamps_ns)
+    lengths_ns = np.round(np.array(LENGTHS_S) * _NS_PER_S).astype(np.int64)
+    ends = np.searchsorted(stamps_ns, stamps_ns[:, None] + lengths_ns, "right") - 1
+    ends = np.maximum(ends, np.arange(1, count + 1)[:, None])  # (T, lengths), ascending
+    new = np.diff(ends, axis=1, prepend=-1) > 0
+    within = new & (ends < count)
+    within &= stamps_ns[np.minimum(ends, count - 1)] - stamps_ns[:, None] <= 1.5 * lengths_ns[-1]
+    first = np.repeat(np.arange(count)[:, None], len(lengths_ns), axis=1)
+    return first[within], ends[within]
 
 
 def of_one_length(stretches: Stretches) -> list[int]:

@@ -14,7 +14,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Int
 from graphvio.calibration import graph, paper_method
 from graphvio.calibration.clocks import find_offset
-from graphvio.calibration.consistency import LIMIT, Further, error_of, whitened
+from graphvio.calibration.consistency import LIMIT, Further, errors_of, whitened
 from graphvio.calibration.dispersion import dispersion
 from graphvio.calibration.pose_pairs import inverses
 from graphvio.calibration.spans import LENGTHS_S, Stretches, ends_of, of_one_length
@@ -186,9 +186,7 @@ def _long_enough(stretches: Stretches) -> Stretches:
 def _with_noise(stretches: Stretches, left2_T_left1: Float) -> Stretches:
     """Stretches of two cameras, of which each has half of what the residuals of stretches of that length show."""
     pairs = stretches.pairs
-    residuals = np.array(
-        [error_of(left2_T_left1, a, b)[0] for a, b in zip(pairs.motion_1, pairs.motion_2, strict=True)]
-    ).reshape(-1, 6)
+    residuals = errors_of(left2_T_left1, pairs.motion_1, pairs.motion_2)
     adjoint = se3_adjoint(se3_inverse(left2_T_left1))
     covariances = stretches.covariances.copy()
     length = _length_classes(stretches)
@@ -243,11 +241,9 @@ def _errors(
     """Errors (N, 6) of the same stretches under another relation of the clocks; NaN where one ends."""
     stamps = _thinned(one.stamps_ns)
     poses, known = _at(other, clock.of(stamps))
-    back = inverses(poses)
-    errors = np.full((len(stretches), 6), np.nan)
-    for k, (i, j) in enumerate(zip(stretches.first.tolist(), stretches.last.tolist(), strict=True)):
-        if known[i] and known[j]:
-            errors[k], _ = error_of(left2_T_left1, np.ascontiguousarray(stretches.motions[k, 0]), back[i] @ poses[j])
+    motion_2 = inverses(poses)[stretches.first] @ poses[stretches.last]
+    errors = errors_of(left2_T_left1, stretches.pairs.motion_1, motion_2)
+    errors[~(known[stretches.first] & known[stretches.last])] = np.nan
     return errors
 
 

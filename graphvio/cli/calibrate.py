@@ -214,6 +214,10 @@ def _tell(found: Calibration) -> None:
             f"{found.names[i]}, {found.names[j]}: {int(fits.sum())} of {len(fits)} motions fit, mean alignment error "
             f"{1e3 * errors[fits].mean():.2f} mm"
         )
+    for j in range(1, len(found.names)):
+        present = found.present(0, j)
+        if present is not None:
+            typer.echo(f"the rig file has {found.names[j]} {_size(present.tangent)} away ({present.sigmas:.1f} sigma)")
     for loop in found.places.loops:
         around = ", ".join(found.names[k] for k in loop.cameras)
         typer.echo(f"around {around}: two at a time miss by {_size(loop.error)}")
@@ -238,24 +242,16 @@ def _table(found: Calibration) -> Table:
 
     from graphvio.geometry import so3_log
 
-    table = Table(title=f"Pose of {found.names[0]} (left camera) in", title_justify="left")
-    table.add_column("")
-    for column in ("x", "y", "z"):
-        table.add_column(column, justify="right")
-    table.add_column("rig file")
+    table = Table(title=f"Pose of the left camera of {found.names[0]} in that of", title_justify="left")
+    for column in ("", "x", "y", "z"):
+        table.add_column(column, justify="right" if column else "left", no_wrap=bool(column))
     for j in range(1, len(found.names)):
         place = found.places.left_T_left1[j]
         sigmas = np.sqrt(np.diag(found.places.covariance)[6 * j - 6 : 6 * j])
         turned = so3_log(np.ascontiguousarray(place[:3, :3]))
-        present = found.present(0, j)
-        before = (
-            ("", "")
-            if present is None
-            else (f"{1e3 * present.distance_m:.1f} mm", f"{present.angle_deg:.3f} deg away, {present.sigmas:.1f} sigma")
-        )
-        table.add_row(f"{found.names[j]}, mm", *map(_with_sigma, 1e3 * place[:3, 3], 1e3 * sigmas[3:]), before[0])
+        table.add_row(f"{found.names[j]}, mm", *map(_with_sigma, 1e3 * place[:3, 3], 1e3 * sigmas[3:]))
         degrees, spread = np.rad2deg(turned), np.rad2deg(sigmas[:3])
-        table.add_row("rotation vector, deg", *map(_with_sigma, degrees, spread), before[1], end_section=True)
+        table.add_row("rotation vector, deg", *map(_with_sigma, degrees, spread), end_section=True)
     return table
 
 

@@ -179,6 +179,8 @@ def _tell(summary: Summary, folder: Path) -> None:
     faults = ", ".join(f"{kind} {count}" for kind, count in sorted(summary.input_faults.items()))
     if faults:
         typer.echo(f"faults of the recording: {faults}")
+    for warning in summary.warnings:
+        typer.echo(f"graphvio: {warning} (graphvio calibrate does)", err=True)
     if summary.resets:
         typer.echo(f"started anew {summary.resets} times: see {folder / 'events.jsonl'}")
     typer.echo(f"results: {folder}")

@@ -65,6 +65,7 @@ class Summary:
         input_faults: kind -> count.
         resets: times the estimation was started anew.
         incidents: kind -> count, of everything in ``events.jsonl``.
+        warnings: what a person should mend before the next run, such as a rig file that the motions refute.
         status: status -> number of estimates.
         pair_medians: name of each of the rig's pairs -> its medians.
         pair_rejected: name of each of the rig's pairs -> test of tracking and stereo matching -> how many corners and
@@ -90,6 +91,7 @@ class Summary:
     input_faults: Mapping[str, int]
     resets: int
     incidents: Mapping[str, int]
+    warnings: Sequence[str]
     status: Mapping[str, int]
     pair_medians: Mapping[str, PairMedians]
     pair_rejected: Mapping[str, Mapping[str, int]]

@@ -1,0 +1,125 @@
+"""More than two cameras at once."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hand_eye import LEFT2_T_LEFT1, motions, planar, turning
+from monte_carlo import band
+from scipy.stats import chi2
+
+from graphvio.arrays import Float
+from graphvio.calibration.pair_calibration import SEEN_FROM, PairCalibration, calibrate_pair
+from graphvio.calibration.scale import ScaleMode
+from graphvio.calibration.several import Places, pairwise, place_all
+from graphvio.calibration.spans import Stretches, all_stretches
+from graphvio.errors import CalibrationError
+from graphvio.geometry import se3_exp, se3_inverse, se3_log
+
+LEFT3_T_LEFT1 = se3_exp(np.array([0.2, -1.5, 0.3, -0.2, 0.1, 0.3]))
+TRUTH = np.array([np.eye(4), LEFT2_T_LEFT1, LEFT3_T_LEFT1])
+NAMES = ("front", "back", "side")
+
+
+def stretches(seed: int, walk: object = turning) -> Stretches:
+    rng = np.random.default_rng(seed)
+    cameras = [motions(walk, se3_inverse(np.ascontiguousarray(place)), rng) for place in TRUTH]  # type: ignore[arg-type]
+    return all_stretches(cameras[0].stamps_ns.tolist(), [each.between for each in cameras])
+
+
+def placed(made: Stretches) -> Places:
+    def calibrate(one: int, other: int, mode: ScaleMode) -> PairCalibration:
+        return calibrate_pair(made.of_both(one, other), scale_mode=mode)
+
+    found, missing = pairwise(NAMES, calibrate, "auto")
+    assert not missing
+    return place_all(found, NAMES, made)
+
+
+def error(places: Places) -> Float:
+    """(12,) tangents to the truth."""
+    return np.concatenate([se3_log(se3_inverse(places.left_T_left1[j]) @ TRUTH[j]) for j in (1, 2)])
+
+
+def test_errors_of_all_are_within_what_is_told_and_no_larger_than_two_at_a_time() -> None:
+    runs = 8
+    squares, ratios = [], []
+    distances: list[float] = []
+    for seed in range(runs):
+        places = placed(stretches(seed))
+        off = error(places)
+        squares.append(off @ np.linalg.solve(places.covariance, off))
+        ratios.append(
+            np.trace(places.covariance_between(1, 2) - SEEN_FROM)
+            / np.trace(places.pairwise[1, 2].covariance - SEEN_FROM)
+        )
+        distances += places.distances.values()
+        (loop,) = places.loops
+        assert loop.statistic < chi2.isf(1e-4, 6)
+        assert places.warnings == ()
+    low, high = band(runs, 12)
+    assert low < np.mean(squares) < high
+    assert np.median(ratios) < 1.02
+    assert max(distances) < chi2.isf(1e-3, 6)
+
+
+def test_places_close_every_loop_exactly() -> None:
+    places = placed(stretches(1))
+    around = np.eye(4)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        around = places.left_T_left1[j] @ se3_inverse(places.left_T_left1[i]) @ around
+    np.testing.assert_allclose(around, np.eye(4), atol=1e-12)
+
+
+def test_covariance_between_two_is_that_of_the_pose_between_them() -> None:
+    places = placed(stretches(2))
+    root = np.linalg.cholesky(places.covariance)
+    rng = np.random.default_rng(0)
+    between = LEFT3_T_LEFT1 @ se3_inverse(LEFT2_T_LEFT1)
+    drawn = []
+    for _ in range(2000):
+        change = root @ rng.standard_normal(12)
+        one, other = (TRUTH[j] @ se3_exp(np.ascontiguousarray(change[6 * j - 6 : 6 * j])) for j in (1, 2))
+        drawn.append(se3_log(se3_inverse(between) @ other @ se3_inverse(one)))
+    told, seen = places.covariance_between(1, 2), np.cov(np.array(drawn).T)
+    np.testing.assert_allclose(np.diag(seen), np.diag(told), rtol=0.15)
+
+
+def test_a_camera_that_is_blind_at_times_is_placed_all_the_same() -> None:
+    made = stretches(3)
+    made.known[made.start_ns > np.median(made.start_ns), 2] = False
+    made.motions[~made.known] = np.nan
+    made.covariances[~made.known] = np.nan
+    places = placed(made)
+    off = error(places)
+    assert off @ np.linalg.solve(places.covariance, off) < chi2.isf(1e-3, 12)
+    sigmas = np.sqrt(np.diag(places.covariance))
+    assert np.all(sigmas[9:] > sigmas[3:6])
+
+
+def test_a_wrong_scale_of_one_camera_is_taken_out_of_all() -> None:
+    made = stretches(4)
+    made.motions[:, 1, :3, 3] *= 1.02
+    places = placed(made)
+    assert any("back measures lengths 2." in sentence for sentence in places.warnings)
+    off = error(places)
+    assert off @ np.linalg.solve(places.covariance, off) < chi2.isf(1e-3, 12)
+    assert max(places.distances.values()) < chi2.isf(1e-3, 6)
+    assert places.loops[0].statistic < chi2.isf(1e-4, 6)
+
+
+def test_planar_motion_leaves_the_heights_of_all_open() -> None:
+    places = placed(stretches(5, planar))
+    for one, other in combinations(range(3), 2):
+        assert not places.pairwise[one, other].observability.is_complete
+    sigmas = np.sqrt(np.diag(places.covariance))
+    assert sigmas[4] > 1.0
+    assert sigmas[10] > 1.0
+    assert sigmas[[3, 5, 9, 11]].max() < 0.03
+
+
+def test_a_camera_that_is_not_on_the_rig_is_named() -> None:
+    made = stretches(6)
+    made.motions[:, 2] = made.motions[::-1, 2].copy()
+    with pytest.raises(CalibrationError, match="front and side: "):
+        placed(made)
