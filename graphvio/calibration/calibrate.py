@@ -76,9 +76,14 @@ def calibrate_pairs(
                     break
     finally:
         separate.close()
-    stretches = stretches_of_motions(separate.motions())
-    names = tuple(pair.name for pair in rig.pairs)
-    _check(stretches, names)
+    motions, names = separate.motions(), tuple(pair.name for pair in rig.pairs)
+    for name, told in zip(names, motions, strict=True):
+        if not told.count:
+            raise CalibrationError(
+                f"{name} told no motion at all in {number} framesets: does it see texture, are its left and right "
+                "images in this order, and is its own calibration right?"
+            )
+    stretches = stretches_of_motions(motions)
 
     def calibrate(one: int, other: int, mode: ScaleMode) -> PairCalibration:
         return calibrate_pair(stretches.of_both(one, other), seed, scale_mode=mode)
@@ -138,16 +143,6 @@ def calibrate_trajectories(
 def stretches_of_motions(motions: Sequence[CameraMotions]) -> Stretches:
     """Stretches between the first camera's instants, of all cameras."""
     return all_stretches(motions[0].stamps_ns.tolist(), [each.between for each in motions])
-
-
-def _check(stretches: Stretches, names: Sequence[str]) -> None:
-    for j, name in enumerate(names):
-        others = stretches.known[:, 0] & stretches.known[:, j] if j else stretches.known[:, 1:].any(axis=1)
-        if not others.any():
-            raise CalibrationError(
-                f"{name} and {names[0] if j else 'the others'} never told their motions at the same time: do both see "
-                "texture, are left and right images of each in this order, and is each pair's own calibration right?"
-            )
 
 
 def _imu(rig: Rig, stretches: Stretches, stamps_ns: Int, gyro: Float) -> tuple[dict[int, ImuAlignment], list[str]]:

@@ -49,6 +49,11 @@ class CameraMotions:
             self._reference[motion.stamp_ns] = motion.reference_stamp_ns
             self._edge[motion.stamp_ns] = moved, covariance
 
+    @property
+    def count(self) -> int:
+        """How many motions there are."""
+        return len(self._edge)
+
     def between(self, start_ns: int, end_ns: int) -> tuple[Float, Float] | None:
         """The motion (4, 4) from one instant to a later one, and its covariance (6, 6), tangent in the camera's frame
         at the end; None where no motions lead from one to the other.

@@ -154,11 +154,13 @@ class Calibration:
                 raise CalibrationError("the recording has no IMU that the first pair could be compared with")
             body_T_left1 = se3(self.imu[0].body_R_left, body_T_left1[:3, 3].copy())
             imu = replace(imu, time_offset_s=self.imu[0].time_offset_s)
-        pairs = [
+        first, *others = self.rig.pairs
+        placed = [
             _placed(pair, body_T_left1 @ se3_inverse(np.ascontiguousarray(left_T_left1)))
-            for pair, left_T_left1 in zip(self.rig.pairs, self.places.left_T_left1, strict=True)
+            for pair, left_T_left1 in zip(others, self.places.left_T_left1[1:], strict=True)
         ]
-        return replace(self.rig, pairs=tuple(pairs), imu=imu)
+        first = _placed(first, body_T_left1) if correct_imu else first
+        return replace(self.rig, pairs=(first, *placed), imu=imu)
 
 
 def rig_warnings(found: Calibration) -> list[str]:

@@ -1,0 +1,70 @@
+"""Rendered recordings to calibrate from: the paper's rig in the calibration room, carried in several ways."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.geometry import se3_exp
+from graphvio.rig import Camera, Rig
+from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
+from graphvio.simulation.motion import Motion
+
+Course = Callable[[Float], Float]
+"""``[x, y, z, yaw, pitch, roll]`` (N, 6) of body in the room at times (N,)."""
+
+
+def planar(t: Float) -> Float:
+    """A cart that drives a curve."""
+    return _course(t, x=0.9 * np.cos(0.7 * t), y=0.9 * np.sin(0.7 * t), yaw=0.8 * np.sin(1.1 * t) + 0.5 * t)
+
+
+def on_the_spot(t: Float) -> Float:
+    """Turned about the vertical through body, and not moved."""
+    return _course(t, yaw=0.9 * np.sin(1.1 * t))
+
+
+def straight(t: Float) -> Float:
+    """Moved about, and not turned."""
+    return _course(t, x=0.5 * np.sin(0.9 * t), y=0.4 * np.sin(1.3 * t), z=0.2 * np.sin(0.7 * t))
+
+
+def _course(
+    t: Float, x: Float | float = 0.0, y: Float | float = 0.0, z: Float | float = 0.0, yaw: Float | float = 0.0
+) -> Float:
+    zero = np.zeros_like(t)
+    level = 1.45 + zero
+    return np.column_stack([zero + x, zero + y, level + z, zero + yaw, zero, zero])
+
+
+def recorded(folder: Path, duration_s: float, course: Course | None = None, trigger_offset_ms: float = 0.0) -> Path:
+    """A recording of 320x240 images; without a course the rig is turned about all axes while it is carried around."""
+    rig = default_rig()
+    pairs = tuple(replace(pair, left=_half_size(pair.left), right=_half_size(pair.right)) for pair in rig.pairs)
+    scene = build_scene("calibration", duration_s, 0.0)
+    if course is not None:
+        scene = replace(scene, motion=Motion(course, duration_s))
+    simulator = Simulator(scene, replace(rig, pairs=pairs), 1, trigger_offset_ms=trigger_offset_ms)
+    return write_recording(simulator, folder).path
+
+
+def with_wrong_place(rig: Rig, degrees: float, metres: float) -> Rig:
+    """The rig with a second pair that is elsewhere."""
+    error = se3_exp(
+        np.concatenate([np.deg2rad(degrees) * np.array([0.6, -0.64, 0.48]), metres * np.array([0.48, 0.6, 0.64])])
+    )
+    other = rig.pairs[1]
+    left, right = (replace(each, body_T_cam=error @ each.body_T_cam) for each in (other.left, other.right))
+    return replace(rig, pairs=(rig.pairs[0], replace(other, left=left, right=right)))
+
+
+def _half_size(camera: Camera) -> Camera:
+    """The camera with pixels of twice the side: pixel (0, 0) is the centre of one."""
+    fx, fy, cx, cy = camera.intrinsics
+    width, height = camera.size_px
+    smaller = np.array([fx / 2, fy / 2, (cx - 0.5) / 2, (cy - 0.5) / 2])
+    return replace(camera, intrinsics=smaller, size_px=(width // 2, height // 2))

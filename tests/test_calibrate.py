@@ -1,0 +1,260 @@
+"""Calibration of a rig from images, by the command and by the function behind it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from calibration_walks import Course, on_the_spot, planar, recorded, straight, with_wrong_place
+from scipy.stats import chi2
+from typer.testing import CliRunner, Result
+
+from graphvio import Calibration, CalibrationError, Rig, calibrate_pairs, open_source
+from graphvio.arrays import Float
+from graphvio.calibration.guide import Advice, Guide
+from graphvio.calibration.separate_motions import SeparateMotions
+from graphvio.cli import app
+from graphvio.config import Config
+from graphvio.geometry import se3_exp, se3_inverse, se3_log, so3_exp, so3_log
+
+pytestmark = pytest.mark.xdist_group("calibrate")
+
+SECONDS = 6.0
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(tmp_path_factory.mktemp("calibrate") / "walk", SECONDS)
+
+
+@pytest.fixture(scope="module")
+def found(walk: Path) -> Calibration:
+    return calibrate_pairs(walk)
+
+
+def command(*arguments: object) -> Result:
+    return CliRunner().invoke(app, list(map(str, arguments)), env={"COLUMNS": "160"})
+
+
+def sigmas_from(found: Calibration, left2_T_left1: Float) -> float:
+    off = se3_log(se3_inverse(found.left2_T_left1) @ np.ascontiguousarray(left2_T_left1))
+    return float(np.sqrt(off @ np.linalg.solve(found.covariance, off)))
+
+
+def is_plausible(found: Calibration, rig: Rig) -> bool:
+    return sigmas_from(found, rig.left2_T_left1()) ** 2 < float(chi2.isf(1e-4, 6))
+
+
+def test_pairs_are_found_within_what_is_told(walk: Path, found: Calibration) -> None:
+    rig = Rig.load(walk / "rig.yaml")
+    assert is_plausible(found, rig)
+    sigmas = np.sqrt(np.diag(found.covariance))
+    assert np.rad2deg(sigmas[:3].max()) < 0.05
+    assert sigmas[3:].max() < 4e-3
+    assert found.is_complete
+    assert found.inliers.mean() > 0.95
+    assert found.pair.frame_inlier.mean() > 0.97
+    assert found.pair.frame_errors_m.mean() < 3.29e-3
+    present = found.present()
+    assert present is not None
+    assert not present.is_off
+    assert not found.warnings
+
+
+def test_where_the_rig_file_has_the_pairs_does_not_matter(walk: Path, found: Calibration) -> None:
+    rig = Rig.load(walk / "rig.yaml")
+    other = calibrate_pairs(open_source(walk, with_wrong_place(rig, 3.0, 0.05)))
+    np.testing.assert_allclose(other.left2_T_left1, found.left2_T_left1, atol=1e-9)
+    present = other.present()
+    assert present is not None
+    assert present.is_off
+    assert not present.is_swapped
+    assert present.angle_deg == pytest.approx(3.0, abs=0.1)
+    assert any("from where it is relative to front" in sentence for sentence in other.warnings)
+
+
+def test_pairs_in_each_others_place_are_told(walk: Path) -> None:
+    rig = Rig.load(walk / "rig.yaml")
+    places = [pair.left.body_T_cam for pair in rig.pairs]
+    moved = []
+    for pair, place in zip(rig.pairs, places[::-1], strict=True):
+        right = place @ se3_inverse(pair.right_T_left)
+        moved.append(
+            replace(pair, left=replace(pair.left, body_T_cam=place), right=replace(pair.right, body_T_cam=right))
+        )
+    swapped = calibrate_pairs(open_source(walk, replace(rig, pairs=tuple(moved))))
+    present = swapped.present()
+    assert present is not None
+    assert present.is_swapped
+    assert any("changed places" in sentence for sentence in swapped.warnings)
+
+
+def test_the_command_puts_a_wrong_rig_right(walk: Path, tmp_path: Path) -> None:
+    rig = Rig.load(walk / "rig.yaml")
+    wrong, out, report = tmp_path / "wrong.yaml", tmp_path / "right.yaml", tmp_path / "report"
+    with_wrong_place(rig, 3.0, 0.05).save(wrong)
+    ran = command("run", walk, "--rig", wrong, "--out", tmp_path / "results")
+    assert ran.exit_code == 0
+    told = re.search(r"pair back is ([\d.]+) deg and ([\d.]+) cm from where the rig file has it", ran.stderr)
+    assert told is not None, ran.stderr
+    assert 2.0 < float(told[1]) < 4.0
+    assert 2.0 < float(told[2]) < 9.0
+    done = command("calibrate", walk, "--rig", wrong, "--out", out, "--report", report)
+    assert done.exit_code == 0, done.output
+    assert re.search(r"the rig has back (2\.9|3\.0)\d+ degrees and 5\d\.\d mm from where it is", done.stderr)
+    right = Rig.load(out)
+    assert np.rad2deg(np.linalg.norm(so3_log(right.left2_T_left1()[:3, :3] @ rig.left2_T_left1()[:3, :3].T))) < 0.1
+    np.testing.assert_allclose(right.left2_T_left1()[:3, 3], rig.left2_T_left1()[:3, 3], atol=5e-3)
+    np.testing.assert_array_equal(right.pairs[0].left.body_T_cam, rig.pairs[0].left.body_T_cam)
+    for j in range(2):
+        np.testing.assert_allclose(right.pairs[j].right_T_left, rig.pairs[j].right_T_left, atol=1e-12)
+
+    numbers = yaml.safe_load((report / "calibration.yaml").read_text())
+    np.testing.assert_allclose(numbers["left_T_left1"]["back"], right.left2_T_left1(), atol=1e-12)
+    assert np.linalg.eigvalsh(np.array(numbers["covariance"])).min() > 0.0
+    assert numbers["rig_before"][0]["off"] is True
+    page = (report / "report.html").read_text()
+    names = {"alignment_errors", "residuals", "turning", "growth"}
+    assert page.count("data:image/png;base64,") == len(names)
+    assert {file.name for file in report.glob("*.png")} == {f"{name}-0-1.png" for name in names}
+    assert "http" not in page  # nothing is fetched from elsewhere
+
+
+@pytest.mark.parametrize(
+    ("course", "words", "code"),  # 1: an exception, of which the command makes a line and exit code 2
+    [
+        (planar, ["rotation only about the axis y (down)", "offset along y (down) cannot be found; tilt the rig"], 3),
+        (on_the_spot, ["rotation only about the axis y (down)", "turn the rig about another axis"], 3),
+        (straight, ["without rotation nothing tells where the cameras are", "turn it about two axes"], 1),
+    ],
+    ids=["planar", "on the spot", "straight"],
+)
+def test_motions_that_do_not_tell_all_are_diagnosed(
+    course: Course, words: list[str], code: int, tmp_path: Path
+) -> None:
+    source = recorded(tmp_path / "walk", 4.0, course)
+    done = command("calibrate", source, "--out", tmp_path / "out.yaml", "--guide")
+    for each in words:
+        assert each in " ".join(done.output.split()) or each in str(done.exception), done.output
+    assert done.exit_code == code
+    assert not (tmp_path / "out.yaml").exists()
+    if code == 3:
+        assert "unknown" in done.stdout
+
+
+def test_pairs_that_are_not_triggered_together(tmp_path: Path) -> None:
+    source = recorded(tmp_path / "walk", SECONDS, trigger_offset_ms=17.0)
+    found = calibrate_pairs(source)
+    assert is_plausible(found, Rig.load(source / "rig.yaml"))
+    assert np.sqrt(np.diag(found.covariance))[3:].max() < 6e-3
+
+
+def test_a_wrong_rotation_and_offset_of_the_imu_are_put_right(walk: Path) -> None:
+    rig = Rig.load(walk / "rig.yaml")
+    assert rig.imu is not None
+    turned = np.eye(4)
+    turned[:3, :3] = so3_exp(np.deg2rad(2.0) * np.array([0.6, 0.0, 0.8]))
+    pairs = []
+    for pair in rig.pairs:
+        left, right = (replace(each, body_T_cam=turned @ each.body_T_cam) for each in (pair.left, pair.right))
+        pairs.append(replace(pair, left=left, right=right))
+    wrong = replace(rig, pairs=tuple(pairs), imu=replace(rig.imu, time_offset_s=0.015))
+    made = calibrate_pairs(open_source(walk, wrong))
+    assert any("front is turned by 2.0" in sentence for sentence in made.warnings)
+    assert any("time offset between cameras and IMU is" in sentence for sentence in made.warnings)
+    assert made.imu is not None
+    assert abs(made.imu[0].time_offset_s) < 4.0 * made.imu[0].time_offset_sigma_s
+    corrected = made.calibrated_rig(correct_imu=True)
+    for j in range(2):
+        off = so3_log(corrected.pairs[j].left.body_T_cam[:3, :3] @ rig.pairs[j].left.body_T_cam[:3, :3].T)
+        assert np.rad2deg(np.linalg.norm(off)) < 0.2
+    assert corrected.imu is not None
+    assert abs(corrected.imu.time_offset_s) < 1e-3
+    kept = made.calibrated_rig()
+    np.testing.assert_array_equal(kept.pairs[0].left.body_T_cam, wrong.pairs[0].left.body_T_cam)
+    assert kept.imu == wrong.imu
+
+
+def test_a_recording_may_be_ended_early(walk: Path) -> None:
+    counts: list[int] = []
+
+    def enough(number: int, _: SeparateMotions) -> bool:
+        counts.append(number)
+        return number == 60
+
+    found = calibrate_pairs(walk, on_frameset=enough)
+    assert counts == list(range(1, 61))
+    assert len(found.pair.frames) < 60
+
+
+def test_the_guide_ends_with_enough(walk: Path) -> None:
+    advice = guided(walk)
+    assert not advice[0].is_enough
+    assert "turn the rig about two axes" in advice[0].text
+    assert advice[-1].is_enough
+    assert advice[-1].text.startswith("enough")
+    sigmas = [each.translation_sigma_m for each in advice]
+    assert sigmas[-1] < sigmas[len(sigmas) // 2] < sigmas[2]
+
+
+def test_the_answer_is_the_same_each_time(walk: Path, found: Calibration) -> None:
+    again = calibrate_pairs(walk)
+    np.testing.assert_array_equal(again.left2_T_left1, found.left2_T_left1)
+    np.testing.assert_array_equal(again.covariance, found.covariance)
+
+
+def test_one_pair_has_nothing_to_be_related_to(walk: Path) -> None:
+    rig = Rig.load(walk / "rig.yaml").with_pairs([0])
+    with pytest.raises(CalibrationError, match="has one stereo pair"):
+        calibrate_pairs(open_source(walk, rig))
+
+
+def test_a_pair_that_sees_nothing_is_named(walk: Path) -> None:
+    """Left and right of the second pair are exchanged: nothing is found where it should be."""
+    rig = Rig.load(walk / "rig.yaml")
+    back = rig.pairs[1]
+    crossed = replace(
+        back, left=replace(back.left, name=back.right.name), right=replace(back.right, name=back.left.name)
+    )
+    with pytest.raises(CalibrationError, match="back told no motion"):
+        calibrate_pairs(open_source(walk, replace(rig, pairs=(rig.pairs[0], crossed))))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--scale", "maybe"], "--scale maybe: give one of auto, estimate, fixed"),
+        (["--pairs", "0"], "one stereo pair"),
+        (["--pairs", "0,7"], "there is no pair 7"),
+    ],
+)
+def test_mistakes_on_the_command_line(walk: Path, arguments: list[str], words: str) -> None:
+    done = command("calibrate", walk, *arguments)
+    assert done.exit_code != 0
+    assert words in str(done.exception)
+
+
+@cache
+def guided(walk: Path) -> list[Advice]:
+    source = open_source(walk)
+    guide = Guide([pair.name for pair in source.rig.pairs])
+    told = []
+
+    def follow(number: int, separate: SeparateMotions) -> bool:
+        if number % 10 == 0:
+            told.append(guide.advise(separate.motions()))
+        return False
+
+    calibrate_pairs(source, config=Config(), on_frameset=follow)
+    return told
+
+
+def test_a_place_that_is_right_has_no_size_in_sigmas(found: Calibration) -> None:
+    assert sigmas_from(found, found.left2_T_left1) < 1e-6
+    moved = found.left2_T_left1 @ se3_exp(np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0]))
+    assert sigmas_from(found, moved) > 20.0
