@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from graphvio.odometry import Odometry
     from graphvio.rig import Camera, Imu, Rig, StereoPair
     from graphvio.sources import open_source
+    from graphvio.trajectory import Trajectory
 
 _HOME_OF = {
     "Calibration": "calibration.result",
@@ -46,6 +47,7 @@ _HOME_OF = {
     "SourceError": "errors",
     "Status": "events",
     "StereoPair": "rig",
+    "Trajectory": "trajectory",
     "calibrate_pairs": "calibration.calibrate",
     "calibrate_trajectories": "calibration.calibrate",
     "open_source": "sources",
@@ -71,6 +73,7 @@ __all__ = [
     "SourceError",
     "Status",
     "StereoPair",
+    "Trajectory",
     "__version__",
     "calibrate_pairs",
     "calibrate_trajectories",

@@ -4,13 +4,17 @@ import sys
 
 from benchmarks.command_line import run_command_line
 
-from campaigns import consistency, endurance, lags, outages, rates, real_imu
+from campaigns import calibration, consistency, endurance, lags, outages, rates, real_imu
+
+_MODULES = (consistency, real_imu, outages, endurance, rates, lags, calibration)
 
 if __name__ == "__main__":
     sys.exit(
         run_command_line(
             "scripts/campaign",
             "Statistical claims by Monte Carlo, and outages. docs/benchmarks.md has their results.",
-            tuple(module.add_parser for module in (consistency, real_imu, outages, endurance, rates, lags)),
+            tuple(
+                module.add_parser for module in (consistency, real_imu, outages, endurance, rates, lags, calibration)
+            ),
         )
     )
