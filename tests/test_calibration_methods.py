@@ -116,6 +116,16 @@ def test_errors_are_within_what_is_told(outlier_share: float) -> None:
     assert missed <= 0.005 * runs * 150
 
 
+def test_a_good_start_serves_where_most_motions_are_wild() -> None:
+    """Slow turns and little noise: outliers are so far off that a solution for all motions leads nowhere."""
+    for seed in range(20):
+        made = drawn(300, np.random.default_rng([seed, 2]), 2e-4, 4e-4, 0.6, turns=(0.05, 0.1, 0.05))
+        start = LEFT2_T_LEFT1 @ se3_exp(np.repeat([3e-4, 3e-4], 3))
+        found = graph.solve(made.pairs, start)
+        assert not np.any(found.inlier & made.outlier)
+        assert found.inlier.sum() > 0.95 * np.sum(~made.outlier)
+
+
 def test_methods_that_differ_by_more_than_they_may_are_told() -> None:
     pairs = drawn(100, np.random.default_rng(6), ANGLE, STEP_M).pairs
     paper, found = both(pairs)

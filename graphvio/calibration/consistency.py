@@ -92,8 +92,16 @@ def without_outliers(
         further: unknowns besides.
     """
     further = Further.none(pairs) if further is None else further
-    found = Consensus(start, np.zeros(len(further.sigmas)), np.empty(0))
-    found = solved(pairs, found, np.ones(len(pairs)), _MOST_ROUNDS, held, further)
+    begun = Consensus(start, np.zeros(len(further.sigmas)), np.empty(0))
+    found = _graduated(pairs, begun, held, further)
+    # Where most pose pairs are wild, a solution for all of them is no beginning, but the start may be.
+    near = _refined(pairs, solved(pairs, begun, np.zeros(len(pairs)), 0, held, further), held, further)
+    return min(found, near, key=lambda each: float(np.minimum(each.squares, LIMIT).sum()))
+
+
+def _graduated(pairs: PosePairs, begun: Consensus, held: Float, further: Further) -> Consensus:
+    """From a cost that is convex to truncated least squares."""
+    found = solved(pairs, begun, np.ones(len(pairs)), _MOST_ROUNDS, held, further)
     sharpness = 1.0 / max(2.0 * found.squares.max() / LIMIT - 1.0, 1.0)
     for _ in range(_MOST_ROUNDS):
         weights = _weights(found.squares, sharpness)
@@ -101,6 +109,16 @@ def without_outliers(
         if np.all((weights < _CERTAIN) | (weights > 1.0 - _CERTAIN)):
             break
         sharpness *= _SHARPENING
+    return _refined(pairs, found, held, further)
+
+
+def _refined(pairs: PosePairs, found: Consensus, held: Float, further: Further) -> Consensus:
+    """Inliers and solution in turns, until the inliers stay the same."""
+    for _ in range(_MOST_ROUNDS):
+        before = found.inlier
+        found = solved(pairs, found, before.astype(np.float64), _STEPS_A_ROUND, held, further)
+        if np.array_equal(before, found.inlier):
+            break
     return solved(pairs, found, found.inlier.astype(np.float64), _MOST_ROUNDS, held, further)
 
 
