@@ -16,7 +16,7 @@ from graphvio.calibration.trajectory_motions import ClockRelation
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.trajectory import Trajectory
 
-SECONDS = 60.0
+SECONDS = 40.0
 OFFSET_S = 123.4567
 WORLD_T_WORLD = se3_exp(np.array([0.3, -0.2, 2.0, 5.0, -3.0, 1.0]))
 SIGMAS = np.repeat([8e-4, 1.5e-3], 3)  # of each pose

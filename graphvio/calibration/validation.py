@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from graphvio.arrays import Float, Int
 from graphvio.calibration import graph
-from graphvio.calibration.consistency import Consensus, Further, solved
+from graphvio.calibration.consistency import Further, whitened
 from graphvio.calibration.dispersion import blocks
 from graphvio.calibration.graph import GraphSolution
 from graphvio.calibration.observability import observe
@@ -20,7 +20,7 @@ from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_inverse, se3_log
 
 _RESAMPLES = 200
-_STEPS = 2
+_TOLD = 1e-12  # of the largest information: less is taken for none
 _POINTS = 8  # of the growth
 _CHANCE = 1e-3
 
@@ -99,22 +99,26 @@ def halves(
 
 def resampled(pairs: PosePairs, solution: GraphSolution, further: Further | None, seed: int) -> Float:
     """Covariance (6, 6) of the solution by a bootstrap over blocks of some seconds, which keeps what neighbouring
-    motions have in common (H. R. Künsch, *The Jackknife and the Bootstrap for General Stationary Observations*, 1989).
+    motions have in common (H. R. Künsch, *The Jackknife and the Bootstrap for General Stationary Observations*, 1989);
+    each time one step of Gauss-Newton from the solution.
     """
     rng = np.random.default_rng(seed)
     chosen = pairs.chosen(solution.inlier)
+    unknowns = Further.none(chosen) if further is None else further.chosen(solution.inlier)
+    errors, jacobians = whitened(chosen, solution.left2_T_left1, unknowns, solution.further)
     number = np.unique(blocks(chosen), return_inverse=True)[1]
     count = int(number.max()) + 1
-    further = Further.none(chosen) if further is None else further.chosen(solution.inlier)
-    start = Consensus(solution.left2_T_left1, solution.further, np.zeros(0))
-    held = solution.observability.undetermined
-    inverse = se3_inverse(solution.left2_T_left1)
-    apart = np.empty((_RESAMPLES, 6))
+    size = jacobians.shape[2]
+    told, pull = np.zeros((count, size, size)), np.zeros((count, size))
+    np.add.at(told, number, np.einsum("nki,nkj->nij", jacobians, jacobians))
+    np.add.at(pull, number, np.einsum("nki,nk->ni", jacobians, errors))
+    known = np.diag(np.concatenate([np.zeros(6), unknowns.sigmas**-2]))
+    steps = np.empty((_RESAMPLES, 6))
     for i in range(_RESAMPLES):
-        times = np.bincount(rng.integers(count, size=count), minlength=count)[number].astype(np.float64)
-        again = solved(chosen, start, times, _STEPS, held, further)
-        apart[i] = se3_log(inverse @ again.left2_T_left1)
-    return np.asarray(np.cov(apart.T))
+        times = np.bincount(rng.integers(count, size=count), minlength=count).astype(np.float64)
+        normal = np.einsum("b,bij->ij", times, told) + known
+        steps[i] = np.linalg.lstsq(normal, -times @ pull, rcond=_TOLD)[0][:6]
+    return np.asarray(np.cov(steps.T))
 
 
 def growth(pairs: PosePairs, solution: GraphSolution, further: Further | None) -> tuple[Grown, ...]:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
     from rich.table import Table
 
     from graphvio.arrays import Float
@@ -71,6 +73,7 @@ def calibrate(
     from graphvio.config import Config
     from graphvio.warmup import warm_up
 
+    _check_places(out, report)
     settings = Config.load(config)
     opened = open_recording(source, rig, settings, pairs=pairs, no_imu=False, from_s=from_s, to_s=to_s)
     mode = _scale_mode(scale)
@@ -121,9 +124,11 @@ def calibrate_trajectories(
     from graphvio.trajectory import Trajectory
 
     mode = _scale_mode(scale)
+    _check_places(out, report)
     read = [Trajectory.read(path) for path in trajectories]
     names = _names(trajectories)
-    found = calibrate_all(read, names, same_clock=same_clock, seed=seed, scale_mode=mode)
+    with _working("relating clocks, motions and cameras"):
+        found = calibrate_all(read, names, same_clock=same_clock, seed=seed, scale_mode=mode)
     _tell(found)
     if report is not None:
         _report(found, report, ", ".join(names), len(read[0]))
@@ -182,6 +187,18 @@ class _Following:
 
     def _interrupt(self, *_: object) -> None:
         self._interrupted = True
+        signal.signal(signal.SIGINT, self._before)  # a second one ends all
+        self._console.print("ending the recording here", soft_wrap=True)
+
+
+def _working(text: str) -> AbstractContextManager[object]:
+    """Shows on a terminal that something is going on."""
+    from contextlib import nullcontext
+
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    return console.status(text) if console.is_terminal else nullcontext()
 
 
 def _scale_mode(text: str) -> ScaleMode:
@@ -194,6 +211,16 @@ def _scale_mode(text: str) -> ScaleMode:
         if text == mode:
             return mode  # type: ignore[no-any-return]
     raise ConfigError(f"--scale {text}: give one of {', '.join(get_args(ScaleMode))}")
+
+
+def _check_places(out: Path | None, report: Path | None) -> None:
+    """Refuse places that cannot be written before minutes are spent."""
+    from graphvio.errors import CalibrationError
+
+    if out is not None and (out.is_dir() or not out.absolute().parent.is_dir()):
+        raise CalibrationError(f"--out {out}: cannot be written; name a file in a folder that exists")
+    if report is not None and report.exists() and not report.is_dir():
+        raise CalibrationError(f"--report {report}: is a file; name a folder")
 
 
 def _names(paths: list[Path]) -> list[str]:

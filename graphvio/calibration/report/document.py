@@ -110,6 +110,7 @@ def _pair(each: PairCalibration) -> dict[str, Any]:
         "dispersion": each.dispersion,
         "by_the_papers_method": {
             "left2_T_left1": each.paper_left2_T_left1.tolist(),
+            "covariance": each.comparison.paper_covariance.tolist(),
             "chi_square": each.comparison.statistic,
             "limit": each.comparison.limit,
             "agrees": each.comparison.agrees,

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 
 from graphvio.calibration.consistency import LIMIT
 from graphvio.calibration.pair_calibration import PairCalibration
@@ -82,18 +83,19 @@ def turning(each: PairCalibration) -> Figure:
     return figure
 
 
-def growth(each: PairCalibration, framesets: int) -> Figure:
+def growth(each: PairCalibration, count: int, unit: str) -> Figure:
     """Angles and translation with their sigmas as the recording grew, against the end's.
 
     Args:
         each: the calibration.
-        framesets: of the whole recording.
+        count: of framesets or poses of the whole recording.
+        unit: what was counted.
     """
     figure = Figure(figsize=(6.4, 5.0), dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
     panels = [figure.add_axes((0.13, bottom, 0.83, 0.38)) for bottom in (0.57, 0.1)]
     begin, end = int(each.pairs.start_ns[0]), int(each.pairs.end_ns[-1])
-    counts = np.array([framesets * (grown.end_ns - begin) / max(end - begin, 1) for grown in each.growth])
+    counts = np.array([count * (grown.end_ns - begin) / max(end - begin, 1) for grown in each.growth])
     apart = np.array([-each.apart(grown.left2_T_left1) for grown in each.growth]).reshape(-1, 6)
     sigmas = np.array([np.sqrt(np.diag(grown.covariance)) for grown in each.growth]).reshape(-1, 6)
     units = np.repeat([np.rad2deg(1.0), 1e3], 3)
@@ -104,13 +106,15 @@ def growth(each: PairCalibration, framesets: int) -> Figure:
             panel.fill_between(counts, middle - spread, middle + spread, color=colour, alpha=0.13, linewidth=0)
         panel.axhline(0.0, color=_GREY, linewidth=0.8)
         panel.set_xscale("log")
+        for axis_format in (panel.xaxis.set_major_formatter, panel.xaxis.set_minor_formatter):
+            axis_format(LogFormatter(labelOnlyBase=False, minor_thresholds=(2.0, 0.5)))
         panel.set_ylabel(label)
         if len(counts) > 1:
             bound = 1.1 * np.abs(units[list(columns)] * (np.abs(apart) + sigmas)[:, list(columns)])[1:].max()
             panel.set_ylim(-bound, bound)
         panel.grid(**_GRID)
         panel.legend(frameon=False, fontsize=8, ncol=3, loc="upper right")
-    panels[1].set_xlabel("framesets used (difference from the result of all; bands: one sigma)")
+    panels[1].set_xlabel(f"{unit} used (difference from the result of all; bands: one sigma)")
     return figure
 
 

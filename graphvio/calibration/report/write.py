@@ -16,14 +16,14 @@ from graphvio.errors import CalibrationError
 PAGE, NUMBERS = "report.html", "calibration.yaml"
 
 
-def write_report(found: Calibration, folder: Path, source: str, framesets: int) -> Path:
+def write_report(found: Calibration, folder: Path, source: str, count: int) -> Path:
     """Write ``report.html`` with everything in it, its pictures as PNGs, and all numbers as ``calibration.yaml``.
 
     Args:
         found: the calibration.
         folder: is made if it is missing.
         source: what was calibrated from, for the title.
-        framesets: that the recording has, or the first trajectory's poses.
+        count: of framesets that were used, or of the first trajectory's poses.
 
     Returns:
         The page.
@@ -39,7 +39,7 @@ def write_report(found: Calibration, folder: Path, source: str, framesets: int) 
             "turning": figures.turning(each),
         }
         if len(each.growth) > 1:
-            drawn["growth"] = figures.growth(each, framesets)
+            drawn["growth"] = figures.growth(each, count, "framesets" if found.rig is not None else "poses")
         pictures[cameras] = {name: _png(figure) for name, figure in drawn.items()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
