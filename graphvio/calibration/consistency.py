@@ -216,9 +216,22 @@ def _whitened(
     for i in range(n):
         error, jacobian = error_of(left2_T_left1, motion_1[i], motion_2[i])
         root = np.linalg.cholesky(error_covariance(left2_T_left1, covariance_1[i], covariance_2[i]))
-        put(jacobians[i, :, :6], np.linalg.solve(root, jacobian))
+        put(jacobians[i, :, :6], jacobian)
         if further:
             error = error + derivatives[i] @ values
-            put(jacobians[i, :, 6:], np.linalg.solve(root, derivatives[i]))
-        put(errors[i], np.linalg.solve(root, error))
+            put(jacobians[i, :, 6:], derivatives[i])
+        put(errors[i], error)
+        _divide(root, errors[i].reshape(6, 1))
+        _divide(root, jacobians[i])
     return errors, jacobians
+
+
+@kernel
+def _divide(root: Float, values: Float) -> None:
+    """Forward substitution: ``values`` (6, K) become ``root^-1 values`` for a lower triangle, in place."""
+    for row in range(6):
+        for column in range(values.shape[1]):
+            total = values[row, column]
+            for k in range(row):
+                total -= root[row, k] * values[k, column]
+            values[row, column] = total / root[row, row]
