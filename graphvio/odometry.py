@@ -27,6 +27,7 @@ from graphvio.events import (
     checked_event,
 )
 from graphvio.filter_belief import FilterBelief
+from graphvio.frontend.alignment import misplaced
 from graphvio.frontend.motion import VisualResult
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.rates import AngularRates
@@ -296,14 +297,13 @@ class Odometry:
             if j in self._told_misaligned:
                 continue
             self._told_misaligned.add(j)
-            d = misalignment.tangent
-            self._report(
-                stamp_ns,
-                "extrinsics_off",
-                f"pair {self.rig.pairs[j].name} is {np.rad2deg(np.linalg.norm(d[:3])):.2f} deg and "
-                f"{100 * np.linalg.norm(d[3:]):.1f} cm from where the rig file has it, as its motion against the first "
-                f"pair's tells (chi-square {misalignment.statistic:.0f}); corrected for this run: calibrate the rig",
-            )
+            self._report(stamp_ns, "extrinsics_off", f"{misplaced(self.rig, j, misalignment)}; corrected for this run")
+
+    @property
+    def rig_warnings(self) -> list[str]:
+        """What the motions until now refute of the rig, a sentence each, with its size and one standard deviation."""
+        found = sorted(self._frontend.misaligned.items())
+        return [f"{misplaced(self.rig, j, misalignment)}; corrected for this run" for j, misalignment in found]
 
     def _report(self, stamp_ns: int, kind: str, detail: str) -> None:
         self._incidents.append(Incident(stamp_ns, kind, detail))

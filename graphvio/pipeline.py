@@ -117,6 +117,7 @@ class _Run:
             framesets=self._delivered,
             awaited=self._delivered - self._before_start,
             resets=self._resets,
+            warnings=self._odometry.rig_warnings,
             truth=self._source.truth,
         )
 

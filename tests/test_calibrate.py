@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 
 from graphvio import Calibration, CalibrationError, Rig, calibrate_pairs, open_source
 from graphvio.arrays import Float
-from graphvio.calibration.guide import Advice, Guide
+from graphvio.calibration.guide import ENOUGH_MOTIONS, Advice, Guide
 from graphvio.calibration.separate_motions import SeparateMotions
 from graphvio.cli import app
 from graphvio.config import Config
@@ -100,10 +100,12 @@ def test_the_command_puts_a_wrong_rig_right(walk: Path, tmp_path: Path) -> None:
     with_wrong_place(rig, 3.0, 0.05).save(wrong)
     ran = command("run", walk, "--rig", wrong, "--out", tmp_path / "results")
     assert ran.exit_code == 0
-    told = re.search(r"pair back is ([\d.]+) deg and ([\d.]+) cm from where the rig file has it", ran.stderr)
+    size = r"pair back is ([\d.]+) \(\+- ([\d.]+)\) deg and ([\d.]+) \(\+- ([\d.]+)\) cm from where the rig file has it"
+    told = re.search(size, ran.stderr)
     assert told is not None, ran.stderr
-    assert 2.0 < float(told[1]) < 4.0
-    assert 2.0 < float(told[2]) < 9.0
+    degrees, degrees_sigma, cm, cm_sigma = map(float, told.groups())
+    assert abs(degrees - 3.0) < 4.0 * degrees_sigma < 1.0
+    assert abs(cm - 5.3) < 4.0 * cm_sigma < 4.0
     done = command("calibrate", walk, "--rig", wrong, "--out", out, "--report", report)
     assert done.exit_code == 0, done.output
     assert re.search(r"the rig has back (2\.9|3\.0)\d+ degrees and 5\d\.\d mm from where it is", done.stderr)
@@ -115,6 +117,7 @@ def test_the_command_puts_a_wrong_rig_right(walk: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(right.pairs[j].right_T_left, rig.pairs[j].right_T_left, atol=1e-12)
 
     numbers = yaml.safe_load((report / "calibration.yaml").read_text())
+    assert yaml.safe_load(out.with_suffix(".calibration.yaml").read_text()) == numbers
     np.testing.assert_allclose(numbers["left_T_left1"]["back"], right.left2_T_left1(), atol=1e-12)
     assert np.linalg.eigvalsh(np.array(numbers["covariance"])).min() > 0.0
     assert numbers["rig_before"][0]["off"] is True
@@ -143,8 +146,13 @@ def test_motions_that_do_not_tell_all_are_diagnosed(
         assert each in " ".join(done.output.split()) or each in str(done.exception), done.output
     assert done.exit_code == code
     assert not (tmp_path / "out.yaml").exists()
+    assert "the rig has back" not in done.output  # what the motions tell is as the rig has it
     if code == 3:
         assert "unknown" in done.stdout
+        numbers = yaml.safe_load((tmp_path / "out.calibration.yaml").read_text())
+        assert numbers["complete"] is False
+        assert len(numbers["undetermined_directions"]["back"]) == (2 if course is on_the_spot else 1)
+        assert numbers["rig_before"][0]["off"] is False
 
 
 def test_pairs_that_are_not_triggered_together(tmp_path: Path) -> None:
@@ -192,12 +200,13 @@ def test_a_recording_may_be_ended_early(walk: Path) -> None:
     assert len(found.pair.frames) < 60
 
 
-def test_the_guide_ends_with_enough(walk: Path) -> None:
+def test_the_guide_leads_to_enough(walk: Path) -> None:
     advice = guided(walk)
     assert not advice[0].is_enough
     assert "turn the rig about two axes" in advice[0].text
-    assert advice[-1].is_enough
-    assert advice[-1].text.startswith("enough")
+    assert not advice[-1].is_enough  # as well known as is asked for, but from six seconds only
+    assert advice[-1].text.startswith("go on like this")
+    assert replace(advice[-1], motions=ENOUGH_MOTIONS).text.startswith("enough")
     sigmas = [each.translation_sigma_m for each in advice]
     assert sigmas[-1] < sigmas[len(sigmas) // 2] < sigmas[2]
 
@@ -225,11 +234,42 @@ def test_a_pair_that_sees_nothing_is_named(walk: Path) -> None:
         calibrate_pairs(open_source(walk, replace(rig, pairs=(rig.pairs[0], crossed))))
 
 
+def test_images_of_each_others_pairs_are_told(walk: Path) -> None:
+    """The rig file has the names of the cameras the other way round."""
+    front, back = Rig.load(walk / "rig.yaml").pairs
+    names = [[each.left.name, each.right.name] for each in (back, front)]
+    crossed = tuple(
+        replace(pair, left=replace(pair.left, name=left), right=replace(pair.right, name=right))
+        for pair, (left, right) in zip((front, back), names, strict=True)
+    )
+    rig = replace(Rig.load(walk / "rig.yaml"), pairs=crossed)
+    with pytest.raises(CalibrationError, match="another pair's"):  # each pair's own calibration is the other's
+        calibrate_pairs(open_source(walk, rig))
+
+
+def test_sigmas_are_those_of_the_numbers_beside_them(found: Calibration) -> None:
+    """Poses are drawn from the covariance, and their offsets and rotation vectors scatter as is shown."""
+    rng, root = np.random.default_rng(0), np.linalg.cholesky(found.covariance)
+    offsets, turns = [], []
+    for _ in range(3000):
+        drawn = found.left2_T_left1 @ se3_exp(root @ rng.standard_normal(6))
+        offsets.append(drawn[:3, 3])
+        turns.append(so3_log(np.ascontiguousarray(drawn[:3, :3])))
+    shown = found.shown(1)
+    np.testing.assert_allclose(np.std(offsets, axis=0), shown.offset_sigmas_m, rtol=0.08)
+    np.testing.assert_allclose(np.std(turns, axis=0), shown.turn_sigmas_rad, rtol=0.08)
+    np.testing.assert_allclose(shown.offset_m, found.left2_T_left1[:3, 3])
+    assert shown.offset_known.all()
+    assert shown.turn_known.all()
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["--scale", "maybe"], "--scale maybe: give one of auto, estimate, fixed"),
         (["--pairs", "0"], "one stereo pair"),
+        (["--correct-imu"], "--correct-imu wants --out FILE"),
+        (["--out", "missing/rig.yaml"], "name a file in a folder that exists"),
         (["--pairs", "0,7"], "there is no pair 7"),
     ],
 )

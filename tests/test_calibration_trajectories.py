@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hand_eye import LEFT2_T_LEFT1
+from monte_carlo import band
 from recordings import REAL_DATA
 from scipy.stats import chi2
 
@@ -65,7 +66,7 @@ def check(found: Calibration) -> None:
     assert off @ np.linalg.solve(found.covariance, off) < chi2.isf(1e-4, 6)
     sigmas = np.sqrt(np.diag(found.covariance))
     assert sigmas[:3].max() < 2e-3
-    assert sigmas[3:].max() < 5e-3
+    assert sigmas[3:].max() < 7e-3
 
 
 def test_offset_of_clocks_and_place_are_found_together() -> None:
@@ -128,6 +129,37 @@ def test_clocks_that_are_said_to_be_one_but_are_not() -> None:
 def test_one_trajectory_is_too_few() -> None:
     with pytest.raises(CalibrationError, match="takes two or more"):
         calibrate_trajectories([first()])
+
+
+def test_clocks_and_place_are_within_what_is_told() -> None:
+    """Several runs: what is told of offset, drift and place is what they scatter by."""
+    offsets, drifts, squares = [], [], []
+    for seed in range(12):
+        one = trajectory(100 + seed, 33.0, np.eye(4))
+        other = trajectory(200 + seed, 50.0, se3_inverse(LEFT2_T_LEFT1), offset_s=OFFSET_S)
+        found = calibrate_trajectories([one, other])
+        assert found.clocks is not None
+        clock = found.clocks[0, 1]
+        offset_s = clock.relation.offset_ns * 1e-9 - OFFSET_S
+        offsets.append(offset_s / clock.offset_sigma_s)
+        drifts.append(clock.relation.drift / clock.drift_sigma)
+        off = se3_log(se3_inverse(found.left2_T_left1) @ LEFT2_T_LEFT1)
+        squares.append(off @ np.linalg.solve(found.covariance, off))
+    _, high = band(12, 1)
+    assert np.mean(np.square(offsets)) < 1.5 * high
+    assert np.mean(np.square(drifts)) < 1.5 * high
+    assert np.mean(squares) < band(12)[1]
+    assert np.mean(squares) > 0.3 * band(12)[0]
+
+
+def test_the_same_trajectory_twice_is_refused() -> None:
+    with pytest.raises(CalibrationError, match="are the same trajectory"):
+        calibrate_trajectories([first(), first()])
+
+
+def test_names_must_differ() -> None:
+    with pytest.raises(CalibrationError, match="as many different names"):
+        calibrate_trajectories([first(), second()], ["a", "a"])
 
 
 def test_trajectories_of_different_walks_are_refused() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -81,7 +82,7 @@ def calibrate_pairs(
         if not told.count:
             raise CalibrationError(
                 f"{name} told no motion at all in {number} framesets: does it see texture, are its left and right "
-                "images in this order, and is its own calibration right?"
+                "images in this order and not another pair's, and is its own calibration right?"
             )
     stretches = stretches_of_motions(motions)
 
@@ -120,6 +121,11 @@ def calibrate_trajectories(
         raise CalibrationError(f"{len(trajectories)} trajectories; to relate cameras takes two or more")
     if names is None:
         names = [f"camera {j}" for j in range(len(trajectories))]
+    if len(set(names)) != len(trajectories):
+        raise CalibrationError(f"{len(trajectories)} trajectories want as many different names, not {', '.join(names)}")
+    for i, j in combinations(range(len(trajectories)), 2):
+        if np.array_equal(trajectories[i].nav_T_body, trajectories[j].nav_T_body):
+            raise CalibrationError(f"{names[i]} and {names[j]} are the same trajectory; give one of each camera")
     two: dict[tuple[int, int], TwoTrajectories] = {}
 
     def calibrate(one: int, other: int, mode: ScaleMode) -> PairCalibration:
@@ -159,5 +165,4 @@ def _imu(rig: Rig, stretches: Stretches, stamps_ns: Int, gyro: Float) -> tuple[d
 
 
 def _clock(both: TwoTrajectories, found: PairCalibration) -> Clock:
-    sigmas = np.sqrt(found.dispersion * np.diag(found.solution.further_covariance))
-    return Clock(both.clock, float(sigmas[0]), float(sigmas[1]))
+    return Clock(both.clock, float(found.further_sigmas[0]), float(found.further_sigmas[1]))

@@ -14,8 +14,9 @@ from graphvio.calibration.pair_calibration import SEEN_FROM, allowance
 from graphvio.calibration.pose_pairs import FEWEST, PosePairs
 from graphvio.errors import CalibrationError
 
-ENOUGH_DEG, ENOUGH_M = 0.05, 2e-3
-"""One standard deviation in the direction that is known least, with which a recording is long enough."""
+ENOUGH_DEG, ENOUGH_M, ENOUGH_MOTIONS = 0.05, 2e-3, 40
+"""One standard deviation in the direction that is known least with which a recording is long enough, and how many
+motions, each of a third of a second, there must be: from fewer, errors that last cannot be told from others."""
 
 _STRETCH_NS = 350_000_000
 _BEGINNING = "turn the rig about two axes, one after the other, by 30 degrees and more, while you walk"
@@ -45,7 +46,7 @@ class Advice:
     def is_enough(self) -> bool:
         """Whether the recording may end."""
         known = self.rotation_sigma_deg <= ENOUGH_DEG and self.translation_sigma_m <= ENOUGH_M
-        return known and not self.missing
+        return known and not self.missing and self.motions >= ENOUGH_MOTIONS
 
     @property
     def text(self) -> str:

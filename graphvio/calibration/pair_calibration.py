@@ -77,6 +77,16 @@ class PairCalibration:
     @cached_property
     def resampled_covariance(self) -> Float:
         """(6, 6) of the solution by a bootstrap."""
+        return self._resampled[:6, :6]
+
+    @cached_property
+    def further_sigmas(self) -> Float:
+        """(M,) of the further unknowns: as the graph has them or as the bootstrap does, whichever is larger."""
+        told = self.dispersion * np.diag(self.solution.further_covariance)
+        return np.sqrt(np.maximum(told, np.diag(self._resampled)[6:]))
+
+    @cached_property
+    def _resampled(self) -> Float:
         return resampled(self.pairs, self.solution, self.further, self.seed)
 
     @cached_property
@@ -91,6 +101,8 @@ class PairCalibration:
     def warnings(self) -> tuple[str, ...]:
         """A sentence for everything that a person should know before using the result; none if all is well."""
         told = list(self.observability.missing)
+        if self.scale.is_wrong and not self.scale_estimated:
+            return tuple(told)  # which makes all of the following fail
         if not self.comparison.agrees:
             told.append(_disagreement(self.comparison))
         share = 1.0 - float(self.inlier.mean())

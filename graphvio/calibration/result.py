@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.linalg import null_space
+from scipy.stats import chi2, norm
 
 from graphvio.arrays import Bool, Float
 from graphvio.calibration.imu_alignment import ImuAlignment
@@ -14,21 +15,25 @@ from graphvio.calibration.pair_calibration import PairCalibration, size_in_words
 from graphvio.calibration.several import Places
 from graphvio.calibration.trajectory_motions import ClockRelation
 from graphvio.errors import CalibrationError
-from graphvio.geometry import se3, se3_inverse, se3_log
+from graphvio.geometry import se3, se3_exp, se3_inverse, se3_log, so3_log, so3_right_jacobian_inverse
 from graphvio.rig import Rig, StereoPair
 
 _CHANCE = 1e-3
 _SIGNIFICANT = 4.0  # sigmas of a drift of clocks
+_TINY = 1e-300
+_COARSE_RAD, _COARSE_M = np.deg2rad(0.5), 0.01
+_NEARER = 20  # steps to the nearest of places that are as likely
+_HARDLY = 0.1  # of a direction that is not determined: a value without that is known
 _SWAPPED = 0.2  # of the distance from the rig's value, that of its inverse is
 
 
 @dataclass(frozen=True, eq=False)
 class Present:
-    """What a rig file says of a pair's place, against the calibration.
+    """What a rig file says of a pair's place, against the calibration, as far as the motions tell.
 
     Attributes:
         tangent: (6,) from the calibration to the file's ``left2_T_left1``, ``[rotation, translation]`` in left1.
-        sigmas: the same in standard deviations: the root of the squared Mahalanobis distance.
+        sigmas: how unlikely that is by chance, as so many standard deviations of one normal variable.
         is_off: whether chance does not explain it.
         is_swapped: whether the file's would be right if both pairs changed places.
     """
@@ -47,6 +52,27 @@ class Present:
     def distance_m(self) -> float:
         """Size of the translation."""
         return float(np.linalg.norm(self.tangent[3:]))
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A place as people read it: three values each, their standard deviations, and whether the motions tell them.
+
+    Attributes:
+        offset_m: (3,) the first left camera's place in another one's axes.
+        offset_sigmas_m: (3,).
+        offset_known: (3,).
+        turn_rad: (3,) rotation vector of the first left camera in the other one.
+        turn_sigmas_rad: (3,).
+        turn_known: (3,).
+    """
+
+    offset_m: Float
+    offset_sigmas_m: Float
+    offset_known: Bool
+    turn_rad: Float
+    turn_sigmas_rad: Float
+    turn_known: Bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,21 +143,50 @@ class Calibration:
     @property
     def is_complete(self) -> bool:
         """Whether the motions tell all of every place."""
-        return all(each.observability.is_complete for each in self.places.pairwise.values())
+        return not any(len(self._undetermined(j)) for j in range(1, len(self.names)))
 
-    def present(self, one: int = 0, other: int = 1) -> Present | None:
-        """The rig's own value against the calibration; None without a rig."""
+    def shown(self, j: int) -> Shown:
+        """The first left camera's pose in that of pair j."""
+        place = np.ascontiguousarray(self.places.left_T_left1[j])
+        covariance = self.places.covariance[6 * j - 6 : 6 * j, 6 * j - 6 : 6 * j]
+        turn = so3_log(place[:3, :3])
+        # A tangent in left1 moves the place by R rho, and the rotation vector by the inverse right Jacobian.
+        by_tangent = np.zeros((6, 6))
+        by_tangent[:3, :3], by_tangent[3:, 3:] = so3_right_jacobian_inverse(turn), place[:3, :3]
+        sigmas = np.sqrt(np.diag(by_tangent @ covariance @ by_tangent.T))
+        known = np.linalg.norm(by_tangent @ self._undetermined(j).T, axis=1) < _HARDLY
+        return Shown(place[:3, 3], sigmas[3:], known[3:], turn, sigmas[:3], known[:3])
+
+    def present(self, j: int = 1) -> Present | None:
+        """The rig's own value for pair j, relative to the first, against the calibration; None without a rig."""
         if self.rig is None:
             return None
-        found = self.places.left_T_left1[other] @ se3_inverse(self.places.left_T_left1[one])
-        given = self.rig.left2_T_left1(one, other)
-        covariance = self.places.covariance_between(one, other)
-        tangent = se3_log(se3_inverse(found) @ given)
-        swapped = se3_log(se3_inverse(found) @ se3_inverse(np.ascontiguousarray(given)))
-        square, other_square = (float(each @ np.linalg.solve(covariance, each)) for each in (tangent, swapped))
-        is_off = square > chi2.isf(_CHANCE, 6)
-        is_swapped = bool(is_off and other_square < _SWAPPED**2 * square)
-        return Present(tangent, float(np.sqrt(square)), bool(is_off), is_swapped)
+        given = np.ascontiguousarray(self.rig.left2_T_left1(0, j))
+        tangent, square, told = self._apart(j, given)
+        _, of_swapped, _ = self._apart(j, se3_inverse(given))
+        chance = float(chi2.sf(square, told))
+        sigmas = float(norm.isf(0.5 * chance)) if chance > _TINY else float(np.sqrt(square))
+        is_off = chance < _CHANCE
+        if told < 6:  # to first order only does the rest not depend on what is not known
+            rotation, translation = np.linalg.norm(tangent.reshape(2, 3), axis=1)
+            is_off = is_off and bool(rotation > _COARSE_RAD or translation > _COARSE_M)
+        return Present(tangent, sigmas, is_off, is_off and of_swapped < _SWAPPED**2 * square)
+
+    def _undetermined(self, j: int) -> Float:
+        return self.places.pairwise[0, j].observability.undetermined
+
+    def _apart(self, j: int, given: Float) -> tuple[Float, float, int]:
+        """Tangent (6,) from the calibration to another value, without what the motions do not tell; its squared
+        Mahalanobis distance, and of how many degrees of freedom that is."""
+        undetermined = self._undetermined(j)
+        place = np.ascontiguousarray(self.places.left_T_left1[j])
+        for _ in range(_NEARER):  # all places along these directions are as likely: take the nearest one
+            apart = se3_log(se3_inverse(place) @ given)
+            place = place @ se3_exp(undetermined.T @ (undetermined @ apart))
+        told = null_space(undetermined).T if len(undetermined) else np.eye(6)
+        apart = told @ se3_log(se3_inverse(place) @ given)
+        covariance = told @ self.places.covariance[6 * j - 6 : 6 * j, 6 * j - 6 : 6 * j] @ told.T
+        return told.T @ apart, float(apart @ np.linalg.solve(covariance, apart)), len(told)
 
     def calibrated_rig(self, correct_imu: bool = False) -> Rig:
         """The rig with all pairs where the calibration has them; the first left camera keeps its place.
@@ -146,12 +201,15 @@ class Calibration:
         if self.rig is None:
             raise CalibrationError("trajectories were calibrated, not a rig: there is no rig to correct")
         if not self.is_complete:
-            raise CalibrationError(f"the rig is not written, as not all is known: {self.warnings[0]}")
+            missing = next(told for each in self.places.pairwise.values() for told in each.observability.missing)
+            raise CalibrationError(f"there is no calibrated rig, as not all is known: {missing}")
         body_T_left1 = np.ascontiguousarray(self.rig.pairs[0].left.body_T_cam)
         imu = self.rig.imu
         if correct_imu:
             if not self.imu or 0 not in self.imu or imu is None:
-                raise CalibrationError("the recording has no IMU that the first pair could be compared with")
+                raise CalibrationError(
+                    "the first pair was not compared with an IMU; the warnings say why, if there is one"
+                )
             body_T_left1 = se3(self.imu[0].body_R_left, body_T_left1[:3, 3].copy())
             imu = replace(imu, time_offset_s=self.imu[0].time_offset_s)
         first, *others = self.rig.pairs
@@ -167,7 +225,7 @@ def rig_warnings(found: Calibration) -> list[str]:
     """What is wrong with the rig file, a sentence each."""
     told = []
     for j in range(1, len(found.names)):
-        present = found.present(0, j)
+        present = found.present(j)
         if present is None or not present.is_off:
             continue
         where = f"the rig has {found.names[j]} {size_in_words(present.tangent)} from where it is relative to "

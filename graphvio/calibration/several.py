@@ -123,7 +123,7 @@ def place_all(
     warnings = [f"{names[i]} and {names[j]}: {told}" for (i, j), each in found.items() for told in each.warnings]
     warnings += [
         f"{names[i]} and {names[j]}: {each.scale.told(names[i], names[j])}"
-        + ("; this was taken out of the result" if each.scale_estimated else "")
+        + ("; this was taken out of the result" if each.scale_estimated else "; the result has it in")
         for (i, j), each in found.items()
         if each.scale.is_wrong
     ]

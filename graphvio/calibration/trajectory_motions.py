@@ -25,7 +25,7 @@ from graphvio.trajectory import Trajectory
 MAX_GAP_S = 0.25
 """Interval between two poses over which a trajectory is interpolated."""
 
-_LEAST_PERIOD_NS = 20_000_000
+_LEAST_PERIOD_NS = 19_500_000  # some less than 20 ms: stamps may be rounded
 _FIRST_SIGMAS = np.repeat([3e-3, 6e-3], 3)  # radians and metres
 _LEAST_SIGMA = 1e-6
 _NORMAL_MEDIAN = 1.4826  # a normal distribution's sigma over the median of absolute values

@@ -98,9 +98,9 @@ def halves(
 
 
 def resampled(pairs: PosePairs, solution: GraphSolution, further: Further | None, seed: int) -> Float:
-    """Covariance (6, 6) of the solution by a bootstrap over blocks of some seconds, which keeps what neighbouring
-    motions have in common (H. R. Künsch, *The Jackknife and the Bootstrap for General Stationary Observations*, 1989);
-    each time one step of Gauss-Newton from the solution.
+    """Covariance (6 + M, 6 + M) of the solution and further unknowns, by a bootstrap over blocks of some seconds, which
+    keeps what neighbouring motions have in common (H. R. Künsch, *The Jackknife and the Bootstrap for General
+    Stationary Observations*, 1989); each time one step of Gauss-Newton from the solution.
     """
     rng = np.random.default_rng(seed)
     chosen = pairs.chosen(solution.inlier)
@@ -113,11 +113,11 @@ def resampled(pairs: PosePairs, solution: GraphSolution, further: Further | None
     np.add.at(told, number, np.einsum("nki,nkj->nij", jacobians, jacobians))
     np.add.at(pull, number, np.einsum("nki,nk->ni", jacobians, errors))
     known = np.diag(np.concatenate([np.zeros(6), unknowns.sigmas**-2]))
-    steps = np.empty((_RESAMPLES, 6))
+    steps = np.empty((_RESAMPLES, size))
     for i in range(_RESAMPLES):
         times = np.bincount(rng.integers(count, size=count), minlength=count).astype(np.float64)
         normal = np.einsum("b,bij->ij", times, told) + known
-        steps[i] = np.linalg.lstsq(normal, -times @ pull, rcond=_TOLD)[0][:6]
+        steps[i] = np.linalg.lstsq(normal, -times @ pull, rcond=_TOLD)[0]
     return np.asarray(np.cov(steps.T))
 
 

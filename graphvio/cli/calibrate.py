@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from graphvio.calibration.separate_motions import SeparateMotions
 
 EXIT_PARTIAL = 3
-_UNKNOWN = 50.0  # millimetres or degrees: nothing tells, then
 
 
 def calibrate(
@@ -29,7 +28,8 @@ def calibrate(
         Path | None, typer.Option("--rig", help="Rig or calibration file.  [default: what the recording carries]")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", help="Write the corrected rig here (.yaml).", metavar="FILE")
+        Path | None,
+        typer.Option("--out", help="Write the corrected rig here (.yaml), and all numbers beside it.", metavar="FILE"),
     ] = None,
     report: Annotated[
         Path | None, typer.Option("--report", help="Folder for a report: page, pictures, all numbers.", metavar="DIR")
@@ -51,7 +51,9 @@ def calibrate(
     ] = None,
     from_s: Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.")] = None,
     to_s: Annotated[float | None, typer.Option("--to", help="End at this second of the recording.")] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Of all random choices.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", help="Of all random choices: the same gives the same result.", min=0)
+    ] = 0,
     verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
 ) -> None:
     """Find where a rig's stereo pairs are relative to each other, from a recording; they need not share a view.
@@ -69,13 +71,17 @@ def calibrate(
         graphvio calibrate walk --rig rig.yaml --guide
     """
     from graphvio.calibration.calibrate import calibrate_pairs
+    from graphvio.calibration.report.document import write_document
     from graphvio.cli.run import open_recording
     from graphvio.config import Config
+    from graphvio.errors import CalibrationError
     from graphvio.warmup import warm_up
 
     _check_places(out, report)
     settings = Config.load(config)
     opened = open_recording(source, rig, settings, pairs=pairs, no_imu=False, from_s=from_s, to_s=to_s)
+    if correct_imu and (out is None or opened.rig.imu is None):
+        raise CalibrationError("--correct-imu wants --out FILE to write the rig to, and a recording with an IMU")
     mode = _scale_mode(scale)
     warm_up(opened.rig.with_pairs([0]).without_imu(), settings)
     names = [pair.name for pair in opened.rig.pairs]
@@ -85,11 +91,13 @@ def calibrate(
     if report is not None:
         _report(found, report, opened.name, following.framesets)
     if out is not None:
+        numbers = out.with_suffix(".calibration.yaml")
+        write_document(found, numbers)
         if found.is_complete:
             found.calibrated_rig(correct_imu).save(out)
-            typer.echo(f"wrote {out}")
+            typer.echo(f"wrote {out}, and all numbers to {numbers}")
         else:
-            typer.echo(f"graphvio: {out} is not written: the motions tell a part only", err=True)
+            typer.echo(f"graphvio: {out} is not written, only {numbers}: the motions tell a part only", err=True)
     _end(found)
 
 
@@ -105,13 +113,15 @@ def calibrate_trajectories(
     scale: Annotated[
         str, typer.Option("--scale", help="Lengths may be wrong by a factor: auto, estimate or fixed.")
     ] = "auto",
-    seed: Annotated[int, typer.Option("--seed", help="Of all random choices.")] = 0,
+    seed: Annotated[
+        int, typer.Option("--seed", help="Of all random choices: the same gives the same result.", min=0)
+    ] = 0,
     verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
 ) -> None:
     """Find where cameras are relative to each other from their trajectories, whatever odometry made them.
 
     Each trajectory may have a world frame and a clock of its own: offsets between clocks are found from the angular
-    speeds, and drifts.
+    speeds, and drifts. Exit codes are those of `graphvio calibrate`.
 
     Examples:
 
@@ -151,6 +161,7 @@ class _Following:
         from graphvio.calibration.guide import Guide
 
         self.framesets = 0
+        self._total = total
         self._console = Console(stderr=True)
         columns = (BarColumn(20), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
         self._bar = Progress(*columns, console=self._console, transient=True)
@@ -166,7 +177,7 @@ class _Following:
         return self
 
     def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGINT, self._before)
+        self._let_go()
         if self._console.is_terminal:
             self._bar.stop()
 
@@ -174,6 +185,9 @@ class _Following:
         """Show how far it is; whether to end."""
         self.framesets = number
         self._bar.update(self._task, completed=number)
+        if number == self._total:
+            self._bar.update(self._task, description="all together")
+            self._let_go()
         if self._guide is not None and number % self._GUIDE_EVERY == 0:
             self._show(self._guide.advise(separate.motions()), number)
         return self._interrupted
@@ -187,8 +201,12 @@ class _Following:
 
     def _interrupt(self, *_: object) -> None:
         self._interrupted = True
-        signal.signal(signal.SIGINT, self._before)  # a second one ends all
-        self._console.print("ending the recording here", soft_wrap=True)
+        self._let_go()
+        self._console.print(f"ended at frameset {self.framesets} of {self._total}", soft_wrap=True, highlight=False)
+
+    def _let_go(self) -> None:
+        """Ctrl-C ends the command from here on."""
+        signal.signal(signal.SIGINT, self._before)
 
 
 def _working(text: str) -> AbstractContextManager[object]:
@@ -242,7 +260,7 @@ def _tell(found: Calibration) -> None:
             f"{1e3 * errors[fits].mean():.2f} mm"
         )
     for j in range(1, len(found.names)):
-        present = found.present(0, j)
+        present = found.present(j)
         if present is not None:
             typer.echo(f"the rig file has {found.names[j]} {_size(present.tangent)} away ({present.sigmas:.1f} sigma)")
     for loop in found.places.loops:
@@ -250,8 +268,8 @@ def _tell(found: Calibration) -> None:
         typer.echo(f"around {around}: two at a time miss by {_size(loop.error)}")
     for (i, j), clock in (found.clocks or {}).items():
         typer.echo(
-            f"{found.names[i]} to {found.names[j]}: add {1e-9 * clock.relation.offset_ns:.6f} s to a stamp "
-            f"(+- {1e3 * clock.offset_sigma_s:.2f} ms)"
+            f"{found.names[i]} to {found.names[j]}: add {1e-9 * clock.relation.offset_ns:.6f} s to a stamp of "
+            f"{found.names[i]} (+- {1e3 * clock.offset_sigma_s:.2f} ms)"
         )
     for warning in found.warnings:
         typer.echo(f"graphvio: {warning}", err=True)
@@ -267,24 +285,21 @@ def _table(found: Calibration) -> Table:
     import numpy as np
     from rich.table import Table
 
-    from graphvio.geometry import so3_log
-
-    table = Table(title=f"Pose of the left camera of {found.names[0]} in that of", title_justify="left")
+    table = Table(title=f"Where {found.names[0]} is (its left camera), seen from", title_justify="left")
     for column in ("", "x", "y", "z"):
         table.add_column(column, justify="right" if column else "left", no_wrap=bool(column))
     for j in range(1, len(found.names)):
-        place = found.places.left_T_left1[j]
-        sigmas = np.sqrt(np.diag(found.places.covariance)[6 * j - 6 : 6 * j])
-        turned = so3_log(np.ascontiguousarray(place[:3, :3]))
-        table.add_row(f"{found.names[j]}, mm", *map(_with_sigma, 1e3 * place[:3, 3], 1e3 * sigmas[3:]))
-        degrees, spread = np.rad2deg(turned), np.rad2deg(sigmas[:3])
-        table.add_row("rotation vector, deg", *map(_with_sigma, degrees, spread), end_section=True)
+        shown = found.shown(j)
+        place = map(_with_sigma, 1e3 * shown.offset_m, 1e3 * shown.offset_sigmas_m, shown.offset_known)
+        turn = map(_with_sigma, np.rad2deg(shown.turn_rad), np.rad2deg(shown.turn_sigmas_rad), shown.turn_known)
+        table.add_row(f"{found.names[j]}, mm", *place)
+        table.add_row("rotation vector, deg", *turn, end_section=True)
     return table
 
 
-def _with_sigma(value: float, sigma: float) -> str:
+def _with_sigma(value: float, sigma: float, known: bool) -> str:
     digits = 2 if sigma > 0.05 else 3
-    return f"{value:.{digits}f} ± {sigma:.{digits}f}" if sigma < _UNKNOWN else "unknown"
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}" if known else "unknown"
 
 
 def _report(found: Calibration, folder: Path, source: str, count: int) -> None:

@@ -19,6 +19,7 @@ from graphvio.arrays import Float
 from graphvio.frontend.refinement import Refined
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.kernels import kernel
+from graphvio.rig import Rig
 
 _KEPT = 100
 _FEWEST = 6
@@ -107,6 +108,19 @@ class PairAlignment:
         if np.mean(squared > 4.0 * _CAUCHY) > _MOST_OUTLIERS:
             return None
         return Misalignment(d, np.asarray(np.linalg.inv(information)), float(d @ (information - prior) @ d))
+
+
+def misplaced(rig: Rig, pair: int, misalignment: Misalignment) -> str:
+    """How far a pair is from where the rig has it, relative to the first pair, as a clause."""
+    adjoint = se3_adjoint(np.ascontiguousarray(rig.pairs[0].left.cam_T_body))
+    turned, moved = np.split(adjoint @ misalignment.tangent, 2)
+    covariance = adjoint @ misalignment.covariance @ adjoint.T
+    sigmas = np.sqrt([np.linalg.eigvalsh(block)[-1] for block in (covariance[:3, :3], covariance[3:, 3:])])
+    return (
+        f"pair {rig.pairs[pair].name} is {np.rad2deg(np.linalg.norm(turned)):.2f} (+- {np.rad2deg(sigmas[0]):.2f}) deg "
+        f"and {100 * np.linalg.norm(moved):.1f} (+- {100 * sigmas[1]:.1f}) cm from where the rig file has it, as its "
+        "motion against the first pair's tells"
+    )
 
 
 def placed(motion: Refined, misalignment: Misalignment | None) -> Refined:

@@ -37,7 +37,6 @@ _COVARIANCE_HEADER = ",".join(["stamp_ns", *(f"{a}_{b}" for a, b in combinations
 _BIAS_HEADER = "stamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
 _PAIRS_HEADER = "stamp_ns,pair,points,inliers,rms_px,own_inliers,own_rms_px"
 _UPPER = np.triu_indices(6)
-_TO_BE_MENDED = ("extrinsics_off",)  # kinds of incidents that a person should hear of at the end
 _NS_PER_S = 1e9
 
 
@@ -88,7 +87,6 @@ class ResultWriter:
         self._pair_rejected: dict[str, Counter[str]] = {name: Counter() for name in self._pair_names}
         self._status: Counter[str] = Counter()
         self._incidents: Counter[str] = Counter()
-        self._warnings: list[str] = []
         self._stamps, self._epochs, self._lost = array("q"), array("q"), array("q")
         self._poses = array("d")
         self._pose_status: list[str] = []
@@ -171,8 +169,6 @@ class ResultWriter:
             GraphvioError: if the disk is full or the folder gone.
         """
         self._incidents[incident.kind] += 1
-        if incident.kind in _TO_BE_MENDED:
-            self._warnings.append(incident.detail)
         self._write("events.jsonl", json.dumps(asdict(incident), ensure_ascii=False))
 
     def finish(
@@ -185,6 +181,7 @@ class ResultWriter:
         framesets: int,
         awaited: int,
         resets: int,
+        warnings: Sequence[str] = (),
         truth: Path | None = None,
     ) -> Summary:
         """Write what is known only at the end: the smoothed trajectory, the summary and the picture.
@@ -197,6 +194,7 @@ class ResultWriter:
             framesets: framesets read.
             awaited: framesets that could have had a pose: those after initialisation may begin.
             resets: times the estimation was started anew.
+            warnings: what a person should mend before the next run.
             truth: trajectory file to measure the run against; if that fails, the summary says why.
 
         Raises:
@@ -222,7 +220,7 @@ class ResultWriter:
             input_faults=dict(input_faults),
             resets=resets,
             incidents=dict(self._incidents),
-            warnings=list(self._warnings),
+            warnings=list(warnings),
             status=dict(self._status),
             pair_medians={name: PairMedians.of(figures) for name, figures in self._pair_figures.items()},
             pair_rejected={name: dict(sorted(counts.items())) for name, counts in self._pair_rejected.items()},

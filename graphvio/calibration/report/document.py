@@ -21,6 +21,11 @@ def document(found: Calibration) -> dict[str, Any]:
         "graphvio_calibration": VERSION,
         "names": list(found.names),
         "complete": found.is_complete,
+        "undetermined_directions": {
+            name: found.places.pairwise[0, j].observability.undetermined.tolist()
+            for j, name in enumerate(found.names)
+            if j
+        },
         "left_T_left1": {
             name: pose.tolist() for name, pose in zip(found.names, found.places.left_T_left1, strict=True)
         },
@@ -134,11 +139,11 @@ def _pair(each: PairCalibration) -> dict[str, Any]:
 
 
 def _present(found: Calibration, j: int) -> dict[str, Any]:
-    present = found.present(0, j)
+    present = found.present(j)
     assert present is not None
     return {
         "name": found.names[j],
-        "rotation_rad": float(np.linalg.norm(present.tangent[:3])),
+        "rotation_deg": present.angle_deg,
         "translation_m": present.distance_m,
         "sigmas": present.sigmas,
         "off": present.is_off,

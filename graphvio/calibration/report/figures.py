@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import NullLocator
 
 from graphvio.calibration.consistency import LIMIT
 from graphvio.calibration.pair_calibration import PairCalibration
@@ -99,22 +99,27 @@ def growth(each: PairCalibration, count: int, unit: str) -> Figure:
     apart = np.array([-each.apart(grown.left2_T_left1) for grown in each.growth]).reshape(-1, 6)
     sigmas = np.array([np.sqrt(np.diag(grown.covariance)) for grown in each.growth]).reshape(-1, 6)
     units = np.repeat([np.rad2deg(1.0), 1e3], 3)
-    for panel, columns, label in ((panels[0], (0, 1, 2), "angle, degrees"), (panels[1], (3, 4, 5), "offset, mm")):
+    for panel, columns, label in (
+        (panels[0], (0, 1, 2), "angle about, degrees"),
+        (panels[1], (3, 4, 5), "offset along, mm"),
+    ):
         for colour, column, name in zip(_AXES, columns, "xyz", strict=True):
             middle, spread = units[column] * apart[:, column], units[column] * sigmas[:, column]
             panel.plot(counts, middle, "o-", color=colour, markersize=3.5, linewidth=1.2, label=name)
             panel.fill_between(counts, middle - spread, middle + spread, color=colour, alpha=0.13, linewidth=0)
         panel.axhline(0.0, color=_GREY, linewidth=0.8)
         panel.set_xscale("log")
-        for axis_format in (panel.xaxis.set_major_formatter, panel.xaxis.set_minor_formatter):
-            axis_format(LogFormatter(labelOnlyBase=False, minor_thresholds=(2.0, 0.5)))
+        panel.set_xticks(counts, [f"{count:.0f}" for count in counts])
+        panel.xaxis.set_minor_locator(NullLocator())
         panel.set_ylabel(label)
         if len(counts) > 1:
             bound = 1.1 * np.abs(units[list(columns)] * (np.abs(apart) + sigmas)[:, list(columns)])[1:].max()
             panel.set_ylim(-bound, bound)
         panel.grid(**_GRID)
         panel.legend(frameon=False, fontsize=8, ncol=3, loc="upper right")
-    panels[1].set_xlabel(f"{unit} used (difference from the result of all; bands: one sigma)")
+    panels[1].set_xlabel(
+        f"{unit} used (axes of the first left camera; difference from the result of all; bands: one sigma)"
+    )
     return figure
 
 

@@ -8,10 +8,9 @@ from html import escape
 
 import numpy as np
 
-from graphvio.arrays import Float
+from graphvio.arrays import Bool, Float
 from graphvio.calibration.pair_calibration import PairCalibration, size_in_words
 from graphvio.calibration.result import Calibration
-from graphvio.geometry import so3_log
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 860px; margin: 2em auto; padding: 0 1em; }
@@ -27,7 +26,8 @@ _CAPTIONS = {
     "every single motion: a narrow heap near zero is good. (Figure 4 of Oskiper et al., CVPR 2007, is the same; theirs "
     "has a mean of 3.29 mm.)",
     "residuals": "The same over time, weighed by what each motion can be expected to be wrong by. Points should lie "
-    "around 1 from beginning to end. Crosses were left out; many at one time mean that a camera was disturbed there.",
+    "around 1 or somewhat below from beginning to end. Crosses were left out; many at one time mean that a camera was "
+    "disturbed there.",
     "turning": "About which axes the rig was turned, as directions seen from the first left camera, and how fast. "
     "Turning about one axis only leaves the offset along it unknown: there should be points in two regions that "
     "are not opposite to each other.",
@@ -62,7 +62,8 @@ def page(found: Calibration, pictures: Mapping[tuple[int, int], Mapping[str, byt
         parts += ["<h2>Cameras and IMU</h2>", _imu(found)]
     if found.clocks:
         parts += ["<h2>Clocks</h2>", _clocks(found)]
-    parts += ["<h2>Numbers</h2>", _numbers(found)]
+    if found.is_complete:
+        parts += ["<h2>Numbers</h2>", _numbers(found)]
     body = "\n".join(parts)
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(source)}: calibration</title>'
@@ -84,24 +85,22 @@ def _verdict(found: Calibration) -> str:
 def _places(found: Calibration) -> str:
     rows = []
     for j in range(1, len(found.names)):
-        place = found.places.left_T_left1[j]
-        sigmas = np.sqrt(np.diag(found.places.covariance)[6 * j - 6 : 6 * j])
-        turned = np.rad2deg(so3_log(np.ascontiguousarray(place[:3, :3])))
+        shown = found.shown(j)
         rows.append(
             (
-                f"{found.names[0]} as seen from {found.names[j]}",
-                _vector(place[:3, 3] * 1e3, sigmas[3:] * 1e3, "mm", 2),
-                _vector(turned, np.rad2deg(sigmas[:3]), "degrees", 3),
+                f"{found.names[0]}, seen from {found.names[j]}",
+                _vector(1e3 * shown.offset_m, 1e3 * shown.offset_sigmas_m, shown.offset_known, "mm", 2),
+                _vector(np.rad2deg(shown.turn_rad), np.rad2deg(shown.turn_sigmas_rad), shown.turn_known, "degrees", 3),
                 _present(found, j),
             )
         )
-    head = ("", "offset x, y, z", "rotation vector", "in the rig file" if found.rig is not None else "")
+    head = ("left cameras", "offset x, y, z", "rotation vector", "in the rig file" if found.rig is not None else "")
     note = "<p>Camera axes: x right, y down, z forward. After +- stands one standard deviation.</p>"
     return _table(rows, head) + note
 
 
 def _present(found: Calibration, j: int) -> str:
-    present = found.present(0, j)
+    present = found.present(j)
     if present is None:
         return ""
     verdict = "agrees" if not present.is_off else "is off"
@@ -113,10 +112,15 @@ def _details(each: PairCalibration) -> str:
     bootstrap = np.sqrt(np.diag(each.resampled_covariance))
     paper = np.sqrt(np.diag(each.comparison.paper_covariance))
     comparison, halves = each.comparison, each.halves
+    frames = f"{len(each.frames)}, of which {int(each.frame_inlier.sum())} fit"
     rows = [
+        *([("motions from frame to frame", frames)] if len(each.frames) else []),
         ("motions used", f"{len(each.pairs)}, of which {int(each.inlier.sum())} fit"),
-        ("motions from frame to frame", f"{len(each.frames)}, of which {int(each.frame_inlier.sum())} fit"),
-        ("two independent methods", f"{size_in_words(comparison.difference)} apart: " + _chance(comparison.agrees)),
+        (
+            "the paper's method and the graph",
+            f"{size_in_words(comparison.difference)} apart: {_chance(comparison.agrees)} (chi-square "
+            f"{comparison.statistic:.1f}, limit {comparison.limit:.1f})",
+        ),
         (
             "first half of the recording against the second",
             "one of them does not tell enough"
@@ -126,7 +130,7 @@ def _details(each: PairCalibration) -> str:
             f"{1e3 * halves.crossed_m[0]:.2f} and {1e3 * halves.crossed_m[1]:.2f} mm by the other half's",
         ),
         (
-            "sigmas: told; by resampling the recording; of the paper's method",
+            "sigmas: told, with what no recording makes smaller; by resampling the recording; of the paper's method",
             f"{_largest(np.rad2deg([told[:3], bootstrap[:3], paper[:3]]), 4)} degrees, "
             f"{_largest(1e3 * np.array([told[3:], bootstrap[3:], paper[3:]]), 2)} mm (largest of three directions)",
         ),
@@ -138,10 +142,19 @@ def _details(each: PairCalibration) -> str:
         ),
         (
             "turning about principal axes",
-            ", ".join(f"{value:.2f}" for value in np.rad2deg(each.observability.turning_rad)) + " degrees rms a motion",
+            f"{_degrees(each.observability.turning_rad)} rms in a motion (singular values of the rotation's problem)",
+        ),
+        (
+            "lever of the turning on the offset",
+            f"{_degrees(each.observability.translation_singular_values)} rms in a motion (singular values of the "
+            "offset's problem; two must be well above nothing)",
         ),
     ]
     return _table(rows)
+
+
+def _degrees(radians: Float) -> str:
+    return ", ".join(f"{value:.2f}" for value in np.rad2deg(radians)) + " degrees"
 
 
 def _largest(sigmas: Float, digits: int) -> str:
@@ -196,6 +209,8 @@ def _numbers(found: Calibration) -> str:
     for j in range(1, len(found.names)):
         name = f"{found.names[j]}_T_{found.names[0]} (left cameras)"
         blocks.append(f"{name}\n{_matrix(found.places.left_T_left1[j])}")
+        by_paper = found.places.pairwise[0, j].paper_left2_T_left1
+        blocks.append(f"{name}, by the paper's method\n{_matrix(by_paper)}")
     return "".join(f"<pre>{escape(block)}</pre>" for block in blocks)
 
 
@@ -203,10 +218,10 @@ def _matrix(values: Float) -> str:
     return "\n".join("  ".join(f"{value: .12f}" for value in row) for row in values)
 
 
-def _vector(values: Float, sigmas: Float, unit: str, digits: int) -> str:
+def _vector(values: Float, sigmas: Float, known: Bool, unit: str, digits: int) -> str:
     told = ", ".join(
-        f"{value:.{digits}f} +- {sigma:.{digits}f}" if sigma < 1e3 else "unknown"
-        for value, sigma in zip(values, sigmas, strict=True)
+        f"{value:.{digits}f} +- {sigma:.{digits}f}" if is_known else "unknown"
+        for value, sigma, is_known in zip(values, sigmas, known, strict=True)
     )
     return f"{told} {unit}"
 
