@@ -121,11 +121,11 @@ def calibrate_trajectories(
         raise CalibrationError(f"{len(trajectories)} trajectories; to relate cameras takes two or more")
     if names is None:
         names = [f"camera {j}" for j in range(len(trajectories))]
-    if len(set(names)) != len(trajectories):
-        raise CalibrationError(f"{len(trajectories)} trajectories want as many different names, not {', '.join(names)}")
     for i, j in combinations(range(len(trajectories)), 2):
         if np.array_equal(trajectories[i].nav_T_body, trajectories[j].nav_T_body):
             raise CalibrationError(f"{names[i]} and {names[j]} are the same trajectory; give one of each camera")
+    if len(set(names)) != len(trajectories):
+        raise CalibrationError(f"{len(trajectories)} trajectories want as many different names, not {', '.join(names)}")
     two: dict[tuple[int, int], TwoTrajectories] = {}
 
     def calibrate(one: int, other: int, mode: ScaleMode) -> PairCalibration:

@@ -113,13 +113,12 @@ def growth(each: PairCalibration, count: int, unit: str) -> Figure:
         panel.xaxis.set_minor_locator(NullLocator())
         panel.set_ylabel(label)
         if len(counts) > 1:
-            bound = 1.1 * np.abs(units[list(columns)] * (np.abs(apart) + sigmas)[:, list(columns)])[1:].max()
+            scaled, bands = (np.abs(units * each)[:, list(columns)] for each in (apart, sigmas))
+            bound = 1.1 * max(scaled.max(), (scaled + bands)[1:].max())
             panel.set_ylim(-bound, bound)
         panel.grid(**_GRID)
         panel.legend(frameon=False, fontsize=8, ncol=3, loc="upper right")
-    panels[1].set_xlabel(
-        f"{unit} used (axes of the first left camera; difference from the result of all; bands: one sigma)"
-    )
+    panels[1].set_xlabel(f"{unit} used; difference from the result of all, with one sigma")
     return figure
 
 
