@@ -32,5 +32,9 @@ class MissingExtraError(GraphvioError):
         super().__init__(f"{purpose} needs {package}: install it with  pip install 'graphvio[{extra}]'")
 
 
+class SessionError(GraphvioError):
+    """A session's file cannot be read or written."""
+
+
 class CalibrationError(GraphvioError):
     """Motions from which the cameras' places on the rig cannot be found."""

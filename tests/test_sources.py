@@ -146,7 +146,7 @@ def test_wrong_paths(tmp_path: Path) -> None:
         open_source(tmp_path)
     file = tmp_path / "file.bag"
     file.write_bytes(b"x")
-    with pytest.raises(SourceError, match="is no folder"):
+    with pytest.raises(SourceError, match="is no recording that graphvio knows"):
         open_source(file)
     with pytest.raises(SourceError, match=r"none of the known layouts.*KITTI odometry.*KITTI raw") as caught:
         open_source(tmp_path)

@@ -18,7 +18,7 @@ from graphvio.rig import Rig
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.images import damage_of
 from graphvio.sources.matching import TOLERANCE_NS, group_pairs, match_sides
-from graphvio.sources.recording import Index, Recording, Track
+from graphvio.sources.recording import ImageFiles, Index, Recording
 from graphvio.sources.sequencer import COVER_NS, merge
 from graphvio.sources.tables import ImuTable, clean_stamps, decimal_ns, parse_stamp, read_imu_csv
 
@@ -164,7 +164,7 @@ def test_memory_does_not_grow_with_length(tmp_path: Path) -> None:
 
     frames = 200
     stamps = np.arange(frames, dtype=np.int64) * 50 * MS
-    track = Track(tmp_path, stamps, ["image.png"] * frames)
+    track = ImageFiles(tmp_path, stamps, ["image.png"] * frames)
     imu = ImuTable(np.arange(0, frames * 50 * MS, 5 * MS), np.zeros((10 * frames, 6)))
     index = Index("long", {"cam0": track, "cam1": track}, imu)
     source = Recording(index, _resized(rig, size_px), FaultLog("long"))

@@ -6,9 +6,11 @@ from typing import NoReturn
 import typer
 
 from graphvio.cli.calibrate import calibrate, calibrate_trajectories
+from graphvio.cli.convert import convert, info
 from graphvio.cli.doctor import doctor
 from graphvio.cli.dump_config import dump_config
 from graphvio.cli.evaluate import evaluate
+from graphvio.cli.record import record
 from graphvio.cli.run import EXIT_INTERRUPTED, run
 from graphvio.cli.simulate import simulate
 from graphvio.cli.view import view
@@ -28,6 +30,9 @@ app = typer.Typer(
 app.command()(run)
 app.command()(calibrate)
 app.command(name="calibrate-trajectories")(calibrate_trajectories)
+app.command()(record)
+app.command()(convert)
+app.command()(info)
 app.command()(evaluate)
 app.command()(simulate)
 app.command()(view)

@@ -12,7 +12,11 @@ import typer
 
 _REQUIRED = {"gtsam": "gtsam", "numpy": "numpy", "numba": "numba", "matplotlib": "matplotlib"}
 _OPENCV = ("opencv-python-headless", "opencv-contrib-python-headless", "opencv-python", "opencv-contrib-python")
-_OPTIONAL = {"viewer": ("rerun", "rerun-sdk", "live view and recordings"), "maps": ("pycolmap", "pycolmap", "maps")}
+_OPTIONAL = {
+    "viewer": ("rerun", "rerun-sdk", "live view and recordings"),
+    "maps": ("pycolmap", "pycolmap", "maps"),
+    "sessions": ("mcap", "mcap", "sessions on disk"),
+}
 
 
 def doctor(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from graphvio.errors import RigError
 from graphvio.rig import Camera, Imu, Rig, StereoPair
-from graphvio.rig_files.reading import NOISE_KEYS, Section, named, read_yaml
+from graphvio.rig_files.reading import NOISE_KEYS, Section, named, parse_yaml, read_yaml
 
 VERSION = 1
 VERSION_KEY = "graphvio_rig"
@@ -28,7 +28,19 @@ def load(path: Path) -> Rig:
     Raises:
         RigError: if it cannot be read, holds an unknown key or an impossible value, or lacks one.
     """
-    document = read_yaml(path)
+    return _rig(read_yaml(path), path)
+
+
+def parse(text: str, path: Path) -> Rig:
+    """The rig in the text of a ``rig.yaml``, which came from a file that holds other things, too.
+
+    Raises:
+        RigError: as `load`.
+    """
+    return _rig(parse_yaml(text, path), path)
+
+
+def _rig(document: Section, path: Path) -> Rig:
     version = document.values.get(VERSION_KEY)
     if version is None:
         raise RigError(f"{path}: {VERSION_KEY} is missing; begin the file with  {VERSION_KEY}: {VERSION}")
@@ -53,6 +65,14 @@ def save(rig: Rig, path: Path) -> None:
     Raises:
         RigError: if the file cannot be written.
     """
+    try:
+        path.write_text(to_text(rig, path.parent), encoding="utf-8")
+    except OSError as error:
+        raise RigError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+
+
+def to_text(rig: Rig, folder: Path) -> str:
+    """The text of a ``rig.yaml`` in a folder, to which masks are relative where they lie in it."""
     lines = [
         "# A rig of stereo pairs. Metres, radians, seconds, pixels; body is the frame of the IMU.",
         f"{VERSION_KEY}: {VERSION}",
@@ -73,11 +93,8 @@ def save(rig: Rig, path: Path) -> None:
         lines.append(f"  - name: {_quoted(pair.name)}")
         for side, camera in (("left", pair.left), ("right", pair.right)):
             lines.append(f"    {side}:")
-            lines += [f"      {line}" for line in _camera_lines(camera, path.parent)]
-    try:
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise RigError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+            lines += [f"      {line}" for line in _camera_lines(camera, folder)]
+    return "\n".join(lines) + "\n"
 
 
 def _pair(section: Section, index: int) -> StereoPair:

@@ -136,7 +136,15 @@ def read_yaml(path: Path) -> Section:
     Raises:
         RigError: if the file cannot be read or holds no mapping.
     """
-    text = read_text(path)
+    return parse_yaml(read_text(path), path)
+
+
+def parse_yaml(text: str, path: Path) -> Section:
+    """The same of a text that is already read.
+
+    Raises:
+        RigError: if it holds no mapping.
+    """
     text = re.sub(r"^%.*$", "", text, flags=re.MULTILINE)  # OpenCV's `%YAML:1.0` is no valid directive
     text = text.replace("!!opencv-matrix", "")
     try:

@@ -1,4 +1,4 @@
-"""Recordings as streams of IMU samples and framesets: EuRoC/ASL, TUM-VI, KITTI odometry and KITTI raw."""
+"""Recordings as streams of IMU samples and framesets: EuRoC/ASL, TUM-VI, KITTI odometry and raw, sessions (MCAP)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def open_source(
     """Open a recording, whatever its layout.
 
     Args:
-        path: folder of the recording.
+        path: folder of the recording, or file of a session.
         rig: decides which pairs are read, and whether the IMU is; None takes the recording's own.
         from_s: where to begin, seconds after the recording's first frameset.
         to_s: where to end (inclusive), on the same scale.
@@ -55,11 +55,26 @@ def open_source(
         raise SourceError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
 
 
+def _open_session(
+    file: Path, rig: Rig | None, from_s: float | None, to_s: float | None, tolerance_ns: int
+) -> Recording:
+    from graphvio.sources import session
+
+    if not session.matches(file):
+        raise SourceError(f"{file}: is no recording that graphvio knows; {session.LAYOUT}, or a folder ({_known()})")
+    if rig is None:
+        rig = session.read_rig(file)
+    if rig is None:
+        raise RigError(f"{file}: carries no rig; give one of your own")
+    faults = FaultLog(file.stem)
+    return Recording(session.read_index(file, rig, faults), rig, faults, from_s, to_s, tolerance_ns)
+
+
 def _open(folder: Path, rig: Rig | None, from_s: float | None, to_s: float | None, tolerance_ns: int) -> Recording:
     if not folder.exists():
         raise SourceError(f"{folder}: does not exist; give the folder of a recording")
     if not folder.is_dir():
-        raise SourceError(f"{folder}: is no folder; give the folder of a recording ({_known()})")
+        return _open_session(folder, rig, from_s, to_s, tolerance_ns)
     if next(folder.iterdir(), None) is None:
         raise SourceError(f"{folder}: is empty; looked for {_known()}")
     layout = next((known for known in _FORMATS if known.matches(folder)), None)

@@ -10,7 +10,7 @@ from graphvio.errors import SourceError
 from graphvio.rig import Rig
 from graphvio.rig_files.euroc import camera_folders, sensors_folder
 from graphvio.sources.faults import FaultLog
-from graphvio.sources.recording import Index, Track
+from graphvio.sources.recording import ImageFiles, Index, Track
 from graphvio.sources.tables import read_frame_csv, read_imu_csv
 
 LAYOUT = "EuRoC/ASL and TUM-VI: mav0/cam0/data.csv, mav0/cam0/data/*.png, mav0/imu0/data.csv"
@@ -55,4 +55,4 @@ def _track(root: Path, camera: str, faults: FaultLog) -> Track:
         faults.add("csv_missing", 0, f"{csv} does not exist; stamps are taken from the names of the images")
     if not names:
         raise SourceError(f"{folder}: lists no image in data.csv, and holds none in data/ that is named by its stamp")
-    return Track(images, stamps, names)
+    return ImageFiles(images, stamps, names)

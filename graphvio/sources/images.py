@@ -41,19 +41,32 @@ def read_grey(path: Path) -> Image:
         raise ImageError("image_missing", f"{path} does not exist") from None
     except OSError as error:
         raise ImageError("image_undecodable", f"{path} cannot be read ({error.strerror})") from None
+    return decode_grey(data, str(path))
+
+
+def decode_grey(data: bytes, where: str) -> Image:
+    """The image (height, width) uint8 in a PNG, JPEG or what else OpenCV knows.
+
+    Args:
+        data: of the file.
+        where: it is from, for what is told of a fault.
+
+    Raises:
+        ImageError: if it is truncated or damaged.
+    """
     damage = damage_of(data)
     if damage:
-        raise ImageError("image_undecodable", f"{path} {damage}")
+        raise ImageError("image_undecodable", f"{where} {damage}")
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise ImageError("image_undecodable", f"{path} is no image ({error.err})") from None
+        raise ImageError("image_undecodable", f"{where} is no image ({error.err})") from None
     if image is None:
-        raise ImageError("image_undecodable", f"{path} is no image")
+        raise ImageError("image_undecodable", f"{where} is no image")
     if image.dtype == np.uint16:
         image = np.right_shift(image, 8).astype(np.uint8)
     if image.dtype != np.uint8:
-        raise ImageError("image_undecodable", f"{path} holds {image.dtype} pixels, not 8 or 16 bits")
+        raise ImageError("image_undecodable", f"{where} holds {image.dtype} pixels, not 8 or 16 bits")
     if image.ndim == 3:
         codes = {1: None, 3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
         code = codes.get(image.shape[2])

@@ -9,7 +9,7 @@ import numpy as np
 from graphvio.errors import SourceError
 from graphvio.rig import Rig
 from graphvio.sources.faults import FaultLog
-from graphvio.sources.recording import Index, Track
+from graphvio.sources.recording import ImageFiles, Index
 from graphvio.sources.tables import clean_stamps, decimal_ns, read_lines
 
 LAYOUT = "KITTI odometry: image_0/*.png, image_1/*.png (or image_2, image_3), times.txt, calib.txt"
@@ -44,7 +44,7 @@ def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
     for camera in rig.cameras:
         if not (path / camera.name).is_dir():
             raise SourceError(f"{path}: has no folder {camera.name}, which the rig names; give KITTI's own calib.txt")
-        tracks[camera.name] = Track(path / camera.name, stamps_ns[kept], names)
+        tracks[camera.name] = ImageFiles(path / camera.name, stamps_ns[kept], names)
     return Index(faults.name, tracks, None, _truth(path))
 
 

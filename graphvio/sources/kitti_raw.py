@@ -14,7 +14,7 @@ import numpy as np
 from graphvio.errors import SourceError
 from graphvio.rig import Rig
 from graphvio.sources.faults import FaultLog
-from graphvio.sources.recording import Index, Track
+from graphvio.sources.recording import ImageFiles, Index
 from graphvio.sources.tables import clean_stamps, decimal_ns, read_lines
 
 LAYOUT = "KITTI raw: image_00/data/*.png, image_00/timestamps.txt (and 01, or 02 and 03)"
@@ -52,7 +52,7 @@ def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
                 raise SourceError(
                     f"{folder}: is missing, and the rig names {camera.name}; give KITTI's own calibration"
                 )
-            tracks[camera.name] = Track(folder, stamps_ns[kept], names)
+            tracks[camera.name] = ImageFiles(folder, stamps_ns[kept], names)
     return Index(faults.name, tracks)
 
 

@@ -12,6 +12,7 @@ from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -33,13 +34,32 @@ _ABSENT_PERIODS = 0.75
 _IMU_GAP_PERIODS = 5.0
 
 
+class Track(Protocol):
+    """Images of one camera, wherever they are."""
+
+    @property
+    def stamps_ns(self) -> Int:
+        """(N,), increasing."""
+
+    def read(self, row: int) -> Image:
+        """The image of a row, from any thread.
+
+        Raises:
+            ImageError: if it is missing or damaged.
+        """
+
+
 @dataclass(frozen=True, eq=False)
-class Track:
-    """Images of one camera: stamps (N,), increasing, and file names in ``folder``."""
+class ImageFiles:
+    """A track of files: stamps (N,), increasing, and file names in ``folder``."""
 
     folder: Path
     stamps_ns: Int
     names: Sequence[str]
+
+    def read(self, row: int) -> Image:
+        """The image of a row."""
+        return read_grey(self.folder / self.names[row])
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +194,7 @@ class Recording:
             for camera, row in zip((pair.left, pair.right), self._framesets.rows[at, number], strict=True):
                 track = self._tracks[camera.name]
                 try:
-                    sides.append(read_grey(track.folder / track.names[row]))
+                    sides.append(track.read(int(row)))
                 except ImageError as fault:
                     faults.append((fault.kind, fault.detail))
             if len(sides) == 2:

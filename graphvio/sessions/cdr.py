@@ -1,0 +1,44 @@
+"""ROS 2 message types and their encoding (CDR), without ROS."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from graphvio.errors import MissingExtraError
+
+
+@cache
+def _types() -> Any:
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise MissingExtraError("rosbags", "sessions", "reading or writing a session") from None
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def make(type_name: str, **fields: Any) -> Any:
+    """A message of a type such as ``sensor_msgs/msg/Image``."""
+    return _types().types[type_name](**fields)
+
+
+def encode(message: Any) -> bytes:
+    """A message as CDR."""
+    return bytes(_types().serialize_cdr(message, message.__msgtype__))
+
+
+def decode(data: bytes, type_name: str) -> Any:
+    """A message from CDR; arrays are views of the data."""
+    return _types().deserialize_cdr(data, type_name)
+
+
+def definition(type_name: str) -> bytes:
+    """The text of a type and of all that it holds, as MCAP's ``ros2msg`` schemas have it."""
+    text, _ = _types().generate_msgdef(type_name, ros_version=2)
+    return str(text).encode()
+
+
+def stamp_ns(data: bytes) -> int:
+    """The stamp of a message that begins with a header, without decoding the rest."""
+    order: Any = "little" if data[1] & 1 else "big"
+    return int.from_bytes(data[4:8], order, signed=True) * 1_000_000_000 + int.from_bytes(data[8:12], order)

@@ -1,0 +1,188 @@
+"""What graphvio has, as ROS 2 messages, and back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from graphvio.arrays import Float, Image
+from graphvio.events import Estimate, ImuSample, Incident
+from graphvio.geometry import quat_wxyz_from_rotation
+from graphvio.rig import Camera, Rig
+from graphvio.sessions.cdr import make
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+IMU, CAMERA_INFO, TRANSFORMS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
+ODOMETRY, LOG = "nav_msgs/msg/Odometry", "rcl_interfaces/msg/Log"
+ODOM, BODY = "odom", "base_link"
+"""REP 105's names of nav and body."""
+
+_NS_PER_S = 1_000_000_000
+_UNKNOWN = -1.0  # in the first element of a covariance: no such quantity
+_DISTORTIONS = {"radial-tangential": ("plumb_bob", 5), "equidistant": ("equidistant", 4)}
+_WARN = 30
+
+
+def header(stamp_ns: int, frame: str) -> Any:
+    """A ``std_msgs/Header``."""
+    return make("std_msgs/msg/Header", stamp=_time(stamp_ns), frame_id=frame)
+
+
+def image(stamp_ns: int, frame: str, pixels: Image) -> Any:
+    """A grey image (height, width)."""
+    height, width = pixels.shape
+    return make(
+        IMAGE,
+        header=header(stamp_ns, frame),
+        height=height,
+        width=width,
+        encoding="mono8",
+        is_bigendian=0,
+        step=width,
+        data=np.ascontiguousarray(pixels).reshape(-1),
+    )
+
+
+def compressed_image(stamp_ns: int, frame: str, png: bytes) -> Any:
+    """An image in a PNG."""
+    return make(
+        COMPRESSED, header=header(stamp_ns, frame), format="mono8; png compressed", data=np.frombuffer(png, np.uint8)
+    )
+
+
+def imu(sample: ImuSample) -> Any:
+    """A sample, with no orientation."""
+    unknown = np.zeros(9)
+    unknown[0] = _UNKNOWN
+    return make(
+        IMU,
+        header=header(sample.stamp_ns, BODY),
+        orientation=_quaternion(np.eye(3)),
+        orientation_covariance=unknown,
+        angular_velocity=_vector(sample.angular_velocity),
+        angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=_vector(sample.linear_acceleration),
+        linear_acceleration_covariance=np.zeros(9),
+    )
+
+
+def imu_sample(message: Any) -> ImuSample:
+    """The sample of a message."""
+    rates, forces = message.angular_velocity, message.linear_acceleration
+    return ImuSample(
+        stamp_of(message.header),
+        np.array([rates.x, rates.y, rates.z]),
+        np.array([forces.x, forces.y, forces.z]),
+    )
+
+
+def camera_info(stamp_ns: int, camera: Camera) -> Any:
+    """Intrinsics and distortion."""
+    fx, fy, cx, cy = camera.intrinsics
+    model, count = _DISTORTIONS[camera.model]
+    return make(
+        CAMERA_INFO,
+        header=header(stamp_ns, camera.name),
+        height=camera.size_px[1],
+        width=camera.size_px[0],
+        distortion_model=model,
+        d=camera.distortion[:count].copy(),
+        k=np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        r=np.eye(3).reshape(-1),
+        p=np.array([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
+        binning_x=0,
+        binning_y=0,
+        roi=make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
+    )
+
+
+def static_transforms(stamp_ns: int, rig: Rig) -> Any:
+    """``body_T_cam`` of all cameras."""
+    return make(
+        TRANSFORMS,
+        transforms=[
+            make(
+                "geometry_msgs/msg/TransformStamped",
+                header=header(stamp_ns, BODY),
+                child_frame_id=camera.name,
+                transform=make(
+                    "geometry_msgs/msg/Transform",
+                    translation=_vector(camera.body_T_cam[:3, 3]),
+                    rotation=_quaternion(camera.body_T_cam[:3, :3]),
+                ),
+            )
+            for camera in rig.cameras
+        ],
+    )
+
+
+def odometry(estimate: Estimate) -> Any:
+    """An estimate that has a pose; ROS orders covariances ``[translation, rotation]``, the pose's in the fixed axes."""
+    assert estimate.nav_T_body is not None
+    assert estimate.covariance is not None
+    R = estimate.nav_T_body[:3, :3]
+    turned = np.zeros((6, 6))
+    turned[:3, 3:], turned[3:, :3] = R, R
+    velocity, velocity_covariance = np.zeros(3), np.full((3, 3), np.nan)
+    if estimate.velocity_nav is not None and estimate.velocity_covariance is not None:
+        velocity = R.T @ estimate.velocity_nav
+        velocity_covariance = R.T @ estimate.velocity_covariance @ R
+    twist_covariance = np.zeros((6, 6))
+    twist_covariance[:3, :3] = velocity_covariance
+    return make(
+        ODOMETRY,
+        header=header(estimate.stamp_ns, ODOM),
+        child_frame_id=BODY,
+        pose=make(
+            "geometry_msgs/msg/PoseWithCovariance",
+            pose=make(
+                "geometry_msgs/msg/Pose", position=_point(estimate.nav_T_body[:3, 3]), orientation=_quaternion(R)
+            ),
+            covariance=(turned @ estimate.covariance @ turned.T).reshape(-1),
+        ),
+        twist=make(
+            "geometry_msgs/msg/TwistWithCovariance",
+            twist=make("geometry_msgs/msg/Twist", linear=_vector(velocity), angular=_vector(np.zeros(3))),
+            covariance=twist_covariance.reshape(-1),
+        ),
+    )
+
+
+def log(incident: Incident) -> Any:
+    """An incident as a line of ``/rosout``."""
+    return make(
+        LOG,
+        stamp=_time(incident.stamp_ns),
+        level=_WARN,
+        name=incident.kind,
+        msg=incident.detail,
+        file="",
+        function="",
+        line=0,
+    )
+
+
+def stamp_of(message_header: Any) -> int:
+    """Nanoseconds of a header's stamp."""
+    return int(message_header.stamp.sec) * _NS_PER_S + int(message_header.stamp.nanosec)
+
+
+def _time(stamp_ns: int) -> Any:
+    seconds, rest = divmod(stamp_ns, _NS_PER_S)
+    return make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+
+
+def _vector(values: Float) -> Any:
+    x, y, z = map(float, values)
+    return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def _point(values: Float) -> Any:
+    x, y, z = map(float, values)
+    return make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+
+
+def _quaternion(rotation: Float) -> Any:
+    w, x, y, z = map(float, quat_wxyz_from_rotation(np.ascontiguousarray(rotation)))
+    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)

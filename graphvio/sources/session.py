@@ -1,0 +1,108 @@
+"""Sessions: MCAP files with ROS 2 messages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from graphvio.arrays import Image, Int
+from graphvio.errors import SessionError, SourceError
+from graphvio.rig import Camera, Rig
+from graphvio.rig_files.native import parse
+from graphvio.sessions import cdr
+from graphvio.sessions.mcap_file import McapFile, Place, Topic, stamps_of
+from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, imu_sample
+from graphvio.sessions.pixels import grey
+from graphvio.sessions.writer import LIBRARY, RIG_ATTACHMENT, image_topic
+from graphvio.sources.faults import FaultLog
+from graphvio.sources.images import ImageError
+from graphvio.sources.recording import Index
+from graphvio.sources.tables import ImuTable, clean_stamps
+
+LAYOUT = "sessions: NAME.mcap"
+
+
+def matches(path: Path) -> bool:
+    """Whether a path is a session."""
+    return path.is_file() and path.suffix == ".mcap"
+
+
+def read_rig(path: Path) -> Rig | None:
+    """The rig that a session carries; None if it carries none.
+
+    Raises:
+        SessionError: if the file cannot be read.
+        RigError: if its rig describes none that is usable.
+    """
+    text = McapFile(path).attachments.get(RIG_ATTACHMENT)
+    return None if text is None else parse(text.decode("utf-8"), path)
+
+
+def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
+    """Index the cameras of a rig, and the IMU if it has one.
+
+    Raises:
+        SessionError: if the file cannot be read.
+        SourceError: if a camera of the rig has no images in it.
+    """
+    file = McapFile(path)
+    if not file.is_whole:
+        faults.add("session_cut", 0, f"{path} was not finished: it ends where its recording was cut")
+    tracks = {}
+    for pair in rig.pairs:
+        for side, camera in (("left", pair.left), ("right", pair.right)):
+            tracks[camera.name] = _Images(file, _topic_of(file, pair.name, side, camera), faults)
+    imu = next((topic for topic in file.topics.values() if topic.type_name == IMU), None)
+    table = None if imu is None or rig.imu is None else _imu(file, imu, faults)
+    return Index(faults.name, tracks, table)
+
+
+class _Images:
+    """Images of one topic."""
+
+    def __init__(self, file: McapFile, topic: Topic, faults: FaultLog) -> None:
+        self._file, self._type, self._name = file, topic.type_name, topic.name
+        stamps = _header_stamps(file, topic)
+        order = np.argsort(stamps, kind="stable")
+        kept = order[clean_stamps(stamps[order], "frame", file.path, faults)]
+        self.stamps_ns: Int = stamps[kept]
+        self._places: Sequence[Place] = [topic.places[k] for k in kept.tolist()]
+
+    def read(self, row: int) -> Image:
+        """The image of a row."""
+        where = f"{self._file.path}, {self._name} at {self.stamps_ns[row]}"
+        try:
+            message = cdr.decode(self._file.read(self._places[row]), self._type)
+        except (SessionError, IndexError, ValueError) as error:
+            raise ImageError("image_undecodable", f"{where} cannot be decoded ({error})") from None
+        return grey(message, where)
+
+
+def _topic_of(file: McapFile, pair: str, side: str, camera: Camera) -> Topic:
+    """The topic of a camera's images: as graphvio names it, or whose name has the camera's."""
+    for name in (image_topic(pair, side, "raw"), image_topic(pair, side, "png")):
+        if name in file.topics:
+            return file.topics[name]
+    images = [topic for topic in file.topics.values() if topic.type_name in (IMAGE, COMPRESSED)]
+    named = [topic for topic in images if camera.name in topic.name.split("/")]
+    if not named:
+        has = ", ".join(topic.name for topic in images) or "none"
+        raise SourceError(f"{file.path}: has no images of camera {camera.name}; topics with images: {has}")
+    return named[0]
+
+
+def _header_stamps(file: McapFile, topic: Topic) -> Int:
+    """Stamps of the messages' headers; graphvio's own sessions are logged by them."""
+    if file.library.startswith(LIBRARY):
+        return stamps_of(topic)
+    return np.array([cdr.stamp_ns(file.read(place)) for place in topic.places], dtype=np.int64)
+
+
+def _imu(file: McapFile, topic: Topic, faults: FaultLog) -> ImuTable:
+    samples = [imu_sample(cdr.decode(file.read(place), IMU)) for place in topic.places]
+    stamps = np.array([sample.stamp_ns for sample in samples], dtype=np.int64)
+    values = np.array([[*sample.angular_velocity, *sample.linear_acceleration] for sample in samples]).reshape(-1, 6)
+    kept = clean_stamps(stamps, "imu", file.path, faults)
+    return ImuTable(stamps[kept], values[kept])

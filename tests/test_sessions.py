@@ -1,0 +1,289 @@
+"""Sessions on disk: what is written is read back, also after a crash, and by others' readers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recordings import small_rig, write_euroc
+from typer.testing import CliRunner
+
+from graphvio import FrameSet, ImuSample, open_source
+from graphvio.cli import app
+from graphvio.errors import SessionError, SourceError
+from graphvio.events import Estimate, Event, Incident, Status
+from graphvio.geometry import se3, so3_exp
+from graphvio.sessions import cdr
+from graphvio.sessions.description import describe
+from graphvio.sessions.mcap_file import McapFile
+from graphvio.sessions.messages import IMAGE, header, odometry
+from graphvio.sessions.pixels import grey
+from graphvio.sessions.writer import ImageFormat, SessionWriter
+from graphvio.sources.images import ImageError
+
+pytest.importorskip("mcap")
+pytest.importorskip("rosbags")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_euroc(tmp_path_factory.mktemp("sessions") / "walk", frames=12)
+
+
+def written(recording: Path, path: Path, image_format: ImageFormat = "raw") -> Path:
+    source = open_source(recording)
+    with SessionWriter(path, source.rig, image_format) as writer:
+        for event in source:
+            writer.add(event)
+        writer.add_incident(Incident(source.end_ns, "imu_gap", "no samples for 80 ms"))
+    assert writer.stopped is None
+    return path
+
+
+def same(one: Event, other: Event) -> None:
+    assert type(one) is type(other)
+    assert one.stamp_ns == other.stamp_ns
+    if isinstance(one, ImuSample) and isinstance(other, ImuSample):
+        np.testing.assert_array_equal(one.angular_velocity, other.angular_velocity)
+        np.testing.assert_array_equal(one.linear_acceleration, other.linear_acceleration)
+    if isinstance(one, FrameSet) and isinstance(other, FrameSet):
+        assert one.images.keys() == other.images.keys()
+        for j, images in one.images.items():
+            for a, b in zip(images, other.images[j], strict=True):
+                np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("image_format", ["raw", "png"])
+def test_a_session_yields_what_was_recorded_to_the_bit(
+    recording: Path, tmp_path: Path, image_format: ImageFormat
+) -> None:
+    session = open_source(written(recording, tmp_path / "walk.mcap", image_format))
+    original = open_source(recording)
+    events, expected = list(session), list(original)
+    assert len(events) == len(expected)
+    for one, other in zip(events, expected, strict=True):
+        same(one, other)
+    assert session.rig.pairs[1].left.name == original.rig.pairs[1].left.name
+    np.testing.assert_array_equal(session.rig.left2_T_left1(), original.rig.left2_T_left1())
+    assert not session.faults.counts
+
+
+def test_others_read_it(recording: Path, tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+    from rosbags.typesys import Stores, get_typestore
+
+    path = written(recording, tmp_path / "walk.mcap")
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    seen: dict[str, int] = {}
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            seen[channel.topic] = seen.get(channel.topic, 0) + 1
+            decoded: Any = types.deserialize_cdr(message.data, schema.name)
+            if channel.topic == "/tf_static":
+                assert [each.child_frame_id for each in decoded.transforms] == ["cam0", "cam1", "cam2", "cam3"]
+            if channel.topic == "/pair0/left/camera_info":
+                assert decoded.distortion_model == "plumb_bob"
+                assert decoded.k[0] == 50.0
+    assert seen["/pair0/left/image_raw"] == 12
+    assert seen["/rosout"] == 1
+    assert seen["/imu"] > 200
+
+
+@pytest.mark.parametrize("share", [0.3, 0.4, 0.5])
+def test_a_file_that_was_cut_is_read_as_far_as_it_goes(recording: Path, tmp_path: Path, share: float) -> None:
+    source = open_source(recording)
+    path = tmp_path / "walk.mcap"
+    with SessionWriter(path, source.rig) as writer:
+        for event in source:
+            writer.add(event)
+            writer._last_flush_s = -1.0  # so that each message has a chunk of its own
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    cut = open_source(path)
+    events = list(cut)
+    assert cut.faults.counts.get("session_cut") == 1
+    for one, other in zip((e for e in events if isinstance(e, FrameSet)), source_framesets(recording), strict=False):
+        same(one, other)
+    assert 0 < len(events) < len(list(source))
+
+
+def source_framesets(recording: Path) -> list[FrameSet]:
+    return [event for event in open_source(recording) if isinstance(event, FrameSet)]
+
+
+_RECORDER = """
+import sys, time
+from pathlib import Path
+import numpy as np
+sys.path.insert(0, {tests!r})
+from recordings import small_rig
+from graphvio import FrameSet, ImuSample
+from graphvio.sessions.writer import SessionWriter
+rig = small_rig(1)
+begin = time.monotonic_ns()
+with SessionWriter(Path({path!r}), rig) as writer:
+    while True:
+        now = time.monotonic_ns()
+        writer.add(ImuSample(now, np.zeros(3), np.array([0.0, 0.0, 9.81])))
+        image = np.full((48, 64), now // 10**6 % 256, np.uint8)
+        writer.add(FrameSet(now, {{0: (image, image)}}))
+        print(now, flush=True)
+        time.sleep(0.005)
+"""
+
+
+@pytest.mark.parametrize("after_s", [0.9, 1.35, 1.7, 2.1])
+def test_a_killed_recording_loses_the_last_second_at_most(tmp_path: Path, after_s: float) -> None:
+    path = tmp_path / "killed.mcap"
+    code = _RECORDER.format(tests=str(Path(__file__).parent), path=str(path))
+    recorder = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert recorder.stdout is not None
+    recorder.stdout.readline()  # it has begun
+    time.sleep(after_s)
+    os.kill(recorder.pid, signal.SIGKILL)
+    last_ns = int(recorder.stdout.read().split()[-2])
+    recorder.wait()
+    file = McapFile(path)
+    assert not file.is_whole
+    recorded = file.topics["/pair0/left/image_raw"].logged_ns
+    assert last_ns - recorded[-1] < 1_000_000_000
+    source = open_source(path)
+    framesets = [event for event in source if isinstance(event, FrameSet)]
+    assert len(framesets) == len(recorded)
+    for frameset in framesets:
+        assert frameset.images[0][0][0, 0] == frameset.stamp_ns // 10**6 % 256
+
+
+def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> None:
+    """A limit on the size of files is as good as a full disk."""
+    code = f"""
+import resource, signal, sys
+from pathlib import Path
+import numpy as np
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from recordings import small_rig
+from graphvio import FrameSet
+from graphvio.sessions.writer import SessionWriter
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+writer = SessionWriter(Path({str(tmp_path / "full.mcap")!r}), small_rig(1))
+rng = np.random.default_rng(0)
+for k in range(60):
+    writer._last_flush_s = -1.0
+    image = rng.integers(0, 256, (48, 64), np.uint8)
+    writer.add(FrameSet(k * 50_000_000, {{0: (image, image)}}))
+writer.close()
+print(writer.stopped)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "recording stopped (File too large)" in done.stdout
+    framesets = [event for event in open_source(tmp_path / "full.mcap") if isinstance(event, FrameSet)]
+    assert 10 < len(framesets) < 60
+
+
+def test_what_a_session_holds_is_told(recording: Path, tmp_path: Path) -> None:
+    path = written(recording, tmp_path / "walk.mcap")
+    found = describe(path)
+    assert found.is_whole
+    topics = {topic.name: topic for topic in found.topics}
+    images = topics["/pair1/right/image_raw"]
+    assert images.rate_hz == pytest.approx(20.0)
+    assert images.gaps == 0
+    assert images.latency_ms == 0.0
+    done = CliRunner().invoke(app, ["info", str(path)])
+    assert done.exit_code == 0
+    assert "/imu  (sensor_msgs/msg/Imu)" in done.stdout
+    assert "200.00 Hz" in done.stdout
+    assert "pairs pair0, pair1, with IMU" in done.stdout
+
+
+def test_the_command_converts_a_piece(recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "piece.mcap"
+    done = CliRunner().invoke(app, ["convert", str(recording), "--out", str(out), "--to", "0.2"])
+    assert done.exit_code == 0, done.output
+    assert len(source_framesets(out)) == 5
+    again = CliRunner().invoke(app, ["convert", str(recording), "--out", str(out)])
+    assert isinstance(again.exception, SessionError)
+    assert "never overwritten" in str(again.exception)
+
+
+def test_recording_keeps_what_the_odometry_made_of_it(recording: Path, tmp_path: Path) -> None:
+    """Images of noise give no pose, which is an incident."""
+    out = tmp_path / "recorded.mcap"
+    done = CliRunner().invoke(app, ["record", str(recording), "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    file = McapFile(out)
+    assert file.is_whole
+    assert len(file.topics["/pair0/left/image_raw"].places) == 12
+    assert "/rosout" in file.topics
+
+
+def test_an_estimate_as_odometry_has_the_axes_of_ros() -> None:
+    """Translation before rotation, about the axes of the parent frame; the twist is in the child's."""
+    R = so3_exp(np.array([0.0, 0.0, 0.5 * np.pi]))
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])  # rotation, translation in body
+    estimate = Estimate(
+        stamp_ns=1_500_000_000,
+        status=Status.TRACKING,
+        nav_T_body=se3(R, np.array([1.0, 2.0, 3.0])),
+        covariance=covariance,
+        velocity_nav=np.array([0.0, 1.0, 0.0]),
+        velocity_covariance=np.diag([0.1, 0.2, 0.3]),
+    )
+    message = odometry(estimate)
+    assert message.header.stamp.sec == 1
+    assert message.header.stamp.nanosec == 500_000_000
+    pose = np.asarray(message.pose.covariance).reshape(6, 6)
+    np.testing.assert_allclose(np.diag(pose), [5.0, 4.0, 6.0, 2.0, 1.0, 3.0], atol=1e-12)
+    linear = message.twist.twist.linear
+    np.testing.assert_allclose([linear.x, linear.y, linear.z], [1.0, 0.0, 0.0], atol=1e-12)
+    twist = np.asarray(message.twist.covariance).reshape(6, 6)
+    np.testing.assert_allclose(np.diag(twist)[:3], [0.2, 0.1, 0.3], atol=1e-12)
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "mono16", "bgr8", "rgb8", "bayer_rggb8"])
+def test_images_of_all_encodings_become_grey(encoding: str) -> None:
+    grey_level, width, height = 90, 6, 4
+    channels = 3 if encoding in ("bgr8", "rgb8") else 1
+    pixels = np.full((height, width, channels), grey_level, np.uint16 if encoding == "mono16" else np.uint8)
+    if encoding == "mono16":
+        pixels = pixels * 256 + 17
+    step = pixels[0].nbytes + 2  # rows may be padded
+    rows = np.zeros((height, step), np.uint8)
+    rows[:, : pixels[0].nbytes] = pixels.reshape(height, -1).view(np.uint8)
+    fields = {"height": height, "width": width, "encoding": encoding, "is_bigendian": 0, "step": step}
+    message = cdr.make(IMAGE, header=header(0, "cam"), data=rows.reshape(-1), **fields)
+    found = grey(cdr.decode(cdr.encode(message), IMAGE), "here")
+    np.testing.assert_array_equal(found, np.full((height, width), grey_level, np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"), [("encoding", "yuv422", "yuv422, which is not known"), ("height", 9, "cut short")]
+)
+def test_images_that_cannot_be_used_are_faults(field: str, value: object, words: str) -> None:
+    fields = {"height": 4, "width": 6, "encoding": "mono8", "is_bigendian": 0, "step": 6} | {field: value}
+    message = cdr.make(IMAGE, header=header(0, "cam"), data=np.zeros(24, np.uint8), **fields)
+    with pytest.raises(ImageError, match=words):
+        grey(message, "here")
+
+
+def test_what_is_no_session_is_refused(recording: Path, tmp_path: Path) -> None:
+    (tmp_path / "noise.mcap").write_bytes(b"noise")
+    with pytest.raises(SessionError, match="is no MCAP file"):
+        open_source(tmp_path / "noise.mcap")
+    (tmp_path / "walk.bag").write_bytes(b"#ROSBAG")
+    with pytest.raises(SourceError, match="is no recording that graphvio knows"):
+        open_source(tmp_path / "walk.bag")
+    rig, path = small_rig(1), written(recording, tmp_path / "walk.mcap")
+    other = replace(rig.pairs[0], name="other", left=replace(rig.pairs[0].left, name="cam9"))
+    with pytest.raises(SourceError, match="has no images of camera cam9"):
+        open_source(path, replace(rig, pairs=(other,)))
