@@ -69,7 +69,7 @@ def test_pairs_are_found_within_what_is_told(walk: Path, found: Calibration) -> 
 def test_where_the_rig_file_has_the_pairs_does_not_matter(walk: Path, found: Calibration) -> None:
     rig = Rig.load(walk / "rig.yaml")
     other = calibrate_pairs(open_source(walk, with_wrong_place(rig, 3.0, 0.05)))
-    np.testing.assert_allclose(other.left2_T_left1, found.left2_T_left1, atol=1e-9)
+    np.testing.assert_allclose(other.left2_T_left1, found.left2_T_left1, atol=1e-7)  # but for rounding
     present = other.present()
     assert present is not None
     assert present.is_off

@@ -44,6 +44,7 @@ class Topic:
         encoding: of its messages, ``cdr`` for ROS 2.
         logged_ns: when each was recorded.
         places: where each is.
+        header_ns: stamps of their headers, where the reader has seen them; else empty.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Topic:
     encoding: str
     logged_ns: list[int] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
+    header_ns: list[int] = field(default_factory=list)
 
 
 class McapFile:

@@ -73,7 +73,7 @@ def _open_session(
 def _open(folder: Path, rig: Rig | None, from_s: float | None, to_s: float | None, tolerance_ns: int) -> Recording:
     if not folder.exists():
         raise SourceError(f"{folder}: does not exist; give the folder of a recording")
-    if not folder.is_dir():
+    if not folder.is_dir() or (folder / "metadata.yaml").is_file():
         return _open_session(folder, rig, from_s, to_s, tolerance_ns)
     if next(folder.iterdir(), None) is None:
         raise SourceError(f"{folder}: is empty; looked for {_known()}")

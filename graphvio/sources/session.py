@@ -1,4 +1,4 @@
-"""Sessions: MCAP files with ROS 2 messages."""
+"""Sessions and others' MCAP files, ROS 2 bags and ROS 1 bags."""
 
 from __future__ import annotations
 
@@ -12,32 +12,44 @@ from graphvio.errors import SessionError, SourceError
 from graphvio.rig import Camera, Rig
 from graphvio.rig_files.native import parse
 from graphvio.sessions import cdr
+from graphvio.sessions.bag_file import BagFile
 from graphvio.sessions.mcap_file import McapFile, Place, Topic, stamps_of
 from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, imu_sample
 from graphvio.sessions.pixels import grey
+from graphvio.sessions.rig_of_topics import rig_of_topics
 from graphvio.sessions.writer import LIBRARY, RIG_ATTACHMENT, image_topic
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.images import ImageError
 from graphvio.sources.recording import Index
 from graphvio.sources.tables import ImuTable, clean_stamps
 
-LAYOUT = "sessions: NAME.mcap"
+LAYOUT = "sessions and bags: NAME.mcap, NAME.bag, a folder with metadata.yaml"
 
 
 def matches(path: Path) -> bool:
-    """Whether a path is a session."""
-    return path.is_file() and path.suffix == ".mcap"
+    """Whether a path is a session or a bag."""
+    return path.suffix in (".mcap", ".bag") if path.is_file() else (path / "metadata.yaml").is_file()
+
+
+def open_store(path: Path) -> McapFile | BagFile:
+    """The messages in a session or bag.
+
+    Raises:
+        SessionError: if it cannot be read.
+    """
+    return McapFile(path) if path.is_file() and path.suffix == ".mcap" else BagFile(path)
 
 
 def read_rig(path: Path) -> Rig | None:
-    """The rig that a session carries; None if it carries none.
+    """The rig that a session carries, or that a bag's messages tell; None if there is none.
 
     Raises:
         SessionError: if the file cannot be read.
         RigError: if its rig describes none that is usable.
     """
-    text = McapFile(path).attachments.get(RIG_ATTACHMENT)
-    return None if text is None else parse(text.decode("utf-8"), path)
+    store = open_store(path)
+    text = store.attachments.get(RIG_ATTACHMENT)
+    return rig_of_topics(store, path.stem) if text is None else parse(text.decode("utf-8"), path)
 
 
 def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
@@ -47,7 +59,7 @@ def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
         SessionError: if the file cannot be read.
         SourceError: if a camera of the rig has no images in it.
     """
-    file = McapFile(path)
+    file = open_store(path)
     if not file.is_whole:
         faults.add("session_cut", 0, f"{path} was not finished: it ends where its recording was cut")
     tracks = {}
@@ -62,7 +74,7 @@ def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
 class _Images:
     """Images of one topic."""
 
-    def __init__(self, file: McapFile, topic: Topic, faults: FaultLog) -> None:
+    def __init__(self, file: McapFile | BagFile, topic: Topic, faults: FaultLog) -> None:
         self._file, self._type, self._name = file, topic.type_name, topic.name
         stamps = _header_stamps(file, topic)
         order = np.argsort(stamps, kind="stable")
@@ -80,9 +92,9 @@ class _Images:
         return grey(message, where)
 
 
-def _topic_of(file: McapFile, pair: str, side: str, camera: Camera) -> Topic:
+def _topic_of(file: McapFile | BagFile, pair: str, side: str, camera: Camera) -> Topic:
     """The topic of a camera's images: as graphvio names it, or whose name has the camera's."""
-    for name in (image_topic(pair, side, "raw"), image_topic(pair, side, "png")):
+    for name in (image_topic(pair, side, "raw"), image_topic(pair, side, "png"), camera.name):
         if name in file.topics:
             return file.topics[name]
     images = [topic for topic in file.topics.values() if topic.type_name in (IMAGE, COMPRESSED)]
@@ -93,14 +105,16 @@ def _topic_of(file: McapFile, pair: str, side: str, camera: Camera) -> Topic:
     return named[0]
 
 
-def _header_stamps(file: McapFile, topic: Topic) -> Int:
+def _header_stamps(file: McapFile | BagFile, topic: Topic) -> Int:
     """Stamps of the messages' headers; graphvio's own sessions are logged by them."""
     if file.library.startswith(LIBRARY):
         return stamps_of(topic)
+    if topic.header_ns:
+        return np.array(topic.header_ns, dtype=np.int64)
     return np.array([cdr.stamp_ns(file.read(place)) for place in topic.places], dtype=np.int64)
 
 
-def _imu(file: McapFile, topic: Topic, faults: FaultLog) -> ImuTable:
+def _imu(file: McapFile | BagFile, topic: Topic, faults: FaultLog) -> ImuTable:
     samples = [imu_sample(cdr.decode(file.read(place), IMU)) for place in topic.places]
     stamps = np.array([sample.stamp_ns for sample in samples], dtype=np.int64)
     values = np.array([[*sample.angular_velocity, *sample.linear_acceleration] for sample in samples]).reshape(-1, 6)

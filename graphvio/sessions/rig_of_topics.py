@@ -1,0 +1,154 @@
+"""The rig that a recording's own messages tell: intrinsics by ``camera_info``, places by ``tf_static``."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.errors import RigError
+from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_inverse
+from graphvio.rig import Camera, Imu, Rig, StereoPair
+from graphvio.sessions import cdr
+from graphvio.sessions.mcap_file import Place, Topic
+from graphvio.sessions.messages import CAMERA_INFO, COMPRESSED, IMAGE, IMU, TRANSFORMS
+
+_MODELS = {"plumb_bob": "radial-tangential", "rational_polynomial": "radial-tangential", "equidistant": "equidistant"}
+_SIDES = (("left", "right"), ("infra1", "infra2"), ("cam0", "cam1"), ("cam2", "cam3"))
+
+
+class Store(Protocol):
+    """A file with messages by topic."""
+
+    topics: dict[str, Topic]
+
+    def read(self, place: Place) -> bytes:
+        """A message."""
+
+
+def rig_of_topics(store: Store, name: str) -> Rig | None:
+    """The rig of all stereo pairs whose images, calibrations and places are there; None if there is none.
+
+    A pair's topics differ in one part of their name only: ``left`` and ``right``, ``infra1`` and ``infra2``. Where
+    transforms do not tell the right camera's place, its ``camera_info`` does, by the projection's fourth column. Body
+    is the IMU's frame, or the first left camera's.
+
+    Raises:
+        RigError: if what is told makes no rig.
+    """
+    images = {each.name: each for each in store.topics.values() if each.type_name in (IMAGE, COMPRESSED)}
+    transforms = _transforms(store)
+    imu = next((each for each in store.topics.values() if each.type_name == IMU and each.places), None)
+    found = []
+    for left, right in _pairs(sorted(images)):
+        infos = [_info(store, topic) for topic in (left, right)]
+        if infos[0] is not None and infos[1] is not None:
+            found.append((left, right, infos[0], infos[1]))
+    if not found:
+        return None
+    body = cdr.decode(store.read(imu.places[0]), IMU).header.frame_id if imu is not None else ""
+    first = _frame(found[0][2], found[0][0])
+    if imu is not None and _path(transforms, body, first) is None:
+        raise RigError(
+            f"{name}: no transform leads from the IMU ({body}) to the camera {first}; give a rig of your own"
+        )
+    body = body if imu is not None else first
+    pairs = []
+    for left, right, left_info, right_info in found:
+        body_T_left = _path(transforms, body, _frame(left_info, left))
+        if body_T_left is None:
+            raise RigError(
+                f"{name}: no transform leads from {body} to {_frame(left_info, left)}; give a rig of your own"
+            )
+        left_T_right = _path(transforms, _frame(left_info, left), _frame(right_info, right))
+        if left_T_right is None or np.allclose(left_T_right, np.eye(4)):
+            left_T_right = np.eye(4)
+            left_T_right[0, 3] = -right_info.p[3] / right_info.p[0] if right_info.p[0] else 0.0
+        places = (body_T_left, body_T_left @ left_T_right)
+        cameras = [
+            _camera(topic, info, place)
+            for topic, info, place in zip((left, right), (left_info, right_info), places, strict=True)
+        ]
+        pairs.append(StereoPair(_pair_name(left), *cameras))
+    return Rig(tuple(pairs), Imu() if imu is not None else None, name)
+
+
+def _pairs(names: list[str]) -> list[tuple[str, str]]:
+    """Topics of left and right cameras."""
+    made = []
+    for name in names:
+        for left, right in _SIDES:
+            parts = name.split("/")
+            for k, part in enumerate(parts):
+                other = "/".join([*parts[:k], part.replace(left, right), *parts[k + 1 :]])
+                if left in part and other in names:
+                    made.append((name, other))
+    return list(dict.fromkeys(made))
+
+
+def _pair_name(left: str) -> str:
+    """What the topic has besides the side."""
+    parts = [part for part in left.split("/") if part and not part.startswith("image")]
+    rest = [part for part in parts if not any(side in part for sides in _SIDES for side in sides)]
+    return "-".join(rest) or "-".join(parts)
+
+
+def _info(store: Store, image_topic: str) -> Any:
+    """The calibration beside a topic with images."""
+    parts = image_topic.split("/")
+    for depth in range(len(parts) - 1, 0, -1):
+        topic = store.topics.get("/".join([*parts[:depth], "camera_info"]))
+        if topic is not None and topic.type_name == CAMERA_INFO and topic.places:
+            return cdr.decode(store.read(topic.places[0]), CAMERA_INFO)
+    return None
+
+
+def _camera(topic: str, info: Any, body_T_cam: Float) -> Camera:
+    if info.distortion_model not in _MODELS:
+        raise RigError(f"{topic}: its camera_info has the distortion {info.distortion_model!r}, which is not known")
+    distortion = np.asarray(info.d, dtype=np.float64)
+    if len(distortion) > 5 and np.any(distortion[5:]):
+        raise RigError(f"{topic}: its camera_info has {len(distortion)} distortion coefficients; at most 5 are known")
+    k = np.asarray(info.k, dtype=np.float64).reshape(3, 3)
+    return Camera(
+        name=topic,
+        model=_MODELS[info.distortion_model],
+        size_px=(int(info.width), int(info.height)),
+        intrinsics=np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
+        distortion=distortion[:5],
+        body_T_cam=body_T_cam,
+    )
+
+
+def _frame(info: Any, topic: str) -> str:
+    return str(info.header.frame_id) or topic
+
+
+def _transforms(store: Store) -> dict[tuple[str, str], Float]:
+    """(parent, child) -> ``parent_T_child`` of all static transforms, both ways."""
+    made: dict[tuple[str, str], Float] = {}
+    for topic in store.topics.values():
+        if topic.type_name != TRANSFORMS or not topic.name.endswith("tf_static"):
+            continue
+        for place in topic.places:
+            for each in cdr.decode(store.read(place), TRANSFORMS).transforms:
+                q, t = each.transform.rotation, each.transform.translation
+                pose = se3(rotation_from_quat_wxyz(np.array([q.w, q.x, q.y, q.z])), np.array([t.x, t.y, t.z]))
+                parent, child = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
+                made[parent, child], made[child, parent] = pose, se3_inverse(pose)
+    return made
+
+
+def _path(transforms: dict[tuple[str, str], Float], start: str, end: str) -> Float | None:
+    """``start_T_end`` along transforms, or None."""
+    start, end = start.lstrip("/"), end.lstrip("/")
+    reached = {start: np.eye(4)}
+    waiting = [start]
+    while waiting:
+        at = waiting.pop(0)
+        for parent, child in transforms:
+            if parent == at and child not in reached:
+                reached[child] = reached[at] @ transforms[parent, child]
+                waiting.append(child)
+    return reached.get(end)

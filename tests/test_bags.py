@@ -1,0 +1,165 @@
+"""Bags of ROS 1 and ROS 2, and others' MCAP files, written by a library that is not ours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recordings import write_euroc
+from test_sessions import same, written
+
+from graphvio import FrameSet, Rig, open_source
+from graphvio.errors import RigError, SessionError
+from graphvio.sessions import cdr
+from graphvio.sessions.description import describe
+from graphvio.sessions.mcap_file import McapFile
+
+pytest.importorskip("mcap")
+pytest.importorskip("rosbags")
+
+LATE_NS = 3_000_000
+Message = tuple[str, str, int, bytes]  # topic, type, when it was recorded, CDR
+Change = Callable[[Message], Message | None]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_euroc(tmp_path_factory.mktemp("bags") / "walk", frames=6)
+
+
+def messages(recording: Path, folder: Path) -> list[Message]:
+    """All that a session of the recording holds, recorded a little after it was measured."""
+    file = McapFile(written(recording, folder / "session.mcap"))
+    found = [
+        (topic.name, topic.type_name, logged_ns + LATE_NS, file.read(place))
+        for topic in file.topics.values()
+        if not topic.name.startswith("/rosout")
+        for logged_ns, place in zip(topic.logged_ns, topic.places, strict=True)
+    ]
+    return sorted(found, key=lambda message: message[2])
+
+
+def ros2_bag(messages: list[Message], path: Path, storage: str) -> Path:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    with Writer(path, version=9, storage_plugin=StoragePlugin[storage]) as writer:
+        connections: dict[str, Any] = {}
+        for topic, type_name, logged_ns, data in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, type_name, typestore=types)
+            writer.write(connections[topic], logged_ns, data)
+    return path
+
+
+def ros1_bag(messages: list[Message], path: Path) -> Path:
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    types = get_typestore(Stores.ROS1_NOETIC)
+    types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+
+    def old(message: Any) -> Any:
+        """A message as ROS 1 has it."""
+        if isinstance(message, list):
+            return [old(each) for each in message]
+        name = getattr(message, "__msgtype__", None)
+        if name is None:
+            return message
+        fields = {key: old(value) for key, value in vars(message).items() if key != "__msgtype__"}
+        if name == "std_msgs/msg/Header":
+            fields["seq"] = 7
+        if name == "sensor_msgs/msg/CameraInfo":
+            fields = {key.upper() if len(key) == 1 else key: value for key, value in fields.items()}
+        return types.types[name](**fields)
+
+    with Writer(path) as writer:
+        connections: dict[str, Any] = {}
+        for topic, type_name, logged_ns, data in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, type_name, typestore=types)
+            message = types.serialize_ros1(old(cdr.decode(data, type_name)), type_name)
+            writer.write(connections[topic], logged_ns, message)
+    return path
+
+
+def bag(kind: str, messages: list[Message], folder: Path) -> Path:
+    if kind == "ros1":
+        return ros1_bag(messages, folder / "walk.bag")
+    made = ros2_bag(messages, folder / "walk", "SQLITE3" if kind == "db3" else "MCAP")
+    return next(made.glob("*.mcap")) if kind == "mcap file" else made
+
+
+@pytest.mark.parametrize("kind", ["ros1", "db3", "mcap", "mcap file"])
+def test_a_bag_yields_what_was_recorded(kind: str, recording: Path, tmp_path: Path) -> None:
+    original = open_source(recording)
+    path = bag(kind, messages(recording, tmp_path), tmp_path)
+    source = open_source(path, original.rig)
+    events, expected = list(source), list(original)
+    assert len(events) == len(expected)
+    for one, other in zip(events, expected, strict=True):
+        same(one, other)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "db3"])
+def test_a_bag_tells_its_own_rig(kind: str, recording: Path, tmp_path: Path) -> None:
+    expected = open_source(recording).rig
+    source = open_source(bag(kind, messages(recording, tmp_path), tmp_path))
+    assert [pair.name for pair in source.rig.pairs] == ["pair0", "pair1"]
+    assert source.rig.imu is not None
+    for one, other in zip(source.rig.cameras, expected.cameras, strict=True):
+        np.testing.assert_allclose(one.intrinsics, other.intrinsics)
+        np.testing.assert_allclose(one.distortion, other.distortion)
+        np.testing.assert_allclose(one.body_T_cam, other.body_T_cam, atol=1e-9)
+    assert len([event for event in source if isinstance(event, FrameSet)]) == 6
+
+
+def test_a_baseline_may_be_told_by_the_projection(recording: Path, tmp_path: Path) -> None:
+    """As drivers of stereo cameras do: both cameras in one frame, and the baseline in ``camera_info``."""
+
+    def change(message: Message) -> Message | None:
+        topic, type_name, logged_ns, data = message
+        if topic.startswith("/pair1") or topic == "/imu" or topic == "/tf_static":
+            return None
+        if topic == "/pair0/right/camera_info":
+            info = cdr.decode(data, type_name)
+            info.header.frame_id = "cam0"
+            info.p = np.array(info.p)
+            info.p[3] = -info.p[0] * 0.12
+            return topic, type_name, logged_ns, cdr.encode(info)
+        return message
+
+    changed = [each for message in messages(recording, tmp_path) if (each := change(message)) is not None]
+    source = open_source(bag("db3", changed, tmp_path))
+    assert source.rig.imu is None
+    (pair,) = source.rig.pairs
+    assert pair.baseline_m == pytest.approx(0.12)
+    np.testing.assert_allclose(pair.left.body_T_cam, np.eye(4))
+
+
+def test_what_a_bag_does_not_tell_is_asked_for(recording: Path, tmp_path: Path) -> None:
+    made = messages(recording, tmp_path)
+    (tmp_path / "one").mkdir()
+    (tmp_path / "two").mkdir()
+    without_places = [message for message in made if message[0] != "/tf_static"]
+    with pytest.raises(RigError, match="no transform leads from the IMU"):
+        open_source(bag("db3", without_places, tmp_path / "one"))
+    without_infos = [message for message in made if "camera_info" not in message[0]]
+    with pytest.raises(RigError, match="carries no rig"):
+        open_source(bag("db3", without_infos, tmp_path / "two"))
+
+
+def test_latency_is_told(recording: Path, tmp_path: Path) -> None:
+    found = describe(bag("mcap file", messages(recording, tmp_path), tmp_path))
+    assert {topic.name: topic.latency_ms for topic in found.topics}["/imu"] == pytest.approx(3.0)
+
+
+def test_a_bag_that_is_damaged_is_refused(recording: Path, tmp_path: Path) -> None:
+    path = bag("ros1", messages(recording, tmp_path), tmp_path)
+    path.write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(SessionError, match="cannot be read as a bag"):
+        open_source(path, Rig.load(recording))
