@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from graphvio.cli import options
+
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
@@ -23,38 +25,26 @@ EXIT_PARTIAL = 3
 
 
 def calibrate(
-    source: Annotated[Path, typer.Argument(help="Folder of a recording: EuRoC/ASL, TUM-VI, KITTI odometry or raw.")],
-    rig: Annotated[
-        Path | None, typer.Option("--rig", help="Rig or calibration file.  [default: what the recording carries]")
-    ] = None,
+    source: options.Source,
+    rig: options.RigFile = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", help="Write the corrected rig here (.yaml), and all numbers beside it.", metavar="FILE"),
     ] = None,
-    report: Annotated[
-        Path | None, typer.Option("--report", help="Folder for a report: page, pictures, all numbers.", metavar="DIR")
-    ] = None,
+    report: options.ReportFolder = None,
     correct_imu: Annotated[
         bool, typer.Option("--correct-imu", help="Also correct the rotation against the IMU and the time offset.")
     ] = False,
     guide: Annotated[
         bool, typer.Option("--guide", help="Tell all along which motions are still needed, and when it is enough.")
     ] = False,
-    scale: Annotated[
-        str, typer.Option("--scale", help="A pair's lengths may be wrong by a factor: auto, estimate or fixed.")
-    ] = "auto",
-    config: Annotated[
-        str, typer.Option("--config", help="Profile, or a YAML file with the values to change.")
-    ] = "default",
-    pairs: Annotated[
-        str | None, typer.Option("--pairs", help="Only these stereo pairs, such as 0,1.  [default: all]")
-    ] = None,
-    from_s: Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.")] = None,
-    to_s: Annotated[float | None, typer.Option("--to", help="End at this second of the recording.")] = None,
-    seed: Annotated[
-        int, typer.Option("--seed", help="Of all random choices: the same gives the same result.", min=0)
-    ] = 0,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+    scale: options.Scale = "auto",
+    config: options.ConfigName = "default",
+    pairs: options.Pairs = None,
+    from_s: options.FromS = None,
+    to_s: options.ToS = None,
+    seed: options.Seed = 0,
+    verbose: options.Verbose = False,
 ) -> None:
     """Find where a rig's stereo pairs are relative to each other, from a recording; they need not share a view.
 
@@ -107,16 +97,10 @@ def calibrate_trajectories(
         bool, typer.Option("--same-clock", help="All stamps are of one clock: no offset is looked for.")
     ] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Write all numbers here (.yaml).", metavar="FILE")] = None,
-    report: Annotated[
-        Path | None, typer.Option("--report", help="Folder for a report: page, pictures, all numbers.", metavar="DIR")
-    ] = None,
-    scale: Annotated[
-        str, typer.Option("--scale", help="Lengths may be wrong by a factor: auto, estimate or fixed.")
-    ] = "auto",
-    seed: Annotated[
-        int, typer.Option("--seed", help="Of all random choices: the same gives the same result.", min=0)
-    ] = 0,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+    report: options.ReportFolder = None,
+    scale: options.Scale = "auto",
+    seed: options.Seed = 0,
+    verbose: options.Verbose = False,
 ) -> None:
     """Find where cameras are relative to each other from their trajectories, whatever odometry made them.
 

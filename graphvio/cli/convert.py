@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from graphvio.cli import options
+
 if TYPE_CHECKING:
     from graphvio.sessions.description import Description, TopicDescription
 
@@ -14,15 +16,13 @@ EXIT_STOPPED = 3
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(help="Recording: a folder as for `graphvio run`, or a session (.mcap).")],
-    out: Annotated[Path, typer.Option("--out", help="Session to write; a new file, .mcap.", metavar="FILE")],
-    rig: Annotated[
-        Path | None, typer.Option("--rig", help="Rig or calibration file.  [default: what the recording carries]")
-    ] = None,
-    png: Annotated[bool, typer.Option("--png", help="Pack images as PNG: smaller and slower.")] = False,
-    from_s: Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.")] = None,
-    to_s: Annotated[float | None, typer.Option("--to", help="End at this second of the recording.")] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+    source: options.Source,
+    out: options.SessionOut,
+    rig: options.RigFile = None,
+    png: options.Png = False,
+    from_s: options.FromS = None,
+    to_s: options.ToS = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Write a recording as a session: one MCAP file with ROS 2 messages, which other tools open as it is.
 
@@ -64,7 +64,7 @@ def convert(
 
 def info(
     session: Annotated[Path, typer.Argument(help="Session (.mcap).")],
-    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Tell what a session holds: topics with their rates, gaps and jitter, how long, how large, what rig.
 

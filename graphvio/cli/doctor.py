@@ -10,6 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
+from graphvio.cli import options
+
 _REQUIRED = {"gtsam": "gtsam", "numpy": "numpy", "numba": "numba", "matplotlib": "matplotlib"}
 _OPENCV = ("opencv-python-headless", "opencv-contrib-python-headless", "opencv-python", "opencv-contrib-python")
 _OPTIONAL = {
@@ -21,7 +23,7 @@ _OPTIONAL = {
 
 def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Tell what graphvio finds on this machine: versions, cores, optional parts, compiled kernels.
 

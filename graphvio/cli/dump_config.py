@@ -6,10 +6,12 @@ from typing import Annotated
 
 import typer
 
+from graphvio.cli import options
+
 
 def dump_config(
     profile: Annotated[str, typer.Argument(help="Profile or YAML file.")] = "default",
-    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Print all values of a configuration as YAML.
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from graphvio.cli import options
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -23,7 +25,7 @@ def evaluate(
     max_gap: Annotated[
         float, typer.Option(help="Greatest interval of the truth that is interpolated, seconds.", min=0.0)
     ] = 0.25,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Compare a trajectory with the truth: ATE, RPE, drift and loop-closure error.
 

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
+
+from graphvio.cli import options
 
 EXIT_STOPPED = 3
 
 
 def record(
-    source: Annotated[Path, typer.Argument(help="Recording: a folder as for `graphvio run`, or a session (.mcap).")],
-    out: Annotated[Path, typer.Option("--out", help="Session to write; a new file, .mcap.", metavar="FILE")],
-    rig: Annotated[
-        Path | None, typer.Option("--rig", help="Rig or calibration file.  [default: what the recording carries]")
-    ] = None,
-    config: Annotated[
-        str, typer.Option("--config", help="Profile, or a YAML file with the values to change.")
-    ] = "default",
-    png: Annotated[bool, typer.Option("--png", help="Pack images as PNG: smaller and slower.")] = False,
-    no_imu: Annotated[bool, typer.Option("--no-imu", help="Use the cameras alone.")] = False,
-    from_s: Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.")] = None,
-    to_s: Annotated[float | None, typer.Option("--to", help="End at this second of the recording.")] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+    source: options.Source,
+    out: options.SessionOut,
+    rig: options.RigFile = None,
+    config: options.ConfigName = "default",
+    png: options.Png = False,
+    no_imu: options.NoImu = False,
+    from_s: options.FromS = None,
+    to_s: options.ToS = None,
+    verbose: options.Verbose = False,
 ) -> None:
     """Run the odometry and record images, IMU, rig, poses and incidents as a session (MCAP, ROS 2 messages).
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from graphvio.cli import options
+
 if TYPE_CHECKING:
     from graphvio.config import Config
     from graphvio.pipeline import Progress
@@ -20,27 +22,21 @@ _LEAST_COMPLETION = 0.9
 
 
 def run(
-    source: Annotated[Path, typer.Argument(help="Folder of a recording: EuRoC/ASL, TUM-VI, KITTI odometry or raw.")],
-    rig: Annotated[
-        Path | None, typer.Option("--rig", help="Rig or calibration file.  [default: what the recording carries]")
-    ] = None,
-    config: Annotated[
-        str, typer.Option("--config", help="Profile, or a YAML file with the values to change.")
-    ] = "default",
+    source: options.Source,
+    rig: options.RigFile = None,
+    config: options.ConfigName = "default",
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the results, new or empty.  [default: results/NAME-N]")
     ] = None,
-    pairs: Annotated[
-        str | None, typer.Option("--pairs", help="Use only these stereo pairs, such as 0 or 0,1.  [default: all]")
-    ] = None,
-    no_imu: Annotated[bool, typer.Option("--no-imu", help="Use the cameras alone.")] = False,
-    from_s: Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.")] = None,
-    to_s: Annotated[float | None, typer.Option("--to", help="End at this second of the recording.")] = None,
+    pairs: options.Pairs = None,
+    no_imu: options.NoImu = False,
+    from_s: options.FromS = None,
+    to_s: options.ToS = None,
     view: Annotated[bool, typer.Option("--view", help="Watch it in the rerun viewer.")] = False,
     save_rrd: Annotated[
         Path | None, typer.Option("--save-rrd", help="Save what the viewer would show; needs no display.")
     ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Estimate the trajectory of a recording.
 

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from graphvio.cli import options
+
 
 def simulate(
     name: Annotated[str, typer.Argument(help="Scene: room, corridor, stairs or calibration.")],
@@ -19,7 +21,7 @@ def simulate(
     trigger_offset_ms: Annotated[
         float, typer.Option("--trigger-offset-ms", help="Each pair is triggered so much after the one before.")
     ] = 0.0,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Simulate a walk with four cameras and an IMU, and write it in the EuRoC/ASL layout.
 

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from graphvio.cli import options
+
 
 def view(
     results: Annotated[Path, typer.Argument(help="Result folder that `graphvio run` has written.")],
@@ -12,7 +14,7 @@ def view(
         Path | None,
         typer.Option(help="Write a rerun recording here instead of opening a window.", metavar="FILE"),
     ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")] = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Open a result folder in rerun's window: path, covariance, biases, events.
 

@@ -1,0 +1,34 @@
+"""Arguments and options that several commands have."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Source = Annotated[
+    Path,
+    typer.Argument(
+        help="Recording: a folder (EuRoC/ASL, TUM-VI, KITTI odometry or raw), a session (.mcap) or a ROS bag."
+    ),
+]
+RigFile = Annotated[
+    Path | None, typer.Option("--rig", help="Rig or calibration file.  [default: what the recording carries]")
+]
+ConfigName = Annotated[str, typer.Option("--config", help="Profile, or a YAML file with the values to change.")]
+Pairs = Annotated[
+    str | None, typer.Option("--pairs", help="Use only these stereo pairs, such as 0 or 0,1.  [default: all]")
+]
+NoImu = Annotated[bool, typer.Option("--no-imu", help="Use the cameras alone.")]
+FromS = Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.")]
+ToS = Annotated[float | None, typer.Option("--to", help="End at this second of the recording.")]
+Png = Annotated[bool, typer.Option("--png", help="Pack images as PNG: smaller and slower.")]
+SessionOut = Annotated[Path, typer.Option("--out", help="Session to write; a new file, .mcap.", metavar="FILE")]
+ReportFolder = Annotated[
+    Path | None, typer.Option("--report", help="Folder for a report: page, pictures, all numbers.", metavar="DIR")
+]
+Scale = Annotated[
+    str,
+    typer.Option("--scale", help="Lengths that a camera measures may be wrong by a factor: auto, estimate or fixed."),
+]
+Seed = Annotated[int, typer.Option("--seed", help="Of all random choices: the same gives the same result.", min=0)]
+Verbose = Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")]
