@@ -281,8 +281,11 @@ def test_what_is_no_session_is_refused(recording: Path, tmp_path: Path) -> None:
     with pytest.raises(SessionError, match="is no MCAP file"):
         open_source(tmp_path / "noise.mcap")
     (tmp_path / "walk.bag").write_bytes(b"#ROSBAG")
-    with pytest.raises(SourceError, match="is no recording that graphvio knows"):
+    with pytest.raises(SessionError, match="cannot be read as a bag"):
         open_source(tmp_path / "walk.bag")
+    (tmp_path / "walk.avi").write_bytes(b"RIFF")
+    with pytest.raises(SourceError, match="is no recording that graphvio knows"):
+        open_source(tmp_path / "walk.avi")
     rig, path = small_rig(1), written(recording, tmp_path / "walk.mcap")
     other = replace(rig.pairs[0], name="other", left=replace(rig.pairs[0].left, name="cam9"))
     with pytest.raises(SourceError, match="has no images of camera cam9"):

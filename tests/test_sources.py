@@ -144,7 +144,7 @@ def test_wrong_paths(tmp_path: Path) -> None:
         open_source(tmp_path / ("x" * 300))
     with pytest.raises(SourceError, match="is empty; looked for EuRoC/ASL"):
         open_source(tmp_path)
-    file = tmp_path / "file.bag"
+    file = tmp_path / "file.avi"
     file.write_bytes(b"x")
     with pytest.raises(SourceError, match="is no recording that graphvio knows"):
         open_source(file)
