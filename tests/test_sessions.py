@@ -140,23 +140,32 @@ with SessionWriter(Path({path!r}), rig) as writer:
 """
 
 
-@pytest.mark.parametrize("after_s", [0.9, 1.35, 1.7, 2.1])
-def test_a_killed_recording_loses_the_last_second_at_most(tmp_path: Path, after_s: float) -> None:
-    path = tmp_path / "killed.mcap"
-    code = _RECORDER.format(tests=str(Path(__file__).parent), path=str(path))
-    recorder = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert recorder.stdout is not None
-    recorder.stdout.readline()  # it has begun
-    time.sleep(after_s)
-    os.kill(recorder.pid, signal.SIGKILL)
-    last_ns = int(recorder.stdout.read().split()[-2])
-    recorder.wait()
+def test_killed_recordings_lose_the_last_second_at_most(tmp_path: Path) -> None:
+    """Ten of them, at moments of all kinds."""
+    moments_s = np.sort(np.random.default_rng(0).uniform(0.8, 3.0, 10))
+    recorders = []
+    for k in range(len(moments_s)):
+        code = _RECORDER.format(tests=str(Path(__file__).parent), path=str(tmp_path / f"{k}.mcap"))
+        recorders.append(subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True))
+    for recorder in recorders:
+        assert recorder.stdout is not None
+        recorder.stdout.readline()  # it has begun
+    begun_s = time.monotonic()
+    for k, (recorder, moment_s) in enumerate(zip(recorders, moments_s, strict=True)):
+        time.sleep(max(begun_s + moment_s - time.monotonic(), 0.0))
+        os.kill(recorder.pid, signal.SIGKILL)
+        assert recorder.stdout is not None
+        last_ns = int(recorder.stdout.read().split()[-2])
+        recorder.wait()
+        check_killed(tmp_path / f"{k}.mcap", last_ns)
+
+
+def check_killed(path: Path, last_ns: int) -> None:
     file = McapFile(path)
     assert not file.is_whole
     recorded = file.topics["/pair0/left/image_raw"].logged_ns
     assert last_ns - recorded[-1] < 1_000_000_000
-    source = open_source(path)
-    framesets = [event for event in source if isinstance(event, FrameSet)]
+    framesets = source_framesets(path)
     assert len(framesets) == len(recorded)
     for frameset in framesets:
         assert frameset.images[0][0][0, 0] == frameset.stamp_ns // 10**6 % 256
