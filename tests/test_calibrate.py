@@ -151,6 +151,8 @@ def test_motions_that_do_not_tell_all_are_diagnosed(
         assert "unknown" in done.stdout
         numbers = yaml.safe_load((tmp_path / "out.calibration.yaml").read_text())
         assert numbers["complete"] is False
+        assert numbers["left_T_left1"]["back"] is None
+        assert None in numbers["known"]["back"]["offset_m"]
         assert len(numbers["undetermined_directions"]["back"]) == (2 if course is on_the_spot else 1)
         assert numbers["rig_before"][0]["off"] is False
 
@@ -186,6 +188,12 @@ def test_a_wrong_rotation_and_offset_of_the_imu_are_put_right(walk: Path) -> Non
     kept = made.calibrated_rig()
     np.testing.assert_array_equal(kept.pairs[0].left.body_T_cam, wrong.pairs[0].left.body_T_cam)
     assert kept.imu == wrong.imu
+
+
+def test_a_rig_that_is_right_keeps_its_imu(walk: Path, found: Calibration) -> None:
+    rig, corrected = Rig.load(walk / "rig.yaml"), found.calibrated_rig(correct_imu=True)
+    np.testing.assert_allclose(corrected.pairs[0].left.body_T_cam, rig.pairs[0].left.body_T_cam, atol=1e-15)
+    assert corrected.imu == rig.imu
 
 
 def test_a_recording_may_be_ended_early(walk: Path) -> None:
@@ -269,6 +277,7 @@ def test_sigmas_are_those_of_the_numbers_beside_them(found: Calibration) -> None
         (["--scale", "maybe"], "--scale maybe: give one of auto, estimate, fixed"),
         (["--pairs", "0"], "one stereo pair"),
         (["--correct-imu"], "--correct-imu wants --out FILE"),
+        (["--out", "rig.txt"], "end its name in .yaml"),
         (["--out", "missing/rig.yaml"], "name a file in a folder that exists"),
         (["--pairs", "0,7"], "there is no pair 7"),
     ],

@@ -81,3 +81,11 @@ def test_too_short_a_piece_is_refused(files: list[Path], tmp_path: Path) -> None
 def test_a_place_that_cannot_be_written_is_told(files: list[Path], tmp_path: Path) -> None:
     done = command(files[0], files[1], "--out", tmp_path / "missing" / "numbers.yaml")
     assert "name a file in a folder that exists" in str(done.exception)
+
+
+def test_what_is_read_is_never_overwritten(files: list[Path], tmp_path: Path) -> None:
+    copy = tmp_path / "front.yaml"
+    copy.write_bytes(files[0].read_bytes())
+    done = command(copy, files[1], "--out", copy)
+    assert "is what is read; name another file" in str(done.exception)
+    assert copy.read_bytes() == files[0].read_bytes()

@@ -23,7 +23,7 @@ _SIGNIFICANT = 4.0  # sigmas of a drift of clocks
 _TINY = 1e-300
 _COARSE_RAD, _COARSE_M = np.deg2rad(0.5), 0.01
 _NEARER = 20  # steps to the nearest of places that are as likely
-_HARDLY = 0.1  # of a direction that is not determined: a value without that is known
+_HARDLY = 0.01  # of a direction that is not determined: a value without that is known
 _SWAPPED = 0.2  # of the distance from the rig's value, that of its inverse is
 
 
@@ -36,12 +36,19 @@ class Present:
         sigmas: how unlikely that is by chance, as so many standard deviations of one normal variable.
         is_off: whether chance does not explain it.
         is_swapped: whether the file's would be right if both pairs changed places.
+        is_partial: whether the motions tell a part only, so that sigmas are about right at best.
     """
 
     tangent: Float
     sigmas: float
     is_off: bool
     is_swapped: bool
+    is_partial: bool = False
+
+    @property
+    def doubt(self) -> str:
+        """What is to be said of its size."""
+        return " as far as the motions tell" if self.is_partial else f" ({self.sigmas:.1f} sigma)"
 
     @property
     def angle_deg(self) -> float:
@@ -170,7 +177,8 @@ class Calibration:
         if told < 6:  # to first order only does the rest not depend on what is not known
             rotation, translation = np.linalg.norm(tangent.reshape(2, 3), axis=1)
             is_off = is_off and bool(rotation > _COARSE_RAD or translation > _COARSE_M)
-        return Present(tangent, sigmas, is_off, is_off and of_swapped < _SWAPPED**2 * square)
+        is_swapped = is_off and of_swapped < _SWAPPED**2 * square
+        return Present(tangent, sigmas, is_off, is_swapped, told < 6)
 
     def _undetermined(self, j: int) -> Float:
         return self.places.pairwise[0, j].observability.undetermined
@@ -193,7 +201,8 @@ class Calibration:
 
         Args:
             correct_imu: whether the cameras are turned against the IMU, and the time offset is set, as the first left
-                camera's comparison with the IMU says; its position in body stays, which rotations do not tell.
+                camera's comparison with the IMU says, where the rig is wrong beyond doubt; its position in body stays,
+                which rotations do not tell.
 
         Raises:
             CalibrationError: if there is no rig, the motions do not tell all, or there was no IMU to correct by.
@@ -210,8 +219,10 @@ class Calibration:
                 raise CalibrationError(
                     "the first pair was not compared with an IMU; the warnings say why, if there is one"
                 )
-            body_T_left1 = se3(self.imu[0].body_R_left, body_T_left1[:3, 3].copy())
-            imu = replace(imu, time_offset_s=self.imu[0].time_offset_s)
+            if self.imu[0].is_turned:
+                body_T_left1 = se3(self.imu[0].body_R_left, body_T_left1[:3, 3].copy())
+            if self.imu[0].is_late:
+                imu = replace(imu, time_offset_s=self.imu[0].time_offset_s)
         first, *others = self.rig.pairs
         placed = [
             _placed(pair, body_T_left1 @ se3_inverse(np.ascontiguousarray(left_T_left1)))
@@ -229,7 +240,7 @@ def rig_warnings(found: Calibration) -> list[str]:
         if present is None or not present.is_off:
             continue
         where = f"the rig has {found.names[j]} {size_in_words(present.tangent)} from where it is relative to "
-        where += f"{found.names[0]} ({present.sigmas:.0f} sigma)"
+        where += f"{found.names[0]}{present.doubt}"
         if present.is_swapped:
             where += "; it would be right if both pairs changed places: are their images, or their cables, swapped?"
         told.append(where)

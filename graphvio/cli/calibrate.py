@@ -67,7 +67,7 @@ def calibrate(
     from graphvio.errors import CalibrationError
     from graphvio.warmup import warm_up
 
-    _check_places(out, report)
+    _check_places(out, report, [] if rig is None else [rig])
     settings = Config.load(config)
     opened = open_recording(source, rig, settings, pairs=pairs, no_imu=False, from_s=from_s, to_s=to_s)
     if correct_imu and (out is None or opened.rig.imu is None):
@@ -78,8 +78,6 @@ def calibrate(
     with _Following(opened.frameset_count, names if guide else None) as following:
         found = calibrate_pairs(opened, config=settings, seed=seed, scale_mode=mode, on_frameset=following.on_frameset)
     _tell(found)
-    if report is not None:
-        _report(found, report, opened.name, following.framesets)
     if out is not None:
         numbers = out.with_suffix(".calibration.yaml")
         write_document(found, numbers)
@@ -88,6 +86,8 @@ def calibrate(
             typer.echo(f"wrote {out}, and all numbers to {numbers}")
         else:
             typer.echo(f"graphvio: {out} is not written, only {numbers}: the motions tell a part only", err=True)
+    if report is not None:
+        _report(found, report, opened.name, following.framesets)
     _end(found)
 
 
@@ -118,17 +118,17 @@ def calibrate_trajectories(
     from graphvio.trajectory import Trajectory
 
     mode = _scale_mode(scale)
-    _check_places(out, report)
+    _check_places(out, report, trajectories)
     read = [Trajectory.read(path) for path in trajectories]
     names = _names(trajectories)
     with _working("relating clocks, motions and cameras"):
         found = calibrate_all(read, names, same_clock=same_clock, seed=seed, scale_mode=mode)
     _tell(found)
-    if report is not None:
-        _report(found, report, ", ".join(names), len(read[0]))
     if out is not None:
         write_document(found, out)
         typer.echo(f"wrote {out}")
+    if report is not None:
+        _report(found, report, ", ".join(names), len(read[0]))
     _end(found)
 
 
@@ -152,6 +152,7 @@ class _Following:
         self._task = self._bar.add_task("each pair alone", total=total)
         self._guide = None if guided is None else Guide(guided)
         self._was_enough = False
+        self._advice: Advice | None = None
         self._interrupted = False
 
     def __enter__(self) -> _Following:
@@ -164,6 +165,8 @@ class _Following:
         self._let_go()
         if self._console.is_terminal:
             self._bar.stop()
+        if self._advice is not None and not self._was_enough:
+            self._console.print(f"frameset {self.framesets}: {self._advice.text}", soft_wrap=True, highlight=False)
 
     def on_frameset(self, number: int, separate: SeparateMotions) -> bool:
         """Show how far it is; whether to end."""
@@ -177,6 +180,7 @@ class _Following:
         return self._interrupted
 
     def _show(self, advice: Advice, number: int) -> None:
+        self._advice = advice
         self._bar.update(self._task, description=advice.text)
         newly_enough = advice.is_enough and not self._was_enough
         self._was_enough = advice.is_enough
@@ -215,14 +219,23 @@ def _scale_mode(text: str) -> ScaleMode:
     raise ConfigError(f"--scale {text}: give one of {', '.join(get_args(ScaleMode))}")
 
 
-def _check_places(out: Path | None, report: Path | None) -> None:
-    """Refuse places that cannot be written before minutes are spent."""
+def _check_places(out: Path | None, report: Path | None, inputs: list[Path]) -> None:
+    """Refuse places that cannot or should not be written before minutes are spent."""
+    import os
+
     from graphvio.errors import CalibrationError
 
-    if out is not None and (out.is_dir() or not out.absolute().parent.is_dir()):
-        raise CalibrationError(f"--out {out}: cannot be written; name a file in a folder that exists")
-    if report is not None and report.exists() and not report.is_dir():
-        raise CalibrationError(f"--report {report}: is a file; name a folder")
+    if out is not None:
+        if out.suffix not in (".yaml", ".yml"):
+            raise CalibrationError(f"--out {out}: is YAML; end its name in .yaml")
+        if out.resolve() in [path.resolve() for path in inputs]:
+            raise CalibrationError(f"--out {out}: is what is read; name another file")
+        if out.is_dir() or not out.absolute().parent.is_dir() or not os.access(out.absolute().parent, os.W_OK):
+            raise CalibrationError(f"--out {out}: cannot be written; name a file in a folder that exists")
+    if report is not None:
+        there = next(path for path in (report.absolute(), *report.absolute().parents) if path.exists())
+        if not there.is_dir() or not os.access(there, os.W_OK):
+            raise CalibrationError(f"--report {report}: cannot be made; name a folder elsewhere")
 
 
 def _names(paths: list[Path]) -> list[str]:
@@ -245,15 +258,16 @@ def _tell(found: Calibration) -> None:
         )
     for j in range(1, len(found.names)):
         present = found.present(j)
-        if present is not None:
-            typer.echo(f"the rig file has {found.names[j]} {_size(present.tangent)} away ({present.sigmas:.1f} sigma)")
+        if present is not None and not present.is_off:
+            typer.echo(f"the rig file has {found.names[j]} {_size(present.tangent)} away{present.doubt}")
     for loop in found.places.loops:
         around = ", ".join(found.names[k] for k in loop.cameras)
         typer.echo(f"around {around}: two at a time miss by {_size(loop.error)}")
     for (i, j), clock in (found.clocks or {}).items():
         typer.echo(
             f"{found.names[i]} to {found.names[j]}: add {1e-9 * clock.relation.offset_ns:.6f} s to a stamp of "
-            f"{found.names[i]} (+- {1e3 * clock.offset_sigma_s:.2f} ms)"
+            f"{found.names[i]} (+- {1e3 * clock.offset_sigma_s:.2f} ms); drift {1e6 * clock.relation.drift:.0f} (+- "
+            f"{1e6 * clock.drift_sigma:.0f}) microseconds a second"
         )
     for warning in found.warnings:
         typer.echo(f"graphvio: {warning}", err=True)
@@ -269,7 +283,8 @@ def _table(found: Calibration) -> Table:
     import numpy as np
     from rich.table import Table
 
-    table = Table(title=f"Where {found.names[0]} is (its left camera), seen from", title_justify="left")
+    which = "" if found.rig is None else " (its left camera)"
+    table = Table(title=f"Where {found.names[0]} is{which}, seen from", title_justify="left")
     for column in ("", "x", "y", "z"):
         table.add_column(column, justify="right" if column else "left", no_wrap=bool(column))
     for j in range(1, len(found.names)):
@@ -289,7 +304,9 @@ def _with_sigma(value: float, sigma: float, known: bool) -> str:
 def _report(found: Calibration, folder: Path, source: str, count: int) -> None:
     from graphvio.calibration.report.write import write_report
 
-    typer.echo(f"report: {write_report(found, folder, source, count)}")
+    with _working("drawing the report"):
+        page = write_report(found, folder, source, count)
+    typer.echo(f"report: {page}")
 
 
 def _end(found: Calibration) -> None:

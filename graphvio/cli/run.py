@@ -176,7 +176,7 @@ def _tell(summary: Summary, folder: Path) -> None:
     if faults:
         typer.echo(f"faults of the recording: {faults}")
     for warning in summary.warnings:
-        typer.echo(f"graphvio: {warning}; graphvio calibrate puts the file right", err=True)
+        typer.echo(f"graphvio: {warning}; graphvio calibrate finds where it is", err=True)
     if summary.resets:
         typer.echo(f"started anew {summary.resets} times: see {folder / 'events.jsonl'}")
     typer.echo(f"results: {folder}")

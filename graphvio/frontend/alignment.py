@@ -28,6 +28,8 @@ _CAUCHY = 9.0  # squared scale for the distance of one motion, which has 6 degre
 _PRIOR_SIGMAS = np.repeat([0.1, 0.2], 3)  # radians and metres: decides only in directions that no motion shows
 _SIGNIFICANT = float(chi2.isf(1e-9, 6))
 _MOST_OUTLIERS = 0.3
+_VAGUE = 0.25  # a size whose sigma is a larger share of it is not told,
+_FINE_RAD, _FINE_M = np.deg2rad(0.2), 0.01  # unless the sigma is no larger than this
 
 
 class Misalignment(NamedTuple):
@@ -116,10 +118,16 @@ def misplaced(rig: Rig, pair: int, misalignment: Misalignment) -> str:
     turned, moved = np.split(adjoint @ misalignment.tangent, 2)
     covariance = adjoint @ misalignment.covariance @ adjoint.T
     sigmas = np.sqrt([np.linalg.eigvalsh(block)[-1] for block in (covariance[:3, :3], covariance[3:, 3:])])
+    angle, distance = float(np.linalg.norm(turned)), float(np.linalg.norm(moved))
+    by_angle = f"{np.rad2deg(angle):.2f} (+- {np.rad2deg(sigmas[0]):.2f}) deg"
+    by_distance = f"{100 * distance:.1f} (+- {100 * sigmas[1]:.1f}) cm"
+    if sigmas[0] > max(_VAGUE * angle, _FINE_RAD):
+        by_angle = "an angle that these motions do not tell"
+    if sigmas[1] > max(_VAGUE * distance, _FINE_M):
+        by_distance = "a distance that these motions do not tell"
     return (
-        f"pair {rig.pairs[pair].name} is {np.rad2deg(np.linalg.norm(turned)):.2f} (+- {np.rad2deg(sigmas[0]):.2f}) deg "
-        f"and {100 * np.linalg.norm(moved):.1f} (+- {100 * sigmas[1]:.1f}) cm from where the rig file has it, as its "
-        "motion against the first pair's tells"
+        f"pair {rig.pairs[pair].name} is {by_angle} and {by_distance} from where the rig file has it, as its motion "
+        "against the first pair's tells"
     )
 
 

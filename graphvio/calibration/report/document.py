@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from graphvio.arrays import Bool, Float
 from graphvio.calibration.pair_calibration import PairCalibration
 from graphvio.calibration.result import Calibration
 from graphvio.errors import CalibrationError
@@ -27,8 +28,10 @@ def document(found: Calibration) -> dict[str, Any]:
             if j
         },
         "left_T_left1": {
-            name: pose.tolist() for name, pose in zip(found.names, found.places.left_T_left1, strict=True)
+            name: pose.tolist() if found.is_complete else None
+            for name, pose in zip(found.names, found.places.left_T_left1, strict=True)
         },
+        "known": {name: _known(found, j) for j, name in enumerate(found.names) if j},
         "covariance": found.places.covariance.tolist(),
         "two_at_a_time": [
             {
@@ -102,7 +105,7 @@ def write_document(found: Calibration, path: Path) -> None:
 
 def _pair(each: PairCalibration) -> dict[str, Any]:
     return {
-        "left2_T_left1": each.left2_T_left1.tolist(),
+        "left2_T_left1": each.left2_T_left1.tolist() if each.observability.is_complete else None,
         "covariance": each.covariance.tolist(),
         "motions": len(each.pairs),
         "inliers": int(each.inlier.sum()),
@@ -114,7 +117,7 @@ def _pair(each: PairCalibration) -> dict[str, Any]:
         },
         "dispersion": each.dispersion,
         "by_the_papers_method": {
-            "left2_T_left1": each.paper_left2_T_left1.tolist(),
+            "left2_T_left1": each.paper_left2_T_left1.tolist() if each.observability.is_complete else None,
             "covariance": each.comparison.paper_covariance.tolist(),
             "chi_square": each.comparison.statistic,
             "limit": each.comparison.limit,
@@ -135,6 +138,21 @@ def _pair(each: PairCalibration) -> dict[str, Any]:
         "translation_singular_values": each.observability.translation_singular_values.tolist(),
         "turning_rad": each.observability.turning_rad.tolist(),
         "missing": list(each.observability.missing),
+    }
+
+
+def _known(found: Calibration, j: int) -> dict[str, Any]:
+    """Values one by one, where the motions tell them; null elsewhere."""
+    shown = found.shown(j)
+
+    def told(values: Float, known: Bool) -> list[float | None]:
+        return [float(value) if is_known else None for value, is_known in zip(values, known, strict=True)]
+
+    return {
+        "offset_m": told(shown.offset_m, shown.offset_known),
+        "offset_sigmas_m": told(shown.offset_sigmas_m, shown.offset_known),
+        "rotation_vector_rad": told(shown.turn_rad, shown.turn_known),
+        "rotation_vector_sigmas_rad": told(shown.turn_sigmas_rad, shown.turn_known),
     }
 
 

@@ -94,7 +94,12 @@ def _places(found: Calibration) -> str:
                 _present(found, j),
             )
         )
-    head = ("left cameras", "offset x, y, z", "rotation vector", "in the rig file" if found.rig is not None else "")
+    head = (
+        "left cameras" if found.rig is not None else "",
+        "offset x, y, z",
+        "rotation vector",
+        "in the rig file" if found.rig is not None else "",
+    )
     note = "<p>Camera axes: x right, y down, z forward. After +- stands one standard deviation.</p>"
     return _table(rows, head) + note
 
@@ -104,7 +109,7 @@ def _present(found: Calibration, j: int) -> str:
     if present is None:
         return ""
     verdict = "agrees" if not present.is_off else "is off"
-    return f"{verdict}: {size_in_words(present.tangent)} away ({present.sigmas:.1f} sigma)"
+    return f"{verdict}: {size_in_words(present.tangent)} away{present.doubt}"
 
 
 def _details(each: PairCalibration) -> str:
@@ -113,6 +118,19 @@ def _details(each: PairCalibration) -> str:
     paper = np.sqrt(np.diag(each.comparison.paper_covariance))
     comparison, halves = each.comparison, each.halves
     frames = f"{len(each.frames)}, of which {int(each.frame_inlier.sum())} fit"
+    turning = [
+        (
+            "turning about principal axes",
+            f"{_degrees(each.observability.turning_rad)} rms in a motion (singular values of the rotation's problem)",
+        ),
+        (
+            "lever of the turning on the offset",
+            f"{_degrees(each.observability.translation_singular_values)} rms in a motion (singular values of the "
+            "offset's problem; two must be well above nothing)",
+        ),
+    ]
+    if not each.observability.is_complete:
+        return _table(turning)
     rows = [
         *([("motions from frame to frame", frames)] if len(each.frames) else []),
         ("motions used", f"{len(each.pairs)}, of which {int(each.inlier.sum())} fit"),
@@ -140,15 +158,7 @@ def _details(each: PairCalibration) -> str:
             f"{np.exp(each.scale.log_ratio):.5f} +- {each.scale.sigma:.5f}"
             + (" (estimated and corrected)" if each.scale_estimated else ""),
         ),
-        (
-            "turning about principal axes",
-            f"{_degrees(each.observability.turning_rad)} rms in a motion (singular values of the rotation's problem)",
-        ),
-        (
-            "lever of the turning on the offset",
-            f"{_degrees(each.observability.translation_singular_values)} rms in a motion (singular values of the "
-            "offset's problem; two must be well above nothing)",
-        ),
+        *turning,
     ]
     return _table(rows)
 
