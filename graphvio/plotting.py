@@ -5,7 +5,7 @@ Only matplotlib's objects are used, so that a program that plots with pyplot is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from graphvio.trajectory import Trajectory, travelled
 
 _DPI = 130
 _ESTIMATE, _TRUTH = "#1f5fbf", "#555555"
-_GRID = {"color": "#dddddd", "linewidth": 0.6}
+_GRID: dict[str, Any] = {"color": "#dddddd", "linewidth": 0.6}
 _STATUS_COLOURS = {
     Status.INITIALISING: "#17a398",
     Status.COASTING: "#f28e1c",
@@ -116,6 +116,37 @@ def draw_evaluation(path: Path, evaluation: Evaluation, name: str = "") -> None:
         if row == 0:
             axes.set_xlabel("time, s")
     _title(figure, plan, f"{name}{': ' if name else ''}{_figures(evaluation)}")
+    _save(figure, path)
+
+
+def draw_comparison(path: Path, evaluations: Mapping[str, Evaluation]) -> None:
+    """Draw the errors of several results over time, one line each.
+
+    Args:
+        path: picture to write; its ending chooses the format.
+        evaluations: name -> what to draw, all against one truth.
+
+    Raises:
+        GraphvioError: if the picture cannot be written.
+    """
+    head_in = 0.5 + 0.22 * len(evaluations)
+    figure = Figure(figsize=(9.0, 5.6 + head_in), dpi=_DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    share = 5.6 / (5.6 + head_in)
+    panels = [figure.add_axes((0.1, share * bottom, 0.87, share * 0.42)) for bottom in (0.56, 0.09)]
+    begin = min((int(each.stamps_ns[0]) for each in evaluations.values()), default=0)
+    for name, each in evaluations.items():
+        seconds = 1e-9 * (each.stamps_ns - begin)
+        label = f"{name}: {each.ate_position_m.rmse:.3g} m, {each.ate_rotation_deg.rmse:.3g}°"
+        panels[0].plot(seconds, each.position_error_m, linewidth=1.2, label=label)
+        panels[1].plot(seconds, each.rotation_error_deg, linewidth=1.2)
+    for panel, label in zip(panels, ("position error, m", "rotation error, degrees"), strict=True):
+        panel.set(ylabel=label, ylim=(0.0, None))
+        panel.grid(**_GRID)
+    panels[1].set_xlabel("time, s")
+    if evaluations:
+        options = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.02), "borderaxespad": 0.0, "frameon": False}
+        panels[0].legend(fontsize=9, title="rmse after alignment", title_fontsize=9, alignment="left", **options)
     _save(figure, path)
 
 

@@ -6,6 +6,7 @@ from typing import NoReturn
 import typer
 
 from graphvio.cli.calibrate import calibrate, calibrate_trajectories
+from graphvio.cli.compare import compare
 from graphvio.cli.convert import convert, info
 from graphvio.cli.doctor import doctor
 from graphvio.cli.dump_config import dump_config
@@ -34,6 +35,7 @@ app.command()(record)
 app.command()(convert)
 app.command()(info)
 app.command()(evaluate)
+app.command()(compare)
 app.command()(simulate)
 app.command()(view)
 app.command(name="dump-config")(dump_config)

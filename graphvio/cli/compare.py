@@ -1,0 +1,104 @@
+"""``graphvio compare``: several results against one truth, or against each other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from graphvio.cli import options
+
+if TYPE_CHECKING:
+    from graphvio.evaluation.comparison import Compared
+
+EXIT_ABOVE = 4
+
+
+def compare(
+    results: Annotated[
+        list[Path], typer.Argument(help="Result folders of `graphvio run`, or trajectory files (TUM, EuRoC).")
+    ],
+    truth: Annotated[
+        Path | None, typer.Option("--truth", help="True trajectory.  [default: the first result is the reference]")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", help="Draw all errors over time: .png, .pdf or .svg.", metavar="FILE")
+    ] = None,
+    smoothed: Annotated[
+        bool, typer.Option("--smoothed", help="Of result folders, take the poses as they left the window.")
+    ] = False,
+    max_ate: Annotated[
+        float | None, typer.Option("--max-ate", help="Exit with code 4 if an ATE exceeds these metres.", min=0.0)
+    ] = None,
+    verbose: options.Verbose = False,
+) -> None:
+    """Compare several results: ATE, RPE, drift and completion, and each one's ATE over the first one's.
+
+    Ends with exit code 4 where --max-ate is exceeded, or a result cannot be compared.
+
+    Examples:
+
+        graphvio compare results/walk-1 results/walk-2 --truth truth.txt --plot compared.png
+
+        graphvio compare results/nightly --truth truth.txt --max-ate 0.05
+    """
+    from rich.console import Console
+
+    from graphvio.errors import GraphvioError
+    from graphvio.evaluation.comparison import compare as compare_all
+    from graphvio.trajectory import Trajectory
+
+    names, trajectories = _names(results), [Trajectory.read(_file(path, smoothed)) for path in results]
+    if truth is None and len(results) < 2:
+        raise GraphvioError("one result and no truth: there is nothing to compare; give --truth FILE or more results")
+    reference = Trajectory.read(truth) if truth is not None else trajectories[0]
+    rest = slice(0 if truth is not None else 1, None)
+    compared = compare_all(names[rest], trajectories[rest], reference)
+    Console(soft_wrap=True).print(_table(compared))
+    for each in compared:
+        if each.evaluation is None:
+            typer.echo(f"graphvio: {each.name}: {each.why_not}", err=True)
+    if plot is not None:
+        from graphvio.plotting import draw_comparison
+
+        draw_comparison(plot, {each.name: each.evaluation for each in compared if each.evaluation is not None})
+    above = [each.name for each in compared if max_ate is not None and each.ate_m > max_ate]
+    if above:
+        typer.echo(f"graphvio: ATE above {max_ate:g} m: {', '.join(above)}", err=True)
+    if above or any(each.evaluation is None for each in compared):
+        raise typer.Exit(EXIT_ABOVE)
+
+
+def _file(path: Path, smoothed: bool) -> Path:
+    return path / ("trajectory_smoothed.txt" if smoothed else "trajectory.txt") if path.is_dir() else path
+
+
+def _names(paths: list[Path]) -> list[str]:
+    names = [path.name if path.is_dir() else path.stem for path in paths]
+    return names if len(set(names)) == len(names) else [str(path) for path in paths]
+
+
+def _table(compared: list[Compared]) -> object:
+    from rich.table import Table
+
+    table = Table()
+    table.add_column("result", overflow="fold")
+    for column in ("ATE, m", "over first", "deg", "RPE 1 s, m", "drift, %", "poses"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for each in compared:
+        found = each.evaluation
+        if found is None:
+            table.add_row(each.name, *["-"] * 6)
+            continue
+        rpe = found.rpe.get("1 s")
+        table.add_row(
+            each.name,
+            f"{found.ate_position_m.rmse:.4f}",
+            "" if each.ate_ratio is None else f"{each.ate_ratio:.2f}",
+            f"{found.ate_rotation_deg.rmse:.3f}",
+            "" if rpe is None else f"{rpe.position_m.rmse:.4f}",
+            "" if found.drift_percent is None else f"{found.drift_percent:.2f}",
+            f"{found.associated}/{found.estimates}",
+        )
+    return table

@@ -1,0 +1,86 @@
+"""``graphvio compare``."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from graphvio.cli import app
+from graphvio.geometry import se3, so3_exp
+from graphvio.trajectory import Trajectory
+
+
+def walk(error_m: float, seed: int = 0) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    poses = []
+    for k in range(200):
+        at = np.array([0.05 * k, np.sin(0.05 * k), 0.0]) + error_m * rng.standard_normal(3)
+        poses.append(se3(so3_exp(np.array([0.0, 0.0, 0.01 * k])), at))
+    return Trajectory(np.arange(200) * 50_000_000, np.array(poses))
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, Path]:
+    made = {}
+    for name, error_m in (("truth", 0.0), ("good", 0.01), ("bad", 0.03)):
+        made[name] = tmp_path / f"{name}.txt"
+        walk(error_m).write(made[name])
+    folder = tmp_path / "walk-1"
+    folder.mkdir()
+    walk(0.02).write(folder / "trajectory.txt")
+    walk(0.005).write(folder / "trajectory_smoothed.txt")
+    made["folder"] = folder
+    return made
+
+
+def command(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["compare", *map(str, arguments)], env={"COLUMNS": "160"})
+
+
+def test_results_are_held_against_one_truth(files: dict[str, Path], tmp_path: Path) -> None:
+    plot = tmp_path / "compared.png"
+    done = command(files["good"], files["bad"], files["folder"], "--truth", files["truth"], "--plot", plot)
+    assert done.exit_code == 0, done.output
+    rows = {row.split("│")[1].strip(): row.split("│") for row in done.stdout.splitlines() if row.count("│") > 5}
+    assert float(rows["good"][2]) == pytest.approx(0.01 * np.sqrt(3.0), rel=0.15)
+    assert float(rows["bad"][3]) == pytest.approx(3.0, rel=0.05)
+    assert float(rows["walk-1"][3]) == pytest.approx(2.0, rel=0.05)
+    picture = cv2.imread(str(plot))
+    assert picture is not None
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+def test_folders_may_give_their_smoothed_poses(files: dict[str, Path]) -> None:
+    done = command(files["good"], files["folder"], "--truth", files["truth"], "--smoothed")
+    (row,) = [row.split("│") for row in done.stdout.splitlines() if "walk-1" in row]
+    assert float(row[3]) == pytest.approx(0.5, rel=0.05)
+
+
+def test_without_a_truth_the_first_is_the_reference(files: dict[str, Path]) -> None:
+    done = command(files["truth"], files["good"])
+    assert done.exit_code == 0
+    assert "truth" not in done.stdout
+    assert "good" in done.stdout
+
+
+def test_a_gate_tells_what_is_above_it(files: dict[str, Path]) -> None:
+    done = command(files["good"], files["bad"], "--truth", files["truth"], "--max-ate", "0.03")
+    assert done.exit_code == 4
+    assert "ATE above 0.03 m: bad" in done.stderr
+    assert command(files["good"], "--truth", files["truth"], "--max-ate", "0.03").exit_code == 0
+
+
+def test_one_that_cannot_be_compared_is_told_and_stops_no_other(files: dict[str, Path], tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere.txt"
+    other = walk(0.01)
+    Trajectory(other.stamps_ns + 10**15, other.nav_T_body).write(elsewhere)
+    done = command(elsewhere, files["good"], "--truth", files["truth"])
+    assert done.exit_code == 4
+    assert "elsewhere: " in done.stderr
+    assert "good" in done.stdout
+
+
+def test_one_result_alone_is_refused(files: dict[str, Path]) -> None:
+    assert "nothing to compare" in str(command(files["good"]).exception)
