@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,11 @@ import numpy as np
 import pytest
 from recordings import write_euroc
 from test_sessions import same, written
+from typer.testing import CliRunner
 
 from graphvio import FrameSet, Rig, open_source
-from graphvio.errors import RigError, SessionError
+from graphvio.cli import app
+from graphvio.errors import RigError, SessionError, SourceError
 from graphvio.sessions import cdr
 from graphvio.sessions.description import describe
 from graphvio.sessions.mcap_file import McapFile
@@ -139,6 +142,30 @@ def test_a_baseline_may_be_told_by_the_projection(recording: Path, tmp_path: Pat
     (pair,) = source.rig.pairs
     assert pair.baseline_m == pytest.approx(0.12)
     np.testing.assert_allclose(pair.left.body_T_cam, np.eye(4))
+
+
+def test_topics_of_any_name_may_be_mapped(recording: Path, tmp_path: Path) -> None:
+    def renamed(message: Message) -> Message:
+        topic, *rest = message
+        names = {"/pair0/left/image_raw": "/a", "/pair0/right/image_raw": "/b", "/imu": "/c"}
+        return (names.get(topic, topic), *rest)  # type: ignore[return-value]
+
+    path = bag("db3", [renamed(message) for message in messages(recording, tmp_path)], tmp_path)
+    rig = open_source(recording).rig.with_pairs([0])
+    odd = replace(rig, pairs=(replace(rig.pairs[0], name="other"),))
+    with pytest.raises(SourceError, match="has no images of camera cam0"):
+        open_source(path, odd)
+    source = open_source(path, odd, topics={"cam0": "/a", "cam1": "/b", "imu": "/c"})
+    assert source.rig.imu is not None
+    assert len([event for event in source if isinstance(event, FrameSet)]) == 6
+    with pytest.raises(SourceError, match="has no topic /d; it has /a, /b, /c"):
+        open_source(path, odd, topics={"cam0": "/d"})
+    with pytest.raises(SourceError, match="the rig has no cam7 to be mapped"):
+        open_source(path, odd, topics={"cam7": "/a"})
+    with pytest.raises(SourceError, match="has no topics to be mapped"):
+        open_source(recording, topics={"cam0": "/a"})
+    done = CliRunner().invoke(app, ["convert", str(path), "--topics", "cam0", "--out", str(tmp_path / "x.mcap")])
+    assert "give NAME=TOPIC separated by commas" in str(done.exception)
 
 
 def test_what_a_bag_does_not_tell_is_asked_for(recording: Path, tmp_path: Path) -> None:

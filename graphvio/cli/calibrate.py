@@ -27,6 +27,7 @@ EXIT_PARTIAL = 3
 def calibrate(
     source: options.Source,
     rig: options.RigFile = None,
+    topics: options.Topics = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", help="Write the corrected rig here (.yaml), and all numbers beside it.", metavar="FILE"),
@@ -69,7 +70,7 @@ def calibrate(
 
     _check_places(out, report, [] if rig is None else [rig])
     settings = Config.load(config)
-    opened = open_recording(source, rig, settings, pairs=pairs, no_imu=False, from_s=from_s, to_s=to_s)
+    opened = open_recording(source, rig, settings, pairs=pairs, no_imu=False, from_s=from_s, to_s=to_s, topics=topics)
     if correct_imu and (out is None or opened.rig.imu is None):
         raise CalibrationError("--correct-imu wants --out FILE to write the rig to, and a recording with an IMU")
     mode = _scale_mode(scale)

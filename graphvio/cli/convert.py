@@ -19,6 +19,7 @@ def convert(
     source: options.Source,
     out: options.SessionOut,
     rig: options.RigFile = None,
+    topics: options.Topics = None,
     png: options.Png = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
@@ -42,7 +43,7 @@ def convert(
     from graphvio.events import FrameSet
     from graphvio.sessions.writer import SessionWriter
 
-    opened = open_recording(source, rig, Config(), pairs=None, no_imu=False, from_s=from_s, to_s=to_s)
+    opened = open_recording(source, rig, Config(), pairs=None, no_imu=False, from_s=from_s, to_s=to_s, topics=topics)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with (
         SessionWriter(out, opened.rig, "png" if png else "raw") as writer,

@@ -15,6 +15,14 @@ RigFile = Annotated[
     Path | None, typer.Option("--rig", help="Rig or calibration file.  [default: what the recording carries]")
 ]
 ConfigName = Annotated[str, typer.Option("--config", help="Profile, or a YAML file with the values to change.")]
+Topics = Annotated[
+    str | None,
+    typer.Option(
+        "--topics",
+        help="For sessions and bags: which topic is of which camera of the rig, or of the IMU, such as "
+        "cam0=/left/image,imu=/imu/data.  [default: by their names]",
+    ),
+]
 Pairs = Annotated[
     str | None, typer.Option("--pairs", help="Use only these stereo pairs, such as 0 or 0,1.  [default: all]")
 ]

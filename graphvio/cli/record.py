@@ -13,6 +13,7 @@ def record(
     source: options.Source,
     out: options.SessionOut,
     rig: options.RigFile = None,
+    topics: options.Topics = None,
     config: options.ConfigName = "default",
     png: options.Png = False,
     no_imu: options.NoImu = False,
@@ -38,7 +39,7 @@ def record(
     from graphvio.warmup import warm_up
 
     settings = Config.load(config)
-    opened = open_recording(source, rig, settings, pairs=None, no_imu=no_imu, from_s=from_s, to_s=to_s)
+    opened = open_recording(source, rig, settings, pairs=None, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
     odometry = Odometry(opened.rig, settings)
     estimated = 0
     with SessionWriter(out, opened.rig, "png" if png else "raw") as writer:

@@ -24,6 +24,7 @@ _LEAST_COMPLETION = 0.9
 def run(
     source: options.Source,
     rig: options.RigFile = None,
+    topics: options.Topics = None,
     config: options.ConfigName = "default",
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for the results, new or empty.  [default: results/NAME-N]")
@@ -60,7 +61,7 @@ def run(
     from graphvio.warmup import warm_up
 
     settings = Config.load(config)
-    opened = open_recording(source, rig, settings, pairs=pairs, no_imu=no_imu, from_s=from_s, to_s=to_s)
+    opened = open_recording(source, rig, settings, pairs=pairs, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
     folder = out if out is not None else ResultWriter.new_folder(Path("results"), opened.name)
     with ExitStack() as stack:
         writer = stack.enter_context(ResultWriter(folder, opened.rig, settings.to_yaml()))
@@ -91,6 +92,7 @@ def open_recording(
     no_imu: bool,
     from_s: float | None,
     to_s: float | None,
+    topics: str | None = None,
 ) -> Source:
     """A recording as the options of a command ask for it."""
     from graphvio.rig import Rig
@@ -98,11 +100,22 @@ def open_recording(
 
     tolerance_ms = settings.timing.simultaneous_ms
     loaded = None if rig is None else Rig.load(rig)
-    opened = open_source(source, loaded, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms)
+    mapped = _topics(topics)
+    opened = open_source(source, loaded, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
     chosen = _choose(opened.rig, pairs, no_imu)
     if chosen is opened.rig:
         return opened
-    return open_source(source, chosen, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms)
+    return open_source(source, chosen, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
+
+
+def _topics(text: str | None) -> dict[str, str]:
+    """Name of a camera or ``imu`` -> topic."""
+    from graphvio.errors import SourceError
+
+    pairs = [each.split("=") for each in (text or "").split(",") if each]
+    if any(len(pair) != 2 or not all(pair) for pair in pairs):
+        raise SourceError(f"--topics {text}: give NAME=TOPIC separated by commas, such as cam0=/left/image,imu=/imu")
+    return {name.strip(): topic.strip() for name, topic in pairs}
 
 
 def _choose(rig: Rig, pairs: str | None, no_imu: bool) -> Rig:

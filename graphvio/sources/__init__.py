@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 from graphvio.errors import RigError, SourceError
@@ -27,6 +28,7 @@ def open_source(
     from_s: float | None = None,
     to_s: float | None = None,
     tolerance_ms: float = 1e-6 * TOLERANCE_NS,
+    topics: Mapping[str, str] | None = None,
 ) -> Source:
     """Open a recording, whatever its layout.
 
@@ -37,6 +39,7 @@ def open_source(
         to_s: where to end (inclusive), on the same scale.
         tolerance_ms: images whose stamps differ by no more are of one instant. Left and right images further apart
             are no pair, and pairs further apart make framesets of their own.
+        topics: name of a camera, or ``imu`` -> topic, for sessions and bags whose topics' names do not tell.
 
     Raises:
         SourceError: if the folder cannot be read, has no known layout, or holds nothing in the given time.
@@ -50,13 +53,18 @@ def open_source(
             f"tolerance_ms is {tolerance_ms}; give 0 to {_MAX_TOLERANCE_MS:g}: what is triggered together"
         )
     try:
-        return _open(Path(path), rig, from_s, to_s, round(1e6 * tolerance_ms))
+        return _open(Path(path), rig, from_s, to_s, round(1e6 * tolerance_ms), topics or {})
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
 
 
 def _open_session(
-    file: Path, rig: Rig | None, from_s: float | None, to_s: float | None, tolerance_ns: int
+    file: Path,
+    rig: Rig | None,
+    from_s: float | None,
+    to_s: float | None,
+    tolerance_ns: int,
+    topics: Mapping[str, str],
 ) -> Recording:
     from graphvio.sources import session
 
@@ -67,14 +75,23 @@ def _open_session(
     if rig is None:
         raise RigError(f"{file}: carries no rig; give one of your own")
     faults = FaultLog(file.stem)
-    return Recording(session.read_index(file, rig, faults), rig, faults, from_s, to_s, tolerance_ns)
+    return Recording(session.read_index(file, rig, faults, topics), rig, faults, from_s, to_s, tolerance_ns)
 
 
-def _open(folder: Path, rig: Rig | None, from_s: float | None, to_s: float | None, tolerance_ns: int) -> Recording:
+def _open(
+    folder: Path,
+    rig: Rig | None,
+    from_s: float | None,
+    to_s: float | None,
+    tolerance_ns: int,
+    topics: Mapping[str, str],
+) -> Recording:
     if not folder.exists():
         raise SourceError(f"{folder}: does not exist; give the folder of a recording")
     if not folder.is_dir() or (folder / "metadata.yaml").is_file():
-        return _open_session(folder, rig, from_s, to_s, tolerance_ns)
+        return _open_session(folder, rig, from_s, to_s, tolerance_ns, topics)
+    if topics:
+        raise SourceError(f"{folder}: has no topics to be mapped; that is for sessions and bags")
     if next(folder.iterdir(), None) is None:
         raise SourceError(f"{folder}: is empty; looked for {_known()}")
     layout = next((known for known in _FORMATS if known.matches(folder)), None)

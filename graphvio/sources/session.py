@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from graphvio.sources.images import ImageError
 from graphvio.sources.recording import Index
 from graphvio.sources.tables import ImuTable, clean_stamps
 
+_IMU_NAME = "imu"
 LAYOUT = "sessions and bags: NAME.mcap, NAME.bag, a folder with metadata.yaml"
 
 
@@ -52,23 +53,42 @@ def read_rig(path: Path) -> Rig | None:
     return rig_of_topics(store, path.stem) if text is None else parse(text.decode("utf-8"), path)
 
 
-def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
+def read_index(path: Path, rig: Rig, faults: FaultLog, topics: Mapping[str, str] | None = None) -> Index:
     """Index the cameras of a rig, and the IMU if it has one.
+
+    Args:
+        path: of the session or bag.
+        rig: whose cameras are looked for.
+        faults: goes on to count.
+        topics: name of a camera, or ``imu`` -> its topic, where names do not tell.
 
     Raises:
         SessionError: if the file cannot be read.
         SourceError: if a camera of the rig has no images in it.
     """
     file = open_store(path)
+    chosen = {name: _named(file, topic) for name, topic in (topics or {}).items()}
+    unknown = set(chosen) - {camera.name for camera in rig.cameras} - {_IMU_NAME}
+    if unknown:
+        names = ", ".join([*(camera.name for camera in rig.cameras), _IMU_NAME])
+        raise SourceError(f"{path}: the rig has no {min(unknown)} to be mapped to a topic; it has {names}")
     if not file.is_whole:
         faults.add("session_cut", 0, f"{path} was not finished: it ends where its recording was cut")
     tracks = {}
     for pair in rig.pairs:
         for side, camera in (("left", pair.left), ("right", pair.right)):
-            tracks[camera.name] = _Images(file, _topic_of(file, pair.name, side, camera), faults)
-    imu = next((topic for topic in file.topics.values() if topic.type_name == IMU), None)
+            topic = chosen.get(camera.name) or _topic_of(file, pair.name, side, camera)
+            tracks[camera.name] = _Images(file, topic, faults)
+    of_imu = [each for each in file.topics.values() if each.type_name == IMU]
+    imu = chosen.get(_IMU_NAME) or next(iter(of_imu), None)
     table = None if imu is None or rig.imu is None else _imu(file, imu, faults)
     return Index(faults.name, tracks, table)
+
+
+def _named(file: McapFile | BagFile, name: str) -> Topic:
+    if name not in file.topics:
+        raise SourceError(f"{file.path}: has no topic {name}; it has {', '.join(sorted(file.topics))}")
+    return file.topics[name]
 
 
 class _Images:
