@@ -25,7 +25,7 @@ def calibrated(walk: Walk, seed: int) -> PairCalibration:
 
 
 def test_errors_are_within_what_is_told() -> None:
-    runs = 16
+    runs = 10
     found = [calibrated(turning, seed) for seed in range(runs)]
     low, high = band(runs)
     assert low < np.mean([each.distance(LEFT2_T_LEFT1) for each in found]) < high

@@ -274,7 +274,7 @@ def test_a_run_that_cannot_begin_leaves_no_folder(room_walk: Path, tmp_path: Pat
 def test_unreadable_and_empty_folders(tmp_path: Path) -> None:
     assert "does not exist" in refused(graphvio("run", tmp_path / "nowhere"))
     (tmp_path / "file").write_text("no folder")
-    assert "is no folder" in refused(graphvio("run", tmp_path / "file"))
+    assert "is no recording that graphvio knows" in refused(graphvio("run", tmp_path / "file"))
     (tmp_path / "empty").mkdir()
     assert "is empty" in refused(graphvio("run", tmp_path / "empty"))
     (tmp_path / "other").mkdir()
