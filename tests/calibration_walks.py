@@ -7,10 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from recordings import half_size
 
 from graphvio.arrays import Float
 from graphvio.geometry import se3_exp
-from graphvio.rig import Camera, Rig
+from graphvio.rig import Rig
 from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
 from graphvio.simulation.motion import Motion
 
@@ -44,7 +45,7 @@ def _course(
 def recorded(folder: Path, duration_s: float, course: Course | None = None, trigger_offset_ms: float = 0.0) -> Path:
     """A recording of 320x240 images; without a course the rig is turned about all axes while it is carried around."""
     rig = default_rig()
-    pairs = tuple(replace(pair, left=_half_size(pair.left), right=_half_size(pair.right)) for pair in rig.pairs)
+    pairs = tuple(replace(pair, left=half_size(pair.left), right=half_size(pair.right)) for pair in rig.pairs)
     scene = build_scene("calibration", duration_s, 0.0)
     if course is not None:
         scene = replace(scene, motion=Motion(course, duration_s))
@@ -52,19 +53,15 @@ def recorded(folder: Path, duration_s: float, course: Course | None = None, trig
     return write_recording(simulator, folder).path
 
 
+def misplacement(degrees: float, metres: float) -> Float:
+    """An error (4, 4) of ``body_T_cam``, from the left."""
+    turn, shift = np.deg2rad(degrees) * np.array([0.6, -0.64, 0.48]), metres * np.array([0.48, 0.6, 0.64])
+    return se3_exp(np.concatenate([turn, shift]))
+
+
 def with_wrong_place(rig: Rig, degrees: float, metres: float) -> Rig:
     """The rig with a second pair that is elsewhere."""
-    error = se3_exp(
-        np.concatenate([np.deg2rad(degrees) * np.array([0.6, -0.64, 0.48]), metres * np.array([0.48, 0.6, 0.64])])
-    )
+    error = misplacement(degrees, metres)
     other = rig.pairs[1]
     left, right = (replace(each, body_T_cam=error @ each.body_T_cam) for each in (other.left, other.right))
     return replace(rig, pairs=(rig.pairs[0], replace(other, left=left, right=right)))
-
-
-def _half_size(camera: Camera) -> Camera:
-    """The camera with pixels of twice the side: pixel (0, 0) is the centre of one."""
-    fx, fy, cx, cy = camera.intrinsics
-    width, height = camera.size_px
-    smaller = np.array([fx / 2, fy / 2, (cx - 0.5) / 2, (cy - 0.5) / 2])
-    return replace(camera, intrinsics=smaller, size_px=(width // 2, height // 2))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -41,6 +42,14 @@ def small_rig(pairs: int = 2, imu: bool = True) -> Rig:
             )
         made.append(StereoPair(f"pair{number}", *cameras))
     return Rig(tuple(made), Imu() if imu else None, "small")
+
+
+def half_size(camera: Camera) -> Camera:
+    """The camera with pixels of twice the side: pixel (0, 0) is the centre of one."""
+    fx, fy, cx, cy = camera.intrinsics
+    width, height = camera.size_px
+    smaller = np.array([fx / 2, fy / 2, (cx - 0.5) / 2, (cy - 0.5) / 2])
+    return replace(camera, intrinsics=smaller, size_px=(width // 2, height // 2))
 
 
 def frame_stamps(frames: int) -> list[int]:

@@ -176,7 +176,7 @@ def test_what_a_bag_does_not_tell_is_asked_for(recording: Path, tmp_path: Path) 
     with pytest.raises(RigError, match="no transform leads from the IMU"):
         open_source(bag("db3", without_places, tmp_path / "one"))
     without_infos = [message for message in made if "camera_info" not in message[0]]
-    with pytest.raises(RigError, match="carries no rig"):
+    with pytest.raises(RigError, match="carries no calibration"):
         open_source(bag("db3", without_infos, tmp_path / "two"))
 
 

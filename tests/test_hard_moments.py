@@ -9,6 +9,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import pytest
+from calibration_walks import misplacement, with_wrong_place
 
 from graphvio import Config, Estimate, FrameSet, Odometry, Status, open_source
 from graphvio.arrays import Float, Image
@@ -16,7 +17,7 @@ from graphvio.evaluation.measures import umeyama_se3
 from graphvio.events import Event, Incident, Quality
 from graphvio.frontend.matching import StereoMatcher, StereoMatches
 from graphvio.frontend.motion import RelativeMotion, VisualResult
-from graphvio.geometry import se3_exp, se3_inverse, se3_log
+from graphvio.geometry import se3_inverse, se3_log
 from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
 
@@ -179,13 +180,8 @@ def test_an_error_of_p12_is_told_and_corrected(room_walk: Path, events: list[Eve
     The ATE of so short a walk, half a millimetre, is partly luck: it stays below a multiple of the better pair's.
     """
     rig = open_source(room_walk).rig.without_imu()
-    error = se3_exp(
-        np.concatenate([np.deg2rad(1.0) * np.array([0.6, -0.64, 0.48]), 0.03 * np.array([0.48, 0.6, 0.64])])
-    )
-    back = rig.pairs[1]
-    moved = [replace(camera, body_T_cam=error @ camera.body_T_cam) for camera in (back.left, back.right)]
-    wrong = replace(rig, pairs=(rig.pairs[0], replace(back, left=moved[0], right=moved[1])))
-    walk = Walk(room_walk, events, as_it_is, rig=wrong)
+    error = misplacement(1.0, 0.03)
+    walk = Walk(room_walk, events, as_it_is, rig=with_wrong_place(rig, 1.0, 0.03))
     told = [incident for incident in walk.incidents if incident.kind == "extrinsics_off"]
     assert len(told) == 1
     assert "pair back" in told[0].detail

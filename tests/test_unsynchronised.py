@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from recordings import START_NS, frame_stamps, small_rig, write_euroc, write_rows
+from recordings import START_NS, frame_stamps, half_size, small_rig, write_euroc, write_rows
 
 from graphvio import Estimate, FrameSet, ImuSample, Odometry, Status, open_source
 from graphvio.config import Config
 from graphvio.errors import SourceError
 from graphvio.evaluation import evaluate
 from graphvio.events import Event
-from graphvio.rig import Camera, Rig
+from graphvio.rig import Rig
 from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
 from graphvio.sources.matching import TOLERANCE_NS, PairIndex, group_pairs, match_sides
 from graphvio.sources.sequencer import merge
@@ -30,14 +30,6 @@ pytestmark = pytest.mark.xdist_group("unsynchronised")
 MS = 1_000_000
 DURATION_S = 3.0
 CONFIG = Config()
-
-
-def half_size(camera: Camera) -> Camera:
-    """The camera with pixels of twice the side: pixel (0, 0) is the centre of one."""
-    fx, fy, cx, cy = camera.intrinsics
-    width, height = camera.size_px
-    smaller = np.array([fx / 2, fy / 2, (cx - 0.5) / 2, (cy - 0.5) / 2])
-    return replace(camera, intrinsics=smaller, size_px=(width // 2, height // 2))
 
 
 def small_simulator(

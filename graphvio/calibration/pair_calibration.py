@@ -33,41 +33,55 @@ class PairCalibration:
     """Where the second of two pairs is, and how that was found.
 
     Attributes:
-        left2_T_left1: (4, 4), the paper's P_12, by the graph.
-        covariance: (6, 6) of it, tangent ``[rotation, translation]`` in left1; very large where the motions do not
-            tell, see `observability`.
+        solution: the graph's, with what the motions tell.
         pairs: N pose pairs that it was found from.
-        inlier: (N,) those that are no outliers.
-        squares: (N,) squared Mahalanobis distances of their errors, 6 degrees of freedom each.
         frames: M pose pairs from each instant to the next, as the paper's.
         paper_left2_T_left1: (4, 4) by the paper's method.
         comparison: of both methods.
-        observability: what the motions tell.
         dispersion: by how much the solution's covariance exceeds what the motions' covariances make of it.
         scale: whether both measure the same lengths.
         scale_estimated: whether lengths of the second were put right by it.
         further: unknowns besides, or None.
-        solution: the graph's.
         floor: (6, 6) what no recording tells, however long, which is in `covariance`.
         seed: of the random triples, and of the bootstrap.
     """
 
-    left2_T_left1: Float
-    covariance: Float
+    solution: GraphSolution
     pairs: PosePairs
-    inlier: Bool
-    squares: Float
     frames: PosePairs
     paper_left2_T_left1: Float
     comparison: Comparison
-    observability: Observability
     dispersion: float
     scale: ScaleCheck
     scale_estimated: bool
     further: Further | None
-    solution: GraphSolution
     floor: Float
     seed: int
+
+    @property
+    def left2_T_left1(self) -> Float:
+        """(4, 4), the paper's P_12, by the graph."""
+        return self.solution.left2_T_left1
+
+    @property
+    def covariance(self) -> Float:
+        """(6, 6) of it, tangent ``[rotation, translation]`` in left1; very large where the motions do not tell."""
+        return self.dispersion * self.solution.covariance + self.floor
+
+    @property
+    def inlier(self) -> Bool:
+        """(N,) pose pairs that are no outliers."""
+        return self.solution.inlier
+
+    @property
+    def squares(self) -> Float:
+        """(N,) squared Mahalanobis distances of their errors, 6 degrees of freedom each."""
+        return self.solution.squares
+
+    @property
+    def observability(self) -> Observability:
+        """What the motions tell."""
+        return self.solution.observability
 
     @cached_property
     def halves(self) -> Halves | None:
@@ -179,20 +193,15 @@ def calibrate_pair(
     floor = allowance(found.left2_T_left1, seen_from)
     frames = stretches.pairs.chosen(stretches.last - stretches.first == 1)
     return PairCalibration(
-        left2_T_left1=found.left2_T_left1,
-        covariance=factor * found.covariance + floor,
+        solution=found,
         pairs=pairs,
-        inlier=found.inlier,
-        squares=found.squares,
         frames=scale.rescaled(frames, checked.log_ratio) if estimate_scale else frames,
         paper_left2_T_left1=paper.left2_T_left1,
         comparison=compare(pairs, paper, found, factor),
-        observability=found.observability,
         dispersion=factor,
         scale=checked,
         scale_estimated=estimate_scale,
         further=with_scale,
-        solution=found,
         floor=floor,
         seed=seed,
     )

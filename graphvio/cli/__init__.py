@@ -7,11 +7,11 @@ import typer
 
 from graphvio.cli.calibrate import calibrate, calibrate_trajectories
 from graphvio.cli.compare import compare
-from graphvio.cli.convert import convert, info
 from graphvio.cli.doctor import doctor
 from graphvio.cli.dump_config import dump_config
 from graphvio.cli.evaluate import evaluate
-from graphvio.cli.record import record
+from graphvio.cli.info import info
+from graphvio.cli.record import convert, record
 from graphvio.cli.run import EXIT_INTERRUPTED, run
 from graphvio.cli.simulate import simulate
 from graphvio.cli.view import view

@@ -49,6 +49,7 @@ class SessionWriter:
 
     Attributes:
         stopped: why nothing is recorded any more, or None.
+        poses: that were recorded.
 
     Raises:
         SessionError: if the file exists or cannot be made.
@@ -58,6 +59,7 @@ class SessionWriter:
     def __init__(self, path: Path, rig: Rig, image_format: ImageFormat = "raw") -> None:
         self.path = path
         self.stopped: str | None = None
+        self.poses = 0
         self._rig = rig
         self._format: ImageFormat = image_format
         self._channels: dict[str, tuple[int, int]] = {}  # topic -> channel, messages so far
@@ -91,8 +93,9 @@ class SessionWriter:
 
     def add_estimate(self, estimate: Estimate) -> None:
         """Record an estimate, if it has a pose."""
-        if estimate.nav_T_body is not None:
+        if estimate.nav_T_body is not None and self.stopped is None:
             self._guarded(lambda: self._add(ODOMETRY_TOPIC, estimate.stamp_ns, messages.odometry(estimate)))
+            self.poses += 1
 
     def add_incident(self, incident: Incident) -> None:
         """Record an incident."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 
 from graphvio.errors import RigError, SourceError
 from graphvio.rig import Rig
 from graphvio.rig_files import find_rig
-from graphvio.sources import euroc, kitti_odometry, kitti_raw
+from graphvio.sources import euroc, kitti_odometry, kitti_raw, session
 from graphvio.sources.base import Source
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.matching import TOLERANCE_NS
@@ -17,7 +18,7 @@ from graphvio.sources.recording import Recording
 
 __all__ = ["FaultLog", "Source", "open_source"]
 
-_FORMATS = (euroc, kitti_odometry, kitti_raw)
+_FORMATS: tuple[ModuleType, ...] = (euroc, kitti_odometry, kitti_raw)
 _MAX_TOLERANCE_MS = 10.0
 
 
@@ -33,7 +34,7 @@ def open_source(
     """Open a recording, whatever its layout.
 
     Args:
-        path: folder of the recording, or file of a session.
+        path: folder of the recording, or file of a session or bag.
         rig: decides which pairs are read, and whether the IMU is; None takes the recording's own.
         from_s: where to begin, seconds after the recording's first frameset.
         to_s: where to end (inclusive), on the same scale.
@@ -58,52 +59,51 @@ def open_source(
         raise SourceError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
 
 
-def _open_session(
-    file: Path,
-    rig: Rig | None,
-    from_s: float | None,
-    to_s: float | None,
-    tolerance_ns: int,
-    topics: Mapping[str, str],
-) -> Recording:
-    from graphvio.sources import session
-
-    if not session.matches(file):
-        raise SourceError(f"{file}: is no recording that graphvio knows; {session.LAYOUT}, or a folder ({_known()})")
-    if rig is None:
-        rig = session.read_rig(file)
-    if rig is None:
-        raise RigError(f"{file}: carries no rig; give one of your own")
-    faults = FaultLog(file.stem)
-    return Recording(session.read_index(file, rig, faults, topics), rig, faults, from_s, to_s, tolerance_ns)
-
-
 def _open(
-    folder: Path,
+    path: Path,
     rig: Rig | None,
     from_s: float | None,
     to_s: float | None,
     tolerance_ns: int,
     topics: Mapping[str, str],
 ) -> Recording:
-    if not folder.exists():
-        raise SourceError(f"{folder}: does not exist; give the folder of a recording")
-    if not folder.is_dir() or (folder / "metadata.yaml").is_file():
-        return _open_session(folder, rig, from_s, to_s, tolerance_ns, topics)
-    if topics:
-        raise SourceError(f"{folder}: has no topics to be mapped; that is for sessions and bags")
-    if next(folder.iterdir(), None) is None:
-        raise SourceError(f"{folder}: is empty; looked for {_known()}")
-    layout = next((known for known in _FORMATS if known.matches(folder)), None)
+    if not path.exists():
+        raise SourceError(f"{path}: does not exist; give the folder of a recording")
+    resolved = path.resolve()
+    faults = FaultLog(resolved.parent.name if resolved.name == "mav0" else _name_of(resolved))
+    if session.matches(path):
+        store = session.open_store(path)
+        rig = _required(rig if rig is not None else session.rig_in(store), path)
+        index = session.read_index(store, rig, faults, topics)
+    else:
+        layout = _layout_of(path)
+        if topics:
+            raise SourceError(f"{path}: has no topics to be mapped; that is for sessions and bags")
+        rig = _required(rig if rig is not None else find_rig(path), path)
+        index = layout.read_index(path, rig, faults)
+    return Recording(index, rig, faults, from_s, to_s, tolerance_ns)
+
+
+def _name_of(path: Path) -> str:
+    return path.name if path.is_dir() else path.stem
+
+
+def _layout_of(path: Path) -> ModuleType:
+    """The module that reads a folder."""
+    if not path.is_dir():
+        raise SourceError(f"{path}: is no recording that graphvio knows; {session.LAYOUT}, or a folder ({_known()})")
+    if next(path.iterdir(), None) is None:
+        raise SourceError(f"{path}: is empty; looked for {_known()}")
+    layout = next((known for known in _FORMATS if known.matches(path)), None)
     if layout is None:
-        raise SourceError(f"{folder}: has none of the known layouts; looked for {_known()}")
+        raise SourceError(f"{path}: has none of the known layouts; looked for {_known()}")
+    return layout
+
+
+def _required(rig: Rig | None, path: Path) -> Rig:
     if rig is None:
-        rig = find_rig(folder)
-    if rig is None:
-        raise RigError(f"{folder}: carries no calibration; write a rig.yaml into it, or give a rig of your own")
-    resolved = folder.resolve()
-    faults = FaultLog(resolved.parent.name if resolved.name == "mav0" else resolved.name)
-    return Recording(layout.read_index(folder, rig, faults), rig, faults, from_s, to_s, tolerance_ns)
+        raise RigError(f"{path}: carries no calibration; write a rig.yaml into it, or give a rig of your own")
+    return rig
 
 
 def _known() -> str:

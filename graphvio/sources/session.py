@@ -41,39 +41,35 @@ def open_store(path: Path) -> McapFile | BagFile:
     return McapFile(path) if path.is_file() and path.suffix == ".mcap" else BagFile(path)
 
 
-def read_rig(path: Path) -> Rig | None:
+def rig_in(file: McapFile | BagFile) -> Rig | None:
     """The rig that a session carries, or that a bag's messages tell; None if there is none.
 
     Raises:
-        SessionError: if the file cannot be read.
         RigError: if its rig describes none that is usable.
     """
-    store = open_store(path)
-    text = store.attachments.get(RIG_ATTACHMENT)
-    return rig_of_topics(store, path.stem) if text is None else parse(text.decode("utf-8"), path)
+    text = file.attachments.get(RIG_ATTACHMENT)
+    return rig_of_topics(file, file.path.stem) if text is None else parse(text.decode("utf-8"), file.path)
 
 
-def read_index(path: Path, rig: Rig, faults: FaultLog, topics: Mapping[str, str] | None = None) -> Index:
+def read_index(file: McapFile | BagFile, rig: Rig, faults: FaultLog, topics: Mapping[str, str]) -> Index:
     """Index the cameras of a rig, and the IMU if it has one.
 
     Args:
-        path: of the session or bag.
+        file: the session or bag.
         rig: whose cameras are looked for.
         faults: goes on to count.
         topics: name of a camera, or ``imu`` -> its topic, where names do not tell.
 
     Raises:
-        SessionError: if the file cannot be read.
         SourceError: if a camera of the rig has no images in it.
     """
-    file = open_store(path)
-    chosen = {name: _named(file, topic) for name, topic in (topics or {}).items()}
+    chosen = {name: _named(file, topic) for name, topic in topics.items()}
     unknown = set(chosen) - {camera.name for camera in rig.cameras} - {_IMU_NAME}
     if unknown:
         names = ", ".join([*(camera.name for camera in rig.cameras), _IMU_NAME])
-        raise SourceError(f"{path}: the rig has no {min(unknown)} to be mapped to a topic; it has {names}")
+        raise SourceError(f"{file.path}: the rig has no {min(unknown)} to be mapped to a topic; it has {names}")
     if not file.is_whole:
-        faults.add("session_cut", 0, f"{path} was not finished: it ends where its recording was cut")
+        faults.add("session_cut", 0, f"{file.path} was not finished: it ends where its recording was cut")
     tracks = {}
     for pair in rig.pairs:
         for side, camera in (("left", pair.left), ("right", pair.right)):
