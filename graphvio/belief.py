@@ -34,12 +34,14 @@ class Belief(ABC):
         epoch: counts declared breaks.
         covariance: of the newest state.
         verdicts: of the tests since the last prediction, by what was measured, see `graphvio.events.Estimate`.
+        starts: counts how often it began, be it anew.
     """
 
     def __init__(self, rig: Rig, config: Config, report: Report, rekey: Callable[[], None]) -> None:
         self.epoch = 0
         self.covariance = StateCovariance(np.zeros((6, 6)))
         self.verdicts: dict[str, Verdict] = {}
+        self.starts = 0
         self._rig = rig
         self._config = config
         self._report = report
@@ -147,6 +149,7 @@ class Belief(ABC):
 
     def _note_start(self, start: Start) -> None:
         """After a start in motion, status is ``initialising`` until the first motions have told what it lacks."""
+        self.starts += 1
         if not start.is_known:
             self._unknown_since_ns, self._is_completed, self._is_told = start.stamp_ns, False, False
 

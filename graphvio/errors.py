@@ -38,3 +38,7 @@ class SessionError(GraphvioError):
 
 class CalibrationError(GraphvioError):
     """Motions from which the cameras' places on the rig cannot be found."""
+
+
+class OptimizationError(GraphvioError):
+    """A session cannot be optimised, or what was kept of it not be read."""

@@ -33,6 +33,7 @@ from graphvio.frontend.visual import VisualFrontend
 from graphvio.rates import AngularRates
 from graphvio.rig import Rig
 from graphvio.smoother_belief import SmootherBelief
+from graphvio.step import Step
 from graphvio.synchroniser import Synchroniser
 
 _NOTABLE_OFFSET_S = 1e-3
@@ -49,10 +50,15 @@ class Odometry:
         rig: cameras and IMU; without an IMU, vision alone is used.
         config: of all stages.
         on_prediction: is called with what is predicted at each sample of the IMU as it comes, within `process`.
+        on_step: is called with what went into each estimate that rests on a start, before it is returned.
     """
 
     def __init__(
-        self, rig: Rig, config: Config | None = None, on_prediction: Callable[[Prediction], None] | None = None
+        self,
+        rig: Rig,
+        config: Config | None = None,
+        on_prediction: Callable[[Prediction], None] | None = None,
+        on_step: Callable[[Step], None] | None = None,
     ) -> None:
         self.rig = rig
         self.config = config or Config()
@@ -62,6 +68,7 @@ class Odometry:
         self._belief: Belief = kind(rig, self.config, self._report, lambda: self._frontend.rekey())
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._on_prediction = on_prediction
+        self._on_step = on_step
         self._time_offset = self._new_time_offset()
         self._told_time_offset = False
         self._told_misaligned: set[int] = set()
@@ -135,7 +142,7 @@ class Odometry:
         stamp_ns = frameset.stamp_ns
         if self._must_wait_for_imu(stamp_ns):
             return self._without_pose(stamp_ns, self._frontend.process(frameset, self._belief.motion_since))
-        starting, span = self._must_start(stamp_ns), None
+        starting, span, starts = self._must_start(stamp_ns), None, self._belief.starts
         if starting:
             self._belief.start(stamp_ns, self._synchroniser.initial_span(stamp_ns))
         else:
@@ -147,8 +154,9 @@ class Odometry:
         if not starting:
             self._tell_of_vision(stamp_ns, visual)
         at_rest = visual.at_rest and self._imu_is_at_rest(span)
-        used = self._belief.use(visual, at_rest) is not None
-        status = self._belief.update(stamp_ns, used or starting, self._frontend.reference_stamps_ns)
+        motion = self._belief.use(visual, at_rest)
+        used = motion is not None or starting
+        status = self._belief.update(stamp_ns, used, self._frontend.reference_stamps_ns)
         self._synchroniser.forget_before(stamp_ns)
         self._predict_from(stamp_ns, status)
         self._correct_time_offset(stamp_ns, visual)
@@ -157,7 +165,21 @@ class Odometry:
             **visual.stage_ms,
             "update": 1e3 * (perf_counter() - measured),
         }
-        return self._assemble(stamp_ns, status, visual, span, at_rest, stage_ms)
+        estimate = self._assemble(stamp_ns, status, visual, span, at_rest, stage_ms)
+        if self._on_step is not None:
+            refused = None if visual.quality is not Quality.GOOD else visual.motion
+            self._on_step(
+                Step(
+                    estimate,
+                    refused if motion is None else motion,
+                    used=motion is not None,
+                    span=span,
+                    started=self._belief.starts != starts,
+                    references=self._frontend.reference_stamps_ns,
+                    frames=self._frontend.reference_frames(stamp_ns),
+                )
+            )
+        return estimate
 
     def _imu_is_at_rest(self, span: ImuSpan | None) -> bool:
         """What the IMU says of a standstill; it does not object where there is none, but where its samples lack."""

@@ -1,0 +1,1 @@
+"""Sessions as a whole: the best trajectory that all of their measurements hold."""

@@ -1,0 +1,259 @@
+"""What the odometry measured in a session, as columns: kept on disk, and optimised as often as one likes."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float, Int
+from graphvio.errors import OptimizationError
+from graphvio.events import Status
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.step import Step
+
+
+class Inertial(NamedTuple):
+    """The IMU in N steps of constant rate and acceleration, by framesets.
+
+    Attributes:
+        begins: (F + 1,) the steps from frameset i - 1 to i are rows ``begins[i]`` to ``begins[i + 1]``.
+        covers: (F,) whether they cover all of that time, and nothing speaks against them.
+        steps_s: (N,) durations.
+        values: (N, 6) angular velocity, rad/s, and specific force, m/s^2, in body.
+    """
+
+    begins: Int
+    covers: Bool
+    steps_s: Float
+    values: Float
+
+
+class Motions(NamedTuple):
+    """M measured motions, in the order of the framesets in which they end.
+
+    Attributes:
+        reference: (M,) row of the frameset that each is measured from.
+        row: (M,) row of the one in which it ends.
+        reference_T_current: (M, 4, 4) of body.
+        covariance: (M, 6, 6) tangent ``[rotation, translation]`` in body at its end.
+        shared_covariance: (M, 6, 6) the part that all motions from one reference have in common, same tangent.
+        inliers: (M,) points that it explains.
+    """
+
+    reference: Int
+    row: Int
+    reference_T_current: Float
+    covariance: Float
+    shared_covariance: Float
+    inliers: Int
+
+    def at(self, k: int, stamps_ns: Int) -> RelativeMotion:
+        """One of them."""
+        return RelativeMotion(
+            int(stamps_ns[self.reference[k]]),
+            int(stamps_ns[self.row[k]]),
+            self.reference_T_current[k],
+            self.covariance[k],
+            self.shared_covariance[k],
+            int(self.inliers[k]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SessionRecord:
+    """A session as the odometry saw it: F framesets that have a pose.
+
+    Attributes:
+        name: of the session.
+        stamps_ns: (F,) increasing.
+        epoch: (F,) poses of different epochs do not share a nav frame.
+        online: (F, 4, 4) ``nav_T_body`` as emitted.
+        smoothed: (F, 4, 4) the same as the smoother left it.
+        covariance: (F, 6, 6) of ``online``, tangent ``[rotation, translation]`` in body.
+        velocity_nav: (F, 3) m/s.
+        gyro_bias: (F, 3) rad/s; zero without an IMU.
+        accel_bias: (F, 3) m/s^2; zero without an IMU.
+        at_rest: (F,) whether images and IMU show no motion.
+        is_keyframe: (F,) whether later motions are measured from it.
+        with_imu: (F,) whether the IMU takes part in the state.
+        motions: of the rig.
+        inertial: the IMU's samples.
+    """
+
+    name: str
+    stamps_ns: Int
+    epoch: Int
+    online: Float
+    smoothed: Float
+    covariance: Float
+    velocity_nav: Float
+    gyro_bias: Float
+    accel_bias: Float
+    at_rest: Bool
+    is_keyframe: Bool
+    with_imu: Bool
+    motions: Motions
+    inertial: Inertial
+
+    def to_bytes(self) -> bytes:
+        """As numpy's archive; equal records give equal bytes."""
+        columns: dict[str, Any] = {"name": np.array(self.name)}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, tuple):
+                columns |= {f"{field.name}.{name}": part for name, part in value._asdict().items()}  # type: ignore[attr-defined]
+            elif field.name != "name":
+                columns[field.name] = value
+        buffer = io.BytesIO()
+        np.savez(buffer, **columns)
+        return buffer.getvalue()
+
+    @staticmethod
+    def load(path: Path) -> SessionRecord:
+        """Read what `to_bytes` gave.
+
+        Raises:
+            OptimizationError: if it cannot be read.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                columns = {name: file[name] for name in file.files}
+            groups = {
+                kind: cls(*(columns.pop(f"{kind}.{name}") for name in cls._fields))
+                for kind, cls in (("motions", Motions), ("inertial", Inertial))
+            }
+            return SessionRecord(**(columns | groups | {"name": str(columns["name"])}))
+        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+            raise OptimizationError(f"{path}: is no record of a session ({error}); remove it to have it made anew") from None
+
+
+class Recorder:
+    """Collects the odometry's steps; its `add` is what `graphvio.Odometry` calls as ``on_step``."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._steps: list[_Row] = []
+        self._motions: list[RelativeMotion] = []
+        self._refused: list[RelativeMotion] = []  # since vision was last used
+        self._references: set[int] = set()
+        self._since: list[tuple[Float, Float]] = []  # the IMU since the last step with a pose
+        self._is_covered = True
+        self._distrusted_from: int | None = None
+        self._used_at = 0  # row of the last step that vision constrains
+
+    def add(self, step: Step) -> None:
+        """Take a step."""
+        estimate, motion = step.estimate, step.motion
+        self._collect_inertial(step)
+        self._references |= step.references
+        if motion is not None and not step.used:
+            self._refused.append(motion)
+        if estimate.nav_T_body is None or estimate.covariance is None or estimate.status is Status.LOST:
+            return
+        if step.started and motion is not None and step.used and self._steps:
+            # Vision is believed against the prediction: so is what it said before, and the IMU since then is not.
+            self._motions += [each for each in self._refused if each is not motion]
+            if estimate.epoch == self._steps[-1].estimate.epoch:
+                for row in self._steps[self._used_at + 1 :]:
+                    row.covers = False
+                self._is_covered = False
+        if motion is not None and step.used:
+            self._motions.append(motion)
+        spans = self._since
+        self._steps.append(
+            _Row(
+                step.estimate,
+                np.concatenate([np.zeros(0), *(each[0] for each in spans)]),
+                np.concatenate([np.zeros((0, 6)), *(each[1] for each in spans)]),
+                self._is_covered and step.span is not None,
+            )
+        )
+        self._since, self._is_covered = [], True
+        if step.used or step.started:
+            self._refused.clear()
+            self._used_at = len(self._steps) - 1
+
+    def finish(self, smoothed: Iterable[tuple[int, Float]]) -> SessionRecord:
+        """The record.
+
+        Args:
+            smoothed: stamps and poses ``nav_T_body`` (4, 4) as the smoother left them, of any framesets.
+
+        Raises:
+            OptimizationError: if no frameset has a pose.
+        """
+        rows = self._steps
+        if not rows:
+            raise OptimizationError(f"{self._name}: the odometry found no pose; graphvio run tells why")
+        estimates = [row.estimate for row in rows]
+        stamps = np.array([each.stamp_ns for each in estimates], dtype=np.int64)
+        row_of = {int(stamp): k for k, stamp in enumerate(stamps)}
+        online = np.array([each.nav_T_body for each in estimates])
+        final = online.copy()
+        for stamp, pose in smoothed:
+            if stamp in row_of:
+                final[row_of[stamp]] = pose
+        return SessionRecord(
+            name=self._name,
+            stamps_ns=stamps,
+            epoch=np.array([each.epoch for each in estimates], dtype=np.int64),
+            online=online,
+            smoothed=final,
+            covariance=np.array([each.covariance for each in estimates]),
+            velocity_nav=np.array([_or_zero(each.velocity_nav) for each in estimates]),
+            gyro_bias=np.array([_or_zero(each.gyro_bias) for each in estimates]),
+            accel_bias=np.array([_or_zero(each.accel_bias) for each in estimates]),
+            at_rest=np.array([each.at_rest for each in estimates]),
+            is_keyframe=np.isin(stamps, sorted(self._references)),
+            with_imu=np.array([each.gyro_bias is not None for each in estimates]),
+            motions=self._joined(row_of),
+            inertial=_joined_inertial(rows),
+        )
+
+    def _collect_inertial(self, step: Step) -> None:
+        if step.span is None:
+            self._is_covered = False
+            return
+        span = step.span
+        self._since.append((span.steps_s, np.hstack([span.angular_velocity, span.linear_acceleration])))
+
+    def _joined(self, row_of: dict[int, int]) -> Motions:
+        kept = [each for each in self._motions if each.stamp_ns in row_of and each.reference_stamp_ns in row_of]
+        kept.sort(key=lambda each: (each.stamp_ns, each.reference_stamp_ns))
+        shape = (len(kept), 6, 6)
+        return Motions(
+            np.array([row_of[each.reference_stamp_ns] for each in kept], dtype=np.int64),
+            np.array([row_of[each.stamp_ns] for each in kept], dtype=np.int64),
+            np.array([each.reference_T_current for each in kept]).reshape(-1, 4, 4),
+            np.array([each.covariance for each in kept]).reshape(shape),
+            np.array([each.shared_covariance for each in kept]).reshape(shape),
+            np.array([each.inliers for each in kept], dtype=np.int64),
+        )
+
+
+@dataclass(eq=False)
+class _Row:
+    estimate: Any
+    steps_s: Float
+    values: Float
+    covers: bool
+
+
+def _or_zero(value: Float | None) -> Float:
+    return np.zeros(3) if value is None else value
+
+
+def _joined_inertial(rows: list[_Row]) -> Inertial:
+    counts = [len(row.steps_s) for row in rows]
+    return Inertial(
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        np.array([row.covers for row in rows]),
+        np.concatenate([row.steps_s for row in rows]),
+        np.concatenate([row.values for row in rows]),
+    )

@@ -1,0 +1,34 @@
+"""One step of the odometry with all that went into it: what an optimisation of the whole session starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from graphvio.backend.inertial import ImuSpan
+from graphvio.events import Estimate
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.frontend.tracks import PairFrame
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What the odometry measured at a frameset, and what it made of that.
+
+    Attributes:
+        estimate: as emitted.
+        motion: by which vision constrains the state; where the gate refused, what it refused; or None.
+        used: whether the motion was let in.
+        span: the IMU since the step before, or None.
+        started: whether the estimation began here, be it anew: what is known of the time before then does not count.
+        references: stamps of the framesets that later motions are measured from.
+        frames: pair index -> its tracks, for those pairs that later motions are measured from at this very frameset.
+    """
+
+    estimate: Estimate
+    motion: RelativeMotion | None
+    used: bool
+    span: ImuSpan | None
+    started: bool
+    references: frozenset[int]
+    frames: Mapping[int, PairFrame]
