@@ -205,6 +205,29 @@ class TimingConfig(Stage):
 
 
 @dataclass(frozen=True)
+class OptimizationConfig(Stage):
+    """Sessions as a whole, afterwards: states, places and loop closures."""
+
+    keyframe_interval_s: float = 0.2
+    """Longest time between two states of the graph; all keyframes are states."""
+    place_distance_m: float = 0.4
+    """Keyframes so far from the place before are places, which are looked at for loop closures,"""
+    place_angle_deg: float = 15.0
+    """or turned by so much."""
+    features: int = 1000
+    """SIFT features of a place's left image, the largest ones."""
+    loop_interval_s: float = 10.0
+    """Places of one session that are nearer in time are not compared."""
+    loop_candidates: int = 3
+    """Places that each is compared with: those that look most alike."""
+    loop_min_inliers: int = 30
+    """Points that a loop closure must explain."""
+    loop_probability: float = 0.99
+    """A loop closure is refused where what it says and what all others say lies outside this share of the chi-square
+    distribution."""
+
+
+@dataclass(frozen=True)
 class Config:
     """All stages."""
 
@@ -217,6 +240,7 @@ class Config:
     smoother: SmootherConfig = field(default_factory=SmootherConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)
     timing: TimingConfig = field(default_factory=TimingConfig)
+    optimization: OptimizationConfig = field(default_factory=OptimizationConfig)
 
     def __post_init__(self) -> None:
         """Refuse stages that do not fit together.

@@ -13,6 +13,7 @@ from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.events import Estimate, Event, FrameSet, Status
 from graphvio.odometry import Odometry
+from graphvio.optimization.record import Recorder
 from graphvio.results import ResultWriter, Summary
 from graphvio.sources import Source
 from graphvio.viewer import Viewer
@@ -51,6 +52,7 @@ def run(
     *,
     viewer: Viewer | None = None,
     on_progress: Callable[[Progress], None] | None = None,
+    recorder: Recorder | None = None,
 ) -> Summary:
     """Run the odometry over a source and write the results.
 
@@ -60,11 +62,13 @@ def run(
         writer: of the results.
         viewer: shows or saves what happens, or None.
         on_progress: called after each frameset.
+        recorder: takes all that an optimisation of the session needs, or None.
 
     Raises:
         GraphvioError: if the source cannot be read or the folder not written.
     """
-    return _Run(source, Odometry(source.rig, config), writer, viewer, on_progress).go()
+    odometry = Odometry(source.rig, config, on_step=None if recorder is None else recorder.add)
+    return _Run(source, odometry, writer, viewer, on_progress, recorder).go()
 
 
 class _Run:
@@ -75,12 +79,14 @@ class _Run:
         writer: ResultWriter,
         viewer: Viewer | None,
         on_progress: Callable[[Progress], None] | None,
+        recorder: Recorder | None,
     ) -> None:
         self._source = source
         self._odometry = odometry
         self._writer = writer
         self._viewer = viewer
         self._on_progress = on_progress
+        self._recorder = recorder
         self._waiting: OrderedDict[int, FrameSet] = OrderedDict()  # for the viewer, until they are estimated
         self._smoothed: list[tuple[int, Float]] = []
         self._frameset_ms: list[float] = []
@@ -151,7 +157,10 @@ class _Run:
             )
 
     def _collect(self) -> None:
-        self._smoothed += self._odometry.take_smoothed()
+        final = self._odometry.take_smoothed()
+        self._smoothed += final
+        if self._recorder is not None:
+            self._recorder.add_smoothed(final)
         for incident in self._odometry.take_incidents():
             self._resets += incident.kind in RESETS
             self._writer.add_incident(incident)

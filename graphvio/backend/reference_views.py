@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import gtsam
 import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.factors import r, x
 from graphvio.backend.noise import gaussian, own_covariance
-from graphvio.backend.window import Window
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_adjoint, se3_inverse
+
+
+class Holder(Protocol):
+    """What holds factors and values: a window, or the graph of a whole session."""
+
+    values: gtsam.Values
+
+    def add(self, factor: gtsam.NonlinearFactor) -> None:
+        """Insert a factor."""
 
 
 class ReferenceViews:
@@ -24,7 +34,7 @@ class ReferenceViews:
         self._shared: dict[int, Float] = {}  # state -> covariance (6, 6) of its view about its pose, in body there
         self._own: tuple[RelativeMotion, Float] | None = None  # of the motion asked for last
 
-    def add(self, k: int, motion: RelativeMotion, window: Window) -> None:
+    def add(self, k: int, motion: RelativeMotion, window: Holder) -> None:
         """Give a motion's reference, state k, an unknown of its own, if it needs one and has none."""
         if k in self._shared or not motion.shared_covariance.any():
             return

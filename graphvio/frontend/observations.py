@@ -7,7 +7,7 @@ frame from the reference instant to the current one. Pair j's own motion, the pa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ class RigArrays(NamedTuple):
 
     Attributes:
         cam_T_body: (P, 2, 4, 4).
-        body_T_left: (P, 4, 4).
+        body_T_left: (P, 4, 4) of the left camera whose points are seen: where one pair sees another's, not its own.
         focal_px: (P, 2), what a normalised image unit is worth.
     """
 
@@ -40,6 +40,11 @@ class RigArrays(NamedTuple):
             np.array([pair.left.body_T_cam for pair in rig.pairs]),
             np.array([[pair.left.focal_px, pair.right.focal_px] for pair in rig.pairs]),
         )
+
+    def crossed(self, pairs: Sequence[tuple[int, int]]) -> RigArrays:
+        """A rig of (a, b): what was a point in pair a's left camera is seen by pair b's cameras now."""
+        of, by = [a for a, _ in pairs], [b for _, b in pairs]
+        return RigArrays(self.cam_T_body[by], self.body_T_left[of], self.focal_px[by])
 
     def corrected(self, nominal: RigArrays, pair: int, correction: Float) -> RigArrays:
         """The same, one pair's cameras moved: its ``body_T_left`` is ``correction`` (4, 4) times the nominal one."""

@@ -133,8 +133,7 @@ def _resect_triples(
         rows = np.flatnonzero(usable & (observations.pair == j))
         if len(rows) < 3:
             continue
-        body_T_left = rig.body_T_left[j]
-        left_T_body = se3_inverse(body_T_left)
+        left_ref_T_body, body_T_left = se3_inverse(rig.body_T_left[j]), se3_inverse(rig.cam_T_body[j, 0])
         right_T_left = se3_compose(rig.cam_T_body[j, 1], body_T_left)
         for h in range(count):
             for k in range(3):
@@ -143,7 +142,7 @@ def _resect_triples(
                 continue
             left_cur_T_ref, solved = _resect_triple(triple, observations, right_T_left, rig.focal_px[j, 1])
             if solved:
-                motions[found] = se3_compose(se3_compose(body_T_left, left_cur_T_ref), left_T_body)
+                motions[found] = se3_compose(se3_compose(body_T_left, left_cur_T_ref), left_ref_T_body)
                 sources[found] = j
                 found += 1
     return motions[:found], sources[:found]

@@ -130,7 +130,7 @@ class SessionRecord:
             }
             return SessionRecord(**(columns | groups | {"name": str(columns["name"])}))
         except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-            raise OptimizationError(f"{path}: is no record of a session ({error}); remove it to have it made anew") from None
+            raise OptimizationError(f"{path}: is no record of a session ({error}); remove it") from None
 
 
 class Recorder:
@@ -144,7 +144,7 @@ class Recorder:
         self._references: set[int] = set()
         self._since: list[tuple[Float, Float]] = []  # the IMU since the last step with a pose
         self._is_covered = True
-        self._distrusted_from: int | None = None
+        self._smoothed: dict[int, Float] = {}
         self._used_at = 0  # row of the last step that vision constrains
 
     def add(self, step: Step) -> None:
@@ -179,11 +179,12 @@ class Recorder:
             self._refused.clear()
             self._used_at = len(self._steps) - 1
 
-    def finish(self, smoothed: Iterable[tuple[int, Float]]) -> SessionRecord:
-        """The record.
+    def add_smoothed(self, poses: Iterable[tuple[int, Float]]) -> None:
+        """Take stamps and poses ``nav_T_body`` (4, 4) as the smoother left them."""
+        self._smoothed.update(poses)
 
-        Args:
-            smoothed: stamps and poses ``nav_T_body`` (4, 4) as the smoother left them, of any framesets.
+    def record(self) -> SessionRecord:
+        """All that was taken.
 
         Raises:
             OptimizationError: if no frameset has a pose.
@@ -195,10 +196,7 @@ class Recorder:
         stamps = np.array([each.stamp_ns for each in estimates], dtype=np.int64)
         row_of = {int(stamp): k for k, stamp in enumerate(stamps)}
         online = np.array([each.nav_T_body for each in estimates])
-        final = online.copy()
-        for stamp, pose in smoothed:
-            if stamp in row_of:
-                final[row_of[stamp]] = pose
+        final = np.array([self._smoothed.get(each.stamp_ns, each.nav_T_body) for each in estimates])
         return SessionRecord(
             name=self._name,
             stamps_ns=stamps,

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from graphvio.events import Event
+from graphvio.events import Event, FrameSet
 from graphvio.rig import Rig
 from graphvio.sources.faults import FaultLog
 
@@ -45,6 +45,13 @@ class Source(Protocol):
     @property
     def decode_ms(self) -> Sequence[float]:
         """Time that the decoding of each frameset took in its thread, milliseconds."""
+
+    def frameset_at(self, stamp_ns: int) -> FrameSet:
+        """One frameset, out of order: the images of it that are usable; from any thread.
+
+        Raises:
+            SourceError: if there is none of this stamp.
+        """
 
     def __iter__(self) -> Iterator[Event]:
         """IMU samples and framesets: the sample that covers a frameset's instant comes before it.

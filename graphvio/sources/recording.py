@@ -158,6 +158,24 @@ class Recording:
         with closing(self._read_framesets()) as framesets:
             yield from merge(self._read_imu(), framesets, offset_ns)
 
+    def frameset_at(self, stamp_ns: int) -> FrameSet:
+        """One frameset, out of order: the images of it that are usable; from any thread.
+
+        Raises:
+            SourceError: if there is none of this stamp.
+        """
+        at = int(np.searchsorted(self._framesets.stamps_ns, stamp_ns))
+        if at == self.frameset_count or self._framesets.stamps_ns[at] != stamp_ns:
+            raise SourceError(f"{self.name}: has no frameset at {stamp_ns}; is it the recording that it was?")
+        item = self._decode(at)
+        sizes = {j: (pair.left.size_px, pair.right.size_px) for j, pair in enumerate(self.rig.pairs)}
+        fits = {
+            j: images
+            for j, images in item.images.items()
+            if all(image.shape[::-1] == size for image, size in zip(images, sizes[j], strict=True))
+        }
+        return FrameSet(stamp_ns, fits)
+
     def _read_imu(self) -> Iterator[ImuSample]:
         if self._imu is None:
             return

@@ -1,0 +1,184 @@
+"""Which loop closures to believe: those that agree with the odometry and with each other.
+
+Fragments, which are the epochs of the sessions, are first joined by the transforms on which most closures between them
+agree. Closures are then weighed by graduated non-convexity (H. Yang, P. Antonante, V. Tzoumas, L. Carlone, RA-L 2020),
+in a graph that holds their ends only: the odometry between two ends is one factor, with the covariance that the full
+graph has for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+
+from graphvio.arrays import Bool, Float, Int
+from graphvio.backend.factors import x
+from graphvio.backend.gating import chi_square_quantile, relative_covariance
+from graphvio.backend.noise import isotropic
+from graphvio.geometry import se3_inverse, se3_log
+from graphvio.optimization.graph import Tie
+
+_AGREE_M = 0.5
+_AGREE_RAD = 0.1
+_LEAST_VOTES = 2
+_FRAME_SIGMA = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """Fragments in common frames.
+
+    Attributes:
+        frames: of each fragment, ``frame_T_nav`` (4, 4).
+        component: of each fragment, the fragment whose nav frame it is in.
+    """
+
+    frames: list[Float]
+    component: list[int]
+
+
+def join_fragments(fragments: Sequence[range], poses: Float, ties: Sequence[Tie]) -> Joined:
+    """Bring fragments that closures tie into the frame of the first of them.
+
+    Args:
+        fragments: states of each, which share a nav frame.
+        poses: (N, 4, 4) of all states, in their fragments' frames.
+        ties: closures, right and wrong ones.
+    """
+    of = np.empty(len(poses), dtype=np.int64)
+    for number, states in enumerate(fragments):
+        of[states.start : states.stop] = number
+    frames = [np.eye(4) for _ in fragments]
+    component = list(range(len(fragments)))
+    between = [(int(of[tie.first]), int(of[tie.second]), tie) for tie in ties if of[tie.first] != of[tie.second]]
+    while True:
+        offers: dict[tuple[int, int], list[Float]] = {}
+        for one, other, tie in between:
+            a, c = component[one], component[other]
+            if a == c:
+                continue
+            a_T_c = frames[one] @ poses[tie.first] @ tie.first_T_second @ se3_inverse(frames[other] @ poses[tie.second])
+            if a < c:
+                offers.setdefault((a, c), []).append(a_T_c)
+            else:
+                offers.setdefault((c, a), []).append(se3_inverse(a_T_c))
+        best = max(
+            ((*_most_voted(transforms), pair) for pair, transforms in offers.items()),
+            key=lambda each: (each[0], (-each[2][0], -each[2][1])),
+            default=None,
+        )
+        if best is None or best[0] < _LEAST_VOTES:
+            return Joined(frames, component)
+        _, a_T_c, (a, c) = best
+        for number in range(len(fragments)):
+            if component[number] == c:
+                frames[number], component[number] = a_T_c @ frames[number], a
+
+
+def consistent(
+    poses: Float, component: Sequence[int], ties: Sequence[Tie], odometry: Sequence[Tie], probability: float
+) -> Bool:
+    """Which closures (L,) agree with the odometry and with each other.
+
+    Args:
+        poses: (N, 4, 4) of all states, in common frames.
+        component: of each state; closures between different ones are left out.
+        ties: L closures.
+        odometry: between the states that are ends of closures, each fragment's in a chain.
+        probability: a closure beyond this share of the chi-square distribution is refused.
+    """
+    kept = np.array([component[tie.first] == component[tie.second] for tie in ties], dtype=bool)
+    asked = np.flatnonzero(kept)
+    if not len(asked):
+        return kept
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    ends = sorted({end for k in asked.tolist() for end in (ties[k].first, ties[k].second)})
+    seen: set[int] = set()
+    for end in ends:
+        values.insert(x(end), gtsam.Pose3(poses[end]))
+        if component[end] not in seen:
+            seen.add(component[end])
+            graph.add(gtsam.PriorFactorPose3(x(end), gtsam.Pose3(poses[end]), isotropic(6, _FRAME_SIGMA)))
+    for tie in odometry:
+        graph.add(tie.factor())
+    asked = _within_odometry(graph, values, ties, asked, probability)
+    kept[:] = False
+    if not len(asked):
+        return kept
+    known = list(range(graph.size()))
+    for k in asked.tolist():
+        graph.add(ties[k].factor())
+    params = gtsam.GncLMParams()
+    params.setKnownInliers(known)
+    params.setLossType(gtsam.GncLossType.TLS)
+    optimizer = gtsam.GncLMOptimizer(graph, values, params)
+    optimizer.setInlierCostThresholdsAtProbability(probability)
+    solution = optimizer.optimize()
+    limit = chi_square_quantile(probability, 6)
+    for place, k in enumerate(asked.tolist(), start=len(known)):
+        kept[k] = 2.0 * graph.at(place).error(solution) <= limit
+    return kept
+
+
+def _within_odometry(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ties: Sequence[Tie], asked: Int, probability: float
+) -> Int:
+    """Those closures (K,) among some (L,) that the odometry alone does not refute.
+
+    Where many are wrong, a first solution with all of them lies far from the truth, and graduated non-convexity does
+    not always find back.
+    """
+    marginals = gtsam.Marginals(graph, values)
+    limit = chi_square_quantile(probability, 6)
+    passed = []
+    for k in asked.tolist():
+        tie = ties[k]
+        predicted, covariance = _motion_between(marginals, values, tie.first, tie.second)
+        error = se3_log(se3_inverse(predicted) @ tie.first_T_second)
+        if error @ np.linalg.solve(covariance + tie.covariance, error) <= limit:
+            passed.append(k)
+    return np.array(passed, dtype=np.int64)
+
+
+def _motion_between(marginals: gtsam.Marginals, values: gtsam.Values, first: int, second: int) -> tuple[Float, Float]:
+    """``first_T_second`` (4, 4) and its covariance (6, 6), in body at the second."""
+    order = [x(first), x(second)]
+    joint = marginals.jointMarginalCovariance(order)
+    covariance = np.block([[joint.at(i, j) for j in order] for i in order])
+    relative = se3_inverse(values.atPose3(order[0]).matrix()) @ values.atPose3(order[1]).matrix()
+    return relative, relative_covariance(relative, covariance)
+
+
+def odometry_between(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, fragments: Sequence[range], ends: Sequence[int]
+) -> list[Tie]:
+    """The motion between the states of each fragment that are ends of closures, with its covariance.
+
+    Args:
+        graph: without closures.
+        values: its solution.
+        fragments: states of each.
+        ends: states, increasing.
+    """
+    marginals = gtsam.Marginals(graph, values)
+    made = []
+    for states in fragments:
+        inside = [end for end in ends if end in states]
+        for first, second in pairwise(inside):
+            made.append(Tie(first, second, *_motion_between(marginals, values, first, second)))
+    return made
+
+
+def _most_voted(transforms: Sequence[Float]) -> tuple[int, Float]:
+    """The transform with which most others agree, and how many do, itself included."""
+    votes = []
+    for one in transforms:
+        errors = np.array([se3_log(se3_inverse(one) @ other) for other in transforms])
+        near = (np.linalg.norm(errors[:, :3], axis=1) < _AGREE_RAD) & (np.linalg.norm(errors[:, 3:], axis=1) < _AGREE_M)
+        votes.append(int(near.sum()))
+    best = int(np.argmax(votes))
+    return votes[best], transforms[best]

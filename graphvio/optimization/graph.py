@@ -1,0 +1,225 @@
+"""The full graph of one or several sessions: all motions, the preintegrated IMU, rests, and loop closures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.factors import b, constant_velocity, first_state, imu_without_samples, r, rest, v, x
+from graphvio.backend.noise import gaussian, isotropic
+from graphvio.backend.preintegration import preintegrate, preintegration_params
+from graphvio.backend.reference_views import ReferenceViews
+from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
+from graphvio.config import SmootherConfig
+from graphvio.optimization.nodes import Nodes
+from graphvio.rig import Imu
+
+_START_TILT_RAD = 0.2
+_START_SPEED_M_S = 10.0
+_START_GYRO_BIAS_RAD_S = 0.1
+_ORIGIN_SIGMA = 1e-4  # radians and metres: without an IMU, the first pose of an epoch is its frame
+
+
+@dataclass(frozen=True, eq=False)
+class Tie:
+    """A relative pose between two states, from a loop closure.
+
+    Attributes:
+        first: the state that it is measured from.
+        second: the one in which it ends.
+        first_T_second: (4, 4) of body.
+        covariance: (6, 6), tangent ``[rotation, translation]`` in body at the second.
+    """
+
+    first: int
+    second: int
+    first_T_second: Float
+    covariance: Float
+
+    def factor(self) -> gtsam.NonlinearFactor:
+        """As the graph has it."""
+        return gtsam.BetweenFactorPose3(
+            x(self.first), x(self.second), gtsam.Pose3(self.first_T_second), gaussian(self.covariance)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Fragment:
+    """An epoch of a session: its poses share a frame.
+
+    Attributes:
+        session: its number.
+        epoch: of the session.
+        states: its states, numbered through all sessions.
+        start: state of the rig at the first of them.
+        with_imu: whether that has a velocity and biases.
+    """
+
+    session: int
+    epoch: int
+    states: range
+    start: RigState
+    with_imu: bool
+
+
+class SessionGraph:
+    """Factors and values of all sessions; states are numbered through, session after session.
+
+    Args:
+        sessions: their states.
+        imus: of each session, or None.
+        config: of the odometry's back-end.
+
+    Attributes:
+        values: of all states, as the odometry left them.
+        fragments: of all sessions, in order.
+        firsts: (S + 1,) the first state of each session, and their number.
+    """
+
+    def __init__(self, sessions: Sequence[Nodes], imus: Sequence[Imu | None], config: SmootherConfig) -> None:
+        self.values = gtsam.Values()
+        self.fragments: list[Fragment] = []
+        self.firsts = np.concatenate([[0], np.cumsum([len(nodes.rows) for nodes in sessions])]).astype(np.int64)
+        self._graph = gtsam.NonlinearFactorGraph()
+        self._kinds: dict[str, list[int]] = {}
+        self._config = config
+        self._kind = ""
+        self._views = ReferenceViews()
+        for number, (nodes, imu) in enumerate(zip(sessions, imus, strict=True)):
+            first = int(self.firsts[number])
+            self._add_states(first, nodes)
+            self._add_fragments(number, first, nodes)
+            self._add_inertial(first, nodes, imu)
+            self._add_motions(first, nodes)
+
+    def __len__(self) -> int:
+        return int(self.firsts[-1])
+
+    def add(self, factor: gtsam.NonlinearFactor) -> None:
+        """Insert a factor of the kind at hand; `ReferenceViews` calls it, too."""
+        self._kinds.setdefault(self._kind, []).append(self._graph.size())
+        self._graph.add(factor)
+
+    def complete(
+        self, roots: Iterable[int], ties: Iterable[Tie] = ()
+    ) -> tuple[gtsam.NonlinearFactorGraph, dict[str, list[int]]]:
+        """The graph with closures and with what defines its frames, and its factors by kind.
+
+        Args:
+            roots: fragments whose first pose defines a frame; closures tie the others to one of these.
+            ties: closures.
+        """
+        graph, kinds = gtsam.NonlinearFactorGraph(self._graph), dict(self._kinds)
+        chosen = frozenset(roots)
+        starts = [
+            factor for number, each in enumerate(self.fragments) for factor in _starts(each, is_root=number in chosen)
+        ]
+        for kind, factors in (("start", starts), ("loop", [tie.factor() for tie in ties])):
+            if factors:
+                kinds[kind] = list(range(graph.size(), graph.size() + len(factors)))
+            for factor in factors:
+                graph.add(factor)
+        return graph, kinds
+
+    def _add_states(self, first: int, nodes: Nodes) -> None:
+        record = nodes.record
+        for k, row in enumerate(nodes.rows.tolist(), start=first):
+            self.values.insert(x(k), gtsam.Pose3(record.smoothed[row]))
+            if record.with_imu[row]:
+                self.values.insert(v(k), record.velocity_nav[row])
+                bias = gtsam.imuBias.ConstantBias(record.accel_bias[row], record.gyro_bias[row])
+                self.values.insert(b(k), bias)
+
+    def _add_fragments(self, session: int, first: int, nodes: Nodes) -> None:
+        record, epoch = nodes.record, nodes.epoch
+        begins = np.concatenate([[0], np.flatnonzero(np.diff(epoch)) + 1, [len(epoch)]]).tolist()
+        for begin, end in pairwise(begins):
+            row = int(nodes.rows[begin])
+            start = RigState(
+                record.smoothed[row], record.velocity_nav[row], record.gyro_bias[row], record.accel_bias[row]
+            )
+            states = range(first + begin, first + end)
+            self.fragments.append(Fragment(session, int(epoch[begin]), states, start, bool(record.with_imu[row])))
+
+    def _add_inertial(self, first: int, nodes: Nodes, imu: Imu | None) -> None:
+        record, config = nodes.record, self._config
+        params = None if imu is None else preintegration_params(imu, config.imu_noise_scale)
+        tied = np.zeros(len(nodes.rows), dtype=bool)
+        tied[np.searchsorted(nodes.rows, record.motions.row[nodes.motions])] = True
+        for n in range(1, len(nodes.rows)):
+            if nodes.epoch[n] != nodes.epoch[n - 1]:
+                continue
+            before, row, k = int(nodes.rows[n - 1]), int(nodes.rows[n]), first + n
+            dt = float(record.stamps_ns[row] - record.stamps_ns[before]) * 1e-9
+            span = nodes.span(n) if params is not None else None
+            if span is not None:
+                self._kind = "imu"
+                bias = gtsam.imuBias.ConstantBias(record.accel_bias[row], record.gyro_bias[row])
+                assert params is not None
+                measurements = preintegrate(span, params, bias)
+                self.add(gtsam.CombinedImuFactor(x(k - 1), v(k - 1), x(k), v(k), b(k - 1), b(k), measurements))
+            else:
+                self._kind = "walk"
+                if record.with_imu[before] and record.with_imu[row] and imu is not None:
+                    for factor in imu_without_samples(
+                        k - 1, k, dt, config.motion_accel_sigma_m_s2, imu, config.imu_noise_scale
+                    ):
+                        self.add(factor)
+                if not tied[n]:  # nothing measured leads here: as the odometry has it, eq. (11)
+                    motion = np.linalg.inv(record.smoothed[before]) @ record.smoothed[row]
+                    accels = np.array([config.motion_angular_accel_sigma_rad_s2, config.motion_accel_sigma_m_s2])
+                    self.add(constant_velocity(k - 1, k, motion, dt, dt, np.zeros(2), accels))
+            if record.at_rest[row] and record.with_imu[row]:
+                self._kind = "rest"
+                self.add(rest(k))
+
+    def _add_motions(self, first: int, nodes: Nodes) -> None:
+        self._kind = "motion"
+        record = nodes.record
+        for number in nodes.motions.tolist():
+            motion = record.motions.at(number, record.stamps_ns)
+            i = first + nodes.index_of_row(int(record.motions.reference[number]))
+            j = first + nodes.index_of_row(int(record.motions.row[number]))
+            self._views.add(i, motion, self)
+            reference, covariance = self._views.seen(i, motion)
+            self.add(
+                gtsam.BetweenFactorPose3(reference, x(j), gtsam.Pose3(motion.reference_T_current), gaussian(covariance))
+            )
+
+
+def _starts(fragment: Fragment, is_root: bool) -> Iterator[gtsam.NonlinearFactor]:
+    """What is known of a fragment's first state: it defines the frame; with an IMU, gravity tells the vertical."""
+    k, pose = fragment.states.start, fragment.start.nav_T_body
+    if not fragment.with_imu:
+        if is_root:
+            yield gtsam.PriorFactorPose3(x(k), gtsam.Pose3(pose), isotropic(6, _ORIGIN_SIGMA))
+        return
+    known = StartUncertainty(origin_covariance(pose[:3, :3], _START_TILT_RAD), _START_SPEED_M_S, _START_GYRO_BIAS_RAD_S)
+    about_pose, *others = first_state(k, fragment.start, known, True)
+    if is_root:
+        yield about_pose
+    yield from others
+
+
+def poses_of(values: gtsam.Values, count: int) -> Float:
+    """Poses (N, 4, 4) of the states."""
+    return np.array([values.atPose3(x(k)).matrix() for k in range(count)]).reshape(-1, 4, 4)
+
+
+def moved(values: gtsam.Values, frames: Sequence[tuple[range, Float]]) -> gtsam.Values:
+    """The same with ranges of states seen from other frames: ``other_T_nav`` (4, 4) of each."""
+    made = gtsam.Values(values)
+    for states, other_T_nav in frames:
+        frame, rotation = gtsam.Pose3(other_T_nav), other_T_nav[:3, :3]
+        for k in states:
+            made.update(x(k), frame.compose(values.atPose3(x(k))))
+            if values.exists(r(k)):
+                made.update(r(k), frame.compose(values.atPose3(r(k))))
+            if values.exists(v(k)):
+                made.update(v(k), rotation @ values.atVector(v(k)))
+    return made

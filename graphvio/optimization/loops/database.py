@@ -1,0 +1,177 @@
+"""A COLMAP database that holds what was seen at the places: cameras and rig, images, features, matches.
+
+COLMAP counts pixels from the corner of an image, and graphvio from the centre of its first pixel: half a pixel lies
+between them, which is added here and taken away again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from graphvio.arrays import AnyArray, Float, Int
+from graphvio.errors import MissingExtraError, OptimizationError
+from graphvio.rig import Camera, Rig
+
+_CENTRE_PX = 0.5
+
+
+def colmap() -> Any:
+    """The library pycolmap.
+
+    Raises:
+        MissingExtraError: if the extra ``maps`` is not installed.
+    """
+    try:
+        import pycolmap
+    except ImportError:
+        raise MissingExtraError("pycolmap", "maps", "loop closure and maps") from None
+    return pycolmap
+
+
+def image_name(session: str, camera: str, stamp_ns: int) -> str:
+    """Of an image in a database and in a reconstruction, and its file below their folder of images."""
+    return f"{session}/{camera}/{stamp_ns}.png"
+
+
+def colmap_camera(camera: Camera, number: int) -> Any:
+    """A camera of the rig as COLMAP has it."""
+    fx, fy, cx, cy = (float(value) for value in camera.intrinsics)
+    k1, k2, p1, p2, k3 = (float(value) for value in camera.distortion)
+    centre = [cx + _CENTRE_PX, cy + _CENTRE_PX]
+    if camera.model == "equidistant":
+        model, lens = "OPENCV_FISHEYE", [k1, k2, p1, p2]
+    elif k3:
+        model, lens = "FULL_OPENCV", [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
+    else:
+        model, lens = "OPENCV", [k1, k2, p1, p2]
+    width, height = camera.size_px
+    return colmap().Camera(
+        model=model, width=width, height=height, params=[fx, fy, *centre, *lens], camera_id=number,
+        has_prior_focal_length=True,
+    )  # fmt: skip
+
+
+class FeatureDatabase:
+    """The database of one or several sessions; a context manager that closes it.
+
+    Args:
+        path: of the file, made if it is missing.
+
+    Raises:
+        OptimizationError: if it cannot be opened.
+        MissingExtraError: if the extra ``maps`` is not installed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._colmap = colmap()
+        self._path = path
+        try:
+            self._file = self._colmap.Database.open(path)
+        except (RuntimeError, ValueError) as error:
+            raise OptimizationError(f"{path}: cannot be opened as a COLMAP database ({error})") from None
+        self._ids: dict[str, int] = {image.name: image.image_id for image in self._file.read_all_images()}
+
+    def __enter__(self) -> FeatureDatabase:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Of all images."""
+        return frozenset(self._ids)
+
+    def image_id(self, name: str) -> int:
+        """COLMAP's number of an image."""
+        return self._ids[name]
+
+    def transaction(self) -> AbstractContextManager[Any]:
+        """What is written inside is written as a whole or not at all."""
+        return self._colmap.DatabaseTransaction(self._file)  # type: ignore[no-any-return]
+
+    def add_rig(self, rig: Rig) -> tuple[int, list[int]]:
+        """Add the rig and its cameras, or find it; the first camera is the reference of COLMAP's rig.
+
+        Returns:
+            The rig's number, and the cameras', in the rig's order.
+        """
+        library = self._colmap
+        numbers = [self._file.write_camera(colmap_camera(camera, 0)) for camera in rig.cameras]
+        made = library.Rig()
+        for number, camera in zip(numbers, rig.cameras, strict=True):
+            sensor = library.sensor_t(library.SensorType.CAMERA, number)
+            if number == numbers[0]:
+                made.add_ref_sensor(sensor)
+            else:
+                made.add_sensor(sensor, rigid(camera.cam_T_body @ rig.cameras[0].body_T_cam))
+        return self._file.write_rig(made), numbers
+
+    def add_place(self, rig_id: int, images: Mapping[int, str]) -> None:
+        """Add the images of one instant: camera's number -> name."""
+        library = self._colmap
+        frame = library.Frame(rig_id=rig_id)
+        made = []
+        for camera, name in images.items():
+            image = library.Image(name=name, camera_id=camera)
+            image.image_id = self._ids[name] = self._file.write_image(image)
+            frame.add_data_id(image.data_id)
+            made.append(image)
+        frame.frame_id = self._file.write_frame(frame)
+        for image in made:
+            image.frame_id = frame.frame_id
+            self._file.update_image(image)
+
+    def add_features(self, name: str, pixels: Float, descriptors: AnyArray | None = None) -> None:
+        """Add features (K, 2) of an image and their descriptors (K, 128), uint8."""
+        number = self._ids[name]
+        self._file.write_keypoints(number, (pixels + _CENTRE_PX).astype(np.float32).reshape(-1, 2))
+        if descriptors is not None:
+            kind = self._colmap.FeatureExtractorType.SIFT
+            self._file.write_descriptors(number, self._colmap.FeatureDescriptors(kind, descriptors))
+
+    def pixels(self, name: str) -> Float:
+        """Features (K, 2) of an image."""
+        return np.asarray(self._file.read_keypoints(self._ids[name])[:, :2], dtype=np.float64) - _CENTRE_PX
+
+    def descriptors(self, name: str) -> Any:
+        """Descriptors of an image's features as COLMAP has them; ``data`` is (K, 128), uint8."""
+        return self._file.read_descriptors(self._ids[name])
+
+    def add_matches(self, first: str, second: str, matches: Int, geometry: Any = None) -> None:
+        """Add which features (M, 2) of two images are one, and the two-view geometry that verifies them.
+
+        Without one, they are taken for verified, as a calibrated pair's are.
+        """
+        one, other = self._ids[first], self._ids[second]
+        rows = np.ascontiguousarray(matches, dtype=np.uint32).reshape(-1, 2)
+        self._file.write_matches(one, other, rows)
+        if geometry is None:
+            library = self._colmap
+            geometry = library.TwoViewGeometry()
+            geometry.config = library.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = rows
+        self._file.write_two_view_geometry(one, other, geometry)
+
+    def matches(self, first: str, second: str) -> Int:
+        """Verified matches (M, 2) of two images."""
+        found = self._file.read_two_view_geometry(self._ids[first], self._ids[second])
+        return np.asarray(found.inlier_matches, dtype=np.int64).reshape(-1, 2)
+
+    def has_matches(self, first: str, second: str) -> bool:
+        """Whether two images were matched."""
+        return bool(self._file.exists_two_view_geometry(self._ids[first], self._ids[second]))
+
+
+def rigid(a_T_b: Float) -> Any:
+    """A transform (4, 4) as COLMAP has it."""
+    library = colmap()
+    return library.Rigid3d(np.ascontiguousarray(a_T_b[:3]))

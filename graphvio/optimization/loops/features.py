@@ -1,0 +1,134 @@
+"""Features of the places, by COLMAP's SIFT on the CPU, and their depth by our own stereo matching."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from graphvio.arrays import AnyArray, Float, Image, Int
+from graphvio.config import Config
+from graphvio.optimization.loops.database import FeatureDatabase, colmap, image_name
+from graphvio.optimization.loops.places import PairObserver
+from graphvio.rig import Rig
+from graphvio.sources import Source
+
+_FIRST_OCTAVE = 0  # the image itself; twice its size, COLMAP's default, costs three times as much
+_COLMAP_CENTRE_PX = 0.5
+_AHEAD = 4  # places that are worked on at a time
+
+
+class Extractor:
+    """SIFT features of images, in any thread.
+
+    Args:
+        most: features of an image, the largest ones.
+    """
+
+    def __init__(self, most: int) -> None:
+        library = colmap()
+        library.logging.minloglevel = library.logging.Level.WARNING.value
+        self._options = library.FeatureExtractionOptions()
+        self._options.num_threads = 1
+        self._options.sift.max_num_features = most
+        self._options.sift.first_octave = _FIRST_OCTAVE
+        self._options.sift.max_num_orientations = 1
+        self._of_thread = threading.local()
+
+    def extract(self, image: Image) -> tuple[Float, AnyArray]:
+        """Pixels (K, 2) and descriptors (K, 128), uint8."""
+        library = colmap()
+        if not hasattr(self._of_thread, "made"):
+            self._of_thread.made = library.FeatureExtractor.create(self._options, library.Device.cpu)
+        keypoints, descriptors = self._of_thread.made.extract_from_uint8_array(np.ascontiguousarray(image))
+        pixels = np.asarray(library.keypoints_to_matrix(keypoints)[:, :2], dtype=np.float64) - _COLMAP_CENTRE_PX
+        return pixels.reshape(-1, 2), np.asarray(descriptors.data, dtype=np.uint8).reshape(-1, 128)
+
+
+def extract_places(
+    source: Source,
+    rig: Rig,
+    session: str,
+    stamps_ns: Sequence[int],
+    database: FeatureDatabase,
+    most_features: int,
+    config: Config,
+    on_progress: Callable[[int], None] | None = None,
+) -> None:
+    """Put the places of a session into the database: features of left images, and where they are in the right ones.
+
+    Places that are in the database already are left as they are, so that an interrupted run goes on.
+
+    Args:
+        source: of the images.
+        rig: their cameras.
+        session: its name, unique in the database.
+        stamps_ns: of the places.
+        database: to write.
+        most_features: of an image.
+        config: of the stereo matching.
+        on_progress: called with the number of places done.
+    """
+    extractor = Extractor(most_features)
+    rig_id, cameras = database.add_rig(rig)
+    of_name = dict(zip((camera.name for camera in rig.cameras), cameras, strict=True))
+    of_thread = threading.local()
+
+    def look(stamp_ns: int) -> dict[int, _Seen]:
+        if not hasattr(of_thread, "observers"):
+            of_thread.observers = [PairObserver(pair, config) for pair in rig.pairs]
+        seen = {}
+        for j, images in source.frameset_at(stamp_ns).images.items():
+            pixels, descriptors = extractor.extract(images[0])
+            frame = of_thread.observers[j].observe(stamp_ns, images, pixels)
+            right, _ = rig.pairs[j].right.project(np.column_stack([frame.right, np.ones(len(pixels))]))
+            seen[j] = _Seen(pixels, descriptors, right[frame.has_depth], np.flatnonzero(frame.has_depth))
+        return seen
+
+    missing = [ns for ns in stamps_ns if not _is_there(database, rig, session, ns)]
+    done = len(stamps_ns) - len(missing)
+    with ThreadPoolExecutor(2, thread_name_prefix="graphvio-features") as pool:
+        pending: list[Any] = []
+        for at, stamp_ns in enumerate(missing):
+            while len(pending) < _AHEAD and at + len(pending) < len(missing):
+                pending.append(pool.submit(look, missing[at + len(pending)]))
+            _store(database, rig, rig_id, of_name, session, stamp_ns, pending.pop(0).result())
+            done += 1
+            if on_progress is not None:
+                on_progress(done)
+
+
+class _Seen:
+    """What one pair shows: left features (K, 2), and which of them (M,) are where (M, 2) in the right image."""
+
+    def __init__(self, left: Float, descriptors: AnyArray, right: Float, in_right: Int) -> None:
+        self.left = left
+        self.descriptors = descriptors
+        self.right = right
+        self.in_right = in_right
+
+
+def _is_there(database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int) -> bool:
+    return any(image_name(session, pair.left.name, stamp_ns) in database.names for pair in rig.pairs)
+
+
+def _store(
+    database: FeatureDatabase, rig: Rig, rig_id: int, cameras: dict[str, int], session: str, stamp_ns: int,
+    seen: dict[int, _Seen],
+) -> None:  # fmt: skip
+    names = {
+        camera.name: image_name(session, camera.name, stamp_ns)
+        for j in seen
+        for camera in (rig.pairs[j].left, rig.pairs[j].right)
+    }
+    with database.transaction():
+        database.add_place(rig_id, {cameras[camera]: name for camera, name in names.items()})
+        for j, found in seen.items():
+            left, right = names[rig.pairs[j].left.name], names[rig.pairs[j].right.name]
+            database.add_features(left, found.left, found.descriptors)
+            database.add_features(right, found.right)
+            rows = np.column_stack([found.in_right, np.arange(len(found.in_right))])
+            database.add_matches(left, right, rows)

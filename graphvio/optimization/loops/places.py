@@ -1,0 +1,75 @@
+"""Places: the keyframes at which a session looks around, and what one stereo pair sees there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphvio.arrays import Float, Image, Int
+from graphvio.config import Config
+from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid
+from graphvio.frontend.matching import StereoMatcher
+from graphvio.frontend.tracks import PairFrame
+from graphvio.geometry import se3_inverse, so3_log
+from graphvio.optimization.record import SessionRecord
+from graphvio.rig import StereoPair
+
+_LEVELS = 2  # of the pyramid, as far as stereo matching needs it
+
+
+def choose_places(record: SessionRecord, distance_m: float, angle_deg: float) -> Int:
+    """Rows (P,) of the keyframes that are so far from the place before them, or turned by so much."""
+    chosen: list[int] = []
+    for row in np.flatnonzero(record.is_keyframe).tolist():
+        if chosen and record.epoch[row] == record.epoch[chosen[-1]]:
+            moved = se3_inverse(record.smoothed[chosen[-1]]) @ record.smoothed[row]
+            angle = np.linalg.norm(so3_log(np.ascontiguousarray(moved[:3, :3])))
+            if np.linalg.norm(moved[:3, 3]) < distance_m and np.rad2deg(angle) < angle_deg:
+                continue
+        chosen.append(row)
+    return np.array(chosen, dtype=np.int64)
+
+
+class PairObserver:
+    """Finds out how deep features of one pair's left image are."""
+
+    def __init__(self, pair: StereoPair, config: Config) -> None:
+        width, height = pair.right.size_px
+        self.pair = pair
+        self._matcher = StereoMatcher(pair, config, np.ones((height, width), dtype=bool))
+
+    def observe(
+        self,
+        stamp_ns: int,
+        images: tuple[Image, Image],
+        pixels: Float,
+        inverse_depths: Float | None = None,
+    ) -> PairFrame:
+        """A frame whose tracks are these features.
+
+        Args:
+            stamp_ns: of the images.
+            images: left and right.
+            pixels: (N, 2) in the left one.
+            inverse_depths: (N,) expected, 1/m; NaN, or no array, where nothing is known.
+        """
+        left, right = (self._pyramid(image) for image in images)
+        rays, has_ray = self.pair.left.unproject(pixels)
+        n = len(pixels)
+        expected = np.full(n, np.nan) if inverse_depths is None else inverse_depths
+        matches = self._matcher.match(left, right, pixels, rays, expected, np.zeros((n, 2)), MIN_GRADIENT)
+        return PairFrame(
+            stamp_ns=stamp_ns,
+            ids=np.arange(n),
+            ages=np.zeros(n, dtype=np.int64),
+            pixels=np.ascontiguousarray(pixels),
+            left=rays,
+            right=matches.right,
+            points=matches.points,
+            covariances=matches.covariances,
+            slopes=matches.slopes,
+            has_depth=matches.good & has_ray,
+            flat_for=np.zeros(n, dtype=np.int64),
+        )
+
+    def _pyramid(self, image: Image) -> Pyramid:
+        return build_pyramid(np.ascontiguousarray(image), _LEVELS)

@@ -1,0 +1,83 @@
+"""Which places look alike: a vocabulary of the session's own descriptors, and one vector for each image.
+
+H. Jegou, M. Douze, C. Schmid, P. Perez, *Aggregating local descriptors into a compact image representation*, CVPR 2010
+(VLAD), with the normalisations of R. Arandjelovic, A. Zisserman, *All about VLAD*, CVPR 2013.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from graphvio.arrays import AnyArray, Float, Int
+
+_WORDS = 64
+_SAMPLE = 40_000  # descriptors that the vocabulary is made from
+_ITERATIONS = 15
+_FULL = 512.0  # length of COLMAP's descriptors
+
+
+def vocabulary(descriptors: Sequence[AnyArray], seed: int) -> AnyArray:
+    """Words (W, 128) that describe the descriptors (K, 128) of images best, by k-means.
+
+    Args:
+        descriptors: uint8, of N images.
+        seed: of the choice of descriptors and of the first words.
+    """
+    rng = np.random.default_rng(seed)
+    each = max(1, _SAMPLE // max(1, len(descriptors)))
+    chosen = [rows[rng.choice(len(rows), min(each, len(rows)), replace=False)] for rows in descriptors if len(rows)]
+    if not chosen:
+        return np.zeros((0, 128), dtype=np.float32)
+    sample = np.concatenate(chosen).astype(np.float32) / np.float32(_FULL)
+    words = min(_WORDS, len(sample))
+    cv2.setRNGSeed(seed)
+    stop = (cv2.TERM_CRITERIA_MAX_ITER, _ITERATIONS, 0.0)
+    _, _, centres = cv2.kmeans(sample, words, None, stop, 1, cv2.KMEANS_PP_CENTERS)  # type: ignore[call-overload]
+    return np.asarray(centres, dtype=np.float32)
+
+
+def describe(descriptors: AnyArray, words: AnyArray) -> AnyArray:
+    """An image's vector (W * 128,), of length one, or zero for an image without features."""
+    made = np.zeros_like(words)
+    if len(descriptors) and len(words):
+        rows = descriptors.astype(np.float32) / np.float32(_FULL)
+        nearest = np.argmax(rows @ words.T - 0.5 * (words**2).sum(axis=1), axis=1)
+        for word in range(len(words)):
+            residual = (rows[nearest == word] - words[word]).sum(axis=0)
+            length = np.linalg.norm(residual)
+            if length > 0.0:
+                made[word] = residual / length
+    vector = made.ravel()
+    length = np.linalg.norm(vector)
+    return np.asarray(vector / length if length > 0.0 else vector)
+
+
+def candidates(similarity: Float, allowed: AnyArray, most: int) -> list[tuple[int, int]]:
+    """For each place its most similar ones among those before it.
+
+    Args:
+        similarity: (P, P) of places, symmetric.
+        allowed: (P, P) which pairs of them may be asked for.
+        most: candidates of a place.
+
+    Returns:
+        Pairs (earlier, later) of places, the most similar first.
+    """
+    found: list[tuple[float, int, int]] = []
+    for later in range(len(similarity)):
+        row = np.where(allowed[later, :later], similarity[later, :later], -np.inf)
+        for earlier in np.argsort(-row, kind="stable")[:most].tolist():
+            if np.isfinite(row[earlier]):
+                found.append((float(row[earlier]), earlier, later))
+    found.sort(key=lambda each: (-each[0], each[1], each[2]))
+    return [(earlier, later) for _, earlier, later in found]
+
+
+def joined(similarity: Float, place: Int, places: int) -> Float:
+    """Similarity (P, P) of places from that of their images (N, N): that of the two images most alike."""
+    made = np.full((places, places), -np.inf)
+    np.maximum.at(made, (place[:, None], place[None, :]), similarity)
+    return made

@@ -1,0 +1,113 @@
+"""Which framesets become states of the graph, and which motions tie them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float, Int
+from graphvio.backend.inertial import ImuSpan
+from graphvio.optimization.record import SessionRecord
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """The N states of one session's graph.
+
+    Attributes:
+        record: of the session.
+        rows: (N,) their framesets, increasing.
+        motions: (M,) those of the record's motions that begin and end at one of them.
+    """
+
+    record: SessionRecord
+    rows: Int
+    motions: Int
+
+    @property
+    def stamps_ns(self) -> Int:
+        """(N,)."""
+        return np.asarray(self.record.stamps_ns[self.rows])
+
+    @property
+    def epoch(self) -> Int:
+        """(N,)."""
+        return np.asarray(self.record.epoch[self.rows])
+
+    def index_of_row(self, row: int) -> int:
+        """The state of a frameset that is one."""
+        return int(np.searchsorted(self.rows, row))
+
+    def span(self, n: int) -> ImuSpan | None:
+        """The IMU from state ``n - 1`` to ``n``; None where it does not cover that."""
+        inertial, first, last = self.record.inertial, self.rows[n - 1] + 1, self.rows[n] + 1
+        if not inertial.covers[first:last].all() or not self.record.with_imu[[first - 1, last - 1]].all():
+            return None
+        steps = slice(int(inertial.begins[first]), int(inertial.begins[last]))
+        values = inertial.values[steps]
+        return ImuSpan(inertial.steps_s[steps], values[:, :3], values[:, 3:])
+
+
+def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
+    """The framesets that others are measured from, the first and last of each epoch, and others in between.
+
+    Args:
+        record: of a session.
+        interval_s: between two states there is no more time than this, as far as there are framesets; what is measured
+            from one keyframe within a shorter time adds little.
+    """
+    stamps, motions = record.stamps_ns, record.motions
+    wanted = np.zeros(len(stamps), dtype=bool)
+    wanted[motions.reference] = True
+    ends = np.flatnonzero(np.diff(record.epoch))
+    wanted[ends] = wanted[ends + 1] = True
+    wanted[0] = wanted[-1] = True
+    wanted[_last_of_each_reference(motions.reference, motions.row)] = True
+    latest = stamps[0]
+    seen = np.zeros(len(stamps), dtype=bool)
+    seen[motions.row] = True
+    for row in range(len(stamps)):
+        due = row + 1 < len(stamps) and stamps[row + 1] - latest > interval_s * 1e9 and seen[row]
+        if wanted[row] or due:
+            wanted[row] = True
+            latest = stamps[row]
+    chosen = np.flatnonzero(wanted[motions.reference] & wanted[motions.row])
+    return Nodes(record, np.flatnonzero(wanted), chosen)
+
+
+def _last_of_each_reference(reference: Int, row: Int) -> Int:
+    last: dict[int, int] = {}
+    for k, r in zip(reference.tolist(), row.tolist(), strict=True):
+        last[k] = max(last.get(k, r), r)
+    return np.array(sorted(last.values()), dtype=np.int64)
+
+
+def spread(nodes: Nodes, nav_T_body: Float) -> Float:
+    """Poses (F, 4, 4) of all framesets from those (N, 4, 4) of the states.
+
+    Between two states the smoothed trajectory is kept, and what it differs by at the second is shared out by time.
+    """
+    from graphvio.geometry import se3_exp, se3_inverse, se3_log
+
+    record, rows = nodes.record, nodes.rows
+    made = np.empty_like(record.smoothed)
+    stamps = record.stamps_ns
+    for n, row in enumerate(rows):
+        made[row] = nav_T_body[n]
+        if n + 1 == len(rows) or record.epoch[row] != record.epoch[rows[n + 1]]:
+            continue
+        after = rows[n + 1]
+        since = se3_inverse(record.smoothed[row])
+        error = se3_log(se3_inverse(since @ record.smoothed[after]) @ se3_inverse(nav_T_body[n]) @ nav_T_body[n + 1])
+        for k in range(row + 1, after):
+            share = float(stamps[k] - stamps[row]) / float(stamps[after] - stamps[row])
+            made[k] = nav_T_body[n] @ since @ record.smoothed[k] @ se3_exp(share * error)
+    return made
+
+
+def has_state(nodes: Nodes) -> Bool:
+    """(F,) which framesets are states."""
+    mask = np.zeros(len(nodes.record.stamps_ns), dtype=bool)
+    mask[nodes.rows] = True
+    return mask

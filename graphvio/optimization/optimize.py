@@ -1,0 +1,216 @@
+"""Sessions as one graph: solved, joined by loop closures, and solved again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.backend.factors import x
+from graphvio.backend.gating import chi_square_quantile
+from graphvio.config import Config
+from graphvio.optimization.consistency import consistent, join_fragments, odometry_between
+from graphvio.optimization.graph import Fragment, SessionGraph, Tie, moved, poses_of
+from graphvio.optimization.loops.search import LoopClosure
+from graphvio.optimization.nodes import Nodes, choose_nodes, spread
+from graphvio.optimization.record import SessionRecord
+from graphvio.optimization.solve import Residuals, residuals, solve
+from graphvio.rig import Imu
+
+Progress = Callable[[str, int, float], None]
+"""Called with what is solved, the number of the iteration, and the cost."""
+
+
+@dataclass(frozen=True, eq=False)
+class OptimizedSession:
+    """One of the sessions.
+
+    Attributes:
+        nodes: the states of its graph.
+        nav_T_body: (F, 4, 4) of all its framesets; nav is the frame of the fragment that ``frame`` tells.
+        covariance: (N, 6, 6) of the states' poses, tangent ``[rotation, translation]`` in body; of what their frame's
+            origin is told from.
+        frame: (F,) number of the frame of each frameset; 0 is the first session's first.
+    """
+
+    nodes: Nodes
+    nav_T_body: Float
+    covariance: Float
+    frame: Int
+
+    @property
+    def record(self) -> SessionRecord:
+        """What the odometry made of it."""
+        return self.nodes.record
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedLoop:
+    """A loop closure, and what became of it.
+
+    Attributes:
+        closure: as it was found.
+        refusal: why it is not used, or empty.
+        distance: squared Mahalanobis distance from the solution, 6 degrees of freedom; NaN between parts that nothing
+            joins.
+    """
+
+    closure: LoopClosure
+    refusal: str
+    distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class Optimization:
+    """What became of the sessions.
+
+    Attributes:
+        sessions: in the order in which they were given.
+        loops: all closures that were offered.
+        fragments: the epochs of all sessions.
+        frames: number of the frame that each fragment is in.
+        before: kind of factor -> its residuals as the odometry left the states.
+        after: the same in the solution.
+        graph: with all that was used.
+        values: the solution.
+        ties: closures that are used, as factors.
+    """
+
+    sessions: Sequence[OptimizedSession]
+    loops: Sequence[JudgedLoop]
+    fragments: Sequence[Fragment]
+    frames: Sequence[int]
+    before: dict[str, Residuals]
+    after: dict[str, Residuals]
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    ties: Sequence[Tie]
+
+    @property
+    def cost_before(self) -> float:
+        """Half the sum of all squared residuals as the odometry left the states, closures not counted."""
+        return _cost(self.before)
+
+    @property
+    def cost_after(self) -> float:
+        """The same in the solution."""
+        return _cost(self.after)
+
+
+def optimize(
+    records: Sequence[SessionRecord],
+    imus: Sequence[Imu | None],
+    closures: Sequence[LoopClosure],
+    config: Config,
+    on_progress: Progress | None = None,
+) -> Optimization:
+    """The best trajectories that all measurements of the sessions hold together.
+
+    Args:
+        records: S sessions as the odometry saw them.
+        imus: of each session's rig, or None.
+        closures: places seen from others, right ones and wrong ones.
+        config: of the back-end and of this stage.
+        on_progress: told how far it is.
+
+    Raises:
+        OptimizationError: if the graph has no unique solution.
+    """
+    settings = config.optimization
+    sessions = [choose_nodes(record, settings.keyframe_interval_s) for record in records]
+    whole = SessionGraph(sessions, imus, config.smoother)
+    fragments = whole.fragments
+    graph, kinds = whole.complete(range(len(fragments)))
+    before = residuals(graph, kinds, whole.values)
+    alone = solve(graph, whole.values, _named(on_progress, "without loops"))
+    ties = [_tie(closure, sessions, whole) for closure in closures]
+    states = [each.states for each in fragments]
+    poses = poses_of(alone, len(whole))
+    joined = join_fragments(states, poses, ties)
+    values = moved(alone, list(zip(states, joined.frames, strict=True)))
+    component = np.repeat(joined.component, [len(each) for each in states]).tolist()
+    ends = sorted({end for tie in ties for end in (tie.first, tie.second)})
+    odometry = odometry_between(graph, alone, states, ends)
+    poses = poses_of(values, len(whole))
+    believed = consistent(poses, component, ties, odometry, settings.loop_probability)
+    used = [tie for tie, is_used in zip(ties, believed, strict=True) if is_used]
+    roots = sorted(set(joined.component))
+    graph, kinds = whole.complete(roots, used)
+    values = solve(graph, values, _named(on_progress, "with loops"))
+    solution, covariances = poses_of(values, len(whole)), _covariances(graph, values, len(whole))
+    frames = [roots.index(number) for number in joined.component]
+    return Optimization(
+        sessions=[
+            _session(nodes, slice(*whole.firsts[number : number + 2]), solution, covariances, fragments, frames)
+            for number, nodes in enumerate(sessions)
+        ],
+        loops=[
+            _judged(closure, tie, bool(is_used), component, solution, settings.loop_probability)
+            for closure, tie, is_used in zip(closures, ties, believed, strict=True)
+        ],
+        fragments=fragments,
+        frames=frames,
+        before=before,
+        after=residuals(graph, kinds, values),
+        graph=graph,
+        values=values,
+        ties=used,
+    )
+
+
+def _tie(closure: LoopClosure, sessions: Sequence[Nodes], whole: SessionGraph) -> Tie:
+    first, second = (
+        int(whole.firsts[place.session]) + sessions[place.session].index_of_row(place.row)
+        for place in (closure.reference, closure.current)
+    )
+    return Tie(first, second, closure.reference_T_current, closure.covariance)
+
+
+def _session(
+    nodes: Nodes, states: slice, solution: Float, covariances: Float, fragments: Sequence[Fragment],
+    frames: Sequence[int],
+) -> OptimizedSession:  # fmt: skip
+    of_epoch = {
+        each.epoch: frame
+        for each, frame in zip(fragments, frames, strict=True)
+        if states.start <= each.states.start < states.stop
+    }
+    return OptimizedSession(
+        nodes,
+        spread(nodes, solution[states]),
+        covariances[states],
+        np.array([of_epoch[epoch] for epoch in nodes.record.epoch.tolist()], dtype=np.int64),
+    )
+
+
+def _judged(
+    closure: LoopClosure, tie: Tie, is_used: bool, component: Sequence[int], solution: Float, probability: float
+) -> JudgedLoop:
+    from graphvio.geometry import se3_inverse, se3_log
+
+    if component[tie.first] != component[tie.second]:
+        return JudgedLoop(closure, "too few closures agree on how its two parts lie to each other", float("nan"))
+    error = se3_log(se3_inverse(se3_inverse(solution[tie.first]) @ solution[tie.second]) @ tie.first_T_second)
+    distance = float(error @ np.linalg.solve(tie.covariance, error))
+    if is_used:
+        return JudgedLoop(closure, "", distance)
+    limit = chi_square_quantile(probability, 6)
+    return JudgedLoop(closure, f"{distance:.0f} beyond chi-square {limit:.1f} of what all others say", distance)
+
+
+def _covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, count: int) -> Float:
+    marginals = gtsam.Marginals(graph, values)
+    return np.array([marginals.marginalCovariance(x(k)) for k in range(count)]).reshape(-1, 6, 6)
+
+
+def _cost(kinds: dict[str, Residuals]) -> float:
+    return 0.5 * float(sum(each.distances.sum() for kind, each in kinds.items() if kind != "loop"))
+
+
+def _named(on_progress: Progress | None, name: str) -> Callable[[int, float], None] | None:
+    if on_progress is None:
+        return None
+    return lambda iteration, cost: on_progress(name, iteration, cost)
