@@ -11,6 +11,7 @@ from graphvio.cli.doctor import doctor
 from graphvio.cli.dump_config import dump_config
 from graphvio.cli.evaluate import evaluate
 from graphvio.cli.info import info
+from graphvio.cli.optimize import optimize
 from graphvio.cli.record import convert, record
 from graphvio.cli.run import EXIT_INTERRUPTED, run
 from graphvio.cli.simulate import simulate
@@ -31,6 +32,7 @@ app = typer.Typer(
 app.command()(run)
 app.command()(calibrate)
 app.command(name="calibrate-trajectories")(calibrate_trajectories)
+app.command()(optimize)
 app.command()(record)
 app.command()(convert)
 app.command()(info)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float, Int
+from graphvio.arrays import Float, Int
 from graphvio.backend.inertial import ImuSpan
+from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.optimization.record import SessionRecord
 
 
@@ -88,8 +89,6 @@ def spread(nodes: Nodes, nav_T_body: Float) -> Float:
 
     Between two states the smoothed trajectory is kept, and what it differs by at the second is shared out by time.
     """
-    from graphvio.geometry import se3_exp, se3_inverse, se3_log
-
     record, rows = nodes.record, nodes.rows
     made = np.empty_like(record.smoothed)
     stamps = record.stamps_ns
@@ -104,10 +103,3 @@ def spread(nodes: Nodes, nav_T_body: Float) -> Float:
             share = float(stamps[k] - stamps[row]) / float(stamps[after] - stamps[row])
             made[k] = nav_T_body[n] @ since @ record.smoothed[k] @ se3_exp(share * error)
     return made
-
-
-def has_state(nodes: Nodes) -> Bool:
-    """(F,) which framesets are states."""
-    mask = np.zeros(len(nodes.record.stamps_ns), dtype=bool)
-    mask[nodes.rows] = True
-    return mask

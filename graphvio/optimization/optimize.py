@@ -12,6 +12,7 @@ from graphvio.arrays import Float, Int
 from graphvio.backend.factors import x
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.config import Config
+from graphvio.geometry import se3_inverse, se3_log
 from graphvio.optimization.consistency import consistent, join_fragments, odometry_between
 from graphvio.optimization.graph import Fragment, SessionGraph, Tie, moved, poses_of
 from graphvio.optimization.loops.search import LoopClosure
@@ -77,6 +78,8 @@ class Optimization:
         graph: with all that was used.
         values: the solution.
         ties: closures that are used, as factors.
+        graph_alone: without closures, each fragment in a frame of its own.
+        alone: its solution.
     """
 
     sessions: Sequence[OptimizedSession]
@@ -88,6 +91,8 @@ class Optimization:
     graph: gtsam.NonlinearFactorGraph
     values: gtsam.Values
     ties: Sequence[Tie]
+    graph_alone: gtsam.NonlinearFactorGraph
+    alone: gtsam.Values
 
     @property
     def cost_before(self) -> float:
@@ -123,9 +128,9 @@ def optimize(
     sessions = [choose_nodes(record, settings.keyframe_interval_s) for record in records]
     whole = SessionGraph(sessions, imus, config.smoother)
     fragments = whole.fragments
-    graph, kinds = whole.complete(range(len(fragments)))
-    before = residuals(graph, kinds, whole.values)
-    alone = solve(graph, whole.values, _named(on_progress, "without loops"))
+    graph_alone, kinds = whole.complete(range(len(fragments)))
+    before = residuals(graph_alone, kinds, whole.values)
+    alone = solve(graph_alone, whole.values, _named(on_progress, "without loops"))
     ties = [_tie(closure, sessions, whole) for closure in closures]
     states = [each.states for each in fragments]
     poses = poses_of(alone, len(whole))
@@ -133,7 +138,7 @@ def optimize(
     values = moved(alone, list(zip(states, joined.frames, strict=True)))
     component = np.repeat(joined.component, [len(each) for each in states]).tolist()
     ends = sorted({end for tie in ties for end in (tie.first, tie.second)})
-    odometry = odometry_between(graph, alone, states, ends)
+    odometry = odometry_between(graph_alone, alone, states, ends)
     poses = poses_of(values, len(whole))
     believed = consistent(poses, component, ties, odometry, settings.loop_probability)
     used = [tie for tie, is_used in zip(ties, believed, strict=True) if is_used]
@@ -158,6 +163,8 @@ def optimize(
         graph=graph,
         values=values,
         ties=used,
+        graph_alone=graph_alone,
+        alone=alone,
     )
 
 
@@ -189,8 +196,6 @@ def _session(
 def _judged(
     closure: LoopClosure, tie: Tie, is_used: bool, component: Sequence[int], solution: Float, probability: float
 ) -> JudgedLoop:
-    from graphvio.geometry import se3_inverse, se3_log
-
     if component[tie.first] != component[tie.second]:
         return JudgedLoop(closure, "too few closures agree on how its two parts lie to each other", float("nan"))
     error = se3_log(se3_inverse(se3_inverse(solution[tie.first]) @ solution[tie.second]) @ tie.first_T_second)

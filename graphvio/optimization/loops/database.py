@@ -98,11 +98,23 @@ class FeatureDatabase:
         """What is written inside is written as a whole or not at all."""
         return self._colmap.DatabaseTransaction(self._file)  # type: ignore[no-any-return]
 
-    def add_rig(self, rig: Rig) -> tuple[int, list[int]]:
-        """Add the rig and its cameras, or find it; the first camera is the reference of COLMAP's rig.
+    def rig_of(self, session: str) -> tuple[int, dict[str, int]] | None:
+        """The number of the rig that took a session's images, and those of its cameras by name; None without images."""
+        numbers = {}
+        for name, number in self._ids.items():
+            of, camera, _ = name.rsplit("/", 2)
+            if of == session and camera not in numbers:
+                numbers[camera] = self._file.read_image(number).camera_id
+        if not numbers:
+            return None
+        sensor = self._colmap.sensor_t(self._colmap.SensorType.CAMERA, next(iter(numbers.values())))
+        return self._file.read_rig_with_sensor(sensor).rig_id, numbers
+
+    def add_rig(self, rig: Rig) -> tuple[int, dict[str, int]]:
+        """Add a rig, whose first camera is the reference of COLMAP's.
 
         Returns:
-            The rig's number, and the cameras', in the rig's order.
+            The rig's number, and those of its cameras by name.
         """
         library = self._colmap
         numbers = [self._file.write_camera(colmap_camera(camera, 0)) for camera in rig.cameras]
@@ -113,7 +125,9 @@ class FeatureDatabase:
                 made.add_ref_sensor(sensor)
             else:
                 made.add_sensor(sensor, rigid(camera.cam_T_body @ rig.cameras[0].body_T_cam))
-        return self._file.write_rig(made), numbers
+        return self._file.write_rig(made), {
+            camera.name: number for camera, number in zip(rig.cameras, numbers, strict=True)
+        }
 
     def add_place(self, rig_id: int, images: Mapping[int, str]) -> None:
         """Add the images of one instant: camera's number -> name."""

@@ -54,7 +54,6 @@ def extract_places(
     session: str,
     stamps_ns: Sequence[int],
     database: FeatureDatabase,
-    most_features: int,
     config: Config,
     on_progress: Callable[[int], None] | None = None,
 ) -> None:
@@ -68,13 +67,10 @@ def extract_places(
         session: its name, unique in the database.
         stamps_ns: of the places.
         database: to write.
-        most_features: of an image.
-        config: of the stereo matching.
+        config: of this stage and of the stereo matching.
         on_progress: called with the number of places done.
     """
-    extractor = Extractor(most_features)
-    rig_id, cameras = database.add_rig(rig)
-    of_name = dict(zip((camera.name for camera in rig.cameras), cameras, strict=True))
+    extractor = Extractor(config.optimization.features)
     of_thread = threading.local()
 
     def look(stamp_ns: int) -> dict[int, _Seen]:
@@ -95,7 +91,7 @@ def extract_places(
         for at, stamp_ns in enumerate(missing):
             while len(pending) < _AHEAD and at + len(pending) < len(missing):
                 pending.append(pool.submit(look, missing[at + len(pending)]))
-            _store(database, rig, rig_id, of_name, session, stamp_ns, pending.pop(0).result())
+            _store(database, rig, session, stamp_ns, pending.pop(0).result())
             done += 1
             if on_progress is not None:
                 on_progress(done)
@@ -115,16 +111,14 @@ def _is_there(database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int) 
     return any(image_name(session, pair.left.name, stamp_ns) in database.names for pair in rig.pairs)
 
 
-def _store(
-    database: FeatureDatabase, rig: Rig, rig_id: int, cameras: dict[str, int], session: str, stamp_ns: int,
-    seen: dict[int, _Seen],
-) -> None:  # fmt: skip
+def _store(database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int, seen: dict[int, _Seen]) -> None:
     names = {
         camera.name: image_name(session, camera.name, stamp_ns)
         for j in seen
         for camera in (rig.pairs[j].left, rig.pairs[j].right)
     }
     with database.transaction():
+        rig_id, cameras = database.rig_of(session) or database.add_rig(rig)
         database.add_place(rig_id, {cameras[camera]: name for camera, name in names.items()})
         for j, found in seen.items():
             left, right = names[rig.pairs[j].left.name], names[rig.pairs[j].right.name]

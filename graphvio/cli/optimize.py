@@ -1,0 +1,121 @@
+"""``graphvio optimize``: recorded sessions as a whole, with loop closures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from graphvio.cli import options
+
+if TYPE_CHECKING:
+    from graphvio.optimization.optimize import Optimization
+
+
+def optimize(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Recordings of one place: folders (EuRoC/ASL, TUM-VI, KITTI), sessions (.mcap) or ROS bags.",
+            metavar="SOURCE...",
+        ),
+    ],
+    rig: options.RigFile = None,
+    topics: options.Topics = None,
+    config: options.ConfigName = "default",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="Folder for the results: new, or that of an interrupted run of the same, which goes on.  "
+            "[default: results/NAME-optimized-N]",
+            metavar="DIR",
+        ),
+    ] = None,
+    pairs: options.Pairs = None,
+    no_imu: options.NoImu = False,
+    no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
+    from_s: options.FromS = None,
+    to_s: options.ToS = None,
+    verbose: options.Verbose = False,
+) -> None:
+    """Find the best trajectory that all measurements of recorded sessions hold together.
+
+    Runs the odometry, finds places that are seen again, by any pair, and optimises everything as one graph. Several
+    sessions of one place are brought into one frame. What is interrupted goes on where it was when it is started again
+    with the same --out.
+
+    Examples:
+
+        graphvio optimize walk --out walk-optimized
+
+        graphvio optimize monday.mcap tuesday.mcap --out both
+    """
+    from graphvio.cli.run import EXIT_INTERRUPTED, open_recording
+    from graphvio.config import Config
+    from graphvio.optimization.loops.database import colmap
+    from graphvio.optimization.pipeline import named, optimize_sessions
+    from graphvio.results import ResultWriter
+    from graphvio.warmup import warm_up
+
+    if not no_loops:
+        colmap()  # before hours of work, not after
+    settings = Config.load(config)
+    sessions = named(
+        [
+            open_recording(source, rig, settings, pairs=pairs, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
+            for source in sources
+        ]
+    )
+    folder = out
+    if folder is None:
+        folder = ResultWriter.new_folder(Path("results"), f"{sessions[0].name}-optimized")
+    for session in sessions:
+        warm_up(session.source.rig, settings)
+    try:
+        with _Stages() as stages:
+            found = optimize_sessions(sessions, folder, settings, with_loops=not no_loops, on_progress=stages.show)
+    except KeyboardInterrupt:
+        typer.echo(f"graphvio: interrupted; the same command with --out {folder} goes on from there", err=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    _tell(found, folder)
+
+
+class _Stages:
+    """A bar for each stage."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        columns = (TextColumn("{task.description:<28}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        self._bars = Progress(*columns, console=Console(stderr=True))
+        self._tasks: dict[str, Any] = {}
+
+    def __enter__(self) -> _Stages:
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bars.stop()
+
+    def show(self, stage: str, done: float, total: float) -> None:
+        """Draw how far a stage is."""
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bars.add_task(stage, total=total)
+        self._bars.update(self._tasks[stage], completed=done, total=total)
+
+
+def _tell(found: Optimization, folder: Path) -> None:
+    used = sum(not loop.refusal for loop in found.loops)
+    typer.echo(
+        f"{sum(len(each.record.stamps_ns) for each in found.sessions)} framesets, "
+        f"{sum(len(each.nodes.rows) for each in found.sessions)} states, "
+        f"{len(found.loops)} loop closures found, {used} used"
+    )
+    frames = len(set(found.frames))
+    if frames > 1:
+        typer.echo(f"graphvio: {frames} parts that no loop closures join, each in a frame of its own", err=True)
+    typer.echo(f"cost {found.cost_before:.0f} as the odometry left it, {found.cost_after:.1f} now")
+    typer.echo(f"results: {folder}")

@@ -1,0 +1,63 @@
+"""Loop closures on disk."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphvio.arrays import Int
+from graphvio.errors import OptimizationError
+from graphvio.optimization.loops.search import LoopClosure, Place
+
+
+def to_bytes(closures: Sequence[LoopClosure]) -> bytes:
+    """As numpy's archive; equal closures give equal bytes."""
+    ends = [[(end.session, end.row, end.stamp_ns) for end in (each.reference, each.current)] for each in closures]
+    crossings = [(k, a, b) for k, each in enumerate(closures) for a, b in each.pairs]
+    columns: dict[str, Any] = {
+        "ends": np.array(ends, dtype=np.int64).reshape(-1, 2, 3),
+        "poses": np.array([each.reference_T_current for each in closures]).reshape(-1, 4, 4),
+        "covariances": np.array([each.covariance for each in closures]).reshape(-1, 6, 6),
+        "inliers": np.array([each.inliers for each in closures], dtype=np.int64),
+        "is_registered": np.array([each.is_registered for each in closures], dtype=bool),
+        "crossings": np.array(crossings, dtype=np.int64).reshape(-1, 3),
+    }
+    buffer = io.BytesIO()
+    np.savez(buffer, **columns)
+    return buffer.getvalue()
+
+
+def load(path: Path) -> list[LoopClosure]:
+    """Read what `to_bytes` gave.
+
+    Raises:
+        OptimizationError: if it cannot be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            columns = {name: file[name] for name in file.files}
+        crossings = columns["crossings"]
+        return [
+            LoopClosure(
+                _place(columns["ends"][k, 0]),
+                _place(columns["ends"][k, 1]),
+                columns["poses"][k],
+                columns["covariances"][k],
+                int(columns["inliers"][k]),
+                tuple((int(a), int(b)) for _, a, b in crossings[crossings[:, 0] == k]),
+                bool(columns["is_registered"][k]),
+            )
+            for k in range(len(columns["ends"]))
+        ]
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise OptimizationError(f"{path}: holds no loop closures ({error}); remove the folder") from None
+
+
+def _place(row: Int) -> Place:
+    session, frameset, stamp_ns = row.tolist()
+    return Place(session, frameset, stamp_ns)

@@ -1,0 +1,163 @@
+"""From recordings to one optimised map, stage by stage: odometry, features, loops, graph."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from graphvio import __version__
+from graphvio.config import Config
+from graphvio.optimization.exchange import covariance_text, trajectory_text, write_g2o
+from graphvio.optimization.loops import saved
+from graphvio.optimization.loops.database import FeatureDatabase
+from graphvio.optimization.loops.features import extract_places
+from graphvio.optimization.loops.places import choose_places
+from graphvio.optimization.loops.search import LoopClosure, Place, SessionInput, find_loops
+from graphvio.optimization.optimize import Optimization, optimize
+from graphvio.optimization.record import Recorder, SessionRecord
+from graphvio.optimization.workspace import Workspace, digest
+from graphvio.pipeline import Progress as RunProgress
+from graphvio.pipeline import run
+from graphvio.results import ResultWriter
+from graphvio.rig_files.native import to_text
+from graphvio.sources import Source
+
+DATABASE = "database.db"
+
+Progress = Callable[[str, float, float], None]
+"""Called with the stage, and how much of how much is done."""
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """A recording with a name that no other of the same optimisation has."""
+
+    name: str
+    source: Source
+
+
+def named(sources: Sequence[Source]) -> list[Session]:
+    """Sessions by their sources' names; a number is added where several have the same."""
+    made: list[Session] = []
+    for source in sources:
+        name, number = source.name, 1
+        while name in {each.name for each in made}:
+            number += 1
+            name = f"{source.name}-{number}"
+        made.append(Session(name, source))
+    return made
+
+
+def optimize_sessions(
+    sessions: Sequence[Session],
+    out: Path,
+    config: Config,
+    *,
+    with_loops: bool = True,
+    on_progress: Progress | None = None,
+) -> Optimization:
+    """Run the odometry on recordings, find loop closures within and between them, and optimise all as one.
+
+    Args:
+        sessions: one or several.
+        out: folder of the results: new, or one in which an optimisation of the same was interrupted, which goes on.
+        config: of all stages.
+        with_loops: whether loop closures are looked for, which needs the extra ``maps``.
+        on_progress: told how far it is.
+
+    Raises:
+        GraphvioError: if a recording cannot be read, holds no pose, or the folder cannot be used.
+    """
+    stages = _Stages(sessions, out, config, on_progress or _quiet)
+    records = [stages.record(number) for number in range(len(sessions))]
+    closures = stages.closures(records) if with_loops else []
+    return stages.result(records, closures)
+
+
+class _Stages:
+    def __init__(self, sessions: Sequence[Session], out: Path, config: Config, on_progress: Progress) -> None:
+        self._sessions = sessions
+        self._config = config
+        self._on_progress = on_progress
+        inputs = {each.name: _identity(each.source) for each in sessions}
+        self._space = Workspace(out, inputs | {"config": config.sha256(), "graphvio": __version__})
+
+    def record(self, number: int) -> SessionRecord:
+        """What the odometry makes of a session; beside it the results of its run."""
+        session = self._sessions[number]
+        name, stage = f"{session.name}/record.npz", f"odometry of {session.name}"
+        if not self._space.has_finished(stage):
+            folder = self._space.folder / session.name / "odometry"
+            shutil.rmtree(folder, ignore_errors=True)  # of a run that was interrupted
+            recorder = Recorder(session.name)
+
+            def follow(progress: RunProgress) -> None:
+                self._on_progress(stage, progress.framesets, progress.total)
+
+            with ResultWriter(folder, session.source.rig, self._config.to_yaml()) as writer:
+                run(session.source, self._config, writer, on_progress=follow, recorder=recorder)
+            self._space.write(name, recorder.record().to_bytes())
+            self._space.finish(stage)
+        return SessionRecord.load(self._space.folder / name)
+
+    def closures(self, records: Sequence[SessionRecord]) -> list[LoopClosure]:
+        """Loop closures within and between the sessions."""
+        inputs = [self._input(number, record) for number, record in enumerate(records)]
+        with FeatureDatabase(self._space.folder / DATABASE) as database:
+            for each in inputs:
+                self._extract(each, database)
+            if not self._space.has_finished("loops"):
+                found = find_loops(
+                    inputs, database, self._config, lambda done, total: self._on_progress("loops", done, total)
+                )
+                self._space.write("loops.npz", saved.to_bytes(found))
+                self._space.finish("loops")
+        return saved.load(self._space.folder / "loops.npz")
+
+    def result(self, records: Sequence[SessionRecord], closures: Sequence[LoopClosure]) -> Optimization:
+        """The solution, with its files."""
+        imus = [each.source.rig.imu for each in self._sessions]
+        found = optimize(
+            records, imus, closures, self._config, lambda name, number, _: self._on_progress(name, number, number)
+        )
+        for session, optimized in zip(self._sessions, found.sessions, strict=True):
+            place = "" if len(self._sessions) == 1 else f"{session.name}/"
+            self._space.write(f"{place}trajectory_optimized.txt", trajectory_text(optimized).encode())
+            self._space.write(f"{place}covariance.csv", covariance_text(optimized).encode())
+        write_g2o(found, self._space.folder / "graph.g2o")
+        return found
+
+    def _input(self, number: int, record: SessionRecord) -> SessionInput:
+        session, settings = self._sessions[number], self._config.optimization
+        rows = choose_places(record, settings.place_distance_m, settings.place_angle_deg)
+        places = [Place(number, row, int(record.stamps_ns[row])) for row in rows.tolist()]
+        return SessionInput(session.name, session.source, session.source.rig, places)
+
+    def _extract(self, session: SessionInput, database: FeatureDatabase) -> None:
+        stage = f"features of {session.name}"
+        if self._space.has_finished(stage):
+            return
+        total = len(session.places)
+        extract_places(
+            session.source,
+            session.rig,
+            session.name,
+            [place.stamp_ns for place in session.places],
+            database,
+            self._config,
+            lambda done: self._on_progress(stage, done, total),
+        )
+        self._space.finish(stage)
+
+
+def _identity(source: Source) -> str:
+    """What tells a recording from others, as far as that shows without reading it."""
+    return digest(
+        source.name, str(source.start_ns), str(source.end_ns), str(source.frameset_count), to_text(source.rig, Path())
+    )
+
+
+def _quiet(stage: str, done: float, total: float) -> None:
+    """Nobody wants to know."""

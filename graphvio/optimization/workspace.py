@@ -1,0 +1,102 @@
+"""The folder of an optimisation: what each stage has left, so that an interrupted run goes on where it was."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from graphvio.errors import OptimizationError
+
+_STATE = "stages.json"
+
+
+class Workspace:
+    """A folder of results that is made stage by stage.
+
+    Args:
+        folder: made if absent; else one that an optimisation of the same input was writing.
+        inputs: what decides the result: name -> value.
+
+    Raises:
+        OptimizationError: if the folder holds something else, or cannot be written.
+    """
+
+    def __init__(self, folder: Path, inputs: Mapping[str, str]) -> None:
+        self.folder = folder
+        self._inputs = dict(inputs)
+        self._finished: list[str] = []
+        state = folder / _STATE
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if state.is_file():
+                self._go_on(json.loads(state.read_text(encoding="utf-8")))
+            elif any(folder.iterdir()):
+                raise OptimizationError(
+                    f"{folder}: is not empty, and results are never overwritten; name another folder"
+                )
+            self._save()
+        except OSError as error:
+            raise _cannot_write(folder, error) from None
+        except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
+            raise OptimizationError(f"{state}: is damaged; remove the folder, or name another one") from None
+
+    def has_finished(self, stage: str) -> bool:
+        """Whether a stage was finished, now or by an earlier run."""
+        return stage in self._finished
+
+    def finish(self, stage: str) -> None:
+        """Note that a stage is finished.
+
+        Raises:
+            OptimizationError: if it cannot be written.
+        """
+        self._finished.append(stage)
+        self._save()
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write a file that is either whole or absent.
+
+        Raises:
+            OptimizationError: if it cannot be written.
+        """
+        path = self.folder / name
+        unfinished = path.with_name(f".{path.name}.tmp")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with unfinished.open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            unfinished.replace(path)
+        except OSError as error:
+            raise _cannot_write(path, error) from None
+
+    def _go_on(self, state: dict[str, object]) -> None:
+        known = state["inputs"]
+        assert isinstance(known, dict)
+        differing = [name for name in sorted({*known, *self._inputs}) if known.get(name) != self._inputs.get(name)]
+        if differing:
+            raise OptimizationError(
+                f"{self.folder}: holds results of other input (different: {', '.join(differing)}); name another folder"
+            )
+        finished = state["finished"]
+        assert isinstance(finished, list)
+        self._finished = [str(stage) for stage in finished]
+
+    def _save(self) -> None:
+        state = {"inputs": self._inputs, "finished": self._finished}
+        self.write(_STATE, (json.dumps(state, indent=2) + "\n").encode())
+
+
+def digest(*parts: str) -> str:
+    """Of some texts."""
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def _cannot_write(where: Path, error: OSError) -> OptimizationError:
+    return OptimizationError(
+        f"{where}: cannot be written ({error.strerror or error}); choose another place for results"
+    )
