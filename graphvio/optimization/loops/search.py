@@ -24,8 +24,7 @@ from graphvio.sources import Source
 
 _LEAST_MATCHES = 20
 _MOST_CROSSINGS = 2  # pairs of images of a candidate that are matched
-_SHARED_PIXELS = 2.5  # features lie closer than patches are wide: measured, by how much squared errors exceed the rest
-_LEAST_SIGMAS = np.repeat([5e-5, 1e-4], 3)  # radians and metres: what cameras' calibrations leave
+_INDEPENDENT_POINTS = 10  # errors of lenses' calibrations are alike across much of an image: more points help no more
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,7 +287,7 @@ def _closure(earlier: Place, later: Place, found: Resection) -> LoopClosure:
         earlier,
         later,
         se3_inverse(found.cur_T_ref),
-        _SHARED_PIXELS * found.covariance + np.diag(_LEAST_SIGMAS**2),
+        found.covariance * max(1.0, found.inliers / _INDEPENDENT_POINTS),
         found.inliers,
         found.pairs,
         found.is_registered,
