@@ -130,7 +130,9 @@ class SessionRecord:
             }
             return SessionRecord(**(columns | groups | {"name": str(columns["name"])}))
         except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-            raise OptimizationError(f"{path}: is no record of a session ({error}); remove it to have it made anew") from None
+            raise OptimizationError(
+                f"{path}: is no record of a session ({error}); remove it to have it made anew"
+            ) from None
 
 
 class Recorder:
