@@ -124,5 +124,5 @@ def test_command_writes_a_recording(tmp_path: Path) -> None:
 def test_command_names_the_scenes(tmp_path: Path) -> None:
     result = CliRunner().invoke(command(), ["kitchen", "--out", str(tmp_path / "r")])
     assert isinstance(result.exception, SourceError)
-    for name in ("room", "corridor", "stairs", "calibration"):
+    for name in ("room", "corridor", "stairs", "loop", "calibration"):
         assert name in str(result.exception)

@@ -5,6 +5,7 @@ import pytest
 from graphvio.arrays import Image
 from graphvio.errors import SourceError
 from graphvio.simulation import SCENE_NAMES, Simulator, build_scene, make_simulator
+from graphvio.simulation.default_rig import default_rig
 
 STRENGTH = 1e-3  # smallest eigenvalue of a corner that stands out from the noise
 
@@ -51,6 +52,21 @@ def test_every_camera_sees_texture_and_no_hole(name: str) -> None:
             assert corners(image) > 80
 
 
+@pytest.mark.parametrize("name", SCENE_NAMES)
+def test_no_camera_passes_through_anything(name: str) -> None:
+    scene = build_scene(name)
+    world_T_body = scene.motion.at(np.arange(0.0, scene.motion.duration_s, 0.05)).world_T_body
+    origin, u, v = np.array([(r.origin, r.edge_u, r.edge_v) for r in scene.world.rectangles]).swapaxes(0, 1)
+    normal = np.cross(u, v)
+    for camera in default_rig().cameras:
+        centres = (world_T_body @ camera.body_T_cam)[:, :3, 3]
+        side = centres @ normal.T - np.sum(origin * normal, axis=1)
+        step, surface = np.nonzero(side[:-1] * side[1:] <= 0.0)  # where a plane is crossed
+        place = centres[step] - origin[surface]
+        within = [np.sum(place * edge[surface], axis=1) / np.sum(edge[surface] ** 2, axis=1) for edge in (u, v)]
+        assert not np.any((within[0] >= 0.0) & (within[0] <= 1.0) & (within[1] >= 0.0) & (within[1] <= 1.0))
+
+
 def test_both_pairs_go_blind_at_the_bend(corridor: Simulator) -> None:
     start, end = corridor.scene.events["blank"]
     assert end < 40.0
@@ -90,3 +106,40 @@ def test_a_cut_walk_is_the_beginning_of_the_whole(corridor: Simulator) -> None:
     assert np.array_equal(cut.world_T_body, corridor.world_T_body[: len(cut.stamps_ns)])
     assert cut.scene.events == corridor.scene.events
     assert np.array_equal(cut.image(119, 0), corridor.image(119, 0))
+
+
+def test_the_loop_passes_its_start_in_both_directions() -> None:
+    scene = build_scene("loop")
+    times = np.arange(0.0, scene.motion.duration_s, 0.05)
+    states = scene.motion.at(times)
+    position, forward = states.world_T_body[:, :3, 3], states.world_T_body[:, :3, 0]
+    walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
+    away = np.linalg.norm(position - position[0], axis=1)
+    assert 75.0 < walked[-1] < 90.0
+    assert away.max() > 15.0
+    at_start = (away < 0.15) & (walked > 1.0)
+    turned = times > scene.events["turn"][1]
+    again, back = at_start & ~turned, at_start & turned
+    assert again.any()
+    assert times[again].mean() == pytest.approx(scene.events["again"][0], abs=0.1)
+    assert (forward[again] @ forward[0] > 0.95).all()
+    assert back.any()
+    assert scene.events["back"][0] < times[back].min() < times[back].max() < scene.events["back"][1]
+    assert (forward[back] @ forward[0] < -0.95).all()
+    assert np.abs(states.angular_velocity).max() < 2.0  # nobody turns on the spot
+    assert np.linalg.norm(states.velocity[times > scene.motion.duration_s - 0.5], axis=1).max() < 1e-9
+
+
+def test_all_legs_of_the_loop_have_texture_and_the_same_doors() -> None:
+    def leg(x: float, y: float) -> str:
+        return "south" if y < 2.0 else "north" if y > 9.0 else "east" if x > 0.0 else "west"
+
+    simulator = make_simulator("loop", rate_hz=0.4)
+    doors = [r.origin + 0.5 * r.edge_u for r in simulator.scene.world.rectangles if r.texture == "door"]
+    seen = [leg(x, y) for x, y in simulator.world_T_body[:, :2, 3]]
+    for name in ("south", "east", "north", "west"):
+        assert sum(leg(x, y) == name for x, y, _ in doors) >= 3
+        assert seen.count(name) >= 2
+    for index in range(len(seen)):
+        for camera in (0, 2):
+            assert corners(simulator.image(index, camera)) > 200

@@ -11,7 +11,7 @@ from graphvio.cli import options
 
 
 def simulate(
-    name: Annotated[str, typer.Argument(help="Scene: room, corridor, stairs or calibration.")],
+    name: Annotated[str, typer.Argument(help="Scene: room, corridor, stairs, loop or calibration.")],
     out: Annotated[Path, typer.Option("--out", help="Folder to write; new or empty.")],
     duration: Annotated[
         float | None, typer.Option("--duration", help="Seconds of the walk.  [default: all of it]")
@@ -25,7 +25,8 @@ def simulate(
 ) -> None:
     """Simulate a walk with four cameras and an IMU, and write it in the EuRoC/ASL layout.
 
-    The corridor has a door that opens in front, a crowd, a bend with blank walls and failing lamps.
+    The corridor has a door that opens in front, a crowd, a bend with blank walls and failing lamps. The loop goes once
+    around four corridors, through its start again, turns round and comes back past it.
 
     Examples:
 

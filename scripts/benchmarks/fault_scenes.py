@@ -39,7 +39,7 @@ def recording(data: Path, scene: str, duration_s: float, seed: int = 0) -> Path:
     def render(folder: Path) -> None:
         write_recording(_simulator(scene, duration_s, seed), folder)
 
-    return rendered_once(data / "faults", f"{scene}-{duration_s:g}s-seed{seed}", render, Path(__file__))
+    return rendered_once(data / "faults", scene, f"{duration_s:g}s-seed{seed}", render, Path(__file__))
 
 
 def texture_map(name: str) -> Map:

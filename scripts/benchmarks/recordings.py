@@ -20,7 +20,7 @@ from graphvio.arrays import Image
 from graphvio.errors import GraphvioError
 from graphvio.events import Event, FrameSet
 from graphvio.rig import Camera, Rig, StereoPair
-from graphvio.simulation import simulate
+from graphvio.simulation import SCENE_NAMES, simulate
 from graphvio.sources import open_source
 
 
@@ -48,24 +48,27 @@ def simulated(data: Path, scene: str, duration_s: float | None = None) -> Path:
         GraphvioError: if it cannot be made.
     """
     length = "whole" if duration_s is None else f"{duration_s:g}s"
-    return rendered_once(data, f"{scene}-{length}", lambda folder: simulate(scene, folder, duration_s=duration_s))
+    return rendered_once(data, scene, length, lambda folder: simulate(scene, folder, duration_s=duration_s))
 
 
-def rendered_once(data: Path, name: str, render: Callable[[Path], object], *sources: Path) -> Path:
+def rendered_once(data: Path, scene: str, variant: str, render: Callable[[Path], object], *sources: Path) -> Path:
     """The folder of a recording, which is rendered if it is missing.
 
-    Its name ends in a digest of the simulator's sources, so that a changed simulator renders anew.
+    Its name ends in a digest of the simulator's sources, so that a changed simulator renders anew; of the scenes'
+    own modules only this scene's counts.
 
     Args:
         data: folder of all recordings.
-        name: tells this recording from all others.
+        scene: of the simulator's, or one that the sources hold.
+        variant: tells this recording from all others of the scene.
         render: writes it into a folder that does not exist yet.
         sources: further files that decide what is rendered.
 
     Raises:
         GraphvioError: if it cannot be made.
     """
-    folder = data / f"{name}-{_digest(sources)}"
+    name = f"{scene}-{variant}"
+    folder = data / f"{name}-{_digest(scene, sources)}"
     if folder.is_dir():
         return folder
     tell(f"rendering {name} into {data}; this is done once and takes about three times its length")
@@ -85,12 +88,15 @@ def rendered_once(data: Path, name: str, render: Callable[[Path], object], *sour
 
 
 @cache
-def _digest(sources: tuple[Path, ...]) -> str:
+def _digest(scene: str, sources: tuple[Path, ...]) -> str:
     """Of everything that decides the bytes of a recording: the simulator, and what it takes from the package."""
     package = Path(graphvio.__file__).parent
     taken = ("cameras.py", "geometry.py", "kernels.py", "rig.py", "rig_files/native.py")
+    scenes = package / "simulation" / "scenes"
+    others = {scenes / f"{name}.py" for name in SCENE_NAMES if name != scene}
+    simulator = sorted(path for path in (package / "simulation").rglob("*.py") if path not in others)
     digest = hashlib.sha256()
-    for path in [*(package / name for name in taken), *sorted((package / "simulation").rglob("*.py")), *sources]:
+    for path in [*(package / name for name in taken), *simulator, *sources]:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:8]
 

@@ -182,8 +182,9 @@ class _Verifier:
         matches = {}
         for (a, b), names in crossings.items():
             rows = self._matched(earlier, later, a, b, names)
-            if len(rows) >= _LEAST_MATCHES:
-                matches[a, b] = rows
+            if len(rows) < _LEAST_MATCHES:
+                break  # the others are less alike
+            matches[a, b] = rows
         if not matches:
             return None
         reference = {a: self._frame(earlier, a) for a, _ in matches}

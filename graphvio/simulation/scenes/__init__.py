@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from graphvio.errors import SourceError
-from graphvio.simulation.scenes import calibration, corridor, room, stairs
+from graphvio.simulation.scenes import calibration, corridor, loop, room, stairs
 from graphvio.simulation.scenes.scene import Scene
 
 _BUILDERS: dict[str, tuple[Callable[[float, float], Scene], float]] = {
     "calibration": (calibration.build, 40.0),
     "corridor": (corridor.build, 60.0),
+    "loop": (loop.build, 73.0),
     "room": (room.build, 40.0),
     "stairs": (stairs.build, 30.0),
 }

@@ -22,7 +22,7 @@ class Scene:
         world: what there is to see.
         motion: of the body; its length is the recording's.
         exposure: light and gain at a time in seconds.
-        events: name -> (start, end) in seconds of what makes the scene hard.
+        events: name -> (start, end) in seconds of what the scene is there for.
     """
 
     name: str
