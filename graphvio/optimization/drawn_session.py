@@ -1,0 +1,190 @@
+"""Sessions drawn by chance: what the odometry would measure on a walk in laps, without images.
+
+For experiments with sessions of any length, whose truth and noise are known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.geometry import se3_exp, se3_inverse
+from graphvio.optimization.loops.search import LoopClosure, Place
+from graphvio.optimization.record import Inertial, Motions, SessionRecord
+from graphvio.rig import Imu
+from graphvio.simulation.imu import ImuTrack, measure
+from graphvio.simulation.motion import Motion
+from graphvio.trajectory import Trajectory
+
+_FRAMESET_HZ = 20
+_KEYFRAME_FRAMES = 4
+_LAP_S = 90.0
+_HALF_LENGTH_M, _HALF_WIDTH_M = 15.0, 9.0
+_MOTION_SIGMAS = np.repeat([3e-4, 8e-4], 3)  # radians and metres, of one keyframe's motion
+_SHARED = 0.5  # share of a motion's covariance that all motions from its keyframe have in common
+_LOOP_SIGMAS = np.repeat([1e-3, 3e-3], 3)
+_FALSE_SIGMAS = np.repeat([0.3, 2.0], 3)
+_VELOCITY_SIGMA = 0.02
+_GYRO_BIAS_SIGMA, _ACCEL_BIAS_SIGMA = 2e-4, 5e-3
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnSession:
+    """A session, and what is true of it.
+
+    Attributes:
+        record: as the odometry would have it.
+        closures: between places of different laps; the false ones come last.
+        false: how many of them are false.
+        truth: of all framesets.
+    """
+
+    record: SessionRecord
+    closures: list[LoopClosure]
+    false: int
+    truth: Trajectory
+
+
+def draw_session(
+    duration_s: float, seed: int, imu: Imu, loops: int, false_share: float = 0.0, session: int = 0
+) -> DrawnSession:
+    """Draw a walk in laps of 90 s around a building, 20 framesets and 5 keyframes a second.
+
+    Args:
+        duration_s: of the walk.
+        seed: of all noise; walks of different seeds go the same way.
+        imu: whose noise is drawn.
+        loops: closures in all.
+        false_share: of them that are false: anywhere, and off by metres.
+        session: number that the closures' places have.
+    """
+    rng = np.random.default_rng([seed, 7])
+    rate = round(imu.rate_hz)
+    samples = round(duration_s * rate)
+    times = np.arange(samples + 1) / rate
+    track = measure(Motion(_course, duration_s), imu, times, (times * _NS).astype(np.int64), seed)
+    rows = np.arange(0, samples + 1, rate // _FRAMESET_HZ)
+    truth = track.states.world_T_body[rows]
+    motions = _motions(truth, rng)
+    drifting = _integrated(truth[0], motions, len(rows))
+    record = SessionRecord(
+        name=f"drawn-{seed}",
+        stamps_ns=track.stamps_ns[rows],
+        epoch=np.zeros(len(rows), dtype=np.int64),
+        online=drifting,
+        smoothed=drifting,
+        covariance=np.tile(np.diag(_MOTION_SIGMAS**2), (len(rows), 1, 1)),
+        velocity_nav=track.states.velocity[rows] + _VELOCITY_SIGMA * rng.standard_normal((len(rows), 3)),
+        gyro_bias=track.gyro_bias[rows] + _GYRO_BIAS_SIGMA * rng.standard_normal((len(rows), 3)),
+        accel_bias=track.accel_bias[rows] + _ACCEL_BIAS_SIGMA * rng.standard_normal((len(rows), 3)),
+        at_rest=np.zeros(len(rows), dtype=bool),
+        is_keyframe=np.arange(len(rows)) % _KEYFRAME_FRAMES == 0,
+        with_imu=np.ones(len(rows), dtype=bool),
+        motions=motions,
+        inertial=_inertial(track, rows),
+    )
+    false = round(false_share * loops)
+    closures = [_true_loop(record, truth, rng, session) for _ in range(loops - false)]
+    closures += [_false_loop(record, rng, session) for _ in range(false)]
+    return DrawnSession(record, closures, false, Trajectory(record.stamps_ns, truth))
+
+
+def closure_between(one: DrawnSession, other: DrawnSession, row: int, seed: int) -> LoopClosure:
+    """A true closure between two sessions, 0 and 1, at about the same place of the lap."""
+    rng = np.random.default_rng([seed, row])
+    motion = se3_inverse(one.truth.nav_T_body[row]) @ other.truth.nav_T_body[row]
+    return _closure(one.record, row, other.record, row, motion, rng, (0, 1))
+
+
+def _course(times_s: Float) -> Float:
+    """``[x, y, z, yaw, pitch, roll]`` (N, 6): around a long round, with the bob of steps."""
+    phase = 2.0 * np.pi * times_s / _LAP_S
+    step = 2.0 * np.pi * 1.9 * times_s
+    return np.column_stack(
+        [
+            _HALF_LENGTH_M * np.cos(phase),
+            _HALF_WIDTH_M * np.sin(phase),
+            1.5 + 0.02 * np.sin(step),
+            np.arctan2(_HALF_WIDTH_M * np.cos(phase), -_HALF_LENGTH_M * np.sin(phase))
+            + 2.0 * np.pi * np.floor((phase + np.pi / 2) / (2.0 * np.pi))
+            + 0.05 * np.sin(0.5 * step),
+            0.01 * np.sin(step),
+            0.02 * np.sin(0.5 * step),
+        ]
+    )
+
+
+def _motions(truth: Float, rng: np.random.Generator) -> Motions:
+    """Each frameset's motion from the keyframe before it."""
+    count = len(truth)
+    row = np.arange(1, count)
+    reference = (row - 1) // _KEYFRAME_FRAMES * _KEYFRAME_FRAMES
+    covariance = np.diag(_MOTION_SIGMAS**2)
+    shared = np.sqrt(_SHARED) * _MOTION_SIGMAS * rng.standard_normal((count // _KEYFRAME_FRAMES + 1, 6))
+    own = np.sqrt(1.0 - _SHARED) * _MOTION_SIGMAS * rng.standard_normal((count - 1, 6))
+    poses = np.array(
+        [
+            se3_inverse(truth[i]) @ truth[j] @ se3_exp(shared[i // _KEYFRAME_FRAMES] + error)
+            for i, j, error in zip(reference.tolist(), row.tolist(), own, strict=True)
+        ]
+    )
+    return Motions(
+        reference,
+        row,
+        poses,
+        np.tile(covariance, (count - 1, 1, 1)),
+        np.tile(_SHARED * covariance, (count - 1, 1, 1)),
+        np.full(count - 1, 200),
+    )
+
+
+def _integrated(first: Float, motions: Motions, count: int) -> Float:
+    poses = np.empty((count, 4, 4))
+    poses[0] = first
+    for i, j, motion in zip(motions.reference.tolist(), motions.row.tolist(), motions.reference_T_current, strict=True):
+        poses[j] = poses[i] @ motion
+    return poses
+
+
+def _inertial(track: ImuTrack, rows: Int) -> Inertial:
+    """Steps from sample to sample, with the mean of both ends."""
+    values = np.hstack([track.angular_velocity, track.linear_acceleration])
+    means = 0.5 * (values[:-1] + values[1:])
+    begins = np.concatenate([[0], rows]).astype(np.int64)
+    covers = np.ones(len(rows), dtype=bool)
+    return Inertial(begins, covers, np.diff(track.stamps_ns) * 1e-9, means)
+
+
+def _true_loop(record: SessionRecord, truth: Float, rng: np.random.Generator, session: int) -> LoopClosure:
+    lap = round(_LAP_S * _FRAMESET_HZ)
+    keyframes = np.flatnonzero(record.is_keyframe)
+    first = int(rng.choice(keyframes[keyframes < len(truth) - lap]))
+    laps = int(rng.integers(1, (len(truth) - 1 - first) // lap + 1))
+    second = first + laps * lap
+    motion = se3_inverse(truth[first]) @ truth[second]
+    return _closure(record, first, record, second, motion, rng, (session, session))
+
+
+def _false_loop(record: SessionRecord, rng: np.random.Generator, session: int) -> LoopClosure:
+    keyframes = np.flatnonzero(record.is_keyframe)
+    first, second = np.sort(rng.choice(keyframes, 2, replace=False)).tolist()
+    wrong = se3_exp(_FALSE_SIGMAS * rng.standard_normal(6))
+    return _closure(record, first, record, second, wrong, rng, (session, session))
+
+
+def _closure(
+    one: SessionRecord, first: int, other: SessionRecord, second: int, motion: Float, rng: np.random.Generator,
+    sessions: tuple[int, int],
+) -> LoopClosure:  # fmt: skip
+    return LoopClosure(
+        Place(sessions[0], first, int(one.stamps_ns[first])),
+        Place(sessions[1], second, int(other.stamps_ns[second])),
+        motion @ se3_exp(_LOOP_SIGMAS * rng.standard_normal(6)),
+        np.diag(_LOOP_SIGMAS**2),
+        100,
+        ((0, 0),),
+        True,
+    )
