@@ -88,7 +88,7 @@ def rendered_once(data: Path, name: str, render: Callable[[Path], object], *sour
 def _digest(sources: tuple[Path, ...]) -> str:
     """Of everything that decides the bytes of a recording: the simulator, and what it takes from the package."""
     package = Path(graphvio.__file__).parent
-    taken = ("cameras.py", "geometry.py", "kernels.py", "rig.py", "rig_files/native.py")
+    taken = ("cameras.py", "euroc_layout.py", "geometry.py", "kernels.py", "rig.py", "rig_files/native.py")
     digest = hashlib.sha256()
     for path in [*(package / name for name in taken), *sorted((package / "simulation").rglob("*.py")), *sources]:
         digest.update(path.read_bytes())
