@@ -11,7 +11,7 @@ from graphvio.rig_files.native import parse
 from graphvio.sessions import cdr
 from graphvio.sessions.mcap_file import McapFile, Topic, stamps_of
 from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, ODOMETRY
-from graphvio.sessions.writer import RIG_ATTACHMENT
+from graphvio.sessions.topics import RIG_ATTACHMENT
 
 _WITH_HEADER = (IMAGE, COMPRESSED, IMU, ODOMETRY)
 _GAP_PERIODS = 1.5
