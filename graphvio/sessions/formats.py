@@ -72,7 +72,7 @@ def format_of(path: Path, asked: str | None) -> str:
         )
     suffix = next((suffix for suffix, known in _BY_SUFFIX.items() if known == asked), None)
     if asked is not None and asked != told and (told is not None or suffix is not None):
-        wanted = f"{suffix}" if suffix is not None else "a folder without that ending"
+        wanted = f"it {suffix}" if suffix is not None else "a folder without that ending"
         raise SessionError(f"{path}: is not how {asked} is named; name {wanted}, or give another --format")
     return asked or told or ""
 
