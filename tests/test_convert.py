@@ -257,7 +257,8 @@ signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 for limit, arguments in ((60_000, ["/x.mcap"]), (60_000, ["/x.bag"]), (60_000, ["/x", "--format", "rosbag2"]),
                          (3_072, ["/y", "--format", "euroc"])):
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-    done = CliRunner().invoke(app, ["convert", {str(recording)!r}, "--out", {str(tmp_path)!r} + arguments[0], *arguments[1:]])
+    name, *options = arguments
+    done = CliRunner().invoke(app, ["convert", {str(recording)!r}, "--out", {str(tmp_path)!r} + name, *options])
     print(done.exit_code, done.stderr.strip().splitlines()[-1], flush=True)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
