@@ -201,9 +201,9 @@ def test_the_odometry_makes_the_same_of_all_formats(
 
 
 def test_a_run_is_measured_against_the_truth_in_a_session(room_walk: Path, tmp_path: Path) -> None:
-    session = converted(room_walk, tmp_path / "room.mcap", "--to", "1.5")
+    session = converted(room_walk, tmp_path / "room.mcap", "--to", str(PIECE_S))
     figures = []
-    for path, options in ((room_walk, ["--to", "1.5"]), (session, [])):
+    for path, options in ((room_walk, ["--to", str(PIECE_S)]), (session, [])):
         out = tmp_path / f"result-{path.name}"
         done = CliRunner().invoke(app, ["run", str(path), "--out", str(out), *options])
         assert done.exit_code == 0, done.output
