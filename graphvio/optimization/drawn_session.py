@@ -103,14 +103,13 @@ def _course(times_s: Float) -> Float:
     """``[x, y, z, yaw, pitch, roll]`` (N, 6): around a long round, with the bob of steps."""
     phase = 2.0 * np.pi * times_s / _LAP_S
     step = 2.0 * np.pi * 1.9 * times_s
+    heading = np.unwrap(np.arctan2(_HALF_WIDTH_M * np.cos(phase), -_HALF_LENGTH_M * np.sin(phase)))
     return np.column_stack(
         [
             _HALF_LENGTH_M * np.cos(phase),
             _HALF_WIDTH_M * np.sin(phase),
             1.5 + 0.02 * np.sin(step),
-            np.arctan2(_HALF_WIDTH_M * np.cos(phase), -_HALF_LENGTH_M * np.sin(phase))
-            + 2.0 * np.pi * np.floor((phase + np.pi / 2) / (2.0 * np.pi))
-            + 0.05 * np.sin(0.5 * step),
+            heading + 0.05 * np.sin(0.5 * step),
             0.01 * np.sin(step),
             0.02 * np.sin(0.5 * step),
         ]
