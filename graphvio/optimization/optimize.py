@@ -13,7 +13,7 @@ from graphvio.backend.factors import x
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.config import Config
 from graphvio.geometry import se3_inverse, se3_log
-from graphvio.optimization.consistency import consistent, join_fragments, odometry_between
+from graphvio.optimization.consistency import consistent, fragment_of, join_fragments, odometry_between
 from graphvio.optimization.graph import Fragment, SessionGraph, Tie, moved, poses_of
 from graphvio.optimization.loops.search import LoopClosure
 from graphvio.optimization.nodes import Nodes, choose_nodes, spread
@@ -136,11 +136,12 @@ def optimize(
     poses = poses_of(alone, len(whole))
     joined = join_fragments(states, poses, ties)
     values = moved(alone, list(zip(states, joined.frames, strict=True)))
-    component = np.repeat(joined.component, [len(each) for each in states]).tolist()
-    ends = sorted({end for tie in ties for end in (tie.first, tie.second)})
+    component = np.array(joined.component)[fragment_of(states)].tolist()
+    within = [tie for tie in ties if component[tie.first] == component[tie.second]]
+    ends = sorted({end for tie in within for end in (tie.first, tie.second)})
     odometry = odometry_between(graph_alone, alone, states, ends)
     poses = poses_of(values, len(whole))
-    believed = consistent(poses, component, ties, odometry, settings.loop_probability)
+    believed = consistent(states, joined, poses, ties, odometry, settings.loop_probability)
     used = [tie for tie, is_used in zip(ties, believed, strict=True) if is_used]
     roots = sorted(set(joined.component))
     graph, kinds = whole.complete(roots, used)
