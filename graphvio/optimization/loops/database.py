@@ -152,9 +152,9 @@ class FeatureDatabase:
         """Features (K, 2) of an image."""
         return np.asarray(self._file.read_keypoints(self._ids[name])[:, :2], dtype=np.float64) - _CENTRE_PX
 
-    def descriptors(self, name: str) -> Any:
-        """Descriptors of an image's features as COLMAP has them; ``data`` is (K, 128), uint8."""
-        return self._file.read_descriptors(self._ids[name])
+    def descriptors(self, name: str) -> AnyArray:
+        """Descriptors (K, 128), uint8, of an image's features."""
+        return np.asarray(self._file.read_descriptors(self._ids[name]).data, dtype=np.uint8).reshape(-1, 128)
 
     def add_matches(self, first: str, second: str, matches: Int, geometry: Any = None) -> None:
         """Add which features (M, 2) of two images are one, and the two-view geometry that verifies them.

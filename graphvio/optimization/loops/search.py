@@ -16,7 +16,7 @@ from graphvio.frontend.stereo import triangulate
 from graphvio.frontend.tracks import PairFrame
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
-from graphvio.optimization.loops.matching import ImageMatcher, estimated_geometry
+from graphvio.optimization.loops.matching import alike, estimated_geometry
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.optimization.loops.resection import Resection, register_again, resect_features
 from graphvio.optimization.loops.retrieval import candidates, describe, joined, vocabulary
@@ -142,7 +142,7 @@ def _similarity(
         np.array([each[1] for each in listed], dtype=np.int64),
         [each[2] for each in listed],
     )
-    descriptors = [np.asarray(database.descriptors(name).data) for name in images.names]
+    descriptors = [database.descriptors(name) for name in images.names]
     words = vocabulary(descriptors, seed)
     vectors = np.array([describe(rows, words) for rows in descriptors]).reshape(len(images), -1)
     return images, np.asarray(vectors @ vectors.T, dtype=np.float64)
@@ -174,7 +174,6 @@ class _Verifier:
         self._database = database
         self._config = config
         self._lock = threading.Lock()
-        self._matcher = ImageMatcher(database, self._lock)
         self._of_thread = threading.local()
         self._verified: list[tuple[str, str, Int, Any]] = []
 
@@ -217,12 +216,15 @@ class _Verifier:
         return {(int(images.pair[i]), int(images.pair[k])): (images.names[i], images.names[k]) for _, i, k in ranked}
 
     def _matched(self, earlier: Place, later: Place, a: int, b: int, names: tuple[str, str]) -> Int:
-        """Rows (M, 2) of features that are one by COLMAP's matcher and two-view geometry."""
-        rows = self._matcher.match(*names)
+        """Rows (M, 2) of features that are one by their descriptors and COLMAP's two-view geometry."""
+        with self._lock:
+            pixels = (self._database.pixels(names[0]), self._database.pixels(names[1]))
+            descriptors = [self._database.descriptors(name) for name in names]
+        rows = alike(*descriptors)
         if len(rows) < _LEAST_MATCHES:
             return np.zeros((0, 2), dtype=np.int64)
         cameras = (self._left(earlier, a), self._left(later, b))
-        geometry = estimated_geometry(cameras, self._matcher.pixels(*names), rows)
+        geometry = estimated_geometry(cameras, pixels, rows)
         verified = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
         if len(verified) >= _LEAST_MATCHES:
             with self._lock:
