@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from io import BytesIO
 from typing import Any
 
@@ -21,9 +20,9 @@ def empty_figure(width_in: float, height_in: float) -> Figure:
     return figure
 
 
-def add_axes(figure: Figure, place: Sequence[float]) -> Any:
+def add_axes(figure: Figure, place: tuple[float, float, float, float]) -> Any:
     """Axes with a grid behind the data; left, bottom, width and height in shares of the figure."""
-    axes = figure.add_axes(tuple(place))
+    axes = figure.add_axes(place)
     axes.grid(**GRID)
     axes.set_axisbelow(True)
     return axes

@@ -14,7 +14,7 @@ td, th { padding: 0.25em 0.9em 0.25em 0; border-bottom: 1px solid #eee; vertical
 td { font-variant-numeric: tabular-nums; } img { max-width: 100%; } figure { margin: 1em 0; }
 figcaption { color: #555; font-size: 0.92em; } .good { color: #1a7f37; } .doubt { color: #b35900; }
 pre { background: #f6f6f6; padding: 0.7em; overflow-x: auto; font-size: 0.85em; }
-table.small { font-size: 0.85em; line-height: 1.35; }
+table.small { font-size: 0.85em; line-height: 1.35; } table.small td:not(:last-child) { white-space: nowrap; }
 """
 
 
