@@ -20,7 +20,7 @@ VERSION = 1
 def document(found: Optimization, numbers: Numbers) -> dict[str, Any]:
     """All numbers. Metres, degrees, seconds; nanoseconds where a name says so; squared Mahalanobis distances have no
     unit. What is unknown is null."""
-    fell = 1.0 - found.cost_after / found.cost_before if found.cost_before > 0.0 else None
+    fell = 1.0 - found.cost_after / found.cost_before if found.cost_before > 1e-6 else None
     return {
         "graphvio_optimization": VERSION,
         "sessions": [_session(each) for each in numbers.sessions],

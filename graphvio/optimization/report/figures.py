@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from scipy.stats import chi2
 
 from graphvio.arrays import Float
@@ -103,10 +103,9 @@ def draw_sigmas(found: Optimization, numbers: Numbers) -> Figure:
 def _edges(kinds: Sequence[Kind]) -> Float:
     """Of bins, for all kinds; what lies outside is counted in the outermost."""
     shown = [_per_dimension(each) for kind in kinds for each in (kind.before, kind.after)]
-    values = np.concatenate([np.array([0.1, 10.0]), *(each for each in shown)])
-    positive = values[values > 0.0]
-    lowest, highest = np.log10(np.clip(np.quantile(positive, [0.005, 0.995]), _LEAST, _MOST))
-    low, high = int(np.floor(lowest)), int(np.ceil(highest))
+    values = np.concatenate([np.ones(1), *shown])
+    lowest, highest = np.log10(np.clip(np.quantile(values[values > 0.0], [0.005, 0.995]), _LEAST, _MOST))
+    low, high = min(int(np.floor(lowest)), -2), max(int(np.ceil(highest)), 2)
     return np.asarray(np.logspace(low, high, (high - low) * _BINS_PER_DECADE + 1))
 
 
@@ -123,9 +122,10 @@ def _draw_kind(axes: Any, kind: Kind, edges: Float) -> None:
               label="noise as assumed (chi-square)")  # fmt: skip
     axes.set_xscale("log")
     axes.set_xlim(edges[0], edges[-1])
-    axes.set_title(f"{kind.name}: {len(some.distances)} factors", fontsize=9.5, loc="left")
+    count = len(some.distances)
+    axes.set_title(f"{kind.name}: {count} {'factor' if count == 1 else 'factors'}", fontsize=9.5, loc="left")
     axes.tick_params(labelsize=8)
-    axes.locator_params(axis="y", nbins=5)
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
 def _per_dimension(residuals: Residuals) -> Float:

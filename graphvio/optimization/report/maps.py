@@ -17,16 +17,17 @@ from graphvio.reporting.figures import GREEN, RED, add_axes, empty_figure
 COLOURS = ("#1f5fbf", "#f28e1c", "#8e44ad", "#17a3b8", "#8c564b", "#555555", "#e377c2", "#9a9a00")
 """Of sessions, in turn; green and red are loop closures'."""
 
-_COLUMN_IN, _HEIGHT_IN = 4.5, 7.0
+_COLUMN_IN, _HEIGHT_IN = 4.5, 6.0
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _GAP_IN = 0.75, 0.15, 0.55, 0.3
 _LEGEND_ROW_IN, _HEADING_IN, _PER_ROW = 0.22, 0.4, 6
-_EDGE = {"markeredgecolor": "white", "markeredgewidth": 0.7, "linestyle": "none", "zorder": 5}
+_EDGE = {"markeredgecolor": "#111111", "markeredgewidth": 0.9, "linestyle": "none", "zorder": 5}
 
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """A session's positions (F, 3) by column, which of them are in the frame, and where epochs begin (F,)."""
+    """A session: positions (F, 3) by column, which of them are in the frame (F,), and where epochs begin (F,)."""
 
+    number: int
     name: str
     colour: str
     columns: tuple[Float, Float]
@@ -49,7 +50,7 @@ def draw_map(found: Optimization, numbers: Numbers, frame: int) -> Figure:
     """
     lines = list(_lines(found, numbers, frame))
     points = np.concatenate([column[line.inside] for line in lines for column in line.columns])
-    figure, panels = _panels(points, _LEGEND_ROW_IN * -(-(len(lines) + 5) // _PER_ROW))
+    figure, panels = _panels(points, _LEGEND_ROW_IN * -(-_labels(found, lines) // _PER_ROW))
     for column, plots in enumerate(panels):
         for axes, z in zip(plots, (1, 2), strict=True):
             _draw_loops(axes, found, lines, column, z)
@@ -72,7 +73,14 @@ def _lines(found: Optimization, numbers: Numbers, frame: int) -> Iterator[_Line]
         if inside.any():
             columns = (told.online[:, :3, 3], session.nav_T_body[:, :3, 3])
             begins = np.append(True, np.diff(session.record.epoch) != 0)
-            yield _Line(told.name, session_colour(number), columns, inside, begins)
+            yield _Line(number, told.name, session_colour(number), columns, inside, begins)
+
+
+def _labels(found: Optimization, lines: list[_Line]) -> int:
+    """How many the legend has at most."""
+    judged = {not loop.refusal for loop in found.loops}
+    epochs = sum(int((line.begins & line.inside).sum()) for line in lines) > len(lines)
+    return len(lines) + len(judged) + epochs + 2
 
 
 def _draw_line(axes: Any, line: _Line, column: int, z: int) -> None:
@@ -82,19 +90,19 @@ def _draw_line(axes: Any, line: _Line, column: int, z: int) -> None:
     rows = np.flatnonzero(line.inside)
     again = positions[line.begins & line.inside & (np.arange(len(positions)) != rows[0])]
     if len(again):
-        axes.plot(again[:, 0], again[:, z], "D", color="#111111", markersize=6, label="new epoch", **_EDGE)
+        axes.plot(again[:, 0], again[:, z], "D", color=line.colour, markersize=5.5, label="new epoch", **_EDGE)
     for row, marker, name in ((rows[0], "o", "start"), (rows[-1], "s", "end")):
         at = positions[row]
-        axes.plot(at[0], at[z], marker, color="#111111", markersize=6.5, label=name, **_EDGE)
+        axes.plot(at[0], at[z], marker, color=line.colour, markersize=6, label=name, **_EDGE)
 
 
 def _draw_loops(axes: Any, found: Optimization, lines: list[_Line], column: int, z: int) -> None:
-    by_name = {line.name: line for line in lines}
+    by_number = {line.number: line for line in lines}
     segments: dict[bool, list[Float]] = {True: [], False: []}
     for loop in found.loops:
         ends = []
         for place in (loop.closure.reference, loop.closure.current):
-            line = by_name.get(found.sessions[place.session].record.name)
+            line = by_number.get(place.session)
             if line is not None and line.inside[place.row]:
                 ends.append(line.columns[column][place.row])
         if len(ends) == 2:

@@ -11,7 +11,7 @@ from graphvio.optimization.optimize import JudgedLoop, Optimization
 from graphvio.optimization.report.document import size_of
 from graphvio.optimization.report.measures import STAGES
 from graphvio.optimization.report.numbers import Kind, Numbers, SessionNumbers
-from graphvio.optimization.report.words import angle, doubts, fell, length, pairs_in_words, parts_in_words, plain
+from graphvio.optimization.report.words import angle, doubts, fell, length, noise, pairs_in_words, parts_in_words, plain
 from graphvio.reporting.page import bullets, html_page, picture, table
 
 MOST_LOOPS = 200
@@ -32,9 +32,9 @@ _MAP = (
 )
 _CAPTIONS = {
     "residuals": "Squared Mahalanobis distance of each factor, divided by its dimension, before and after. Were "
-    "all noise as it is assumed, and the states not fitted to it, the bars would follow the dashed line: to the left of "
-    "it the noise is smaller than assumed, to the right larger. What lies beyond an end is counted in the last bar there. "
-    "Before, loop closures are held against the odometry's smoothed poses.",
+    "all noise as it is assumed, and the states not fitted to it, the bars would follow the dashed line; to the left "
+    "of it the noise is smaller than assumed, to the right larger. What lies beyond an end is counted in the last bar "
+    "there. Before, loop closures are held against the odometry's smoothed poses.",
     "moved": "How far each optimised pose is from the one that was emitted online. Ticks at the bottom are ends of "
     "loop closures that are used.",
     "sigmas": "One standard deviation of a pose in its frame, x, y and z together (the root of the sum of three "
@@ -57,7 +57,9 @@ def page(found: Optimization, numbers: Numbers, maps: Mapping[int, bytes], pictu
     if doubtful:
         parts += ['<div class="doubt"><b>Read before use:</b>', bullets(doubtful), "</div>"]
     else:
-        parts.append('<p class="good"><b>All sessions lie in one frame, and nothing speaks against the result.</b></p>')
+        parts.append(
+            '<p class="good"><b>All sessions lie in one frame, and no check here speaks against the result.</b></p>'
+        )
     parts += [_head(found, numbers), _sessions(numbers.sessions), _accuracy(numbers.sessions), _loop_errors(numbers)]
     parts += ["<h2>Trajectories</h2>", *_maps(numbers, maps)]
     parts += ["<h2>Where the trajectory moved</h2>", picture("moved", pictures["moved"], _CAPTIONS["moved"])]
@@ -182,12 +184,15 @@ def _residuals(numbers: Numbers) -> str:
     ]
     rows.append(("all", "", "", str(numbers.dimensions), "", plain(numbers.per_dimension)))
     head = ("factors", "", "number", "dimensions", "mean square per dimension, before", "after")
-    expected, is_small = numbers.expected_per_dimension, numbers.per_dimension < 0.5 * numbers.expected_per_dimension
     note = (
         f"<p>{numbers.unknowns} unknowns are fitted to {numbers.dimensions} dimensions: were all noise as assumed, the "
-        f"mean over all after would be about {plain(expected)}."
+        f"mean over all after would be about {plain(numbers.expected_per_dimension)}."
     )
-    note += " It is smaller: the measurements are better than assumed, and sigmas on the safe side." if is_small else ""
+    note += (
+        " It is smaller: the measurements are better than assumed, and sigmas rather too large."
+        if noise(numbers) < 0
+        else ""
+    )
     return table(rows, head) + note + "</p>"
 
 

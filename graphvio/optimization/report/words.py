@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from graphvio.backend.gating import chi_square_quantile
 from graphvio.optimization.optimize import Optimization
 from graphvio.optimization.report.numbers import Numbers
 
-_FAR_OFF = 2.0  # times the expected residuals
+_FAR_OFF = 2.0  # times the expected squares
+_SURELY = 0.999
+_NO_COST = 1e-6
 _MOST_PARTS = 40
 
 
@@ -24,20 +27,35 @@ def angle(degrees: float | None) -> str:
 
 
 def plain(value: float | None) -> str:
-    """A number without a unit, to three digits; large ones without an exponent."""
+    """A number without a unit, to three digits, or all before the point."""
     if value is None:
         return ""
     if abs(value) < 1e-9:
         return "0"
+    if abs(value) >= 1e6:
+        return f"{value:.1e}"
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
 
 
 def fell(found: Optimization) -> str:
-    """By what share the cost fell."""
-    if found.cost_before <= 0.0:
+    """By what share the cost fell. It may rise where the odometry's smoother left little to gain."""
+    if found.cost_after > max(found.cost_before, _NO_COST):
+        return ": it rose, as loop closures move the states"
+    if found.cost_before < _NO_COST:
         return ""
     share = 100.0 * (1.0 - found.cost_after / found.cost_before)
-    return f": it fell by {share:.2f} %" if share >= 0.0 else f": it rose by {-share:.2f} %"
+    return f": it fell by {share:.2f} %"
+
+
+def noise(numbers: Numbers) -> int:
+    """Whether residuals are smaller (-1) or larger (1) than the assumed noise makes them, by far and not by chance."""
+    degrees = numbers.dimensions - numbers.unknowns
+    if degrees <= 0:
+        return 0
+    squares = numbers.per_dimension * numbers.dimensions
+    if squares > max(_FAR_OFF * degrees, chi_square_quantile(_SURELY, degrees)):
+        return 1
+    return -1 if squares < min(degrees / _FAR_OFF, chi_square_quantile(1.0 - _SURELY, degrees)) else 0
 
 
 def doubts(found: Optimization, numbers: Numbers) -> list[str]:
@@ -51,15 +69,10 @@ def doubts(found: Optimization, numbers: Numbers) -> list[str]:
     if not numbers.used:
         which = f"None of {len(found.loops)} loop closures" if found.loops else "No loop closure"
         made.append(f"{which} is used: drift is what the odometry and the IMU leave of it.")
-    if found.cost_after > found.cost_before:
-        made.append(
-            "The cost without loop closures rose: they pull the trajectory away from what the odometry measured."
-        )
-    expected = numbers.expected_per_dimension
-    if expected > 0.0 and numbers.per_dimension > _FAR_OFF * expected:
+    if noise(numbers) > 0:
         made.append(
             f"Residuals are larger than the noise that was assumed (mean square {plain(numbers.per_dimension)} per "
-            f"dimension, {plain(expected)} expected): sigmas are too small."
+            f"dimension, {plain(numbers.expected_per_dimension)} expected): sigmas are too small."
         )
     for each in numbers.sessions:
         if each.accuracy is not None and each.accuracy["optimized"].position_m > each.accuracy["online"].position_m:
