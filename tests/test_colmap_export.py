@@ -15,6 +15,7 @@ from calibration_walks import recorded, walk_simulator
 
 from graphvio import Config, Odometry, open_source
 from graphvio.arrays import Float
+from graphvio.config import OptimizationConfig
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.colmap_export import ColmapModel, export
@@ -52,7 +53,7 @@ class Exported:
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     folder = tmp_path_factory.mktemp("colmap")
     source = open_source(recorded(folder / "recording", SECONDS))
-    config = Config()
+    config = replace(Config(), optimization=OptimizationConfig(features=500))
     recorder = Recorder(NAME)
     odometry = Odometry(source.rig, config, on_step=recorder.add)
     for event in source:
@@ -64,7 +65,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     optimization = optimize([record], [source.rig.imu], [], config)
     with FeatureDatabase(folder / "database.db") as database:
         stamps = [place.stamp_ns for place in places]
-        extract_places(source, source.rig, NAME, stamps, database, 500, config)
+        extract_places(source, source.rig, NAME, stamps, database, config)
         models = export(optimization, [session], database, folder, config)
     return Exported(session, optimization, folder, models)
 

@@ -203,8 +203,12 @@ def _judged(
     distance = float(error @ np.linalg.solve(tie.covariance, error))
     if is_used:
         return JudgedLoop(closure, "", distance)
-    limit = chi_square_quantile(probability, 6)
-    return JudgedLoop(closure, f"{distance:.0f} beyond chi-square {limit:.1f} of what all others say", distance)
+    sigmas, limit = np.sqrt(distance), np.sqrt(chi_square_quantile(probability, 6))
+    if sigmas > limit:
+        why = f"{sigmas:.0f} standard deviations from what all others say, more than {limit:.1f}"
+    else:
+        why = "contradicts the odometry alone"
+    return JudgedLoop(closure, why, distance)
 
 
 def _covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, count: int) -> Float:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from graphvio import __version__
 from graphvio.config import Config
+from graphvio.errors import TrajectoryError
+from graphvio.optimization.colmap_export import export
 from graphvio.optimization.exchange import covariance_text, trajectory_text, write_g2o
 from graphvio.optimization.loops import saved
 from graphvio.optimization.loops.database import FeatureDatabase
@@ -17,12 +19,14 @@ from graphvio.optimization.loops.places import choose_places
 from graphvio.optimization.loops.search import LoopClosure, Place, SessionInput, find_loops
 from graphvio.optimization.optimize import Optimization, optimize
 from graphvio.optimization.record import Recorder, SessionRecord
+from graphvio.optimization.report.write import write_report
 from graphvio.optimization.workspace import Workspace, digest
 from graphvio.pipeline import Progress as RunProgress
 from graphvio.pipeline import run
 from graphvio.results import ResultWriter
 from graphvio.rig_files.native import to_text
 from graphvio.sources import Source
+from graphvio.trajectory import Trajectory
 
 DATABASE = "database.db"
 
@@ -72,7 +76,7 @@ def optimize_sessions(
     """
     stages = _Stages(sessions, out, config, on_progress or _quiet)
     records = [stages.record(number) for number in range(len(sessions))]
-    closures = stages.closures(records) if with_loops else []
+    closures = stages.closures(records) if with_loops else None
     return stages.result(records, closures)
 
 
@@ -116,18 +120,34 @@ class _Stages:
                 self._space.finish("loops")
         return saved.load(self._space.folder / "loops.npz")
 
-    def result(self, records: Sequence[SessionRecord], closures: Sequence[LoopClosure]) -> Optimization:
-        """The solution, with its files."""
+    def result(self, records: Sequence[SessionRecord], closures: Sequence[LoopClosure] | None) -> Optimization:
+        """The solution, with its files; without closures, which are None where none were looked for, there is no map."""
         imus = [each.source.rig.imu for each in self._sessions]
         found = optimize(
-            records, imus, closures, self._config, lambda name, number, _: self._on_progress(name, number, number)
+            records, imus, closures or [], self._config, lambda name, number, _: self._on_progress(name, number, number)
         )
         for session, optimized in zip(self._sessions, found.sessions, strict=True):
             place = "" if len(self._sessions) == 1 else f"{session.name}/"
             self._space.write(f"{place}trajectory_optimized.txt", trajectory_text(optimized).encode())
             self._space.write(f"{place}covariance.csv", covariance_text(optimized).encode())
         write_g2o(found, self._space.folder / "graph.g2o")
+        if closures is not None and not self._space.has_finished("map"):
+            self._export(found, records)
+            self._space.finish("map")
+        write_report(found, self._space.folder, [_truth(each.source) for each in self._sessions])
         return found
+
+    def _export(self, found: Optimization, records: Sequence[SessionRecord]) -> None:
+        inputs = [self._input(number, record) for number, record in enumerate(records)]
+        with FeatureDatabase(self._space.folder / DATABASE) as database:
+            export(
+                found,
+                inputs,
+                database,
+                self._space.folder / "colmap",
+                self._config,
+                lambda what, done, total: self._on_progress(f"map: {what}", done, total),
+            )
 
     def _input(self, number: int, record: SessionRecord) -> SessionInput:
         session, settings = self._sessions[number], self._config.optimization
@@ -157,6 +177,14 @@ def _identity(source: Source) -> str:
     return digest(
         source.name, str(source.start_ns), str(source.end_ns), str(source.frameset_count), to_text(source.rig, Path())
     )
+
+
+def _truth(source: Source) -> Trajectory | None:
+    """The true trajectory of a recording that carries a usable one."""
+    try:
+        return None if source.truth is None else Trajectory.read(source.truth)
+    except TrajectoryError:
+        return None  # the odometry's own summary says why
 
 
 def _quiet(stage: str, done: float, total: float) -> None:
