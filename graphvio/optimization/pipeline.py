@@ -121,7 +121,7 @@ class _Stages:
         return saved.load(self._space.folder / "loops.npz")
 
     def result(self, records: Sequence[SessionRecord], closures: Sequence[LoopClosure] | None) -> Optimization:
-        """The solution, with its files; without closures, which are None where none were looked for, there is no map."""
+        """The solution, with its files; where closures are None, none were looked for, and there is no map."""
         imus = [each.source.rig.imu for each in self._sessions]
         found = optimize(
             records, imus, closures or [], self._config, lambda name, number, _: self._on_progress(name, number, number)
