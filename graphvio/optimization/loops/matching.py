@@ -49,7 +49,9 @@ def estimated_geometry(cameras: tuple[Camera, Camera], pixels: tuple[Float, Floa
     """COLMAP's two-view geometry that explains most matches (M, 2) of pixels (K, 2) and (L, 2)."""
     first, second = (colmap_camera(camera, 1) for camera in cameras)
     one, other = (each + _COLMAP_CENTRE_PX for each in pixels)
-    return colmap().estimate_calibrated_two_view_geometry(first, one, second, other, rows.astype(np.uint32))
+    options = colmap().TwoViewGeometryOptions()
+    options.ransac.random_seed = 0  # else it depends on what the thread did before
+    return colmap().estimate_calibrated_two_view_geometry(first, one, second, other, rows.astype(np.uint32), options)
 
 
 def known_geometry(
