@@ -15,16 +15,19 @@ from graphvio.backend.factors import x
 from graphvio.config import Config, SmootherConfig
 from graphvio.errors import OptimizationError
 from graphvio.evaluation import evaluate
+from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.optimization.consistency import motion_between
 from graphvio.optimization.drawn_session import DrawnSession, closure_between, draw_session
 from graphvio.optimization.exchange import write_g2o
+from graphvio.optimization.extrinsics import c, d, own_motion
 from graphvio.optimization.loops import saved
 from graphvio.optimization.loops.search import LoopClosure
 from graphvio.optimization.nodes import choose_nodes, spread
 from graphvio.optimization.optimize import Optimization, optimize
 from graphvio.optimization.record import Motions, SessionRecord
 from graphvio.rig import Imu
+from graphvio.simulation import default_rig
 from graphvio.trajectory import Trajectory
 
 IMU = Imu()
@@ -162,6 +165,49 @@ def test_poses_between_states_keep_the_smoothed_motion(walk: DrawnSession) -> No
     moved = se3_exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]))
     elsewhere = spread(nodes, moved @ walk.record.smoothed[nodes.rows])
     np.testing.assert_allclose(elsewhere, moved @ walk.record.smoothed, atol=1e-9)
+
+
+def test_the_calibration_is_found_with_the_trajectory() -> None:
+    """A pair off by 0.5 degrees and 3 mm, another by 2 degrees and 4 cm, images 6 ms late: found within sigmas."""
+    true = [
+        se3_exp(np.array([0.005, -0.006, 0.004, 0.002, -0.001, 0.002])),
+        se3_exp(np.array([-0.02, 0.03, 0.01, 0.03, 0.02, -0.02])),
+    ]
+    drawn = draw_session(180.0, 4, IMU, 20, corrections=true, offset_s=0.006)
+    found = optimize([drawn.record], [IMU], drawn.closures, CONFIG, calibrates=True)
+    (correction,) = found.corrections
+    for pair, expected in enumerate(true):
+        error = se3_log(se3_inverse(correction.pairs[pair]) @ expected)
+        assert np.linalg.norm(error[:3]) < 2e-3
+        assert error @ np.linalg.solve(correction.covariances[pair], error) < 16.8
+    assert correction.offset_sigma_s is not None
+    assert abs(correction.offset_s - 0.006) < min(1e-3, 4.0 * correction.offset_sigma_s)
+    rig = correction.corrected(default_rig())
+    np.testing.assert_allclose(
+        rig.pairs[1].right.body_T_cam, correction.pairs[1] @ default_rig().pairs[1].right.body_T_cam
+    )
+
+
+def test_derivatives_of_a_single_pairs_motion() -> None:
+    rng = np.random.default_rng(3)
+    twists = rng.standard_normal((2, 6))
+    motion = RelativeMotion(0, 1, se3_exp(0.5 * rng.standard_normal(6)), np.eye(6), np.zeros((6, 6)), 10)
+    factor = own_motion(0, 1, 0, 1, motion, (twists[0], twists[1]))
+    values = gtsam.Values()
+    for key in (x(0), x(1), c(0, 1)):
+        values.insert(key, gtsam.Pose3(se3_exp(0.5 * rng.standard_normal(6))))
+    values.insert(d(0), np.array([0.1]))
+    found, _ = factor.linearize(values).jacobian()
+    columns = []
+    for key, size in ((x(0), 6), (x(1), 6), (c(0, 1), 6), (d(0), 1)):
+        for axis in range(size):
+            both = []
+            for step in (1e-6, -1e-6):
+                change = gtsam.VectorValues()
+                change.insert(key, step * np.eye(size)[axis])
+                both.append(factor.unwhitenedError(values.retract(change)))
+            columns.append((both[0] - both[1]) / 2e-6)
+    np.testing.assert_allclose(found, np.array(columns).T, atol=1e-6)
 
 
 def test_records_and_closures_are_kept_to_the_bit(walk: DrawnSession, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from graphvio.errors import OptimizationError
 from graphvio.geometry import se3, se3_exp, se3_inverse, so3_exp
 from graphvio.optimization.loops.search import LoopClosure, Place
 from graphvio.optimization.optimize import JudgedLoop, Optimization, optimize
-from graphvio.optimization.record import Inertial, Motions, SessionRecord
+from graphvio.optimization.record import NO_MOTIONS, Inertial, Motions, SessionRecord
 from graphvio.optimization.report.words import length, plain
 from graphvio.optimization.report.write import write_report
 from graphvio.trajectory import Trajectory
@@ -69,6 +69,8 @@ def session(name: str, seed: int, breaks: tuple[int, ...] = ()) -> SessionRecord
         motions=Motions(
             ends - 1, ends, np.array(motions), np.repeat(covariance[None], count, 0), nothing, np.full(count, 100)
         ),
+        own=NO_MOTIONS,
+        own_pair=np.zeros(0, dtype=np.int64),
         inertial=Inertial(np.zeros(POSES + 1, dtype=np.int64), no, np.zeros(0), np.zeros((0, 6))),
     )
 

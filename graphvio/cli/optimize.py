@@ -36,6 +36,10 @@ def optimize(
     pairs: options.Pairs = None,
     no_imu: options.NoImu = False,
     no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
+    refine_calibration: Annotated[
+        bool,
+        typer.Option("--refine-calibration", help="Find the pairs' places and the IMU's time offset, too."),
+    ] = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
     verbose: options.Verbose = False,
@@ -75,7 +79,14 @@ def optimize(
         warm_up(session.source.rig, settings)
     try:
         with _Stages() as stages:
-            found = optimize_sessions(sessions, folder, settings, with_loops=not no_loops, on_progress=stages.show)
+            found = optimize_sessions(
+                sessions,
+                folder,
+                settings,
+                with_loops=not no_loops,
+                calibrates=refine_calibration,
+                on_progress=stages.show,
+            )
     except KeyboardInterrupt:
         typer.echo(f"graphvio: interrupted; the same command with --out {folder} goes on from there", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None

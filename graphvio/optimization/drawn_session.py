@@ -5,6 +5,7 @@ For experiments with sessions of any length, whose truth and noise are known.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,8 +50,9 @@ class DrawnSession:
 
 
 def draw_session(
-    duration_s: float, seed: int, imu: Imu, loops: int, false_share: float = 0.0, session: int = 0
-) -> DrawnSession:
+    duration_s: float, seed: int, imu: Imu, loops: int, false_share: float = 0.0, session: int = 0,
+    corrections: Sequence[Float] = (), offset_s: float = 0.0,
+) -> DrawnSession:  # fmt: skip
     """Draw a walk in laps of 90 s around a building, 20 framesets and 5 keyframes a second.
 
     Args:
@@ -60,15 +62,21 @@ def draw_session(
         loops: closures in all.
         false_share: of them that are false: anywhere, and off by metres.
         session: number that the closures' places have.
+        corrections: of each pair, what its place in the rig file must be multiplied by from the left (4, 4); single
+            pairs' motions are drawn for these.
+        offset_s: how much later on the IMU's clock the images are taken than the rig file says.
     """
     rng = np.random.default_rng([seed, 7])
     rate = round(imu.rate_hz)
     samples = round(duration_s * rate)
     times = np.arange(samples + 1) / rate
-    track = measure(Motion(_course, duration_s), imu, times, (times * _NS).astype(np.int64), seed)
+    motion = Motion(_course, duration_s + 1.0)
+    track = measure(motion, imu, times, (times * _NS).astype(np.int64), seed)
     rows = np.arange(0, samples + 1, rate // _FRAMESET_HZ)
     truth = track.states.world_T_body[rows]
-    motions = _motions(truth, rng)
+    seen = motion.at(times[rows] + offset_s).world_T_body if offset_s else truth
+    motions = _motions(seen, rng)
+    own, own_pair = _own_motions(seen, corrections, rng)
     drifting = _integrated(truth[0], motions, len(rows))
     record = SessionRecord(
         name=f"drawn-{seed}",
@@ -84,6 +92,8 @@ def draw_session(
         is_keyframe=np.arange(len(rows)) % _KEYFRAME_FRAMES == 0,
         with_imu=np.ones(len(rows), dtype=bool),
         motions=motions,
+        own=own,
+        own_pair=own_pair,
         inertial=_inertial(track, rows),
     )
     false = round(false_share * loops)
@@ -138,6 +148,29 @@ def _motions(truth: Float, rng: np.random.Generator) -> Motions:
         np.tile(_SHARED * covariance, (count - 1, 1, 1)),
         np.full(count - 1, 200),
     )
+
+
+def _own_motions(truth: Float, corrections: Sequence[Float], rng: np.random.Generator) -> tuple[Motions, Int]:
+    """What each pair alone says of the motion over each keyframe, and the pair."""
+    ends = np.arange(_KEYFRAME_FRAMES, len(truth), _KEYFRAME_FRAMES)
+    row = np.repeat(ends, len(corrections))
+    pair = np.tile(np.arange(len(corrections)), len(ends))
+    sigmas = np.sqrt(len(corrections)) * _MOTION_SIGMAS
+    poses = [
+        se3_inverse(corrections[j]) @ se3_inverse(truth[k - _KEYFRAME_FRAMES]) @ truth[k] @ corrections[j]
+        @ se3_exp(sigmas * rng.standard_normal(6))
+        for k, j in zip(row.tolist(), pair.tolist(), strict=True)
+    ]  # fmt: skip
+    covariance = np.tile(np.diag(sigmas**2), (len(row), 1, 1))
+    made = Motions(
+        row - _KEYFRAME_FRAMES,
+        row,
+        np.array(poses).reshape(-1, 4, 4),
+        covariance.reshape(-1, 6, 6),
+        np.zeros((len(row), 6, 6)),
+        np.full(len(row), 100),
+    )
+    return made, pair
 
 
 def _integrated(first: Float, motions: Motions, count: int) -> Float:

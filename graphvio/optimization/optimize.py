@@ -14,6 +14,7 @@ from graphvio.backend.gating import chi_square_quantile
 from graphvio.config import Config
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.optimization.consistency import consistent, fragment_of, join_fragments, odometry_between
+from graphvio.optimization.extrinsics import RigCorrection, correction_of
 from graphvio.optimization.graph import Fragment, SessionGraph, Tie, moved, poses_of
 from graphvio.optimization.loops.search import LoopClosure
 from graphvio.optimization.nodes import Nodes, choose_nodes, spread
@@ -80,6 +81,7 @@ class Optimization:
         ties: closures that are used, as factors.
         graph_alone: without closures, each fragment in a frame of its own.
         alone: its solution.
+        corrections: of each session's rig file, where the calibration was unknown.
     """
 
     sessions: Sequence[OptimizedSession]
@@ -93,6 +95,7 @@ class Optimization:
     ties: Sequence[Tie]
     graph_alone: gtsam.NonlinearFactorGraph
     alone: gtsam.Values
+    corrections: Sequence[RigCorrection] = ()
 
     @property
     def cost_before(self) -> float:
@@ -111,6 +114,7 @@ def optimize(
     closures: Sequence[LoopClosure],
     config: Config,
     on_progress: Progress | None = None,
+    calibrates: bool = False,
 ) -> Optimization:
     """The best trajectories that all measurements of the sessions hold together.
 
@@ -120,13 +124,15 @@ def optimize(
         closures: places seen from others, right ones and wrong ones.
         config: of the back-end and of this stage.
         on_progress: told how far it is.
+        calibrates: whether the places of the pairs, and the IMU's time offset, are unknowns with priors.
 
     Raises:
         OptimizationError: if the graph has no unique solution.
     """
     settings = config.optimization
-    sessions = [choose_nodes(record, settings.keyframe_interval_s) for record in records]
-    whole = SessionGraph(sessions, imus, config.smoother)
+    interval_s = np.inf if calibrates else settings.keyframe_interval_s
+    sessions = [choose_nodes(record, interval_s) for record in records]
+    whole = SessionGraph(sessions, imus, config.smoother, calibrates)
     fragments = whole.fragments
     graph_alone, kinds = whole.complete(range(len(fragments)))
     before = residuals(graph_alone, kinds, whole.values)
@@ -166,6 +172,11 @@ def optimize(
         ties=used,
         graph_alone=graph_alone,
         alone=alone,
+        corrections=[
+            correction_of(graph, values, number, int(record.own_pair.max()) + 1)
+            for number, record in enumerate(records)
+            if calibrates and len(record.own_pair)
+        ],
     )
 
 

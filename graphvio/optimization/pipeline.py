@@ -60,6 +60,7 @@ def optimize_sessions(
     config: Config,
     *,
     with_loops: bool = True,
+    calibrates: bool = False,
     on_progress: Progress | None = None,
 ) -> Optimization:
     """Run the odometry on recordings, find loop closures within and between them, and optimise all as one.
@@ -69,24 +70,30 @@ def optimize_sessions(
         out: folder of the results: new, or one in which an optimisation of the same was interrupted, which goes on.
         config: of all stages.
         with_loops: whether loop closures are looked for, which needs the extra ``maps``.
+        calibrates: whether the places of the pairs, and the IMU's time offset, are unknowns of the graph, too.
         on_progress: told how far it is.
 
     Raises:
         GraphvioError: if a recording cannot be read, holds no pose, or the folder cannot be used.
     """
-    stages = _Stages(sessions, out, config, on_progress or _quiet)
+    stages = _Stages(sessions, out, config, calibrates, on_progress or _quiet)
     records = [stages.record(number) for number in range(len(sessions))]
     closures = stages.closures(records) if with_loops else None
     return stages.result(records, closures)
 
 
 class _Stages:
-    def __init__(self, sessions: Sequence[Session], out: Path, config: Config, on_progress: Progress) -> None:
+    def __init__(
+        self, sessions: Sequence[Session], out: Path, config: Config, calibrates: bool, on_progress: Progress
+    ) -> None:
         self._sessions = sessions
+        self._calibrates = calibrates
         self._config = config
         self._on_progress = on_progress
         inputs = {each.name: _identity(each.source) for each in sessions}
-        self._space = Workspace(out, inputs | {"config": config.sha256(), "graphvio": __version__})
+        self._space = Workspace(
+            out, inputs | {"config": config.sha256(), "calibration": str(calibrates), "graphvio": __version__}
+        )
 
     def record(self, number: int) -> SessionRecord:
         """What the odometry makes of a session; beside it the results of its run."""
@@ -124,8 +131,16 @@ class _Stages:
         """The solution, with its files; where closures are None, none were looked for, and there is no map."""
         imus = [each.source.rig.imu for each in self._sessions]
         found = optimize(
-            records, imus, closures or [], self._config, lambda name, number, _: self._on_progress(name, number, number)
+            records,
+            imus,
+            closures or [],
+            self._config,
+            lambda name, number, _: self._on_progress(name, number, number),
+            self._calibrates,
         )
+        for session, correction in zip(self._sessions, found.corrections, strict=False):
+            rig = correction.corrected(session.source.rig)
+            self._space.write(f"{session.name}/rig_optimized.yaml", to_text(rig, Path()).encode())
         for session, optimized in zip(self._sessions, found.sessions, strict=True):
             place = "" if len(self._sessions) == 1 else f"{session.name}/"
             self._space.write(f"{place}trajectory_optimized.txt", trajectory_text(optimized).encode())
