@@ -21,7 +21,7 @@ from graphvio.cli import app
 from graphvio.config import Config
 from graphvio.errors import MissingExtraError, OptimizationError
 from graphvio.geometry import se3_inverse, se3_log
-from graphvio.optimization.pipeline import named, optimize_sessions
+from graphvio.optimization.pipeline import optimize_sessions
 from graphvio.trajectory import Trajectory
 
 pytest.importorskip("pycolmap", reason="loop closure needs the extra maps")
@@ -112,7 +112,7 @@ def test_a_folder_of_something_else_is_left_alone(walk: Path, settings: Path, do
 def test_two_sessions_come_into_one_frame(walk: Path, tmp_path: Path) -> None:
     """Two pieces of one recording, which overlap by a second, as if they were two visits."""
     sources = [open_source(walk, from_s=0.0, to_s=4.0), open_source(walk, from_s=3.0)]
-    found = optimize_sessions(named(sources), tmp_path / "both", Config.from_yaml(SETTINGS))
+    found = optimize_sessions(sources, tmp_path / "both", Config.from_yaml(SETTINGS))
     assert found.frames == [0, 0]
     first, second = (Trajectory(each.record.stamps_ns, each.nav_T_body) for each in found.sessions)
     common = np.intersect1d(first.stamps_ns, second.stamps_ns)

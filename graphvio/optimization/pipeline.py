@@ -55,8 +55,8 @@ def named(sources: Sequence[Source]) -> list[Session]:
 
 
 def optimize_sessions(
-    sessions: Sequence[Session],
-    out: Path,
+    sources: Sequence[Source],
+    out: str | Path,
     config: Config,
     *,
     with_loops: bool = True,
@@ -66,7 +66,7 @@ def optimize_sessions(
     """Run the odometry on recordings, find loop closures within and between them, and optimise all as one.
 
     Args:
-        sessions: one or several.
+        sources: one or several recordings.
         out: folder of the results: new, or one in which an optimisation of the same was interrupted, which goes on.
         config: of all stages.
         with_loops: whether loop closures are looked for, which needs the extra ``maps``.
@@ -76,7 +76,8 @@ def optimize_sessions(
     Raises:
         GraphvioError: if a recording cannot be read, holds no pose, or the folder cannot be used.
     """
-    stages = _Stages(sessions, out, config, calibrates, on_progress or _quiet)
+    sessions = named(sources)
+    stages = _Stages(sessions, Path(out), config, calibrates, on_progress or _quiet)
     records = [stages.record(number) for number in range(len(sessions))]
     closures = stages.closures(records) if with_loops else None
     return stages.result(records, closures)
