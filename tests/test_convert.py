@@ -30,6 +30,8 @@ from graphvio.trajectory import Trajectory, tum_line
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
 
+CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
+CLIP_PIECE = ("--to", "6")
 FRAMES = 8
 PIECE_S = 0.8
 
@@ -297,3 +299,28 @@ def test_a_bag_is_read_at_any_place(recording: Path, tmp_path: Path) -> None:
         forth = [bag.read(place) for place in places]
         assert [bag.read(place) for place in reversed(places)] == forth[::-1]
         assert len(set(forth)) == len(places)
+
+
+@pytest.fixture(scope="module")
+def trajectory_of_the_clip(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    if not CLIP.is_dir():
+        pytest.skip("shared/data/euroc_mh01_clip is absent")
+    return trajectory_of(CLIP, tmp_path_factory.mktemp("clip") / "results", *CLIP_PIECE)
+
+
+def trajectory_of(source: Path, out: Path, *options: str) -> bytes:
+    done = CliRunner().invoke(app, ["run", str(source), "--out", str(out), *options])
+    assert done.exit_code == 0, done.output
+    return (out / "trajectory.txt").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["recorded.mcap", "clip.bag", "clip"])
+def test_a_real_recording_gives_the_same_from_all_formats(
+    name: str, trajectory_of_the_clip: bytes, tmp_path: Path
+) -> None:
+    """From the MCAP file that ``record`` makes while the odometry runs, and from bags of ROS 1 and ROS 2."""
+    verb = ["record"] if name == "recorded.mcap" else ["convert"]
+    kind = ["--format", "rosbag2"] if name == "clip" else []
+    made = CliRunner().invoke(app, [*verb, str(CLIP), "--out", str(tmp_path / name), *kind, *CLIP_PIECE])
+    assert made.exit_code == 0, made.output
+    assert trajectory_of(tmp_path / name, tmp_path / "results") == trajectory_of_the_clip
