@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from graphvio import ImuSample, Odometry, open_source
 from graphvio.arrays import Bool, Float
 from graphvio.backend.factors import x
 from graphvio.config import Config, SmootherConfig
@@ -25,7 +26,7 @@ from graphvio.optimization.loops import saved
 from graphvio.optimization.loops.search import LoopClosure
 from graphvio.optimization.nodes import choose_nodes, spread
 from graphvio.optimization.optimize import Optimization, optimize
-from graphvio.optimization.record import Motions, SessionRecord
+from graphvio.optimization.record import Motions, Recorder, SessionRecord
 from graphvio.rig import Imu
 from graphvio.simulation import default_rig
 from graphvio.trajectory import Trajectory
@@ -36,8 +37,8 @@ CONFIG = Config()
 
 @pytest.fixture(scope="module")
 def walk() -> DrawnSession:
-    """Three and a half laps with 40 closures, of which the last 12 are false."""
-    return draw_session(315.0, 1, IMU, 40, 0.3)
+    """Two and a half laps with 40 closures, of which the last 12 are false."""
+    return draw_session(225.0, 1, IMU, 40, 0.3)
 
 
 def ate_m(poses: Float, drawn: DrawnSession) -> float:
@@ -72,10 +73,10 @@ def test_false_closures_that_agree_with_each_other_are_refused(walk: DrawnSessio
 
 
 def test_what_is_told_of_the_uncertainty_is_true() -> None:
-    """NEES of the last pose seen from the first, over 60 walks with the IMU's noise as it is: 95 % band of its mean."""
+    """NEES of the last pose seen from the first, over 40 walks with the IMU's noise as it is: 95 % band of its mean."""
     config = replace(CONFIG, smoother=replace(SmootherConfig(), imu_noise_scale=1.0))
     squares = []
-    for seed in range(60):
+    for seed in range(40):
         drawn = draw_session(12.0, seed, IMU, 0)
         found = optimize([drawn.record], [IMU], [], config)
         last = len(found.sessions[0].nodes.rows) - 1
@@ -83,7 +84,7 @@ def test_what_is_told_of_the_uncertainty_is_true() -> None:
         true = se3_inverse(drawn.truth.nav_T_body[0]) @ drawn.truth.nav_T_body[-1]
         error = se3_log(se3_inverse(relative) @ true)
         squares.append(error @ np.linalg.solve(covariance, error))
-    assert 5.15 < np.mean(squares) < 6.9
+    assert 4.95 < np.mean(squares) < 7.1
 
 
 def test_sessions_of_one_place_come_into_one_frame() -> None:
@@ -243,3 +244,36 @@ def test_other_tools_find_the_same_optimum_in_the_pose_graph(walk: DrawnSession,
     ]
     assert max(apart) < 0.02
     assert found.values.exists(x(0))
+
+
+@pytest.mark.xdist_group("room_walk")
+def test_an_imu_that_is_found_wrong_does_not_bend_the_trajectory(room_walk: Path) -> None:
+    """From 2.5 s on its biases are others: vision is refused for a second, and then believed, also in what it said."""
+    source = open_source(room_walk)
+    recorder = Recorder("walk")
+    odometry = Odometry(source.rig, CONFIG, on_step=recorder.add)
+    kinds = []
+    for event in source:
+        if isinstance(event, ImuSample) and event.stamp_ns - source.start_ns > 2_500_000_000:
+            event = replace(
+                event,
+                angular_velocity=event.angular_velocity + np.array([0.05, 0.0, 0.05]),
+                linear_acceleration=event.linear_acceleration + np.array([0.5, 0.0, 0.0]),
+            )
+        odometry.process(event)
+        recorder.add_smoothed(odometry.take_smoothed())
+        kinds += [incident.kind for incident in odometry.take_incidents()]
+    odometry.finish()
+    recorder.add_smoothed(odometry.take_smoothed())
+    assert "gate_reset" in kinds
+    record = recorder.record()
+    assert record.is_start.sum() == 2
+    found = optimize([record], [source.rig.imu], [], CONFIG)
+    assert source.truth is not None
+    truth = Trajectory.read(source.truth)
+    before, after = (
+        evaluate(Trajectory(record.stamps_ns, poses), truth).ate_position_m.rmse
+        for poses in (record.online, found.sessions[0].nav_T_body)
+    )
+    assert after < 0.5 * before
+    assert found.after["imu"].per_dimension < 0.3

@@ -66,6 +66,7 @@ def session(name: str, seed: int, breaks: tuple[int, ...] = ()) -> SessionRecord
         at_rest=no,
         is_keyframe=~no,
         with_imu=no,
+        is_start=no,
         motions=Motions(
             ends - 1, ends, np.array(motions), np.repeat(covariance[None], count, 0), nothing, np.full(count, 100)
         ),

@@ -91,6 +91,7 @@ def draw_session(
         at_rest=np.zeros(len(rows), dtype=bool),
         is_keyframe=np.arange(len(rows)) % _KEYFRAME_FRAMES == 0,
         with_imu=np.ones(len(rows), dtype=bool),
+        is_start=np.arange(len(rows)) == 0,
         motions=motions,
         own=own,
         own_pair=own_pair,

@@ -18,11 +18,13 @@ from graphvio.backend.states import RigState, StartUncertainty, origin_covarianc
 from graphvio.config import SmootherConfig
 from graphvio.optimization.extrinsics import own_motion, unknowns
 from graphvio.optimization.nodes import Nodes
+from graphvio.optimization.record import SessionRecord
 from graphvio.rig import Imu
 
 _START_TILT_RAD = 0.2
 _START_SPEED_M_S = 10.0
 _START_GYRO_BIAS_RAD_S = 0.1
+_START_ACCEL_BIAS_M_S2 = 0.5
 _ORIGIN_SIGMA = 1e-4  # radians and metres: without an IMU, the first pose of an epoch is its frame
 
 
@@ -171,7 +173,10 @@ class SessionGraph:
                 self.add(gtsam.CombinedImuFactor(x(k - 1), v(k - 1), x(k), v(k), b(k - 1), b(k), measurements))
             else:
                 self._kind = "walk"
-                if record.with_imu[before] and record.with_imu[row] and imu is not None:
+                if record.is_start[before + 1 : row + 1].any():
+                    for factor in _start_of_imu(k, record, row):
+                        self.add(factor)
+                elif record.with_imu[before] and record.with_imu[row] and imu is not None:
                     for factor in imu_without_samples(
                         k - 1, k, dt, config.motion_accel_sigma_m_s2, imu, config.imu_noise_scale
                     ):
@@ -229,6 +234,15 @@ def _starts(fragment: Fragment, is_root: bool) -> Iterator[gtsam.NonlinearFactor
     if is_root:
         yield about_pose
     yield from others
+
+
+def _start_of_imu(k: int, record: SessionRecord, row: int) -> Iterator[gtsam.NonlinearFactor]:
+    """What is known of velocity and biases where the estimation began anew: next to nothing."""
+    if record.with_imu[row]:
+        yield gtsam.PriorFactorVector(v(k), record.velocity_nav[row], isotropic(3, _START_SPEED_M_S))
+        sigmas = np.repeat([_START_ACCEL_BIAS_M_S2, _START_GYRO_BIAS_RAD_S], 3)
+        bias = gtsam.imuBias.ConstantBias(record.accel_bias[row], record.gyro_bias[row])
+        yield gtsam.PriorFactorConstantBias(b(k), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
 
 def poses_of(values: gtsam.Values, count: int) -> Float:

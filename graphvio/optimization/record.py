@@ -92,6 +92,7 @@ class SessionRecord:
         at_rest: (F,) whether images and IMU show no motion.
         is_keyframe: (F,) whether later motions are measured from it.
         with_imu: (F,) whether the IMU takes part in the state.
+        is_start: (F,) whether the estimation began here, be it anew: velocity and biases before then tell nothing.
         motions: of the rig.
         own: motions of body over whole keyframes that single pairs tell.
         own_pair: the pair of each of these.
@@ -110,6 +111,7 @@ class SessionRecord:
     at_rest: Bool
     is_keyframe: Bool
     with_imu: Bool
+    is_start: Bool
     motions: Motions
     own: Motions
     own_pair: Int
@@ -188,6 +190,7 @@ class Recorder:
                 np.concatenate([np.zeros(0), *(each[0] for each in spans)]),
                 np.concatenate([np.zeros((0, 6)), *(each[1] for each in spans)]),
                 self._is_covered and step.span is not None,
+                step.started,
             )
         )
         self._since, self._is_covered = [], True
@@ -227,6 +230,7 @@ class Recorder:
             at_rest=np.array([each.at_rest for each in estimates]),
             is_keyframe=np.isin(stamps, sorted(self._references)),
             with_imu=np.array([each.gyro_bias is not None for each in estimates]),
+            is_start=np.array([row.is_start for row in rows]),
             motions=_joined([motion for motion in motions if _is_known(motion, row_of)], row_of),
             own=_joined([motion for _, motion in self._own if _is_known(motion, row_of)], row_of),
             own_pair=np.array([j for j, motion in self._own if _is_known(motion, row_of)], dtype=np.int64),
@@ -247,6 +251,7 @@ class _Row:
     steps_s: Float
     values: Float
     covers: bool
+    is_start: bool
 
 
 def _or_zero(value: Float | None) -> Float:
