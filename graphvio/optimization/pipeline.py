@@ -70,19 +70,37 @@ def optimize_sessions(
     Raises:
         GraphvioError: if a recording cannot be read, holds no pose, or the folder cannot be used.
     """
-    stages = _Stages(sessions, out, config, on_progress or _quiet)
+    stages = Stages(sessions, out, config, on_progress)
     records = [stages.record(number) for number in range(len(sessions))]
     closures = stages.closures(records) if with_loops else []
     return stages.result(records, closures)
 
 
-class _Stages:
-    def __init__(self, sessions: Sequence[Session], out: Path, config: Config, on_progress: Progress) -> None:
+class Stages:
+    """The stages one by one, for who runs them elsewhere than one after the other.
+
+    Args:
+        sessions: one or several.
+        out: folder of the results, as `optimize_sessions` takes it.
+        config: of all stages.
+        on_progress: told how far it is.
+
+    Attributes:
+        inputs: what decides the results: name -> value.
+
+    Raises:
+        OptimizationError: if the folder cannot be used.
+    """
+
+    def __init__(
+        self, sessions: Sequence[Session], out: Path, config: Config, on_progress: Progress | None = None
+    ) -> None:
         self._sessions = sessions
         self._config = config
-        self._on_progress = on_progress
+        self._on_progress = on_progress or _quiet
         inputs = {each.name: _identity(each.source) for each in sessions}
-        self._space = Workspace(out, inputs | {"config": config.sha256(), "graphvio": __version__})
+        self.inputs = inputs | {"config": config.sha256(), "graphvio": __version__}
+        self._space = Workspace(out, self.inputs)
 
     def record(self, number: int) -> SessionRecord:
         """What the odometry makes of a session; beside it the results of its run."""
@@ -104,7 +122,7 @@ class _Stages:
 
     def closures(self, records: Sequence[SessionRecord]) -> list[LoopClosure]:
         """Loop closures within and between the sessions."""
-        inputs = [self._input(number, record) for number, record in enumerate(records)]
+        inputs = [self.places(number, record) for number, record in enumerate(records)]
         with FeatureDatabase(self._space.folder / DATABASE) as database:
             for each in inputs:
                 self._extract(each, database)
@@ -129,7 +147,8 @@ class _Stages:
         write_g2o(found, self._space.folder / "graph.g2o")
         return found
 
-    def _input(self, number: int, record: SessionRecord) -> SessionInput:
+    def places(self, number: int, record: SessionRecord) -> SessionInput:
+        """A session with the places at which loop closures are looked for."""
         session, settings = self._sessions[number], self._config.optimization
         rows = choose_places(record, settings.place_distance_m, settings.place_angle_deg)
         places = [Place(number, row, int(record.stamps_ns[row])) for row in rows.tolist()]

@@ -178,7 +178,9 @@ class _Verifier:
     def verify(self, candidate: tuple[int, int]) -> LoopClosure | None:
         """The loop closure of an earlier and a later place, or None."""
         earlier, later = (self._places[number] for number in candidate)
-        colmap().set_random_seed(self._config.motion.seed)  # the thread's: whatever it tried before, and whichever it is
+        colmap().set_random_seed(
+            self._config.motion.seed
+        )  # the thread's: whatever it tried before, and whichever it is
         crossings = self._crossings(*candidate)
         matches = {}
         for (a, b), names in crossings.items():
