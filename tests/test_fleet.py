@@ -33,14 +33,14 @@ from graphvio.warmup import warm_up
 
 pytestmark = pytest.mark.xdist_group("fleet")
 
-SESSIONS, FRAMES, CORRUPT = 20, 24, "walk-07"
+SESSIONS, FRAMES, CORRUPT = 20, 18, "walk-07"
 PLACES_PER_TASK = 2
 CONFIG = """
 optimization:
-  features: 150
+  features: 100
   place_distance_m: 0.1
   place_angle_deg: 5.0
-  loop_interval_s: 0.5
+  loop_interval_s: 0.3
   loop_min_inliers: 15
 """
 
@@ -133,11 +133,14 @@ def done(folder: Path, config: Config, cluster: Any) -> Done:
     return Done(out, outcomes, killer)
 
 
-def test_all_others_arrive_and_are_those_of_one_process(done: Done, folder: Path, config: Config) -> None:
+def test_all_others_arrive_and_are_those_of_one_process(
+    done: Done, folder: Path, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert done.killer.interrupted
     assert done.killer.pid != done.killer.cluster.workers[0].pid
     assert [each.name for each in done.outcomes] == [f"walk-{number:02d}" for number in range(SESSIONS)]
     assert [each.name for each in done.outcomes if each.error] == [CORRUPT]
+    monkeypatch.setattr("graphvio.results.writer.draw_run", lambda *_, **__: None)  # a third of the time
     parts, loops = set(), 0
     for each in done.outcomes:
         if each.error:
@@ -170,7 +173,7 @@ def test_the_table_tells_of_every_session(done: Done) -> None:
         if row["name"] == CORRUPT:
             assert (row["status"], row["failed_in"], row["ate_m"]) == ("failed", "odometry", "")
             assert "none of its" in row["error"]
-            assert "truncated" in row["error"]
+            assert "image_undecodable" in row["error"]
         else:
             assert (row["status"], row["error"], row["framesets"]) == ("optimized", "", str(FRAMES))
             assert float(row["ate_m"]) < 0.01
@@ -277,7 +280,7 @@ def test_what_can_be_listed(folder: Path, tmp_path: Path) -> None:
             wrong.mkdir()
         elif wrong.name == "binary":
             wrong.write_bytes(b"\xff\xfe\x80")
-        with pytest.raises(FleetError, match="give a folder or a list|neither a folder nor a list"):
+        with pytest.raises(FleetError, match=r"give a folder or a list|neither a folder nor a list"):
             list_sessions(str(wrong))
     with pytest.raises(FleetError, match="cannot be reached"):
         list_sessions("nonsense://bucket/list.txt")

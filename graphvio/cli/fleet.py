@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -10,12 +9,7 @@ import typer
 from graphvio.cli import options
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from graphvio.config import Config
-    from graphvio.fleet.listing import Listed
     from graphvio.fleet.run import FleetProgress
-    from graphvio.rig import Rig
 
 fleet = typer.Typer(help="Many sessions side by side, on this machine or on a Dask cluster.", no_args_is_help=True)
 
@@ -71,6 +65,8 @@ def optimize(
 
         graphvio fleet optimize list.txt --out s3://bucket/results --scheduler tcp://10.0.0.5:8786
     """
+    import logging
+
     from graphvio.cli.run import EXIT_INCOMPLETE, EXIT_INTERRUPTED
     from graphvio.config import Config
     from graphvio.errors import FleetError
@@ -88,8 +84,7 @@ def optimize(
     settings = Config.load(config)
     loaded = None if rig is None else Rig.load(rig)
     listed = list_sessions(sessions)
-    if scheduler is None:
-        _compile_kernels(listed, loaded, settings)
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is told below
     try:
         with _Bar(len(listed)) as bar:
             outcomes = optimize_fleet(
@@ -114,23 +109,6 @@ def optimize(
         raise typer.Exit(EXIT_INCOMPLETE)
 
 
-def _compile_kernels(listed: Sequence[Listed], rig: Rig | None, settings: Config) -> None:
-    """Before there are several processes, which would all compile the same."""
-    from graphvio.errors import GraphvioError
-    from graphvio.simulation import default_rig
-    from graphvio.sources import open_source
-    from graphvio.warmup import warm_up
-
-    local = [Path(each.recording) for each in listed if rig is None and Path(each.recording).exists()]
-    for recording in local:
-        try:
-            rig = open_source(recording).rig
-            break
-        except GraphvioError:
-            pass  # it will be told when its turn comes
-    warm_up(rig or default_rig(), settings)
-
-
 class _Bar:
     """One bar for all sessions."""
 
@@ -151,9 +129,7 @@ class _Bar:
 
     def show(self, progress: FleetProgress) -> None:
         """Draw how far everything is."""
-        failed = f", {progress.failed} failed" if progress.failed else ""
-        self._bars.update(
-            self._task,
-            completed=progress.optimized + progress.failed,
-            description=f"{progress.tasks} tasks{failed}; {progress.latest}",
-        )
+        texts = [f"{progress.tasks} tasks"]
+        texts += [f"{progress.failed} failed"] if progress.failed else []
+        texts += [progress.latest] if progress.latest else []
+        self._bars.update(self._task, completed=progress.optimized + progress.failed, description=", ".join(texts))

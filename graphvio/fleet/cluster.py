@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
-from graphvio.errors import FleetError, MissingExtraError
+from graphvio.config import Config
+from graphvio.errors import FleetError, GraphvioError, MissingExtraError
+from graphvio.rig import Rig
+from graphvio.simulation import default_rig
+from graphvio.sources import open_source
+from graphvio.warmup import warm_up
 
 RETRIES = 2
 _CONNECT_S = 20.0
@@ -34,6 +40,24 @@ def default_workers() -> int:
     two. With two processes, one works while the other is started anew or waits for the disk.
     """
     return max(2, (os.cpu_count() or 1) // 2)
+
+
+def compile_kernels(recordings: Sequence[str], rig: Rig | None, config: Config) -> None:
+    """Compile the odometry's kernels in this process, before there are several, which would all compile the same.
+
+    Args:
+        recordings: paths and URLs; the first one that can be opened here tells the rig.
+        rig: of all recordings, or None.
+        config: of the odometry.
+    """
+    for recording in (Path(each) for each in recordings if rig is None):
+        if recording.exists():
+            try:
+                rig = open_source(recording).rig
+                break
+            except GraphvioError:
+                pass  # it is told when its turn comes
+    warm_up(rig or default_rig(), config)
 
 
 @contextmanager
@@ -66,6 +90,7 @@ def connected(scheduler: str | None, workers: int | None = None) -> Iterator[Any
                 processes=True,
                 dashboard_address=None,
                 silence_logs=logging.CRITICAL,
+                preload=["graphvio.fleet.preload"],
             )
         except (OSError, RuntimeError) as error:
             raise FleetError(f"workers cannot be started on this machine ({error})") from None

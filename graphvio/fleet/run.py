@@ -10,7 +10,7 @@ from typing import Any
 from graphvio.config import Config
 from graphvio.errors import FleetError, GraphvioError
 from graphvio.fleet import tasks
-from graphvio.fleet.cluster import RETRIES, connected, distributed
+from graphvio.fleet.cluster import RETRIES, compile_kernels, connected, distributed
 from graphvio.fleet.listing import Listed
 from graphvio.fleet.markers import Marker, finished
 from graphvio.fleet.storage import Storage, local_path
@@ -33,7 +33,7 @@ class FleetProgress:
         optimized: whose results are there.
         failed: that were given up.
         tasks: that have ended since the start, well or not.
-        latest: the task that ended last: stage and session.
+        latest: the task that ended last: stage and session; empty before the first.
     """
 
     sessions: int
@@ -72,7 +72,7 @@ def optimize_fleet(
         scheduler: address of a Dask scheduler; None works on this machine.
         workers: processes on this machine.
         places_per_task: whose features one task extracts, at most.
-        on_progress: called when a task has ended.
+        on_progress: called at the start and when a task has ended.
 
     Returns:
         What became of each session, in their order.
@@ -93,6 +93,8 @@ def optimize_fleet(
     fleet = _Fleet([_Session(job) for job in jobs], on_progress)
     waiting = fleet.look()
     if waiting:
+        if scheduler is None:
+            compile_kernels([session.job.recording for session in waiting], rig, config)
         with connected(scheduler, workers) as client:
             fleet.work(client, waiting)
     outcomes = [each.outcome() for each in fleet.sessions]
@@ -156,6 +158,7 @@ class _Fleet:
                 session.failed_in, session.error = tasks.ODOMETRY, _one_line(error)
             if not session.error and not session.is_optimized:
                 waiting.append(session)
+        self._tell("")
         return waiting
 
     def work(self, client: Any, waiting: Sequence[_Session]) -> None:
