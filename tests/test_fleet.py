@@ -85,7 +85,7 @@ def config(folder: Path) -> Config:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as made:
+    with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0") as made:
         yield made
 
 
@@ -186,8 +186,8 @@ def test_the_table_tells_of_every_session(done: Done) -> None:
     assert "://" not in page
 
 
-def command(folder: Path, cluster: Any, *arguments: object) -> Result:
-    common = ["--config", folder / "config.yaml", "--scheduler", cluster.scheduler_address]
+def command(folder: Path, *arguments: object) -> Result:
+    common = ["--config", folder / "config.yaml"]
     return CliRunner().invoke(app, ["fleet", "optimize", *map(str, [*arguments, *common])], env={"COLUMNS": "160"})
 
 
@@ -201,7 +201,7 @@ def test_again_does_only_what_is_missing(done: Done, folder: Path, cluster: Any,
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
     (out / "walk-03" / "trajectory_optimized.txt").unlink()
     (out / "walk-11" / "loops.npz").unlink()
-    result = command(folder, cluster, listed, "--out", out)
+    result = command(folder, listed, "--out", out, "--scheduler", cluster.scheduler_address)
     assert result.exit_code == 3, result.output
     assert f"{CORRUPT} failed in odometry: " in result.output
     assert "19 of 20 sessions optimised" in result.output
@@ -215,13 +215,14 @@ def test_again_does_only_what_is_missing(done: Done, folder: Path, cluster: Any,
         assert (out / name).read_bytes() == (done.out / name).read_bytes()
 
 
-def test_a_session_that_was_mended_arrives(done: Done, folder: Path, cluster: Any, tmp_path: Path) -> None:
-    sound = tmp_path / CORRUPT
-    shutil.copytree(folder / "sound", sound)
-    result = command(folder, cluster, tmp_path, "--out", tmp_path / "out")
+def test_workers_on_this_machine_and_other_input(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "sessions").mkdir()
+    shutil.copytree(folder / "sound", tmp_path / "sessions" / CORRUPT)
+    arguments = (tmp_path / "sessions", "--out", tmp_path / "out", "--workers", 1)
+    result = command(folder, *arguments)
     assert result.exit_code == 0, result.output
     assert "1 of 1 sessions optimised" in result.output
-    other = command(folder, cluster, tmp_path, "--out", tmp_path / "out", "--no-loops")
+    other = command(folder, *arguments, "--no-loops")
     assert other.exit_code == 3
     assert "holds results of other input (different: loops)" in other.output
 

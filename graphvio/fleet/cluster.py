@@ -88,7 +88,7 @@ def connected(scheduler: str | None, workers: int | None = None) -> Iterator[Any
                 n_workers=workers or default_workers(),
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
                 preload=["graphvio.fleet.preload"],
             )
