@@ -18,11 +18,14 @@ if TYPE_CHECKING:
         EventError,
         GraphvioError,
         MissingExtraError,
+        OptimizationError,
         RigError,
         SourceError,
     )
     from graphvio.events import Estimate, FrameSet, ImuSample, Prediction, Status
     from graphvio.odometry import Odometry
+    from graphvio.optimization.optimize import Optimization
+    from graphvio.optimization.pipeline import optimize_sessions
     from graphvio.rig import Camera, Imu, Rig, StereoPair
     from graphvio.sources import open_source
     from graphvio.trajectory import Trajectory
@@ -41,6 +44,8 @@ _HOME_OF = {
     "ImuSample": "events",
     "MissingExtraError": "errors",
     "Odometry": "odometry",
+    "Optimization": "optimization.optimize",
+    "OptimizationError": "errors",
     "Prediction": "events",
     "Rig": "rig",
     "RigError": "errors",
@@ -51,6 +56,7 @@ _HOME_OF = {
     "calibrate_pairs": "calibration.calibrate",
     "calibrate_trajectories": "calibration.calibrate",
     "open_source": "sources",
+    "optimize_sessions": "optimization.pipeline",
 }
 
 __all__ = [
@@ -67,6 +73,8 @@ __all__ = [
     "ImuSample",
     "MissingExtraError",
     "Odometry",
+    "Optimization",
+    "OptimizationError",
     "Prediction",
     "Rig",
     "RigError",
@@ -78,6 +86,7 @@ __all__ = [
     "calibrate_pairs",
     "calibrate_trajectories",
     "open_source",
+    "optimize_sessions",
 ]
 
 

@@ -175,6 +175,7 @@ class Odometry:
                     used=motion is not None,
                     span=span,
                     started=self._belief.starts != starts,
+                    own={} if motion is None else visual.own,
                     references=self._frontend.reference_stamps_ns,
                     frames=self._frontend.reference_frames(stamp_ns),
                 )

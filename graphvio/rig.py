@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _ROTATION_TOLERANCE = 1e-3
+_ROUNDING = 1e-14
 _MIN_BASELINE_M = 1e-3
 _MAX_AXES_ANGLE_DEG = 45.0
 
@@ -244,6 +245,18 @@ class Rig:
         from graphvio.rig_files import save_rig
 
         save_rig(self, Path(path))
+
+
+def as_written(camera: Camera, body_T_cam: Float) -> Camera:
+    """A camera that has just been made, with exactly the transform (4, 4) that its file holds.
+
+    The constructor makes rotations orthonormal, and so changes the last digit of those that are. What was written is
+    thus read back as it was; a transform that differs by more than rounding stays as the constructor made it.
+    """
+    given = np.array(body_T_cam, dtype=np.float64)
+    if np.abs(given - camera.body_T_cam).max() <= _ROUNDING:
+        _set(camera, "body_T_cam", given)
+    return camera
 
 
 def checked_transform(matrix: object, where: str) -> Float:

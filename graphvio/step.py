@@ -22,6 +22,7 @@ class Step:
         span: the IMU since the step before, or None.
         started: whether the estimation began here, be it anew: what is known of the time before then does not count.
         references: stamps of the framesets that later motions are measured from.
+        own: pair index -> what it alone says of the motion, at the end of a keyframe whose motion is used.
         frames: pair index -> its tracks, for those pairs that later motions are measured from at this very frameset.
     """
 
@@ -31,4 +32,5 @@ class Step:
     span: ImuSpan | None
     started: bool
     references: frozenset[int]
+    own: Mapping[int, RelativeMotion]
     frames: Mapping[int, PairFrame]

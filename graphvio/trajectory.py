@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.errors import TrajectoryError
+from graphvio.errors import SessionError, TrajectoryError
 from graphvio.geometry import interpolate, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 
 _NS_PER_S = 1_000_000_000
@@ -23,6 +23,7 @@ _COLUMNS = 8
 _KITTI_COLUMNS = 12
 _NORM_TOLERANCE = 0.05
 _STAMP_MAX_NS = 2**62
+_SESSIONS = (".mcap", ".bag")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +85,12 @@ class Trajectory:
         """The poses at some indices, or where a mask (N,) is true."""
         return Trajectory(self.stamps_ns[which], self.nav_T_body[which])
 
+    def around(self, begin_ns: int, end_ns: int) -> Trajectory:
+        """The poses from ``begin_ns`` to ``end_ns``, and the nearest one before and after, to interpolate with."""
+        first = int(np.searchsorted(self.stamps_ns, begin_ns, side="right")) - 1
+        last = int(np.searchsorted(self.stamps_ns, end_ns)) + 1
+        return self.select(slice(max(first, 0), last))
+
     def transformed(self, other_T_nav: Float) -> Trajectory:
         """The same motion seen from another frame: ``other_T_body`` for ``other_T_nav`` (4, 4)."""
         return Trajectory(self.stamps_ns, np.asarray(other_T_nav) @ self.nav_T_body)
@@ -123,12 +130,17 @@ class Trajectory:
     def read(path: str | Path) -> Trajectory:
         """Read a TUM, EuRoC or KITTI file, told apart by commas or blanks and the number of columns.
 
-        KITTI's poses take their stamps from ``times.txt`` beside them, or in ``../sequences/NAME``.
+        KITTI's poses take their stamps from ``times.txt`` beside them, or in ``../sequences/NAME``. Of a session or
+        bag, the true trajectory in it is read.
 
         Raises:
-            TrajectoryError: if the file cannot be read, a line is no pose, or the stamps do not increase.
+            TrajectoryError: if the file cannot be read, a line is no pose, or the stamps do not increase; or if a
+                session has no truth.
         """
-        return _read(Path(path))
+        path = Path(path)
+        if path.suffix in _SESSIONS or path.is_dir():
+            return _read_session(path)
+        return _read(path)
 
     def write(self, path: str | Path) -> None:
         """Write a TUM file: nine decimals on the stamp, ``q_w >= 0``.
@@ -177,6 +189,18 @@ def stamp_ns_from_seconds(text: str) -> int:
         return int(stamp.to_integral_value())
     except DecimalException:
         raise ValueError(f"{text!r} is no time") from None
+
+
+def _read_session(path: Path) -> Trajectory:
+    from graphvio.sessions.opening import is_store
+    from graphvio.sessions.truth import read_truth
+
+    if not is_store(path):
+        raise TrajectoryError(f"{path}: is no trajectory file, and no session; give a TUM or EuRoC trajectory file")
+    try:
+        return Trajectory(*read_truth(path))
+    except SessionError as error:
+        raise TrajectoryError(str(error)) from None
 
 
 def _read(path: Path) -> Trajectory:

@@ -42,15 +42,19 @@ def _course(
     return np.column_stack([zero + x, zero + y, level + z, zero + yaw, zero, zero])
 
 
-def recorded(folder: Path, duration_s: float, course: Course | None = None, trigger_offset_ms: float = 0.0) -> Path:
-    """A recording of 320x240 images; without a course the rig is turned about all axes while it is carried around."""
+def walk_simulator(duration_s: float, course: Course | None = None, trigger_offset_ms: float = 0.0) -> Simulator:
+    """Of 320x240 images; without a course the rig is turned about all axes while it is carried around."""
     rig = default_rig()
     pairs = tuple(replace(pair, left=half_size(pair.left), right=half_size(pair.right)) for pair in rig.pairs)
     scene = build_scene("calibration", duration_s, 0.0)
     if course is not None:
         scene = replace(scene, motion=Motion(course, duration_s))
-    simulator = Simulator(scene, replace(rig, pairs=pairs), 1, trigger_offset_ms=trigger_offset_ms)
-    return write_recording(simulator, folder).path
+    return Simulator(scene, replace(rig, pairs=pairs), 1, trigger_offset_ms=trigger_offset_ms)
+
+
+def recorded(folder: Path, duration_s: float, course: Course | None = None, trigger_offset_ms: float = 0.0) -> Path:
+    """A recording of what the simulator sees."""
+    return write_recording(walk_simulator(duration_s, course, trigger_offset_ms), folder).path
 
 
 def misplacement(degrees: float, metres: float) -> Float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 import shutil
 import signal
@@ -27,7 +28,7 @@ from graphvio.fleet.listing import Listed, list_sessions
 from graphvio.fleet.run import FleetProgress, optimize_fleet
 from graphvio.fleet.storage import Storage
 from graphvio.fleet.table import COLUMNS, Outcome
-from graphvio.optimization.pipeline import Session, optimize_sessions
+from graphvio.optimization.pipeline import optimize_sessions
 from graphvio.sources import open_source
 from graphvio.warmup import warm_up
 
@@ -140,13 +141,14 @@ def test_all_others_arrive_and_are_those_of_one_process(
     assert done.killer.pid != done.killer.cluster.workers[0].pid
     assert [each.name for each in done.outcomes] == [f"walk-{number:02d}" for number in range(SESSIONS)]
     assert [each.name for each in done.outcomes if each.error] == [CORRUPT]
-    monkeypatch.setattr("graphvio.results.writer.draw_run", lambda *_, **__: None)  # a third of the time
+    for drawing in ("graphvio.results.writer.draw_run", "graphvio.optimization.pipeline.write_report"):
+        monkeypatch.setattr(drawing, lambda *_, **__: None)  # most of the time
     parts, loops = set(), 0
     for each in done.outcomes:
         if each.error:
             continue
         alone = folder / "alone" / each.name
-        optimize_sessions([Session(each.name, open_source(each.recording))], alone, config)
+        optimize_sessions([open_source(each.recording)], alone, config)
         for name in ("trajectory_optimized.txt", "covariance.csv", "graph.g2o", "loops.npz", f"{each.name}/record.npz"):
             assert (done.out / each.name / name).read_bytes() == (alone / name).read_bytes(), (each.name, name)
         assert rows(done.out / each.name / "database.db") == rows(alone / "database.db"), each.name
@@ -207,12 +209,15 @@ def test_again_does_only_what_is_missing(done: Done, folder: Path, cluster: Any,
     assert "19 of 20 sessions optimised" in result.output
     changed = {str(path.relative_to(out)) for path, stamp in before.items() if path.stat().st_mtime_ns != stamp}
     assert {name.split("/")[0] for name in changed} == {"walk-03", "walk-11", "summary.csv", "summary.html"}
-    assert {name for name in changed if name.startswith("walk-03")} == {
-        f"walk-03/{name}" for name in ("trajectory_optimized.txt", "covariance.csv", "graph.g2o", "stages/graph.json")
-    }
+    marker = json.loads((out / "walk-03/stages/graph.json").read_text())
+    made = {"database.db", "stages/graph.json", *marker["files"]}
+    assert {"trajectory_optimized.txt", "covariance.csv", "graph.g2o", "report.html"} <= made
+    assert {name for name in changed if name.startswith("walk-03")} == {f"walk-03/{name}" for name in made}
     assert not any(name.endswith(("record.npz", "odometry.json")) for name in changed)
-    for name in ("walk-03/trajectory_optimized.txt", "walk-11/loops.npz"):
+    for name in ("walk-03/trajectory_optimized.txt", "walk-11/loops.npz", "walk-11/graph.g2o"):
         assert (out / name).read_bytes() == (done.out / name).read_bytes()
+    for name in ("walk-03", "walk-11"):
+        assert rows(out / name / "database.db") == rows(done.out / name / "database.db")
 
 
 def test_workers_on_this_machine_and_other_input(folder: Path, tmp_path: Path) -> None:

@@ -24,9 +24,11 @@ from graphvio.geometry import se3, so3_exp
 from graphvio.sessions import cdr
 from graphvio.sessions.description import describe
 from graphvio.sessions.mcap_file import McapFile
+from graphvio.sessions.mcap_storage import McapStorage
 from graphvio.sessions.messages import IMAGE, header, odometry
 from graphvio.sessions.pixels import grey
-from graphvio.sessions.writer import ImageFormat, SessionWriter
+from graphvio.sessions.topics import ImageFormat
+from graphvio.sessions.writer import SessionWriter
 from graphvio.sources.images import ImageError
 
 pytest.importorskip("mcap")
@@ -102,9 +104,10 @@ def test_a_file_that_was_cut_is_read_as_far_as_it_goes(recording: Path, tmp_path
     source = open_source(recording)
     path = tmp_path / "walk.mcap"
     with SessionWriter(path, source.rig) as writer:
+        assert isinstance(writer._storage, McapStorage)
         for event in source:
             writer.add(event)
-            writer._last_flush_s = -1.0  # so that each message has a chunk of its own
+            writer._storage._last_flush_s = -1.0  # so that each event has a chunk of its own
     whole = path.read_bytes()
     path.write_bytes(whole[: int(share * len(whole))])
     cut = open_source(path)
@@ -186,7 +189,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
 writer = SessionWriter(Path({str(tmp_path / "full.mcap")!r}), small_rig(1))
 rng = np.random.default_rng(0)
 for k in range(60):
-    writer._last_flush_s = -1.0
+    writer._storage._last_flush_s = -1.0
     image = rng.integers(0, 256, (48, 64), np.uint8)
     writer.add(FrameSet(k * 50_000_000, {{0: (image, image)}}))
 writer.close()

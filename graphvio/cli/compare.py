@@ -17,7 +17,8 @@ EXIT_ABOVE = 4
 
 def compare(
     results: Annotated[
-        list[Path], typer.Argument(help="Result folders of `graphvio run`, or trajectory files (TUM, EuRoC).")
+        list[Path],
+        typer.Argument(help="Result folders of `graphvio run` and `graphvio optimize`, or trajectory files."),
     ],
     truth: Annotated[
         Path | None, typer.Option("--truth", help="True trajectory.  [default: the first result is the reference]")
@@ -71,7 +72,12 @@ def compare(
 
 
 def _file(path: Path, smoothed: bool) -> Path:
-    return path / ("trajectory_smoothed.txt" if smoothed else "trajectory.txt") if path.is_dir() else path
+    if not path.is_dir():
+        return path
+    optimized = path / "trajectory_optimized.txt"
+    if optimized.is_file():
+        return optimized
+    return path / ("trajectory_smoothed.txt" if smoothed else "trajectory.txt")
 
 
 def _names(paths: list[Path]) -> list[str]:

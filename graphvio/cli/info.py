@@ -1,4 +1,4 @@
-"""``graphvio info``: what a session holds."""
+"""``graphvio info``: what a session or bag holds."""
 
 from __future__ import annotations
 
@@ -10,18 +10,23 @@ import typer
 from graphvio.cli import options
 
 if TYPE_CHECKING:
-    from graphvio.sessions.description import Description, TopicDescription
+    from graphvio.sessions.description import Description, Synchronisation, TopicDescription
+    from graphvio.sessions.stamps import Clock
 
 
 def info(
-    session: Annotated[Path, typer.Argument(help="Session (.mcap).")],
+    session: Annotated[Path, typer.Argument(help="Session (.mcap) or ROS bag (.bag, or a ROS 2 folder).")],
     verbose: options.Verbose = False,
 ) -> None:
-    """Tell what a session holds: topics with their rates, gaps and jitter, how long, how large, what rig.
+    """Tell what a session or bag holds: topics with their rates, gaps and jitter, how long, how large, what rig; and
+    how far clocks are to be trusted: stamps that go back or jump, how long after its stamp a message was recorded and
+    whether that drifts, and how well cameras are synchronised.
 
-    Example:
+    Examples:
 
         graphvio info mh01.mcap
+
+        graphvio info walk.bag
     """
     from graphvio.sessions.description import describe
 
@@ -33,10 +38,13 @@ def _tell(found: Description) -> None:
         f"{found.path}: {found.duration_s:.1f} s, {found.size_bytes / 1e6:.1f} MB"
         + ("" if found.is_whole else ", cut: its recording was not finished")
     )
-    typer.echo(f"written by {found.library or 'an unknown program'}")
+    if found.library:
+        typer.echo(f"written by {found.library}")
     typer.echo(f"rig: {found.rig or 'none inside; give one with --rig'}")
     for topic in found.topics:
         typer.echo(f"{topic.name}  ({topic.type_name}): {topic.messages} messages{_regularity(topic)}")
+    for each in found.synchronisation:
+        typer.echo(_synchronised(each))
 
 
 def _regularity(topic: TopicDescription) -> str:
@@ -44,4 +52,23 @@ def _regularity(topic: TopicDescription) -> str:
         return ""
     told = f", {topic.rate_hz:.2f} Hz, jitter {topic.jitter_ms:.2f} ms, {topic.gaps} gaps, longest interval "
     told += f"{topic.longest_ms:.1f} ms"
-    return told if topic.latency_ms is None else f"{told}, recorded {topic.latency_ms:.2f} ms after their stamps"
+    return told if topic.clock is None else told + _clock(topic.clock)
+
+
+def _clock(clock: Clock) -> str:
+    told = f", recorded {clock.latency_ms:.2f} ms after their stamps"
+    if clock.drift_ms_per_minute is not None:
+        told += f", drifting by {clock.drift_ms_per_minute:.2f} +- {clock.drift_sigma:.2f} ms a minute"
+    if clock.backward:
+        told += f", {clock.backward} stamps that repeat or go back"
+    if clock.jumps:
+        told += f", {clock.jumps} jumps of the stamps by a second or more"
+    return told
+
+
+def _synchronised(found: Synchronisation) -> str:
+    what = f"{found.first} to {found.second}: "
+    if found.offset is None:
+        return f"{what}no stamps belong together"
+    told = f"{what}{found.offset.matched} of {found.images} images, the second {found.offset.median_ms:.3f} ms later"
+    return f"{told} (median), {found.offset.largest_ms:.3f} ms apart at most"

@@ -36,6 +36,10 @@ def optimize(
     pairs: options.Pairs = None,
     no_imu: options.NoImu = False,
     no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
+    refine_calibration: Annotated[
+        bool,
+        typer.Option("--refine-calibration", help="Find the pairs' places and the IMU's time offset, too."),
+    ] = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
     verbose: options.Verbose = False,
@@ -55,27 +59,32 @@ def optimize(
     from graphvio.cli.run import EXIT_INTERRUPTED, open_recording
     from graphvio.config import Config
     from graphvio.optimization.loops.database import colmap
-    from graphvio.optimization.pipeline import named, optimize_sessions
+    from graphvio.optimization.pipeline import optimize_sessions
     from graphvio.results import ResultWriter
     from graphvio.warmup import warm_up
 
     if not no_loops:
         colmap()  # before hours of work, not after
     settings = Config.load(config)
-    sessions = named(
-        [
-            open_recording(source, rig, settings, pairs=pairs, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
-            for source in sources
-        ]
-    )
+    opened = [
+        open_recording(source, rig, settings, pairs=pairs, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
+        for source in sources
+    ]
     folder = out
     if folder is None:
-        folder = ResultWriter.new_folder(Path("results"), f"{sessions[0].name}-optimized")
-    for session in sessions:
-        warm_up(session.source.rig, settings)
+        folder = ResultWriter.new_folder(Path("results"), f"{opened[0].name}-optimized")
+    for source in opened:
+        warm_up(source.rig, settings)
     try:
         with _Stages() as stages:
-            found = optimize_sessions(sessions, folder, settings, with_loops=not no_loops, on_progress=stages.show)
+            found = optimize_sessions(
+                opened,
+                folder,
+                settings,
+                with_loops=not no_loops,
+                calibrates=refine_calibration,
+                on_progress=stages.show,
+            )
     except KeyboardInterrupt:
         typer.echo(f"graphvio: interrupted; the same command with --out {folder} goes on from there", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None

@@ -1,18 +1,22 @@
-"""``graphvio record`` and ``graphvio convert``: sessions on disk, with what the odometry made of them or without."""
+"""``graphvio record`` and ``graphvio convert``: recordings on disk, with what the odometry made of them or without."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections import deque
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from graphvio.cli import options
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
+    from graphvio.events import Event
     from graphvio.odometry import Odometry
+    from graphvio.sessions.formats import RecordingWriter
+    from graphvio.sessions.writer import SessionWriter
     from graphvio.sources import Source
+    from graphvio.trajectory import Trajectory
 
 EXIT_STOPPED = 3
 
@@ -39,18 +43,31 @@ def record(
     """
     from graphvio.cli.run import open_recording
     from graphvio.config import Config
+    from graphvio.errors import SessionError
     from graphvio.odometry import Odometry
+    from graphvio.sessions.writer import SessionWriter
     from graphvio.warmup import warm_up
 
+    if out.suffix != ".mcap":
+        raise SessionError(f"{out}: is recorded as MCAP, which is read by its name; name it .mcap")
     settings = Config.load(config)
     opened = open_recording(source, rig, settings, pairs=None, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
     warm_up(opened.rig, settings)
-    _write(opened, out, png, Odometry(opened.rig, settings))
+    writer = SessionWriter(out, opened.rig, "png" if png else "raw")
+    _write(opened, _truth(opened, is_whole=from_s is None and to_s is None), writer, Odometry(opened.rig, settings))
+    typer.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {writer.poses} poses")
+    _exit_if_stopped(writer)
 
 
 def convert(
     source: options.Source,
-    out: options.SessionOut,
+    out: Annotated[
+        Path, typer.Option("--out", help="What to write; new: NAME.mcap, NAME.bag, or a folder.", metavar="PATH")
+    ],
+    file_format: Annotated[
+        str | None,
+        typer.Option("--format", help="mcap, rosbag1, rosbag2 or euroc.  [default: by the name: .mcap, .bag]"),
+    ] = None,
     rig: options.RigFile = None,
     topics: options.Topics = None,
     png: options.Png = False,
@@ -58,26 +75,56 @@ def convert(
     to_s: options.ToS = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Write a recording as a session: one MCAP file with ROS 2 messages.
+    """Write a recording in another format: MCAP, a ROS 1 or ROS 2 bag, or the EuRoC/ASL layout.
 
-    Ends with exit code 3 where the disk became full; what was written until then can be read.
+    Ends with exit code 3 where the disk became full, with a line that tells whether what was written can be read.
 
     Examples:
 
         graphvio convert MH_01_easy --out mh01.mcap
 
+        graphvio convert mh01.mcap --out mh01.bag
+
+        graphvio convert mh01.bag --format euroc --out MH_01_again
+
         graphvio convert walk --from 10 --to 20 --png --out piece.mcap
     """
     from graphvio.cli.run import open_recording
     from graphvio.config import Config
+    from graphvio.sessions.formats import format_of, open_writer
 
+    known = format_of(out, file_format)
     opened = open_recording(source, rig, Config(), pairs=None, no_imu=False, from_s=from_s, to_s=to_s, topics=topics)
-    _write(opened, out, png, None)
+    truth = _truth(opened, is_whole=from_s is None and to_s is None)
+    writer = open_writer(out, opened.rig, known, "png" if png else "raw")
+    _write(opened, truth, writer, None)
+    files = [out] if out.is_file() else [file for file in out.rglob("*") if file.is_file()]
+    size = sum(file.stat().st_size for file in files)
+    typer.echo(f"{out}: {size / 1e6:.1f} MB, {known}, {f'truth of {len(truth)} poses' if truth else 'no truth'}")
+    if [camera.name for camera in writer.rig.cameras] != [camera.name for camera in opened.rig.cameras]:
+        names = zip(opened.rig.cameras, writer.rig.cameras, strict=True)
+        typer.echo("cameras are renamed: " + ", ".join(f"{old.name} is {new.name}" for old, new in names))
+    _exit_if_stopped(writer)
 
 
-def _write(opened: Source, out: Path, png: bool, odometry: Odometry | None) -> None:
-    """Record all events, and what an odometry makes of them; without one there is no reason to go on when the disk is
-    full."""
+def _truth(opened: Source, is_whole: bool) -> Trajectory | None:
+    """The true trajectory of what is converted; one that cannot be read is told, and left out."""
+    from graphvio.errors import TrajectoryError
+    from graphvio.trajectory import Trajectory
+
+    if opened.truth is None:
+        return None
+    try:
+        truth = Trajectory.read(opened.truth)
+    except TrajectoryError as error:
+        typer.echo(f"graphvio: the true trajectory is left out: {error}", err=True)
+        return None
+    return truth if is_whole else truth.around(opened.start_ns, opened.end_ns)
+
+
+def _write(opened: Source, truth: Trajectory | None, writer: RecordingWriter, odometry: Odometry | None) -> None:
+    """Record all events, the truth, and what an odometry makes of them; without one there is no reason to go on when
+    the disk is full."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -85,29 +132,37 @@ def _write(opened: Source, out: Path, png: bool, odometry: Odometry | None) -> N
     from graphvio.sessions.writer import SessionWriter
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with (
-        SessionWriter(out, opened.rig, "png" if png else "raw") as writer,
-        Progress(*columns, console=Console(stderr=True), transient=True) as bar,
-    ):
+    poses = deque(zip(truth.stamps_ns.tolist(), truth.nav_T_body, strict=True) if truth is not None else ())
+    with writer, Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("framesets", total=opened.frameset_count)
         for event in opened:
+            while poses and poses[0][0] <= event.stamp_ns:
+                writer.add_true_pose(*poses.popleft())
             writer.add(event)
             bar.advance(task, isinstance(event, FrameSet))
-            if odometry is not None:
-                estimate = odometry.process(event)
-                if estimate is not None:
-                    writer.add_estimate(estimate)
-                for incident in odometry.take_incidents():
-                    writer.add_incident(incident)
+            if odometry is not None and isinstance(writer, SessionWriter):
+                _advance(odometry, event, writer)
             elif writer.stopped is not None:
                 break
-        if odometry is not None:
+        for stamp_ns, pose in poses:
+            writer.add_true_pose(stamp_ns, pose)
+        if odometry is not None and isinstance(writer, SessionWriter):
             for estimate in odometry.finish():
                 writer.add_estimate(estimate)
         incidents = odometry.take_incidents() if odometry is not None else []
         for incident in (*incidents, *opened.faults.incidents):
             writer.add_incident(incident)
-    typer.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {writer.poses} poses")
+
+
+def _advance(odometry: Odometry, event: Event, writer: SessionWriter) -> None:
+    estimate = odometry.process(event)
+    if estimate is not None:
+        writer.add_estimate(estimate)
+    for incident in odometry.take_incidents():
+        writer.add_incident(incident)
+
+
+def _exit_if_stopped(writer: RecordingWriter) -> None:
     if writer.stopped is not None:
         typer.echo(f"graphvio: {writer.stopped}", err=True)
         raise typer.Exit(EXIT_STOPPED)

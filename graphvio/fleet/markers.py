@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -20,14 +20,14 @@ class Marker:
     Attributes:
         stage: its name, such as ``odometry`` or ``features-0-of-2``.
         inputs: what decided the results: name -> value.
-        files: name -> bytes, of what it left in the session's folder.
+        files: names of what it left in the session's folder.
         wall_s: time that it took, fetching and putting included.
         figures: name -> value, of the session's health.
     """
 
     stage: str
     inputs: Mapping[str, str]
-    files: Mapping[str, int]
+    files: Sequence[str]
     wall_s: float
     figures: Mapping[str, Any] = field(default_factory=dict)
 
@@ -38,7 +38,7 @@ class Marker:
             FleetError: if it cannot be written.
         """
         text = json.dumps(asdict(self), indent=2, allow_nan=False) + "\n"
-        storage.write(f"{_FOLDER}/{self.stage}.json", text.encode())
+        storage.write(_name(self.stage), text.encode())
 
 
 def finished(storage: Storage, inputs: Mapping[str, str]) -> dict[str, Marker]:
@@ -51,18 +51,27 @@ def finished(storage: Storage, inputs: Mapping[str, str]) -> dict[str, Marker]:
     Raises:
         FleetError: if the folder cannot be read, or holds results of other inputs.
     """
-    sizes = storage.sizes()
+    there = storage.sizes()
     found = {}
-    for name in sorted(sizes):
+    for name in sorted(there):
         if not name.startswith(f"{_FOLDER}/") or not name.endswith(".json"):
             continue
         marker = _read(storage, name)
         if marker is None:
             continue
         refuse_others(storage, [marker], inputs)
-        if all(sizes.get(file) == size for file, size in marker.files.items()):
+        if there.keys() >= set(marker.files):
             found[marker.stage] = marker
     return found
+
+
+def forget(storage: Storage, stage: str) -> None:
+    """Have a stage done again.
+
+    Raises:
+        FleetError: if its marker cannot be removed.
+    """
+    storage.remove(_name(stage))
 
 
 def refuse_others(storage: Storage, markers: Iterable[Marker], inputs: Mapping[str, str]) -> None:
@@ -91,3 +100,7 @@ def _read(storage: Storage, name: str) -> Marker | None:
         return Marker(**json.loads(storage.read(name) or b""))
     except (ValueError, TypeError):
         return None
+
+
+def _name(stage: str) -> str:
+    return f"{_FOLDER}/{stage}.json"

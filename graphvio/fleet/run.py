@@ -157,6 +157,7 @@ class _Fleet:
             except GraphvioError as error:
                 session.failed_in, session.error = tasks.ODOMETRY, _one_line(error)
             if not session.error and not session.is_optimized:
+                session.markers.pop(tasks.GRAPH, None)  # what it was made of is made anew
                 waiting.append(session)
         self._tell("")
         return waiting

@@ -9,9 +9,9 @@ from __future__ import annotations
 import json
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -20,7 +20,7 @@ from graphvio import __version__
 from graphvio.config import Config
 from graphvio.errors import FleetError, TrajectoryError
 from graphvio.evaluation import evaluate
-from graphvio.fleet.markers import Marker, finished, refuse_others
+from graphvio.fleet.markers import Marker, finished, forget, refuse_others
 from graphvio.fleet.storage import Storage, fetch_recording
 from graphvio.optimization.loops import saved
 from graphvio.optimization.loops.database import FeatureDatabase
@@ -143,6 +143,7 @@ def loops(job: Job, parts: int) -> Marker:
             for part in range(parts):
                 with FeatureDatabase(task.folder / _part_name(part, parts)) as database:
                     merge_places(database, whole, session.name, session.rig, stamps)
+        forget(task.storage, GRAPH)  # which adds to the database
         return {"loops_found": len(task.stages.closures([record]))}
 
     marker = _perform(job, LOOPS, work)
@@ -160,7 +161,7 @@ def graph(job: Job) -> Marker:
 
     def work(task: _Task) -> dict[str, Any]:
         task.fetch(ODOMETRY, *([LOOPS] if job.with_loops else []))
-        closures = saved.load(task.folder / "loops.npz") if job.with_loops else []
+        closures = saved.load(task.folder / "loops.npz") if job.with_loops else None
         found = task.stages.result([task.record()], closures)
         return {
             "loops_found": len(found.loops),
@@ -171,7 +172,7 @@ def graph(job: Job) -> Marker:
             "ate_m": _ate_m(task.folder / "trajectory_optimized.txt", task.source.truth),
         }
 
-    marker = _perform(job, GRAPH, work)
+    marker = _perform(job, GRAPH, work, changed=(DATABASE,))
     Storage(job.results).remove_unfinished()
     return marker
 
@@ -186,6 +187,7 @@ class _Task:
     stages: Stages
     storage: Storage
     done: Mapping[str, Marker]
+    fetched: set[str] = field(default_factory=set)
 
     def fetch(self, *stages: str) -> None:
         """Get the files that earlier stages have left."""
@@ -193,6 +195,7 @@ class _Task:
             if stage not in self.done:
                 raise FleetError(f"{self.job.results}: the files of {stage} are gone; run it again")
             for name in self.done[stage].files:
+                self.fetched.add(name)
                 self.storage.fetch(name, self.folder / name)
 
     def record(self) -> SessionRecord:
@@ -200,7 +203,8 @@ class _Task:
         return SessionRecord.load(self.folder / self.job.name / "record.npz")
 
 
-def _perform(job: Job, stage: str, work: Callable[[_Task], dict[str, Any]]) -> Marker:
+def _perform(job: Job, stage: str, work: Callable[[_Task], dict[str, Any]], changed: Sequence[str] = ()) -> Marker:
+    """Do the work, unless it is done, and put what it made, and those files that it fetched and changed."""
     begun = perf_counter()
     if job.version != __version__:
         raise FleetError(f"this worker has graphvio {__version__}, and was asked by {job.version}; install one version")
@@ -214,15 +218,13 @@ def _perform(job: Job, stage: str, work: Callable[[_Task], dict[str, Any]]) -> M
         stages = Stages([Session(job.name, source)], scratch, job.config)
         inputs = stages.inputs | job.inputs
         refuse_others(storage, done.values(), inputs)
-        figures = work(_Task(job, scratch, source, stages, storage, done))
-        there = {name for marker in done.values() for name in marker.files} | {_STATE}
-        made = sorted(path for path in scratch.rglob("*") if path.is_file())
-        files = {str(path.relative_to(scratch)): path for path in made}
-        files = {name: path for name, path in files.items() if name not in there}
-        for name, path in files.items():
-            storage.put(path, name)
-        sizes = {name: path.stat().st_size for name, path in files.items()}
-        marker = Marker(stage, inputs, sizes, perf_counter() - begun, figures)
+        task = _Task(job, scratch, source, stages, storage, done)
+        figures = work(task)
+        there = {str(path.relative_to(scratch)) for path in scratch.rglob("*") if path.is_file()}
+        made = sorted(there - task.fetched - {_STATE})
+        for name in [*made, *sorted(task.fetched.intersection(changed))]:
+            storage.put(scratch / name, name)
+        marker = Marker(stage, inputs, made, perf_counter() - begun, figures)
         marker.write(storage)
         return marker
 

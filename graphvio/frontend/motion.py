@@ -54,6 +54,7 @@ class VisualResult:
         quality: how far the motion can be trusted.
         reason: why it is not good, or empty.
         alternatives: where pairs contradict each other, what each side says with its own covariance: one is right.
+        own: at the end of a keyframe, pair -> its own motion of body, as the rig file's place of the pair makes it.
         at_rest: the images have shown no motion for a while.
         frozen: pairs that were left out because a camera of theirs repeats an image.
         pairs: pair index -> report.
@@ -67,6 +68,7 @@ class VisualResult:
     reason: str
     pairs: Mapping[int, PairReport]
     alternatives: tuple[RelativeMotion, ...] = ()
+    own: Mapping[int, RelativeMotion] = field(default_factory=dict)
     at_rest: bool = False
     frozen: frozenset[int] = frozenset()
     stage_ms: Mapping[str, float] = field(default_factory=dict)

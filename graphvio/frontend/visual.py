@@ -26,7 +26,7 @@ from graphvio.frontend.standstill import Standstill
 from graphvio.frontend.stopwatch import Stopwatch
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import PairFrame
-from graphvio.geometry import se3_inverse, so3_log
+from graphvio.geometry import se3_adjoint, se3_inverse, so3_log
 from graphvio.rig import Rig
 
 MotionPredictor = Callable[[int], Float | None]
@@ -123,7 +123,9 @@ class VisualFrontend:
         resting = self._standstill.look(frames, correspondences.identities(frames, refined.inlier))
         self._drop_outliers(frames, correspondences, agreement)
         watch.lap("judge")
+        own: dict[int, RelativeMotion] = {}
         if self._references.are_spent(frames, correspondences, refined, len(agreement.sides) > 1):
+            own = self._own_motions(reference_stamp_ns, stamp_ns, agreement)
             self._learn_alignments(agreement)
             reports = _with_rejections(reports, self._refer_to(frames))
         watch.lap("renew")
@@ -133,6 +135,7 @@ class VisualFrontend:
             reason,
             reports,
             alternatives=tuple(side.motion for side in sides) if len(sides) > 1 else (),
+            own=own,
             at_rest=resting,
             frozen=frozen.pairs,
             stage_ms=watch.stage_ms,
@@ -242,6 +245,21 @@ class VisualFrontend:
             np.zeros((6, 6)) if used_once else refined.shared_covariance,
             int(refined.inlier.sum()),
         )
+
+    def _own_motions(self, reference_stamp_ns: int, stamp_ns: int, agreement: Agreement) -> dict[int, RelativeMotion]:
+        """What each pair alone says, without the corrections in force; a single pair's is what all say."""
+        alone = {agreement.sides[0].pairs[0]: agreement.sides[0].refined} if len(self._rig.pairs) == 1 else {}
+        made = {}
+        for j, refined in (agreement.own or alone).items():
+            back = se3_inverse(self._alignments[j].correction) if j in self._alignments else np.eye(4)
+            adjoint = se3_adjoint(back)
+            uncorrected = replace(
+                refined,
+                cur_T_ref=back @ refined.cur_T_ref @ se3_inverse(back),
+                covariance=adjoint @ refined.covariance @ adjoint.T,
+            )
+            made[j] = self._motion(reference_stamp_ns, stamp_ns, uncorrected)
+        return made
 
     def _drop_outliers(
         self, frames: Mapping[int, PairFrame], correspondences: Correspondences, agreement: Agreement

@@ -26,6 +26,7 @@ _AGREE_M = 0.5
 _AGREE_RAD = 0.1
 _LEAST_VOTES = 2
 _FRAME_SIGMA = 1e-6
+_JOINED_SIGMAS = np.repeat([_AGREE_RAD, _AGREE_M], 3)  # of how fragments lie to each other before closures are weighed
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +50,7 @@ def join_fragments(fragments: Sequence[range], poses: Float, ties: Sequence[Tie]
         poses: (N, 4, 4) of all states, in their fragments' frames.
         ties: closures, right and wrong ones.
     """
-    of = np.empty(len(poses), dtype=np.int64)
-    for number, states in enumerate(fragments):
-        of[states.start : states.stop] = number
+    of = fragment_of(fragments)
     frames = [np.eye(4) for _ in fragments]
     component = list(range(len(fragments)))
     between = [(int(of[tie.first]), int(of[tie.second]), tie) for tie in ties if of[tie.first] != of[tie.second]]
@@ -79,18 +78,27 @@ def join_fragments(fragments: Sequence[range], poses: Float, ties: Sequence[Tie]
                 frames[number], component[number] = a_T_c @ frames[number], a
 
 
+def fragment_of(fragments: Sequence[range]) -> Int:
+    """Number (N,) of the fragment of each state."""
+    return np.repeat(np.arange(len(fragments)), [len(states) for states in fragments])
+
+
 def consistent(
-    poses: Float, component: Sequence[int], ties: Sequence[Tie], odometry: Sequence[Tie], probability: float
-) -> Bool:
+    fragments: Sequence[range], joined: Joined, poses: Float, ties: Sequence[Tie], odometry: Sequence[Tie],
+    probability: float,
+) -> Bool:  # fmt: skip
     """Which closures (L,) agree with the odometry and with each other.
 
     Args:
-        poses: (N, 4, 4) of all states, in common frames.
-        component: of each state; closures between different ones are left out.
+        fragments: states of each.
+        joined: how they lie to each other; closures between those that are not joined are left out.
+        poses: (N, 4, 4) of all states, in the frames that are common now.
         ties: L closures.
         odometry: between the states that are ends of closures, each fragment's in a chain.
         probability: a closure beyond this share of the chi-square distribution is refused.
     """
+    of = fragment_of(fragments)
+    component = np.array(joined.component)[of]
     kept = np.array([component[tie.first] == component[tie.second] for tie in ties], dtype=bool)
     asked = np.flatnonzero(kept)
     if not len(asked):
@@ -100,9 +108,11 @@ def consistent(
     seen: set[int] = set()
     for end in ends:
         values.insert(x(end), gtsam.Pose3(poses[end]))
-        if component[end] not in seen:
-            seen.add(component[end])
-            graph.add(gtsam.PriorFactorPose3(x(end), gtsam.Pose3(poses[end]), isotropic(6, _FRAME_SIGMA)))
+        if of[end] not in seen:
+            seen.add(int(of[end]))
+            is_root = joined.component[of[end]] == of[end]
+            noise = isotropic(6, _FRAME_SIGMA) if is_root else gtsam.noiseModel.Diagonal.Sigmas(_JOINED_SIGMAS)
+            graph.add(gtsam.PriorFactorPose3(x(end), gtsam.Pose3(poses[end]), noise))
     for tie in odometry:
         graph.add(tie.factor())
     asked = _within_odometry(graph, values, ties, asked, probability)
@@ -137,14 +147,14 @@ def _within_odometry(
     passed = []
     for k in asked.tolist():
         tie = ties[k]
-        predicted, covariance = _motion_between(marginals, values, tie.first, tie.second)
+        predicted, covariance = motion_between(marginals, values, tie.first, tie.second)
         error = se3_log(se3_inverse(predicted) @ tie.first_T_second)
         if error @ np.linalg.solve(covariance + tie.covariance, error) <= limit:
             passed.append(k)
     return np.array(passed, dtype=np.int64)
 
 
-def _motion_between(marginals: gtsam.Marginals, values: gtsam.Values, first: int, second: int) -> tuple[Float, Float]:
+def motion_between(marginals: gtsam.Marginals, values: gtsam.Values, first: int, second: int) -> tuple[Float, Float]:
     """``first_T_second`` (4, 4) and its covariance (6, 6), in body at the second."""
     order = [x(first), x(second)]
     joint = marginals.jointMarginalCovariance(order)
@@ -169,7 +179,7 @@ def odometry_between(
     for states in fragments:
         inside = [end for end in ends if end in states]
         for first, second in pairwise(inside):
-            made.append(Tie(first, second, *_motion_between(marginals, values, first, second)))
+            made.append(Tie(first, second, *motion_between(marginals, values, first, second)))
     return made
 
 

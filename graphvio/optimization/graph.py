@@ -9,13 +9,14 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 
-from graphvio.arrays import Float
+from graphvio.arrays import Float, Int
 from graphvio.backend.factors import b, constant_velocity, first_state, imu_without_samples, r, rest, v, x
 from graphvio.backend.noise import gaussian, isotropic
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.reference_views import ReferenceViews
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
 from graphvio.config import SmootherConfig
+from graphvio.optimization.extrinsics import own_motion, unknowns
 from graphvio.optimization.nodes import Nodes
 from graphvio.rig import Imu
 
@@ -74,6 +75,8 @@ class SessionGraph:
         sessions: their states.
         imus: of each session, or None.
         config: of the odometry's back-end.
+        calibrates: whether the places of the pairs, and the IMU's time offset, are unknowns; then each pair's own
+            motions over whole keyframes are the factors, as far as there are.
 
     Attributes:
         values: of all states, as the odometry left them.
@@ -81,7 +84,9 @@ class SessionGraph:
         firsts: (S + 1,) the first state of each session, and their number.
     """
 
-    def __init__(self, sessions: Sequence[Nodes], imus: Sequence[Imu | None], config: SmootherConfig) -> None:
+    def __init__(
+        self, sessions: Sequence[Nodes], imus: Sequence[Imu | None], config: SmootherConfig, calibrates: bool = False
+    ) -> None:
         self.values = gtsam.Values()
         self.fragments: list[Fragment] = []
         self.firsts = np.concatenate([[0], np.cumsum([len(nodes.rows) for nodes in sessions])]).astype(np.int64)
@@ -95,7 +100,8 @@ class SessionGraph:
             self._add_states(first, nodes)
             self._add_fragments(number, first, nodes)
             self._add_inertial(first, nodes, imu)
-            self._add_motions(first, nodes)
+            own = self._add_own_motions(number, first, nodes) if calibrates else np.zeros(0, dtype=np.int64)
+            self._add_motions(first, nodes, own)
 
     def __len__(self) -> int:
         return int(self.firsts[-1])
@@ -178,10 +184,29 @@ class SessionGraph:
                 self._kind = "rest"
                 self.add(rest(k))
 
-    def _add_motions(self, first: int, nodes: Nodes) -> None:
+    def _add_own_motions(self, session: int, first: int, nodes: Nodes) -> Int:
+        """Motions of single pairs, with the calibration as unknowns; rows (K,) of the framesets in which they end."""
+        record = nodes.record
+        own, with_imu = record.own, bool(record.with_imu.all())
+        if not len(record.own_pair):
+            return record.own_pair
+        self._kind = "calibration"
+        for key, value, prior in unknowns(session, int(record.own_pair.max()) + 1, with_imu):
+            self.values.insert(key, value)
+            self.add(prior)
+        self._kind = "motion"
+        for number, pair in enumerate(record.own_pair.tolist()):
+            i, j = (nodes.index_of_row(int(rows[number])) for rows in (own.reference, own.row))
+            motion = own.at(number, record.stamps_ns)
+            twists = (nodes.twist(i), nodes.twist(j)) if with_imu else None
+            self.add(own_motion(session, pair, first + i, first + j, motion, twists))
+        return own.row
+
+    def _add_motions(self, first: int, nodes: Nodes, left_out: Int) -> None:
+        """All motions of the rig, but those that end in some framesets."""
         self._kind = "motion"
         record = nodes.record
-        for number in nodes.motions.tolist():
+        for number in nodes.motions[~np.isin(record.motions.row[nodes.motions], left_out)].tolist():
             motion = record.motions.at(number, record.stamps_ns)
             i = first + nodes.index_of_row(int(record.motions.reference[number]))
             j = first + nodes.index_of_row(int(record.motions.row[number]))

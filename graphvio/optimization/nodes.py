@@ -40,6 +40,14 @@ class Nodes:
         """The state of a frameset that is one."""
         return int(np.searchsorted(self.rows, row))
 
+    def twist(self, n: int) -> Float:
+        """(6,) angular rate, rad/s, and velocity, m/s, of body in body at state ``n``, which the IMU covers."""
+        record, row = self.record, int(self.rows[n])
+        inertial = record.inertial
+        around = inertial.values[max(int(inertial.begins[row + 1]) - 1, 0) : int(inertial.begins[row + 1]) + 1]
+        rate = around[:, :3].mean(axis=0) - record.gyro_bias[row]
+        return np.concatenate([rate, record.smoothed[row, :3, :3].T @ record.velocity_nav[row]])
+
     def span(self, n: int) -> ImuSpan | None:
         """The IMU from state ``n - 1`` to ``n``; None where it does not cover that."""
         inertial, first, last = self.record.inertial, self.rows[n - 1] + 1, self.rows[n] + 1
@@ -64,6 +72,7 @@ def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
     ends = np.flatnonzero(np.diff(record.epoch))
     wanted[ends] = wanted[ends + 1] = True
     wanted[0] = wanted[-1] = True
+    wanted[record.own.reference] = wanted[record.own.row] = True
     wanted[_last_of_each_reference(motions.reference, motions.row)] = True
     latest = stamps[0]
     seen = np.zeros(len(stamps), dtype=bool)

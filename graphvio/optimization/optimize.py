@@ -13,7 +13,8 @@ from graphvio.backend.factors import x
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.config import Config
 from graphvio.geometry import se3_inverse, se3_log
-from graphvio.optimization.consistency import consistent, join_fragments, odometry_between
+from graphvio.optimization.consistency import consistent, fragment_of, join_fragments, odometry_between
+from graphvio.optimization.extrinsics import RigCorrection, correction_of
 from graphvio.optimization.graph import Fragment, SessionGraph, Tie, moved, poses_of
 from graphvio.optimization.loops.search import LoopClosure
 from graphvio.optimization.nodes import Nodes, choose_nodes, spread
@@ -80,6 +81,7 @@ class Optimization:
         ties: closures that are used, as factors.
         graph_alone: without closures, each fragment in a frame of its own.
         alone: its solution.
+        corrections: of each session's rig file, where the calibration was unknown.
     """
 
     sessions: Sequence[OptimizedSession]
@@ -93,6 +95,7 @@ class Optimization:
     ties: Sequence[Tie]
     graph_alone: gtsam.NonlinearFactorGraph
     alone: gtsam.Values
+    corrections: Sequence[RigCorrection] = ()
 
     @property
     def cost_before(self) -> float:
@@ -111,6 +114,7 @@ def optimize(
     closures: Sequence[LoopClosure],
     config: Config,
     on_progress: Progress | None = None,
+    calibrates: bool = False,
 ) -> Optimization:
     """The best trajectories that all measurements of the sessions hold together.
 
@@ -120,13 +124,15 @@ def optimize(
         closures: places seen from others, right ones and wrong ones.
         config: of the back-end and of this stage.
         on_progress: told how far it is.
+        calibrates: whether the places of the pairs, and the IMU's time offset, are unknowns with priors.
 
     Raises:
         OptimizationError: if the graph has no unique solution.
     """
     settings = config.optimization
-    sessions = [choose_nodes(record, settings.keyframe_interval_s) for record in records]
-    whole = SessionGraph(sessions, imus, config.smoother)
+    interval_s = np.inf if calibrates else settings.keyframe_interval_s
+    sessions = [choose_nodes(record, interval_s) for record in records]
+    whole = SessionGraph(sessions, imus, config.smoother, calibrates)
     fragments = whole.fragments
     graph_alone, kinds = whole.complete(range(len(fragments)))
     before = residuals(graph_alone, kinds, whole.values)
@@ -136,11 +142,12 @@ def optimize(
     poses = poses_of(alone, len(whole))
     joined = join_fragments(states, poses, ties)
     values = moved(alone, list(zip(states, joined.frames, strict=True)))
-    component = np.repeat(joined.component, [len(each) for each in states]).tolist()
-    ends = sorted({end for tie in ties for end in (tie.first, tie.second)})
+    component = np.array(joined.component)[fragment_of(states)].tolist()
+    within = [tie for tie in ties if component[tie.first] == component[tie.second]]
+    ends = sorted({end for tie in within for end in (tie.first, tie.second)})
     odometry = odometry_between(graph_alone, alone, states, ends)
     poses = poses_of(values, len(whole))
-    believed = consistent(poses, component, ties, odometry, settings.loop_probability)
+    believed = consistent(states, joined, poses, ties, odometry, settings.loop_probability)
     used = [tie for tie, is_used in zip(ties, believed, strict=True) if is_used]
     roots = sorted(set(joined.component))
     graph, kinds = whole.complete(roots, used)
@@ -165,6 +172,11 @@ def optimize(
         ties=used,
         graph_alone=graph_alone,
         alone=alone,
+        corrections=[
+            correction_of(graph, values, number, int(record.own_pair.max()) + 1)
+            for number, record in enumerate(records)
+            if calibrates and len(record.own_pair)
+        ],
     )
 
 
@@ -202,8 +214,12 @@ def _judged(
     distance = float(error @ np.linalg.solve(tie.covariance, error))
     if is_used:
         return JudgedLoop(closure, "", distance)
-    limit = chi_square_quantile(probability, 6)
-    return JudgedLoop(closure, f"{distance:.0f} beyond chi-square {limit:.1f} of what all others say", distance)
+    sigmas, limit = np.sqrt(distance), np.sqrt(chi_square_quantile(probability, 6))
+    if sigmas > limit:
+        why = f"{sigmas:.0f} standard deviations from what all others say, more than {limit:.1f}"
+    else:
+        why = "contradicts the odometry alone"
+    return JudgedLoop(closure, why, distance)
 
 
 def _covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, count: int) -> Float:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from graphvio import __version__
 from graphvio.config import Config
+from graphvio.errors import TrajectoryError
+from graphvio.optimization.colmap_export import export
 from graphvio.optimization.exchange import covariance_text, trajectory_text, write_g2o
 from graphvio.optimization.loops import saved
 from graphvio.optimization.loops.database import FeatureDatabase
@@ -17,12 +19,14 @@ from graphvio.optimization.loops.places import choose_places
 from graphvio.optimization.loops.search import LoopClosure, Place, SessionInput, find_loops
 from graphvio.optimization.optimize import Optimization, optimize
 from graphvio.optimization.record import Recorder, SessionRecord
+from graphvio.optimization.report.write import write_report
 from graphvio.optimization.workspace import Workspace, digest
 from graphvio.pipeline import Progress as RunProgress
 from graphvio.pipeline import run
 from graphvio.results import ResultWriter
 from graphvio.rig_files.native import to_text
 from graphvio.sources import Source
+from graphvio.trajectory import Trajectory
 
 DATABASE = "database.db"
 
@@ -51,28 +55,31 @@ def named(sources: Sequence[Source]) -> list[Session]:
 
 
 def optimize_sessions(
-    sessions: Sequence[Session],
-    out: Path,
+    sources: Sequence[Source],
+    out: str | Path,
     config: Config,
     *,
     with_loops: bool = True,
+    calibrates: bool = False,
     on_progress: Progress | None = None,
 ) -> Optimization:
     """Run the odometry on recordings, find loop closures within and between them, and optimise all as one.
 
     Args:
-        sessions: one or several.
+        sources: one or several recordings.
         out: folder of the results: new, or one in which an optimisation of the same was interrupted, which goes on.
         config: of all stages.
         with_loops: whether loop closures are looked for, which needs the extra ``maps``.
+        calibrates: whether the places of the pairs, and the IMU's time offset, are unknowns of the graph, too.
         on_progress: told how far it is.
 
     Raises:
         GraphvioError: if a recording cannot be read, holds no pose, or the folder cannot be used.
     """
-    stages = Stages(sessions, out, config, on_progress)
+    sessions = named(sources)
+    stages = Stages(sessions, Path(out), config, calibrates, on_progress)
     records = [stages.record(number) for number in range(len(sessions))]
-    closures = stages.closures(records) if with_loops else []
+    closures = stages.closures(records) if with_loops else None
     return stages.result(records, closures)
 
 
@@ -83,6 +90,7 @@ class Stages:
         sessions: one or several.
         out: folder of the results, as `optimize_sessions` takes it.
         config: of all stages.
+        calibrates: as `optimize_sessions` takes it.
         on_progress: told how far it is.
 
     Attributes:
@@ -93,13 +101,19 @@ class Stages:
     """
 
     def __init__(
-        self, sessions: Sequence[Session], out: Path, config: Config, on_progress: Progress | None = None
+        self,
+        sessions: Sequence[Session],
+        out: Path,
+        config: Config,
+        calibrates: bool = False,
+        on_progress: Progress | None = None,
     ) -> None:
         self._sessions = sessions
+        self._calibrates = calibrates
         self._config = config
         self._on_progress = on_progress or _quiet
         inputs = {each.name: _identity(each.source) for each in sessions}
-        self.inputs = inputs | {"config": config.sha256(), "graphvio": __version__}
+        self.inputs = inputs | {"config": config.sha256(), "calibration": str(calibrates), "graphvio": __version__}
         self._space = Workspace(out, self.inputs)
 
     def record(self, number: int) -> SessionRecord:
@@ -134,18 +148,42 @@ class Stages:
                 self._space.finish("loops")
         return saved.load(self._space.folder / "loops.npz")
 
-    def result(self, records: Sequence[SessionRecord], closures: Sequence[LoopClosure]) -> Optimization:
-        """The solution, with its files."""
+    def result(self, records: Sequence[SessionRecord], closures: Sequence[LoopClosure] | None) -> Optimization:
+        """The solution, with its files; where closures are None, none were looked for, and there is no map."""
         imus = [each.source.rig.imu for each in self._sessions]
         found = optimize(
-            records, imus, closures, self._config, lambda name, number, _: self._on_progress(name, number, number)
+            records,
+            imus,
+            closures or [],
+            self._config,
+            lambda name, number, _: self._on_progress(name, number, number),
+            self._calibrates,
         )
+        for session, correction in zip(self._sessions, found.corrections, strict=False):
+            rig = correction.corrected(session.source.rig)
+            self._space.write(f"{session.name}/rig_optimized.yaml", to_text(rig, Path()).encode())
         for session, optimized in zip(self._sessions, found.sessions, strict=True):
             place = "" if len(self._sessions) == 1 else f"{session.name}/"
             self._space.write(f"{place}trajectory_optimized.txt", trajectory_text(optimized).encode())
             self._space.write(f"{place}covariance.csv", covariance_text(optimized).encode())
         write_g2o(found, self._space.folder / "graph.g2o")
+        if closures is not None and not self._space.has_finished("map"):
+            self._export(found, records)
+            self._space.finish("map")
+        write_report(found, self._space.folder, [_truth(each.source) for each in self._sessions])
         return found
+
+    def _export(self, found: Optimization, records: Sequence[SessionRecord]) -> None:
+        inputs = [self.places(number, record) for number, record in enumerate(records)]
+        with FeatureDatabase(self._space.folder / DATABASE) as database:
+            export(
+                found,
+                inputs,
+                database,
+                self._space.folder / "colmap",
+                self._config,
+                lambda what, done, total: self._on_progress(f"map: {what}", done, total),
+            )
 
     def places(self, number: int, record: SessionRecord) -> SessionInput:
         """A session with the places at which loop closures are looked for."""
@@ -176,6 +214,14 @@ def _identity(source: Source) -> str:
     return digest(
         source.name, str(source.start_ns), str(source.end_ns), str(source.frameset_count), to_text(source.rig, Path())
     )
+
+
+def _truth(source: Source) -> Trajectory | None:
+    """The true trajectory of a recording that carries a usable one."""
+    try:
+        return None if source.truth is None else Trajectory.read(source.truth)
+    except TrajectoryError:
+        return None  # the odometry's own summary says why
 
 
 def _quiet(stage: str, done: float, total: float) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -65,6 +65,16 @@ class Motions(NamedTuple):
         )
 
 
+NO_MOTIONS = Motions(
+    np.zeros(0, dtype=np.int64),
+    np.zeros(0, dtype=np.int64),
+    np.zeros((0, 4, 4)),
+    np.zeros((0, 6, 6)),
+    np.zeros((0, 6, 6)),
+    np.zeros(0, dtype=np.int64),
+)
+
+
 @dataclass(frozen=True, eq=False)
 class SessionRecord:
     """A session as the odometry saw it: F framesets that have a pose.
@@ -83,6 +93,8 @@ class SessionRecord:
         is_keyframe: (F,) whether later motions are measured from it.
         with_imu: (F,) whether the IMU takes part in the state.
         motions: of the rig.
+        own: motions of body over whole keyframes that single pairs tell.
+        own_pair: the pair of each of these.
         inertial: the IMU's samples.
     """
 
@@ -99,6 +111,8 @@ class SessionRecord:
     is_keyframe: Bool
     with_imu: Bool
     motions: Motions
+    own: Motions
+    own_pair: Int
     inertial: Inertial
 
     def to_bytes(self) -> bytes:
@@ -126,7 +140,7 @@ class SessionRecord:
                 columns = {name: file[name] for name in file.files}
             groups = {
                 kind: cls(*(columns.pop(f"{kind}.{name}") for name in cls._fields))
-                for kind, cls in (("motions", Motions), ("inertial", Inertial))
+                for kind, cls in (("motions", Motions), ("own", Motions), ("inertial", Inertial))
             }
             return SessionRecord(**(columns | groups | {"name": str(columns["name"])}))
         except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
@@ -140,6 +154,7 @@ class Recorder:
         self._name = name
         self._steps: list[_Row] = []
         self._motions: list[RelativeMotion] = []
+        self._own: list[tuple[int, RelativeMotion]] = []
         self._refused: list[RelativeMotion] = []  # since vision was last used
         self._references: set[int] = set()
         self._since: list[tuple[Float, Float]] = []  # the IMU since the last step with a pose
@@ -165,6 +180,7 @@ class Recorder:
                 self._is_covered = False
         if motion is not None and step.used:
             self._motions.append(motion)
+            self._own += sorted(step.own.items())
         spans = self._since
         self._steps.append(
             _Row(
@@ -193,6 +209,7 @@ class Recorder:
         if not rows:
             raise OptimizationError(f"{self._name}: the odometry found no pose; graphvio run tells why")
         estimates = [row.estimate for row in rows]
+        motions = sorted(self._motions, key=lambda each: (each.stamp_ns, each.reference_stamp_ns))
         stamps = np.array([each.stamp_ns for each in estimates], dtype=np.int64)
         row_of = {int(stamp): k for k, stamp in enumerate(stamps)}
         online = np.array([each.nav_T_body for each in estimates])
@@ -210,7 +227,9 @@ class Recorder:
             at_rest=np.array([each.at_rest for each in estimates]),
             is_keyframe=np.isin(stamps, sorted(self._references)),
             with_imu=np.array([each.gyro_bias is not None for each in estimates]),
-            motions=self._joined(row_of),
+            motions=_joined([motion for motion in motions if _is_known(motion, row_of)], row_of),
+            own=_joined([motion for _, motion in self._own if _is_known(motion, row_of)], row_of),
+            own_pair=np.array([j for j, motion in self._own if _is_known(motion, row_of)], dtype=np.int64),
             inertial=_joined_inertial(rows),
         )
 
@@ -220,19 +239,6 @@ class Recorder:
             return
         span = step.span
         self._since.append((span.steps_s, np.hstack([span.angular_velocity, span.linear_acceleration])))
-
-    def _joined(self, row_of: dict[int, int]) -> Motions:
-        kept = [each for each in self._motions if each.stamp_ns in row_of and each.reference_stamp_ns in row_of]
-        kept.sort(key=lambda each: (each.stamp_ns, each.reference_stamp_ns))
-        shape = (len(kept), 6, 6)
-        return Motions(
-            np.array([row_of[each.reference_stamp_ns] for each in kept], dtype=np.int64),
-            np.array([row_of[each.stamp_ns] for each in kept], dtype=np.int64),
-            np.array([each.reference_T_current for each in kept]).reshape(-1, 4, 4),
-            np.array([each.covariance for each in kept]).reshape(shape),
-            np.array([each.shared_covariance for each in kept]).reshape(shape),
-            np.array([each.inliers for each in kept], dtype=np.int64),
-        )
 
 
 @dataclass(eq=False)
@@ -254,4 +260,20 @@ def _joined_inertial(rows: list[_Row]) -> Inertial:
         np.array([row.covers for row in rows]),
         np.concatenate([row.steps_s for row in rows]),
         np.concatenate([row.values for row in rows]),
+    )
+
+
+def _is_known(motion: RelativeMotion, row_of: Mapping[int, int]) -> bool:
+    return motion.stamp_ns in row_of and motion.reference_stamp_ns in row_of
+
+
+def _joined(motions: Sequence[RelativeMotion], row_of: Mapping[int, int]) -> Motions:
+    shape = (len(motions), 6, 6)
+    return Motions(
+        np.array([row_of[each.reference_stamp_ns] for each in motions], dtype=np.int64),
+        np.array([row_of[each.stamp_ns] for each in motions], dtype=np.int64),
+        np.array([each.reference_T_current for each in motions]).reshape(-1, 4, 4),
+        np.array([each.covariance for each in motions]).reshape(shape),
+        np.array([each.shared_covariance for each in motions]).reshape(shape),
+        np.array([each.inliers for each in motions], dtype=np.int64),
     )

@@ -58,7 +58,7 @@ def solve(
     Raises:
         OptimizationError: if there is no unique solution.
     """
-    params = gtsam.LevenbergMarquardtParams.CeresDefaults()
+    params = gtsam.LevenbergMarquardtParams()
     params.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
     try:
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from graphvio.errors import RigError
-from graphvio.rig import Camera, Imu, Rig, StereoPair
+from graphvio.rig import Camera, Imu, Rig, StereoPair, as_written
 from graphvio.rig_files.reading import NOISE_KEYS, Section, named, parse_yaml, read_yaml
 
 VERSION = 1
@@ -110,15 +110,17 @@ def _camera(section: Section) -> Camera:
         mask = (section.file.parent / section.text("mask")).resolve()
         if not mask.is_file():
             raise RigError(f"{section.where('mask')}: there is no image {mask}; correct the path or remove the key")
-    return Camera(
+    body_T_cam = section.matrix("body_T_cam")
+    camera = Camera(
         name=section.text("name"),
         model=section.text("model"),
         size_px=section.size("size_px"),
         intrinsics=section.array("intrinsics", (4,)),
         distortion=section.array("distortion"),
-        body_T_cam=section.matrix("body_T_cam"),
+        body_T_cam=body_T_cam,
         mask=mask,
     )
+    return as_written(camera, body_T_cam)
 
 
 def _imu(section: Section) -> Imu:

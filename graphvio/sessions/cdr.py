@@ -9,7 +9,12 @@ from graphvio.errors import MissingExtraError
 
 
 @cache
-def _types() -> Any:
+def types() -> Any:
+    """The types of ROS 2 (Humble).
+
+    Raises:
+        MissingExtraError: if the extra ``sessions`` is not installed.
+    """
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
@@ -19,22 +24,22 @@ def _types() -> Any:
 
 def make(type_name: str, **fields: Any) -> Any:
     """A message of a type such as ``sensor_msgs/msg/Image``."""
-    return _types().types[type_name](**fields)
+    return types().types[type_name](**fields)
 
 
 def encode(message: Any) -> bytes:
     """A message as CDR."""
-    return bytes(_types().serialize_cdr(message, message.__msgtype__))
+    return bytes(types().serialize_cdr(message, message.__msgtype__))
 
 
 def decode(data: bytes, type_name: str) -> Any:
     """A message from CDR; arrays are views of the data."""
-    return _types().deserialize_cdr(data, type_name)
+    return types().deserialize_cdr(data, type_name)
 
 
 def definition(type_name: str) -> bytes:
     """The text of a type and of all that it holds, as MCAP's ``ros2msg`` schemas have it."""
-    text, _ = _types().generate_msgdef(type_name, ros_version=2)
+    text, _ = types().generate_msgdef(type_name, ros_version=2)
     return str(text).encode()
 
 

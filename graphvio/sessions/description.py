@@ -1,4 +1,4 @@
-"""What a session holds, and how regular it is."""
+"""What a session or bag holds, how regular it is, and how far its clocks are to be trusted."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from graphvio.rig_files.native import parse
-from graphvio.sessions import cdr
+from graphvio.arrays import Int
+from graphvio.errors import RigError, SessionError
+from graphvio.sessions.bag_file import BagFile
 from graphvio.sessions.mcap_file import McapFile, Topic, stamps_of
-from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, ODOMETRY
-from graphvio.sessions.writer import RIG_ATTACHMENT
+from graphvio.sessions.messages import COMPRESSED, IMAGE, STAMPED
+from graphvio.sessions.opening import is_store, open_store
+from graphvio.sessions.rig_of_topics import pair_name, stereo_topics
+from graphvio.sessions.stamps import Clock, Offset, all_header_stamps, compare_clocks, compare_topics
+from graphvio.sources.session import rig_in
 
-_WITH_HEADER = (IMAGE, COMPRESSED, IMU, ODOMETRY)
 _GAP_PERIODS = 1.5
 _FEWEST = 3
-_COMPARED = 50  # messages of a topic whose headers are held against the log's times
 _NS_PER_MS, _NS_PER_S = 1e6, 1e9
 
 
@@ -28,35 +30,59 @@ class TopicDescription:
         name: of the topic.
         type_name: of its messages.
         messages: how many.
-        rate_hz: by the median interval.
+        rate_hz: by the median interval of when they were recorded.
         jitter_ms: standard deviation of the intervals, but for gaps.
         gaps: intervals longer than one and a half median ones.
         longest_ms: interval.
-        latency_ms: median of when messages were recorded after their headers' stamps.
+        clock: stamps of the headers against the times of recording; None also where messages have no header.
     """
 
     name: str
     type_name: str
     messages: int
-    rate_hz: float | None
-    jitter_ms: float | None
-    gaps: int | None
-    longest_ms: float | None
-    latency_ms: float | None
+    rate_hz: float | None = None
+    jitter_ms: float | None = None
+    gaps: int | None = None
+    longest_ms: float | None = None
+    clock: Clock | None = None
+
+    @property
+    def latency_ms(self) -> float | None:
+        """Median of when messages were recorded after their headers' stamps."""
+        return None if self.clock is None else self.clock.latency_ms
+
+
+@dataclass(frozen=True)
+class Synchronisation:
+    """Stamps of one camera's images against another's.
+
+    Attributes:
+        first: what is compared, such as ``pair0 left``.
+        second: with what.
+        offset: of the second's stamps, or None where none belong together.
+        images: of the first.
+    """
+
+    first: str
+    second: str
+    offset: Offset | None
+    images: int
 
 
 @dataclass(frozen=True)
 class Description:
-    """A session.
+    """A session or bag.
 
     Attributes:
-        path: of the file.
+        path: of it.
         size_bytes: of it.
         duration_s: from the first to the last message.
-        library: that wrote it.
+        library: that wrote it, or empty.
         is_whole: whether its writing was finished.
-        rig: one line on the rig in it, or empty.
+        rig: one line on the rig in it, or on why that is not usable; empty where there is none.
         topics: by name.
+        synchronisation: left against right of each pair, then the first pair against each other one, as far as the
+            topics' names tell which images are of a pair.
     """
 
     path: Path
@@ -66,47 +92,60 @@ class Description:
     is_whole: bool
     rig: str
     topics: tuple[TopicDescription, ...]
+    synchronisation: tuple[Synchronisation, ...]
 
 
 def describe(path: Path) -> Description:
-    """Describe a session.
+    """Describe a session or bag.
 
     Raises:
-        SessionError: if it cannot be read.
-        RigError: if the rig in it is not usable.
+        SessionError: if it is none, or cannot be read.
+        MissingExtraError: if the extra ``sessions`` is not installed.
     """
-    file = McapFile(path)
-    stamps = [stamps_of(topic) for topic in file.topics.values() if topic.places]
-    begin, end = (min(each.min() for each in stamps), max(each.max() for each in stamps)) if stamps else (0, 0)
-    text, rig = file.attachments.get(RIG_ATTACHMENT), ""
-    if text is not None:
-        given = parse(text.decode("utf-8"), path)
-        pairs = ", ".join(pair.name for pair in given.pairs)
-        rig = f"{given.name}, pairs {pairs}, {'with' if given.imu else 'without'} IMU"
+    if not path.exists():
+        raise SessionError(f"{path}: does not exist; give a session or bag")
+    if not is_store(path):
+        raise SessionError(
+            f"{path}: is no session or bag; give NAME.mcap, NAME.bag or the folder of a ROS 2 bag, or convert a "
+            "recording of another layout by graphvio convert"
+        )
+    store = open_store(path)
+    logged = [stamps_of(topic) for topic in store.topics.values() if topic.places]
+    begin, end = (min(each.min() for each in logged), max(each.max() for each in logged)) if logged else (0, 0)
+    stamped = [topic for topic in store.topics.values() if topic.type_name in STAMPED and topic.places]
+    stamps = all_header_stamps(store, stamped)
+    images = {name for name in stamps if store.topics[name].type_name in (IMAGE, COMPRESSED)}
     return Description(
         path=path,
-        size_bytes=path.stat().st_size,
+        size_bytes=path.stat().st_size if path.is_file() else sum(file.stat().st_size for file in path.iterdir()),
         duration_s=float(end - begin) / _NS_PER_S,
-        library=file.library,
-        is_whole=file.is_whole,
-        rig=rig,
-        topics=tuple(_topic(file, topic) for _, topic in sorted(file.topics.items())),
+        library=store.library,
+        is_whole=store.is_whole,
+        rig=_rig(store),
+        topics=tuple(_topic(topic, stamps.get(name)) for name, topic in sorted(store.topics.items())),
+        synchronisation=_synchronisation({name: stamps[name] for name in images}),
     )
 
 
-def _topic(file: McapFile, topic: Topic) -> TopicDescription:
-    stamps = np.sort(stamps_of(topic))
-    count = len(stamps)
+def _rig(store: McapFile | BagFile) -> str:
+    try:
+        rig = rig_in(store)
+    except RigError as error:
+        return f"not usable: {error}"
+    if rig is None:
+        return ""
+    pairs = ", ".join(pair.name for pair in rig.pairs)
+    return f"{rig.name}, pairs {pairs}, {'with' if rig.imu else 'without'} IMU"
+
+
+def _topic(topic: Topic, header_ns: Int | None) -> TopicDescription:
+    logged_ns = stamps_of(topic)
+    stamps, count = np.sort(logged_ns), len(logged_ns)
     if count < _FEWEST or stamps[0] == stamps[-1]:
-        return TopicDescription(topic.name, topic.type_name, count, None, None, None, None, None)
+        return TopicDescription(topic.name, topic.type_name, count)
     steps = np.diff(stamps).astype(np.float64)
     median = float(np.median(steps))
     within = steps[steps <= _GAP_PERIODS * median]
-    latency = None
-    if topic.type_name in _WITH_HEADER:
-        rows = np.unique(np.linspace(0, count - 1, _COMPARED).astype(int)).tolist()
-        late = [topic.logged_ns[k] - cdr.stamp_ns(file.read(topic.places[k])) for k in rows]
-        latency = float(np.median(late)) / _NS_PER_MS
     return TopicDescription(
         topic.name,
         topic.type_name,
@@ -115,5 +154,16 @@ def _topic(file: McapFile, topic: Topic) -> TopicDescription:
         float(np.std(within)) / _NS_PER_MS,
         int(np.sum(steps > _GAP_PERIODS * median)),
         float(steps.max()) / _NS_PER_MS,
-        latency,
+        None if header_ns is None else compare_clocks(header_ns, logged_ns),
+    )
+
+
+def _synchronisation(stamps: dict[str, Int]) -> tuple[Synchronisation, ...]:
+    """Of topics with images, by their stamps (N,)."""
+    pairs = {pair_name(left): (left, right) for left, right in stereo_topics(stamps)}
+    wanted = [(f"{name} left", f"{name} right", left, right) for name, (left, right) in pairs.items()]
+    first, *others = pairs or [""]
+    wanted += [(f"{first} left", f"{name} left", pairs[first][0], pairs[name][0]) for name in others]
+    return tuple(
+        Synchronisation(one, other, compare_topics(stamps[a], stamps[b]), len(stamps[a])) for one, other, a, b in wanted
     )

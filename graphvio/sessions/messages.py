@@ -7,18 +7,25 @@ from typing import Any
 import numpy as np
 
 from graphvio.arrays import Float, Image
+from graphvio.errors import SessionError
 from graphvio.events import Estimate, ImuSample, Incident
-from graphvio.geometry import quat_wxyz_from_rotation
+from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 from graphvio.rig import Camera, Rig
 from graphvio.sessions.cdr import make
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 IMU, CAMERA_INFO, TRANSFORMS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
-ODOMETRY, LOG = "nav_msgs/msg/Odometry", "rcl_interfaces/msg/Log"
+ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
+LOG, TEXT = "rcl_interfaces/msg/Log", "std_msgs/msg/String"
+STAMPED = (IMAGE, COMPRESSED, IMU, CAMERA_INFO, ODOMETRY, POSE)
+"""Types that begin with a header."""
 ODOM, BODY = "odom", "base_link"
 """REP 105's names of nav and body."""
+WORLD = "world"
+"""Frame of the truth."""
 
 _NS_PER_S = 1_000_000_000
+_STAMP_END_S = 2**31
 _UNKNOWN = -1.0  # in the first element of a covariance: no such quantity
 _DISTORTIONS = {"radial-tangential": ("plumb_bob", 5), "equidistant": ("equidistant", 4)}
 _WARN = 30
@@ -149,6 +156,31 @@ def odometry(estimate: Estimate) -> Any:
     )
 
 
+def true_pose(stamp_ns: int, world_T_body: Float) -> Any:
+    """A pose (4, 4) of the true trajectory."""
+    return make(
+        POSE,
+        header=header(stamp_ns, WORLD),
+        pose=make(
+            "geometry_msgs/msg/Pose",
+            position=_point(world_T_body[:3, 3]),
+            orientation=_quaternion(world_T_body[:3, :3]),
+        ),
+    )
+
+
+def pose_of(message: Any) -> Float:
+    """The pose (4, 4) in a ``PoseStamped`` or an ``Odometry``."""
+    pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+    q, t = pose.orientation, pose.position
+    return se3(rotation_from_quat_wxyz(np.array([q.w, q.x, q.y, q.z])), np.array([t.x, t.y, t.z]))
+
+
+def text(content: str) -> Any:
+    """A text."""
+    return make(TEXT, data=content)
+
+
 def log(incident: Incident) -> Any:
     """An incident as a line of ``/rosout``."""
     return make(
@@ -170,6 +202,8 @@ def stamp_of(message_header: Any) -> int:
 
 def _time(stamp_ns: int) -> Any:
     seconds, rest = divmod(stamp_ns, _NS_PER_S)
+    if not 0 <= seconds < _STAMP_END_S:
+        raise SessionError(f"stamp {stamp_ns} ns is no time that ROS messages hold: they hold 1970 to 2038")
     return make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
 
 

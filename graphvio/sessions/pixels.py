@@ -45,7 +45,7 @@ def grey(message: Any, where: str) -> Image:
         order = ">u2" if message.is_bigendian else "<u2"
         return np.ascontiguousarray(np.right_shift(rows[:, : 2 * width].copy().view(order), 8).astype(np.uint8))
     if encoding in _GREY:
-        return np.ascontiguousarray(rows[:, :width])
+        return rows[:, :width].copy()  # a view of the message could not be written to, nor compiled kernels take it
     if encoding not in _TO_GREY:
         raise ImageError("image_undecodable", f"{where} is encoded as {encoding}, which is not known")
     channels = _CHANNELS.get(encoding, 1)

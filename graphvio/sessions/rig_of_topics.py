@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Protocol
 
 import numpy as np
@@ -41,7 +42,7 @@ def rig_of_topics(store: Store, name: str) -> Rig | None:
     transforms = _transforms(store)
     imu = next((each for each in store.topics.values() if each.type_name == IMU and each.places), None)
     found = []
-    for left, right in _pairs(sorted(images)):
+    for left, right in stereo_topics(images):
         infos = [_info(store, topic) for topic in (left, right)]
         if infos[0] is not None and infos[1] is not None:
             found.append((left, right, infos[0], infos[1]))
@@ -70,12 +71,13 @@ def rig_of_topics(store: Store, name: str) -> Rig | None:
             _camera(topic, info, place)
             for topic, info, place in zip((left, right), (left_info, right_info), places, strict=True)
         ]
-        pairs.append(StereoPair(_pair_name(left), *cameras))
+        pairs.append(StereoPair(pair_name(left), *cameras))
     return Rig(tuple(pairs), Imu() if imu is not None else None, name)
 
 
-def _pairs(names: list[str]) -> list[tuple[str, str]]:
-    """Topics of left and right cameras."""
+def stereo_topics(images: Iterable[str]) -> list[tuple[str, str]]:
+    """Topics of left and right cameras among topics with images: their names differ in that part only."""
+    names = sorted(images)
     made = []
     for name in names:
         for left, right in _SIDES:
@@ -87,8 +89,8 @@ def _pairs(names: list[str]) -> list[tuple[str, str]]:
     return list(dict.fromkeys(made))
 
 
-def _pair_name(left: str) -> str:
-    """What the topic has besides the side."""
+def pair_name(left: str) -> str:
+    """A pair's name: what the topic of its left camera has besides the side."""
     parts = [part for part in left.split("/") if part and not part.startswith("image")]
     rest = [part for part in parts if not any(side in part for sides in _SIDES for side in sides)]
     return "-".join(rest) or "-".join(parts)

@@ -1,39 +1,35 @@
-"""Records a session: one MCAP file, of which a crash loses the last second at most."""
+"""Records a session: sensors' events, and what the odometry made of them, as messages."""
 
 from __future__ import annotations
 
 import logging
-import os
-import threading
-import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal, Self
+from typing import TYPE_CHECKING, Any, Self
 
-from graphvio import __version__
-from graphvio.arrays import Image
-from graphvio.errors import MissingExtraError, SessionError
+from graphvio.arrays import Float, Image
 from graphvio.events import Estimate, Event, FrameSet, Incident
 from graphvio.rig import Rig
 from graphvio.rig_files.native import to_text
-from graphvio.sessions import cdr, messages
+from graphvio.sessions import messages
+from graphvio.sessions.mcap_storage import McapStorage
+from graphvio.sessions.topics import (
+    IMU_TOPIC,
+    LOG_TOPIC,
+    ODOMETRY_TOPIC,
+    RIG_ATTACHMENT,
+    RIG_TOPIC,
+    TRANSFORMS_TOPIC,
+    TRUTH_TOPIC,
+    ImageFormat,
+    image_topic,
+)
 
 if TYPE_CHECKING:
-    from types import TracebackType
+    from collections.abc import Callable
 
-ImageFormat = Literal["raw", "png"]
-RIG_ATTACHMENT = "rig.yaml"
-LIBRARY = "graphvio"
-IMU_TOPIC, TRANSFORMS_TOPIC, ODOMETRY_TOPIC, LOG_TOPIC = "/imu", "/tf_static", "/odometry", "/rosout"
+    from graphvio.sessions.storage import Storage
 
-_CHUNK_BYTES = 4 * 1024 * 1024
-_FLUSH_S = 0.5  # two flushes a second, so that a second is lost at most
-_ENCODING, _SCHEMA_ENCODING, _PROFILE = "cdr", "ros2msg", "ros2"
 _log = logging.getLogger(__name__)
-
-
-def image_topic(pair: str, side: str, image_format: ImageFormat) -> str:
-    """Topic of a camera's images."""
-    return f"/{pair}/{side}/image_raw" + ("/compressed" if image_format == "png" else "")
 
 
 class SessionWriter:
@@ -43,49 +39,52 @@ class SessionWriter:
     `stopped`; the caller goes on.
 
     Args:
-        path: of the file, which must not exist.
+        path: of the file or folder, which must not exist.
         rig: of the framesets; written into the file, so that it needs no other.
         image_format: images as they are, or as PNG, which is smaller and slower.
+        storage: makes what is written at the path: MCAP, of which a crash loses the last second at most, or a bag.
 
     Attributes:
+        rig: of the framesets.
         stopped: why nothing is recorded any more, or None.
         poses: that were recorded.
 
     Raises:
-        SessionError: if the file exists or cannot be made.
+        SessionError: if the file exists or cannot be made, or from any method if a stamp is no time that messages hold.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
 
-    def __init__(self, path: Path, rig: Rig, image_format: ImageFormat = "raw") -> None:
+    def __init__(
+        self,
+        path: Path,
+        rig: Rig,
+        image_format: ImageFormat = "raw",
+        storage: Callable[[Path], Storage] = McapStorage,
+    ) -> None:
         self.path = path
         self.stopped: str | None = None
         self.poses = 0
-        self._rig = rig
+        self.rig = rig
+        self._rig_text = to_text(rig, path.parent)
         self._format: ImageFormat = image_format
-        self._channels: dict[str, tuple[int, int]] = {}  # topic -> channel, messages so far
-        self._schemas: dict[str, int] = {}
-        try:
-            self._file: BinaryIO = path.open("xb")
-        except FileExistsError:
-            raise SessionError(f"{path}: exists, and sessions are never overwritten; name another file") from None
-        except OSError as error:
-            raise SessionError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
-        self._mcap = _mcap_writer(self._file)
-        self._last_flush_s = time.monotonic()
         self._has_begun = False
-        self._closing = threading.Event()
-        self._syncing = threading.Thread(target=self._sync, name="graphvio-session", daemon=True)
-        self._guarded(self._begin)
-        self._syncing.start()
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._is_closed = False
+        self._storage = storage(path)
+        if self._storage.has_attachments:
+            self._guarded(lambda: self._storage.attach(RIG_ATTACHMENT, self._rig_text))
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def add(self, event: Event) -> None:
         """Record an IMU sample or a frameset."""
+        self._first_ns = event.stamp_ns if self._first_ns is None else self._first_ns
+        self._last_ns = max(self._last_ns, event.stamp_ns)
         if isinstance(event, FrameSet):
             self._guarded(lambda: self._add_frameset(event))
         else:
@@ -97,42 +96,47 @@ class SessionWriter:
             self._guarded(lambda: self._add(ODOMETRY_TOPIC, estimate.stamp_ns, messages.odometry(estimate)))
             self.poses += 1
 
+    def add_true_pose(self, stamp_ns: int, world_T_body: Float) -> None:
+        """Record a pose (4, 4) of the true trajectory."""
+        self._guarded(lambda: self._add(TRUTH_TOPIC, stamp_ns, messages.true_pose(stamp_ns, world_T_body)))
+
     def add_incident(self, incident: Incident) -> None:
-        """Record an incident."""
+        """Record an incident; one without a time of the recording, at the recording's nearest end."""
+        if self._first_ns is not None:
+            stamp_ns = min(max(incident.stamp_ns, self._first_ns), self._last_ns)
+            incident = Incident(stamp_ns, incident.kind, incident.detail)
         self._guarded(lambda: self._add(LOG_TOPIC, incident.stamp_ns, messages.log(incident)))
 
     def close(self) -> None:
         """Finish the file; a second time does nothing."""
-        if self._closing.is_set():
+        if self._is_closed:
             return
-        self._guarded(self._mcap.finish)
-        self._closing.set()
-        self._syncing.join()
+        self._is_closed = True
+        self._guarded(self._storage.finish)
         try:
-            self._file.close()
+            self._storage.close()
         except OSError as error:
-            self._stop(error)
-
-    def _begin(self) -> None:
-        self._mcap.start(_PROFILE, f"{LIBRARY} {__version__}")
-        self._mcap.add_attachment(
-            0, 0, RIG_ATTACHMENT, "application/yaml", to_text(self._rig, self.path.parent).encode()
-        )
-        self._file.flush()
+            if self.stopped is None:
+                self._stop(error)
 
     def _add_frameset(self, frameset: FrameSet) -> None:
         if not self._has_begun:
             self._has_begun = True
-            stamp = frameset.stamp_ns
-            self._add(TRANSFORMS_TOPIC, stamp, messages.static_transforms(stamp, self._rig))
-            for pair in self._rig.pairs:
-                for side, camera in (("left", pair.left), ("right", pair.right)):
-                    self._add(f"/{pair.name}/{side}/camera_info", stamp, messages.camera_info(stamp, camera))
+            self._add_calibration(frameset.stamp_ns)
         for number, images in sorted(frameset.images.items()):
-            pair = self._rig.pairs[number]
+            pair = self.rig.pairs[number]
             for side, camera, pixels in zip(("left", "right"), (pair.left, pair.right), images, strict=True):
                 topic = image_topic(pair.name, side, self._format)
                 self._add(topic, frameset.stamp_ns, self._image(frameset.stamp_ns, camera.name, pixels))
+
+    def _add_calibration(self, stamp_ns: int) -> None:
+        if not self._storage.has_attachments:
+            self._add(RIG_TOPIC, stamp_ns, messages.text(self._rig_text), is_latched=True)
+        self._add(TRANSFORMS_TOPIC, stamp_ns, messages.static_transforms(stamp_ns, self.rig), is_latched=True)
+        for pair in self.rig.pairs:
+            for side, camera in (("left", pair.left), ("right", pair.right)):
+                topic = f"/{pair.name}/{side}/camera_info"
+                self._add(topic, stamp_ns, messages.camera_info(stamp_ns, camera), is_latched=True)
 
     def _image(self, stamp_ns: int, frame: str, pixels: Image) -> Any:
         if self._format == "raw":
@@ -142,22 +146,10 @@ class SessionWriter:
         _, png = cv2.imencode(".png", pixels)
         return messages.compressed_image(stamp_ns, frame, png.tobytes())
 
-    def _add(self, topic: str, stamp_ns: int, message: Any) -> None:
-        if topic not in self._channels:
-            name = message.__msgtype__
-            if name not in self._schemas:
-                self._schemas[name] = self._mcap.register_schema(name, _SCHEMA_ENCODING, cdr.definition(name))
-            self._channels[topic] = self._mcap.register_channel(topic, _ENCODING, self._schemas[name]), 0
-        channel, count = self._channels[topic]
-        self._channels[topic] = channel, count + 1
-        self._mcap.add_message(channel, stamp_ns, cdr.encode(message), stamp_ns, count)
-        now_s = time.monotonic()
-        if now_s - self._last_flush_s >= _FLUSH_S:
-            self._last_flush_s = now_s
-            self._mcap._Writer__finalize_chunk()  # the library ends chunks by size only
-            self._file.flush()
+    def _add(self, topic: str, stamp_ns: int, message: Any, is_latched: bool = False) -> None:
+        self._storage.write(topic, stamp_ns, message, is_latched)
 
-    def _guarded(self, action: Any) -> None:
+    def _guarded(self, action: Callable[[], None]) -> None:
         if self.stopped is None:
             try:
                 action()
@@ -165,21 +157,10 @@ class SessionWriter:
                 self._stop(error)
 
     def _stop(self, error: OSError) -> None:
-        self.stopped = f"{self.path}: recording stopped ({error.strerror}); what was written until then can be read"
+        rest = (
+            "what was written until then can be read"
+            if self._storage.is_readable_when_cut
+            else "what was written until then cannot be read: remove it, make room and begin again"
+        )
+        self.stopped = f"{self.path}: recording stopped ({error.strerror}); {rest}"
         _log.error("%s", self.stopped)
-
-    def _sync(self) -> None:
-        """Has what was flushed on the disk, for when the power fails."""
-        while not self._closing.wait(_FLUSH_S):
-            try:
-                os.fsync(self._file.fileno())
-            except (OSError, ValueError):
-                return
-
-
-def _mcap_writer(file: BinaryIO) -> Any:
-    try:
-        from mcap.writer import CompressionType, Writer
-    except ImportError:
-        raise MissingExtraError("mcap", "sessions", "reading or writing a session") from None
-    return Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.LZ4)

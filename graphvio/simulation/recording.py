@@ -9,28 +9,17 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from graphvio import euroc_layout
 from graphvio.arrays import Float, Image
 from graphvio.errors import SourceError
+from graphvio.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
 from graphvio.geometry import quat_wxyz_from_rotation
-from graphvio.rig import Camera, Imu
 from graphvio.simulation.simulator import Simulator, make_simulator
 
 Progress = Callable[[int, int], None]
 """Called with (framesets written, framesets in all)."""
-
-_PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # noise hardly shrinks any further
-_IMU_HEADER = (
-    "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
-    "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
-)
-_TRUTH_HEADER = (
-    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
-    "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], "
-    "b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]"
-)
 
 
 @dataclass(frozen=True)
@@ -159,65 +148,39 @@ def _in_order(
 
 
 def _write_image(path: Path, image: Image) -> None:
-    if not cv2.imwrite(str(path), image, _PNG_OPTIONS):
-        raise SourceError(f"{path}: cannot be written; is the disk full?")
+    try:
+        euroc_layout.write_image(path, image)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be written ({error.strerror}); is the disk full?") from None
 
 
 def _write_sensors(simulator: Simulator, mav0: Path) -> None:
     for number, camera in enumerate(simulator.rig.cameras):
         folder = mav0 / camera.name
         pair = number // 2
-        (folder / "sensor.yaml").write_text(_camera_yaml(camera, simulator.rates_hz[pair]))
-        rows = [f"{stamp},{stamp}.png" for stamp in simulator.triggers_ns(pair)]
-        (folder / "data.csv").write_text("\n".join(["#timestamp [ns],filename", *rows, ""]))
-    for name in ("imu0", "state_groundtruth_estimate0"):
+        text = euroc_layout.camera_yaml(camera, simulator.rates_hz[pair], f"simulated {camera.name}")
+        (folder / "sensor.yaml").write_text(text)
+        rows = [euroc_layout.frame_row(int(stamp)) for stamp in simulator.triggers_ns(pair)]
+        (folder / "data.csv").write_text("\n".join([euroc_layout.FRAME_HEADER, *rows, ""]))
+    for name in (IMU_FOLDER, TRUTH_FOLDER):
         (mav0 / name).mkdir()
-    (mav0 / "imu0" / "sensor.yaml").write_text(_imu_yaml(simulator.imu))
-    truth = f"sensor_type: visual-inertial\ncomment: exact truth of the simulation\n{_matrix_yaml(np.eye(4))}"
-    (mav0 / "state_groundtruth_estimate0" / "sensor.yaml").write_text(truth)
+    (mav0 / IMU_FOLDER / "sensor.yaml").write_text(euroc_layout.imu_yaml(simulator.imu, "simulated"))
+    (mav0 / TRUTH_FOLDER / "sensor.yaml").write_text(euroc_layout.truth_yaml("exact truth of the simulation"))
     (mav0 / "body.yaml").write_text(f"comment: simulated walk, scene {simulator.scene.name}\n")
 
 
 def _write_inertial(simulator: Simulator, mav0: Path) -> None:
     track = simulator.imu_track
     readings = np.hstack([track.angular_velocity, track.linear_acceleration])
-    _write_table(mav0 / "imu0" / "data.csv", _IMU_HEADER, track.stamps_ns.tolist(), readings)
+    _write_table(mav0 / IMU_FOLDER / "data.csv", euroc_layout.IMU_HEADER, track.stamps_ns.tolist(), readings)
     poses = track.states.world_T_body
     quaternions = np.array([quat_wxyz_from_rotation(np.ascontiguousarray(pose[:3, :3])) for pose in poses])
     truth = np.hstack([poses[:, :3, 3], quaternions, track.states.velocity, track.gyro_bias, track.accel_bias])
-    path = mav0 / "state_groundtruth_estimate0" / "data.csv"
-    _write_table(path, _TRUTH_HEADER, track.stamps_ns.tolist(), truth)
+    _write_table(mav0 / TRUTH_FOLDER / "data.csv", euroc_layout.STATE_HEADER, track.stamps_ns.tolist(), truth)
 
 
 def _write_table(path: Path, header: str, stamps: Sequence[int], values: Float) -> None:
     with path.open("w") as file:
         file.write(header + "\n")
         for stamp, row in zip(stamps, values, strict=True):
-            file.write(f"{stamp}," + ",".join(f"{value:.12g}" for value in row) + "\n")
-
-
-def _matrix_yaml(body_T_sensor: Float) -> str:
-    rows = ",\n         ".join(", ".join(f"{value:.15g}" for value in row) for row in body_T_sensor)
-    return f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{rows}]\n"
-
-
-def _camera_yaml(camera: Camera, rate_hz: float) -> str:
-    coefficients = camera.distortion if camera.distortion[4] != 0.0 else camera.distortion[:4]
-    return (
-        f"sensor_type: camera\ncomment: simulated {camera.name}\n{_matrix_yaml(camera.body_T_cam)}"
-        f"rate_hz: {rate_hz:g}\nresolution: [{camera.size_px[0]}, {camera.size_px[1]}]\n"
-        "camera_model: pinhole\n"
-        f"intrinsics: [{', '.join(f'{value:.12g}' for value in camera.intrinsics)}]\n"
-        f"distortion_model: {camera.model}\n"
-        f"distortion_coefficients: [{', '.join(f'{value:.12g}' for value in coefficients)}]\n"
-    )
-
-
-def _imu_yaml(imu: Imu) -> str:
-    return (
-        f"sensor_type: imu\ncomment: simulated\n{_matrix_yaml(np.eye(4))}rate_hz: {imu.rate_hz:g}\n"
-        f"gyroscope_noise_density: {imu.gyro_noise_density:.12g}\n"
-        f"gyroscope_random_walk: {imu.gyro_random_walk:.12g}\n"
-        f"accelerometer_noise_density: {imu.accel_noise_density:.12g}\n"
-        f"accelerometer_random_walk: {imu.accel_random_walk:.12g}\n"
-    )
+            file.write(euroc_layout.rounded_row(stamp, row) + "\n")

@@ -10,6 +10,7 @@ from types import ModuleType
 from graphvio.errors import RigError, SourceError
 from graphvio.rig import Rig
 from graphvio.rig_files import find_rig
+from graphvio.sessions.opening import open_store
 from graphvio.sources import euroc, kitti_odometry, kitti_raw, session
 from graphvio.sources.base import Source
 from graphvio.sources.faults import FaultLog
@@ -77,7 +78,7 @@ def _open(
     resolved = path.resolve()
     faults = FaultLog(resolved.parent.name if resolved.name == "mav0" else _name_of(resolved))
     if session.matches(path):
-        store = session.open_store(path)
+        store = open_store(path)
         rig = _required(rig if rig is not None else session.rig_in(store), path)
         index = session.read_index(store, rig, faults, topics)
     else:

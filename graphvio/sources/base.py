@@ -40,7 +40,7 @@ class Source(Protocol):
 
     @property
     def truth(self) -> Path | None:
-        """File with the true trajectory, where the recording carries one."""
+        """Where `Trajectory.read` finds the true trajectory, if the recording carries one: a file, or a session."""
 
     @property
     def decode_ms(self) -> Sequence[float]:

@@ -13,11 +13,14 @@ from graphvio.rig import Camera, Rig
 from graphvio.rig_files.native import parse
 from graphvio.sessions import cdr
 from graphvio.sessions.bag_file import BagFile
-from graphvio.sessions.mcap_file import McapFile, Place, Topic, stamps_of
-from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, imu_sample
+from graphvio.sessions.mcap_file import McapFile, Place, Topic
+from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, TEXT, imu_sample
+from graphvio.sessions.opening import is_store
 from graphvio.sessions.pixels import grey
 from graphvio.sessions.rig_of_topics import rig_of_topics
-from graphvio.sessions.writer import LIBRARY, RIG_ATTACHMENT, image_topic
+from graphvio.sessions.stamps import header_stamps
+from graphvio.sessions.topics import RIG_ATTACHMENT, RIG_TOPIC, image_topic
+from graphvio.sessions.truth import truth_topic
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.images import ImageError
 from graphvio.sources.recording import Index
@@ -29,16 +32,7 @@ LAYOUT = "sessions and bags: NAME.mcap, NAME.bag, a folder with metadata.yaml"
 
 def matches(path: Path) -> bool:
     """Whether a path is a session or a bag."""
-    return path.suffix in (".mcap", ".bag") if path.is_file() else (path / "metadata.yaml").is_file()
-
-
-def open_store(path: Path) -> McapFile | BagFile:
-    """The messages in a session or bag.
-
-    Raises:
-        SessionError: if it cannot be read.
-    """
-    return McapFile(path) if path.is_file() and path.suffix == ".mcap" else BagFile(path)
+    return is_store(path)
 
 
 def rig_in(file: McapFile | BagFile) -> Rig | None:
@@ -47,8 +41,13 @@ def rig_in(file: McapFile | BagFile) -> Rig | None:
     Raises:
         RigError: if its rig describes none that is usable.
     """
-    text = file.attachments.get(RIG_ATTACHMENT)
-    return rig_of_topics(file, file.path.stem) if text is None else parse(text.decode("utf-8"), file.path)
+    attached = file.attachments.get(RIG_ATTACHMENT)
+    if attached is not None:
+        return parse(attached.decode("utf-8"), file.path)
+    told = file.topics.get(RIG_TOPIC)
+    if told is not None and told.type_name == TEXT and told.places:
+        return parse(cdr.decode(file.read(told.places[0]), TEXT).data, file.path)
+    return rig_of_topics(file, file.path.stem)
 
 
 def read_index(file: McapFile | BagFile, rig: Rig, faults: FaultLog, topics: Mapping[str, str]) -> Index:
@@ -78,7 +77,7 @@ def read_index(file: McapFile | BagFile, rig: Rig, faults: FaultLog, topics: Map
     of_imu = [each for each in file.topics.values() if each.type_name == IMU]
     imu = chosen.get(_IMU_NAME) or next(iter(of_imu), None)
     table = None if imu is None or rig.imu is None else _imu(file, imu, faults)
-    return Index(faults.name, tracks, table)
+    return Index(faults.name, tracks, table, file.path if truth_topic(file.topics) is not None else None)
 
 
 def _named(file: McapFile | BagFile, name: str) -> Topic:
@@ -92,7 +91,7 @@ class _Images:
 
     def __init__(self, file: McapFile | BagFile, topic: Topic, faults: FaultLog) -> None:
         self._file, self._type, self._name = file, topic.type_name, topic.name
-        stamps = _header_stamps(file, topic)
+        stamps = header_stamps(file, topic)
         order = np.argsort(stamps, kind="stable")
         kept = order[clean_stamps(stamps[order], "frame", file.path, faults)]
         self.stamps_ns: Int = stamps[kept]
@@ -119,15 +118,6 @@ def _topic_of(file: McapFile | BagFile, pair: str, side: str, camera: Camera) ->
         has = ", ".join(topic.name for topic in images) or "none"
         raise SourceError(f"{file.path}: has no images of camera {camera.name}; topics with images: {has}")
     return named[0]
-
-
-def _header_stamps(file: McapFile | BagFile, topic: Topic) -> Int:
-    """Stamps of the messages' headers; graphvio's own sessions are logged by them."""
-    if file.library.startswith(LIBRARY):
-        return stamps_of(topic)
-    if topic.header_ns:
-        return np.array(topic.header_ns, dtype=np.int64)
-    return np.array([cdr.stamp_ns(file.read(place)) for place in topic.places], dtype=np.int64)
 
 
 def _imu(file: McapFile | BagFile, topic: Topic, faults: FaultLog) -> ImuTable:

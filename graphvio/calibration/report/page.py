@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from base64 import b64encode
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
 
 import numpy as np
@@ -11,16 +10,8 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.calibration.pair_calibration import PairCalibration, size_in_words
 from graphvio.calibration.result import Calibration
+from graphvio.reporting.page import bullets, html_page, picture, table
 
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 860px; margin: 2em auto; padding: 0 1em; }
-h1 { font-size: 1.5em; } h2 { font-size: 1.2em; margin-top: 2em; border-top: 1px solid #ddd; padding-top: 1em; }
-table { border-collapse: collapse; margin: 0.8em 0; } th { text-align: left; font-weight: 600; }
-td, th { padding: 0.25em 0.9em 0.25em 0; border-bottom: 1px solid #eee; vertical-align: top; }
-td { font-variant-numeric: tabular-nums; } img { max-width: 100%; } figure { margin: 1em 0; }
-figcaption { color: #555; font-size: 0.92em; } .good { color: #1a7f37; } .doubt { color: #b35900; }
-pre { background: #f6f6f6; padding: 0.7em; overflow-x: auto; font-size: 0.85em; }
-"""
 _CAPTIONS = {
     "alignment_errors": "Both cameras tell where the second one went. This is how far apart their answers are, for "
     "every single motion: a narrow heap near zero is good. (Figure 4 of Oskiper et al., CVPR 2007, is the same; theirs "
@@ -51,10 +42,10 @@ def page(found: Calibration, pictures: Mapping[tuple[int, int], Mapping[str, byt
         _places(found),
     ]
     if found.warnings:
-        parts += ["<h2>What to know before using it</h2>", _list(found.warnings)]
+        parts += ["<h2>What to know before using it</h2>", bullets(found.warnings)]
     for (i, j), each in found.places.pairwise.items():
         parts.append(f"<h2>{escape(found.names[i])} and {escape(found.names[j])}</h2>")
-        parts += [_picture(name, png) for name, png in pictures[i, j].items()]
+        parts += [picture(name, png, _CAPTIONS[name]) for name, png in pictures[i, j].items()]
         parts.append(_details(each))
     if found.places.loops:
         parts += ["<h2>All cameras together</h2>", _together(found)]
@@ -64,11 +55,7 @@ def page(found: Calibration, pictures: Mapping[tuple[int, int], Mapping[str, byt
         parts += ["<h2>Clocks</h2>", _clocks(found)]
     if found.is_complete:
         parts += ["<h2>Numbers</h2>", _numbers(found)]
-    body = "\n".join(parts)
-    return (
-        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(source)}: calibration</title>'
-        f"<style>{_STYLE}</style></head><body>\n{body}\n</body></html>\n"
-    )
+    return html_page(f"{source}: calibration", parts)
 
 
 def _verdict(found: Calibration) -> str:
@@ -101,7 +88,7 @@ def _places(found: Calibration) -> str:
         "in the rig file" if found.rig is not None else "",
     )
     note = "<p>Camera axes: x right, y down, z forward. After +- stands one standard deviation.</p>"
-    return _table(rows, head) + note
+    return table(rows, head) + note
 
 
 def _present(found: Calibration, j: int) -> str:
@@ -130,7 +117,7 @@ def _details(each: PairCalibration) -> str:
         ),
     ]
     if not each.observability.is_complete:
-        return _table(turning)
+        return table(turning)
     rows = [
         *([("motions from frame to frame", frames)] if len(each.frames) else []),
         ("motions used", f"{len(each.pairs)}, of which {int(each.inlier.sum())} fit"),
@@ -160,7 +147,7 @@ def _details(each: PairCalibration) -> str:
         ),
         *turning,
     ]
-    return _table(rows)
+    return table(rows)
 
 
 def _degrees(radians: Float) -> str:
@@ -182,9 +169,9 @@ def _together(found: Calibration) -> str:
     ]
     return (
         "<p>Results for two at a time, one after the other around three cameras, should lead back to the beginning.</p>"
-        + _table(loops, ("around", "misses by", "chi-square"))
+        + table(loops, ("around", "misses by", "chi-square"))
         + "<p>The result above is for all motions at once. How far it is from results for two at a time:</p>"
-        + _table(apart, ("", "chi-square"))
+        + table(apart, ("", "chi-square"))
     )
 
 
@@ -199,7 +186,7 @@ def _imu(found: Calibration) -> str:
         )
         for j, each in (found.imu or {}).items()
     ]
-    return _table(rows, ("", "turned from where the rig has it", "time offset, camera to IMU"))
+    return table(rows, ("", "turned from where the rig has it", "time offset, camera to IMU"))
 
 
 def _clocks(found: Calibration) -> str:
@@ -211,7 +198,7 @@ def _clocks(found: Calibration) -> str:
         )
         for (i, j), clock in (found.clocks or {}).items()
     ]
-    return _table(rows, ("", "add to a stamp", "drift"))
+    return table(rows, ("", "add to a stamp", "drift"))
 
 
 def _numbers(found: Calibration) -> str:
@@ -238,19 +225,3 @@ def _vector(values: Float, sigmas: Float, known: Bool, unit: str, digits: int) -
 
 def _chance(agrees: bool) -> str:
     return "agree" if agrees else "more than chance explains"
-
-
-def _picture(name: str, png: bytes) -> str:
-    data = b64encode(png).decode("ascii")
-    caption = _CAPTIONS[name]
-    return f'<figure><img alt="{name}" src="data:image/png;base64,{data}"><figcaption>{caption}</figcaption></figure>'
-
-
-def _list(items: Iterable[str]) -> str:
-    return "<ul>" + "".join(f"<li>{escape(item)}</li>" for item in items) + "</ul>"
-
-
-def _table(rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
-    lines = ["".join(f"<th>{escape(cell)}</th>" for cell in head)] if head else []
-    lines += ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
-    return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"

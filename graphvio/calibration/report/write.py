@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from io import BytesIO
 from pathlib import Path
-
-from matplotlib.figure import Figure
 
 from graphvio.calibration.report import figures
 from graphvio.calibration.report.document import write_document
 from graphvio.calibration.report.page import page
 from graphvio.calibration.result import Calibration
 from graphvio.errors import CalibrationError
+from graphvio.reporting.figures import png
 
 PAGE, NUMBERS = "report.html", "calibration.yaml"
 
@@ -40,20 +38,14 @@ def write_report(found: Calibration, folder: Path, source: str, count: int) -> P
         }
         if len(each.growth) > 1:
             drawn["growth"] = figures.growth(each, count, "framesets" if found.rig is not None else "poses")
-        pictures[cameras] = {name: _png(figure) for name, figure in drawn.items()}
+        pictures[cameras] = {name: png(figure) for name, figure in drawn.items()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for (i, j), named in pictures.items():
-            for name, png in named.items():
-                (folder / f"{name}-{i}-{j}.png").write_bytes(png)
+            for name, data in named.items():
+                (folder / f"{name}-{i}-{j}.png").write_bytes(data)
         (folder / PAGE).write_text(page(found, pictures, source), encoding="utf-8")
     except OSError as error:
         raise CalibrationError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
     write_document(found, folder / NUMBERS)
     return folder / PAGE
-
-
-def _png(figure: Figure) -> bytes:
-    held = BytesIO()
-    figure.savefig(held, format="png", metadata={"Software": None})
-    return held.getvalue()

@@ -22,7 +22,7 @@ _CENTRE_PX = 0.5
 
 
 def colmap() -> Any:
-    """The library pycolmap.
+    """The library pycolmap, which says nothing less than warnings.
 
     Raises:
         MissingExtraError: if the extra ``maps`` is not installed.
@@ -31,6 +31,7 @@ def colmap() -> Any:
         import pycolmap
     except ImportError:
         raise MissingExtraError("pycolmap", "maps", "loop closure and maps") from None
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
     return pycolmap
 
 
@@ -90,9 +91,18 @@ class FeatureDatabase:
         """Of all images."""
         return frozenset(self._ids)
 
+    @property
+    def path(self) -> Path:
+        """Of the file."""
+        return self._path
+
     def image_id(self, name: str) -> int:
         """COLMAP's number of an image."""
         return self._ids[name]
+
+    def frame_id(self, name: str) -> int:
+        """COLMAP's number of the frame that an image is part of."""
+        return int(self._file.read_image(self._ids[name]).frame_id)
 
     def transaction(self) -> AbstractContextManager[Any]:
         """What is written inside is written as a whole or not at all."""
@@ -156,9 +166,9 @@ class FeatureDatabase:
         """Features (K, 2) of an image."""
         return np.asarray(self._file.read_keypoints(self._ids[name])[:, :2], dtype=np.float64) - _CENTRE_PX
 
-    def descriptors(self, name: str) -> Any:
-        """Descriptors of an image's features as COLMAP has them; ``data`` is (K, 128), uint8."""
-        return self._file.read_descriptors(self._ids[name])
+    def descriptors(self, name: str) -> AnyArray:
+        """Descriptors (K, 128), uint8, of an image's features."""
+        return np.asarray(self._file.read_descriptors(self._ids[name]).data, dtype=np.uint8).reshape(-1, 128)
 
     def add_matches(self, first: str, second: str, matches: Int, geometry: Any = None) -> None:
         """Add which features (M, 2) of two images are one, and the two-view geometry that verifies them.
@@ -180,9 +190,55 @@ class FeatureDatabase:
         found = self._file.read_two_view_geometry(self._ids[first], self._ids[second])
         return np.asarray(found.inlier_matches, dtype=np.int64).reshape(-1, 2)
 
+    def all_matches(self, first: str, second: str) -> Int:
+        """Matches (M, 2) of two images, verified or not."""
+        found = self._file.read_matches(self._ids[first], self._ids[second])
+        return np.asarray(found, dtype=np.int64).reshape(-1, 2)
+
     def has_matches(self, first: str, second: str) -> bool:
         """Whether two images were matched."""
-        return bool(self._file.exists_two_view_geometry(self._ids[first], self._ids[second]))
+        return bool(self._file.exists_matches(self._ids[first], self._ids[second]))
+
+    def verified_pairs(self) -> list[tuple[str, str]]:
+        """Names of the images between which there are verified matches."""
+        names = {number: name for name, number in self._ids.items()}
+        pairs, _ = self._file.read_two_view_geometry_num_inliers()
+        found = [self._colmap.pair_id_to_image_pair(pair) for pair in pairs]
+        return [(names[first], names[second]) for first, second in found]
+
+    def verify(self, first: str, second: str, geometry: Any) -> None:
+        """Say anew which matches of two images are verified; None: none are, and all stay as unverified ones."""
+        one, other = self._ids[first], self._ids[second]
+        if self._file.exists_two_view_geometry(one, other):
+            self._file.delete_two_view_geometry(one, other)
+        if geometry is not None:
+            self._file.write_two_view_geometry(one, other, geometry)
+
+    def model(self, rigs: Mapping[int, Float]) -> Any:
+        """A reconstruction without points, whose numbers are the database's.
+
+        Args:
+            rigs: frame's number -> (4, 4), from world to its rig's reference camera.
+        """
+        file, made = self._file, self._colmap.Reconstruction()
+        frames = [frame for frame in file.read_all_frames() if frame.frame_id in rigs]
+        of_frames = {frame.rig_id for frame in frames}
+        used = [rig for rig in file.read_all_rigs() if rig.rig_id in of_frames]
+        cameras = {sensor.id for rig in used for sensor in rig.sensor_ids()}
+        for camera in file.read_all_cameras():
+            if camera.camera_id in cameras:
+                made.add_camera(camera)
+        for rig in used:
+            made.add_rig(rig)
+        for frame in frames:
+            frame.rig_from_world = rigid(rigs[frame.frame_id])
+            made.add_frame(frame)
+        for image in file.read_all_images():
+            if image.frame_id in rigs:
+                made.add_image(image)
+        for frame in frames:
+            made.register_frame(frame.frame_id)
+        return made
 
 
 def rigid(a_T_b: Float) -> Any:

@@ -30,7 +30,6 @@ class Extractor:
 
     def __init__(self, most: int) -> None:
         library = colmap()
-        library.logging.minloglevel = library.logging.Level.WARNING.value
         self._options = library.FeatureExtractionOptions()
         self._options.num_threads = 1
         self._options.sift.max_num_features = most

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.rig import Rig
 
@@ -39,7 +37,6 @@ def merge_places(
             for pair in rig.pairs:
                 if pair.left.name in names:
                     left, right = names[pair.left.name], names[pair.right.name]
-                    descriptors = np.asarray(part.descriptors(left).data, dtype=np.uint8).reshape(-1, 128)
-                    whole.add_features(left, part.pixels(left), descriptors)
+                    whole.add_features(left, part.pixels(left), part.descriptors(left))
                     whole.add_features(right, part.pixels(right))
                     whole.add_matches(left, right, part.matches(left, right))

@@ -15,11 +15,12 @@ from graphvio.config import Config
 from graphvio.frontend.stereo import triangulate
 from graphvio.frontend.tracks import PairFrame
 from graphvio.geometry import se3_inverse
-from graphvio.optimization.loops.database import FeatureDatabase, colmap, colmap_camera, image_name
+from graphvio.optimization.loops.database import FeatureDatabase, image_name
+from graphvio.optimization.loops.matching import alike, estimated_geometry
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.optimization.loops.resection import Resection, register_again, resect_features
 from graphvio.optimization.loops.retrieval import candidates, describe, joined, vocabulary
-from graphvio.rig import Rig, StereoPair
+from graphvio.rig import Camera, Rig, StereoPair
 from graphvio.sources import Source
 
 _LEAST_MATCHES = 20
@@ -140,7 +141,7 @@ def _similarity(
         np.array([each[1] for each in listed], dtype=np.int64),
         [each[2] for each in listed],
     )
-    descriptors = [np.asarray(database.descriptors(name).data) for name in images.names]
+    descriptors = [database.descriptors(name) for name in images.names]
     words = vocabulary(descriptors, seed)
     vectors = np.array([describe(rows, words) for rows in descriptors]).reshape(len(images), -1)
     return images, np.asarray(vectors @ vectors.T, dtype=np.float64)
@@ -178,9 +179,6 @@ class _Verifier:
     def verify(self, candidate: tuple[int, int]) -> LoopClosure | None:
         """The loop closure of an earlier and a later place, or None."""
         earlier, later = (self._places[number] for number in candidate)
-        colmap().set_random_seed(
-            self._config.motion.seed
-        )  # the thread's: whatever it tried before, and whichever it is
         crossings = self._crossings(*candidate)
         matches = {}
         for (a, b), names in crossings.items():
@@ -218,30 +216,19 @@ class _Verifier:
         return {(int(images.pair[i]), int(images.pair[k])): (images.names[i], images.names[k]) for _, i, k in ranked}
 
     def _matched(self, earlier: Place, later: Place, a: int, b: int, names: tuple[str, str]) -> Int:
-        """Rows (M, 2) of features that are one by COLMAP's matcher and two-view geometry."""
-        library = colmap()
+        """Rows (M, 2) of features that are one by their descriptors and COLMAP's two-view geometry."""
         with self._lock:
-            pixels = [self._database.pixels(name) for name in names]
+            pixels = (self._database.pixels(names[0]), self._database.pixels(names[1]))
             descriptors = [self._database.descriptors(name) for name in names]
-        if not hasattr(self._of_thread, "matcher"):
-            options = library.FeatureMatchingOptions()
-            options.num_threads = 1
-            options.use_gpu = False
-            self._of_thread.matcher = library.FeatureMatcher.create(options, library.Device.cpu)
-        keypoints = [_keypoints(each) for each in pixels]
-        rows = self._of_thread.matcher.match(keypoints[0], descriptors[0], keypoints[1], descriptors[1])
+        rows = alike(*descriptors)
         if len(rows) < _LEAST_MATCHES:
             return np.zeros((0, 2), dtype=np.int64)
-        cameras = [
-            colmap_camera(self._sessions[place.session].rig.pairs[j].left, 1) for place, j in ((earlier, a), (later, b))
-        ]
-        geometry = library.estimate_calibrated_two_view_geometry(
-            cameras[0], pixels[0] + 0.5, cameras[1], pixels[1] + 0.5, rows
-        )
+        cameras = (self._left(earlier, a), self._left(later, b))
+        geometry = estimated_geometry(cameras, pixels, rows)
         verified = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
         if len(verified) >= _LEAST_MATCHES:
             with self._lock:
-                self._verified.append((*names, np.asarray(rows, dtype=np.int64), geometry))
+                self._verified.append((*names, rows, geometry))
         return verified
 
     def _frame(self, place: Place, j: int) -> PairFrame:
@@ -253,6 +240,9 @@ class _Verifier:
             pixels, in_right = self._database.pixels(left), self._database.pixels(right)
             rows = self._database.matches(left, right)
         return frame_of(pair, place.stamp_ns, pixels, in_right, rows)
+
+    def _left(self, place: Place, j: int) -> Camera:
+        return self._sessions[place.session].rig.pairs[j].left
 
     def _frameset(self, place: Place) -> Any:
         return self._sessions[place.session].source.frameset_at(place.stamp_ns)
@@ -278,12 +268,6 @@ def frame_of(pair: StereoPair, stamp_ns: int, pixels: Float, in_right: Float, ro
         stamp_ns, np.arange(n), none, pixels, left, right, points, covariances, np.zeros((n, 2)), has_depth & has_ray,
         none,
     )  # fmt: skip
-
-
-def _keypoints(pixels: Float) -> Any:
-    rows = np.zeros((len(pixels), 4), dtype=np.float32)
-    rows[:, :2], rows[:, 2] = pixels + 0.5, 1.0
-    return colmap().keypoints_from_matrix(np.ascontiguousarray(rows))
 
 
 def _closure(earlier: Place, later: Place, found: Resection) -> LoopClosure:

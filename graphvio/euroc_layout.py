@@ -1,0 +1,89 @@
+"""The texts and images of a recording in the EuRoC/ASL layout, as the simulator and ``graphvio convert`` write them."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from graphvio.arrays import Float, Image
+from graphvio.rig import Camera, Imu
+
+IMU_FOLDER, TRUTH_FOLDER = "imu0", "state_groundtruth_estimate0"
+FRAME_HEADER = "#timestamp [ns],filename"
+IMU_HEADER = (
+    "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+    "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
+)
+POSE_HEADER = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
+STATE_HEADER = (
+    f"{POSE_HEADER}, "
+    "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], "
+    "b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]"
+)
+
+_PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # noise hardly shrinks any further
+
+
+def write_image(path: Path, image: Image) -> None:
+    """Write an image (height, width) uint8 as PNG.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    is_packed, png = cv2.imencode(".png", image, _PNG_OPTIONS)
+    if not is_packed:
+        raise OSError(errno.EINVAL, "the image cannot be packed", str(path))
+    path.write_bytes(png.tobytes())
+
+
+def frame_row(stamp_ns: int) -> str:
+    """A row of a camera's ``data.csv``."""
+    return f"{stamp_ns},{stamp_ns}.png"
+
+
+def rounded_row(stamp_ns: int, values: Iterable[float]) -> str:
+    """A row of a table with twelve significant digits."""
+    return f"{stamp_ns}," + ",".join(f"{value:.12g}" for value in values)
+
+
+def exact_row(stamp_ns: int, values: Iterable[float]) -> str:
+    """A row of a table whose values read back to the last digit."""
+    return f"{stamp_ns}," + ",".join(repr(float(value)) for value in values)
+
+
+def camera_yaml(camera: Camera, rate_hz: float, comment: str) -> str:
+    """A camera's ``sensor.yaml``."""
+    coefficients = camera.distortion if camera.distortion[4] != 0.0 else camera.distortion[:4]
+    return (
+        f"sensor_type: camera\ncomment: {comment}\n{_matrix_yaml(camera.body_T_cam)}"
+        f"rate_hz: {rate_hz:g}\nresolution: [{camera.size_px[0]}, {camera.size_px[1]}]\n"
+        "camera_model: pinhole\n"
+        f"intrinsics: [{', '.join(f'{value:.12g}' for value in camera.intrinsics)}]\n"
+        f"distortion_model: {camera.model}\n"
+        f"distortion_coefficients: [{', '.join(f'{value:.12g}' for value in coefficients)}]\n"
+    )
+
+
+def imu_yaml(imu: Imu, comment: str) -> str:
+    """The IMU's ``sensor.yaml``."""
+    return (
+        f"sensor_type: imu\ncomment: {comment}\n{_matrix_yaml(np.eye(4))}rate_hz: {imu.rate_hz:g}\n"
+        f"gyroscope_noise_density: {imu.gyro_noise_density:.12g}\n"
+        f"gyroscope_random_walk: {imu.gyro_random_walk:.12g}\n"
+        f"accelerometer_noise_density: {imu.accel_noise_density:.12g}\n"
+        f"accelerometer_random_walk: {imu.accel_random_walk:.12g}\n"
+    )
+
+
+def truth_yaml(comment: str) -> str:
+    """The truth's ``sensor.yaml``: poses of body."""
+    return f"sensor_type: visual-inertial\ncomment: {comment}\n{_matrix_yaml(np.eye(4))}"
+
+
+def _matrix_yaml(body_T_sensor: Float) -> str:
+    rows = ",\n         ".join(", ".join(f"{value:.15g}" for value in row) for row in body_T_sensor)
+    return f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{rows}]\n"

@@ -1,0 +1,118 @@
+"""Which features of different places are one: the database's verified matches under the optimised poses.
+
+Verified are matches of neighbours in time and of the loop closures that are used, as far as they lie on the epipolar
+planes of the optimised poses. All other matches stay in the database as what they are, features that look alike, and
+are not verified: COLMAP makes no points of those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.geometry import se3_inverse
+from graphvio.optimization.loops.database import FeatureDatabase, image_name
+from graphvio.optimization.loops.matching import alike, known_geometry
+from graphvio.optimization.loops.search import Place, SessionInput
+from graphvio.optimization.optimize import Optimization
+from graphvio.rig import Camera
+
+_NEIGHBOURS = 2  # places after each that it is matched with
+_EPIPOLAR_PX = 4.0  # COLMAP's own limit for two views
+_LEAST_MATCHES = 15  # of two images: COLMAP makes no use of fewer
+
+
+@dataclass(frozen=True, eq=False)
+class _ImagePair:
+    """Left images of two places."""
+
+    names: tuple[str, str]
+    cameras: tuple[Camera, Camera]
+    second_T_first: Float
+
+
+def verify_matches(
+    optimization: Optimization,
+    sessions: Sequence[SessionInput],
+    database: FeatureDatabase,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Match neighbouring places, and say anew which matches between places the optimised poses verify.
+
+    Args:
+        optimization: of the sessions, in the same order.
+        sessions: whose places are in the database.
+        database: to write; images that were matched before are not matched again.
+        on_progress: called with the pairs of images done, and how many there are.
+    """
+    pairs = {each.names: each for each in _neighbours(optimization, sessions, database)}
+    pairs |= {each.names: each for each in _loops(optimization, sessions, database)}
+    lefts = {
+        image_name(session.name, pair.left.name, place.stamp_ns)
+        for session in sessions
+        for place in session.places
+        for pair in session.rig.pairs
+    }
+    with database.transaction():
+        for first, second in database.verified_pairs():
+            if first in lefts and second in lefts:
+                database.verify(first, second, None)
+    asked = sorted(pairs.values(), key=lambda each: each.names)
+    for done, pair in enumerate(asked, start=1):
+        with database.transaction():
+            _verify(pair, database)
+        if on_progress is not None:
+            on_progress(done, len(asked))
+
+
+def _verify(pair: _ImagePair, database: FeatureDatabase) -> None:
+    first, second = pair.names
+    if not database.has_matches(first, second):
+        database.add_matches(first, second, alike(database.descriptors(first), database.descriptors(second)))
+    pixels, rows = (database.pixels(first), database.pixels(second)), database.all_matches(first, second)
+    geometry = known_geometry(pair.cameras, pair.second_T_first, pixels, rows, _EPIPOLAR_PX)
+    database.verify(first, second, geometry if len(geometry.inlier_matches) >= _LEAST_MATCHES else None)
+
+
+def _neighbours(
+    optimization: Optimization, sessions: Sequence[SessionInput], database: FeatureDatabase
+) -> Iterator[_ImagePair]:
+    for number, session in enumerate(sessions):
+        frame = optimization.sessions[number].frame
+        for k, place in enumerate(session.places):
+            for other in session.places[k + 1 : k + 1 + _NEIGHBOURS]:
+                if frame[place.row] != frame[other.row]:
+                    continue
+                for j in range(len(session.rig.pairs)):
+                    pair = _image_pair(optimization, sessions, (place, other), (j, j))
+                    if database.names.issuperset(pair.names):
+                        yield pair
+
+
+def _loops(
+    optimization: Optimization, sessions: Sequence[SessionInput], database: FeatureDatabase
+) -> Iterator[_ImagePair]:
+    """The images that the search matched at the places of the closures that are used."""
+    for loop in optimization.loops:
+        if loop.refusal:
+            continue
+        places = (loop.closure.reference, loop.closure.current)
+        for a in range(len(sessions[places[0].session].rig.pairs)):
+            for b in range(len(sessions[places[1].session].rig.pairs)):
+                pair = _image_pair(optimization, sessions, places, (a, b))
+                if database.names.issuperset(pair.names) and database.has_matches(*pair.names):
+                    yield pair
+
+
+def _image_pair(
+    optimization: Optimization, sessions: Sequence[SessionInput], places: tuple[Place, Place], pairs: tuple[int, int]
+) -> _ImagePair:
+    of = [sessions[place.session] for place in places]
+    first, second = (session.rig.pairs[j].left for session, j in zip(of, pairs, strict=True))
+    names = [image_name(s.name, c.name, p.stamp_ns) for s, c, p in zip(of, (first, second), places, strict=True)]
+    nav_T_one, nav_T_other = (optimization.sessions[p.session].nav_T_body[p.row] for p in places)
+    second_T_first = second.cam_T_body @ se3_inverse(nav_T_other) @ nav_T_one @ first.body_T_cam
+    return _ImagePair((names[0], names[1]), (first, second), np.ascontiguousarray(second_T_first))

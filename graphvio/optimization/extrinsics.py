@@ -1,0 +1,135 @@
+"""The rig's calibration as unknowns of the full graph: where each pair is, and the IMU's time offset.
+
+A pair whose true ``body_T_left`` is ``C`` times the rig file's reports a motion ``M`` of body as ``C^-1 M C``, see
+`graphvio.frontend.alignment`. Its images are taken ``d`` later on the IMU's clock than the rig file says, so that it
+sees body as ``x exp(d xi)``, with the twist ``xi`` of body there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.factors import x
+from graphvio.backend.noise import gaussian, isotropic
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.geometry import se3_adjoint, se3_compose, se3_exp, se3_inverse, se3_log
+from graphvio.rig import Rig
+
+_FIRST_SIGMAS = np.repeat([0.02, 0.005], 3)  # of the first pair against the IMU: radians, metres
+_OTHER_SIGMAS = np.repeat([0.05, 0.05], 3)
+_OFFSET_SIGMA_S = 0.02
+
+
+def c(session: int, pair: int) -> int:
+    """A pair's correction: what its ``body_T_left`` is to be multiplied by from the left."""
+    return int(gtsam.symbol("c", 256 * session + pair))
+
+
+def d(session: int) -> int:
+    """The correction of a session's time offset, seconds."""
+    return int(gtsam.symbol("d", session))
+
+
+@dataclass(frozen=True, eq=False)
+class RigCorrection:
+    """What the measurements say of a session's rig file.
+
+    Attributes:
+        pairs: pair -> what its ``body_T_left`` is to be multiplied by from the left (4, 4).
+        covariances: pair -> (6, 6) of it, tangent ``[rotation, translation]``; of the first pair without an IMU, zero.
+        offset_s: to be added to the IMU's time offset.
+        offset_sigma_s: its standard deviation, or None without an IMU.
+    """
+
+    pairs: dict[int, Float]
+    covariances: dict[int, Float]
+    offset_s: float
+    offset_sigma_s: float | None
+
+    def corrected(self, rig: Rig) -> Rig:
+        """The rig with these corrections."""
+        pairs = []
+        for j, pair in enumerate(rig.pairs):
+            correction = self.pairs.get(j, np.eye(4))
+            left, right = (
+                replace(camera, body_T_cam=correction @ camera.body_T_cam) for camera in (pair.left, pair.right)
+            )
+            pairs.append(replace(pair, left=left, right=right))
+        imu = rig.imu
+        if imu is not None and self.offset_sigma_s is not None:
+            imu = replace(imu, time_offset_s=imu.time_offset_s + self.offset_s)
+        return replace(rig, pairs=tuple(pairs), imu=imu)
+
+
+def unknowns(session: int, pairs: int, with_imu: bool) -> Iterator[tuple[int, Any, gtsam.NonlinearFactor]]:
+    """Variables with their first values and priors; without an IMU the first pair is where the rig file has it."""
+    for pair in range(pairs):
+        sigmas = _FIRST_SIGMAS if pair == 0 else _OTHER_SIGMAS
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas if with_imu or pair else np.full(6, 1e-9))
+        yield c(session, pair), gtsam.Pose3(), gtsam.PriorFactorPose3(c(session, pair), gtsam.Pose3(), noise)
+    if with_imu:
+        prior = gtsam.PriorFactorVector(d(session), np.zeros(1), isotropic(1, _OFFSET_SIGMA_S))
+        yield d(session), np.zeros(1), prior
+
+
+def own_motion(
+    session: int, pair: int, i: int, j: int, motion: RelativeMotion, twists: tuple[Float, Float] | None
+) -> gtsam.NoiseModelFactor:
+    """What a pair alone says of the motion between two states.
+
+    Args:
+        session: its number.
+        pair: its number in the rig.
+        i: state that the motion is measured from.
+        j: state in which it ends.
+        motion: as the rig file's place of the pair makes it.
+        twists: (6,) ``[rotation, translation]`` a second of body at both states; None without an IMU.
+    """
+    keys = [x(i), x(j), c(session, pair)] + ([] if twists is None else [d(session)])
+    return gtsam.CustomFactor(gaussian(motion.covariance), keys, _error(motion.reference_T_current, twists))
+
+
+def correction_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, session: int, pairs: int) -> RigCorrection:
+    """The solution's corrections, with covariances."""
+    marginals = gtsam.Marginals(graph, values)
+    has_offset = values.exists(d(session))
+    return RigCorrection(
+        {pair: values.atPose3(c(session, pair)).matrix() for pair in range(pairs)},
+        {pair: np.asarray(marginals.marginalCovariance(c(session, pair))) for pair in range(pairs)},
+        float(values.atVector(d(session))[0]) if has_offset else 0.0,
+        float(np.sqrt(marginals.marginalCovariance(d(session))[0, 0])) if has_offset else None,
+    )
+
+
+def _error(measured: Float, twists: tuple[Float, Float] | None) -> Callable[..., Float]:
+    """Of ``measured^-1 C^-1 exp(-d xi_i) x_i^-1 x_j exp(d xi_j) C``, with derivatives on the right."""
+    inverse = se3_inverse(measured)
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, derivatives: list[Float] | None) -> Float:
+        keys = factor.keys()
+        then, now, correction = (values.atPose3(key).matrix() for key in keys[:3])
+        before, after = correction, correction
+        if twists is not None:
+            late_s = float(values.atVector(keys[3])[0])
+            before, after = (se3_compose(se3_exp(late_s * twist), correction) for twist in twists)
+        motion = se3_compose(se3_compose(se3_inverse(then), now), after)
+        seen = se3_compose(se3_inverse(before), motion)
+        residual = se3_log(se3_compose(inverse, seen))
+        if derivatives is not None:
+            left = gtsam.Pose3.LogmapDerivative(residual)
+            from_then, from_now = se3_adjoint(se3_inverse(motion)), se3_adjoint(se3_inverse(after))
+            derivatives[0] = np.asfortranarray(-left @ from_then)
+            derivatives[1] = np.asfortranarray(left @ from_now)
+            derivatives[2] = np.asfortranarray(left @ (np.eye(6) - se3_adjoint(se3_inverse(seen))))
+            if twists is not None:
+                change = from_now @ twists[1] - from_then @ twists[0]
+                derivatives[3] = np.asfortranarray((left @ change)[:, None])
+        return residual
+
+    return error

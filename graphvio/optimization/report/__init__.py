@@ -1,0 +1,1 @@
+"""What is written of an optimisation: all numbers, and a page for people with its pictures."""

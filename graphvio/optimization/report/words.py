@@ -1,0 +1,96 @@
+"""How numbers are told on the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from graphvio.backend.gating import chi_square_quantile
+from graphvio.optimization.optimize import Optimization
+from graphvio.optimization.report.numbers import Numbers
+
+_FAR_OFF = 2.0  # times the expected squares
+_SURELY = 0.999
+_NO_COST = 1e-6
+_MOST_PARTS = 40
+
+
+def length(metres: float | None) -> str:
+    """With its unit: millimetres below a decimetre."""
+    if metres is None:
+        return "unknown"
+    return f"{1e3 * metres:.2f} mm" if metres < 0.1 else f"{metres:.3f} m" if metres < 10.0 else f"{metres:.1f} m"
+
+
+def angle(degrees: float | None) -> str:
+    """With its unit."""
+    return "unknown" if degrees is None else f"{degrees:.4f} degrees" if degrees < 0.1 else f"{degrees:.2f} degrees"
+
+
+def plain(value: float | None) -> str:
+    """A number without a unit, to three digits, or all before the point."""
+    if value is None:
+        return ""
+    if abs(value) < 1e-9:
+        return "0"
+    if abs(value) >= 1e6:
+        return f"{value:.1e}"
+    return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
+
+
+def fell(found: Optimization) -> str:
+    """By what share the cost fell. It may rise where the odometry's smoother left little to gain."""
+    if found.cost_after > max(found.cost_before, _NO_COST):
+        return ": it rose, as loop closures move the states"
+    if found.cost_before < _NO_COST:
+        return ""
+    share = 100.0 * (1.0 - found.cost_after / found.cost_before)
+    return f": it fell by {share:.2f} %"
+
+
+def noise(numbers: Numbers) -> int:
+    """Whether residuals are smaller (-1) or larger (1) than the assumed noise makes them, by far and not by chance."""
+    degrees = numbers.dimensions - numbers.unknowns
+    if degrees <= 0:
+        return 0
+    squares = numbers.per_dimension * numbers.dimensions
+    if squares > max(_FAR_OFF * degrees, chi_square_quantile(_SURELY, degrees)):
+        return 1
+    return -1 if squares < min(degrees / _FAR_OFF, chi_square_quantile(1.0 - _SURELY, degrees)) else 0
+
+
+def doubts(found: Optimization, numbers: Numbers) -> list[str]:
+    """What a reader must know before using the result."""
+    made = []
+    if numbers.frames > 1:
+        made.append(
+            f"No loop closures join all parts: there are {numbers.frames} frames, and positions in different ones "
+            "cannot be compared."
+        )
+    if not numbers.used:
+        which = f"None of {len(found.loops)} loop closures" if found.loops else "No loop closure"
+        made.append(f"{which} is used: drift is what the odometry and the IMU leave of it.")
+    if noise(numbers) > 0:
+        made.append(
+            f"Residuals are larger than the noise that was assumed (mean square {plain(numbers.per_dimension)} per "
+            f"dimension, {plain(numbers.expected_per_dimension)} expected): sigmas are too small."
+        )
+    for each in numbers.sessions:
+        if each.accuracy is not None and each.accuracy["optimized"].position_m > each.accuracy["online"].position_m:
+            made.append(f"{each.name} is farther from the truth than the online trajectory was.")
+    return made
+
+
+def parts_in_words(numbers: Numbers, frame: int) -> list[str]:
+    """The epochs that are in a frame."""
+    inside = [part for part in numbers.parts if part.frame == frame]
+    made = [
+        f"{numbers.sessions[part.session].name}, epoch {part.epoch}: {part.begin_s:.1f} to {part.end_s:.1f} s, "
+        f"{part.framesets} {'frameset' if part.framesets == 1 else 'framesets'}"
+        for part in inside[:_MOST_PARTS]
+    ]
+    return made + ([f"and {len(inside) - _MOST_PARTS} more"] if len(inside) > _MOST_PARTS else [])
+
+
+def pairs_in_words(pairs: Sequence[tuple[int, int]]) -> str:
+    """Which pair saw at the second place what which pair saw at the first."""
+    return "; ".join(f"{first} by {second}" for first, second in pairs)

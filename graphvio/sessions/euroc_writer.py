@@ -1,0 +1,161 @@
+"""Writes a recording in the EuRoC/ASL layout, with graphvio's ``rig.yaml`` beside ``mav0``."""
+
+from __future__ import annotations
+
+import logging
+import re
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Self, TextIO
+
+import numpy as np
+
+from graphvio import euroc_layout
+from graphvio.arrays import Float
+from graphvio.errors import RigError
+from graphvio.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
+from graphvio.events import Event, FrameSet
+from graphvio.geometry import quat_wxyz_from_rotation
+from graphvio.rig import Rig
+from graphvio.rig_files.native import FILE_NAME
+from graphvio.sessions.storage import exists_error, not_writable_error
+
+if TYPE_CHECKING:
+    from graphvio.events import Incident
+
+_log = logging.getLogger(__name__)
+_COMMENT = "converted by graphvio"
+
+
+class EurocWriter:
+    """Writes sensors' events as a folder; values of the IMU and poses read back to the last digit.
+
+    Images bear the stamps of their framesets. When the disk is full writing stops, as with `SessionWriter`.
+
+    Args:
+        path: of the folder, which must not exist, or be empty.
+        rig: of the framesets.
+
+    Attributes:
+        stopped: why nothing is written any more, or None.
+        rig: as written: cameras are called ``cam0``, ``cam1`` and so on in the layout, and are renamed if they are not.
+
+    Raises:
+        SessionError: if the folder is not empty or cannot be made.
+    """
+
+    def __init__(self, path: Path, rig: Rig) -> None:
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise exists_error(path)
+        self.path = path
+        self.rig = _named_as_the_layout(rig)
+        self.stopped: str | None = None
+        self._mav0 = path / "mav0"
+        self._stamps: dict[str, list[int]] = {camera.name: [] for camera in self.rig.cameras}
+        self._tables: dict[str, TextIO] = {}
+        self._open = ExitStack()
+        try:
+            self._begin()
+        except OSError as error:
+            self._open.close()
+            raise not_writable_error(path, error) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def add(self, event: Event) -> None:
+        """Write an IMU sample or a frameset."""
+        try:
+            if self.stopped is None:
+                self._add(event)
+        except OSError as error:
+            self._stop(error)
+
+    def add_true_pose(self, stamp_ns: int, world_T_body: Float) -> None:
+        """Write a pose (4, 4) of the true trajectory."""
+        try:
+            if self.stopped is None:
+                quat_wxyz = quat_wxyz_from_rotation(np.ascontiguousarray(world_T_body[:3, :3]))
+                self._add_row(TRUTH_FOLDER, euroc_layout.exact_row(stamp_ns, [*world_T_body[:3, 3], *quat_wxyz]))
+        except OSError as error:
+            self._stop(error)
+
+    def add_incident(self, incident: Incident) -> None:
+        """The layout has no place for incidents."""
+
+    def close(self) -> None:
+        """Finish the folder; a second time does nothing."""
+        try:
+            if self.stopped is None:
+                self._write_sensors()
+            self._open.close()
+        except OSError as error:
+            if self.stopped is None:
+                self._stop(error)
+
+    def _begin(self) -> None:
+        self._mav0.mkdir(parents=True)
+        try:
+            self.rig.save(self.path / FILE_NAME)
+        except RigError as error:
+            raise OSError(None, str(error)) from None
+        for camera in self.rig.cameras:
+            (self._mav0 / camera.name / "data").mkdir(parents=True)
+            self._add_table(camera.name, euroc_layout.FRAME_HEADER)
+        if self.rig.imu is not None:
+            self._add_table(IMU_FOLDER, euroc_layout.IMU_HEADER)
+
+    def _add_table(self, folder: str, header: str) -> None:
+        (self._mav0 / folder).mkdir(exist_ok=True)
+        table = (self._mav0 / folder / "data.csv").open("w", encoding="ascii")
+        self._tables[folder] = self._open.enter_context(table)
+        table.write(header + "\n")
+
+    def _add_row(self, folder: str, row: str) -> None:
+        if folder == TRUTH_FOLDER and folder not in self._tables:
+            self._add_table(folder, euroc_layout.POSE_HEADER)
+        self._tables[folder].write(row + "\n")
+
+    def _add(self, event: Event) -> None:
+        if not isinstance(event, FrameSet):
+            values = [*event.angular_velocity, *event.linear_acceleration]
+            self._add_row(IMU_FOLDER, euroc_layout.exact_row(event.stamp_ns, values))
+            return
+        for number, images in sorted(event.images.items()):
+            pair = self.rig.pairs[number]
+            for camera, image in zip((pair.left, pair.right), images, strict=True):
+                euroc_layout.write_image(self._mav0 / camera.name / "data" / f"{event.stamp_ns}.png", image)
+                self._add_row(camera.name, euroc_layout.frame_row(event.stamp_ns))
+                self._stamps[camera.name].append(event.stamp_ns)
+
+    def _write_sensors(self) -> None:
+        for camera in self.rig.cameras:
+            text = euroc_layout.camera_yaml(camera, _rate_hz(self._stamps[camera.name]), f"{camera.name}, {_COMMENT}")
+            (self._mav0 / camera.name / "sensor.yaml").write_text(text, encoding="utf-8")
+        if self.rig.imu is not None:
+            (self._mav0 / IMU_FOLDER / "sensor.yaml").write_text(euroc_layout.imu_yaml(self.rig.imu, _COMMENT))
+        if TRUTH_FOLDER in self._tables:
+            (self._mav0 / TRUTH_FOLDER / "sensor.yaml").write_text(euroc_layout.truth_yaml(_COMMENT))
+
+    def _stop(self, error: OSError) -> None:
+        self.stopped = f"{self.path}: writing stopped ({error.strerror}); what was written until then can be read"
+        _log.error("%s", self.stopped)
+
+
+def _named_as_the_layout(rig: Rig) -> Rig:
+    if all(re.fullmatch(r"cam\d+", camera.name) for camera in rig.cameras):
+        return rig
+    pairs = tuple(
+        replace(pair, left=replace(pair.left, name=f"cam{2 * k}"), right=replace(pair.right, name=f"cam{2 * k + 1}"))
+        for k, pair in enumerate(rig.pairs)
+    )
+    return replace(rig, pairs=pairs)
+
+
+def _rate_hz(stamps_ns: list[int]) -> float:
+    """By the median interval; 0 where there is none."""
+    return 1e9 / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0

@@ -1,0 +1,95 @@
+"""The formats that recordings are converted to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol, Self
+
+from graphvio.arrays import Float
+from graphvio.errors import SessionError
+from graphvio.events import Event, Incident
+from graphvio.rig import Rig
+from graphvio.sessions.bag_storage import Ros1Storage, Ros2Storage
+from graphvio.sessions.euroc_writer import EurocWriter
+from graphvio.sessions.mcap_storage import McapStorage
+from graphvio.sessions.storage import Storage
+from graphvio.sessions.topics import ImageFormat
+from graphvio.sessions.writer import SessionWriter
+
+FORMATS = ("mcap", "rosbag1", "rosbag2", "euroc")
+
+_BY_SUFFIX = {".mcap": "mcap", ".bag": "rosbag1"}
+_STORAGES: dict[str, Callable[[Path], Storage]] = {"mcap": McapStorage, "rosbag1": Ros1Storage, "rosbag2": Ros2Storage}
+
+
+class RecordingWriter(Protocol):
+    """Takes what a source yields.
+
+    Attributes:
+        stopped: why nothing is written any more, or None.
+    """
+
+    stopped: str | None
+
+    @property
+    def rig(self) -> Rig:
+        """As written."""
+
+    def __enter__(self) -> Self:
+        """Itself."""
+
+    def __exit__(self, *_: object) -> None:
+        """Finish what is written."""
+
+    def add(self, event: Event) -> None:
+        """Write an IMU sample or a frameset."""
+
+    def add_true_pose(self, stamp_ns: int, world_T_body: Float) -> None:
+        """Write a pose (4, 4) of the true trajectory."""
+
+    def add_incident(self, incident: Incident) -> None:
+        """Write an incident, where the format has a place for it."""
+
+
+def format_of(path: Path, asked: str | None) -> str:
+    """The format, one of `FORMATS`, of what is written at a path.
+
+    Args:
+        path: a file ``NAME.mcap`` or ``NAME.bag``, or a folder.
+        asked: the format, or None to go by the name.
+
+    Raises:
+        SessionError: if the name does not tell it, or tells another.
+    """
+    if asked is not None and asked not in FORMATS:
+        raise SessionError(f"--format {asked}: is not known; give one of {', '.join(FORMATS)}")
+    told = _BY_SUFFIX.get(path.suffix)
+    if asked is None and told is None:
+        raise SessionError(
+            f"{path}: its name tells no format; name a file .mcap or .bag, or give --format rosbag2 or --format euroc "
+            "for a folder"
+        )
+    suffix = next((suffix for suffix, known in _BY_SUFFIX.items() if known == asked), None)
+    if asked is not None and asked != told and (told is not None or suffix is not None):
+        wanted = f"it {suffix}" if suffix is not None else "a folder without that ending"
+        raise SessionError(f"{path}: is not how {asked} is named; name {wanted}, or give another --format")
+    return asked or told or ""
+
+
+def open_writer(path: Path, rig: Rig, file_format: str, image_format: ImageFormat = "raw") -> RecordingWriter:
+    """A writer of a format.
+
+    Args:
+        path: of the file or folder, which must not exist.
+        rig: of the framesets.
+        file_format: one of `FORMATS`.
+        image_format: of images in sessions and bags; the EuRoC layout has PNG in any case.
+
+    Raises:
+        SessionError: if the target exists or cannot be made.
+        MissingExtraError: if the extra ``sessions`` is not installed.
+    """
+    if file_format == "euroc":
+        return EurocWriter(path, rig)
+    return SessionWriter(path, rig, image_format, _STORAGES[file_format])

@@ -1,0 +1,91 @@
+"""Messages as ROS 1 has them, from and to those of ROS 2: headers have a sequence number, and some names differ."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from graphvio.errors import MissingExtraError
+from graphvio.sessions import cdr
+from graphvio.sessions.messages import CAMERA_INFO, LOG, TRANSFORMS
+
+_HEADER, _OLD_LOG = "std_msgs/msg/Header", "rosgraph_msgs/msg/Log"
+_OLD_LEVELS = {10: 1, 20: 2, 30: 4, 40: 8, 50: 16}
+
+
+@cache
+def types() -> Any:
+    """The types of ROS 1 (Noetic), and that of ``tf_static``.
+
+    Raises:
+        MissingExtraError: if the extra ``sessions`` is not installed.
+    """
+    try:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError:
+        raise MissingExtraError("rosbags", "sessions", "writing a bag") from None
+    made = get_typestore(Stores.ROS1_NOETIC)
+    made.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
+    return made
+
+
+def type_name(name: str) -> str:
+    """The type that stands for one of ROS 2."""
+    return _OLD_LOG if name == LOG else name
+
+
+def modern(message: Any) -> Any:
+    """A ROS 1 message as ROS 2 has it; names of fields are lower case there."""
+    if isinstance(message, list):
+        return [modern(each) for each in message]
+    name = getattr(message, "__msgtype__", None)
+    if name is None:
+        return message
+    fields = {key.lower(): value for key, value in vars(message).items() if key != "__msgtype__"}
+    if name == _HEADER:
+        fields.pop("seq", None)
+    return cdr.make(name, **{key: modern(value) for key, value in fields.items()})
+
+
+def encode(message: Any, number: int) -> bytes:
+    """A ROS 2 message as ROS 1 has it, serialised.
+
+    Args:
+        message: one of those that graphvio writes.
+        number: of the message in its topic, for the headers.
+    """
+    old = _old_log(message, number) if message.__msgtype__ == LOG else _old(message, number)
+    return bytes(types().serialize_ros1(old, old.__msgtype__))
+
+
+def stamp_ns(data: bytes) -> int:
+    """The stamp of a message that begins with a header, without decoding the rest."""
+    return int.from_bytes(data[4:8], "little") * 1_000_000_000 + int.from_bytes(data[8:12], "little")
+
+
+def _old(message: Any, number: int) -> Any:
+    if isinstance(message, list):
+        return [_old(each, number) for each in message]
+    name = getattr(message, "__msgtype__", None)
+    if name is None:
+        return message
+    fields = {key: _old(value, number) for key, value in vars(message).items() if key != "__msgtype__"}
+    if name == _HEADER:
+        fields["seq"] = number
+    if name == CAMERA_INFO:
+        fields = {key.upper() if len(key) == 1 else key: value for key, value in fields.items()}
+    return types().types[name](**fields)
+
+
+def _old_log(message: Any, number: int) -> Any:
+    made = types().types
+    return made[_OLD_LOG](
+        header=made[_HEADER](seq=number, stamp=_old(message.stamp, number), frame_id=""),
+        level=_OLD_LEVELS[message.level],
+        name=message.name,
+        msg=message.msg,
+        file=message.file,
+        function=message.function,
+        line=message.line,
+        topics=[],
+    )

@@ -1,0 +1,39 @@
+"""The true trajectory that a session or bag carries."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.errors import TrajectoryError
+from graphvio.sessions import cdr
+from graphvio.sessions.mcap_file import Topic
+from graphvio.sessions.messages import ODOMETRY, POSE, pose_of, stamp_of
+from graphvio.sessions.opening import open_store
+from graphvio.sessions.topics import TRUTH_TOPIC
+
+
+def truth_topic(topics: Mapping[str, Topic]) -> Topic | None:
+    """The topic with the truth, or None."""
+    topic = topics.get(TRUTH_TOPIC)
+    return topic if topic is not None and topic.type_name in (POSE, ODOMETRY) and topic.places else None
+
+
+def read_truth(path: Path) -> tuple[Int, Float]:
+    """Stamps (N,), increasing, and poses (N, 4, 4) of the true trajectory in a session or bag.
+
+    Raises:
+        TrajectoryError: if it holds none.
+        SessionError: if it cannot be read.
+    """
+    store = open_store(path, lambda topic: topic == TRUTH_TOPIC)
+    topic = truth_topic(store.topics)
+    if topic is None:
+        raise TrajectoryError(f"{path}: holds no true trajectory, which would be poses on the topic {TRUTH_TOPIC}")
+    found = (cdr.decode(store.read(place), topic.type_name) for place in topic.places)
+    poses = {stamp_of(message.header): pose_of(message) for message in found}
+    stamps = sorted(poses)
+    return np.array(stamps, dtype=np.int64), np.array([poses[stamp] for stamp in stamps])

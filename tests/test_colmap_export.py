@@ -1,0 +1,238 @@
+"""The optimised session as COLMAP reads it: rigs, frames, poses and points, against ours and the true surfaces."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from calibration_walks import recorded, walk_simulator
+
+from graphvio import Config, Odometry, open_source
+from graphvio.arrays import Float
+from graphvio.config import OptimizationConfig
+from graphvio.errors import OptimizationError
+from graphvio.geometry import se3_inverse
+from graphvio.optimization.colmap_export import ColmapModel, export
+from graphvio.optimization.loops.database import FeatureDatabase, image_name
+from graphvio.optimization.loops.features import extract_places
+from graphvio.optimization.loops.matching import alike
+from graphvio.optimization.loops.places import choose_places
+from graphvio.optimization.loops.search import LoopClosure, Place, SessionInput
+from graphvio.optimization.optimize import JudgedLoop, Optimization, optimize
+from graphvio.optimization.record import Recorder
+
+pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed: the extra maps")
+
+SECONDS = 2.5
+NAME = "walk"
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    session: SessionInput
+    optimization: Optimization
+    folder: Path
+    models: list[ColmapModel]
+
+    @property
+    def database(self) -> Path:
+        return self.folder / "database.db"
+
+    def nav_T_body(self, stamp_ns: int) -> Float:
+        optimized = self.optimization.sessions[0]
+        return np.asarray(optimized.nav_T_body[np.searchsorted(optimized.record.stamps_ns, stamp_ns)])
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    folder = tmp_path_factory.mktemp("colmap")
+    source = open_source(recorded(folder / "recording", SECONDS))
+    config = replace(Config(), optimization=OptimizationConfig(features=500))
+    recorder = Recorder(NAME)
+    odometry = Odometry(source.rig, config, on_step=recorder.add)
+    for event in source:
+        odometry.process(event)
+    odometry.finish()
+    record = recorder.record()
+    places = [Place(0, int(row), int(record.stamps_ns[row])) for row in choose_places(record, 0.25, 10.0)]
+    session = SessionInput(NAME, source, source.rig, places)
+    optimization = optimize([record], [source.rig.imu], [], config)
+    with FeatureDatabase(folder / "database.db") as database:
+        stamps = [place.stamp_ns for place in places]
+        extract_places(source, source.rig, NAME, stamps, database, config)
+        models = export(optimization, [session], database, folder, config)
+    return Exported(session, optimization, folder, models)
+
+
+@pytest.fixture
+def again(exported: Exported, tmp_path: Path) -> Iterator[tuple[FeatureDatabase, Path]]:
+    """The database, to be changed, and a folder."""
+    shutil.copy(exported.database, tmp_path)
+    with FeatureDatabase(tmp_path / exported.database.name) as database:
+        yield database, tmp_path
+
+
+def read(exported: Exported) -> Any:
+    return pycolmap.Reconstruction(exported.models[0].folder)
+
+
+def test_rig_frames_and_images_are_those_of_the_database(exported: Exported) -> None:
+    model, rig = read(exported), exported.session.rig
+    assert model.num_rigs() == 1
+    assert model.num_reg_frames() == len(exported.session.places)
+    assert model.num_reg_images() == len(exported.session.places) * len(rig.cameras)
+    database = pycolmap.Database.open(exported.database)
+    for image in database.read_all_images():
+        kept = model.image(image.image_id)
+        assert (kept.name, kept.camera_id, kept.frame_id) == (image.name, image.camera_id, image.frame_id)
+        assert kept.num_points2D() == database.num_keypoints_for_image(image.image_id)
+    database.close()
+
+
+def test_cameras_are_ours(exported: Exported) -> None:
+    """COLMAP counts pixels from the image's corner, half a pixel before ours."""
+    model = read(exported)
+    for number, camera in zip(sorted(model.cameras), exported.session.rig.cameras, strict=True):
+        kept = model.camera(number)
+        assert kept.model_name == "OPENCV"
+        assert (kept.width, kept.height) == camera.size_px
+        np.testing.assert_array_equal(kept.params[:4] - [0.0, 0.0, 0.5, 0.5], camera.intrinsics)
+        np.testing.assert_array_equal(kept.params[4:], camera.distortion[:4])
+
+
+def test_poses_are_ours(exported: Exported) -> None:
+    cameras = {camera.name: camera for camera in exported.session.rig.cameras}
+    for image in read(exported).images.values():
+        _, camera, file = image.name.split("/")
+        expected = cameras[camera].cam_T_body @ se3_inverse(exported.nav_T_body(int(Path(file).stem)))
+        np.testing.assert_allclose(image.cam_from_world().matrix(), expected[:3], rtol=0.0, atol=1e-9)
+
+
+def test_points_are_seen_by_many_images_within_a_pixel(exported: Exported) -> None:
+    (told,), model = exported.models, read(exported)
+    assert told.reprojection_error_px < 0.5
+    assert told.mean_track_length > 3.0
+    assert (told.points, told.observations) == (model.num_points3D(), model.compute_num_observations())
+    errors = []
+    for image in model.images.values():
+        camera = exported.session.rig.cameras[sorted(model.cameras).index(image.camera_id)]
+        seen = [each for each in image.points2D if each.has_point3D()]
+        points = np.array([model.point3D(each.point3D_id).xyz for each in seen])
+        cam_T_world = image.cam_from_world().matrix()
+        pixels, _ = camera.project(points @ cam_T_world[:, :3].T + cam_T_world[:, 3])
+        errors += np.linalg.norm(pixels + 0.5 - [each.xy for each in seen], axis=1).tolist()
+    assert len(errors) == told.observations
+    assert np.mean(errors) == pytest.approx(told.reprojection_error_px, rel=1e-6)
+
+
+def test_points_lie_on_the_true_surfaces(exported: Exported) -> None:
+    simulator = walk_simulator(SECONDS)
+    row_of = {int(stamp): row for row, stamp in enumerate(simulator.stamps_ns)}
+    model = read(exported)
+    errors = []
+    for place in exported.session.places[::3]:
+        for number, camera in enumerate(exported.session.rig.cameras):
+            depth = simulator.view(row_of[place.stamp_ns], number).depth
+            image = model.find_image_with_name(image_name(NAME, camera.name, place.stamp_ns))
+            cam_T_world = image.cam_from_world()
+            for each in image.points2D:
+                if each.has_point3D():
+                    u, v = np.round(each.xy - 0.5).astype(int)
+                    errors.append((cam_T_world * model.point3D(each.point3D_id).xyz)[2] / depth[v, u] - 1.0)
+    assert len(errors) > 1000
+    assert np.median(np.abs(errors)) < 0.01
+    assert np.mean(np.abs(errors) > 0.1) < 0.03
+
+
+def test_images_are_lossless(exported: Exported) -> None:
+    place, pair = exported.session.places[-1], exported.session.rig.pairs[1]
+    images = exported.session.source.frameset_at(place.stamp_ns).images[1]
+    for camera, image in zip((pair.left, pair.right), images, strict=True):
+        path = exported.folder / "images" / image_name(NAME, camera.name, place.stamp_ns)
+        np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), image)
+    assert all((exported.folder / "images" / image.name).exists() for image in read(exported).images.values())
+
+
+def test_descriptors_are_matched_as_by_colmap(exported: Exported) -> None:
+    first, second = (image_name(NAME, "cam0", place.stamp_ns) for place in exported.session.places[:2])
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    matcher = pycolmap.FeatureMatcher.create(options, pycolmap.Device.cpu)
+    file = pycolmap.Database.open(exported.database)
+    keypoints, descriptors = [], []
+    for image in (file.read_image_with_name(first), file.read_image_with_name(second)):
+        rows = np.zeros((file.num_keypoints_for_image(image.image_id), 4), dtype=np.float32)
+        rows[:, 2] = 1.0
+        keypoints.append(pycolmap.keypoints_from_matrix(rows))
+        descriptors.append(file.read_descriptors(image.image_id))
+    file.close()
+    expected = matcher.match(keypoints[0], descriptors[0], keypoints[1], descriptors[1])
+    found = alike(*(np.asarray(each.data) for each in descriptors))
+    assert len(found) > 50
+    np.testing.assert_array_equal(found, expected)
+    assert alike(np.zeros((0, 128), np.uint8), np.asarray(descriptors[0].data)).shape == (0, 2)
+
+
+def test_matches_of_a_refused_loop_closure_make_no_points(
+    exported: Exported, again: tuple[FeatureDatabase, Path]
+) -> None:
+    database, folder = again
+    places = exported.session.places
+    names = [image_name(NAME, "cam0", place.stamp_ns) for place in (places[0], places[-1])]
+    rows = np.column_stack([np.arange(100), np.arange(100)])
+    database.add_matches(names[0], names[1], rows)
+    closure = LoopClosure(places[0], places[-1], np.eye(4), np.eye(6), 100, ((0, 0),), False)
+    refused = replace(exported.optimization, loops=[JudgedLoop(closure, "far from what all others say", 1e3)])
+    (model,) = export(refused, [exported.session], database, folder, Config())
+    assert (names[0], names[1]) not in database.verified_pairs()
+    np.testing.assert_array_equal(database.all_matches(names[0], names[1]), rows)
+    assert (model.points, model.observations) == (exported.models[0].points, exported.models[0].observations)
+
+
+def test_of_a_used_loop_closure_only_matches_that_fit_the_poses_are_verified(
+    exported: Exported, again: tuple[FeatureDatabase, Path]
+) -> None:
+    """The matches of two neighbours, as if a search had found them, and as many that are wrong."""
+    database, folder = again
+    places = exported.session.places[:2]
+    names = [image_name(NAME, "cam0", place.stamp_ns) for place in (places[0], places[1])]
+    right, all_rows = database.matches(names[0], names[1]), database.all_matches(names[0], names[1])
+    assert 0.8 * len(all_rows) < len(right) <= len(all_rows)
+    others = image_name(NAME, "cam2", places[1].stamp_ns)
+    count = min(len(database.pixels(names[0])), len(database.pixels(others)))
+    wrong = np.column_stack([np.arange(count), np.arange(count)[::-1]])
+    database.add_matches(names[0], others, wrong)
+    closure = LoopClosure(places[0], places[1], np.eye(4), np.eye(6), 100, ((0, 1),), False)
+    used = replace(exported.optimization, loops=[JudgedLoop(closure, "", 1.0)])
+    export(used, [exported.session], database, folder, Config())
+    np.testing.assert_array_equal(database.matches(names[0], names[1]), right)
+    assert len(database.matches(names[0], others)) < 0.2 * len(wrong)
+
+
+def test_each_frame_is_a_model_and_the_largest_comes_first(
+    exported: Exported, again: tuple[FeatureDatabase, Path]
+) -> None:
+    database, folder = again
+    (folder / "sparse" / "7").mkdir(parents=True)
+    session = exported.optimization.sessions[0]
+    parted = np.where(np.arange(len(session.frame)) < exported.session.places[2].row, 0, 1)
+    apart = replace(exported.optimization, sessions=[replace(session, frame=parted)])
+    models = export(apart, [exported.session], database, folder, Config())
+    assert [each.frame for each in models] == [1, 0]
+    assert [each.places for each in models] == [len(exported.session.places) - 2, 2]
+    assert sorted(path.name for path in (folder / "sparse").iterdir()) == ["0", "1"]
+    first, second = (pycolmap.Reconstruction(each.folder) for each in models)
+    assert not set(first.images) & set(second.images)
+    assert min(first.num_points3D(), second.num_points3D()) > 0
+
+
+def test_a_database_without_the_places_is_told(exported: Exported, tmp_path: Path) -> None:
+    path = tmp_path / "empty.db"
+    with FeatureDatabase(path) as database, pytest.raises(OptimizationError, match=r"empty\.db: holds no image"):
+        export(exported.optimization, [exported.session], database, tmp_path, Config())

@@ -1,0 +1,245 @@
+"""Sessions as one graph, on sessions drawn by chance whose truth and noise are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from graphvio.arrays import Bool, Float
+from graphvio.backend.factors import x
+from graphvio.config import Config, SmootherConfig
+from graphvio.errors import OptimizationError
+from graphvio.evaluation import evaluate
+from graphvio.frontend.motion import RelativeMotion
+from graphvio.geometry import se3_exp, se3_inverse, se3_log
+from graphvio.optimization.consistency import motion_between
+from graphvio.optimization.drawn_session import DrawnSession, closure_between, draw_session
+from graphvio.optimization.exchange import write_g2o
+from graphvio.optimization.extrinsics import c, d, own_motion
+from graphvio.optimization.loops import saved
+from graphvio.optimization.loops.search import LoopClosure
+from graphvio.optimization.nodes import choose_nodes, spread
+from graphvio.optimization.optimize import Optimization, optimize
+from graphvio.optimization.record import Motions, SessionRecord
+from graphvio.rig import Imu
+from graphvio.simulation import default_rig
+from graphvio.trajectory import Trajectory
+
+IMU = Imu()
+CONFIG = Config()
+
+
+@pytest.fixture(scope="module")
+def walk() -> DrawnSession:
+    """Three and a half laps with 40 closures, of which the last 12 are false."""
+    return draw_session(315.0, 1, IMU, 40, 0.3)
+
+
+def ate_m(poses: Float, drawn: DrawnSession) -> float:
+    return evaluate(Trajectory(drawn.record.stamps_ns, poses), drawn.truth).ate_position_m.rmse
+
+
+def optimized(drawn: DrawnSession, closures: list[LoopClosure]) -> Optimization:
+    return optimize([drawn.record], [IMU], closures, CONFIG)
+
+
+def test_false_closures_do_not_bend_the_trajectory(walk: DrawnSession) -> None:
+    """With 30 % false closures the result is within a tenth of that of the right ones alone."""
+    right = walk.closures[: -walk.false]
+    clean, mixed, alone = optimized(walk, right), optimized(walk, walk.closures), optimized(walk, [])
+    assert ate_m(clean.sessions[0].nav_T_body, walk) < 0.5 * ate_m(alone.sessions[0].nav_T_body, walk)
+    assert ate_m(alone.sessions[0].nav_T_body, walk) < ate_m(walk.record.online, walk)
+    assert ate_m(mixed.sessions[0].nav_T_body, walk) < 1.1 * ate_m(clean.sessions[0].nav_T_body, walk)
+    assert [bool(loop.refusal) for loop in mixed.loops] == [False] * len(right) + [True] * walk.false
+    assert all("standard deviations from what all others say" in loop.refusal for loop in mixed.loops[-walk.false :])
+    assert mixed.cost_after < mixed.cost_before
+    assert 0.1 < mixed.after["loop"].per_dimension < 1.2  # of the IMU's noise three times as much is expected
+
+
+def test_false_closures_that_agree_with_each_other_are_refused(walk: DrawnSession) -> None:
+    """As many wrong ones as right ones, all off by the same two metres, as where a pattern repeats."""
+    right = walk.closures[: -walk.false]
+    shift = np.eye(4)
+    shift[:3, 3] = 2.0, 0.0, 0.0
+    wrong = [replace(each, reference_T_current=shift @ each.reference_T_current) for each in right]
+    found = optimized(walk, right + wrong)
+    assert [bool(loop.refusal) for loop in found.loops] == [False] * len(right) + [True] * len(wrong)
+
+
+def test_what_is_told_of_the_uncertainty_is_true() -> None:
+    """NEES of the last pose seen from the first, over 60 walks with the IMU's noise as it is: 95 % band of its mean."""
+    config = replace(CONFIG, smoother=replace(SmootherConfig(), imu_noise_scale=1.0))
+    squares = []
+    for seed in range(60):
+        drawn = draw_session(12.0, seed, IMU, 0)
+        found = optimize([drawn.record], [IMU], [], config)
+        last = len(found.sessions[0].nodes.rows) - 1
+        relative, covariance = motion_between(gtsam.Marginals(found.graph, found.values), found.values, 0, last)
+        true = se3_inverse(drawn.truth.nav_T_body[0]) @ drawn.truth.nav_T_body[-1]
+        error = se3_log(se3_inverse(relative) @ true)
+        squares.append(error @ np.linalg.solve(covariance, error))
+    assert 5.15 < np.mean(squares) < 6.9
+
+
+def test_sessions_of_one_place_come_into_one_frame() -> None:
+    """Two walks, each in a frame of its own, are one after a few closures between them; one closure is not believed."""
+    one, other = draw_session(100.0, 1, IMU, 10), draw_session(100.0, 2, IMU, 10, session=1)
+    turned = se3_exp(np.array([0.0, 0.0, 2.0, 5.0, -3.0, 0.4]))
+    elsewhere = replace(
+        other.record,
+        online=turned @ other.record.online,
+        smoothed=turned @ other.record.smoothed,
+        velocity_nav=other.record.velocity_nav @ turned[:3, :3].T,
+    )
+    between = [closure_between(one, other, row, 5) for row in (80, 400, 1200)]
+    apart = optimize([one.record, elsewhere], [IMU, IMU], [*one.closures, *other.closures, between[0]], CONFIG)
+    assert apart.frames == [0, 1]
+    assert apart.loops[-1].refusal.startswith("too few closures agree")
+    joined = optimize([one.record, elsewhere], [IMU, IMU], [*one.closures, *other.closures, *between], CONFIG)
+    assert joined.frames == [0, 0]
+    assert [set(each.frame.tolist()) for each in joined.sessions] == [{0}, {0}]
+    apart_m = np.linalg.norm(
+        joined.sessions[0].nav_T_body[:, :3, 3] - joined.sessions[1].nav_T_body[:, :3, 3], axis=1
+    )  # both walks go the same way at the same time
+    assert apart_m.max() < 0.1
+
+
+def chosen(motions: Motions, which: Bool) -> Motions:
+    columns: dict[str, Any] = {name: column[which] for name, column in motions._asdict().items()}
+    return Motions(**columns)
+
+
+def broken(drawn: DrawnSession, row: int) -> SessionRecord:
+    """The same walk with a new epoch from a row on, whose first pose is a wrong guess."""
+    record, moved = drawn.record, se3_exp(np.array([0.0, 0.0, 0.5, 3.0, 1.0, 0.0]))
+    kept = (record.motions.reference >= row) | (record.motions.row < row)
+    poses = record.smoothed.copy()
+    poses[row:] = moved @ poses[row:]
+    velocity = record.velocity_nav.copy()
+    velocity[row:] = velocity[row:] @ moved[:3, :3].T
+    epoch = record.epoch.copy()
+    epoch[row:] = 1
+    motions = chosen(record.motions, kept)
+    return replace(record, online=poses, smoothed=poses, velocity_nav=velocity, epoch=epoch, motions=motions)
+
+
+def test_a_break_is_bridged_by_closures_and_stays_declared_without(walk: DrawnSession) -> None:
+    record = broken(walk, 3000)
+    found = optimize([record], [IMU], walk.closures, CONFIG)
+    assert found.frames == [0, 0]
+    assert ate_m(found.sessions[0].nav_T_body, walk) < 0.1
+    alone = optimize([record], [IMU], [], CONFIG)
+    assert alone.frames == [0, 1]
+    assert np.array_equal(alone.sessions[0].frame, record.epoch)
+
+
+def test_without_an_imu_motions_alone_are_solved(walk: DrawnSession) -> None:
+    record = replace(walk.record, with_imu=np.zeros(len(walk.record.stamps_ns), dtype=bool))
+    found = optimize([record], [None], walk.closures, CONFIG)
+    assert "imu" not in found.after
+    assert ate_m(found.sessions[0].nav_T_body, walk) < 0.3 * ate_m(record.online, walk)
+
+
+def test_a_part_without_any_measurement_is_held_by_constant_velocity(walk: DrawnSession) -> None:
+    """Neither motions nor IMU for half a second: the graph still has one solution."""
+    record = walk.record
+    blind = (record.motions.row > 1000) & (record.motions.reference < 1010)
+    covers = record.inertial.covers.copy()
+    covers[1000:1011] = False
+    motions = chosen(record.motions, ~blind)
+    record = replace(record, motions=motions, inertial=record.inertial._replace(covers=covers))
+    found = optimize([record], [IMU], [], CONFIG)
+    assert np.isfinite(found.sessions[0].covariance).all()
+    assert "walk" in found.after
+
+
+def test_poses_between_states_keep_the_smoothed_motion(walk: DrawnSession) -> None:
+    nodes = choose_nodes(walk.record, 1.0)
+    exact = spread(nodes, walk.record.smoothed[nodes.rows])
+    np.testing.assert_allclose(exact, walk.record.smoothed, atol=1e-9)
+    moved = se3_exp(np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]))
+    elsewhere = spread(nodes, moved @ walk.record.smoothed[nodes.rows])
+    np.testing.assert_allclose(elsewhere, moved @ walk.record.smoothed, atol=1e-9)
+
+
+def test_the_calibration_is_found_with_the_trajectory() -> None:
+    """A pair off by 0.5 degrees and 3 mm, another by 2 degrees and 4 cm, images 6 ms late: found within sigmas."""
+    true = [
+        se3_exp(np.array([0.005, -0.006, 0.004, 0.002, -0.001, 0.002])),
+        se3_exp(np.array([-0.02, 0.03, 0.01, 0.03, 0.02, -0.02])),
+    ]
+    drawn = draw_session(180.0, 4, IMU, 20, corrections=true, offset_s=0.006)
+    found = optimize([drawn.record], [IMU], drawn.closures, CONFIG, calibrates=True)
+    (correction,) = found.corrections
+    for pair, expected in enumerate(true):
+        error = se3_log(se3_inverse(correction.pairs[pair]) @ expected)
+        assert np.linalg.norm(error[:3]) < 2e-3
+        assert error @ np.linalg.solve(correction.covariances[pair], error) < 16.8
+    assert correction.offset_sigma_s is not None
+    assert abs(correction.offset_s - 0.006) < min(1e-3, 4.0 * correction.offset_sigma_s)
+    rig = correction.corrected(default_rig())
+    np.testing.assert_allclose(
+        rig.pairs[1].right.body_T_cam, correction.pairs[1] @ default_rig().pairs[1].right.body_T_cam
+    )
+
+
+def test_derivatives_of_a_single_pairs_motion() -> None:
+    rng = np.random.default_rng(3)
+    twists = rng.standard_normal((2, 6))
+    motion = RelativeMotion(0, 1, se3_exp(0.5 * rng.standard_normal(6)), np.eye(6), np.zeros((6, 6)), 10)
+    factor = own_motion(0, 1, 0, 1, motion, (twists[0], twists[1]))
+    values = gtsam.Values()
+    for key in (x(0), x(1), c(0, 1)):
+        values.insert(key, gtsam.Pose3(se3_exp(0.5 * rng.standard_normal(6))))
+    values.insert(d(0), np.array([0.1]))
+    found, _ = factor.linearize(values).jacobian()
+    columns = []
+    for key, size in ((x(0), 6), (x(1), 6), (c(0, 1), 6), (d(0), 1)):
+        for axis in range(size):
+            both = []
+            for step in (1e-6, -1e-6):
+                change = gtsam.VectorValues()
+                change.insert(key, step * np.eye(size)[axis])
+                both.append(factor.unwhitenedError(values.retract(change)))
+            columns.append((both[0] - both[1]) / 2e-6)
+    np.testing.assert_allclose(found, np.array(columns).T, atol=1e-6)
+
+
+def test_records_and_closures_are_kept_to_the_bit(walk: DrawnSession, tmp_path: Path) -> None:
+    record, closures = tmp_path / "record.npz", tmp_path / "loops.npz"
+    record.write_bytes(walk.record.to_bytes())
+    closures.write_bytes(saved.to_bytes(walk.closures))
+    again, loops = SessionRecord.load(record), saved.load(closures)
+    assert again.to_bytes() == walk.record.to_bytes()
+    assert saved.to_bytes(loops) == saved.to_bytes(walk.closures)
+    first, second = optimized(walk, walk.closures), optimize([again], [IMU], loops, CONFIG)
+    assert np.array_equal(first.sessions[0].nav_T_body, second.sessions[0].nav_T_body)
+    record.write_bytes(record.read_bytes()[:-100])
+    with pytest.raises(OptimizationError, match="is no record of a session"):
+        SessionRecord.load(record)
+
+
+def test_other_tools_find_the_same_optimum_in_the_pose_graph(walk: DrawnSession, tmp_path: Path) -> None:
+    """What g2o holds of motions, IMU and closures has its optimum where the full graph has it."""
+    found = optimized(walk, walk.closures)
+    write_g2o(found, tmp_path / "graph.g2o")
+    graph, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
+    nodes = found.sessions[0].nodes
+    assert values.size() == len(nodes.rows)
+    disturbed = gtsam.Values()
+    for k, row in enumerate(nodes.rows.tolist()):
+        disturbed.insert(k, gtsam.Pose3(walk.record.smoothed[row]))
+    first = gtsam.Pose3(found.sessions[0].nav_T_body[nodes.rows[0]])
+    graph.add(gtsam.PriorFactorPose3(0, first, gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    solution = gtsam.LevenbergMarquardtOptimizer(graph, disturbed).optimize()
+    apart = [
+        np.linalg.norm(solution.atPose3(k).translation() - found.sessions[0].nav_T_body[row, :3, 3])
+        for k, row in enumerate(nodes.rows.tolist())
+    ]
+    assert max(apart) < 0.02
+    assert found.values.exists(x(0))

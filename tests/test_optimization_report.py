@@ -1,0 +1,235 @@
+"""The report of an optimisation, of walks on a circle that are made by hand."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from base64 import b64decode
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from graphvio.arrays import Float
+from graphvio.config import Config
+from graphvio.errors import OptimizationError
+from graphvio.geometry import se3, se3_exp, se3_inverse, so3_exp
+from graphvio.optimization.loops.search import LoopClosure, Place
+from graphvio.optimization.optimize import JudgedLoop, Optimization, optimize
+from graphvio.optimization.record import NO_MOTIONS, Inertial, Motions, SessionRecord
+from graphvio.optimization.report.words import length, plain
+from graphvio.optimization.report.write import write_report
+from graphvio.trajectory import Trajectory
+
+POSES, LAP = 120, 60
+SIGMAS = np.repeat([2e-3, 1e-2], 3)  # radians, metres
+STEP_NS = 100_000_000
+
+
+def circle() -> Float:
+    """(N, 4, 4): two laps."""
+    angles = 2.0 * np.pi * np.arange(POSES) / LAP
+    rotations = [so3_exp(np.array([0.0, 0.0, angle])) for angle in angles]
+    places = np.column_stack([5.0 * np.sin(angles), 5.0 - 5.0 * np.cos(angles), 0.2 * np.sin(3.0 * angles)])
+    return np.array([se3(rotation, place) for rotation, place in zip(rotations, places, strict=True)])
+
+
+def session(name: str, seed: int, breaks: tuple[int, ...] = ()) -> SessionRecord:
+    """As an odometry without IMU would see the circle, whose poses drift; at breaks a new epoch begins."""
+    rng, true = np.random.default_rng(seed), circle()
+    epoch = np.searchsorted(np.array(breaks, dtype=np.int64), np.arange(POSES), side="right")
+    poses, motions, rows = [np.eye(4)], [], []
+    for k in range(1, POSES):
+        motion = se3_inverse(true[k - 1]) @ true[k] @ se3_exp(SIGMAS * rng.standard_normal(6))
+        if epoch[k] == epoch[k - 1]:
+            motions.append(motion)
+            rows.append(k)
+        poses.append(poses[-1] @ motion if epoch[k] == epoch[k - 1] else np.eye(4))
+    ends, count = np.array(rows, dtype=np.int64), len(rows)
+    covariance, zero = np.diag(SIGMAS**2), np.zeros((POSES, 3))
+    no, nothing = np.zeros(POSES, dtype=bool), np.zeros((count, 6, 6))
+    return SessionRecord(
+        name=name,
+        stamps_ns=STEP_NS * np.arange(1, POSES + 1, dtype=np.int64),
+        epoch=epoch.astype(np.int64),
+        online=np.array(poses),
+        smoothed=np.array(poses),
+        covariance=np.array([(k + 1) * covariance for k in range(POSES)]),
+        velocity_nav=zero,
+        gyro_bias=zero,
+        accel_bias=zero,
+        at_rest=no,
+        is_keyframe=~no,
+        with_imu=no,
+        motions=Motions(
+            ends - 1, ends, np.array(motions), np.repeat(covariance[None], count, 0), nothing, np.full(count, 100)
+        ),
+        own=NO_MOTIONS,
+        own_pair=np.zeros(0, dtype=np.int64),
+        inertial=Inertial(np.zeros(POSES + 1, dtype=np.int64), no, np.zeros(0), np.zeros((0, 6))),
+    )
+
+
+def loop(first: tuple[int, int], second: tuple[int, int], reference_T_current: Float, points: int) -> LoopClosure:
+    """Between places, which are a session's number and a row."""
+    earlier, later = (Place(number, row, STEP_NS * (row + 1)) for number, row in (first, second))
+    return LoopClosure(earlier, later, reference_T_current, 1e-6 * np.eye(6), points, ((0, 0), (0, 1)), True)
+
+
+def between(first: int, second: int) -> Float:
+    return np.asarray(se3_inverse(circle()[first]) @ circle()[second])
+
+
+@pytest.fixture(scope="module")
+def one() -> Optimization:
+    """A session with a right loop and a wrong one."""
+    loops = [loop((0, 2), (0, 62), between(2, 62), 321), loop((0, 20), (0, 110), np.eye(4), 45)]
+    return optimize([session("ring<1>", 1)], [None], loops, Config())
+
+
+def two_sessions() -> Optimization:
+    """Two, of which the second's first epoch lies in a frame of its own, as its loop closures cannot say where."""
+    records = [session("first", 2), session("second", 3, breaks=(30,))]
+    found = optimize(records, [None, None], [], Config())
+    first, second = found.sessions
+    frame, poses = np.where(np.arange(POSES) < 30, 1, 0), second.nav_T_body.copy()
+    poses[30:] = circle()[30:]
+    loops = [JudgedLoop(loop((0, row), (1, row + LAP), between(row, row + LAP), 100), "", 3.0) for row in (5, 15, 25)]
+    return replace(
+        found, sessions=[first, replace(second, frame=frame, nav_T_body=poses)], frames=[0, 1, 0], loops=loops
+    )
+
+
+@pytest.fixture(scope="module")
+def truth() -> Trajectory:
+    return Trajectory(STEP_NS * np.arange(1, POSES + 1, dtype=np.int64), circle())
+
+
+class Page(HTMLParser):
+    """Its text, and the pictures; fails where elements are not closed in turn."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.text, self.pictures, self._open = "", list[bytes](), list[str]()
+        self.feed(html)
+        self.close()
+        assert not self._open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        if tag == "img":
+            kind, data = str(values["src"]).split(",", 1)
+            assert kind == "data:image/png;base64"
+            assert values["alt"]
+            self.pictures.append(b64decode(data, validate=True))
+        elif tag != "meta":
+            self._open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data + " "
+
+
+def report(found: Optimization, folder: Path, truths: list[Trajectory | None]) -> tuple[Page, dict[str, Any]]:
+    path = write_report(found, folder, truths)
+    assert {file.name for file in folder.iterdir()} == {"report.html", "summary.json"}
+    html = path.read_text(encoding="utf-8")
+    assert "http" not in html
+    return Page(html), json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def written(
+    one: Optimization, truth: Trajectory, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Page, dict[str, Any]]:
+    return report(one, tmp_path_factory.mktemp("one") / "new" / "folder", [truth])
+
+
+def test_page_and_summary_tell_the_same(one: Optimization, written: tuple[Page, dict[str, Any]]) -> None:
+    page, summary = written
+    assert summary["loops"]["found"] == 2
+    assert summary["loops"]["used"] == 1
+    assert "2 found, 1 used, 1 refused" in page.text
+    assert summary["cost"]["after"] == one.cost_after
+    assert summary["cost"]["before"] == one.cost_before
+    (each,) = summary["sessions"]
+    assert (each["framesets"], each["states"]) == (POSES, len(one.sessions[0].nodes.rows))
+    assert f"{POSES}, of which {each['states']} are states" in page.text
+    for stage in ("online", "optimized"):
+        assert length(each["ate_rmse"][stage]["position_m"]) in page.text
+    assert each["ate_rmse"]["optimized"]["position_m"] < each["ate_rmse"]["online"]["position_m"]
+    error = summary["loops"]["error_of_used"]
+    assert error["online"]["count"] == 1
+    assert error["optimized"]["max_m"] < 0.1 * error["online"]["max_m"]
+    assert length(error["online"]["max_m"]) in page.text
+    for kind, residuals in summary["residuals"].items():
+        assert kind in page.text
+        assert plain(residuals["after"]["per_dimension"]) in page.text
+    assert summary["residuals"]["loop"]["before"]["per_dimension"] > 100.0
+    assert summary["unknowns"] == one.values.dim()
+    assert "ring<1>" in page.text
+
+
+def test_refused_loops_are_told_with_the_reason(written: tuple[Page, dict[str, Any]]) -> None:
+    page, told = written
+    wrong = told["loops"]["all"][1]
+    assert wrong["refusal"]
+    assert f"refused: {wrong['refusal']}" in page.text
+    assert wrong["points"] == 45
+    assert (wrong["reference"]["since_start_s"], wrong["current"]["since_start_s"]) == (2.0, 11.0)
+    assert re.search(r"2\.00 s\s+11\.00 s\s+0 by 0; 0 by 1\s+45\s+0\.000 m, 0\.0 degrees", page.text)
+
+
+def test_pictures_hold_all_of_it(written: tuple[Page, dict[str, Any]]) -> None:
+    page, _ = written
+    assert len(page.pictures) == 4  # map, moved, sigmas, residuals
+    for png in page.pictures:
+        pixels = matplotlib.image.imread(io.BytesIO(png))[..., :3]
+        assert min(pixels.shape[:2]) > 300
+        assert 0.01 < (pixels.min(axis=2) < 0.9).mean() < 0.6
+        ink = pixels.min(axis=2) < 0.9
+        assert not ink[[0, -1]].any()
+        assert not ink[:, [0, -1]].any()
+    pixels = matplotlib.image.imread(io.BytesIO(page.pictures[0]))[..., :3]
+    blue, red = (pixels[..., channel] - pixels[..., 2 - channel] > 0.2 for channel in (2, 0))
+    for half in (slice(None, pixels.shape[1] // 2), slice(pixels.shape[1] // 2, None)):
+        assert blue[:, half].sum() > 300
+        assert red[:, half].sum() > 100
+
+
+def test_parts_that_nothing_joins_are_told(truth: Trajectory, tmp_path: Path) -> None:
+    found = two_sessions()
+    page, told = report(found, tmp_path, [truth, None])
+    assert told["frames"] == 2
+    assert "there are 2 frames" in page.text
+    assert "Frame 1" in page.text
+    assert "second, epoch 0: 0.0 to 2.9 s, 30 framesets" in page.text
+    assert len(page.pictures) == 5
+    assert "second: no ground truth" in page.text
+    error = told["loops"]["error_of_used"]
+    assert error["online"]["count"] == 0
+    assert error["optimized"]["count"] == 3
+
+
+def test_long_lists_of_loops_are_cut(one: Optimization, tmp_path: Path) -> None:
+    many = replace(one, loops=[one.loops[0]] * 230)
+    page, told = report(many, tmp_path, [None])
+    assert "no ground truth" in page.text
+    assert "and 30 more" in page.text
+    assert page.text.count("0 by 0; 0 by 1") == 200
+    assert len(told["loops"]["all"]) == 230
+
+
+def test_what_cannot_be_written_is_told(one: Optimization, tmp_path: Path) -> None:
+    with pytest.raises(OptimizationError, match="2 truths for 1 sessions"):
+        write_report(one, tmp_path, [None, None])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OptimizationError, match="cannot be written"):
+        write_report(one, tmp_path / "file", [None])

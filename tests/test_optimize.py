@@ -1,0 +1,142 @@
+"""``graphvio optimize`` on rendered images: its files, what an interrupted run does, several sessions, real data."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calibration_walks import recorded
+from typer.testing import CliRunner, Result
+
+from graphvio import open_source
+from graphvio.arrays import Float
+from graphvio.cli import app
+from graphvio.config import Config
+from graphvio.errors import MissingExtraError, OptimizationError
+from graphvio.geometry import se3_inverse, se3_log
+from graphvio.optimization.pipeline import optimize_sessions
+from graphvio.trajectory import Trajectory
+
+pytest.importorskip("pycolmap", reason="loop closure needs the extra maps")
+CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
+SECONDS = 7.0
+SETTINGS = "optimization: {loop_interval_s: 3.0, place_distance_m: 0.2, features: 500}\n"
+ALWAYS_EQUAL = ("trajectory_optimized.txt", "covariance.csv", "graph.g2o", "loops.npz", "walk/record.npz")
+
+
+def to_and_fro(t: Float) -> Float:
+    """Every four seconds at the same place, looking the same way."""
+    swing, zero = 0.5 * np.pi * t, np.zeros_like(t)
+    return np.column_stack(
+        [0.7 * np.sin(swing), 0.5 * np.cos(swing), 1.45 + zero, 0.3 * np.sin(swing), zero, 0.05 * np.cos(2.0 * swing)]
+    )
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(tmp_path_factory.mktemp("optimize") / "walk", SECONDS, to_and_fro)
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("settings") / "settings.yaml"
+    file.write_text(SETTINGS)
+    return file
+
+
+@pytest.fixture(scope="module")
+def done(walk: Path, settings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of a run that nothing interrupted."""
+    out = tmp_path_factory.mktemp("results") / "walk"
+    finished = command(walk, "--config", settings, "--out", out)
+    assert finished.exit_code == 0, finished.output
+    return out
+
+
+def command(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["optimize", *map(str, arguments)], env={"COLUMNS": "160"})
+
+
+def test_the_result_is_better_than_online(done: Path) -> None:
+    summary = json.loads((done / "summary.json").read_text())
+    (session,) = summary["sessions"]
+    errors = {name: each["position_m"] for name, each in session["ate_rmse"].items()}
+    assert errors["optimized"] < 0.5 * errors["online"]
+    assert errors["optimized"] < 0.002
+    assert summary["loops"]["used"] >= 5
+    assert summary["cost"]["after"] < summary["cost"]["before"]
+    for name in (*ALWAYS_EQUAL, "report.html", "database.db", "colmap/sparse/0/points3D.bin"):
+        assert (done / name).stat().st_size > 100, name
+    trajectory = Trajectory.read(done / "trajectory_optimized.txt")
+    assert len(trajectory) == session["framesets"]
+
+
+def test_a_killed_run_goes_on_and_ends_the_same(walk: Path, settings: Path, done: Path, tmp_path: Path) -> None:
+    out = tmp_path / "walk"
+    line = [sys.executable, "-c", "from graphvio.cli import main; main()", "optimize", walk, "--config", settings]
+    line += ["--out", out]
+    process = subprocess.Popen([str(part) for part in line], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120.0
+    while not (out / "database.db").exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    finished = json.loads((out / "stages.json").read_text())["finished"]
+    assert finished == ["odometry of walk"]
+    record = (out / "walk" / "record.npz").stat().st_mtime_ns
+    assert command(walk, "--config", settings, "--out", out).exit_code == 0
+    assert (out / "walk" / "record.npz").stat().st_mtime_ns == record
+    for name in ALWAYS_EQUAL:
+        assert (out / name).read_bytes() == (done / name).read_bytes(), name
+
+
+def test_a_folder_of_something_else_is_left_alone(walk: Path, settings: Path, done: Path, tmp_path: Path) -> None:
+    before = {path: path.read_bytes() for path in done.rglob("*.txt")}
+    refused = command(walk, "--out", done)
+    assert isinstance(refused.exception, OptimizationError)
+    assert "holds results of other input (different: config)" in str(refused.exception)
+    assert {path: path.read_bytes() for path in done.rglob("*.txt")} == before
+    (tmp_path / "mine.txt").write_text("mine")
+    refused = command(walk, "--config", settings, "--out", tmp_path)
+    assert isinstance(refused.exception, OptimizationError)
+    assert "is not empty" in str(refused.exception)
+
+
+def test_two_sessions_come_into_one_frame(walk: Path, tmp_path: Path) -> None:
+    """Two pieces of one recording, which overlap by a second, as if they were two visits."""
+    sources = [open_source(walk, from_s=0.0, to_s=4.0), open_source(walk, from_s=3.0)]
+    found = optimize_sessions(sources, tmp_path / "both", Config.from_yaml(SETTINGS))
+    assert found.frames == [0, 0]
+    first, second = (Trajectory(each.record.stamps_ns, each.nav_T_body) for each in found.sessions)
+    common = np.intersect1d(first.stamps_ns, second.stamps_ns)
+    assert len(common) == 21
+    for stamp in common:
+        one, other = (each.nav_T_body[np.searchsorted(each.stamps_ns, stamp)] for each in (first, second))
+        assert np.linalg.norm(se3_log(se3_inverse(one) @ other)) < 0.005
+    for name in ("walk", "walk-2"):
+        assert (tmp_path / "both" / name / "trajectory_optimized.txt").exists()
+
+
+def test_without_loops_nothing_of_maps_is_needed(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert command(walk, "--to", "3", "--no-loops", "--out", tmp_path / "walk").exit_code == 0
+    assert not (tmp_path / "walk" / "database.db").exists()
+    refused = command(walk, "--to", "3", "--out", tmp_path / "other")
+    assert isinstance(refused.exception, MissingExtraError)
+    assert "graphvio[maps]" in str(refused.exception)
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.skipif(not CLIP.is_dir(), reason="shared/data/euroc_mh01_clip is absent")
+def test_a_real_recording_becomes_better(tmp_path: Path) -> None:
+    done = command(CLIP, "--out", tmp_path / "clip")
+    assert done.exit_code == 0, done.output
+    (session,) = json.loads((tmp_path / "clip" / "summary.json").read_text())["sessions"]
+    assert session["ate_rmse"]["optimized"]["position_m"] < 0.95 * session["ate_rmse"]["online"]["position_m"]
