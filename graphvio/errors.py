@@ -42,3 +42,7 @@ class CalibrationError(GraphvioError):
 
 class OptimizationError(GraphvioError):
     """A session cannot be optimised, or what was kept of it not be read."""
+
+
+class FleetError(GraphvioError):
+    """Sessions cannot be listed, their files not be reached, or the workers not be used."""

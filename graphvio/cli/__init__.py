@@ -10,6 +10,7 @@ from graphvio.cli.compare import compare
 from graphvio.cli.doctor import doctor
 from graphvio.cli.dump_config import dump_config
 from graphvio.cli.evaluate import evaluate
+from graphvio.cli.fleet import fleet
 from graphvio.cli.info import info
 from graphvio.cli.optimize import optimize
 from graphvio.cli.record import convert, record
@@ -33,6 +34,7 @@ app.command()(run)
 app.command()(calibrate)
 app.command(name="calibrate-trajectories")(calibrate_trajectories)
 app.command()(optimize)
+app.add_typer(fleet, name="fleet")
 app.command()(record)
 app.command()(convert)
 app.command()(info)

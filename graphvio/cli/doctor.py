@@ -18,6 +18,7 @@ _OPTIONAL = {
     "viewer": ("rerun", "rerun-sdk", "live view and recordings"),
     "maps": ("pycolmap", "pycolmap", "maps"),
     "sessions": ("mcap", "mcap", "sessions on disk"),
+    "fleet": ("distributed", "dask", "many sessions side by side"),
 }
 
 

@@ -77,24 +77,44 @@ def optimize_sessions(
         GraphvioError: if a recording cannot be read, holds no pose, or the folder cannot be used.
     """
     sessions = named(sources)
-    stages = _Stages(sessions, Path(out), config, calibrates, on_progress or _quiet)
+    stages = Stages(sessions, Path(out), config, calibrates, on_progress)
     records = [stages.record(number) for number in range(len(sessions))]
     closures = stages.closures(records) if with_loops else None
     return stages.result(records, closures)
 
 
-class _Stages:
+class Stages:
+    """The stages one by one, for who runs them elsewhere than one after the other.
+
+    Args:
+        sessions: one or several.
+        out: folder of the results, as `optimize_sessions` takes it.
+        config: of all stages.
+        calibrates: as `optimize_sessions` takes it.
+        on_progress: told how far it is.
+
+    Attributes:
+        inputs: what decides the results: name -> value.
+
+    Raises:
+        OptimizationError: if the folder cannot be used.
+    """
+
     def __init__(
-        self, sessions: Sequence[Session], out: Path, config: Config, calibrates: bool, on_progress: Progress
+        self,
+        sessions: Sequence[Session],
+        out: Path,
+        config: Config,
+        calibrates: bool = False,
+        on_progress: Progress | None = None,
     ) -> None:
         self._sessions = sessions
         self._calibrates = calibrates
         self._config = config
-        self._on_progress = on_progress
+        self._on_progress = on_progress or _quiet
         inputs = {each.name: _identity(each.source) for each in sessions}
-        self._space = Workspace(
-            out, inputs | {"config": config.sha256(), "calibration": str(calibrates), "graphvio": __version__}
-        )
+        self.inputs = inputs | {"config": config.sha256(), "calibration": str(calibrates), "graphvio": __version__}
+        self._space = Workspace(out, self.inputs)
 
     def record(self, number: int) -> SessionRecord:
         """What the odometry makes of a session; beside it the results of its run."""
@@ -116,7 +136,7 @@ class _Stages:
 
     def closures(self, records: Sequence[SessionRecord]) -> list[LoopClosure]:
         """Loop closures within and between the sessions."""
-        inputs = [self._input(number, record) for number, record in enumerate(records)]
+        inputs = [self.places(number, record) for number, record in enumerate(records)]
         with FeatureDatabase(self._space.folder / DATABASE) as database:
             for each in inputs:
                 self._extract(each, database)
@@ -154,7 +174,7 @@ class _Stages:
         return found
 
     def _export(self, found: Optimization, records: Sequence[SessionRecord]) -> None:
-        inputs = [self._input(number, record) for number, record in enumerate(records)]
+        inputs = [self.places(number, record) for number, record in enumerate(records)]
         with FeatureDatabase(self._space.folder / DATABASE) as database:
             export(
                 found,
@@ -165,7 +185,8 @@ class _Stages:
                 lambda what, done, total: self._on_progress(f"map: {what}", done, total),
             )
 
-    def _input(self, number: int, record: SessionRecord) -> SessionInput:
+    def places(self, number: int, record: SessionRecord) -> SessionInput:
+        """A session with the places at which loop closures are looked for."""
         session, settings = self._sessions[number], self._config.optimization
         rows = choose_places(record, settings.place_distance_m, settings.place_angle_deg)
         places = [Place(number, row, int(record.stamps_ns[row])) for row in rows.tolist()]

@@ -17,10 +17,15 @@ from graphvio.sources.faults import FaultLog
 from graphvio.sources.matching import TOLERANCE_NS
 from graphvio.sources.recording import Recording
 
-__all__ = ["FaultLog", "Source", "open_source"]
+__all__ = ["FaultLog", "Source", "is_recording", "open_source"]
 
 _FORMATS: tuple[ModuleType, ...] = (euroc, kitti_odometry, kitti_raw)
 _MAX_TOLERANCE_MS = 10.0
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a path is of a known layout, so that `open_source` would try to read it."""
+    return session.matches(path) or (path.is_dir() and any(known.matches(path) for known in _FORMATS))
 
 
 def open_source(

@@ -1,0 +1,135 @@
+"""``graphvio fleet optimize``: many sessions side by side."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from graphvio.cli import options
+
+if TYPE_CHECKING:
+    from graphvio.fleet.run import FleetProgress
+
+fleet = typer.Typer(help="Many sessions side by side, on this machine or on a Dask cluster.", no_args_is_help=True)
+
+
+@fleet.callback()
+def _group() -> None:
+    """Many sessions side by side, on this machine or on a Dask cluster."""
+
+
+@fleet.command()
+def optimize(
+    sessions: Annotated[
+        str,
+        typer.Argument(
+            help="Folder of recordings, or text file with a path or URL a line; itself a path or URL.",
+            metavar="FOLDER|LIST",
+        ),
+    ],
+    out: Annotated[
+        str,
+        typer.Option(
+            "--out", help="Folder for the results, path or URL: new, or that of a run to go on with.", metavar="DIR"
+        ),
+    ],
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            "--scheduler",
+            help="A Dask scheduler that runs, such as tcp://host:8786.  [default: workers on this machine]",
+            metavar="ADDRESS",
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            "--workers", help="Processes on this machine.  [default: half its cores, and two at least]", min=1
+        ),
+    ] = None,
+    rig: options.RigFile = None,
+    config: options.ConfigName = "default",
+    no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
+    verbose: options.Verbose = False,
+) -> None:
+    """Optimise many recorded sessions, each by itself, and tell in a table how each went.
+
+    A session that cannot be done costs no other: it is tried three times, and then told in the table. Ends with exit
+    code 0; with 2 where the input cannot be used; with 3 where a session failed. Run again with the same --out, it does
+    what is missing.
+
+    Examples:
+
+        graphvio fleet optimize recordings --out results
+
+        graphvio fleet optimize list.txt --out s3://bucket/results --scheduler tcp://10.0.0.5:8786
+    """
+    import logging
+
+    from graphvio.cli.run import EXIT_INCOMPLETE, EXIT_INTERRUPTED
+    from graphvio.config import Config
+    from graphvio.errors import FleetError
+    from graphvio.fleet.cluster import distributed
+    from graphvio.fleet.listing import list_sessions
+    from graphvio.fleet.run import optimize_fleet
+    from graphvio.optimization.loops.database import colmap
+    from graphvio.rig import Rig
+
+    if scheduler is not None and workers is not None:
+        raise FleetError("--workers is for this machine, and --scheduler has its own: give one of them")
+    distributed()
+    if not no_loops:
+        colmap()
+    settings = Config.load(config)
+    loaded = None if rig is None else Rig.load(rig)
+    listed = list_sessions(sessions)
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is told below
+    try:
+        with _Bar(len(listed)) as bar:
+            outcomes = optimize_fleet(
+                listed,
+                out,
+                settings,
+                rig=loaded,
+                with_loops=not no_loops,
+                scheduler=scheduler,
+                workers=workers,
+                on_progress=bar.show,
+            )
+    except KeyboardInterrupt:
+        typer.echo(f"graphvio: interrupted; the same command with --out {out} goes on from there", err=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    failed = [each for each in outcomes if each.error]
+    for each in failed:
+        typer.echo(f"graphvio: {each.name} failed in {each.failed_in}: {each.error}", err=True)
+    typer.echo(f"{len(outcomes) - len(failed)} of {len(outcomes)} sessions optimised")
+    typer.echo(f"results: {out}")
+    if failed:
+        raise typer.Exit(EXIT_INCOMPLETE)
+
+
+class _Bar:
+    """One bar for all sessions."""
+
+    def __init__(self, sessions: int) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        columns = (BarColumn(), MofNCompleteColumn(), TextColumn("sessions, {task.description}"), TimeElapsedColumn())
+        self._bars = Progress(*columns, console=Console(stderr=True))
+        self._task: Any = self._bars.add_task("0 tasks", total=sessions)
+
+    def __enter__(self) -> _Bar:
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bars.stop()
+
+    def show(self, progress: FleetProgress) -> None:
+        """Draw how far everything is."""
+        texts = [f"{progress.tasks} tasks"]
+        texts += [f"{progress.failed} failed"] if progress.failed else []
+        texts += [progress.latest] if progress.latest else []
+        self._bars.update(self._task, completed=progress.optimized + progress.failed, description=", ".join(texts))

@@ -1,0 +1,1 @@
+"""Many sessions, each optimised by itself, side by side on Dask's workers."""

@@ -1,0 +1,98 @@
+"""Dask's workers: a cluster on this machine, or one that is there already."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from graphvio.config import Config
+from graphvio.errors import FleetError, GraphvioError, MissingExtraError
+from graphvio.rig import Rig
+from graphvio.simulation import default_rig
+from graphvio.sources import open_source
+from graphvio.warmup import warm_up
+
+RETRIES = 2
+_CONNECT_S = 20.0
+
+
+def distributed() -> Any:
+    """The library of that name.
+
+    Raises:
+        MissingExtraError: if the extra ``fleet`` is not installed.
+    """
+    try:
+        import distributed
+    except ImportError:
+        raise MissingExtraError("dask", "fleet", "working on many sessions") from None
+    return distributed
+
+
+def default_workers() -> int:
+    """Processes of a cluster on this machine: one for two cores, and two at least.
+
+    The odometry keeps about two cores busy, a thread for each pair and one that decodes; the other stages keep one or
+    two. With two processes, one works while the other is started anew or waits for the disk.
+    """
+    return max(2, (os.cpu_count() or 1) // 2)
+
+
+def compile_kernels(recordings: Sequence[str], rig: Rig | None, config: Config) -> None:
+    """Compile the odometry's kernels in this process, before there are several, which would all compile the same.
+
+    Args:
+        recordings: paths and URLs; the first one that can be opened here tells the rig.
+        rig: of all recordings, or None.
+        config: of the odometry.
+    """
+    for recording in (Path(each) for each in recordings if rig is None):
+        if recording.exists():
+            try:
+                rig = open_source(recording).rig
+                break
+            except GraphvioError:
+                pass  # it is told when its turn comes
+    warm_up(rig or default_rig(), config)
+
+
+@contextmanager
+def connected(scheduler: str | None, workers: int | None = None) -> Iterator[Any]:
+    """A client of Dask.
+
+    Args:
+        scheduler: address of one that runs; None starts a cluster on this machine, and ends it.
+        workers: processes of such a cluster, of one thread each; None leaves the number to `default_workers`.
+
+    Raises:
+        FleetError: if the scheduler cannot be reached, or the cluster not be started.
+    """
+    library = distributed()
+    if scheduler is not None:
+        try:
+            client = library.Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise FleetError(f"{scheduler}: no Dask scheduler answers there ({error}); check the address") from None
+        with client:
+            yield client
+        return
+    import dask
+
+    with dask.config.set({"distributed.scheduler.allowed-failures": RETRIES}):
+        try:
+            cluster = library.LocalCluster(
+                n_workers=workers or default_workers(),
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,
+                preload=["graphvio.fleet.preload"],
+            )
+        except (OSError, RuntimeError) as error:
+            raise FleetError(f"workers cannot be started on this machine ({error})") from None
+        with cluster, library.Client(cluster, set_as_default=False) as client:
+            yield client

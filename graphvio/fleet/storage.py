@@ -1,0 +1,206 @@
+"""Files wherever fsspec reaches them: local folders, S3, GCS and others, by their paths or URLs."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from graphvio.errors import FleetError, MissingExtraError
+from graphvio.optimization.workspace import digest
+
+_UNFINISHED = ".tmp"
+
+
+def file_system(url: str) -> tuple[Any, str]:
+    """The file system of a path or URL, and the path in it.
+
+    Raises:
+        FleetError: if the kind of URL is unknown, or what it needs is not installed.
+        MissingExtraError: if the extra ``fleet`` is not installed.
+    """
+    try:
+        from fsspec.core import url_to_fs
+    except ImportError:
+        raise MissingExtraError("fsspec", "fleet", "working on many sessions") from None
+    try:
+        files, path = url_to_fs(url)
+    except (ImportError, ValueError) as error:
+        raise FleetError(f"{url}: cannot be reached ({error})") from None
+    return files, str(path)
+
+
+def local_path(url: str) -> Path | None:
+    """The path of a local file or folder, absolute; None if the URL is of something else."""
+    files, path = file_system(url)
+    protocol = (files.protocol,) if isinstance(files.protocol, str) else files.protocol
+    return Path(path) if "file" in protocol else None
+
+
+class Storage:
+    """A folder of results, local or not.
+
+    Args:
+        url: path or URL; made when the first file is put there.
+
+    Raises:
+        FleetError: if it cannot be reached.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.url = url.rstrip("/")
+        self._files, self._root = file_system(self.url)
+        self._local = local_path(self.url)
+
+    def sizes(self) -> dict[str, int]:
+        """Name -> bytes, of all files in it and in folders below.
+
+        Raises:
+            FleetError: if it cannot be reached.
+        """
+        with self._reaching(self.url, "read"):
+            self._files.invalidate_cache()
+            try:
+                found = self._files.find(self._root, detail=True)
+            except FileNotFoundError:
+                return {}
+            root = self._root.rstrip("/") + "/"
+            return {path.removeprefix(root): int(info["size"]) for path, info in found.items()}
+
+    def read(self, name: str) -> bytes | None:
+        """What a file holds; None if it is not there.
+
+        Raises:
+            FleetError: if it cannot be reached.
+        """
+        with self._reaching(name, "read"):
+            try:
+                return bytes(self._files.cat_file(self._path(name)))
+            except FileNotFoundError:
+                return None
+
+    def fetch(self, name: str, to: Path) -> None:
+        """Copy a file to a local place, whose folder is made.
+
+        Raises:
+            FleetError: if it cannot be read, or the copy not be written.
+        """
+        with self._reaching(name, "read"):
+            to.parent.mkdir(parents=True, exist_ok=True)
+            self._files.get_file(self._path(name), str(to))
+
+    def put(self, path: Path, name: str) -> None:
+        """Copy a local file to here; it is whole or absent, whoever looks and whatever fails.
+
+        Raises:
+            FleetError: if it cannot be written.
+        """
+        unfinished = self._unfinished(name)
+        with self._reaching(name, "written"):
+            try:
+                self._make_folder(name)
+                self._files.put_file(str(path), unfinished)
+                self._move(unfinished, name)
+            except BaseException:
+                self._discard(unfinished)
+                raise
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write a file that is whole or absent.
+
+        Raises:
+            FleetError: if it cannot be written.
+        """
+        unfinished = self._unfinished(name)
+        with self._reaching(name, "written"):
+            try:
+                self._make_folder(name)
+                self._files.pipe_file(unfinished, data)
+                self._move(unfinished, name)
+            except BaseException:
+                self._discard(unfinished)
+                raise
+
+    def remove(self, name: str) -> None:
+        """Remove a file, if it is there.
+
+        Raises:
+            FleetError: if it cannot be removed.
+        """
+        with self._reaching(name, "removed"), suppress(FileNotFoundError):
+            self._files.rm_file(self._path(name))
+
+    def remove_unfinished(self) -> None:
+        """Remove what tasks have left that were broken off while they wrote."""
+        for name in self.sizes():
+            if name.endswith(_UNFINISHED):
+                self.remove(name)
+
+    def _path(self, name: str) -> str:
+        return f"{self._root.rstrip('/')}/{name}"
+
+    def _unfinished(self, name: str) -> str:
+        folder, _, file = self._path(name).rpartition("/")
+        return f"{folder}/.{file}.{uuid.uuid4().hex[:8]}{_UNFINISHED}"
+
+    def _make_folder(self, name: str) -> None:
+        self._files.makedirs(self._path(name).rpartition("/")[0], exist_ok=True)
+
+    def _move(self, unfinished: str, name: str) -> None:
+        if self._local is None:
+            self._files.mv(unfinished, self._path(name))
+            return
+        with Path(unfinished).open("rb") as file:
+            os.fsync(file.fileno())
+        Path(unfinished).replace(self._path(name))
+
+    def _discard(self, unfinished: str) -> None:
+        with suppress(Exception):  # it may not have been begun, or the disk be gone; what failed first is told
+            self._files.rm_file(unfinished)
+
+    @contextmanager
+    def _reaching(self, name: str, what: str) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise FleetError(
+                f"{self.url}: {name} cannot be {what} ({error.strerror or error}); check the place of the results"
+            ) from None
+
+
+def fetch_recording(url: str, scratch: Path) -> Path:
+    """A recording as a local path: where it is, or a copy in a folder that keeps the one that was fetched last.
+
+    Args:
+        url: path or URL of a folder or file.
+        scratch: folder for the copy, of one thread at a time.
+
+    Raises:
+        FleetError: if it is not there, cannot be read or does not fit on the disk.
+    """
+    local = local_path(url)
+    if local is not None:
+        return local
+    files, path = file_system(url.rstrip("/"))
+    kept = scratch / "recording"
+    folder = kept / digest(url)
+    copy = folder / path.rpartition("/")[2]
+    if copy.exists():
+        return copy
+    shutil.rmtree(kept, ignore_errors=True)
+    unfinished = kept / "unfinished" / copy.name
+    try:
+        unfinished.parent.mkdir(parents=True)
+        if files.isdir(path):
+            files.get(f"{path}/", f"{unfinished}/", recursive=True)
+        else:
+            files.get_file(path, str(unfinished))
+        unfinished.parent.replace(folder)
+    except OSError as error:
+        shutil.rmtree(kept, ignore_errors=True)
+        raise FleetError(f"{url}: cannot be fetched ({error.strerror or error})") from None
+    return copy

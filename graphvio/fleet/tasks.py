@@ -1,0 +1,268 @@
+"""The stages of one session as tasks: each fetches what it needs, works in a folder of its own, and puts what it made.
+
+A task that is finished already, by an earlier run or by a worker that was thought dead, gives what it gave then. What
+a task that was broken off has left is overwritten when it is done again, or removed when the session is finished.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from graphvio import __version__
+from graphvio.config import Config
+from graphvio.errors import FleetError, TrajectoryError
+from graphvio.evaluation import evaluate
+from graphvio.fleet.markers import Marker, finished, forget, refuse_others
+from graphvio.fleet.storage import Storage, fetch_recording
+from graphvio.optimization.loops import saved
+from graphvio.optimization.loops.database import FeatureDatabase
+from graphvio.optimization.loops.features import extract_places
+from graphvio.optimization.loops.merge import merge_places
+from graphvio.optimization.pipeline import DATABASE, Session, Stages
+from graphvio.optimization.record import SessionRecord
+from graphvio.optimization.workspace import digest
+from graphvio.rig import Rig
+from graphvio.rig_files.native import to_text
+from graphvio.sources import Source, open_source
+from graphvio.trajectory import Trajectory
+
+ODOMETRY, LOOPS, GRAPH = "odometry", "loops", "graph"
+
+_ONE_AT_A_TIME = threading.Lock()  # the odometry has threads of its own, and recordings share a place
+_STATE = "stages.json"  # of a folder that one process works in from the first stage to the last
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A session to optimise.
+
+    Attributes:
+        name: of it.
+        recording: path or URL.
+        results: path or URL of its folder.
+        config: of all stages.
+        rig: None takes the recording's own.
+        with_loops: whether loop closures are looked for.
+        places_per_task: whose features one task extracts, at most.
+    """
+
+    name: str
+    recording: str
+    results: str
+    config: Config
+    rig: Rig | None
+    with_loops: bool
+    places_per_task: int
+    version: str = __version__
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        """What decides the results, as far as it is known without opening the recording."""
+        return {
+            "recording": self.recording,
+            "config": self.config.sha256(),
+            "graphvio": self.version,
+            "rig": "" if self.rig is None else digest(to_text(self.rig, Path())),
+            "loops": str(self.with_loops),
+        }
+
+
+def features_stage(part: int, parts: int) -> str:
+    """Name of the stage that extracts the features of one part of the places."""
+    return f"features-{part}-of-{parts}"
+
+
+def odometry(job: Job) -> Marker:
+    """Run the odometry; figures are those of its summary, and ``parts``: tasks for the features of all places.
+
+    Raises:
+        GraphvioError: if the recording cannot be read, or a file not be written.
+    """
+
+    def work(task: _Task) -> dict[str, Any]:
+        record = task.stages.record(0)
+        summary = json.loads((task.folder / job.name / "odometry" / "summary.json").read_text(encoding="utf-8"))
+        places = len(task.stages.places(0, record).places)
+        truth = summary["evaluation"]
+        return {
+            "parts": max(1, -(-places // job.places_per_task)),
+            "framesets": summary["framesets"],
+            "duration_s": summary["duration_s"],
+            "path_length_m": summary["path_length_m"],
+            "completion": summary["completion"],
+            "epochs": len(summary["epochs"]),
+            "resets": summary["resets"],
+            "ate_odometry_m": None if truth is None else truth["ate_position_m"]["rmse"],
+        }
+
+    return _perform(job, ODOMETRY, work)
+
+
+def features(job: Job, part: int, parts: int) -> Marker:
+    """Extract the features of one part of the places into a database of its own.
+
+    Raises:
+        GraphvioError: if the recording cannot be read, or a file not be written.
+    """
+
+    def work(task: _Task) -> dict[str, Any]:
+        task.fetch(ODOMETRY)
+        session = task.stages.places(0, task.record())
+        stamps = [place.stamp_ns for place in session.places]
+        first, last = part * len(stamps) // parts, (part + 1) * len(stamps) // parts
+        path = task.folder / _part_name(part, parts)
+        path.parent.mkdir()
+        with FeatureDatabase(path) as database:
+            extract_places(session.source, session.rig, session.name, stamps[first:last], database, job.config)
+        return {}
+
+    return _perform(job, features_stage(part, parts), work)
+
+
+def loops(job: Job, parts: int) -> Marker:
+    """Join the databases of all parts, and find loop closures.
+
+    Raises:
+        GraphvioError: if the recording cannot be read, or a file not be written.
+    """
+
+    def work(task: _Task) -> dict[str, Any]:
+        task.fetch(ODOMETRY, *(features_stage(part, parts) for part in range(parts)))
+        record = task.record()
+        session = task.stages.places(0, record)
+        stamps = [place.stamp_ns for place in session.places]
+        with FeatureDatabase(task.folder / DATABASE) as whole:
+            for part in range(parts):
+                with FeatureDatabase(task.folder / _part_name(part, parts)) as database:
+                    merge_places(database, whole, session.name, session.rig, stamps)
+        forget(task.storage, GRAPH)  # which adds to the database
+        return {"loops_found": len(task.stages.closures([record]))}
+
+    marker = _perform(job, LOOPS, work)
+    for part in range(parts):
+        Storage(job.results).remove(_part_name(part, parts))
+    return marker
+
+
+def graph(job: Job) -> Marker:
+    """Optimise everything that is known of the session, and write the results.
+
+    Raises:
+        GraphvioError: if there is no unique solution, or a file cannot be written.
+    """
+
+    def work(task: _Task) -> dict[str, Any]:
+        task.fetch(ODOMETRY, *([LOOPS] if job.with_loops else []))
+        closures = saved.load(task.folder / "loops.npz") if job.with_loops else None
+        found = task.stages.result([task.record()], closures)
+        return {
+            "loops_found": len(found.loops),
+            "loops_used": sum(not loop.refusal for loop in found.loops),
+            "cost_before": found.cost_before,
+            "cost_after": found.cost_after,
+            "frames": len(set(found.frames)),
+            "ate_m": _ate_m(task.folder / "trajectory_optimized.txt", task.source.truth),
+        }
+
+    marker = _perform(job, GRAPH, work, changed=(DATABASE,))
+    Storage(job.results).remove_unfinished()
+    return marker
+
+
+@dataclass(eq=False)
+class _Task:
+    """A stage at work in a folder of its own."""
+
+    job: Job
+    folder: Path
+    source: Source
+    stages: Stages
+    storage: Storage
+    done: Mapping[str, Marker]
+    fetched: set[str] = field(default_factory=set)
+
+    def fetch(self, *stages: str) -> None:
+        """Get the files that earlier stages have left."""
+        for stage in stages:
+            if stage not in self.done:
+                raise FleetError(f"{self.job.results}: the files of {stage} are gone; run it again")
+            for name in self.done[stage].files:
+                self.fetched.add(name)
+                self.storage.fetch(name, self.folder / name)
+
+    def record(self) -> SessionRecord:
+        """Of the odometry, fetched."""
+        return SessionRecord.load(self.folder / self.job.name / "record.npz")
+
+
+def _perform(job: Job, stage: str, work: Callable[[_Task], dict[str, Any]], changed: Sequence[str] = ()) -> Marker:
+    """Do the work, unless it is done, and put what it made, and those files that it fetched and changed."""
+    begun = perf_counter()
+    if job.version != __version__:
+        raise FleetError(f"this worker has graphvio {__version__}, and was asked by {job.version}; install one version")
+    storage = Storage(job.results)
+    with _ONE_AT_A_TIME, _scratch() as (kept, scratch):
+        done = finished(storage, job.inputs)
+        if stage in done:
+            return done[stage]
+        recording = fetch_recording(job.recording, kept)
+        source = open_source(recording, job.rig, tolerance_ms=job.config.timing.simultaneous_ms)
+        stages = Stages([Session(job.name, source)], scratch, job.config)
+        inputs = stages.inputs | job.inputs
+        refuse_others(storage, done.values(), inputs)
+        task = _Task(job, scratch, source, stages, storage, done)
+        figures = work(task)
+        there = {str(path.relative_to(scratch)) for path in scratch.rglob("*") if path.is_file()}
+        made = sorted(there - task.fetched - {_STATE})
+        for name in [*made, *sorted(task.fetched.intersection(changed))]:
+            storage.put(scratch / name, name)
+        marker = Marker(stage, inputs, made, perf_counter() - begun, figures)
+        marker.write(storage)
+        return marker
+
+
+@contextmanager
+def _scratch() -> Iterator[tuple[Path, Path]]:
+    """A folder of this process that stays as long as its worker, if it is one, and one of this task alone.
+
+    Raises:
+        FleetError: if the disk is full.
+    """
+    try:
+        with tempfile.TemporaryDirectory(prefix="graphvio-", dir=_worker_folder()) as own:
+            scratch = Path(own) / "session"
+            scratch.mkdir()
+            yield Path(_worker_folder() or own), scratch
+    except OSError as error:
+        raise FleetError(f"{error.filename or tempfile.gettempdir()}: {error.strerror or error}") from None
+
+
+def _worker_folder() -> str | None:
+    from distributed import get_worker
+
+    try:
+        return str(get_worker().local_directory)
+    except ValueError:
+        return None
+
+
+def _part_name(part: int, parts: int) -> str:
+    return f"parts/features-{part}-of-{parts}.db"
+
+
+def _ate_m(trajectory: Path, truth: Path | None) -> float | None:
+    """Of the optimised trajectory, rmse; None without a truth that fits."""
+    if truth is None:
+        return None
+    try:
+        return evaluate(Trajectory.read(trajectory), Trajectory.read(truth)).ate_position_m.rmse
+    except TrajectoryError:
+        return None
