@@ -222,7 +222,7 @@ class OptimizationConfig(Stage):
     """Places that each is compared with: those that look most alike."""
     loop_min_inliers: int = 30
     """Points that a loop closure must explain."""
-    loop_probability: float = 0.99
+    loop_probability: float = 0.999
     """A loop closure is refused where what it says and what all others say lies outside this share of the chi-square
     distribution."""
 
