@@ -13,11 +13,12 @@ from graphvio.backend.states import RigState
 from graphvio.backend.time_offset import integrated_rates
 from graphvio.config import Config
 from graphvio.events import ImuSample
+from graphvio.frontend.alignment import learn_from_nothing
 from graphvio.frontend.observations import Observations, RigArrays, correspond
 from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import common_rows
-from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log, so3_log
+from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, so3_log
 from graphvio.rig import Imu, Rig
 
 _POINTS = 20
@@ -46,6 +47,8 @@ def warm_up(rig: Rig, config: Config) -> None:
     )
     for solve in (joint_motion, best_pair_motion):
         solve(RigArrays.of(rig), observations, np.eye(4), config.motion, rng)
+    learn_from_nothing(joint_motion(RigArrays.of(rig), observations, np.eye(4), config.motion, rng))
+    se3(np.eye(3), np.zeros(3))
     se3_exp(np.zeros(6))
     own_covariance(np.eye(6), np.eye(6))
     for pose in (np.eye(4), np.asfortranarray(np.eye(4))):  # gtsam's matrices are in Fortran's order

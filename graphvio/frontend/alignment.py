@@ -112,6 +112,14 @@ class PairAlignment:
         return Misalignment(d, np.asarray(np.linalg.inv(information)), float(d @ (information - prior) @ d))
 
 
+def learn_from_nothing(motion: Refined) -> None:
+    """Do what `PairAlignment` does, with one motion that says nothing, for the warm-up."""
+    alignment = PairAlignment()
+    for _ in range(_FEWEST):
+        alignment.add(motion, motion)
+    alignment.learn()
+
+
 def misplaced(rig: Rig, pair: int, misalignment: Misalignment) -> str:
     """How far a pair is from where the rig has it, relative to the first pair, as a clause."""
     adjoint = se3_adjoint(np.ascontiguousarray(rig.pairs[0].left.cam_T_body))
