@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -99,15 +99,7 @@ class Storage:
         Raises:
             FleetError: if it cannot be written.
         """
-        unfinished = self._unfinished(name)
-        with self._reaching(name, "written"):
-            try:
-                self._make_folder(name)
-                self._files.put_file(str(path), unfinished)
-                self._move(unfinished, name)
-            except BaseException:
-                self._discard(unfinished)
-                raise
+        self._replace(name, lambda unfinished: self._files.put_file(str(path), unfinished))
 
     def write(self, name: str, data: bytes) -> None:
         """Write a file that is whole or absent.
@@ -115,15 +107,7 @@ class Storage:
         Raises:
             FleetError: if it cannot be written.
         """
-        unfinished = self._unfinished(name)
-        with self._reaching(name, "written"):
-            try:
-                self._make_folder(name)
-                self._files.pipe_file(unfinished, data)
-                self._move(unfinished, name)
-            except BaseException:
-                self._discard(unfinished)
-                raise
+        self._replace(name, lambda unfinished: self._files.pipe_file(unfinished, data))
 
     def remove(self, name: str) -> None:
         """Remove a file, if it is there.
@@ -142,6 +126,18 @@ class Storage:
 
     def _path(self, name: str) -> str:
         return f"{self._root.rstrip('/')}/{name}"
+
+    def _replace(self, name: str, fill: Callable[[str], None]) -> None:
+        """Fill a file under another name, and move it."""
+        unfinished = self._unfinished(name)
+        with self._reaching(name, "written"):
+            try:
+                self._make_folder(name)
+                fill(unfinished)
+                self._move(unfinished, name)
+            except BaseException:
+                self._discard(unfinished)
+                raise
 
     def _unfinished(self, name: str) -> str:
         folder, _, file = self._path(name).rpartition("/")
