@@ -177,7 +177,6 @@ class Odometry:
                     started=self._belief.starts != starts,
                     own={} if motion is None else visual.own,
                     references=self._frontend.reference_stamps_ns,
-                    frames=self._frontend.reference_frames(stamp_ns),
                 )
             )
         return estimate

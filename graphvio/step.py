@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from graphvio.backend.inertial import ImuSpan
 from graphvio.events import Estimate
 from graphvio.frontend.motion import RelativeMotion
-from graphvio.frontend.tracks import PairFrame
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +22,6 @@ class Step:
         started: whether the estimation began here, be it anew: what is known of the time before then does not count.
         references: stamps of the framesets that later motions are measured from.
         own: pair index -> what it alone says of the motion, at the end of a keyframe whose motion is used.
-        frames: pair index -> its tracks, for those pairs that later motions are measured from at this very frameset.
     """
 
     estimate: Estimate
@@ -33,4 +31,3 @@ class Step:
     started: bool
     references: frozenset[int]
     own: Mapping[int, RelativeMotion]
-    frames: Mapping[int, PairFrame]

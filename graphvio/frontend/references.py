@@ -31,10 +31,6 @@ class References:
         """A pair's reference frame, or None."""
         return self._frames.get(pair)
 
-    def at(self, stamp_ns: int) -> dict[int, PairFrame]:
-        """Reference frames of one instant."""
-        return {j: frame for j, frame in self._frames.items() if frame.stamp_ns == stamp_ns}
-
     def replace(self, frames: Mapping[int, PairFrame]) -> None:
         """These frames are their pairs' references from here on."""
         self._frames.update(frames)

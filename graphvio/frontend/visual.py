@@ -64,10 +64,6 @@ class VisualFrontend:
         """Stamps of the framesets that later motions will be measured from."""
         return self._references.stamps_ns
 
-    def reference_frames(self, stamp_ns: int) -> dict[int, PairFrame]:
-        """Pair index -> its reference frame, of the pairs whose reference is of this stamp."""
-        return self._references.at(stamp_ns)
-
     @property
     def misaligned(self) -> Mapping[int, Misalignment]:
         """Pairs whose place relative to the first pair is not what the rig says: motions allow for it."""
