@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from graphvio.arrays import Image
+from graphvio.arrays import Bool, Image
 from graphvio.errors import RigError
 from graphvio.events import FrameSet
 from graphvio.rig import Camera, Rig
@@ -31,3 +32,19 @@ def _checked(image: Image, camera: Camera) -> Image:
             f"({height}, {width}), uint8"
         )
     return np.ascontiguousarray(image)
+
+
+def allowed_pixels(camera: Camera, window_px: int) -> Bool:
+    """Where (height, width) points of a camera's image may be: where no pixel of their patch is masked, or anywhere.
+
+    Raises:
+        RigError: if the camera's mask is no image of its size.
+    """
+    width, height = camera.size_px
+    if camera.mask is None:
+        return np.ones((height, width), dtype=bool)
+    mask = cv2.imread(str(camera.mask), cv2.IMREAD_GRAYSCALE)
+    if mask is None or mask.shape != (height, width):
+        raise RigError(f"camera {camera.name}: mask {camera.mask} is no image of {width}x{height} pixels")
+    reach = 2 * (window_px // 2 + 1) + 1  # a patch at any sub-pixel place
+    return np.asarray(cv2.erode(mask, np.ones((reach, reach), dtype=np.uint8), borderValue=(255,)) > 0)

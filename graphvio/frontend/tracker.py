@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
-from graphvio.errors import RigError
 from graphvio.frontend.anchor import Anchor
 from graphvio.frontend.corners import find_corners, occupied_cells, thinned
 from graphvio.frontend.grain import noise_sigma
+from graphvio.frontend.images import allowed_pixels
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.stopwatch import Stopwatch
 from graphvio.frontend.tracks import PairFrame, common_rows, passes, usable_at
-from graphvio.rig import Camera, StereoPair
+from graphvio.rig import StereoPair
 
 _MAX_TRACKS_PER_CELL = 2
 _MAX_FLAT_FRAMES = 3  # then another corner of the cell gets its chance
@@ -32,8 +31,8 @@ class PairTracker:
         self._pair = pair
         self._config = config
         self._cell_px = config.corners.cell_px(pair.left.size_px[0])
-        self._allowed = _allowed(pair.left, config.tracking.window_px)
-        self._matcher = StereoMatcher(pair, config, _allowed(pair.right, config.tracking.window_px))
+        self._allowed = allowed_pixels(pair.left, config.tracking.window_px)
+        self._matcher = StereoMatcher(pair, config, allowed_pixels(pair.right, config.tracking.window_px))
         self._next_id = 0
         self._last = PairFrame.empty()
         self._left: Pyramid = ()
@@ -217,15 +216,3 @@ class PairTracker:
         tracked, settled = np.concatenate([tracked, new]), np.concatenate([settled, np.ones(len(new), dtype=bool)])
         weak = find_corners(image, self._allowed, tracked, settled, cell_px, border_px, admitted)
         return np.concatenate([new, weak])
-
-
-def _allowed(camera: Camera, window_px: int) -> Bool:
-    """Where (height, width) points of a camera's image may be: where no pixel of their patch is masked, or anywhere."""
-    width, height = camera.size_px
-    if camera.mask is None:
-        return np.ones((height, width), dtype=bool)
-    mask = cv2.imread(str(camera.mask), cv2.IMREAD_GRAYSCALE)
-    if mask is None or mask.shape != (height, width):
-        raise RigError(f"camera {camera.name}: mask {camera.mask} is no image of {width}x{height} pixels")
-    reach = 2 * (window_px // 2 + 1) + 1  # a patch at any sub-pixel place
-    return np.asarray(cv2.erode(mask, np.ones((reach, reach), dtype=np.uint8), borderValue=(255,)) > 0)

@@ -18,7 +18,8 @@ from graphvio.arrays import AnyArray, Float, Int
 from graphvio.errors import MissingExtraError, OptimizationError
 from graphvio.rig import Camera, Rig
 
-_CENTRE_PX = 0.5
+CENTRE_PX = 0.5
+"""Where COLMAP has the centre of an image's first pixel."""
 
 
 def colmap() -> Any:
@@ -44,7 +45,7 @@ def colmap_camera(camera: Camera, number: int) -> Any:
     """A camera of the rig as COLMAP has it."""
     fx, fy, cx, cy = (float(value) for value in camera.intrinsics)
     k1, k2, p1, p2, k3 = (float(value) for value in camera.distortion)
-    centre = [cx + _CENTRE_PX, cy + _CENTRE_PX]
+    centre = [cx + CENTRE_PX, cy + CENTRE_PX]
     if camera.model == "equidistant":
         model, lens = "OPENCV_FISHEYE", [k1, k2, p1, p2]
     elif k3:
@@ -95,10 +96,6 @@ class FeatureDatabase:
     def path(self) -> Path:
         """Of the file."""
         return self._path
-
-    def image_id(self, name: str) -> int:
-        """COLMAP's number of an image."""
-        return self._ids[name]
 
     def frame_id(self, name: str) -> int:
         """COLMAP's number of the frame that an image is part of."""
@@ -157,14 +154,14 @@ class FeatureDatabase:
     def add_features(self, name: str, pixels: Float, descriptors: AnyArray | None = None) -> None:
         """Add features (K, 2) of an image and their descriptors (K, 128), uint8."""
         number = self._ids[name]
-        self._file.write_keypoints(number, (pixels + _CENTRE_PX).astype(np.float32).reshape(-1, 2))
+        self._file.write_keypoints(number, (pixels + CENTRE_PX).astype(np.float32).reshape(-1, 2))
         if descriptors is not None:
             kind = self._colmap.FeatureExtractorType.SIFT
             self._file.write_descriptors(number, self._colmap.FeatureDescriptors(kind, descriptors))
 
     def pixels(self, name: str) -> Float:
         """Features (K, 2) of an image."""
-        return np.asarray(self._file.read_keypoints(self._ids[name])[:, :2], dtype=np.float64) - _CENTRE_PX
+        return np.asarray(self._file.read_keypoints(self._ids[name])[:, :2], dtype=np.float64) - CENTRE_PX
 
     def descriptors(self, name: str) -> AnyArray:
         """Descriptors (K, 128), uint8, of an image's features."""

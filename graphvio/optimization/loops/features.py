@@ -11,13 +11,12 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Image, Int
 from graphvio.config import Config
-from graphvio.optimization.loops.database import FeatureDatabase, colmap, image_name
+from graphvio.optimization.loops.database import CENTRE_PX, FeatureDatabase, colmap, image_name
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.rig import Rig
 from graphvio.sources import Source
 
 _FIRST_OCTAVE = 0  # the image itself; twice its size, COLMAP's default, costs three times as much
-_COLMAP_CENTRE_PX = 0.5
 _AHEAD = 4  # places that are worked on at a time
 
 
@@ -43,7 +42,7 @@ class Extractor:
         if not hasattr(self._of_thread, "made"):
             self._of_thread.made = library.FeatureExtractor.create(self._options, library.Device.cpu)
         keypoints, descriptors = self._of_thread.made.extract_from_uint8_array(np.ascontiguousarray(image))
-        pixels = np.asarray(library.keypoints_to_matrix(keypoints)[:, :2], dtype=np.float64) - _COLMAP_CENTRE_PX
+        pixels = np.asarray(library.keypoints_to_matrix(keypoints)[:, :2], dtype=np.float64) - CENTRE_PX
         return pixels.reshape(-1, 2), np.asarray(descriptors.data, dtype=np.uint8).reshape(-1, 128)
 
 
@@ -77,8 +76,11 @@ def extract_places(
             of_thread.observers = [PairObserver(pair, config) for pair in rig.pairs]
         seen = {}
         for j, images in source.frameset_at(stamp_ns).images.items():
+            observer = of_thread.observers[j]
             pixels, descriptors = extractor.extract(images[0])
-            frame = of_thread.observers[j].observe(stamp_ns, images, pixels)
+            usable = observer.usable(pixels)
+            pixels, descriptors = pixels[usable], descriptors[usable]
+            frame = observer.observe(stamp_ns, images, pixels)
             right, _ = rig.pairs[j].right.project(np.column_stack([frame.right, np.ones(len(pixels))]))
             seen[j] = _Seen(pixels, descriptors, right[frame.has_depth], np.flatnonzero(frame.has_depth))
         return seen

@@ -8,10 +8,9 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Int
 from graphvio.geometry import skew
-from graphvio.optimization.loops.database import colmap, colmap_camera
+from graphvio.optimization.loops.database import CENTRE_PX, colmap, colmap_camera
 from graphvio.rig import Camera
 
-_COLMAP_CENTRE_PX = 0.5
 _UNIT = 512.0**2  # COLMAP scales descriptors to this squared length
 _MOST_ANGLE = 0.7  # between descriptors of one feature, radians; COLMAP's
 _MOST_RATIO = 0.8  # of the best's angle to the second best's; COLMAP's
@@ -48,7 +47,7 @@ def _best(products: AnyArray) -> tuple[Int, Bool]:
 def estimated_geometry(cameras: tuple[Camera, Camera], pixels: tuple[Float, Float], rows: Int) -> Any:
     """COLMAP's two-view geometry that explains most matches (M, 2) of pixels (K, 2) and (L, 2)."""
     first, second = (colmap_camera(camera, 1) for camera in cameras)
-    one, other = (each + _COLMAP_CENTRE_PX for each in pixels)
+    one, other = (each + CENTRE_PX for each in pixels)
     options = colmap().TwoViewGeometryOptions()
     options.ransac.random_seed = 0  # else it depends on what the thread did before
     return colmap().estimate_calibrated_two_view_geometry(first, one, second, other, rows.astype(np.uint32), options)

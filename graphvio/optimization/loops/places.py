@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphvio.arrays import Float, Image, Int
+from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
+from graphvio.frontend.images import allowed_pixels
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid
 from graphvio.frontend.matching import StereoMatcher
-from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.tracks import PairFrame, usable_at
 from graphvio.geometry import se3_inverse, so3_log
 from graphvio.optimization.record import SessionRecord
 from graphvio.rig import StereoPair
@@ -33,9 +34,15 @@ class PairObserver:
     """Finds out how deep features of one pair's left image are."""
 
     def __init__(self, pair: StereoPair, config: Config) -> None:
-        width, height = pair.right.size_px
+        window_px = config.tracking.window_px
         self.pair = pair
-        self._matcher = StereoMatcher(pair, config, np.ones((height, width), dtype=bool))
+        self._allowed = allowed_pixels(pair.left, window_px)
+        self._matcher = StereoMatcher(pair, config, allowed_pixels(pair.right, window_px))
+
+    def usable(self, pixels: Float) -> Bool:
+        """Which pixels (N, 2) of the left image are in it, and not masked."""
+        inside, usable = usable_at(pixels, self._allowed, 0.0)
+        return inside & usable
 
     def observe(
         self,
