@@ -21,7 +21,8 @@ from graphvio.errors import GraphvioError
 from graphvio.simulation import SCENE_NAMES
 from graphvio.sources import open_source
 
-DRAWN, RECORDED = "drawn", "recordings"
+HOUR, FALSE, RECORDED = "hour", "false", "recordings"
+_PARTS = (HOUR, FALSE, RECORDED)
 _SCENES = (AIMED_AT, "room", "corridor", "stairs")
 _RETRIEVED = (AIMED_AT, "room")
 
@@ -29,9 +30,7 @@ _RETRIEVED = (AIMED_AT, "room")
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``optimize``."""
     parser = add_command(subparsers, "optimize", "sessions as a whole: time, accuracy, false closures", __doc__)
-    parser.add_argument(
-        "--parts", nargs="+", choices=[DRAWN, RECORDED], default=[DRAWN, RECORDED], help="default: both"
-    )
+    parser.add_argument("--parts", nargs="+", choices=_PARTS, default=_PARTS, help="default: all")
     parser.add_argument("--minutes", type=float, nargs="+", default=[15.0, 30.0, 60.0], metavar="M",
                         help="lengths of the drawn sessions (default: 15 30 60)")  # fmt: skip
     parser.add_argument("--seeds", type=int, default=5, help="walks with false closures, of each kind (default: 5)")
@@ -41,7 +40,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--clip", type=Path, default=CLIP, metavar="DIR",
                         help="a real recording with truth, left out if it is not there (default: "
                         "shared/data/euroc_mh01_clip beside the project)")  # fmt: skip
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write the reports of both parts to this folder")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write a report of each part to this folder")
     parser.add_argument("--docs", action="store_true", help="put the reports into docs/benchmarks.md")
     add_data_option(parser)
     parser.set_defaults(run=main)
@@ -51,7 +50,7 @@ def main(args: argparse.Namespace) -> None:
     """Measure and report."""
     if args.seeds < 1 or args.jobs < 1 or min(args.minutes) <= 3.0:
         raise GraphvioError("--seeds and --jobs must be positive, and --minutes more than 3: loops close between laps")
-    for part, measure in ((DRAWN, _drawn), (RECORDED, _recorded)):
+    for part, measure in ((HOUR, _hour), (FALSE, _false), (RECORDED, _recorded)):
         if part not in args.parts:
             continue
         report = Report()
@@ -63,9 +62,12 @@ def main(args: argparse.Namespace) -> None:
             report.save_to_docs(f"optimize-{part}")
 
 
-def _drawn(report: Report, args: argparse.Namespace) -> None:
+def _hour(report: Report, args: argparse.Namespace) -> None:
     tell("drawn sessions, each in a process of its own")
     add_hour(report, args.minutes)
+
+
+def _false(report: Report, args: argparse.Namespace) -> None:
     tell("false closures")
     add_false_closures(report, args.seeds, args.jobs)
 
