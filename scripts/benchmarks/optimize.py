@@ -78,6 +78,8 @@ def _recorded(report: Report, args: argparse.Namespace) -> None:
         recordings[CLIP_NAME if args.clip == CLIP else args.clip.name] = args.clip
     else:
         report.add(f"The real clip is left out: the folder {args.clip.name} is not there.")
+    if not recordings:
+        raise GraphvioError("nothing to run: no scene is named and the clip is not there")
     with tempfile.TemporaryDirectory() as folder:
         space = Path(folder)
         tell("recordings, optimised as a whole")
