@@ -19,12 +19,13 @@ _ITERATIONS = 15
 _FULL = 512.0  # length of COLMAP's descriptors
 
 
-def vocabulary(descriptors: Sequence[AnyArray], seed: int) -> AnyArray:
+def vocabulary(descriptors: Sequence[AnyArray], seed: int, most: int = _WORDS) -> AnyArray:
     """Words (W, 128) that describe the descriptors (K, 128) of images best, by k-means.
 
     Args:
         descriptors: uint8, of N images.
         seed: of the choice of descriptors and of the first words.
+        most: words.
     """
     rng = np.random.default_rng(seed)
     each = max(1, _SAMPLE // max(1, len(descriptors)))
@@ -32,7 +33,7 @@ def vocabulary(descriptors: Sequence[AnyArray], seed: int) -> AnyArray:
     if not chosen:
         return np.zeros((0, 128), dtype=np.float32)
     sample = np.concatenate(chosen).astype(np.float32) / np.float32(_FULL)
-    words = min(_WORDS, len(sample))
+    words = min(most, len(sample))
     cv2.setRNGSeed(seed)
     stop = (cv2.TERM_CRITERIA_MAX_ITER, _ITERATIONS, 0.0)
     _, _, centres = cv2.kmeans(sample, words, None, stop, 1, cv2.KMEANS_PP_CENTERS)  # type: ignore[call-overload]
