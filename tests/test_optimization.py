@@ -18,12 +18,12 @@ from graphvio.errors import OptimizationError
 from graphvio.evaluation import evaluate
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
-from graphvio.optimization.consistency import motion_between
 from graphvio.optimization.drawn_session import DrawnSession, closure_between, draw_session
 from graphvio.optimization.exchange import write_g2o
 from graphvio.optimization.extrinsics import c, d, own_motion
 from graphvio.optimization.loops import saved
 from graphvio.optimization.loops.search import LoopClosure
+from graphvio.optimization.marginals import Marginals
 from graphvio.optimization.nodes import choose_nodes, spread
 from graphvio.optimization.optimize import Optimization, optimize
 from graphvio.optimization.record import Motions, Recorder, SessionRecord
@@ -80,7 +80,7 @@ def test_what_is_told_of_the_uncertainty_is_true() -> None:
         drawn = draw_session(12.0, seed, IMU, 0)
         found = optimize([drawn.record], [IMU], [], config)
         last = len(found.sessions[0].nodes.rows) - 1
-        relative, covariance = motion_between(gtsam.Marginals(found.graph, found.values), found.values, 0, last)
+        relative, covariance = Marginals(found.graph, found.values).motion(0, last)
         true = se3_inverse(drawn.truth.nav_T_body[0]) @ drawn.truth.nav_T_body[-1]
         error = se3_log(se3_inverse(relative) @ true)
         squares.append(error @ np.linalg.solve(covariance, error))

@@ -17,10 +17,11 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.backend.factors import x
-from graphvio.backend.gating import chi_square_quantile, relative_covariance
+from graphvio.backend.gating import chi_square_quantile
 from graphvio.backend.noise import isotropic
 from graphvio.geometry import se3_inverse, se3_log
-from graphvio.optimization.graph import Tie
+from graphvio.optimization.marginals import Marginals
+from graphvio.optimization.tie import Tie
 
 _AGREE_M = 0.5
 _AGREE_RAD = 0.1
@@ -84,8 +85,8 @@ def fragment_of(fragments: Sequence[range]) -> Int:
 
 
 def consistent(
-    fragments: Sequence[range], joined: Joined, poses: Float, ties: Sequence[Tie], odometry: Sequence[Tie],
-    probability: float,
+    fragments: Sequence[range], joined: Joined, poses: Float, ties: Sequence[Tie], alone: Marginals,
+    odometry: Sequence[Tie], probability: float,
 ) -> Bool:  # fmt: skip
     """Which closures (L,) agree with the odometry and with each other.
 
@@ -94,6 +95,7 @@ def consistent(
         joined: how they lie to each other; closures between those that are not joined are left out.
         poses: (N, 4, 4) of all states, in the frames that are common now.
         ties: L closures.
+        alone: of the solution without closures.
         odometry: between the states that are ends of closures, each fragment's in a chain.
         probability: a closure beyond this share of the chi-square distribution is refused.
     """
@@ -115,7 +117,13 @@ def consistent(
             graph.add(gtsam.PriorFactorPose3(x(end), gtsam.Pose3(poses[end]), noise))
     for tie in odometry:
         graph.add(tie.factor())
-    asked = _within_odometry(graph, values, ties, asked, probability)
+    # Where many are wrong, a first solution with all of them lies far from the truth, and graduated non-convexity does
+    # not always find back: what the odometry alone refutes is left out before.
+    limit = chi_square_quantile(probability, 6)
+    joined_ends = Marginals(graph, values)
+    asked = np.array(
+        [k for k in asked.tolist() if _by_odometry(ties[k], of, alone, joined_ends) <= limit], dtype=np.int64
+    )
     kept[:] = False
     if not len(asked):
         return kept
@@ -128,58 +136,29 @@ def consistent(
     optimizer = gtsam.GncLMOptimizer(graph, values, params)
     optimizer.setInlierCostThresholdsAtProbability(probability)
     solution = optimizer.optimize()
-    limit = chi_square_quantile(probability, 6)
     for place, k in enumerate(asked.tolist(), start=len(known)):
         kept[k] = 2.0 * graph.at(place).error(solution) <= limit
     return kept
 
 
-def _within_odometry(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ties: Sequence[Tie], asked: Int, probability: float
-) -> Int:
-    """Those closures (K,) among some (L,) that the odometry alone does not refute.
-
-    Where many are wrong, a first solution with all of them lies far from the truth, and graduated non-convexity does
-    not always find back.
-    """
-    marginals = gtsam.Marginals(graph, values)
-    limit = chi_square_quantile(probability, 6)
-    passed = []
-    for k in asked.tolist():
-        tie = ties[k]
-        predicted, covariance = motion_between(marginals, values, tie.first, tie.second)
-        error = se3_log(se3_inverse(predicted) @ tie.first_T_second)
-        if error @ np.linalg.solve(covariance + tie.covariance, error) <= limit:
-            passed.append(k)
-    return np.array(passed, dtype=np.int64)
+def _by_odometry(tie: Tie, of: Int, alone: Marginals, joined_ends: Marginals) -> float:
+    """Squared distance of a closure from what is known without any, or, between fragments, with the votes only."""
+    return (alone if of[tie.first] == of[tie.second] else joined_ends).distance(tie)
 
 
-def motion_between(marginals: gtsam.Marginals, values: gtsam.Values, first: int, second: int) -> tuple[Float, Float]:
-    """``first_T_second`` (4, 4) and its covariance (6, 6), in body at the second."""
-    order = [x(first), x(second)]
-    joint = marginals.jointMarginalCovariance(order)
-    covariance = np.block([[joint.at(i, j) for j in order] for i in order])
-    relative = se3_inverse(values.atPose3(order[0]).matrix()) @ values.atPose3(order[1]).matrix()
-    return relative, relative_covariance(relative, covariance)
-
-
-def odometry_between(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, fragments: Sequence[range], ends: Sequence[int]
-) -> list[Tie]:
+def odometry_between(marginals: Marginals, fragments: Sequence[range], ends: Sequence[int]) -> list[Tie]:
     """The motion between the states of each fragment that are ends of closures, with its covariance.
 
     Args:
-        graph: without closures.
-        values: its solution.
+        marginals: of the solution without closures.
         fragments: states of each.
         ends: states, increasing.
     """
-    marginals = gtsam.Marginals(graph, values)
     made = []
     for states in fragments:
         inside = [end for end in ends if end in states]
         for first, second in pairwise(inside):
-            made.append(Tie(first, second, *motion_between(marginals, values, first, second)))
+            made.append(Tie(first, second, *marginals.motion(first, second)))
     return made
 
 

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from graphvio.optimization.consistency import odometry_between
+from graphvio.optimization.marginals import Marginals
 from graphvio.optimization.optimize import Optimization, OptimizedSession
 from graphvio.trajectory import tum_line
 
@@ -39,7 +40,8 @@ def write_g2o(optimization: Optimization, path: Path) -> None:
     """
     count = int(sum(len(session.nodes.rows) for session in optimization.sessions))
     fragments = [each.states for each in optimization.fragments]
-    odometry = odometry_between(optimization.graph_alone, optimization.alone, fragments, range(count))
+    marginals = Marginals(optimization.graph_alone, optimization.alone)
+    odometry = odometry_between(marginals, fragments, range(count))
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     at = 0
     for session in optimization.sessions:

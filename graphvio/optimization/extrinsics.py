@@ -19,6 +19,7 @@ from graphvio.backend.factors import x
 from graphvio.backend.noise import gaussian, isotropic
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_adjoint, se3_compose, se3_exp, se3_inverse, se3_log
+from graphvio.optimization.marginals import Marginals
 from graphvio.rig import Rig
 
 _FIRST_SIGMAS = np.repeat([0.02, 0.005], 3)  # of the first pair against the IMU: radians, metres
@@ -95,15 +96,14 @@ def own_motion(
     return gtsam.CustomFactor(gaussian(motion.covariance), keys, _error(motion.reference_T_current, twists))
 
 
-def correction_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, session: int, pairs: int) -> RigCorrection:
+def correction_of(marginals: Marginals, values: gtsam.Values, session: int, pairs: int) -> RigCorrection:
     """The solution's corrections, with covariances."""
-    marginals = gtsam.Marginals(graph, values)
     has_offset = values.exists(d(session))
     return RigCorrection(
         {pair: values.atPose3(c(session, pair)).matrix() for pair in range(pairs)},
-        {pair: np.asarray(marginals.marginalCovariance(c(session, pair))) for pair in range(pairs)},
+        {pair: marginals.variable(c(session, pair)) for pair in range(pairs)},
         float(values.atVector(d(session))[0]) if has_offset else 0.0,
-        float(np.sqrt(marginals.marginalCovariance(d(session))[0, 0])) if has_offset else None,
+        float(np.sqrt(marginals.variable(d(session))[0, 0])) if has_offset else None,
     )
 
 

@@ -19,6 +19,7 @@ from graphvio.config import SmootherConfig
 from graphvio.optimization.extrinsics import own_motion, unknowns
 from graphvio.optimization.nodes import Nodes
 from graphvio.optimization.record import SessionRecord
+from graphvio.optimization.tie import Tie
 from graphvio.rig import Imu
 
 _START_TILT_RAD = 0.2
@@ -26,29 +27,6 @@ _START_SPEED_M_S = 10.0
 _START_GYRO_BIAS_RAD_S = 0.1
 _START_ACCEL_BIAS_M_S2 = 0.5
 _ORIGIN_SIGMA = 1e-4  # radians and metres: without an IMU, the first pose of an epoch is its frame
-
-
-@dataclass(frozen=True, eq=False)
-class Tie:
-    """A relative pose between two states, from a loop closure.
-
-    Attributes:
-        first: the state that it is measured from.
-        second: the one in which it ends.
-        first_T_second: (4, 4) of body.
-        covariance: (6, 6), tangent ``[rotation, translation]`` in body at the second.
-    """
-
-    first: int
-    second: int
-    first_T_second: Float
-    covariance: Float
-
-    def factor(self) -> gtsam.NonlinearFactor:
-        """As the graph has it."""
-        return gtsam.BetweenFactorPose3(
-            x(self.first), x(self.second), gtsam.Pose3(self.first_T_second), gaussian(self.covariance)
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,12 +133,12 @@ class SessionGraph:
             self.fragments.append(Fragment(session, int(epoch[begin]), states, start, bool(record.with_imu[row])))
 
     def _add_inertial(self, first: int, nodes: Nodes, imu: Imu | None) -> None:
-        record, config = nodes.record, self._config
+        record, config, epoch = nodes.record, self._config, nodes.epoch
         params = None if imu is None else preintegration_params(imu, config.imu_noise_scale)
         tied = np.zeros(len(nodes.rows), dtype=bool)
         tied[np.searchsorted(nodes.rows, record.motions.row[nodes.motions])] = True
         for n in range(1, len(nodes.rows)):
-            if nodes.epoch[n] != nodes.epoch[n - 1]:
+            if epoch[n] != epoch[n - 1]:
                 continue
             before, row, k = int(nodes.rows[n - 1]), int(nodes.rows[n]), first + n
             dt = float(record.stamps_ns[row] - record.stamps_ns[before]) * 1e-9

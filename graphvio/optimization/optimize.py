@@ -9,17 +9,18 @@ import gtsam
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.backend.factors import x
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.config import Config
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.optimization.consistency import consistent, fragment_of, join_fragments, odometry_between
 from graphvio.optimization.extrinsics import RigCorrection, correction_of
-from graphvio.optimization.graph import Fragment, SessionGraph, Tie, moved, poses_of
+from graphvio.optimization.graph import Fragment, SessionGraph, moved, poses_of
 from graphvio.optimization.loops.search import LoopClosure
+from graphvio.optimization.marginals import Marginals
 from graphvio.optimization.nodes import Nodes, choose_nodes, spread
 from graphvio.optimization.record import SessionRecord
 from graphvio.optimization.solve import Residuals, residuals, solve
+from graphvio.optimization.tie import Tie
 from graphvio.rig import Imu
 
 Progress = Callable[[str, int, float], None]
@@ -56,8 +57,8 @@ class JudgedLoop:
     Attributes:
         closure: as it was found.
         refusal: why it is not used, or empty.
-        distance: squared Mahalanobis distance from the solution, 6 degrees of freedom; NaN between parts that nothing
-            joins.
+        distance: squared Mahalanobis distance from the solution, 6 degrees of freedom; of one that is refused, the
+            solution's own uncertainty counts, too. NaN between parts that nothing joins.
     """
 
     closure: LoopClosure
@@ -145,14 +146,26 @@ def optimize(
     component = np.array(joined.component)[fragment_of(states)].tolist()
     within = [tie for tie in ties if component[tie.first] == component[tie.second]]
     ends = sorted({end for tie in within for end in (tie.first, tie.second)})
-    odometry = odometry_between(graph_alone, alone, states, ends)
+    known_alone = Marginals(graph_alone, alone)
+    odometry = odometry_between(known_alone, states, ends)
     poses = poses_of(values, len(whole))
-    believed = consistent(states, joined, poses, ties, odometry, settings.loop_probability)
-    used = [tie for tie, is_used in zip(ties, believed, strict=True) if is_used]
+    believed = consistent(states, joined, poses, ties, known_alone, odometry, settings.loop_probability)
     roots = sorted(set(joined.component))
-    graph, kinds = whole.complete(roots, used)
-    values = solve(graph, values, _named(on_progress, "with loops"))
-    solution, covariances = poses_of(values, len(whole)), _covariances(graph, values, len(whole))
+    limit = chi_square_quantile(settings.loop_probability, 6)
+    distances = np.full(len(ties), np.nan)
+    while True:
+        graph, kinds = whole.complete(roots, [tie for tie, is_used in zip(ties, believed, strict=True) if is_used])
+        values = solve(graph, values, _named(on_progress, "with loops"))
+        marginals = Marginals(graph, values)
+        for k, tie in enumerate(ties):
+            if component[tie.first] == component[tie.second] and not believed[k]:
+                distances[k] = marginals.distance(tie)
+        again = ~believed & (distances <= limit)  # refused too soon: the solution without them bears them out
+        if not again.any():
+            break
+        believed |= again
+    solution = poses_of(values, len(whole))
+    covariances = np.array([marginals.pose(k) for k in range(len(whole))]).reshape(-1, 6, 6)
     frames = [roots.index(number) for number in joined.component]
     return Optimization(
         sessions=[
@@ -160,8 +173,8 @@ def optimize(
             for number, nodes in enumerate(sessions)
         ],
         loops=[
-            _judged(closure, tie, bool(is_used), component, solution, settings.loop_probability)
-            for closure, tie, is_used in zip(closures, ties, believed, strict=True)
+            _judged(closure, tie, bool(is_used), float(distance), solution, limit)
+            for closure, tie, is_used, distance in zip(closures, ties, believed, distances, strict=True)
         ],
         fragments=fragments,
         frames=frames,
@@ -169,11 +182,11 @@ def optimize(
         after=residuals(graph, kinds, values),
         graph=graph,
         values=values,
-        ties=used,
+        ties=[tie for tie, is_used in zip(ties, believed, strict=True) if is_used],
         graph_alone=graph_alone,
         alone=alone,
         corrections=[
-            correction_of(graph, values, number, int(record.own_pair.max()) + 1)
+            correction_of(marginals, values, number, int(record.own_pair.max()) + 1)
             for number, record in enumerate(records)
             if calibrates and len(record.own_pair)
         ],
@@ -206,25 +219,17 @@ def _session(
 
 
 def _judged(
-    closure: LoopClosure, tie: Tie, is_used: bool, component: Sequence[int], solution: Float, probability: float
+    closure: LoopClosure, tie: Tie, is_used: bool, distance: float, solution: Float, limit: float
 ) -> JudgedLoop:
-    if component[tie.first] != component[tie.second]:
-        return JudgedLoop(closure, "too few closures agree on how its two parts lie to each other", float("nan"))
-    error = se3_log(se3_inverse(se3_inverse(solution[tie.first]) @ solution[tie.second]) @ tie.first_T_second)
-    distance = float(error @ np.linalg.solve(tie.covariance, error))
+    """What became of a closure, whose squared distance is known if it is not used, but could have been."""
     if is_used:
-        return JudgedLoop(closure, "", distance)
-    sigmas, limit = np.sqrt(distance), np.sqrt(chi_square_quantile(probability, 6))
-    if sigmas > limit:
-        why = f"{sigmas:.0f} standard deviations from what all others say, more than {limit:.1f}"
-    else:
-        why = "contradicts the odometry alone"
+        error = se3_log(se3_inverse(se3_inverse(solution[tie.first]) @ solution[tie.second]) @ tie.first_T_second)
+        return JudgedLoop(closure, "", float(error @ np.linalg.solve(tie.covariance, error)))
+    if np.isnan(distance):
+        return JudgedLoop(closure, "too few closures agree on how its two parts lie to each other", distance)
+    sigmas, most = np.sqrt(distance), np.sqrt(limit)
+    why = f"{sigmas:.0f} standard deviations from what all others say, more than {most:.1f}"
     return JudgedLoop(closure, why, distance)
-
-
-def _covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, count: int) -> Float:
-    marginals = gtsam.Marginals(graph, values)
-    return np.array([marginals.marginalCovariance(x(k)) for k in range(count)]).reshape(-1, 6, 6)
 
 
 def _cost(kinds: dict[str, Residuals]) -> float:

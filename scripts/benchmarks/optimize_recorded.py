@@ -131,8 +131,8 @@ def optimized(folder: Path, name: str, out: Path, pairs: tuple[int, ...] | None 
         spent[stage] += now - latest
         latest = now
 
-    session = Session(name, source)
-    found = optimize_sessions([session], out, config, on_progress=lambda what, *_: note(_stage(what)))
+    session = Session(source.name, source)
+    found = optimize_sessions([source], out, config, on_progress=lambda what, *_: note(_stage(what)))
     note("map")  # and the report
     made = Optimized(out, session, Trajectory.read(source.truth), found, spent)
     tell(

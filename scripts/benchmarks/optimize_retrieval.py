@@ -115,7 +115,7 @@ def _by_tree(run: Optimized, views: _Views) -> tuple[Float, float]:
         options = library.VocabTreePairingOptions()
         options.vocab_tree_path, options.num_images, options.num_threads = path, len(views.names), _TREE_THREADS
         ranked = library.Database.open(left.path)
-        number = {left.image_id(name): k for k, name in enumerate(views.names)}
+        number = {ranked.read_image_with_name(name).image_id: k for k, name in enumerate(views.names)}
         similarity = np.full((len(number), len(number)), -np.inf)
         pairs = library.VocabTreePairGenerator(options, ranked, list(number))
         while not pairs.has_finished():
