@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -88,6 +89,8 @@ def optimize(
     except KeyboardInterrupt:
         typer.echo(f"graphvio: interrupted; the same command with --out {folder} goes on from there", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    for session in found.sessions:
+        _warn(folder / session.record.name / "odometry")
     _tell(found, folder)
 
 
@@ -114,6 +117,18 @@ class _Stages:
         if stage not in self._tasks:
             self._tasks[stage] = self._bars.add_task(stage, total=total)
         self._bars.update(self._tasks[stage], completed=done, total=total)
+
+
+def _warn(odometry: Path) -> None:
+    """Of what the odometry found wrong in a session."""
+    from graphvio.cli.run import LEAST_COMPLETION
+
+    summary = json.loads((odometry / "summary.json").read_text(encoding="utf-8"))
+    for warning in summary["warnings"]:
+        typer.echo(f"graphvio: {warning}; try --refine-calibration, or graphvio calibrate", err=True)
+    if summary["completion"] < LEAST_COMPLETION:
+        share = 100 * summary["completion"]
+        typer.echo(f"graphvio: only {share:.0f} % of the framesets have a pose; {odometry} tells why", err=True)
 
 
 def _tell(found: Optimization, folder: Path) -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 EXIT_INCOMPLETE = 3
 EXIT_INTERRUPTED = 130
-_LEAST_COMPLETION = 0.9
+LEAST_COMPLETION = 0.9
 
 
 def run(
@@ -74,7 +74,7 @@ def run(
             typer.echo(f"graphvio: interrupted; what was estimated until then is in {folder}", err=True)
             raise typer.Exit(EXIT_INTERRUPTED) from None
     _tell(summary, folder)
-    if summary.completion < _LEAST_COMPLETION:
+    if summary.completion < LEAST_COMPLETION:
         typer.echo(
             f"graphvio: only {100 * summary.completion:.0f} % of the framesets have a pose; "
             f"{folder / 'events.jsonl'} tells when and why",

@@ -215,7 +215,7 @@ def _perform(job: Job, stage: str, work: Callable[[_Task], dict[str, Any]], chan
             return done[stage]
         recording = fetch_recording(job.recording, kept)
         source = open_source(recording, job.rig, tolerance_ms=job.config.timing.simultaneous_ms)
-        stages = Stages([Session(job.name, source)], scratch, job.config)
+        stages = Stages([Session(job.name, source)], scratch, job.config, with_loops=job.with_loops)
         inputs = stages.inputs | job.inputs
         refuse_others(storage, done.values(), inputs)
         task = _Task(job, scratch, source, stages, storage, done)

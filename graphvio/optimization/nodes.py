@@ -8,6 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.backend.inertial import ImuSpan
+from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.optimization.record import SessionRecord
 
@@ -37,8 +38,15 @@ class Nodes:
         return np.asarray(self.record.epoch[self.rows])
 
     def index_of_row(self, row: int) -> int:
-        """The state of a frameset that is one."""
-        return int(np.searchsorted(self.rows, row))
+        """The state of a frameset.
+
+        Raises:
+            OptimizationError: if it is none.
+        """
+        index = int(np.searchsorted(self.rows, row))
+        if index == len(self.rows) or self.rows[index] != row:
+            raise OptimizationError(f"{self.record.name}: frameset {row} is no state of the graph, but tied to one")
+        return index
 
     def twist(self, n: int) -> Float:
         """(6,) angular rate, rad/s, and velocity, m/s, of body in body at state ``n``, which the IMU covers."""
@@ -67,7 +75,7 @@ def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
             from one keyframe within a shorter time adds little.
     """
     stamps, motions = record.stamps_ns, record.motions
-    wanted = np.zeros(len(stamps), dtype=bool)
+    wanted = record.is_keyframe.copy()
     wanted[motions.reference] = True
     ends = np.flatnonzero(np.diff(record.epoch))
     wanted[ends] = wanted[ends + 1] = True

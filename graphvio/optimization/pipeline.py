@@ -77,10 +77,9 @@ def optimize_sessions(
         GraphvioError: if a recording cannot be read, holds no pose, or the folder cannot be used.
     """
     sessions = named(sources)
-    stages = Stages(sessions, Path(out), config, calibrates, on_progress)
+    stages = Stages(sessions, Path(out), config, with_loops=with_loops, calibrates=calibrates, on_progress=on_progress)
     records = [stages.record(number) for number in range(len(sessions))]
-    closures = stages.closures(records) if with_loops else None
-    return stages.result(records, closures)
+    return stages.result(records, stages.closures(records) if with_loops else None)
 
 
 class Stages:
@@ -90,6 +89,7 @@ class Stages:
         sessions: one or several.
         out: folder of the results, as `optimize_sessions` takes it.
         config: of all stages.
+        with_loops: as `optimize_sessions` takes it.
         calibrates: as `optimize_sessions` takes it.
         on_progress: told how far it is.
 
@@ -105,6 +105,8 @@ class Stages:
         sessions: Sequence[Session],
         out: Path,
         config: Config,
+        *,
+        with_loops: bool = True,
         calibrates: bool = False,
         on_progress: Progress | None = None,
     ) -> None:
@@ -112,8 +114,12 @@ class Stages:
         self._calibrates = calibrates
         self._config = config
         self._on_progress = on_progress or _quiet
-        inputs = {each.name: _identity(each.source) for each in sessions}
-        self.inputs = inputs | {"config": config.sha256(), "calibration": str(calibrates), "graphvio": __version__}
+        self.inputs = {each.name: _identity(each.source) for each in sessions} | {
+            "config": config.sha256(),
+            "loops": str(with_loops),
+            "calibration": str(calibrates),
+            "graphvio": __version__,
+        }
         self._space = Workspace(out, self.inputs)
 
     def record(self, number: int) -> SessionRecord:
