@@ -16,7 +16,7 @@ from graphvio.frontend.tracks import PairFrame
 from graphvio.geometry import se3, se3_inverse, se3_log, so3_exp
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.optimization.loops.resection import resect_features
-from graphvio.optimization.loops.retrieval import candidates, describe, joined, vocabulary
+from graphvio.optimization.loops.retrieval import candidates, describe, vocabulary
 from graphvio.rig import StereoPair
 from graphvio.simulation import default_rig
 
@@ -123,18 +123,22 @@ def test_an_image_is_most_like_another_of_the_same_place() -> None:
     words = vocabulary(images, 0)
     assert np.array_equal(words, vocabulary(images, 0))
     vectors = np.array([describe(image, words) for image in images])
-    similarity = joined(vectors @ vectors.T, np.arange(24), 24)
-    offered = candidates(similarity, ~np.eye(24, dtype=bool), 1)
+    offered = candidates(vectors, np.arange(24), lambda earlier, later: True, 1)
     best = {later: earlier for earlier, later in offered}
     assert [best[later] for later in range(12, 24)] == list(range(12))
     assert not describe(images[0][:0], words).any()
 
 
 def test_only_allowed_places_are_offered_the_most_alike_first() -> None:
-    similarity = np.array([[1.0, 0.9, 0.2, 0.8], [0.9, 1.0, 0.3, 0.1], [0.2, 0.3, 1.0, 0.5], [0.8, 0.1, 0.5, 1.0]])
-    allowed = np.abs(np.arange(4)[:, None] - np.arange(4)[None, :]) > 1
-    assert candidates(similarity, allowed, 2) == [(0, 3), (0, 2), (1, 3)]
-    assert candidates(similarity, allowed, 1) == [(0, 3), (0, 2)]
+    """Of five images, the last two are of one place, which looks like the first by one of them."""
+    vectors = np.array([[1.0, 0.0], [0.9, 0.4359], [0.2, 0.9798], [0.1, 0.995], [0.8, 0.6]], dtype=np.float32)
+    place = np.array([0, 1, 2, 3, 3])
+
+    def may(earlier: int, later: int) -> bool:
+        return later - earlier > 1
+
+    assert candidates(vectors, place, may, 2) == [(1, 3), (0, 3), (0, 2)]
+    assert candidates(vectors, place, may, 1) == [(1, 3), (0, 2)]
 
 
 def test_what_a_mask_hides_is_no_feature(tmp_path: Path) -> None:

@@ -177,6 +177,7 @@ def test_the_calibration_is_found_with_the_trajectory() -> None:
     drawn = draw_session(100.0, 4, IMU, 5, corrections=true, offset_s=0.006)
     found = optimize([drawn.record], [IMU], drawn.closures, CONFIG, calibrates=True)
     (correction,) = found.corrections
+    assert correction is not None
     for pair, expected in enumerate(true):
         error = se3_log(se3_inverse(correction.pairs[pair]) @ expected)
         assert np.linalg.norm(error[:3]) < 2e-3

@@ -25,7 +25,10 @@ from graphvio.optimization.tie import Tie
 
 _AGREE_M = 0.5
 _AGREE_RAD = 0.1
-_LEAST_VOTES = 2
+_LEAST_VOTES = 3
+_STRONG_POINTS = (
+    100  # of a closure that may vote: fewer may be one thing that two places have alike, seen again and again
+)
 _FRAME_SIGMA = 1e-6
 _JOINED_SIGMAS = np.repeat([_AGREE_RAD, _AGREE_M], 3)  # of how fragments lie to each other before closures are weighed
 
@@ -43,18 +46,23 @@ class Joined:
     component: list[int]
 
 
-def join_fragments(fragments: Sequence[range], poses: Float, ties: Sequence[Tie]) -> Joined:
+def join_fragments(fragments: Sequence[range], poses: Float, ties: Sequence[Tie], inliers: Sequence[int]) -> Joined:
     """Bring fragments that closures tie into the frame of the first of them.
 
     Args:
         fragments: states of each, which share a nav frame.
         poses: (N, 4, 4) of all states, in their fragments' frames.
         ties: closures, right and wrong ones.
+        inliers: points of each closure.
     """
     of = fragment_of(fragments)
     frames = [np.eye(4) for _ in fragments]
     component = list(range(len(fragments)))
-    between = [(int(of[tie.first]), int(of[tie.second]), tie) for tie in ties if of[tie.first] != of[tie.second]]
+    between = [
+        (int(of[tie.first]), int(of[tie.second]), tie)
+        for tie, points in zip(ties, inliers, strict=True)
+        if of[tie.first] != of[tie.second] and points >= _STRONG_POINTS
+    ]
     while True:
         offers: dict[tuple[int, int], list[Float]] = {}
         for one, other, tie in between:

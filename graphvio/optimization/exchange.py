@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from errno import ENOSPC
 from itertools import combinations_with_replacement
 from pathlib import Path
 
 import gtsam
 import numpy as np
 
-from graphvio.optimization.consistency import odometry_between
+from graphvio.errors import OptimizationError
+from graphvio.geometry import se3_inverse
+from graphvio.optimization.graph import poses_of
 from graphvio.optimization.marginals import Marginals
 from graphvio.optimization.optimize import Optimization, OptimizedSession
+from graphvio.optimization.tie import Tie
 from graphvio.trajectory import tum_line
 
 _TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -35,20 +41,44 @@ def covariance_text(session: OptimizedSession) -> str:
 def write_g2o(optimization: Optimization, path: Path) -> None:
     """A graph of the states' poses, for tools that know poses only.
 
-    What motions, IMU and rests say together of two states that follow each other is one edge, with its covariance;
-    closures are edges as they are.
+    Edges are the motions, each as the solution without closures has it, which the IMU has a part in, with its
+    covariance; where no motion leads to a state, one from the state before; and the closures as they are.
+
+    Raises:
+        OptimizationError: if the file cannot be written.
     """
-    count = int(sum(len(session.nodes.rows) for session in optimization.sessions))
-    fragments = [each.states for each in optimization.fragments]
-    marginals = Marginals(optimization.graph_alone, optimization.alone)
-    odometry = odometry_between(marginals, fragments, range(count))
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     at = 0
     for session in optimization.sessions:
         for pose in session.nav_T_body[session.nodes.rows]:
             values.insert(at, gtsam.Pose3(pose))
             at += 1
-    for tie in (*odometry, *optimization.ties):
+    for tie in (*_edges(optimization), *optimization.ties):
         noise = gtsam.noiseModel.Gaussian.Covariance(0.5 * (tie.covariance + tie.covariance.T), False)
         graph.add(gtsam.BetweenFactorPose3(tie.first, tie.second, gtsam.Pose3(tie.first_T_second), noise))
-    gtsam.writeG2o(graph, values, str(path))
+    unfinished = path.with_name(f".{path.name}.tmp")
+    gtsam.writeG2o(graph, values, str(unfinished))
+    try:
+        if unfinished.read_bytes().count(b"EDGE") != graph.size():
+            raise OSError(ENOSPC, os.strerror(ENOSPC))  # gtsam does not tell
+        unfinished.replace(path)
+    except OSError as error:
+        raise OptimizationError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+
+def _edges(optimization: Optimization) -> Iterator[Tie]:
+    """What is measured without closures: motions, and what leads to states that none ends in."""
+    marginals: Marginals | None = None
+    poses, first = poses_of(optimization.alone, int(sum(len(each.nodes.rows) for each in optimization.sessions))), 0
+    for session in optimization.sessions:
+        nodes, motions = session.nodes, session.record.motions
+        tied = np.zeros(len(nodes.rows), dtype=bool)
+        for k in nodes.motions.tolist():
+            i, j = nodes.index_of_row(int(motions.reference[k])), nodes.index_of_row(int(motions.row[k]))
+            tied[j] = True
+            yield Tie(first + i, first + j, se3_inverse(poses[first + i]) @ poses[first + j], motions.covariance[k])
+        for n in np.flatnonzero(~tied).tolist():
+            if n and nodes.epoch[n] == nodes.epoch[n - 1]:
+                marginals = marginals or Marginals(optimization.graph_alone, optimization.alone)
+                yield Tie(first + n - 1, first + n, *marginals.motion(first + n - 1, first + n))
+        first += len(nodes.rows)

@@ -11,6 +11,7 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.config import Config
+from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.optimization.consistency import consistent, fragment_of, join_fragments, odometry_between
 from graphvio.optimization.extrinsics import RigCorrection, correction_of
@@ -82,7 +83,7 @@ class Optimization:
         ties: closures that are used, as factors.
         graph_alone: without closures, each fragment in a frame of its own.
         alone: its solution.
-        corrections: of each session's rig file, where the calibration was unknown.
+        corrections: of each session's rig file, or None where the calibration was not asked for.
     """
 
     sessions: Sequence[OptimizedSession]
@@ -96,7 +97,7 @@ class Optimization:
     ties: Sequence[Tie]
     graph_alone: gtsam.NonlinearFactorGraph
     alone: gtsam.Values
-    corrections: Sequence[RigCorrection] = ()
+    corrections: Sequence[RigCorrection | None]
 
     @property
     def cost_before(self) -> float:
@@ -128,8 +129,23 @@ def optimize(
         calibrates: whether the places of the pairs, and the IMU's time offset, are unknowns with priors.
 
     Raises:
-        OptimizationError: if the graph has no unique solution.
+        OptimizationError: if the graph has no unique solution, or closures are of other sessions.
     """
+    try:
+        return _optimize(records, imus, closures, config, on_progress, calibrates)
+    except RuntimeError as error:  # of gtsam
+        why = " ".join(str(error).split())[:200]
+        raise OptimizationError(f"the sessions' graph has no unique solution ({why})") from None
+
+
+def _optimize(
+    records: Sequence[SessionRecord],
+    imus: Sequence[Imu | None],
+    closures: Sequence[LoopClosure],
+    config: Config,
+    on_progress: Progress | None,
+    calibrates: bool,
+) -> Optimization:
     settings = config.optimization
     interval_s = np.inf if calibrates else settings.keyframe_interval_s
     sessions = [choose_nodes(record, interval_s) for record in records]
@@ -141,7 +157,7 @@ def optimize(
     ties = [_tie(closure, sessions, whole) for closure in closures]
     states = [each.states for each in fragments]
     poses = poses_of(alone, len(whole))
-    joined = join_fragments(states, poses, ties)
+    joined = join_fragments(states, poses, ties, [closure.inliers for closure in closures])
     values = moved(alone, list(zip(states, joined.frames, strict=True)))
     component = np.array(joined.component)[fragment_of(states)].tolist()
     within = [tie for tie in ties if component[tie.first] == component[tie.second]]
@@ -187,13 +203,18 @@ def optimize(
         alone=alone,
         corrections=[
             correction_of(marginals, values, number, int(record.own_pair.max()) + 1)
-            for number, record in enumerate(records)
             if calibrates and len(record.own_pair)
+            else None
+            for number, record in enumerate(records)
         ],
     )
 
 
 def _tie(closure: LoopClosure, sessions: Sequence[Nodes], whole: SessionGraph) -> Tie:
+    for place in (closure.reference, closure.current):
+        stamps_ns = sessions[place.session].record.stamps_ns
+        if place.row >= len(stamps_ns) or stamps_ns[place.row] != place.stamp_ns:
+            raise OptimizationError("the loop closures are of other sessions than those that are given")
     first, second = (
         int(whole.firsts[place.session]) + sessions[place.session].index_of_row(place.row)
         for place in (closure.reference, closure.current)

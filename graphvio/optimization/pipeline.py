@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from graphvio import __version__
@@ -24,6 +24,7 @@ from graphvio.optimization.workspace import Workspace, digest
 from graphvio.pipeline import Progress as RunProgress
 from graphvio.pipeline import run
 from graphvio.results import ResultWriter
+from graphvio.rig import Rig
 from graphvio.rig_files.native import to_text
 from graphvio.sources import Source
 from graphvio.trajectory import Trajectory
@@ -115,6 +116,7 @@ class Stages:
         self._config = config
         self._on_progress = on_progress or _quiet
         self.inputs = {each.name: _identity(each.source) for each in sessions} | {
+            "sessions": ", ".join(each.name for each in sessions),
             "config": config.sha256(),
             "loops": str(with_loops),
             "calibration": str(calibrates),
@@ -137,21 +139,22 @@ class Stages:
             with ResultWriter(folder, session.source.rig, self._config.to_yaml()) as writer:
                 run(session.source, self._config, writer, on_progress=follow, recorder=recorder)
             self._space.write(name, recorder.record().to_bytes())
-            self._space.finish(stage)
+            self._space.finish(stage, name, f"{session.name}/odometry/summary.json")
         return SessionRecord.load(self._space.folder / name)
 
     def closures(self, records: Sequence[SessionRecord]) -> list[LoopClosure]:
         """Loop closures within and between the sessions."""
         inputs = [self.places(number, record) for number, record in enumerate(records)]
-        with FeatureDatabase(self._space.folder / DATABASE) as database:
-            for each in inputs:
-                self._extract(each, database)
-            if not self._space.has_finished("loops"):
+        missing = [each for each in inputs if not self._space.has_finished(_features_of(each.name))]
+        if missing or not self._space.has_finished("loops"):
+            with FeatureDatabase(self._space.folder / DATABASE) as database:
+                for each in missing:
+                    self._extract(each, database)
                 found = find_loops(
                     inputs, database, self._config, lambda done, total: self._on_progress("loops", done, total)
                 )
-                self._space.write("loops.npz", saved.to_bytes(found))
-                self._space.finish("loops")
+            self._space.write("loops.npz", saved.to_bytes(found))
+            self._space.finish("loops", "loops.npz", DATABASE)
         return saved.load(self._space.folder / "loops.npz")
 
     def result(self, records: Sequence[SessionRecord], closures: Sequence[LoopClosure] | None) -> Optimization:
@@ -165,23 +168,32 @@ class Stages:
             lambda name, number, _: self._on_progress(name, number, number),
             self._calibrates,
         )
-        for session, correction in zip(self._sessions, found.corrections, strict=False):
-            rig = correction.corrected(session.source.rig)
-            self._space.write(f"{session.name}/rig_optimized.yaml", to_text(rig, Path()).encode())
+        rigs = [
+            each.source.rig if correction is None else correction.corrected(each.source.rig)
+            for each, correction in zip(self._sessions, found.corrections, strict=True)
+        ]
+        if self._calibrates:
+            for session, rig in zip(self._sessions, rigs, strict=True):
+                self._space.write(f"{session.name}/rig_optimized.yaml", to_text(rig, Path()).encode())
         for session, optimized in zip(self._sessions, found.sessions, strict=True):
             place = "" if len(self._sessions) == 1 else f"{session.name}/"
             self._space.write(f"{place}trajectory_optimized.txt", trajectory_text(optimized).encode())
             self._space.write(f"{place}covariance.csv", covariance_text(optimized).encode())
         write_g2o(found, self._space.folder / "graph.g2o")
         if closures is not None and not self._space.has_finished("map"):
-            self._export(found, records)
-            self._space.finish("map")
+            self._export(found, records, rigs)
+            self._space.finish("map", "colmap/sparse/0/points3D.bin")
         write_report(found, self._space.folder, [_truth(each.source) for each in self._sessions])
         return found
 
-    def _export(self, found: Optimization, records: Sequence[SessionRecord]) -> None:
-        inputs = [self.places(number, record) for number, record in enumerate(records)]
+    def _export(self, found: Optimization, records: Sequence[SessionRecord], rigs: Sequence[Rig]) -> None:
+        inputs = [
+            replace(self.places(number, record), rig=rig)
+            for number, (record, rig) in enumerate(zip(records, rigs, strict=True))
+        ]
         with FeatureDatabase(self._space.folder / DATABASE) as database:
+            for each in inputs if self._calibrates else []:
+                database.move_cameras(each.name, each.rig)
             export(
                 found,
                 inputs,
@@ -199,10 +211,7 @@ class Stages:
         return SessionInput(session.name, session.source, session.source.rig, places)
 
     def _extract(self, session: SessionInput, database: FeatureDatabase) -> None:
-        stage = f"features of {session.name}"
-        if self._space.has_finished(stage):
-            return
-        total = len(session.places)
+        stage, total = _features_of(session.name), len(session.places)
         extract_places(
             session.source,
             session.rig,
@@ -212,7 +221,12 @@ class Stages:
             self._config,
             lambda done: self._on_progress(stage, done, total),
         )
-        self._space.finish(stage)
+        self._space.finish(stage, DATABASE)
+
+
+def _features_of(name: str) -> str:
+    """The stage's name."""
+    return f"features of {name}"
 
 
 def _identity(source: Source) -> str:

@@ -27,7 +27,7 @@ class Workspace:
     def __init__(self, folder: Path, inputs: Mapping[str, str]) -> None:
         self.folder = folder
         self._inputs = dict(inputs)
-        self._finished: list[str] = []
+        self._finished: dict[str, list[str]] = {}
         state = folder / _STATE
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -44,16 +44,16 @@ class Workspace:
             raise OptimizationError(f"{state}: is damaged; remove the folder, or name another one") from None
 
     def has_finished(self, stage: str) -> bool:
-        """Whether a stage was finished, now or by an earlier run."""
-        return stage in self._finished
+        """Whether a stage was finished, now or by an earlier run, and its files are there."""
+        return stage in self._finished and all((self.folder / name).is_file() for name in self._finished[stage])
 
-    def finish(self, stage: str) -> None:
-        """Note that a stage is finished.
+    def finish(self, stage: str, *files: str) -> None:
+        """Note that a stage is finished, and has left these files.
 
         Raises:
             OptimizationError: if it cannot be written.
         """
-        self._finished.append(stage)
+        self._finished[stage] = list(files)
         self._save()
 
     def write(self, name: str, data: bytes) -> None:
@@ -83,8 +83,8 @@ class Workspace:
                 f"{self.folder}: holds results of other input (different: {', '.join(differing)}); name another folder"
             )
         finished = state["finished"]
-        assert isinstance(finished, list)
-        self._finished = [str(stage) for stage in finished]
+        assert isinstance(finished, dict)
+        self._finished = {str(stage): [str(name) for name in files] for stage, files in finished.items()}
 
     def _save(self) -> None:
         state = {"inputs": self._inputs, "finished": self._finished}

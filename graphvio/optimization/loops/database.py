@@ -123,18 +123,27 @@ class FeatureDatabase:
         Returns:
             The rig's number, and those of its cameras by name.
         """
+        numbers = {camera.name: self._file.write_camera(colmap_camera(camera, 0)) for camera in rig.cameras}
+        return self._file.write_rig(self._rig(rig, numbers)), numbers
+
+    def move_cameras(self, session: str, rig: Rig) -> None:
+        """Put the cameras of a session, if it has images, where a rig has them."""
+        known = self.rig_of(session)
+        if known is not None:
+            made = self._rig(rig, known[1])
+            made.rig_id = known[0]
+            self._file.update_rig(made)
+
+    def _rig(self, rig: Rig, numbers: Mapping[str, int]) -> Any:
         library = self._colmap
-        numbers = [self._file.write_camera(colmap_camera(camera, 0)) for camera in rig.cameras]
         made = library.Rig()
-        for number, camera in zip(numbers, rig.cameras, strict=True):
-            sensor = library.sensor_t(library.SensorType.CAMERA, number)
-            if number == numbers[0]:
+        for camera in rig.cameras:
+            sensor = library.sensor_t(library.SensorType.CAMERA, numbers[camera.name])
+            if camera is rig.cameras[0]:
                 made.add_ref_sensor(sensor)
             else:
                 made.add_sensor(sensor, rigid(camera.cam_T_body @ rig.cameras[0].body_T_cam))
-        return self._file.write_rig(made), {
-            camera.name: number for camera, number in zip(rig.cameras, numbers, strict=True)
-        }
+        return made
 
     def add_place(self, rig_id: int, images: Mapping[int, str]) -> None:
         """Add the images of one instant: camera's number -> name."""

@@ -6,12 +6,12 @@ H. Jegou, M. Douze, C. Schmid, P. Perez, *Aggregating local descriptors into a c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 
-from graphvio.arrays import AnyArray, Float, Int
+from graphvio.arrays import AnyArray, Int
 
 _WORDS = 64
 _SAMPLE = 40_000  # descriptors that the vocabulary is made from
@@ -56,29 +56,31 @@ def describe(descriptors: AnyArray, words: AnyArray) -> AnyArray:
     return np.asarray(vector / length if length > 0.0 else vector)
 
 
-def candidates(similarity: Float, allowed: AnyArray, most: int) -> list[tuple[int, int]]:
-    """For each place its most similar ones among those before it.
+def candidates(vectors: AnyArray, place: Int, may: Callable[[int, int], bool], most: int) -> list[tuple[int, int]]:
+    """For each place its most similar ones among those before it: places are as alike as their images most alike.
 
     Args:
-        similarity: (P, P) of places, symmetric.
-        allowed: (P, P) which pairs of them may be asked for.
+        vectors: (N, D) of images, of length one.
+        place: (N,) number of each image's place, in order.
+        may: whether an earlier and a later place may be compared.
         most: candidates of a place.
 
     Returns:
         Pairs (earlier, later) of places, the most similar first.
     """
     found: list[tuple[float, int, int]] = []
-    for later in range(len(similarity)):
-        row = np.where(allowed[later, :later], similarity[later, :later], -np.inf)
-        for earlier in np.argsort(-row, kind="stable")[:most].tolist():
-            if np.isfinite(row[earlier]):
-                found.append((float(row[earlier]), earlier, later))
+    numbers, starts = np.unique(place, return_index=True)
+    ends = np.append(starts[1:], len(place))
+    for at in range(1, len(numbers)):  # a row at a time: all of them would not fit for hours of images
+        own = vectors[starts[at] : ends[at]]
+        alike = np.max(own @ vectors[: starts[at]].T, axis=0)
+        by_place = np.maximum.reduceat(alike, starts[:at])
+        taken = 0
+        for k in np.argsort(-by_place, kind="stable").tolist():
+            if taken == most:
+                break
+            if may(int(numbers[k]), int(numbers[at])):
+                found.append((float(by_place[k]), int(numbers[k]), int(numbers[at])))
+                taken += 1
     found.sort(key=lambda each: (-each[0], each[1], each[2]))
     return [(earlier, later) for _, earlier, later in found]
-
-
-def joined(similarity: Float, place: Int, places: int) -> Float:
-    """Similarity (P, P) of places from that of their images (N, N): that of the two images most alike."""
-    made = np.full((places, places), -np.inf)
-    np.maximum.at(made, (place[:, None], place[None, :]), similarity)
-    return made

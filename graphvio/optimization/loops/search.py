@@ -19,7 +19,7 @@ from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.matching import alike, estimated_geometry
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.optimization.loops.resection import Resection, register_again, resect_features
-from graphvio.optimization.loops.retrieval import candidates, describe, joined, vocabulary
+from graphvio.optimization.loops.retrieval import candidates, describe, vocabulary
 from graphvio.rig import Camera, Rig, StereoPair
 from graphvio.sources import Source
 
@@ -98,12 +98,17 @@ def find_loops(
         on_progress: called with the candidates that were tried, and how many there are.
     """
     places = [place for session in sessions for place in session.places]
-    images, similarity = _similarity(sessions, places, database, config.motion.seed)
+    images = _described(sessions, places, database, config.motion.seed)
     if not images:
         return []
-    allowed = _allowed(places, config.optimization.loop_interval_s)
-    offered = candidates(joined(similarity, images.place, len(places)), allowed, config.optimization.loop_candidates)
-    verifier = _Verifier(sessions, places, images, similarity, database, config)
+    apart_ns = round(config.optimization.loop_interval_s * 1e9)
+
+    def may(earlier: int, later: int) -> bool:
+        one, other = places[earlier], places[later]
+        return one.session != other.session or abs(other.stamp_ns - one.stamp_ns) > apart_ns
+
+    offered = candidates(images.vectors, images.place, may, config.optimization.loop_candidates)
+    verifier = _Verifier(sessions, places, images, database, config)
     found: list[LoopClosure] = []
     with ThreadPoolExecutor(2, thread_name_prefix="graphvio-loops") as pool:
         for done, closure in enumerate(pool.map(verifier.verify, offered), start=1):
@@ -117,41 +122,52 @@ def find_loops(
 
 @dataclass(frozen=True, eq=False)
 class _Images:
-    """N left images of the places: number of the place (N,), pair (N,), and name."""
+    """N left images of the places: number of the place (N,), pair (N,), name, and what they look like (N, D)."""
 
     place: Int
     pair: Int
     names: Sequence[str]
+    vectors: AnyArray
 
     def __len__(self) -> int:
         return len(self.names)
 
 
-def _similarity(
+class _Descriptors(Sequence[AnyArray]):
+    """Those of some images, read when they are asked for: all of an hour would not fit."""
+
+    def __init__(self, database: FeatureDatabase, names: Sequence[str]) -> None:
+        self._database = database
+        self._names = names
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __getitem__(self, k: Any) -> Any:
+        return self._database.descriptors(self._names[k])
+
+
+def _described(
     sessions: Sequence[SessionInput], places: Sequence[Place], database: FeatureDatabase, seed: int
-) -> tuple[_Images, Float]:
+) -> _Images:
     listed = [
         (number, j, image_name(sessions[place.session].name, pair.left.name, place.stamp_ns))
         for number, place in enumerate(places)
         for j, pair in enumerate(sessions[place.session].rig.pairs)
     ]
     listed = [each for each in listed if each[2] in database.names]
-    images = _Images(
+    names = [each[2] for each in listed]
+    descriptors = _Descriptors(database, names)
+    words = vocabulary(descriptors, seed)
+    vectors = np.zeros((len(names), words.size), dtype=np.float32)
+    for k, rows in enumerate(descriptors):
+        vectors[k] = describe(rows, words)
+    return _Images(
         np.array([each[0] for each in listed], dtype=np.int64),
         np.array([each[1] for each in listed], dtype=np.int64),
-        [each[2] for each in listed],
+        names,
+        vectors,
     )
-    descriptors = [database.descriptors(name) for name in images.names]
-    words = vocabulary(descriptors, seed)
-    vectors = np.array([describe(rows, words) for rows in descriptors]).reshape(len(images), -1)
-    return images, np.asarray(vectors @ vectors.T, dtype=np.float64)
-
-
-def _allowed(places: Sequence[Place], interval_s: float) -> AnyArray:
-    stamps = np.array([place.stamp_ns for place in places])
-    session = np.array([place.session for place in places])
-    apart = np.abs(stamps[:, None] - stamps[None, :]) > interval_s * 1e9
-    return np.asarray(apart | (session[:, None] != session[None, :]))
 
 
 class _Verifier:
@@ -162,14 +178,12 @@ class _Verifier:
         sessions: Sequence[SessionInput],
         places: Sequence[Place],
         images: _Images,
-        similarity: Float,
         database: FeatureDatabase,
         config: Config,
     ) -> None:
         self._sessions = sessions
         self._places = places
         self._images = images
-        self._similarity = similarity
         self._database = database
         self._config = config
         self._lock = threading.Lock()
@@ -210,8 +224,11 @@ class _Verifier:
         """The images of two places that are most alike: (a, b) -> their names."""
         images = self._images
         ones, others = np.flatnonzero(images.place == earlier), np.flatnonzero(images.place == later)
+        alike = images.vectors[ones] @ images.vectors[others].T
         ranked = sorted(
-            ((-float(self._similarity[i, k]), i, k) for i in ones.tolist() for k in others.tolist()),
+            (-float(alike[row, column]), i, k)
+            for row, i in enumerate(ones.tolist())
+            for column, k in enumerate(others.tolist())
         )[:_MOST_CROSSINGS]
         return {(int(images.pair[i]), int(images.pair[k])): (images.names[i], images.names[k]) for _, i, k in ranked}
 
