@@ -110,6 +110,21 @@ def test_sessions_of_one_place_come_into_one_frame() -> None:
     assert apart_m.max() < 0.1
 
 
+def test_things_that_two_buildings_have_alike_do_not_join_them() -> None:
+    """Ten closures that agree, each on a few points, as on one poster, are not believed; with a hundred each they are."""
+    one, other = draw_session(40.0, 1, IMU, 0), draw_session(40.0, 2, IMU, 0, session=1)
+    between = [closure_between(one, other, row, 5) for row in range(100, 300, 20)]
+    few = [replace(each, inliers=60) for each in between]
+    assert optimize([one.record, other.record], [IMU, IMU], few, CONFIG).frames == [0, 1]
+    assert optimize([one.record, other.record], [IMU, IMU], between, CONFIG).frames == [0, 0]
+
+
+def test_closures_of_other_sessions_are_refused(walk: DrawnSession) -> None:
+    other = draw_session(40.0, 2, IMU, 0)
+    with pytest.raises(OptimizationError, match="are of other sessions"):
+        optimize([other.record], [IMU], walk.closures, CONFIG)
+
+
 def chosen(motions: Motions, which: Bool) -> Motions:
     columns: dict[str, Any] = {name: column[which] for name, column in motions._asdict().items()}
     return Motions(**columns)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from calibration_walks import recorded
+from calibration_walks import recorded, with_wrong_place
 from typer.testing import CliRunner, Result
 
 from graphvio import open_source
@@ -22,9 +24,10 @@ from graphvio.config import Config
 from graphvio.errors import MissingExtraError, OptimizationError
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.optimization.pipeline import optimize_sessions
+from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
 
-pytest.importorskip("pycolmap", reason="loop closure needs the extra maps")
+pycolmap: Any = pytest.importorskip("pycolmap", reason="loop closure needs the extra maps")
 CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 SECONDS = 7.0
 SETTINGS = "optimization: {loop_interval_s: 3.0, place_distance_m: 0.2, features: 500}\n"
@@ -107,6 +110,35 @@ def test_a_folder_of_something_else_is_left_alone(walk: Path, settings: Path, do
     refused = command(walk, "--config", settings, "--out", tmp_path)
     assert isinstance(refused.exception, OptimizationError)
     assert "is not empty" in str(refused.exception)
+
+
+def test_files_that_are_gone_are_made_again(done: Path, walk: Path, settings: Path, tmp_path: Path) -> None:
+    out = tmp_path / "walk"
+    shutil.copytree(done, out)
+    for name in ("database.db", "walk/record.npz", "graph.g2o"):
+        (out / name).unlink()
+    shutil.rmtree(out / "colmap")
+    assert command(walk, "--config", settings, "--out", out).exit_code == 0
+    for name in (*ALWAYS_EQUAL, "colmap/sparse/0/points3D.bin", "summary.json"):
+        assert (out / name).read_bytes() == (done / name).read_bytes(), name
+
+
+def test_the_calibration_is_refined_and_used_for_the_map(walk: Path, settings: Path, tmp_path: Path) -> None:
+    rig = open_source(walk).rig
+    with_wrong_place(rig, 1.0, 0.03).save(tmp_path / "wrong.yaml")
+    out = tmp_path / "walk"
+    refined = command(
+        walk, "--config", settings, "--rig", tmp_path / "wrong.yaml", "--refine-calibration", "--out", out
+    )
+    assert refined.exit_code == 0, refined.output
+    found = Rig.load(out / "walk" / "rig_optimized.yaml")
+    error = se3_log(se3_inverse(rig.left2_T_left1()) @ found.left2_T_left1())
+    assert np.rad2deg(np.linalg.norm(error[:3])) < 0.2
+    assert np.linalg.norm(error[3:]) < 0.01
+    model = pycolmap.Reconstruction(out / "colmap" / "sparse" / "0")
+    (other,) = [each for each in model.rigs[1].non_ref_sensors.values() if abs(each.rotation.angle()) > 1.0][:1]
+    expected = found.pairs[1].left.cam_T_body @ found.pairs[0].left.body_T_cam
+    np.testing.assert_allclose(other.matrix(), expected[:3], atol=1e-6)
 
 
 def test_two_sessions_come_into_one_frame(walk: Path, tmp_path: Path) -> None:

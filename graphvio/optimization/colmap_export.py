@@ -179,7 +179,7 @@ def _triangulated(model: Any, database: FeatureDatabase, folder: Path, target: P
     """The reconstruction with the points of the database's verified matches; neither poses nor cameras change."""
     library = colmap()
     options = library.IncrementalPipelineOptions()
-    options.num_threads = _THREADS
+    options.num_threads = 1  # with more, points depend on which of them is first
     options.random_seed = config.motion.seed
     options.image_names = sorted(image.name for image in model.images.values())
     options.load_all_images = True

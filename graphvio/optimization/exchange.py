@@ -29,6 +29,15 @@ def trajectory_text(session: OptimizedSession) -> str:
     return "".join(f"{tum_line(stamp, pose)}\n" for stamp, pose in poses)
 
 
+def frames_text(session: OptimizedSession) -> str:
+    """Which of its poses share a frame: first and last stamp of each run of poses, and the frame's number."""
+    stamps, frame = session.record.stamps_ns, session.frame
+    begins = np.concatenate([[0], np.flatnonzero(np.diff(frame)) + 1]).tolist()
+    ends = [*(begin - 1 for begin in begins[1:]), len(frame) - 1]
+    rows = [f"{stamps[one]},{stamps[other]},{frame[one]}" for one, other in zip(begins, ends, strict=True)]
+    return "\n".join(["first_stamp_ns,last_stamp_ns,frame", *rows]) + "\n"
+
+
 def covariance_text(session: OptimizedSession) -> str:
     """Upper triangles (21) of the states' covariances, tangent ``[rotation, translation]`` in body."""
     header = ",".join(["stamp_ns", *(f"{one}_{other}" for one, other in combinations_with_replacement(_TANGENT, 2))])

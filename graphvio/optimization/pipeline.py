@@ -11,7 +11,7 @@ from graphvio import __version__
 from graphvio.config import Config
 from graphvio.errors import TrajectoryError
 from graphvio.optimization.colmap_export import export
-from graphvio.optimization.exchange import covariance_text, trajectory_text, write_g2o
+from graphvio.optimization.exchange import covariance_text, frames_text, trajectory_text, write_g2o
 from graphvio.optimization.loops import saved
 from graphvio.optimization.loops.database import FeatureDatabase
 from graphvio.optimization.loops.features import extract_places
@@ -179,6 +179,7 @@ class Stages:
             place = "" if len(self._sessions) == 1 else f"{session.name}/"
             self._space.write(f"{place}trajectory_optimized.txt", trajectory_text(optimized).encode())
             self._space.write(f"{place}covariance.csv", covariance_text(optimized).encode())
+            self._space.write(f"{place}frames.csv", frames_text(optimized).encode())
         write_g2o(found, self._space.folder / "graph.g2o")
         if closures is not None and not self._space.has_finished("map"):
             self._export(found, records, rigs)
