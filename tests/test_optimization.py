@@ -111,7 +111,7 @@ def test_sessions_of_one_place_come_into_one_frame() -> None:
 
 
 def test_things_that_two_buildings_have_alike_do_not_join_them() -> None:
-    """Ten closures that agree, each on a few points, as on one poster, are not believed; with a hundred each they are."""
+    """Ten closures that agree, each on few points, as on one poster, are not believed; with a hundred each they are."""
     one, other = draw_session(40.0, 1, IMU, 0), draw_session(40.0, 2, IMU, 0, session=1)
     between = [closure_between(one, other, row, 5) for row in range(100, 300, 20)]
     few = [replace(each, inliers=60) for each in between]

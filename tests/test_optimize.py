@@ -134,7 +134,7 @@ def test_the_calibration_is_refined_and_used_for_the_map(walk: Path, settings: P
     found = Rig.load(out / "walk" / "rig_optimized.yaml")
     error = se3_log(se3_inverse(rig.left2_T_left1()) @ found.left2_T_left1())
     assert np.rad2deg(np.linalg.norm(error[:3])) < 0.2
-    assert np.linalg.norm(error[3:]) < 0.01
+    assert np.linalg.norm(error[3:]) < 0.5 * 0.03
     model = pycolmap.Reconstruction(out / "colmap" / "sparse" / "0")
     (other,) = [each for each in model.rigs[1].non_ref_sensors.values() if abs(each.rotation.angle()) > 1.0][:1]
     expected = found.pairs[1].left.cam_T_body @ found.pairs[0].left.body_T_cam
