@@ -93,10 +93,12 @@ def fragment_of(fragments: Sequence[range]) -> Int:
 
 
 def consistent(
-    fragments: Sequence[range], joined: Joined, poses: Float, ties: Sequence[Tie], alone: Marginals,
-    odometry: Sequence[Tie], probability: float,
-) -> Bool:  # fmt: skip
+    fragments: Sequence[range], joined: Joined, poses: Float, ties: Sequence[Tie], alone: Marginals, probability: float
+) -> tuple[Bool, Float]:
     """Which closures (L,) agree with the odometry and with each other.
+
+    Where many are wrong, a first solution with all of them lies far from the truth, and graduated non-convexity does
+    not always find back: what the odometry alone refutes is left out before.
 
     Args:
         fragments: states of each.
@@ -104,17 +106,51 @@ def consistent(
         poses: (N, 4, 4) of all states, in the frames that are common now.
         ties: L closures.
         alone: of the solution without closures.
-        odometry: between the states that are ends of closures, each fragment's in a chain.
         probability: a closure beyond this share of the chi-square distribution is refused.
+
+    Returns:
+        Which agree, and their squared distances (L,) from what is known without any, 6 degrees of freedom: from the
+        odometry, or between fragments from how these are joined; NaN where they are not.
     """
     of = fragment_of(fragments)
     component = np.array(joined.component)[of]
-    kept = np.array([component[tie.first] == component[tie.second] for tie in ties], dtype=bool)
-    asked = np.flatnonzero(kept)
-    if not len(asked):
-        return kept
+    limit = chi_square_quantile(probability, 6)
+    distances, asked = np.full(len(ties), np.nan), []
+    for k, tie in enumerate(ties):
+        if of[tie.first] == of[tie.second]:
+            distances[k] = alone.distance(tie)
+        if distances[k] <= limit or (of[tie.first] != of[tie.second] and component[tie.first] == component[tie.second]):
+            asked.append(k)
+    ends = sorted({end for k in asked for end in (ties[k].first, ties[k].second)})
+    graph, values = _ends_only(ends, of, joined, poses, _odometry_between(alone, fragments, ends))
+    kept = np.zeros(len(ties), dtype=bool)
+    across = [k for k in asked if of[ties[k].first] != of[ties[k].second]]
+    if across:
+        as_joined = Marginals(graph, values)
+        for k in across:
+            distances[k] = as_joined.distance(ties[k])
+    asked = [k for k in asked if distances[k] <= limit]
+    if not asked:
+        return kept, distances
+    known = list(range(graph.size()))
+    for k in asked:
+        graph.add(ties[k].factor())
+    params = gtsam.GncLMParams()
+    params.setKnownInliers(known)
+    params.setLossType(gtsam.GncLossType.TLS)
+    optimizer = gtsam.GncLMOptimizer(graph, values, params)
+    optimizer.setInlierCostThresholdsAtProbability(probability)
+    solution = optimizer.optimize()
+    for place, k in enumerate(asked, start=len(known)):
+        kept[k] = 2.0 * graph.at(place).error(solution) <= limit
+    return kept, distances
+
+
+def _ends_only(
+    ends: Sequence[int], of: Int, joined: Joined, poses: Float, odometry: Sequence[Tie]
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """A graph of the states that are ends of closures; each fragment lies to its root as the votes have it, about."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    ends = sorted({end for k in asked.tolist() for end in (ties[k].first, ties[k].second)})
     seen: set[int] = set()
     for end in ends:
         values.insert(x(end), gtsam.Pose3(poses[end]))
@@ -125,36 +161,10 @@ def consistent(
             graph.add(gtsam.PriorFactorPose3(x(end), gtsam.Pose3(poses[end]), noise))
     for tie in odometry:
         graph.add(tie.factor())
-    # Where many are wrong, a first solution with all of them lies far from the truth, and graduated non-convexity does
-    # not always find back: what the odometry alone refutes is left out before.
-    limit = chi_square_quantile(probability, 6)
-    joined_ends = Marginals(graph, values)
-    asked = np.array(
-        [k for k in asked.tolist() if _by_odometry(ties[k], of, alone, joined_ends) <= limit], dtype=np.int64
-    )
-    kept[:] = False
-    if not len(asked):
-        return kept
-    known = list(range(graph.size()))
-    for k in asked.tolist():
-        graph.add(ties[k].factor())
-    params = gtsam.GncLMParams()
-    params.setKnownInliers(known)
-    params.setLossType(gtsam.GncLossType.TLS)
-    optimizer = gtsam.GncLMOptimizer(graph, values, params)
-    optimizer.setInlierCostThresholdsAtProbability(probability)
-    solution = optimizer.optimize()
-    for place, k in enumerate(asked.tolist(), start=len(known)):
-        kept[k] = 2.0 * graph.at(place).error(solution) <= limit
-    return kept
+    return graph, values
 
 
-def _by_odometry(tie: Tie, of: Int, alone: Marginals, joined_ends: Marginals) -> float:
-    """Squared distance of a closure from what is known without any, or, between fragments, with the votes only."""
-    return (alone if of[tie.first] == of[tie.second] else joined_ends).distance(tie)
-
-
-def odometry_between(marginals: Marginals, fragments: Sequence[range], ends: Sequence[int]) -> list[Tie]:
+def _odometry_between(marginals: Marginals, fragments: Sequence[range], ends: Sequence[int]) -> list[Tie]:
     """The motion between the states of each fragment that are ends of closures, with its covariance.
 
     Args:

@@ -13,7 +13,7 @@ from graphvio.backend.gating import chi_square_quantile
 from graphvio.config import Config
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse, se3_log
-from graphvio.optimization.consistency import consistent, fragment_of, join_fragments, odometry_between
+from graphvio.optimization.consistency import consistent, fragment_of, join_fragments
 from graphvio.optimization.extrinsics import RigCorrection, correction_of
 from graphvio.optimization.graph import Fragment, SessionGraph, moved, poses_of
 from graphvio.optimization.loops.search import LoopClosure
@@ -159,27 +159,23 @@ def _optimize(
     poses = poses_of(alone, len(whole))
     joined = join_fragments(states, poses, ties, [closure.inliers for closure in closures])
     values = moved(alone, list(zip(states, joined.frames, strict=True)))
-    component = np.array(joined.component)[fragment_of(states)].tolist()
-    within = [tie for tie in ties if component[tie.first] == component[tie.second]]
-    ends = sorted({end for tie in within for end in (tie.first, tie.second)})
-    known_alone = Marginals(graph_alone, alone)
-    odometry = odometry_between(known_alone, states, ends)
+    np.array(joined.component)[fragment_of(states)].tolist()
     poses = poses_of(values, len(whole))
-    believed = consistent(states, joined, poses, ties, known_alone, odometry, settings.loop_probability)
+    known_alone = Marginals(graph_alone, alone)
+    believed, distances = consistent(states, joined, poses, ties, known_alone, settings.loop_probability)
     roots = sorted(set(joined.component))
     limit = chi_square_quantile(settings.loop_probability, 6)
-    distances = np.full(len(ties), np.nan)
     while True:
         graph, kinds = whole.complete(roots, [tie for tie, is_used in zip(ties, believed, strict=True) if is_used])
         values = solve(graph, values, _named(on_progress, "with loops"))
         marginals = Marginals(graph, values)
-        for k, tie in enumerate(ties):
-            if component[tie.first] == component[tie.second] and not believed[k]:
-                distances[k] = marginals.distance(tie)
-        again = ~believed & (distances <= limit)  # refused too soon: the solution without them bears them out
-        if not again.any():
+        # Refused too soon are those that the odometry does not refute, and that the solution without them bears out.
+        doubted = np.flatnonzero(~believed & (distances <= limit))
+        distances[doubted] = [marginals.distance(ties[k]) for k in doubted.tolist()]
+        again = doubted[distances[doubted] <= limit]
+        if not len(again):
             break
-        believed |= again
+        believed[again] = True
     solution = poses_of(values, len(whole))
     covariances = np.array([marginals.pose(k) for k in range(len(whole))]).reshape(-1, 6, 6)
     frames = [roots.index(number) for number in joined.component]
