@@ -141,9 +141,8 @@ def test_no_change_of_bytes_gives_more_than_a_refusal(session: Path, tmp_path: P
         try:
             for event in open_source(path, rig if number % 3 == 0 else None):
                 assert isinstance(event, ImuSample | FrameSet)
-        except GraphvioError as error:
+        except GraphvioError:
             refused += 1
-            assert str(error)
     assert refused < 40
 
 
@@ -153,5 +152,3 @@ def _records(data: bytes) -> list[int]:
         found.append(at)
         at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
     return found
-
-

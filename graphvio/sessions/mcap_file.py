@@ -204,10 +204,13 @@ class McapFile:
         lost = 0
         for chunk, body in self._waiting:
             (channel,) = struct.unpack_from("<H", body)
-            if channel in self._by_channel:
-                self._take_index(chunk, body)
-            else:
+            if channel not in self._by_channel:
                 lost += 1
+                continue
+            try:
+                self._take_index(chunk, body)
+            except _DAMAGE as error:
+                self.damages.append(f"{self.path}: an index of the chunk at byte {chunk} is damaged ({error})")
         if lost:
             self.damages.append(f"{self.path}: {lost} indexes are of channels that damaged chunks had; copy it anew")
         if self._waiting:

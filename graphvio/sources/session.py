@@ -20,7 +20,7 @@ from graphvio.sessions.opening import is_store
 from graphvio.sessions.pixels import grey
 from graphvio.sessions.rig_of_topics import rig_of_topics
 from graphvio.sessions.stamps import header_stamps
-from graphvio.sessions.topics import RIG_ATTACHMENT, RIG_TOPIC, image_topic
+from graphvio.sessions.topics import RIG_ATTACHMENT, RIG_TOPIC, image_topic, of_type, preference
 from graphvio.sessions.truth import truth_topic
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.images import ImageError
@@ -88,8 +88,12 @@ def read_index(file: McapFile | BagFile, rig: Rig, faults: FaultLog, topics: Map
         for side, camera in (("left", pair.left), ("right", pair.right)):
             topic = chosen.get(camera.name) or _topic_of(file, pair.name, side, camera)
             tracks[camera.name] = _Images(file, topic, faults)
-    of_imu = [each for each in file.topics.values() if each.type_name == IMU]
+    of_imu = of_type(file.topics, IMU)
     imu = chosen.get(_IMU_NAME) or next(iter(of_imu), None)
+    if len(of_imu) > 1 and _IMU_NAME not in chosen and rig.imu is not None:
+        names = ", ".join(each.name for each in of_imu)
+        detail = f"{file.path}: has samples on {names}; the first is taken, or what --topics imu=TOPIC says"
+        faults.add("imu_several", 0, detail)
     table = None if imu is None or rig.imu is None else _imu(file, imu, faults)
     return Index(faults.name, tracks, table, file.path if truth_topic(file.topics) is not None else None)
 
@@ -134,7 +138,7 @@ def _topic_of(file: McapFile | BagFile, pair: str, side: str, camera: Camera) ->
     if not named:
         has = ", ".join(topic.name for topic in images) or "none"
         raise SourceError(f"{file.path}: has no images of camera {camera.name}; topics with images: {has}")
-    return named[0]
+    return min(named, key=lambda topic: preference(topic.name))
 
 
 def _imu(file: McapFile | BagFile, topic: Topic, faults: FaultLog) -> ImuTable:
