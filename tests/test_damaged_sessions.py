@@ -110,7 +110,7 @@ def test_the_odometry_goes_on(session: Path, tmp_path: Path) -> None:
     """What a chunk with images is to the odometry, an image that is damaged is in a folder."""
     chunk = McapFile(session).topics["/pair0/left/image_raw"].places[4].chunk
     path = changed(session, tmp_path / "walk.mcap", chunk + 200)
-    done = CliRunner().invoke(app, ["convert", str(path), "--out", str(tmp_path / "again.mcap")])
+    done = CliRunner().invoke(app, ["record", str(path), "--out", str(tmp_path / "again.mcap")])
     assert done.exit_code == 0, done.output
     assert "/rosout" in McapFile(tmp_path / "again.mcap").topics
     told = CliRunner().invoke(app, ["info", str(path)])

@@ -95,7 +95,7 @@ def test_of_several_imus_the_first_is_taken_and_it_is_said(
 ) -> None:
     made = messages(recording, tmp_path)
     other = []
-    for topic, type_name, logged_ns, data in made:
+    for _, type_name, logged_ns, data in made:
         if type_name == IMU:
             message = cdr.decode(data, IMU)
             message.angular_velocity = replace(message.angular_velocity, x=1.0)
