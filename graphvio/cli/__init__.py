@@ -12,6 +12,7 @@ from graphvio.cli.dump_config import dump_config
 from graphvio.cli.evaluate import evaluate
 from graphvio.cli.fleet import fleet
 from graphvio.cli.info import info
+from graphvio.cli.interrupts import interruptible
 from graphvio.cli.optimize import optimize
 from graphvio.cli.record import convert, record
 from graphvio.cli.run import EXIT_INTERRUPTED, run
@@ -49,8 +50,9 @@ app.command()(doctor)
 def main() -> None:
     """Entry point: a user's mistake becomes one line and exit code 2; ``--verbose`` shows the traceback."""
     try:
-        code = app(standalone_mode=False)
-    except typer.Abort:
+        with interruptible():
+            code = app(standalone_mode=False)
+    except (typer.Abort, KeyboardInterrupt):
         sys.exit(EXIT_INTERRUPTED)
     except GraphvioError as error:
         if "--verbose" in sys.argv:

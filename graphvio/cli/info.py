@@ -36,7 +36,8 @@ def info(
 def _tell(found: Description) -> None:
     typer.echo(
         f"{found.path}: {found.duration_s:.1f} s, {found.size_bytes / 1e6:.1f} MB"
-        + ("" if found.is_whole else ", cut: its recording was not finished")
+        + ("" if found.is_whole else ", cut: its recording was not finished, or it is damaged")
+        + (f", {found.damaged} damaged chunks or records" if found.damaged else "")
     )
     if found.library:
         typer.echo(f"written by {found.library}")

@@ -57,6 +57,7 @@ def optimize(
 
         graphvio optimize monday.mcap tuesday.mcap --out both
     """
+    from graphvio.cli.interrupts import interruptible
     from graphvio.cli.run import EXIT_INTERRUPTED, open_recording
     from graphvio.config import Config
     from graphvio.optimization.loops.database import colmap
@@ -77,7 +78,7 @@ def optimize(
     for source in opened:
         warm_up(source.rig, settings)
     try:
-        with _Stages() as stages:
+        with interruptible(), _Stages() as stages:
             found = optimize_sessions(
                 opened,
                 folder,

@@ -35,13 +35,14 @@ def record(
 ) -> None:
     """Run the odometry and record images, IMU, rig, poses and incidents as a session (MCAP, ROS 2 messages).
 
-    When the disk is full recording stops, the odometry goes on, and the exit code is 3.
+    When the disk is full recording stops, the odometry goes on, and the exit code is 3. After Ctrl-C, which ends with
+    130, what was recorded until then can be read.
 
     Example:
 
         graphvio record walk --out walk.mcap
     """
-    from graphvio.cli.run import open_recording
+    from graphvio.cli.run import EXIT_INTERRUPTED, open_recording
     from graphvio.config import Config
     from graphvio.errors import SessionError
     from graphvio.odometry import Odometry
@@ -54,7 +55,12 @@ def record(
     opened = open_recording(source, rig, settings, pairs=None, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
     warm_up(opened.rig, settings)
     writer = SessionWriter(out, opened.rig, "png" if png else "raw")
-    _write(opened, _truth(opened, is_whole=from_s is None and to_s is None), writer, Odometry(opened.rig, settings))
+    truth = _truth(opened, is_whole=from_s is None and to_s is None)
+    try:
+        _write(opened, truth, writer, Odometry(opened.rig, settings))
+    except KeyboardInterrupt:
+        typer.echo(f"graphvio: interrupted; what was recorded until then is in {out}, which can be read", err=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
     typer.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {writer.poses} poses")
     _exit_if_stopped(writer)
 
@@ -128,14 +134,17 @@ def _write(opened: Source, truth: Trajectory | None, writer: RecordingWriter, od
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from graphvio.cli.interrupts import HeldInterrupt, interruptible
     from graphvio.events import FrameSet
     from graphvio.sessions.writer import SessionWriter
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     poses = deque(zip(truth.stamps_ns.tolist(), truth.nav_T_body, strict=True) if truth is not None else ())
-    with writer, Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    progress = Progress(*columns, console=Console(stderr=True), transient=True)
+    with interruptible(), HeldInterrupt() as held, writer, progress as bar:
         task = bar.add_task("framesets", total=opened.frameset_count)
         for event in opened:
+            held.check()
             while poses and poses[0][0] <= event.stamp_ns:
                 writer.add_true_pose(*poses.popleft())
             writer.add(event)

@@ -54,6 +54,7 @@ def run(
     """
     from contextlib import ExitStack
 
+    from graphvio.cli.interrupts import interruptible
     from graphvio.config import Config
     from graphvio.pipeline import run as run_pipeline
     from graphvio.results import ResultWriter
@@ -69,7 +70,8 @@ def run(
         warm_up(opened.rig, settings)
         line = stack.enter_context(_ProgressLine())
         try:
-            summary = run_pipeline(opened, settings, writer, viewer=viewer, on_progress=line.show)
+            with interruptible():
+                summary = run_pipeline(opened, settings, writer, viewer=viewer, on_progress=line.show)
         except KeyboardInterrupt:
             typer.echo(f"graphvio: interrupted; what was estimated until then is in {folder}", err=True)
             raise typer.Exit(EXIT_INTERRUPTED) from None

@@ -28,6 +28,9 @@ class BagFile:
         topics: name -> messages.
         attachments: none.
         is_whole: always.
+        damages: none; what is damaged is refused.
+        has_damaged_attachment: never.
+        damaged_chunks: none.
 
     Raises:
         SessionError: if it cannot be read.
@@ -45,6 +48,9 @@ class BagFile:
         self.topics: dict[str, Topic] = {}
         self.attachments: dict[str, bytes] = {}
         self.is_whole = True
+        self.damages: list[str] = []
+        self.has_damaged_attachment = False
+        self.damaged_chunks = 0
         self._lock = threading.Lock()
         try:
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from graphvio.errors import MissingExtraError
+from graphvio.errors import MissingExtraError, SessionError
 
 
 @cache
@@ -32,9 +32,23 @@ def encode(message: Any) -> bytes:
     return bytes(types().serialize_cdr(message, message.__msgtype__))
 
 
-def decode(data: bytes, type_name: str) -> Any:
-    """A message from CDR; arrays are views of the data."""
-    return types().deserialize_cdr(data, type_name)
+def decode(data: bytes, type_name: str, where: object = "a message") -> Any:
+    """A message from CDR; arrays are views of the data.
+
+    Args:
+        data: of the message.
+        type_name: of it.
+        where: it is from, for what is told of damage.
+
+    Raises:
+        SessionError: if it is damaged.
+    """
+    known = types()
+    try:
+        return known.deserialize_cdr(data, type_name)
+    except Exception as error:  # the library has errors of many types for bytes that are none of its own
+        why = str(error) or type(error).__name__
+        raise SessionError(f"{where}: holds a damaged {type_name} ({why}); copy the file anew") from None
 
 
 def definition(type_name: str) -> bytes:
@@ -44,6 +58,12 @@ def definition(type_name: str) -> bytes:
 
 
 def stamp_ns(data: bytes) -> int:
-    """The stamp of a message that begins with a header, without decoding the rest."""
+    """The stamp of a message that begins with a header, without decoding the rest.
+
+    Raises:
+        SessionError: if the message is too short to have one.
+    """
+    if len(data) < 12:
+        raise SessionError(f"a message of {len(data)} bytes has no header; copy the file anew")
     order: Any = "little" if data[1] & 1 else "big"
     return int.from_bytes(data[4:8], order, signed=True) * 1_000_000_000 + int.from_bytes(data[8:12], order)

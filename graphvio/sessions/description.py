@@ -13,7 +13,7 @@ from graphvio.sessions.bag_file import BagFile
 from graphvio.sessions.mcap_file import McapFile, Topic, stamps_of
 from graphvio.sessions.messages import COMPRESSED, IMAGE, STAMPED
 from graphvio.sessions.opening import is_store, open_store
-from graphvio.sessions.rig_of_topics import pair_name, stereo_topics
+from graphvio.sessions.rig_of_topics import stereo_topics
 from graphvio.sessions.stamps import Clock, Offset, all_header_stamps, compare_clocks, compare_topics
 from graphvio.sources.session import rig_in
 
@@ -79,6 +79,8 @@ class Description:
         duration_s: from the first to the last message.
         library: that wrote it, or empty.
         is_whole: whether its writing was finished.
+        damaged: chunks and other records that are damaged, of those that were read for this; of graphvio's own
+            sessions, that is no chunk but the first.
         rig: one line on the rig in it, or on why that is not usable; empty where there is none.
         topics: by name.
         synchronisation: left against right of each pair, then the first pair against each other one, as far as the
@@ -90,6 +92,7 @@ class Description:
     duration_s: float
     library: str
     is_whole: bool
+    damaged: int
     rig: str
     topics: tuple[TopicDescription, ...]
     synchronisation: tuple[Synchronisation, ...]
@@ -115,13 +118,15 @@ def describe(path: Path) -> Description:
     stamped = [topic for topic in store.topics.values() if topic.type_name in STAMPED and topic.places]
     stamps = all_header_stamps(store, stamped)
     images = {name for name in stamps if store.topics[name].type_name in (IMAGE, COMPRESSED)}
+    rig = _rig(store)
     return Description(
         path=path,
         size_bytes=path.stat().st_size if path.is_file() else sum(file.stat().st_size for file in path.iterdir()),
         duration_s=float(end - begin) / _NS_PER_S,
         library=store.library,
         is_whole=store.is_whole,
-        rig=_rig(store),
+        damaged=store.damaged_chunks + len(store.damages),
+        rig=rig,
         topics=tuple(_topic(topic, stamps.get(name)) for name, topic in sorted(store.topics.items())),
         synchronisation=_synchronisation({name: stamps[name] for name in images}),
     )
@@ -130,7 +135,7 @@ def describe(path: Path) -> Description:
 def _rig(store: McapFile | BagFile) -> str:
     try:
         rig = rig_in(store)
-    except RigError as error:
+    except (RigError, SessionError) as error:
         return f"not usable: {error}"
     if rig is None:
         return ""
@@ -160,7 +165,7 @@ def _topic(topic: Topic, header_ns: Int | None) -> TopicDescription:
 
 def _synchronisation(stamps: dict[str, Int]) -> tuple[Synchronisation, ...]:
     """Of topics with images, by their stamps (N,)."""
-    pairs = {pair_name(left): (left, right) for left, right in stereo_topics(stamps)}
+    pairs = stereo_topics(stamps)
     wanted = [(f"{name} left", f"{name} right", left, right) for name, (left, right) in pairs.items()]
     first, *others = pairs or [""]
     wanted += [(f"{first} left", f"{name} left", pairs[first][0], pairs[name][0]) for name in others]

@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.errors import RigError
+from graphvio.errors import RigError, SessionError
 from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_inverse
 from graphvio.rig import Camera, Imu, Rig, StereoPair
 from graphvio.sessions import cdr
 from graphvio.sessions.mcap_file import Place, Topic
 from graphvio.sessions.messages import CAMERA_INFO, COMPRESSED, IMAGE, IMU, TRANSFORMS
+from graphvio.sessions.topics import camera_of, of_type, preference
 
 _MODELS = {"plumb_bob": "radial-tangential", "rational_polynomial": "radial-tangential", "equidistant": "equidistant"}
 _SIDES = (("left", "right"), ("infra1", "infra2"), ("cam0", "cam1"), ("cam2", "cam3"))
+_WORDS = tuple(side for sides in _SIDES for side in sides)
 
 
 class Store(Protocol):
     """A file with messages by topic."""
 
+    path: Path
     topics: dict[str, Topic]
 
     def read(self, place: Place) -> bytes:
@@ -31,32 +35,34 @@ class Store(Protocol):
 def rig_of_topics(store: Store, name: str) -> Rig | None:
     """The rig of all stereo pairs whose images, calibrations and places are there; None if there is none.
 
-    A pair's topics differ in one part of their name only: ``left`` and ``right``, ``infra1`` and ``infra2``. Where
+    A pair's topics differ in one part of their name only: ``left`` and ``right``, ``infra1`` and ``infra2``. Of several
+    topics with one camera's images one is taken, and of several with samples of an IMU the first by name. Where
     transforms do not tell the right camera's place, its ``camera_info`` does, by the projection's fourth column. Body
     is the IMU's frame, or the first left camera's.
 
     Raises:
         RigError: if what is told makes no rig.
+        SessionError: if it is damaged.
     """
-    images = {each.name: each for each in store.topics.values() if each.type_name in (IMAGE, COMPRESSED)}
+    images = [each.name for each in of_type(store.topics, IMAGE, COMPRESSED)]
     transforms = _transforms(store)
-    imu = next((each for each in store.topics.values() if each.type_name == IMU and each.places), None)
+    imu = next(iter(of_type(store.topics, IMU)), None)
     found = []
-    for left, right in stereo_topics(images):
+    for pair, (left, right) in stereo_topics(images).items():
         infos = [_info(store, topic) for topic in (left, right)]
         if infos[0] is not None and infos[1] is not None:
-            found.append((left, right, infos[0], infos[1]))
+            found.append((pair, left, right, infos[0], infos[1]))
     if not found:
         return None
-    body = cdr.decode(store.read(imu.places[0]), IMU).header.frame_id if imu is not None else ""
-    first = _frame(found[0][2], found[0][0])
+    body = _first(store, imu).header.frame_id if imu is not None else ""
+    first = _frame(found[0][3], found[0][1])
     if imu is not None and _path(transforms, body, first) is None:
         raise RigError(
             f"{name}: no transform leads from the IMU ({body}) to the camera {first}; give a rig of your own"
         )
     body = body if imu is not None else first
     pairs = []
-    for left, right, left_info, right_info in found:
+    for pair, left, right, left_info, right_info in found:
         body_T_left = _path(transforms, body, _frame(left_info, left))
         if body_T_left is None:
             raise RigError(
@@ -71,28 +77,37 @@ def rig_of_topics(store: Store, name: str) -> Rig | None:
             _camera(topic, info, place)
             for topic, info, place in zip((left, right), (left_info, right_info), places, strict=True)
         ]
-        pairs.append(StereoPair(pair_name(left), *cameras))
+        pairs.append(StereoPair(pair, *cameras))
     return Rig(tuple(pairs), Imu() if imu is not None else None, name)
 
 
-def stereo_topics(images: Iterable[str]) -> list[tuple[str, str]]:
-    """Topics of left and right cameras among topics with images: their names differ in that part only."""
+def stereo_topics(images: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """Name of each pair -> topics of its left and right camera, among topics with images.
+
+    Their names differ in one part only. Where a camera has several, raw and compressed or raw and rectified, one is
+    taken: see `preference`.
+    """
     names = sorted(images)
-    made = []
-    for name in names:
+    made: dict[tuple[str, str], tuple[str, str]] = {}
+    for name in sorted(names, key=preference):
         for left, right in _SIDES:
             parts = name.split("/")
             for k, part in enumerate(parts):
                 other = "/".join([*parts[:k], part.replace(left, right), *parts[k + 1 :]])
                 if left in part and other in names:
-                    made.append((name, other))
-    return list(dict.fromkeys(made))
+                    made.setdefault((camera_of(name, _WORDS), camera_of(other, _WORDS)), (name, other))
+    found = sorted(made.items())
+    short = [_without_side(left) for (left, _), _ in found]
+    return {
+        name if short.count(name) == 1 else "-".join(filter(None, left.split("/"))): topics
+        for name, ((left, _), topics) in zip(short, found, strict=True)
+    }
 
 
-def pair_name(left: str) -> str:
-    """A pair's name: what the topic of its left camera has besides the side."""
-    parts = [part for part in left.split("/") if part and not part.startswith("image")]
-    rest = [part for part in parts if not any(side in part for sides in _SIDES for side in sides)]
+def _without_side(camera: str) -> str:
+    """A pair's name: what the name of its left camera has besides the side."""
+    parts = [part for part in camera.split("/") if part]
+    rest = [part for part in parts if not any(side in part for side in _WORDS)]
     return "-".join(rest) or "-".join(parts)
 
 
@@ -102,8 +117,18 @@ def _info(store: Store, image_topic: str) -> Any:
     for depth in range(len(parts) - 1, 0, -1):
         topic = store.topics.get("/".join([*parts[:depth], "camera_info"]))
         if topic is not None and topic.type_name == CAMERA_INFO and topic.places:
-            return cdr.decode(store.read(topic.places[0]), CAMERA_INFO)
+            return _first(store, topic)
     return None
+
+
+def _first(store: Store, topic: Topic) -> Any:
+    """The first message of a topic that is not damaged."""
+    for place in topic.places[:-1]:
+        try:
+            return cdr.decode(store.read(place), topic.type_name, store.path)
+        except SessionError:  # all say the same
+            continue
+    return cdr.decode(store.read(topic.places[-1]), topic.type_name, store.path)
 
 
 def _camera(topic: str, info: Any, body_T_cam: Float) -> Camera:
@@ -134,7 +159,7 @@ def _transforms(store: Store) -> dict[tuple[str, str], Float]:
         if topic.type_name != TRANSFORMS or not topic.name.endswith("tf_static"):
             continue
         for place in topic.places:
-            for each in cdr.decode(store.read(place), TRANSFORMS).transforms:
+            for each in cdr.decode(store.read(place), TRANSFORMS, store.path).transforms:
                 q, t = each.transform.rotation, each.transform.translation
                 pose = se3(rotation_from_quat_wxyz(np.array([q.w, q.x, q.y, q.z])), np.array([t.x, t.y, t.z]))
                 parent, child = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")

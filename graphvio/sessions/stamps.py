@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from graphvio.arrays import Int
+from graphvio.errors import SessionError
 from graphvio.sessions import cdr
 from graphvio.sessions.mcap_file import Place, Topic, stamps_of
 from graphvio.sessions.mcap_storage import LIBRARY
@@ -67,32 +68,29 @@ class Offset:
 def header_stamps(store: Store, topic: Topic) -> Int:
     """Stamps (N,) of the headers of a topic's messages, in the order of the file.
 
-    graphvio's own sessions are logged by them, and bags have been read for them; other files are read here.
-
-    Raises:
-        SessionError: if a message cannot be read.
+    graphvio's own sessions are logged by them, and bags have been read for them; other files are read here. A message
+    that is damaged has the time at which it was recorded.
     """
     return all_header_stamps(store, [topic])[topic.name]
 
 
 def all_header_stamps(store: Store, topics: Iterable[Topic]) -> dict[str, Int]:
-    """Name of a topic -> its `header_stamps`; messages are read in the order of the file, so each chunk but once.
-
-    Raises:
-        SessionError: if a message cannot be read.
-    """
+    """Name of a topic -> its `header_stamps`; messages are read in the order of the file, so each chunk but once."""
     found: dict[str, Int] = {}
-    waiting = []
+    waiting: list[tuple[Place, str, int]] = []
     for topic in topics:
         if store.library.startswith(LIBRARY):
             found[topic.name] = stamps_of(topic)
         elif topic.header_ns:
             found[topic.name] = np.array(topic.header_ns, dtype=np.int64)
         else:
-            found[topic.name] = np.zeros(len(topic.places), dtype=np.int64)
+            found[topic.name] = stamps_of(topic)
             waiting += [(place, topic.name, row) for row, place in enumerate(topic.places)]
     for place, name, row in sorted(waiting):
-        found[name][row] = cdr.stamp_ns(store.read(place))
+        try:
+            found[name][row] = cdr.stamp_ns(store.read(place))
+        except SessionError:  # told by who reads it
+            continue
     return found
 
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.errors import TrajectoryError
+from graphvio.errors import SessionError, TrajectoryError
 from graphvio.sessions import cdr
 from graphvio.sessions.mcap_file import Topic
 from graphvio.sessions.messages import ODOMETRY, POSE, pose_of, stamp_of
 from graphvio.sessions.opening import open_store
 from graphvio.sessions.topics import TRUTH_TOPIC
+
+_log = logging.getLogger(__name__)
 
 
 def truth_topic(topics: Mapping[str, Topic]) -> Topic | None:
@@ -33,7 +36,18 @@ def read_truth(path: Path) -> tuple[Int, Float]:
     topic = truth_topic(store.topics)
     if topic is None:
         raise TrajectoryError(f"{path}: holds no true trajectory, which would be poses on the topic {TRUTH_TOPIC}")
-    found = (cdr.decode(store.read(place), topic.type_name) for place in topic.places)
-    poses = {stamp_of(message.header): pose_of(message) for message in found}
+    poses: dict[int, Float] = {}
+    damaged: list[SessionError] = []
+    for place in topic.places:
+        try:
+            message = cdr.decode(store.read(place), topic.type_name, path)
+        except SessionError as error:
+            damaged.append(error)
+        else:
+            poses[stamp_of(message.header)] = pose_of(message)
+    if damaged:
+        _log.warning("%s: %d true poses are left out; the first: %s", path, len(damaged), damaged[0])
+    if not poses:
+        raise TrajectoryError(f"{path}: not one pose on {TRUTH_TOPIC} can be read; copy the file anew")
     stamps = sorted(poses)
     return np.array(stamps, dtype=np.int64), np.array([poses[stamp] for stamp in stamps])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from graphvio.arrays import Image, Int
@@ -14,12 +15,12 @@ from graphvio.rig_files.native import parse
 from graphvio.sessions import cdr
 from graphvio.sessions.bag_file import BagFile
 from graphvio.sessions.mcap_file import McapFile, Place, Topic
-from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, TEXT, imu_sample
+from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, TEXT, imu_sample, stamp_of
 from graphvio.sessions.opening import is_store
 from graphvio.sessions.pixels import grey
 from graphvio.sessions.rig_of_topics import rig_of_topics
 from graphvio.sessions.stamps import header_stamps
-from graphvio.sessions.topics import RIG_ATTACHMENT, RIG_TOPIC, image_topic
+from graphvio.sessions.topics import RIG_ATTACHMENT, RIG_TOPIC, image_topic, of_type, preference
 from graphvio.sessions.truth import truth_topic
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.images import ImageError
@@ -40,14 +41,25 @@ def rig_in(file: McapFile | BagFile) -> Rig | None:
 
     Raises:
         RigError: if its rig describes none that is usable.
+        SessionError: if its rig is damaged.
     """
     attached = file.attachments.get(RIG_ATTACHMENT)
     if attached is not None:
-        return parse(attached.decode("utf-8"), file.path)
+        try:
+            text = attached.decode("utf-8")
+        except UnicodeDecodeError:
+            raise _damaged_rig(file) from None
+        return parse(text, file.path)
+    if file.has_damaged_attachment:
+        raise _damaged_rig(file)
     told = file.topics.get(RIG_TOPIC)
     if told is not None and told.type_name == TEXT and told.places:
-        return parse(cdr.decode(file.read(told.places[0]), TEXT).data, file.path)
+        return parse(cdr.decode(file.read(told.places[0]), TEXT, file.path).data, file.path)
     return rig_of_topics(file, file.path.stem)
+
+
+def _damaged_rig(file: McapFile | BagFile) -> SessionError:
+    return SessionError(f"{file.path}: the rig in it is damaged; copy the file anew, or give a rig of your own")
 
 
 def read_index(file: McapFile | BagFile, rig: Rig, faults: FaultLog, topics: Mapping[str, str]) -> Index:
@@ -68,14 +80,20 @@ def read_index(file: McapFile | BagFile, rig: Rig, faults: FaultLog, topics: Map
         names = ", ".join([*(camera.name for camera in rig.cameras), _IMU_NAME])
         raise SourceError(f"{file.path}: the rig has no {min(unknown)} to be mapped to a topic; it has {names}")
     if not file.is_whole:
-        faults.add("session_cut", 0, f"{file.path} was not finished: it ends where its recording was cut")
+        faults.add("session_cut", 0, f"{file.path} was not finished, or is damaged: it is read as far as it goes")
+    for detail in file.damages:
+        faults.add("session_damaged", 0, detail)
     tracks = {}
     for pair in rig.pairs:
         for side, camera in (("left", pair.left), ("right", pair.right)):
             topic = chosen.get(camera.name) or _topic_of(file, pair.name, side, camera)
             tracks[camera.name] = _Images(file, topic, faults)
-    of_imu = [each for each in file.topics.values() if each.type_name == IMU]
+    of_imu = of_type(file.topics, IMU)
     imu = chosen.get(_IMU_NAME) or next(iter(of_imu), None)
+    if len(of_imu) > 1 and _IMU_NAME not in chosen and rig.imu is not None:
+        names = ", ".join(each.name for each in of_imu)
+        detail = f"{file.path}: has samples on {names}; the first is taken, or what --topics imu=TOPIC says"
+        faults.add("imu_several", 0, detail)
     table = None if imu is None or rig.imu is None else _imu(file, imu, faults)
     return Index(faults.name, tracks, table, file.path if truth_topic(file.topics) is not None else None)
 
@@ -101,10 +119,13 @@ class _Images:
         """The image of a row."""
         where = f"{self._file.path}, {self._name} at {self.stamps_ns[row]}"
         try:
-            message = cdr.decode(self._file.read(self._places[row]), self._type)
-        except (SessionError, IndexError, ValueError) as error:
+            message = cdr.decode(self._file.read(self._places[row]), self._type, self._file.path)
+            image = grey(message, where)
+        except (SessionError, IndexError, ValueError, cv2.error) as error:
             raise ImageError("image_undecodable", f"{where} cannot be decoded ({error})") from None
-        return grey(message, where)
+        if stamp_of(message.header) != self.stamps_ns[row]:
+            raise ImageError("image_undecodable", f"{where} is damaged: it has the stamp {stamp_of(message.header)}")
+        return image
 
 
 def _topic_of(file: McapFile | BagFile, pair: str, side: str, camera: Camera) -> Topic:
@@ -117,12 +138,25 @@ def _topic_of(file: McapFile | BagFile, pair: str, side: str, camera: Camera) ->
     if not named:
         has = ", ".join(topic.name for topic in images) or "none"
         raise SourceError(f"{file.path}: has no images of camera {camera.name}; topics with images: {has}")
-    return named[0]
+    return min(named, key=lambda topic: preference(topic.name))
 
 
 def _imu(file: McapFile | BagFile, topic: Topic, faults: FaultLog) -> ImuTable:
-    samples = [imu_sample(cdr.decode(file.read(place), IMU)) for place in topic.places]
-    stamps = np.array([sample.stamp_ns for sample in samples], dtype=np.int64)
-    values = np.array([[*sample.angular_velocity, *sample.linear_acceleration] for sample in samples]).reshape(-1, 6)
-    kept = clean_stamps(stamps, "imu", file.path, faults)
-    return ImuTable(stamps[kept], values[kept])
+    stamps: list[int] = []
+    values: list[list[float]] = []
+    for place, logged_ns in zip(topic.places, topic.logged_ns, strict=True):
+        try:
+            sample = imu_sample(cdr.decode(file.read(place), IMU, file.path))
+        except SessionError as error:
+            faults.add("imu_garbage", logged_ns, str(error))
+            continue
+        row = [*sample.angular_velocity.tolist(), *sample.linear_acceleration.tolist()]
+        if not np.isfinite(row).all() or sample.stamp_ns < 0:
+            detail = f"{file.path}: the sample of stamp {sample.stamp_ns} holds NaN, infinity or an impossible stamp"
+            faults.add("imu_garbage", sample.stamp_ns, detail)
+            continue
+        stamps.append(sample.stamp_ns)
+        values.append(row)
+    table = ImuTable(np.array(stamps, dtype=np.int64), np.array(values, dtype=np.float64).reshape(-1, 6))
+    kept = clean_stamps(table.stamps_ns, "imu", file.path, faults)
+    return ImuTable(table.stamps_ns[kept], table.values[kept])
