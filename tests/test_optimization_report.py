@@ -14,14 +14,17 @@ from typing import Any
 import matplotlib.image
 import numpy as np
 import pytest
+from synthetic import two_pair_rig
 
 from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3, se3_exp, se3_inverse, so3_exp
+from graphvio.optimization.extrinsics import RigCorrection
 from graphvio.optimization.loops.search import LoopClosure, Place
 from graphvio.optimization.optimize import JudgedLoop, Optimization, optimize
 from graphvio.optimization.record import NO_MOTIONS, Inertial, Motions, SessionRecord
+from graphvio.optimization.report.calibration import calibrations
 from graphvio.optimization.report.words import length, plain
 from graphvio.optimization.report.write import write_report
 from graphvio.trajectory import Trajectory
@@ -217,6 +220,75 @@ def test_parts_that_nothing_joins_are_told(truth: Trajectory, tmp_path: Path) ->
     error = told["loops"]["error_of_used"]
     assert error["online"]["count"] == 0
     assert error["optimized"]["count"] == 3
+
+
+def correction(angle_rad: float, shift_m: float, offset_s: float | None) -> RigCorrection:
+    """Of two pairs, of which the first is held unless there is an offset."""
+    covariance = np.diag(np.repeat([1e-3, 2e-3], 3) ** 2)
+    found = se3_exp(np.array([0.0, 0.0, angle_rad, shift_m, 0.0, 0.0]))
+    first = covariance if offset_s is not None else np.zeros((6, 6))
+    pairs = {0: np.eye(4), 1: found}
+    return RigCorrection(pairs, {0: first, 1: covariance}, offset_s or 0.0, None if offset_s is None else 1e-3)
+
+
+def test_the_calibration_that_is_found_is_told(one: Optimization, tmp_path: Path) -> None:
+    page, told = report(replace(one, corrections=[correction(0.01, 0.0, -0.005)]), tmp_path, [None])
+    (each,) = told["calibrations"]
+    first, second = each["pairs"]
+    assert not each["borne_out"]
+    assert first["borne_out"]
+    assert not second["borne_out"]
+    assert second["of"] == "body's origin"
+    assert second["angle_deg"] == pytest.approx(np.rad2deg(0.01))
+    assert second["angle_sigma_deg"] == pytest.approx(np.rad2deg(1e-3))
+    assert second["angle_sigmas"] == pytest.approx(10.0)
+    assert second["distance_sigma_m"] == pytest.approx(2e-3)
+    assert each["time_offset"] == {"correction_s": -0.005, "sigma_s": 1e-3, "sigmas": 5.0, "borne_out": False}
+    assert "0.573 degrees, sigma 0.057: 10.0 sigmas" in page.text
+    assert "-5.00 ms, sigma 1.00: 5.0 sigmas" in page.text
+    assert "the rig file is refuted" in page.text
+
+
+def test_a_rig_file_that_is_borne_out_is_told(one: Optimization, tmp_path: Path) -> None:
+    found = replace(one, corrections=[correction(0.001, 0.003, None)])
+    page, told = report(found, tmp_path, [None])
+    (each,) = told["calibrations"]
+    first, second = each["pairs"]
+    assert each["borne_out"]
+    assert first["held"]
+    assert first["angle_sigmas"] is None
+    assert each["time_offset"] is None
+    assert second["distance_sigmas"] == pytest.approx(1.5, rel=1e-3)
+    assert "held where the rig file has it" in page.text
+    assert "the rig file is borne out" in page.text
+    assert "refuted:" not in page.text
+
+
+def test_all_axes_together_can_refute_a_rig_file(one: Optimization) -> None:
+    """The largest sigma hides a shift along an axis that is known much better."""
+    found = correction(0.0, 0.002, None)
+    sharp = found.covariances[1].copy()
+    sharp[3, 3] = 1e-4**2
+    both = replace(found, covariances=found.covariances | {1: sharp})
+    (each,) = calibrations(replace(one, corrections=[both]), [None])
+    assert each is not None
+    assert each.pairs[1].distance_sigmas == pytest.approx(1.0)
+    assert not each.is_borne_out
+
+
+def test_a_pair_s_place_is_that_of_its_left_camera(one: Optimization) -> None:
+    """A pair that is far from the body, and turns about itself, does not move."""
+    rig = two_pair_rig()
+    place = rig.pairs[1].left.body_T_cam[:3, 3]
+    turned = se3_exp(np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
+    turned[:3, 3] = place - turned[:3, :3] @ place
+    known = RigCorrection({0: np.eye(4), 1: turned}, {0: np.zeros((6, 6)), 1: 1e-6 * np.eye(6)}, 0.0, None)
+    (each,) = calibrations(replace(one, corrections=[known]), [rig])
+    assert each is not None
+    assert each.pairs[1].of == "left camera"
+    assert each.pairs[1].distance_m == pytest.approx(0.0, abs=1e-12)
+    assert each.pairs[1].distance_sigma_m == pytest.approx(1e-3 * np.sqrt(1.0 + place @ place))
+    assert calibrations(one, [rig]) == [None]
 
 
 def test_long_lists_of_loops_are_cut(one: Optimization, tmp_path: Path) -> None:

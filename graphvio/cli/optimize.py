@@ -132,6 +132,10 @@ def _warn(odometry: Path) -> None:
 
 
 def _tell(found: Optimization, folder: Path) -> None:
+    from graphvio.optimization.report.calibration import calibrations
+    from graphvio.optimization.report.odometry import rig_of
+    from graphvio.optimization.report.words import calibration_in_words
+
     used = sum(not loop.refusal for loop in found.loops)
     typer.echo(
         f"{sum(len(each.record.stamps_ns) for each in found.sessions)} framesets, "
@@ -142,4 +146,7 @@ def _tell(found: Optimization, folder: Path) -> None:
     if frames > 1:
         typer.echo(f"graphvio: {frames} parts that no loop closures join, each in a frame of its own", err=True)
     typer.echo(f"cost {found.cost_before:.0f} as the odometry left it, {found.cost_after:.1f} now")
+    for calibration in calibrations(found, [rig_of(folder, each.record.name) for each in found.sessions]):
+        for line in [] if calibration is None else calibration_in_words(calibration):
+            typer.echo(line if len(found.sessions) == 1 else f"{calibration.session}, {line}")
     typer.echo(f"results: {folder}")

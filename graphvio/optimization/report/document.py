@@ -11,6 +11,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.optimization.optimize import JudgedLoop, Optimization
+from graphvio.optimization.report.calibration import SessionCalibration
 from graphvio.optimization.report.numbers import Kind, Numbers, SessionNumbers
 from graphvio.optimization.solve import Residuals
 
@@ -31,6 +32,7 @@ def document(found: Optimization, numbers: Numbers) -> dict[str, Any]:
             "after": found.cost_after,
             "fell_percent": None if fell is None else 100.0 * fell,
         },
+        "calibrations": [_calibration(each) for each in numbers.calibrations],
         "residuals": {kind.name: _kind(kind) for kind in numbers.kinds},
         "dimensions": numbers.dimensions,
         "unknowns": numbers.unknowns,
@@ -76,6 +78,41 @@ def _session(each: SessionNumbers) -> dict[str, Any]:
             "max_m": float(each.sigma_m.max()),
             "median_deg": float(np.median(each.sigma_deg)),
             "max_deg": float(each.sigma_deg.max()),
+        },
+    }
+
+
+def _calibration(each: SessionCalibration | None) -> dict[str, Any] | None:
+    if each is None:
+        return None
+    offset = each.offset
+    return {
+        "session": each.session,
+        "borne_out": each.is_borne_out,
+        "pairs": [
+            {
+                "pair": pair.pair,
+                "name": pair.name or None,
+                "held": pair.is_held,
+                "of": pair.of,
+                "angle_deg": pair.angle_deg,
+                "angle_sigma_deg": pair.angle_sigma_deg,
+                "angle_sigmas": pair.angle_sigmas,
+                "distance_m": pair.distance_m,
+                "distance_sigma_m": pair.distance_sigma_m,
+                "distance_sigmas": pair.distance_sigmas,
+                "squared_distance": pair.squared_distance,
+                "borne_out": pair.is_borne_out,
+            }
+            for pair in each.pairs
+        ],
+        "time_offset": None
+        if offset is None
+        else {
+            "correction_s": offset.offset_s,
+            "sigma_s": offset.sigma_s,
+            "sigmas": offset.sigmas,
+            "borne_out": offset.is_borne_out,
         },
     }
 

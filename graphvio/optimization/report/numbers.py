@@ -10,6 +10,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.errors import OptimizationError
 from graphvio.optimization.optimize import Optimization
+from graphvio.optimization.report.calibration import SessionCalibration, calibrations
 from graphvio.optimization.report.measures import (
     STAGES,
     Accuracy,
@@ -25,6 +26,7 @@ from graphvio.optimization.report.measures import (
     sigmas,
 )
 from graphvio.optimization.solve import Residuals
+from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
 
 _ORDER = ("imu", "motion", "rest", "walk", "start", "loop")
@@ -87,6 +89,7 @@ class Numbers:
         used: loop closures that are.
         refused: loop closures that are not.
         loop_errors: of the used ones by stage.
+        calibrations: what is found of each session's rig file, or None where it was no unknown.
         unknowns: of the solution, all states' dimensions.
     """
 
@@ -96,6 +99,7 @@ class Numbers:
     used: int
     refused: int
     loop_errors: Mapping[str, Spread]
+    calibrations: Sequence[SessionCalibration | None]
     unknowns: int
 
     @property
@@ -120,12 +124,13 @@ class Numbers:
         return squares / self.dimensions if self.dimensions else 0.0
 
 
-def numbers_of(found: Optimization, truths: Sequence[Trajectory | None]) -> Numbers:
+def numbers_of(found: Optimization, truths: Sequence[Trajectory | None], rigs: Sequence[Rig | None]) -> Numbers:
     """Compute them.
 
     Args:
         found: the optimisation.
         truths: of each session, or None.
+        rigs: of each session, as its file has it, or None.
 
     Raises:
         OptimizationError: if there is not one truth, or None, for each session.
@@ -142,6 +147,7 @@ def numbers_of(found: Optimization, truths: Sequence[Trajectory | None]) -> Numb
         used=int(is_used.sum()),
         refused=int((~is_used).sum()),
         loop_errors={stage: Spread.of(loop_errors(found, stage)[is_used]) for stage in STAGES},
+        calibrations=calibrations(found, rigs),
         unknowns=int(found.values.dim()),
     )
 

@@ -8,10 +8,22 @@ from html import escape
 import numpy as np
 
 from graphvio.optimization.optimize import JudgedLoop, Optimization
+from graphvio.optimization.report.calibration import SessionCalibration
 from graphvio.optimization.report.document import size_of
 from graphvio.optimization.report.measures import STAGES
 from graphvio.optimization.report.numbers import Kind, Numbers, SessionNumbers
-from graphvio.optimization.report.words import angle, doubts, fell, length, noise, pairs_in_words, parts_in_words, plain
+from graphvio.optimization.report.words import (
+    angle,
+    doubts,
+    fell,
+    length,
+    noise,
+    pair_name,
+    pairs_in_words,
+    parts_in_words,
+    plain,
+    verdict,
+)
 from graphvio.reporting.page import bullets, html_page, picture, table
 
 MOST_LOOPS = 200
@@ -61,6 +73,9 @@ def page(found: Optimization, numbers: Numbers, maps: Mapping[int, bytes], pictu
             '<p class="good"><b>All sessions lie in one frame, and no check here speaks against the result.</b></p>'
         )
     parts += [_head(found, numbers), _sessions(numbers.sessions), _accuracy(numbers.sessions), _loop_errors(numbers)]
+    known = [each for each in numbers.calibrations if each is not None]
+    if known:
+        parts += ["<h2>Calibration</h2>", *(_calibration(each, len(numbers.sessions) > 1) for each in known)]
     parts += ["<h2>Trajectories</h2>", *_maps(numbers, maps)]
     parts += ["<h2>Where the trajectory moved</h2>", picture("moved", pictures["moved"], _CAPTIONS["moved"])]
     parts += ["<h2>Uncertainty</h2>", picture("sigmas", pictures["sigmas"], _CAPTIONS["sigmas"])]
@@ -148,6 +163,42 @@ def _loop_errors(numbers: Numbers) -> str:
     if numbers.loop_errors["online"].count < numbers.used:
         text += "; before, only those within one epoch can be told"
     return f"{text}:</p>" + table(rows, ("loop-closure error", "loops", "median", "largest"))
+
+
+def _calibration(each: SessionCalibration, with_name: bool) -> str:
+    rows = []
+    for pair in each.pairs:
+        if pair.is_held:
+            rows.append((pair_name(pair), "", "", verdict(pair)))
+        else:
+            rows.append(
+                (
+                    pair_name(pair),
+                    f"{pair.angle_deg:.3f} degrees, sigma {pair.angle_sigma_deg:.3f}: {pair.angle_sigmas:.1f} sigmas",
+                    f"{1e3 * pair.distance_m:.2f} mm, sigma {1e3 * pair.distance_sigma_m:.2f}: "
+                    f"{pair.distance_sigmas:.1f} sigmas",
+                    verdict(pair),
+                )
+            )
+    if each.offset is not None:
+        offset = each.offset
+        told = f"{1e3 * offset.offset_s:+.2f} ms, sigma {1e3 * offset.sigma_s:.2f}: {offset.sigmas:.1f} sigmas"
+        rows.append(("time offset of the IMU", "", told, verdict(offset)))
+    name = f"{each.session}: " if with_name else ""
+    all_in_all = (
+        "<b>the rig file is borne out</b>: all of it is within three standard deviations of what is found."
+        if each.is_borne_out
+        else "<b>the rig file is refuted</b>: the result here is by the calibration that is found, which is in "
+        f"<code>{escape(each.session)}/rig_optimized.yaml</code>."
+    )
+    is_known = bool(each.pairs) and each.pairs[0].of == "left camera"
+    moved = "the left camera" if is_known else "body's origin, as if one piece with the pair"
+    note = (
+        f"<p>Between the rig file's place of each pair and the one that is found; what is moved is {moved}. Sigmas are "
+        "the largest over all axes; what the motions do not tell keeps the sigma that was assumed before. A pair's "
+        "place is refuted, too, where all axes together contradict it as surely.</p>"
+    )
+    return f"<p>{escape(name)}{all_in_all}</p>" + table(rows, ("", "turned by", "moved by", "")) + note
 
 
 def _maps(numbers: Numbers, maps: Mapping[int, bytes]) -> list[str]:

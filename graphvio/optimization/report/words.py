@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.optimization.optimize import Optimization
+from graphvio.optimization.report.calibration import OffsetCorrection, PairCorrection, SessionCalibration
 from graphvio.optimization.report.numbers import Numbers
 
 _FAR_OFF = 2.0  # times the expected squares
@@ -78,6 +79,40 @@ def doubts(found: Optimization, numbers: Numbers) -> list[str]:
         if each.accuracy is not None and each.accuracy["optimized"].position_m > each.accuracy["online"].position_m:
             made.append(f"{each.name} is farther from the truth than the online trajectory was.")
     return made
+
+
+def calibration_in_words(each: SessionCalibration) -> list[str]:
+    """What is found of a session's rig file: a line for each pair, and one for the time offset."""
+    made = [f"{_pair_in_words(pair)}: {verdict(pair)}" for pair in each.pairs]
+    if each.offset is not None:
+        found = each.offset
+        made.append(
+            f"time offset {1e3 * found.offset_s:+.2f} ms (sigma {1e3 * found.sigma_s:.2f} ms: {found.sigmas:.1f} "
+            f"sigmas): {verdict(found)}"
+        )
+    return made
+
+
+def pair_name(pair: PairCorrection) -> str:
+    """Its number, and its name where that is known."""
+    return f"pair {pair.pair} ({pair.name})" if pair.name else f"pair {pair.pair}"
+
+
+def verdict(found: PairCorrection | OffsetCorrection) -> str:
+    """Whether the rig file's value may stay."""
+    if isinstance(found, PairCorrection) and found.is_held:
+        return "held where the rig file has it"
+    return "the rig file is borne out" if found.is_borne_out else "the rig file is refuted"
+
+
+def _pair_in_words(pair: PairCorrection) -> str:
+    if pair.is_held:
+        return pair_name(pair)
+    return (
+        f"{pair_name(pair)}: turned by {pair.angle_deg:.3f} degrees (sigma {pair.angle_sigma_deg:.3f}: "
+        f"{pair.angle_sigmas:.1f} sigmas), {pair.of} moved by {1e3 * pair.distance_m:.2f} mm (sigma "
+        f"{1e3 * pair.distance_sigma_m:.2f}: {pair.distance_sigmas:.1f} sigmas)"
+    )
 
 
 def parts_in_words(numbers: Numbers, frame: int) -> list[str]:
