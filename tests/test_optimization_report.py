@@ -176,6 +176,12 @@ def test_page_and_summary_tell_the_same(one: Optimization, written: tuple[Page, 
     for kind, residuals in summary["residuals"].items():
         assert kind in page.text
         assert plain(residuals["after"]["per_dimension"]) in page.text
+        assert plain(residuals["after"]["median_sigmas"]) in page.text
+    motion = one.after["motion"]
+    expected = np.sqrt(np.median(motion.distances) / (motion.dimensions / len(motion.distances)))
+    assert summary["residuals"]["motion"]["after"]["median_sigmas"] == pytest.approx(expected)
+    assert f"motions from images 0 before, {plain(expected)} after" in page.text
+    assert "fell by" not in page.text
     assert summary["residuals"]["loop"]["before"]["per_dimension"] > 100.0
     assert summary["unknowns"] == one.values.dim()
     assert "ring<1>" in page.text

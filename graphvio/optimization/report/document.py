@@ -12,7 +12,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.optimization.optimize import JudgedLoop, Optimization
 from graphvio.optimization.report.calibration import SessionCalibration
-from graphvio.optimization.report.numbers import Kind, Numbers, SessionNumbers
+from graphvio.optimization.report.numbers import Kind, Numbers, SessionNumbers, median_sigmas
 from graphvio.optimization.solve import Residuals
 
 VERSION = 1
@@ -123,6 +123,7 @@ def _kind(kind: Kind) -> dict[str, Any]:
             "factors": len(residuals.distances),
             "dimensions": residuals.dimensions,
             "per_dimension": residuals.per_dimension if residuals.dimensions else None,
+            "median_sigmas": median_sigmas(residuals),
         }
 
     return {"before": told(kind.before), "after": told(kind.after)}

@@ -124,6 +124,18 @@ class Numbers:
         return squares / self.dimensions if self.dimensions else 0.0
 
 
+def per_dimension(residuals: Residuals) -> Float:
+    """Squared Mahalanobis distance of each factor over its dimension; factors of a kind have the same."""
+    count = len(residuals.distances)
+    return np.asarray(residuals.distances / (residuals.dimensions / count)) if count else np.zeros(0)
+
+
+def median_sigmas(residuals: Residuals | None) -> float | None:
+    """Median error of the factors, standard deviations per dimension: a few that are far off do not move it."""
+    values = np.zeros(0) if residuals is None else per_dimension(residuals)
+    return float(np.sqrt(np.median(values))) if len(values) else None
+
+
 def numbers_of(found: Optimization, truths: Sequence[Trajectory | None], rigs: Sequence[Rig | None]) -> Numbers:
     """Compute them.
 

@@ -11,12 +11,13 @@ from graphvio.optimization.optimize import JudgedLoop, Optimization
 from graphvio.optimization.report.calibration import SessionCalibration
 from graphvio.optimization.report.document import size_of
 from graphvio.optimization.report.measures import STAGES
-from graphvio.optimization.report.numbers import Kind, Numbers, SessionNumbers
+from graphvio.optimization.report.numbers import Kind, Numbers, SessionNumbers, median_sigmas
 from graphvio.optimization.report.words import (
     angle,
+    cost,
     doubts,
-    fell,
     length,
+    medians,
     noise,
     pair_name,
     pairs_in_words,
@@ -38,6 +39,10 @@ _MEANINGS = {
     "start": "what is known of a first state",
     "loop": "loop closures that are used",
 }
+_WHY_LARGE = (
+    "The cost before may be large all the same: at the start of a session the odometry's poses are of different "
+    "updates, and the few motions between those dominate the sum."
+)
 _MAP = (
     "Online poses on the left, optimised ones on the right; seen from above, and from the side below. Every loop "
     "closure ties two places by a line: where the odometry drifted, lines of those used are longer on the left. "
@@ -87,9 +92,11 @@ def page(found: Optimization, numbers: Numbers, maps: Mapping[int, bytes], pictu
 
 
 def _head(found: Optimization, numbers: Numbers) -> str:
+    told = medians(numbers)
+    lead = f"<p>{escape(told)} {_WHY_LARGE}</p>" if told else ""
     count = len(numbers.sessions)
     framesets, states = (sum(getattr(each, name) for each in numbers.sessions) for name in ("framesets", "states"))
-    return table(
+    return lead + table(
         [
             ("sessions", f"{count}, in {numbers.frames} {'frame' if numbers.frames == 1 else 'frames'}"),
             (
@@ -101,7 +108,7 @@ def _head(found: Optimization, numbers: Numbers) -> str:
             ("loop closures", f"{len(found.loops)} found, {numbers.used} used, {numbers.refused} refused"),
             (
                 "cost (half the sum of squared residuals, loop closures not counted)",
-                f"{plain(found.cost_before)} before, {plain(found.cost_after)} after{fell(found)}",
+                cost(found),
             ),
         ]
     )
@@ -228,13 +235,24 @@ def _residuals(numbers: Numbers) -> str:
             _MEANINGS.get(kind.name, ""),
             str(len(kind.after.distances)),
             str(kind.after.dimensions),
+            plain(median_sigmas(kind.before)),
+            plain(median_sigmas(kind.after)),
             mean(kind, "before"),
             mean(kind, "after"),
         )
         for kind in numbers.kinds
     ]
-    rows.append(("all", "", "", str(numbers.dimensions), "", plain(numbers.per_dimension)))
-    head = ("factors", "", "number", "dimensions", "mean square per dimension, before", "after")
+    rows.append(("all", "", "", str(numbers.dimensions), "", "", "", plain(numbers.per_dimension)))
+    head = (
+        "factors",
+        "",
+        "number",
+        "dimensions",
+        "median, sigmas per dimension, before",
+        "after",
+        "mean square per dimension, before",
+        "after",
+    )
     note = (
         f"<p>{numbers.unknowns} unknowns are fitted to {numbers.dimensions} dimensions: were all noise as assumed, the "
         f"mean over all after would be about {plain(numbers.expected_per_dimension)}."

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.optimization.optimize import Optimization
 from graphvio.optimization.report.calibration import OffsetCorrection, PairCorrection, SessionCalibration
-from graphvio.optimization.report.numbers import Numbers
+from graphvio.optimization.report.numbers import Numbers, median_sigmas
 
 _FAR_OFF = 2.0  # times the expected squares
 _SURELY = 0.999
@@ -38,14 +38,25 @@ def plain(value: float | None) -> str:
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
 
 
-def fell(found: Optimization) -> str:
-    """By what share the cost fell. It may rise where the odometry's smoother left little to gain."""
+def medians(numbers: Numbers) -> str:
+    """What the medians of motions, of the IMU and of loop closures were and are; empty if there is nothing to tell."""
+    kinds = {kind.name: kind for kind in numbers.kinds}
+    told = []
+    for kind, name in (("motion", "motions from images"), ("imu", "IMU"), ("loop", "loop closures that are used")):
+        each = kinds.get(kind)
+        before, after = (None, None) if each is None else (median_sigmas(each.before), median_sigmas(each.after))
+        if after is not None:
+            known = "not told" if before is None else plain(before)
+            told.append(f"{name} {known} before, {plain(after)} after")
+    return f"Median errors, standard deviations per dimension: {'; '.join(told)}." if told else ""
+
+
+def cost(found: Optimization) -> str:
+    """The sum of all, and why it may mislead. It may rise where the odometry's smoother left little to gain."""
+    text = f"{plain(found.cost_before)} before, {plain(found.cost_after)} after"
     if found.cost_after > max(found.cost_before, _NO_COST):
-        return ": it rose, as loop closures move the states"
-    if found.cost_before < _NO_COST:
-        return ""
-    share = 100.0 * (1.0 - found.cost_after / found.cost_before)
-    return f": it fell by {share:.2f} %"
+        return text + ": it rose, as loop closures move the states"
+    return text
 
 
 def noise(numbers: Numbers) -> int:
