@@ -27,6 +27,7 @@ from graphvio.optimization.record import NO_MOTIONS, Inertial, Motions, SessionR
 from graphvio.optimization.report.calibration import calibrations
 from graphvio.optimization.report.words import length, plain
 from graphvio.optimization.report.write import write_report
+from graphvio.optimization.solve import Residuals
 from graphvio.trajectory import Trajectory
 
 POSES, LAP = 120, 60
@@ -145,7 +146,7 @@ def report(found: Optimization, folder: Path, truths: list[Trajectory | None]) -
     path = write_report(found, folder, truths)
     assert {file.name for file in folder.iterdir()} == {"report.html", "summary.json"}
     html = path.read_text(encoding="utf-8")
-    assert "http" not in html
+    assert "://" not in html  # base64 may spell http, but has no colon
     return Page(html), json.loads((folder / "summary.json").read_text(encoding="utf-8"))
 
 
@@ -296,6 +297,40 @@ def test_a_pair_s_place_is_that_of_its_left_camera(one: Optimization) -> None:
     assert each.pairs[1].distance_m == pytest.approx(0.0, abs=1e-12)
     assert each.pairs[1].distance_sigma_m == pytest.approx(1e-3 * np.sqrt(1.0 + place @ place))
     assert calibrations(one, [rig]) == [None]
+
+
+def test_nothing_speaks_against_a_good_result(one: Optimization, tmp_path: Path) -> None:
+    page, told = report(replace(one, loops=one.loops[:1]), tmp_path, [None])
+    assert "no check here speaks against the result" in page.text
+    assert told["sessions"][0]["completion"] is None
+
+
+def test_many_refused_loops_are_a_doubt(one: Optimization, tmp_path: Path) -> None:
+    half, _ = report(one, tmp_path / "half", [None])
+    assert "places look alike" not in half.text
+    page, _ = report(replace(one, loops=[*one.loops, one.loops[1]]), tmp_path / "most", [None])
+    assert "Read before use" in page.text
+    assert "2 of 3 loop closures that were found are refused: places look alike here" in page.text
+
+
+def test_used_loops_that_contradict_the_solution_are_a_doubt(one: Optimization, tmp_path: Path) -> None:
+    after = one.after | {"loop": Residuals(np.array([7.2]), 6)}
+    page, _ = report(replace(one, loops=one.loops[:1], after=after), tmp_path, [None])
+    assert "Read before use" in page.text
+    assert "their mean square per dimension is 1.2, that of motions" in page.text
+
+
+@pytest.mark.parametrize(("completion", "is_doubtful"), [(0.89, True), (0.9, False)])
+def test_a_session_with_gaps_is_a_doubt(
+    one: Optimization, tmp_path: Path, completion: float, is_doubtful: bool
+) -> None:
+    beside = tmp_path / "ring<1>" / "odometry"
+    beside.mkdir(parents=True)
+    (beside / "summary.json").write_text(json.dumps({"completion": completion}))
+    html = write_report(replace(one, loops=one.loops[:1]), tmp_path, [None]).read_text(encoding="utf-8")
+    assert ("Only 89 % of the framesets" in html) == is_doubtful
+    assert ("Read before use" in html) == is_doubtful
+    assert json.loads((tmp_path / "summary.json").read_text())["sessions"][0]["completion"] == completion
 
 
 def test_long_lists_of_loops_are_cut(one: Optimization, tmp_path: Path) -> None:

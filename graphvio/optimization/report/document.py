@@ -62,6 +62,7 @@ def _session(each: SessionNumbers) -> dict[str, Any]:
     return {
         "name": each.name,
         "framesets": each.framesets,
+        "completion": each.completion,
         "states": each.states,
         "duration_s": each.duration_s,
         "length_m": each.length_m,

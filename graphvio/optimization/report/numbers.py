@@ -39,6 +39,7 @@ class SessionNumbers:
     Attributes:
         name: of it.
         framesets: that have a pose.
+        completion: share of those that could have one; None if it is not known.
         states: of the graph.
         duration_s: from the first pose to the last.
         length_m: along the optimised positions.
@@ -55,6 +56,7 @@ class SessionNumbers:
 
     name: str
     framesets: int
+    completion: float | None
     states: int
     duration_s: float
     length_m: float
@@ -136,13 +138,19 @@ def median_sigmas(residuals: Residuals | None) -> float | None:
     return float(np.sqrt(np.median(values))) if len(values) else None
 
 
-def numbers_of(found: Optimization, truths: Sequence[Trajectory | None], rigs: Sequence[Rig | None]) -> Numbers:
+def numbers_of(
+    found: Optimization,
+    truths: Sequence[Trajectory | None],
+    rigs: Sequence[Rig | None],
+    completions: Sequence[float | None],
+) -> Numbers:
     """Compute them.
 
     Args:
         found: the optimisation.
         truths: of each session, or None.
         rigs: of each session, as its file has it, or None.
+        completions: of each session, the share of its framesets that have a pose, or None.
 
     Raises:
         OptimizationError: if there is not one truth, or None, for each session.
@@ -153,7 +161,7 @@ def numbers_of(found: Optimization, truths: Sequence[Trajectory | None], rigs: S
         )
     is_used = np.array([not loop.refusal for loop in found.loops], dtype=bool)
     return Numbers(
-        sessions=_sessions(found, truths),
+        sessions=_sessions(found, truths, completions),
         parts=parts(found),
         kinds=_kinds(found),
         used=int(is_used.sum()),
@@ -164,15 +172,19 @@ def numbers_of(found: Optimization, truths: Sequence[Trajectory | None], rigs: S
     )
 
 
-def _sessions(found: Optimization, truths: Sequence[Trajectory | None]) -> list[SessionNumbers]:
+def _sessions(
+    found: Optimization, truths: Sequence[Trajectory | None], completions: Sequence[float | None]
+) -> list[SessionNumbers]:
     made = []
-    for session, truth, online in zip(found.sessions, truths, online_in_frame(found), strict=True):
+    columns = zip(found.sessions, truths, completions, online_in_frame(found), strict=True)
+    for session, truth, completion, online in columns:
         record = session.record
         accuracy, why_not = accuracies_or_why_not(session, truth)
         made.append(
             SessionNumbers(
                 record.name,
                 len(record.stamps_ns),
+                completion,
                 len(session.nodes.rows),
                 float(record.stamps_ns[-1] - record.stamps_ns[0]) * 1e-9,
                 path_length_m(session),

@@ -13,6 +13,8 @@ _FAR_OFF = 2.0  # times the expected squares
 _SURELY = 0.999
 _NO_COST = 1e-6
 _MOST_PARTS = 40
+_LOOPS_DOUBTFUL = 1.0  # mean square per dimension
+_LEAST_COMPLETION = 0.9
 
 
 def length(metres: float | None) -> str:
@@ -81,12 +83,29 @@ def doubts(found: Optimization, numbers: Numbers) -> list[str]:
     if not numbers.used:
         which = f"None of {len(found.loops)} loop closures" if found.loops else "No loop closure"
         made.append(f"{which} is used: drift is what the odometry and the IMU leave of it.")
+    if numbers.used and 2 * numbers.refused > len(found.loops):
+        made.append(
+            f"{numbers.refused} of {len(found.loops)} loop closures that were found are refused: places look alike "
+            "here. What is used agrees with the odometry, so it does not prove the odometry right."
+        )
+    kinds = {kind.name: kind.after for kind in numbers.kinds}
+    if "loop" in kinds and kinds["loop"].per_dimension > _LOOPS_DOUBTFUL:
+        motions = f", that of motions {plain(kinds['motion'].per_dimension)}" if "motion" in kinds else ""
+        made.append(
+            "The loop closures that are used contradict the solution: their mean square per dimension is "
+            f"{plain(kinds['loop'].per_dimension)}{motions}. A wrong one may be among them."
+        )
     if noise(numbers) > 0:
         made.append(
             f"Residuals are larger than the noise that was assumed (mean square {plain(numbers.per_dimension)} per "
             f"dimension, {plain(numbers.expected_per_dimension)} expected): sigmas are too small."
         )
     for each in numbers.sessions:
+        if each.completion is not None and each.completion < _LEAST_COMPLETION:
+            made.append(
+                f"Only {100.0 * each.completion:.0f} % of the framesets of {each.name} have a pose; its odometry's "
+                "results tell why."
+            )
         if each.accuracy is not None and each.accuracy["optimized"].position_m > each.accuracy["online"].position_m:
             made.append(f"{each.name} is farther from the truth than the online trajectory was.")
     return made

@@ -12,7 +12,7 @@ from graphvio.optimization.report import figures
 from graphvio.optimization.report.document import document
 from graphvio.optimization.report.maps import draw_map
 from graphvio.optimization.report.numbers import Numbers, numbers_of
-from graphvio.optimization.report.odometry import rig_of
+from graphvio.optimization.report.odometry import completion, rig_of
 from graphvio.optimization.report.page import page
 from graphvio.reporting.figures import png
 from graphvio.reporting.files import replace_file
@@ -37,7 +37,8 @@ def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory 
         OptimizationError: if there is not one truth, or None, for each session, or the folder cannot be written.
     """
     names = [session.record.name for session in found.sessions]
-    numbers = numbers_of(found, truths, [rig_of(folder, name) for name in names])
+    rigs, completions = [rig_of(folder, name) for name in names], [completion(folder, name) for name in names]
+    numbers = numbers_of(found, truths, rigs, completions)
     summary = json.dumps(document(found, numbers), indent=2, allow_nan=False) + "\n"
     maps = {frame: png(draw_map(found, numbers, frame)) for frame in _frames_to_draw(numbers)}
     pictures = {
