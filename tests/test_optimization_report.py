@@ -17,6 +17,7 @@ import pytest
 from synthetic import two_pair_rig
 
 from graphvio.arrays import Float
+from graphvio.cli.optimize import _tell
 from graphvio.config import Config
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3, se3_exp, se3_inverse, so3_exp
@@ -331,6 +332,25 @@ def test_a_session_with_gaps_is_a_doubt(
     assert ("Only 89 % of the framesets" in html) == is_doubtful
     assert ("Read before use" in html) == is_doubtful
     assert json.loads((tmp_path / "summary.json").read_text())["sessions"][0]["completion"] == completion
+
+
+def test_the_terminal_tells_medians_and_calibration(
+    one: Optimization, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _tell(replace(one, corrections=[correction(0.01, 0.0, -0.005)]), tmp_path)
+    told = capsys.readouterr().out
+    assert re.search(r"^cost \S+ -> \S+; median error per motion \S+ -> \S+ sigmas$", told, re.MULTILINE)
+    assert "pair 1: turned by 0.573 degrees (sigma 0.057: 10.0 sigmas)" in told
+    assert "time offset -5.00 ms (sigma 1.00 ms: 5.0 sigmas): the rig file is refuted" in told
+
+
+def test_sessions_without_a_correction_are_told_apart() -> None:
+    corrections: Any = [None, correction(0.0, 0.0, None)]
+    found = replace(two_sessions(), corrections=corrections)
+    first, second = calibrations(found, [None, None])
+    assert first is None
+    assert second is not None
+    assert second.session == "second"
 
 
 def test_long_lists_of_loops_are_cut(one: Optimization, tmp_path: Path) -> None:
