@@ -133,6 +133,11 @@ def _warn(odometry: Path) -> None:
 
 
 def _tell(found: Optimization, folder: Path) -> None:
+    from graphvio.optimization.report.calibration import calibrations
+    from graphvio.optimization.report.numbers import median_sigmas
+    from graphvio.optimization.report.odometry import rig_of
+    from graphvio.optimization.report.words import calibration_in_words, plain
+
     used = sum(not loop.refusal for loop in found.loops)
     typer.echo(
         f"{sum(len(each.record.stamps_ns) for each in found.sessions)} framesets, "
@@ -142,5 +147,14 @@ def _tell(found: Optimization, folder: Path) -> None:
     frames = len(set(found.frames))
     if frames > 1:
         typer.echo(f"graphvio: {frames} parts that no loop closures join, each in a frame of its own", err=True)
-    typer.echo(f"cost {found.cost_before:.0f} as the odometry left it, {found.cost_after:.1f} now")
+    before, after = (median_sigmas(kinds.get("motion")) for kinds in (found.before, found.after))
+    median = ""
+    if before is not None and after is not None:
+        median = f"; median error per motion {plain(before)} -> {plain(after)} sigmas"
+    typer.echo(f"cost {plain(found.cost_before)} -> {plain(found.cost_after)}{median}")
+    for each in calibrations(found, [rig_of(folder, session.record.name) for session in found.sessions]):
+        if each is not None:
+            name = "" if len(found.sessions) == 1 else f"{each.session}, "
+            for line in calibration_in_words(each):
+                typer.echo(f"{name}{line}")
     typer.echo(f"results: {folder}")

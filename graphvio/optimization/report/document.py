@@ -11,7 +11,8 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.optimization.optimize import JudgedLoop, Optimization
-from graphvio.optimization.report.numbers import Kind, Numbers, SessionNumbers
+from graphvio.optimization.report.calibration import SessionCalibration
+from graphvio.optimization.report.numbers import Kind, Numbers, SessionNumbers, median_sigmas
 from graphvio.optimization.solve import Residuals
 
 VERSION = 1
@@ -31,6 +32,7 @@ def document(found: Optimization, numbers: Numbers) -> dict[str, Any]:
             "after": found.cost_after,
             "fell_percent": None if fell is None else 100.0 * fell,
         },
+        "calibrations": [_calibration(each) for each in numbers.calibrations],
         "residuals": {kind.name: _kind(kind) for kind in numbers.kinds},
         "dimensions": numbers.dimensions,
         "unknowns": numbers.unknowns,
@@ -60,6 +62,7 @@ def _session(each: SessionNumbers) -> dict[str, Any]:
     return {
         "name": each.name,
         "framesets": each.framesets,
+        "completion": each.completion,
         "states": each.states,
         "duration_s": each.duration_s,
         "length_m": each.length_m,
@@ -80,12 +83,48 @@ def _session(each: SessionNumbers) -> dict[str, Any]:
     }
 
 
+def _calibration(each: SessionCalibration | None) -> dict[str, Any] | None:
+    if each is None:
+        return None
+    offset = each.offset
+    return {
+        "session": each.session,
+        "borne_out": each.is_borne_out,
+        "pairs": [
+            {
+                "pair": pair.pair,
+                "name": pair.name or None,
+                "held": pair.is_held,
+                "of": pair.of,
+                "angle_deg": pair.angle_deg,
+                "angle_sigma_deg": pair.angle_sigma_deg,
+                "angle_sigmas": pair.angle_sigmas,
+                "distance_m": pair.distance_m,
+                "distance_sigma_m": pair.distance_sigma_m,
+                "distance_sigmas": pair.distance_sigmas,
+                "squared_distance": pair.squared_distance,
+                "borne_out": pair.is_borne_out,
+            }
+            for pair in each.pairs
+        ],
+        "time_offset": None
+        if offset is None
+        else {
+            "correction_s": offset.offset_s,
+            "sigma_s": offset.sigma_s,
+            "sigmas": offset.sigmas,
+            "borne_out": offset.is_borne_out,
+        },
+    }
+
+
 def _kind(kind: Kind) -> dict[str, Any]:
     def told(residuals: Residuals) -> dict[str, Any]:
         return {
             "factors": len(residuals.distances),
             "dimensions": residuals.dimensions,
             "per_dimension": residuals.per_dimension if residuals.dimensions else None,
+            "median_sigmas": median_sigmas(residuals),
         }
 
     return {"before": told(kind.before), "after": told(kind.after)}

@@ -14,8 +14,7 @@ from graphvio.arrays import Float
 from graphvio.optimization.optimize import Optimization
 from graphvio.optimization.report.maps import session_colour
 from graphvio.optimization.report.measures import seconds
-from graphvio.optimization.report.numbers import Kind, Numbers
-from graphvio.optimization.solve import Residuals
+from graphvio.optimization.report.numbers import Kind, Numbers, per_dimension
 from graphvio.reporting.figures import BLUE, GREEN, GREY, add_axes, empty_figure
 
 _COLUMNS = 3
@@ -102,7 +101,7 @@ def draw_sigmas(found: Optimization, numbers: Numbers) -> Figure:
 
 def _edges(kinds: Sequence[Kind]) -> Float:
     """Of bins, for all kinds; what lies outside is counted in the outermost."""
-    shown = [_per_dimension(each) for kind in kinds for each in (kind.before, kind.after)]
+    shown = [per_dimension(each) for kind in kinds for each in (kind.before, kind.after)]
     values = np.concatenate([np.ones(1), *shown])
     lowest, highest = np.log10(np.clip(np.quantile(values[values > 0.0], [0.005, 0.995]), _LEAST, _MOST))
     low, high = min(int(np.floor(lowest)), -2), max(int(np.ceil(highest)), 2)
@@ -111,7 +110,7 @@ def _edges(kinds: Sequence[Kind]) -> Float:
 
 def _draw_kind(axes: Any, kind: Kind, edges: Float) -> None:
     inside = (edges[0] * 1.0001, edges[-1] * 0.9999)
-    before, after = (np.clip(_per_dimension(each), *inside) for each in (kind.before, kind.after))
+    before, after = (np.clip(per_dimension(each), *inside) for each in (kind.before, kind.after))
     axes.hist(after, bins=edges, color=BLUE, alpha=0.75, label="after")
     axes.hist(before, bins=edges, histtype="step", color="#f28e1c", linewidth=1.3, label="before")
     some = kind.after if len(kind.after.distances) else kind.before
@@ -126,11 +125,6 @@ def _draw_kind(axes: Any, kind: Kind, edges: Float) -> None:
     axes.set_title(f"{kind.name}: {count} {'factor' if count == 1 else 'factors'}", fontsize=9.5, loc="left")
     axes.tick_params(labelsize=8)
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-
-
-def _per_dimension(residuals: Residuals) -> Float:
-    count = len(residuals.distances)
-    return np.asarray(residuals.distances / (residuals.dimensions / count)) if count else np.zeros(0)
 
 
 def _unit(most_m: float) -> tuple[float, str]:

@@ -20,6 +20,7 @@ COLOURS = ("#1f5fbf", "#f28e1c", "#8e44ad", "#17a3b8", "#8c564b", "#555555", "#e
 _COLUMN_IN, _HEIGHT_IN = 4.5, 6.0
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _GAP_IN = 0.75, 0.15, 0.55, 0.3
 _LEGEND_ROW_IN, _HEADING_IN, _PER_ROW = 0.22, 0.4, 6
+_REFUSED, _REFUSED_ALPHA = "loop, refused", 0.15  # there may be hundreds of them
 _EDGE = {"markeredgecolor": "#111111", "markeredgewidth": 0.9, "linestyle": "none", "zorder": 5}
 
 
@@ -60,10 +61,13 @@ def draw_map(found: Optimization, numbers: Numbers, frame: int) -> Figure:
     handles, labels = plan.get_legend_handles_labels()
     kept = dict(zip(labels, handles, strict=True))
     width, height = figure.get_size_inches()
-    figure.legend(
+    legend = figure.legend(
         kept.values(), kept.keys(), loc="upper left", bbox_to_anchor=(_LEFT_IN / width, 1.0 - 0.05 / height),
         ncol=_PER_ROW, frameon=False, fontsize=9, borderaxespad=0.0, handlelength=1.6, columnspacing=1.4,
     )  # fmt: skip
+    for text, handle in zip(legend.get_texts(), legend.get_lines(), strict=True):
+        if text.get_text() == _REFUSED:
+            handle.set(alpha=0.6, linewidth=1.0)  # what is faint in the plot is to be seen here
     return figure
 
 
@@ -107,12 +111,11 @@ def _draw_loops(axes: Any, found: Optimization, lines: list[_Line], column: int,
                 ends.append(line.columns[column][place.row])
         if len(ends) == 2:
             segments[not loop.refusal] += [*ends, np.full(3, np.nan)]
-    for is_used, name, style in (
-        (False, "loop, refused", {"color": RED, "linewidth": 0.5, "zorder": 2}),
-        (True, "loop, used", {"color": GREEN, "linewidth": 3.0, "alpha": 0.5, "zorder": 2.5}),
-    ):
+    refused = {"color": RED, "linewidth": 0.5, "alpha": _REFUSED_ALPHA, "zorder": 1.5}
+    used = {"color": GREEN, "linewidth": 1.2, "alpha": 0.85, "zorder": 4, "marker": ".", "markersize": 3}
+    for is_used, name, style in ((False, _REFUSED, refused), (True, "loop, used", used)):
         if segments[is_used]:
-            axes.plot(*np.array(segments[is_used])[:, [0, z]].T, ".-", markersize=3, label=name, **style)
+            axes.plot(*np.array(segments[is_used])[:, [0, z]].T, label=name, **style)
 
 
 def _panels(points: Float, legend_in: float) -> tuple[Figure, list[tuple[Any, Any]]]:

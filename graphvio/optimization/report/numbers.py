@@ -10,6 +10,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.errors import OptimizationError
 from graphvio.optimization.optimize import Optimization
+from graphvio.optimization.report.calibration import SessionCalibration, calibrations
 from graphvio.optimization.report.measures import (
     STAGES,
     Accuracy,
@@ -25,6 +26,7 @@ from graphvio.optimization.report.measures import (
     sigmas,
 )
 from graphvio.optimization.solve import Residuals
+from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
 
 _ORDER = ("imu", "motion", "rest", "walk", "start", "loop")
@@ -37,6 +39,7 @@ class SessionNumbers:
     Attributes:
         name: of it.
         framesets: that have a pose.
+        completion: share of those that could have one; None if it is not known.
         states: of the graph.
         duration_s: from the first pose to the last.
         length_m: along the optimised positions.
@@ -53,6 +56,7 @@ class SessionNumbers:
 
     name: str
     framesets: int
+    completion: float | None
     states: int
     duration_s: float
     length_m: float
@@ -87,6 +91,7 @@ class Numbers:
         used: loop closures that are.
         refused: loop closures that are not.
         loop_errors: of the used ones by stage.
+        calibrations: what is found of each session's rig file, or None where it was no unknown.
         unknowns: of the solution, all states' dimensions.
     """
 
@@ -96,6 +101,7 @@ class Numbers:
     used: int
     refused: int
     loop_errors: Mapping[str, Spread]
+    calibrations: Sequence[SessionCalibration | None]
     unknowns: int
 
     @property
@@ -120,12 +126,31 @@ class Numbers:
         return squares / self.dimensions if self.dimensions else 0.0
 
 
-def numbers_of(found: Optimization, truths: Sequence[Trajectory | None]) -> Numbers:
+def per_dimension(residuals: Residuals) -> Float:
+    """Squared Mahalanobis distance of each factor over its dimension; factors of a kind have the same."""
+    count = len(residuals.distances)
+    return np.asarray(residuals.distances / (residuals.dimensions / count)) if count else np.zeros(0)
+
+
+def median_sigmas(residuals: Residuals | None) -> float | None:
+    """Median error of the factors, standard deviations per dimension: a few that are far off do not move it."""
+    values = np.zeros(0) if residuals is None else per_dimension(residuals)
+    return float(np.sqrt(np.median(values))) if len(values) else None
+
+
+def numbers_of(
+    found: Optimization,
+    truths: Sequence[Trajectory | None],
+    rigs: Sequence[Rig | None],
+    completions: Sequence[float | None],
+) -> Numbers:
     """Compute them.
 
     Args:
         found: the optimisation.
         truths: of each session, or None.
+        rigs: of each session, as its file has it, or None.
+        completions: of each session, the share of its framesets that have a pose, or None.
 
     Raises:
         OptimizationError: if there is not one truth, or None, for each session.
@@ -136,25 +161,30 @@ def numbers_of(found: Optimization, truths: Sequence[Trajectory | None]) -> Numb
         )
     is_used = np.array([not loop.refusal for loop in found.loops], dtype=bool)
     return Numbers(
-        sessions=_sessions(found, truths),
+        sessions=_sessions(found, truths, completions),
         parts=parts(found),
         kinds=_kinds(found),
         used=int(is_used.sum()),
         refused=int((~is_used).sum()),
         loop_errors={stage: Spread.of(loop_errors(found, stage)[is_used]) for stage in STAGES},
+        calibrations=calibrations(found, rigs),
         unknowns=int(found.values.dim()),
     )
 
 
-def _sessions(found: Optimization, truths: Sequence[Trajectory | None]) -> list[SessionNumbers]:
+def _sessions(
+    found: Optimization, truths: Sequence[Trajectory | None], completions: Sequence[float | None]
+) -> list[SessionNumbers]:
     made = []
-    for session, truth, online in zip(found.sessions, truths, online_in_frame(found), strict=True):
+    columns = zip(found.sessions, truths, completions, online_in_frame(found), strict=True)
+    for session, truth, completion, online in columns:
         record = session.record
         accuracy, why_not = accuracies_or_why_not(session, truth)
         made.append(
             SessionNumbers(
                 record.name,
                 len(record.stamps_ns),
+                completion,
                 len(session.nodes.rows),
                 float(record.stamps_ns[-1] - record.stamps_ns[0]) * 1e-9,
                 path_length_m(session),

@@ -8,10 +8,23 @@ from html import escape
 import numpy as np
 
 from graphvio.optimization.optimize import JudgedLoop, Optimization
+from graphvio.optimization.report.calibration import SessionCalibration
 from graphvio.optimization.report.document import size_of
 from graphvio.optimization.report.measures import STAGES
-from graphvio.optimization.report.numbers import Kind, Numbers, SessionNumbers
-from graphvio.optimization.report.words import angle, doubts, fell, length, noise, pairs_in_words, parts_in_words, plain
+from graphvio.optimization.report.numbers import Kind, Numbers, SessionNumbers, median_sigmas
+from graphvio.optimization.report.words import (
+    angle,
+    cost,
+    doubts,
+    length,
+    medians,
+    noise,
+    pair_name,
+    pairs_in_words,
+    parts_in_words,
+    plain,
+    verdict,
+)
 from graphvio.reporting.page import bullets, html_page, picture, table
 
 MOST_LOOPS = 200
@@ -26,6 +39,10 @@ _MEANINGS = {
     "start": "what is known of a first state",
     "loop": "loop closures that are used",
 }
+_WHY_LARGE = (
+    "The cost before may be large all the same: at the start of a session the odometry's poses are of different "
+    "updates, and the few motions between those dominate the sum."
+)
 _MAP = (
     "Online poses on the left, optimised ones on the right; seen from above, and from the side below. Every loop "
     "closure ties two places by a line: where the odometry drifted, lines of those used are longer on the left. "
@@ -61,6 +78,9 @@ def page(found: Optimization, numbers: Numbers, maps: Mapping[int, bytes], pictu
             '<p class="good"><b>All sessions lie in one frame, and no check here speaks against the result.</b></p>'
         )
     parts += [_head(found, numbers), _sessions(numbers.sessions), _accuracy(numbers.sessions), _loop_errors(numbers)]
+    known = [each for each in numbers.calibrations if each is not None]
+    if known:
+        parts += ["<h2>Calibration</h2>", *(_calibration(each, len(numbers.sessions) > 1) for each in known)]
     parts += ["<h2>Trajectories</h2>", *_maps(numbers, maps)]
     parts += ["<h2>Where the trajectory moved</h2>", picture("moved", pictures["moved"], _CAPTIONS["moved"])]
     parts += ["<h2>Uncertainty</h2>", picture("sigmas", pictures["sigmas"], _CAPTIONS["sigmas"])]
@@ -72,9 +92,11 @@ def page(found: Optimization, numbers: Numbers, maps: Mapping[int, bytes], pictu
 
 
 def _head(found: Optimization, numbers: Numbers) -> str:
+    told = medians(numbers)
+    lead = f"<p>{escape(told)} {_WHY_LARGE}</p>" if told else ""
     count = len(numbers.sessions)
     framesets, states = (sum(getattr(each, name) for each in numbers.sessions) for name in ("framesets", "states"))
-    return table(
+    return lead + table(
         [
             ("sessions", f"{count}, in {numbers.frames} {'frame' if numbers.frames == 1 else 'frames'}"),
             (
@@ -86,7 +108,7 @@ def _head(found: Optimization, numbers: Numbers) -> str:
             ("loop closures", f"{len(found.loops)} found, {numbers.used} used, {numbers.refused} refused"),
             (
                 "cost (half the sum of squared residuals, loop closures not counted)",
-                f"{plain(found.cost_before)} before, {plain(found.cost_after)} after{fell(found)}",
+                cost(found),
             ),
         ]
     )
@@ -150,6 +172,42 @@ def _loop_errors(numbers: Numbers) -> str:
     return f"{text}:</p>" + table(rows, ("loop-closure error", "loops", "median", "largest"))
 
 
+def _calibration(each: SessionCalibration, with_name: bool) -> str:
+    rows = []
+    for pair in each.pairs:
+        if pair.is_held:
+            rows.append((pair_name(pair), "", "", verdict(pair)))
+        else:
+            rows.append(
+                (
+                    pair_name(pair),
+                    f"{pair.angle_deg:.3f} degrees, sigma {pair.angle_sigma_deg:.3f}: {pair.angle_sigmas:.1f} sigmas",
+                    f"{1e3 * pair.distance_m:.2f} mm, sigma {1e3 * pair.distance_sigma_m:.2f}: "
+                    f"{pair.distance_sigmas:.1f} sigmas",
+                    verdict(pair),
+                )
+            )
+    if each.offset is not None:
+        offset = each.offset
+        told = f"{1e3 * offset.offset_s:+.2f} ms, sigma {1e3 * offset.sigma_s:.2f}: {offset.sigmas:.1f} sigmas"
+        rows.append(("time offset of the IMU", "", told, verdict(offset)))
+    name = f"{each.session}: " if with_name else ""
+    all_in_all = (
+        "<b>the rig file is borne out</b>: all of it is within three standard deviations of what is found."
+        if each.is_borne_out
+        else "<b>the rig file is refuted</b>: the result here is by the calibration that is found, which is in "
+        f"<code>{escape(each.session)}/rig_optimized.yaml</code>."
+    )
+    is_known = bool(each.pairs) and each.pairs[0].of == "left camera"
+    moved = "the left camera" if is_known else "body's origin, as if one piece with the pair"
+    note = (
+        f"<p>Between the rig file's place of each pair and the one that is found; what is moved is {moved}. Sigmas are "
+        "the largest over all axes; what the motions do not tell keeps the sigma that was assumed before. A pair's "
+        "place is refuted, too, where all axes together contradict it as surely.</p>"
+    )
+    return f"<p>{escape(name)}{all_in_all}</p>" + table(rows, ("", "turned by", "moved by", "")) + note
+
+
 def _maps(numbers: Numbers, maps: Mapping[int, bytes]) -> list[str]:
     made = []
     for frame in range(numbers.frames):
@@ -177,13 +235,24 @@ def _residuals(numbers: Numbers) -> str:
             _MEANINGS.get(kind.name, ""),
             str(len(kind.after.distances)),
             str(kind.after.dimensions),
+            plain(median_sigmas(kind.before)),
+            plain(median_sigmas(kind.after)),
             mean(kind, "before"),
             mean(kind, "after"),
         )
         for kind in numbers.kinds
     ]
-    rows.append(("all", "", "", str(numbers.dimensions), "", plain(numbers.per_dimension)))
-    head = ("factors", "", "number", "dimensions", "mean square per dimension, before", "after")
+    rows.append(("all", "", "", str(numbers.dimensions), "", "", "", plain(numbers.per_dimension)))
+    head = (
+        "factors",
+        "",
+        "number",
+        "dimensions",
+        "median, sigmas per dimension, before",
+        "after",
+        "mean square per dimension, before",
+        "after",
+    )
     note = (
         f"<p>{numbers.unknowns} unknowns are fitted to {numbers.dimensions} dimensions: were all noise as assumed, the "
         f"mean over all after would be about {plain(numbers.expected_per_dimension)}."

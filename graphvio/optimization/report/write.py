@@ -12,6 +12,7 @@ from graphvio.optimization.report import figures
 from graphvio.optimization.report.document import document
 from graphvio.optimization.report.maps import draw_map
 from graphvio.optimization.report.numbers import Numbers, numbers_of
+from graphvio.optimization.report.odometry import completion, rig_of
 from graphvio.optimization.report.page import page
 from graphvio.reporting.figures import png
 from graphvio.reporting.files import replace_file
@@ -26,7 +27,7 @@ def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory 
 
     Args:
         found: the optimisation.
-        folder: is made if it is missing.
+        folder: is made if it is missing; what the odometry left there of each session, in NAME/odometry, is told, too.
         truths: of each session, poses of body on the session's clock in any frame; or None.
 
     Returns:
@@ -35,7 +36,9 @@ def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory 
     Raises:
         OptimizationError: if there is not one truth, or None, for each session, or the folder cannot be written.
     """
-    numbers = numbers_of(found, truths)
+    names = [session.record.name for session in found.sessions]
+    rigs, completions = [rig_of(folder, name) for name in names], [completion(folder, name) for name in names]
+    numbers = numbers_of(found, truths, rigs, completions)
     summary = json.dumps(document(found, numbers), indent=2, allow_nan=False) + "\n"
     maps = {frame: png(draw_map(found, numbers, frame)) for frame in _frames_to_draw(numbers)}
     pictures = {
