@@ -187,13 +187,14 @@ class SessionGraph:
 
     def _add_motions(self, first: int, nodes: Nodes, left_out: Int) -> None:
         """All motions of the rig, but those that end in some framesets."""
-        self._kind = "motion"
         record = nodes.record
         for number in nodes.motions[~np.isin(record.motions.row[nodes.motions], left_out)].tolist():
             motion = record.motions.at(number, record.stamps_ns)
             i = first + nodes.index_of_row(int(record.motions.reference[number]))
             j = first + nodes.index_of_row(int(record.motions.row[number]))
+            self._kind = "view"
             self._views.add(i, motion, self)
+            self._kind = "motion"
             reference, covariance = self._views.seen(i, motion)
             self.add(
                 gtsam.BetweenFactorPose3(reference, x(j), gtsam.Pose3(motion.reference_T_current), gaussian(covariance))

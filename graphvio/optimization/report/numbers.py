@@ -29,7 +29,7 @@ from graphvio.optimization.solve import Residuals
 from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
 
-_ORDER = ("imu", "motion", "rest", "walk", "start", "loop")
+_ORDER = ("imu", "motion", "view", "rest", "walk", "start", "calibration", "loop")
 
 
 @dataclass(frozen=True, eq=False)

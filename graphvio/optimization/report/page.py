@@ -34,9 +34,11 @@ _STAGES = ("online", "smoothed", "optimised")
 _MEANINGS = {
     "imu": "preintegrated IMU between two states",
     "motion": "motion of the rig, from images",
+    "view": "the error that a keyframe's motions share",
     "rest": "the rig stands still",
     "walk": "a stretch without IMU or images: steady motion",
     "start": "what is known of a first state",
+    "calibration": "what the rig file says of places and offset",
     "loop": "loop closures that are used",
 }
 _WHY_LARGE = (
