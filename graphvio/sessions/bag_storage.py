@@ -14,7 +14,16 @@ from graphvio.sessions.storage import exists_error, not_writable_error
 _ROS2_VERSION: Final = 8  # of metadata.yaml; the newest whose QoS profiles older distributions read, too
 
 
-class Ros1Storage:
+class _Bag:
+    has_attachments = False
+    is_readable_when_cut = False
+
+    def attach(self, name: str, text: str) -> None:
+        """Bags have no attachments."""
+        raise NotImplementedError
+
+
+class Ros1Storage(_Bag):
     """A ROS 1 bag; without its end, which has the index, it cannot be read.
 
     Args:
@@ -24,9 +33,6 @@ class Ros1Storage:
         SessionError: if the file exists or cannot be made.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
-
-    has_attachments = False
-    is_readable_when_cut = False
 
     def __init__(self, path: Path) -> None:
         try:
@@ -42,10 +48,6 @@ class Ros1Storage:
             raise exists_error(path) from None
         except OSError as error:
             raise not_writable_error(path, error) from None
-
-    def attach(self, name: str, text: str) -> None:
-        """Bags have no attachments."""
-        raise NotImplementedError
 
     def write(self, topic: str, stamp_ns: int, message: Any, is_latched: bool) -> None:
         """Store a ROS 2 message as ROS 1 has it."""
@@ -67,7 +69,7 @@ class Ros1Storage:
         self._writer.abort()
 
 
-class Ros2Storage:
+class Ros2Storage(_Bag):
     """A ROS 2 bag: a folder with an SQLite file, whose messages are there once it is finished.
 
     Args:
@@ -77,9 +79,6 @@ class Ros2Storage:
         SessionError: if the folder exists or cannot be made.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
-
-    has_attachments = False
-    is_readable_when_cut = False
 
     def __init__(self, path: Path) -> None:
         try:
@@ -95,10 +94,6 @@ class Ros2Storage:
             raise exists_error(path) from None
         except (OSError, sqlite3.Error) as error:
             raise not_writable_error(path, _as_os_error(error)) from None
-
-    def attach(self, name: str, text: str) -> None:
-        """Bags have no attachments."""
-        raise NotImplementedError
 
     def write(self, topic: str, stamp_ns: int, message: Any, is_latched: bool) -> None:
         """Store a message."""

@@ -8,9 +8,8 @@ from typing import Any
 from graphvio.errors import MissingExtraError, SessionError
 
 
-@cache
-def types() -> Any:
-    """The types of ROS 2 (Humble).
+def typestore(name: str) -> Any:
+    """The types of a ROS distribution, by the name that rosbags has for it.
 
     Raises:
         MissingExtraError: if the extra ``sessions`` is not installed.
@@ -19,7 +18,17 @@ def types() -> Any:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingExtraError("rosbags", "sessions", "reading or writing a session") from None
-    return get_typestore(Stores.ROS2_HUMBLE)
+    return get_typestore(Stores[name])
+
+
+@cache
+def types() -> Any:
+    """The types of ROS 2 (Humble).
+
+    Raises:
+        MissingExtraError: if the extra ``sessions`` is not installed.
+    """
+    return typestore("ROS2_HUMBLE")
 
 
 def make(type_name: str, **fields: Any) -> Any:

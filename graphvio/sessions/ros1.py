@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from graphvio.errors import MissingExtraError
 from graphvio.sessions import cdr
 from graphvio.sessions.messages import CAMERA_INFO, LOG, TRANSFORMS
 
@@ -20,11 +19,9 @@ def types() -> Any:
     Raises:
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
-    try:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ImportError:
-        raise MissingExtraError("rosbags", "sessions", "writing a bag") from None
-    made = get_typestore(Stores.ROS1_NOETIC)
+    made = cdr.typestore("ROS1_NOETIC")
+    from rosbags.typesys import get_types_from_msg
+
     made.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
     return made
 
