@@ -119,6 +119,7 @@ def test_nothing_is_lost_there_and_back(kind: str, recording: Path, tmp_path: Pa
 def test_from_bag_to_bag_with_images_as_png(recording: Path, tmp_path: Path) -> None:
     first = converted(recording, tmp_path / "a.bag", "--png")
     second = converted(first, tmp_path / "rosbag2", "--png")
+    assert second.is_dir()
     equal(recording, converted(second, tmp_path / "b.mcap"))
 
 

@@ -26,9 +26,7 @@ from graphvio.optimization.tie import Tie
 _AGREE_M = 0.5
 _AGREE_RAD = 0.1
 _LEAST_VOTES = 3
-_STRONG_POINTS = (
-    100  # of a closure that may vote: fewer may be one thing that two places have alike, seen again and again
-)
+_STRONG_POINTS = 100  # of a closure that may vote: fewer may be one thing that two places have alike
 _FRAME_SIGMA = 1e-6
 _JOINED_SIGMAS = np.repeat([_AGREE_RAD, _AGREE_M], 3)  # of how fragments lie to each other before closures are weighed
 

@@ -15,6 +15,8 @@ _ROS2_VERSION: Final = 8  # of metadata.yaml; the newest whose QoS profiles olde
 
 
 class _Bag:
+    """What bags of ROS 1 and ROS 2 have in common."""
+
     has_attachments = False
     is_readable_when_cut = False
 
