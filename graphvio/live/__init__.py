@@ -1,0 +1,1 @@
+"""The odometry on live sensors, in real time."""

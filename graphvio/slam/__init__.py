@@ -1,0 +1,1 @@
+"""The odometry as the front-end of a SLAM system: keyframes out, global corrections in."""
