@@ -82,6 +82,11 @@ class Belief(ABC):
     def motion_since(self, then_ns: int) -> Float | None:
         """``now_T_then`` (4, 4) of body from an earlier frameset to the newest state, or None if it is not known."""
 
+    @abstractmethod
+    def covariance_since(self, then_ns: int) -> Float | None:
+        """Covariance (6, 6) of the motion from a state that was kept to the newest one, tangent ``[rotation,
+        translation]`` in the newest body, or None if it is not known."""
+
     def take_final(self) -> list[tuple[int, Float]]:
         """Stamps and poses ``nav_T_body`` that became final since the last call; not always in time order."""
         taken, self._final = self._final, []

@@ -228,6 +228,18 @@ class OptimizationConfig(Stage):
 
 
 @dataclass(frozen=True)
+class KeyframesConfig(Stage):
+    """What a SLAM system is given, and how it is believed; without one, nothing of it is done."""
+
+    descriptors: Literal["orb", "sift", "none"] = "orb"
+    """Of the landmarks in the left images."""
+    images: bool = False
+    """Whether keyframes carry their images."""
+    gate_probability: float = 0.999
+    """A correction is refused where what it says lies outside this share of the chi-square distribution."""
+
+
+@dataclass(frozen=True)
 class Config:
     """All stages."""
 
@@ -241,6 +253,7 @@ class Config:
     filter: FilterConfig = field(default_factory=FilterConfig)
     timing: TimingConfig = field(default_factory=TimingConfig)
     optimization: OptimizationConfig = field(default_factory=OptimizationConfig)
+    keyframes: KeyframesConfig = field(default_factory=KeyframesConfig)
 
     def __post_init__(self) -> None:
         """Refuse stages that do not fit together.

@@ -75,6 +75,10 @@ class FilterBelief(Belief):
             return None
         return se3_inverse(self._filter.state.nav_T_body) @ self._poses[then_ns]
 
+    def covariance_since(self, then_ns: int) -> Float | None:
+        """None: a filter knows no state but the newest."""
+        return None
+
     def end(self) -> None:
         """See `Belief`: a filter never corrects a pose later."""
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from time import perf_counter
 
 import numpy as np
@@ -11,7 +12,6 @@ from graphvio.arrays import Float
 from graphvio.backend.inertial import NO_SAMPLES, ImuSpan
 from graphvio.backend.initialisation import is_at_rest
 from graphvio.backend.propagation import Propagator
-from graphvio.backend.time_offset import TimeOffsetFilter
 from graphvio.belief import Belief
 from graphvio.config import Config
 from graphvio.errors import EventError
@@ -30,14 +30,15 @@ from graphvio.filter_belief import FilterBelief
 from graphvio.frontend.alignment import misplaced
 from graphvio.frontend.motion import VisualResult
 from graphvio.frontend.visual import VisualFrontend
+from graphvio.geometry import se3_inverse
+from graphvio.offset_correction import OffsetCorrection
 from graphvio.rates import AngularRates
 from graphvio.rig import Rig
+from graphvio.slam.keyframe import CorrectionResult, Keyframe
+from graphvio.slam.keyframes import Keyframes
 from graphvio.smoother_belief import SmootherBelief
 from graphvio.step import Step
 from graphvio.synchroniser import Synchroniser
-
-_NOTABLE_OFFSET_S = 1e-3
-_SURELY = 5.0  # standard deviations
 
 
 class Odometry:
@@ -69,12 +70,12 @@ class Odometry:
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._on_prediction = on_prediction
         self._on_step = on_step
-        self._time_offset = self._new_time_offset()
-        self._told_time_offset = False
+        self._time_offset = OffsetCorrection(rig, self.config, self._synchroniser, self._report)
+        self._keyframes = Keyframes(rig, self.config)
         self._told_misaligned: set[int] = set()
         self._frozen: frozenset[int] = frozenset()
         self._rates = AngularRates()
-        self._incidents: list[Incident] = []
+        self._incidents: deque[Incident] = deque()  # appended to by any thread that corrects
         self._first_ns: int | None = None
         self._finished = False
 
@@ -109,6 +110,7 @@ class Odometry:
             estimates.append(self._estimate(frameset))
         self._belief.end()
         self._frontend.close()
+        self._keyframes.log.close()
         self._finished = True
         return estimates
 
@@ -127,12 +129,63 @@ class Odometry:
 
     def take_incidents(self) -> list[Incident]:
         """What happened since the last call that a person would want to know of."""
-        taken, self._incidents = self._incidents, []
-        return taken
+        return [self._incidents.popleft() for _ in range(len(self._incidents))]
 
     def take_smoothed(self) -> list[tuple[int, Float]]:
         """Stamps and poses ``nav_T_body`` that became final since the last call; not always in time order."""
         return self._belief.take_final()
+
+    def limit_corners(self, share: float) -> None:
+        """Follow only a share, above 0 and up to 1, of the corners that the configuration asks for, from now on: for
+        real time, where time does not suffice. From the thread that calls `process`."""
+        self._frontend.limit_corners(share)
+
+    # ------------------------------------------------------------------ for SLAM
+
+    def on_keyframe(self, callback: Callable[[Keyframe], None]) -> None:
+        """Have each keyframe from now on handed to a callback, within `process`: it had better return soon."""
+        self._keyframes.call(callback)
+
+    def keyframes(self, from_id: int = 0) -> Iterator[Keyframe]:
+        """Keyframes from now on as they come, each waited for, until `finish`; for a thread of its own.
+
+        Args:
+            from_id: where to begin, or to go on. Ids that are passed over were no longer kept: see `KeyframeLog`.
+        """
+        return self._keyframes.follow(from_id)
+
+    def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
+        """Say where a keyframe is in the map; any thread may. `map_T_odom` moves, and nothing else.
+
+        Args:
+            keyframe_id: of it, however long ago in this epoch: what came since then is carried forward.
+            map_T_body: (4, 4) of body there.
+            covariance: (6, 6), tangent ``[rotation, translation]`` in body.
+
+        Returns:
+            Whether it was believed. One that is far from expected is refused by chi-square and reported, until several
+            in a row agree with each other.
+
+        Raises:
+            EventError: if the pose is not rigid, or the covariance is none.
+        """
+        result = self._keyframes.map_frame.correct(keyframe_id, map_T_body, covariance)
+        if result.reason:
+            kind = "map_moved" if result.accepted else "correction_refused"
+            self._report(self._belief.latest_ns if self._belief.has_started else 0, kind, result.reason)
+        return result
+
+    @property
+    def map_T_odom(self) -> Float | None:
+        """(4, 4) of the newest epoch's odom frame, which is nav, in the map (REP 105), or None before a correction."""
+        return self._keyframes.map_frame.map_T_odom
+
+    def map_T_body(self, stamp_ns: int) -> Float | None:
+        """Where the rig is in the map (4, 4), or None where `predict` has no pose or the map is not known."""
+        prediction, map_T_odom = self.predict(stamp_ns), self.map_T_odom
+        if prediction is None or map_T_odom is None or prediction.epoch != self._keyframes.map_frame.epoch:
+            return None
+        return map_T_odom @ prediction.nav_T_body
 
     # ------------------------------------------------------------------ one frameset
 
@@ -156,10 +209,12 @@ class Odometry:
         at_rest = visual.at_rest and self._imu_is_at_rest(span)
         motion = self._belief.use(visual, at_rest)
         used = motion is not None or starting
-        status = self._belief.update(stamp_ns, used, self._frontend.reference_stamps_ns)
+        references, before = self._frontend.reference_stamps_ns, self._keyframes.previous_ns
+        is_reference = stamp_ns in references
+        status = self._belief.update(stamp_ns, used, references | {before} if is_reference and before else references)
         self._synchroniser.forget_before(stamp_ns)
         self._predict_from(stamp_ns, status)
-        self._correct_time_offset(stamp_ns, visual)
+        self._time_offset.update(stamp_ns, visual)
         stage_ms = {
             "predict": 1e3 * (predicted - start),
             **visual.stage_ms,
@@ -176,42 +231,33 @@ class Odometry:
                     span=span,
                     started=self._belief.starts != starts,
                     own={} if motion is None else visual.own,
-                    references=self._frontend.reference_stamps_ns,
+                    references=references,
                 )
             )
+        if is_reference:
+            self._add_keyframe(estimate, frameset, before)
         return estimate
+
+    def _add_keyframe(self, estimate: Estimate, frameset: FrameSet, before_ns: int | None) -> None:
+        """A frameset from which later motions are measured, with the motion since the one before."""
+        motion = None
+        if before_ns is not None:
+            now_T_before, covariance = self._belief.motion_since(before_ns), self._belief.covariance_since(before_ns)
+            if now_T_before is not None and covariance is not None:
+                motion = se3_inverse(now_T_before), covariance
+        self._keyframes.add(
+            estimate,
+            self._frontend.frames_at(estimate.stamp_ns),
+            frameset.images,
+            self._frontend.body_T_left,
+            motion,
+        )
 
     def _imu_is_at_rest(self, span: ImuSpan | None) -> bool:
         """What the IMU says of a standstill; it does not object where there is none, but where its samples lack."""
         if span is None:
             return not self._belief.has_imu
         return is_at_rest(span, self.config.initialisation)
-
-    def _new_time_offset(self) -> TimeOffsetFilter | None:
-        imu = self.rig.imu
-        if imu is None or not self.config.fusion.estimate_time_offset:
-            return None
-        return TimeOffsetFilter(imu, self.config.smoother.imu_noise_scale, self._synchroniser.span)
-
-    def _correct_time_offset(self, stamp_ns: int, visual: VisualResult) -> None:
-        """Later framesets take the IMU at their true instants, once the offset is known well enough."""
-        if self._time_offset is None or visual.motion is None or visual.quality is not Quality.GOOD:
-            return
-        self._time_offset.update(visual.motion)
-        if not self._time_offset.estimate.is_usable:
-            return
-        self._synchroniser.shift_imu(self._time_offset.corrected())
-        offset_s, sigma_s = self._synchroniser.time_offset_s, self._time_offset.estimate.sigma_s
-        assert self.rig.imu is not None
-        off_s = offset_s - self.rig.imu.time_offset_s
-        if not self._told_time_offset and abs(off_s) > max(_NOTABLE_OFFSET_S, _SURELY * sigma_s):
-            self._told_time_offset = True
-            self._report(
-                stamp_ns,
-                "time_offset_off",
-                f"the IMU's stamps are {1e3 * off_s:.1f} ms later than the rig says (sigma {1e3 * sigma_s:.1f} ms), as "
-                f"rotations tell; corrected for this run: set time_offset_s: {offset_s:.4f} in the rig",
-            )
 
     def _must_wait_for_imu(self, stamp_ns: int) -> bool:
         """Before the IMU's first sample there is nothing to start from, unless it has been awaited for long."""
@@ -293,8 +339,8 @@ class Odometry:
             velocity_covariance=known.velocity if honest else None,
             gyro_bias_covariance=known.gyro_bias,
             accel_bias_covariance=known.accel_bias,
-            time_offset_s=None if self._time_offset is None else self._synchroniser.time_offset_s,
-            time_offset_sigma_s=None if self._time_offset is None else self._time_offset.estimate.sigma_s,
+            time_offset_s=self._time_offset.offset_s,
+            time_offset_sigma_s=self._time_offset.sigma_s,
             innovations=belief.verdicts,
             rates=self._rates.update(visual.motion, span, state.gyro_bias, belief.latest_rate()),
             vision=visual.quality,

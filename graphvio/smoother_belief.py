@@ -80,6 +80,16 @@ class SmootherBelief(Belief):
             return None
         return se3_inverse(smoother.pose(smoother.latest_ns)) @ smoother.pose(then_ns)
 
+    def covariance_since(self, then_ns: int) -> Float | None:
+        """See `Belief`."""
+        smoother = self._smoother
+        if smoother is None or not smoother.knows(then_ns):
+            return None
+        try:
+            return smoother.covariance_since(then_ns)
+        except SOLVER_ERRORS:
+            return None
+
     def end(self) -> None:
         """See `Belief`."""
         if self._smoother is not None:

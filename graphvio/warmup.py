@@ -20,6 +20,7 @@ from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import common_rows
 from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, so3_log
 from graphvio.rig import Imu, Rig
+from graphvio.slam.descriptors import orientations
 
 _POINTS = 20
 
@@ -48,6 +49,7 @@ def warm_up(rig: Rig, config: Config) -> None:
     for solve in (joint_motion, best_pair_motion):
         solve(RigArrays.of(rig), observations, np.eye(4), config.motion, rng)
     learn_from_nothing(joint_motion(RigArrays.of(rig), observations, np.eye(4), config.motion, rng))
+    orientations(noise, np.full((1, 2), 20.0))
     se3(np.eye(3), np.zeros(3))
     se3_exp(np.zeros(6))
     own_covariance(np.eye(6), np.eye(6))

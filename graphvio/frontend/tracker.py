@@ -94,6 +94,10 @@ class PairTracker:
         self._last = self._last.extended(replace(new, stage_ms=watch.stage_ms))
         return self._last
 
+    def limit_corners(self, share: float) -> None:
+        """From now on have only a share of the image's cells, and so of the corners."""
+        self._cell_px = round(self._config.corners.cell_px(self._pair.left.size_px[0]) / np.sqrt(share))
+
     def anchor(self) -> None:
         """Hold the tracks against the newest frame's own patches from here on."""
         if self._left:

@@ -65,6 +65,20 @@ class VisualFrontend:
         return self._references.stamps_ns
 
     @property
+    def body_T_left(self) -> Float:
+        """(P, 4, 4) of the pairs' left cameras, with the corrections that are in force."""
+        return self._arrays.body_T_left
+
+    def frames_at(self, stamp_ns: int) -> dict[int, PairFrame]:
+        """What the pairs saw at the newest frameset, if it is of this stamp."""
+        return {j: frame for j, frame in self._latest.items() if frame.stamp_ns == stamp_ns}
+
+    def limit_corners(self, share: float) -> None:
+        """From now on follow only a share, above 0 and up to 1, of the corners that the configuration asks for."""
+        for tracker in self._trackers:
+            tracker.limit_corners(share)
+
+    @property
     def misaligned(self) -> Mapping[int, Misalignment]:
         """Pairs whose place relative to the first pair is not what the rig says: motions allow for it."""
         return {j: alignment.in_force for j, alignment in self._alignments.items() if alignment.in_force is not None}

@@ -1,0 +1,193 @@
+"""Where the odometry's frame lies in a map, by what a SLAM system says of single keyframes (REP 105).
+
+The unknown is ``map_T_odom``. What odometry drifts from one keyframe to the next makes it walk; a correction measures
+it at its keyframe. All covariances are taken to the tangent in odom, where they add up, so that corrections may come in
+any order: they are taken in by a Kalman filter in the order of their keyframes, anew from the one that came late.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from graphvio.arrays import Float
+from graphvio.errors import EventError
+from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from graphvio.slam.keyframe import CorrectionResult, Keyframe
+
+_MOST_KEYFRAMES = 10_000  # that can be corrected; an hour or so
+_MOST_CORRECTIONS = 200  # that are taken in anew when one comes late
+_FIRST_AGREEMENT = 3  # refused corrections in a row that must agree to be believed; each time it takes twice as many
+_RIGID = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class _Passed:
+    """A keyframe: its pose, and the odometry's drift (6, 6) until there, tangent in odom."""
+
+    odom_T_body: Float
+    drift: Float
+
+
+@dataclass(frozen=True, eq=False)
+class _Correction:
+    """``map_T_odom`` as a correction of a keyframe has it, and its covariance (6, 6), tangent in odom."""
+
+    keyframe_id: int
+    map_T_odom: Float
+    covariance: Float
+
+
+class MapFrame:
+    """``map_T_odom`` of the newest epoch; from any thread.
+
+    Args:
+        probability: corrections outside this share of the chi-square distribution are refused.
+    """
+
+    def __init__(self, probability: float) -> None:
+        self._threshold = float(chi2.ppf(probability, 6))
+        self._lock = threading.Lock()
+        self._epoch: int | None = None
+        self._passed: dict[int, _Passed] = {}
+        self._accepted: list[_Correction] = []  # in the order of keyframes
+        self._refused: list[_Correction] = []  # since the last one that was accepted
+        self._agreement = _FIRST_AGREEMENT
+        self._belief: _Correction | None = None  # what all that were accepted say together, at the last one's keyframe
+
+    @property
+    def map_T_odom(self) -> Float | None:
+        """(4, 4), or None before the epoch's first correction."""
+        belief = self._belief
+        return None if belief is None else belief.map_T_odom
+
+    @property
+    def epoch(self) -> int | None:
+        """The epoch that it is of."""
+        return self._epoch
+
+    def add(self, keyframe: Keyframe) -> None:
+        """The next keyframe; one of a new epoch ends what was known of the old one."""
+        with self._lock:
+            if keyframe.epoch != self._epoch:
+                self._epoch = keyframe.epoch
+                self._passed, self._accepted, self._refused = {}, [], []
+                self._agreement, self._belief = _FIRST_AGREEMENT, None
+            drift = np.zeros((6, 6))
+            if self._passed and keyframe.relative_covariance is not None:
+                to_odom = se3_adjoint(keyframe.odom_T_body)
+                step = to_odom @ keyframe.relative_covariance @ to_odom.T
+                drift = self._passed[next(reversed(self._passed))].drift + step
+            self._passed[keyframe.id] = _Passed(keyframe.odom_T_body, drift)
+            if len(self._passed) > _MOST_KEYFRAMES:
+                del self._passed[next(iter(self._passed))]
+
+    def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
+        """Take in where a keyframe is in the map, or refuse it.
+
+        What is far from expected is refused, until so many in a row agree with each other that they are believed; the
+        next time it takes twice as many, so that two that contradict each other do not take turns.
+
+        Args:
+            keyframe_id: of the newest epoch; a second correction of a keyframe takes the place of the first.
+            map_T_body: (4, 4).
+            covariance: (6, 6), tangent ``[rotation, translation]`` in body.
+
+        Raises:
+            EventError: if the pose is not rigid, or the covariance is none.
+        """
+        map_T_body, covariance = _checked(map_T_body, covariance)
+        with self._lock:
+            if keyframe_id not in self._passed:
+                return self._refusal(f"keyframe {keyframe_id} is not of the newest epoch, or too old, or never was")
+            odom_T_body = self._passed[keyframe_id].odom_T_body
+            to_odom = se3_adjoint(odom_T_body)
+            offered = _Correction(keyframe_id, map_T_body @ se3_inverse(odom_T_body), to_odom @ covariance @ to_odom.T)
+            if self._belief is None:
+                return self._accept(offered, None)
+            statistic = self._distance(self._belief, offered)
+            if statistic <= self._threshold:
+                return self._accept(offered, statistic)
+            self._refused.append(offered)
+            newest = self._refused[-self._agreement :]
+            if len(newest) == self._agreement and self._agree(newest):
+                self._agreement *= 2
+                self._accepted = newest[:-1]
+                return self._accept(
+                    offered, statistic, f"{len(newest)} refused corrections in a row agree: the map moves"
+                )
+            del self._refused[: -4 * self._agreement]
+            return self._refusal(
+                f"keyframe {keyframe_id}: squared distance {statistic:.1f} beyond chi-square {self._threshold:.1f}",
+                statistic,
+            )
+
+    def _accept(self, offered: _Correction, statistic: float | None, reason: str = "") -> CorrectionResult:
+        others = [each for each in self._accepted if each.keyframe_id != offered.keyframe_id]
+        self._accepted = sorted([*others, offered], key=lambda each: each.keyframe_id)
+        self._refused = []
+        self._belief = self._fused(self._accepted)
+        if len(self._accepted) > _MOST_CORRECTIONS:  # the older half becomes one
+            half = self._accepted[: _MOST_CORRECTIONS // 2]
+            self._accepted = [self._fused(half), *self._accepted[len(half) :]]
+        return CorrectionResult(True, reason, statistic, self._threshold, self._belief.map_T_odom)
+
+    def _refusal(self, reason: str, statistic: float | None = None) -> CorrectionResult:
+        return CorrectionResult(False, reason, statistic, self._threshold, self.map_T_odom)
+
+    def _fused(self, corrections: Sequence[_Correction]) -> _Correction:
+        """What corrections in the order of their keyframes say together, at the last one's."""
+        belief = corrections[0]
+        for offered in corrections[1:]:
+            prior = belief.covariance + self._drift(belief, offered)
+            gain = np.linalg.solve(prior + offered.covariance, prior).T
+            step = gain @ _difference(belief, offered)
+            rest = np.eye(6) - gain
+            belief = _Correction(
+                offered.keyframe_id,
+                belief.map_T_odom @ se3_exp(step),
+                rest @ prior @ rest.T + gain @ offered.covariance @ gain.T,
+            )
+        return belief
+
+    def _agree(self, corrections: Sequence[_Correction]) -> bool:
+        last = corrections[-1]
+        return all(self._distance(each, last) <= self._threshold for each in corrections[:-1])
+
+    def _distance(self, one: _Correction, other: _Correction) -> float:
+        """Squared Mahalanobis distance."""
+        difference = _difference(one, other)
+        covariance = one.covariance + other.covariance + self._drift(one, other)
+        return float(difference @ np.linalg.solve(covariance, difference))
+
+    def _drift(self, one: _Correction, other: _Correction) -> Float:
+        """What odometry may have drifted between two keyframes, (6, 6), tangent in odom."""
+        oldest = next(iter(self._passed.values()))
+        first, last = (
+            self._passed.get(each.keyframe_id, oldest).drift
+            for each in sorted((one, other), key=lambda each: each.keyframe_id)
+        )
+        return np.asarray(last - first)
+
+
+def _difference(one: _Correction, other: _Correction) -> Float:
+    return se3_log(se3_inverse(one.map_T_odom) @ other.map_T_odom)
+
+
+def _checked(map_T_body: Float, covariance: Float) -> tuple[Float, Float]:
+    pose, spread = (np.array(each, dtype=np.float64) for each in (map_T_body, covariance))
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise EventError(f"map_T_body has shape {pose.shape}, or holds NaN; give a rigid transform (4, 4)")
+    rotation = pose[:3, :3]
+    off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(pose[3] - [0, 0, 0, 1]).max())
+    if off > _RIGID or np.linalg.det(rotation) < 0.0:
+        raise EventError(f"map_T_body is no rigid transform: off by {off:.2g}; give rotation and translation (4, 4)")
+    if spread.shape != (6, 6) or not np.isfinite(spread).all():
+        raise EventError(f"covariance has shape {spread.shape}, or holds NaN; give (6, 6) [rotation, translation]")
+    if not np.allclose(spread, spread.T, rtol=1e-6, atol=1e-12) or np.linalg.eigvalsh(spread)[0] <= 0.0:
+        raise EventError("covariance is not symmetric and positive definite; say how well each direction is known")
+    return pose, 0.5 * (spread + spread.T)
