@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from graphvio.arrays import Float, Int
 from graphvio.backend.inertial import ImuBuffer, ImuSpan
@@ -16,7 +16,16 @@ from graphvio.rig import Rig
 _LEAST_INTERVAL_NS = 1_000_000  # between framesets: less is of one instant, and no motion can be told from it
 _SUSPICIOUS_JUMP_NS = 5_000_000_000
 
-Stamped = TypeVar("Stamped", ImuSample, FrameSet)
+
+class HasStamp(Protocol):
+    """Anything that has a time."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of one clock."""
+
+
+Stamped = TypeVar("Stamped", bound=HasStamp)
 Report = Callable[[int, str, str], None]
 """Takes stamp, kind and detail of an incident."""
 
@@ -40,8 +49,8 @@ class Synchroniser:
         self._imu = ImuBuffer(config.timing.max_imu_gap_ms)
         self._held: deque[FrameSet] = deque()
         self._newest_ns: int | None = None
-        self._sample_jumps: _JumpGuard[ImuSample] = _JumpGuard("imu_future_stamp", report)
-        self._frameset_jumps: _JumpGuard[FrameSet] = _JumpGuard("frameset_future_stamp", report)
+        self._sample_jumps: JumpGuard[ImuSample] = JumpGuard("imu_future_stamp", report)
+        self._frameset_jumps: JumpGuard[FrameSet] = JumpGuard("frameset_future_stamp", report)
 
     def add_sample(self, sample: ImuSample) -> list[ImuSample]:
         """Take a sample of the IMU; the samples that may be used from now on, with stamps on the framesets' clock."""
@@ -155,7 +164,7 @@ class Synchroniser:
         return covered or waited_ns > self._timing.max_imu_wait_ms * 1e6
 
 
-class _JumpGuard(Generic[Stamped]):
+class JumpGuard(Generic[Stamped]):
     """Believes a jump of the clock only when a second stamp confirms it: one wild stamp must not stop time."""
 
     def __init__(self, kind: str, report: Report) -> None:
@@ -165,15 +174,24 @@ class _JumpGuard(Generic[Stamped]):
         self._suspect: Stamped | None = None
 
     def confirm(self, event: Stamped) -> list[Stamped]:
-        """The events that may be taken now, in order."""
+        """The events that may be taken now, in order; far ahead is more than 5 s."""
         suspect, self._suspect = self._suspect, None
         if suspect is not None:
             if 0 < event.stamp_ns - suspect.stamp_ns < _SUSPICIOUS_JUMP_NS:
                 self._newest_ns = event.stamp_ns
                 return [suspect, event]
-            self._report(suspect.stamp_ns, self._kind, "left out: far ahead of the stamps before and after it")
+            self._leave_out(suspect)
         if self._newest_ns is not None and event.stamp_ns - self._newest_ns > _SUSPICIOUS_JUMP_NS:
             self._suspect = event
             return []
         self._newest_ns = max(event.stamp_ns, self._newest_ns or event.stamp_ns)
         return [event]
+
+    def end(self) -> None:
+        """Nothing more will come, so what was not confirmed is left out."""
+        suspect, self._suspect = self._suspect, None
+        if suspect is not None:
+            self._leave_out(suspect)
+
+    def _leave_out(self, suspect: Stamped) -> None:
+        self._report(suspect.stamp_ns, self._kind, "left out: far ahead of the stamps before and after it")

@@ -1,0 +1,324 @@
+"""Stamps of devices on the host's clock: how well, how smoothly, and what happens when a clock begins anew."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+import synthetic  # noqa: F401  (hypothesis' settings)
+from hypothesis import given
+from hypothesis import strategies as st
+
+from graphvio.arrays import Float, Int
+from graphvio.live.clock import FAST_SLEW, SETTLING_NS, SLEW, ClockMap, ClockMaps
+from graphvio.live.drawn_clock import Conditions, Messages, clock_errors, draw_messages
+from graphvio.live.envelope import Envelope
+
+MS = 1_000_000
+S = 1_000_000_000
+
+
+@dataclass
+class Run:
+    """What a map makes of messages; refused ones have no entry in ``mapped`` and ``kept``."""
+
+    mapped: list[int] = field(default_factory=list)
+    kept: list[int] = field(default_factory=list)
+    reports: Counter[str] = field(default_factory=Counter)
+    drift_ppm: float = 0.0
+
+
+def feed(messages: Messages) -> Run:
+    run = Run()
+
+    def report(stamp_ns: int, kind: str, detail: str) -> None:
+        assert "clock drawn" in detail
+        run.reports[kind] += 1
+
+    clock = ClockMap("drawn", report)
+    for k, (stamp, arrival) in enumerate(zip(messages.stamps_ns.tolist(), messages.arrivals_ns.tolist(), strict=True)):
+        at = clock.map(stamp, arrival)
+        if at is not None:
+            run.mapped.append(at)
+            run.kept.append(k)
+    run.drift_ppm = clock.drift_ppm
+    return run
+
+
+def drawn(duration_s: float = 10.0, seed: int = 0, begin_s: float = 0.0, **conditions: float) -> Messages:
+    return draw_messages(Conditions(**conditions), duration_s, np.random.default_rng(seed), begin_s)
+
+
+def joined(*parts: Messages) -> Messages:
+    columns = (np.concatenate([getattr(p, name) for p in parts]) for name in ("stamps_ns", "arrivals_ns", "truth_ns"))
+    return Messages(*columns)
+
+
+def errors_us(run: Run, messages: Messages) -> Float:
+    return np.asarray(1e-3 * (np.array(run.mapped) - messages.truth_ns[run.kept]))
+
+
+def rates(run: Run, messages: Messages) -> tuple[Float, Int]:
+    """Seconds of the host per second of the device from message to message, and the stamps at their ends."""
+    stamps = messages.stamps_ns[run.kept]
+    return np.diff(np.array(run.mapped)) / np.diff(stamps), stamps[1:] - stamps[0]
+
+
+def assert_smooth(run: Run, messages: Messages) -> None:
+    """Time goes forward, and by its own pace: the drift that is believed, and the slew; rounding is 1 ns."""
+    assert (np.diff(np.array(run.mapped)) > 0).all()
+    rate, at = rates(run, messages)
+    step_ns = np.diff(messages.stamps_ns[run.kept])
+    bound = np.where(at - step_ns < SETTLING_NS, FAST_SLEW, SLEW) + 1e-3 + 2.0 / step_ns  # drifts of up to 1000 ppm
+    assert (np.abs(rate - 1.0) <= bound).all()
+
+
+# ------------------------------------------------------------------ accuracy
+
+
+@pytest.mark.parametrize("drift_ppm", [-200.0, 0.0, 200.0])
+@pytest.mark.parametrize(
+    ("rate_hz", "at_5_s", "at_10_s", "ppm"), [(200.0, 150.0, 50.0, 10.0), (30.0, 500.0, 250.0, 30.0)]
+)
+def test_stamps_are_mapped_far_better_than_messages_come(
+    drift_ppm: float, rate_hz: float, at_5_s: float, at_10_s: float, ppm: float
+) -> None:
+    """Jitter of 2 ms, 1 % of the messages 50 ms late; bounds in microseconds are of the largest error of six runs."""
+    five, ten, thirty = clock_errors(Conditions(drift_ppm, rate_hz=rate_hz), (5.0, 10.0, 30.0), runs=6)
+    assert five.max_us < at_5_s
+    assert ten.max_us < at_10_s
+    assert ten.drift_ppm < ppm
+    assert thirty.max_us < 100.0
+    assert thirty.drift_ppm < 3.0
+
+
+def test_until_the_drift_is_known_errors_are_what_it_adds_up_to() -> None:
+    (one,) = clock_errors(Conditions(200.0), (1.0,), runs=6)
+    assert one.max_us < 600.0
+
+
+def test_a_bus_that_is_polled() -> None:
+    """Delays spread evenly over 8 ms, as of a slow USB device; there is no density of small ones."""
+    messages = drawn(30.0, drift_ppm=-80.0, jitter_ms=0.0, outlier_share=0.0)
+    rng = np.random.default_rng(1)
+    arrivals = np.maximum.accumulate(messages.truth_ns + rng.integers(0, 8 * MS, len(messages.truth_ns)))
+    run = feed(replace_arrivals(messages, arrivals))
+    assert np.abs(errors_us(run, messages)[2000:]).max() < 200.0
+    assert run.drift_ppm == pytest.approx(-80.0, abs=5.0)
+
+
+def test_a_crystal_that_warms_up() -> None:
+    """From 20 to 10 ppm within two minutes."""
+    at_s = np.arange(0.0, 120.0, 0.01)
+    wander_ns = 1e3 * (20.0 * at_s - 5.0 * at_s**2 / 120.0)
+    stamps = np.round(1e9 * at_s - wander_ns).astype(np.int64)
+    truth = np.round(1e9 * at_s).astype(np.int64)
+    arrivals = truth + np.round(1e6 * np.random.default_rng(2).exponential(2.0, len(at_s))).astype(np.int64)
+    messages = Messages(stamps, arrivals, truth)
+    run = feed(messages)
+    assert np.abs(errors_us(run, messages)[1000:]).max() < 250.0
+    assert run.drift_ppm == pytest.approx(12.0, abs=3.0)  # of the last minute
+
+
+def replace_arrivals(messages: Messages, arrivals_ns: Int) -> Messages:
+    return Messages(messages.stamps_ns, arrivals_ns, messages.truth_ns)
+
+
+# ------------------------------------------------------------------ smoothness
+
+
+@pytest.mark.parametrize("drift_ppm", [-200.0, 30.0, 200.0])
+@pytest.mark.parametrize("jitter_ms", [0.2, 5.0, 20.0])
+def test_time_never_jumps(drift_ppm: float, jitter_ms: float) -> None:
+    messages = drawn(40.0, drift_ppm=drift_ppm, jitter_ms=jitter_ms)
+    run = feed(messages)
+    assert len(run.kept) == len(messages.stamps_ns)
+    assert not run.reports
+    assert_smooth(run, messages)
+
+
+@given(
+    delays=st.lists(st.integers(0, 450_000), min_size=2, max_size=120),
+    steps=st.lists(st.integers(1, 400_000), min_size=120, max_size=120),
+)
+def test_time_goes_forward_whatever_the_delays(delays: list[int], steps: list[int]) -> None:
+    """Microseconds; messages that overtake each other included, and pauses of up to 0.4 s."""
+    stamps = 1000 * np.cumsum(steps[: len(delays)], dtype=np.int64)
+    arrivals = 7 * S + stamps + 1000 * np.array(delays, dtype=np.int64)
+    messages = Messages(stamps, arrivals, stamps)
+    run = feed(messages)
+    assert len(run.kept) == len(stamps)
+    assert_smooth(run, messages)
+    assert feed(messages).mapped == run.mapped
+
+
+def test_sensors_of_a_device_share_one_function() -> None:
+    """Images come 40 ms later than samples of the same stamp, and are mapped to the same time."""
+    samples = drawn(8.0, drift_ppm=150.0, rate_hz=200.0)
+    queue = [(int(a), int(s), "imu") for a, s in zip(samples.arrivals_ns, samples.stamps_ns, strict=True)]
+    queue += [(arrival + 40 * MS, stamp, "camera") for arrival, stamp, _ in queue[::10]]
+    clock = ClockMap("drawn", lambda *_: None)
+    mapped: dict[str, dict[int, int | None]] = {"imu": {}, "camera": {}}
+    for arrival, stamp, sensor in sorted(queue):
+        mapped[sensor][stamp] = clock.map(stamp, arrival)
+    assert len(mapped["camera"]) == 160
+    for stamp, at in mapped["camera"].items():
+        assert at == mapped["imu"][stamp]
+
+
+def test_a_backlog_at_the_start_is_made_good_within_a_second() -> None:
+    """Messages of the first 0.3 s come at once, 0.3 s late."""
+    messages = drawn(3.0, outlier_share=0.0)
+    arrivals = np.maximum(messages.arrivals_ns, messages.truth_ns[0] + 300 * MS)
+    run = feed(replace_arrivals(messages, arrivals))
+    errors = errors_us(run, messages)
+    assert errors[0] == pytest.approx(3e5, rel=0.01)
+    assert np.abs(errors[200:]).max() < 200.0
+    assert_smooth(run, messages)
+
+
+def test_a_clock_that_goes_forward_a_little_is_followed_slowly() -> None:
+    messages = drawn(30.0)
+    stamps = messages.stamps_ns + np.where(np.arange(len(messages.stamps_ns)) >= 2000, 12 * MS, 0)
+    run = feed(Messages(stamps, messages.arrivals_ns, messages.truth_ns))
+    errors = errors_us(run, messages)
+    assert run.reports == {"clock_stepped": 1}
+    assert errors[2000] == pytest.approx(12e3, abs=100.0)
+    assert np.abs(errors[2000 + round(12.5 * 200) :]).max() < 200.0
+    rate, _ = rates(run, Messages(stamps, messages.arrivals_ns, messages.truth_ns))
+    assert np.abs(rate[200:] - 1.0).max() < SLEW + 1e-4
+
+
+def test_a_busy_host_changes_nothing() -> None:
+    """For ten seconds nothing comes less than 30 ms late."""
+    messages = drawn(60.0, drift_ppm=50.0)
+    at_s = 1e-9 * (messages.truth_ns - messages.truth_ns[0])
+    late = np.where((at_s > 30.0) & (at_s < 40.0), 30 * MS, 0)
+    run = feed(replace_arrivals(messages, messages.arrivals_ns + late))
+    assert np.abs(errors_us(run, messages)[2000:]).max() < 100.0
+
+
+# ------------------------------------------------------------------ clocks that begin anew
+
+
+@pytest.mark.parametrize("away_s", [0.0, 3.0, 600.0])
+def test_a_device_that_is_plugged_in_again(away_s: float) -> None:
+    before = drawn(20.0, seed=1, drift_ppm=120.0)
+    after = drawn(20.0, seed=2, begin_s=20.1 + away_s, drift_ppm=120.0)  # stamps from the start again
+    messages = joined(before, after)
+    run = feed(messages)
+    assert run.reports["clock_restarted"] == 1
+    lost = len(messages.stamps_ns) - len(run.kept)
+    assert lost == run.reports["stamp_implausible"]
+    assert 2 <= lost <= 20  # 50 ms, or what comes meanwhile
+    assert (np.diff(np.array(run.mapped)) > 0).all()
+    errors = errors_us(run, messages)
+    assert np.abs(errors[-200:]).max() < 100.0
+    second = np.flatnonzero(np.array(run.kept) >= 4000)
+    assert np.abs(errors[second[200] :]).max() < 200.0  # the crystal is the same: its drift is known at once
+
+
+def test_a_notice_of_the_driver_saves_the_first_messages() -> None:
+    reports: Counter[str] = Counter()
+    maps = ClockMaps(lambda stamp_ns, kind, detail: reports.update([kind]))
+    before, after = drawn(5.0, seed=1), drawn(5.0, seed=2, begin_s=8.0)
+    mapped = []
+    for part in (before, after):
+        for stamp, arrival in zip(part.stamps_ns.tolist(), part.arrivals_ns.tolist(), strict=True):
+            mapped.append(maps.map("drawn", stamp, arrival))
+        maps.doubt("drawn")
+        maps.doubt(None)
+        maps.doubt("never heard of")
+    assert None not in mapped
+    assert reports == {"clock_restarted": 1}
+    assert list(maps.drifts_ppm) == ["drawn"]
+
+
+def test_a_doubt_that_is_not_confirmed_changes_nothing() -> None:
+    messages = drawn(5.0)
+    doubted = ClockMap("drawn", lambda *_: None)
+    mapped = []
+    for k, (stamp, arrival) in enumerate(zip(messages.stamps_ns.tolist(), messages.arrivals_ns.tolist(), strict=True)):
+        if k == 500:
+            doubted.doubt()
+        mapped.append(doubted.map(stamp, arrival))
+    assert mapped == feed(messages).mapped
+
+
+@pytest.mark.parametrize("jump_ns", [-3600 * S, -800 * MS, 700 * MS, 3600 * S])
+def test_one_wild_stamp_is_left_out(jump_ns: int) -> None:
+    messages = drawn(5.0)
+    stamps = messages.stamps_ns.copy()
+    stamps[500] += jump_ns
+    run = feed(Messages(stamps, messages.arrivals_ns, messages.truth_ns))
+    assert run.reports == {"stamp_implausible": 1}
+    assert run.kept == [k for k in range(1000) if k != 500]
+    assert np.abs(errors_us(run, messages)[400:]).max() < 100.0
+
+
+@pytest.mark.parametrize("jump_ns", [-3600 * S, -700 * MS, 700 * MS, 3600 * S])
+def test_a_clock_that_is_set_is_mapped_anew(jump_ns: int) -> None:
+    messages = drawn(20.0)
+    stamps = messages.stamps_ns + np.where(np.arange(4000) >= 2000, jump_ns, 0)
+    run = feed(Messages(stamps, messages.arrivals_ns, messages.truth_ns))
+    assert run.reports["clock_restarted"] == 1
+    assert len(run.kept) >= 3980
+    assert np.abs(errors_us(run, messages)[-1500:]).max() < 100.0
+    assert (np.diff(np.array(run.mapped)) > 0).all()
+
+
+def test_a_pause_of_the_host_is_no_other_clock() -> None:
+    """For 2 s nothing is read; then all comes at once, and nothing is lost or moved."""
+    messages = drawn(10.0)
+    held = (messages.truth_ns > messages.truth_ns[0] + 5 * S) & (messages.truth_ns < messages.truth_ns[0] + 7 * S)
+    arrivals = np.where(held, messages.truth_ns[0] + 7 * S, messages.arrivals_ns)
+    run = feed(replace_arrivals(messages, np.maximum.accumulate(arrivals)))
+    assert not run.reports
+    assert len(run.kept) == 2000
+    assert np.abs(errors_us(run, messages)[400:]).max() < 100.0
+
+
+def test_a_clock_that_stood_still_is_mapped_anew() -> None:
+    """A device that slept for 10 s, and whose stamps go on where they were."""
+    before = drawn(10.0, seed=1)
+    after = drawn(10.0, seed=2, begin_s=20.0)
+    shifted = Messages(after.stamps_ns + 10 * S, after.arrivals_ns, after.truth_ns)
+    run = feed(joined(before, shifted))
+    assert run.reports == {"clock_restarted": 1}
+    assert np.abs(errors_us(run, joined(before, shifted))[-1000:]).max() < 100.0
+
+
+def test_without_a_clock_stamps_are_kept() -> None:
+    maps = ClockMaps(lambda *_: None)
+    assert maps.map(None, 123, 456) == 123
+    assert not maps.drifts_ppm
+
+
+# ------------------------------------------------------------------ the line under the delays
+
+
+@given(
+    delays=st.lists(st.integers(0, 3_000_000), min_size=5, max_size=60),
+    drift_ppm=st.integers(-300, 300),
+)
+def test_the_line_lies_under_all_windows_and_touches_one(delays: list[int], drift_ppm: int) -> None:
+    envelope = Envelope()
+    points = [(k * S, delay + drift_ppm * k * 1000) for k, delay in enumerate(delays)]  # a window each
+    for point in points:
+        envelope.add(*point)
+    heights = [delay - envelope.line.at(time) for time, delay in points[:-1]]  # the last window is open
+    assert min(heights) == pytest.approx(0.0, abs=1e-3)
+    centre = float(np.mean([time for time, _ in points[:-1]]))
+    for drift in np.linspace(-1e-3, 1e-3, 101):  # no other line below them is higher in the middle
+        at_zero = min(delay - drift * time for time, delay in points[:-1])
+        assert at_zero + drift * centre <= envelope.line.at(centre) + 1e-3
+
+
+def test_a_line_without_scatter_is_found_exactly() -> None:
+    envelope = Envelope()
+    for k in range(10):
+        envelope.add(k * S, 1000 - 50_000 * k)
+    assert envelope.line.drift == pytest.approx(-50e-6, rel=1e-12)
+    assert envelope.line.at(0) == pytest.approx(1000.0)
