@@ -240,6 +240,19 @@ class KeyframesConfig(Stage):
 
 
 @dataclass(frozen=True)
+class LiveConfig(Stage):
+    """Real time, on live sensors."""
+
+    max_latency_ms: float = 100.0
+    """From the arrival of a frameset's last image to its estimate: before this is exceeded fewer corners are followed,
+    and then framesets are skipped."""
+    max_image_wait_ms: float = 50.0
+    """So long an image waits for its partner, and a pair for the others."""
+    stuck_s: float = 5.0
+    """A stage that works on one thing for longer is stuck."""
+
+
+@dataclass(frozen=True)
 class Config:
     """All stages."""
 
@@ -254,6 +267,7 @@ class Config:
     timing: TimingConfig = field(default_factory=TimingConfig)
     optimization: OptimizationConfig = field(default_factory=OptimizationConfig)
     keyframes: KeyframesConfig = field(default_factory=KeyframesConfig)
+    live: LiveConfig = field(default_factory=LiveConfig)
 
     def __post_init__(self) -> None:
         """Refuse stages that do not fit together.

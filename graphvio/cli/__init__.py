@@ -13,9 +13,11 @@ from graphvio.cli.evaluate import evaluate
 from graphvio.cli.fleet import fleet
 from graphvio.cli.info import info
 from graphvio.cli.interrupts import interruptible
+from graphvio.cli.live import live
 from graphvio.cli.optimize import optimize
 from graphvio.cli.record import convert, record
 from graphvio.cli.run import EXIT_INTERRUPTED, run
+from graphvio.cli.serve import serve
 from graphvio.cli.simulate import simulate
 from graphvio.cli.view import view
 from graphvio.errors import GraphvioError
@@ -32,6 +34,8 @@ app = typer.Typer(
     epilog="Examples:  graphvio simulate room --out room  |  graphvio run room  |  graphvio doctor",
 )
 app.command()(run)
+app.command()(live)
+app.command()(serve)
 app.command()(calibrate)
 app.command(name="calibrate-trajectories")(calibrate_trajectories)
 app.command()(optimize)

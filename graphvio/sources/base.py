@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
+from graphvio.arrays import Int
 from graphvio.events import Event, FrameSet
 from graphvio.rig import Rig
 from graphvio.sources.faults import FaultLog
@@ -29,6 +30,10 @@ class Source(Protocol):
     @property
     def frameset_count(self) -> int:
         """How many framesets it yields at most."""
+
+    @property
+    def stamps_ns(self) -> Int:
+        """(N,) stamps of the framesets, camera clock, increasing."""
 
     @property
     def start_ns(self) -> int:

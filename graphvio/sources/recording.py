@@ -94,6 +94,7 @@ class Recording:
         name: of the recording.
         rig: the rig to which pair indices refer; its IMU is None where the recording has no samples.
         faults: complete once an iteration has ended; a new iteration counts anew.
+        stamps_ns: (N,) of the framesets.
         frameset_count: how many framesets it yields at most.
         start_ns: stamp of the first frameset.
         end_ns: stamp of the last one.
@@ -135,7 +136,8 @@ class Recording:
             for pair in rig.pairs
         ]
         self._framesets = _cut(group_pairs(pairs, tolerance_ns), from_s, to_s, index.name)
-        self.frameset_count = len(self._framesets.stamps_ns)
+        self.stamps_ns = self._framesets.stamps_ns
+        self.frameset_count = len(self.stamps_ns)
         self.start_ns = int(self._framesets.stamps_ns[0])
         self.end_ns = int(self._framesets.stamps_ns[-1])
         self._count_frame_faults(rig, pairs)

@@ -4,17 +4,15 @@ import sys
 
 from benchmarks.command_line import run_command_line
 
-from campaigns import calibration, consistency, endurance, lags, outages, rates, real_imu
+from campaigns import calibration, consistency, endurance, lags, outages, rates, real_imu, soak
 
-_MODULES = (consistency, real_imu, outages, endurance, rates, lags, calibration)
+_MODULES = (consistency, real_imu, outages, endurance, rates, lags, calibration, soak)
 
 if __name__ == "__main__":
     sys.exit(
         run_command_line(
             "scripts/campaign",
             "Statistical claims by Monte Carlo, and outages. docs/benchmarks.md has their results.",
-            tuple(
-                module.add_parser for module in (consistency, real_imu, outages, endurance, rates, lags, calibration)
-            ),
+            tuple(module.add_parser for module in _MODULES),
         )
     )

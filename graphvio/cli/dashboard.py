@@ -1,0 +1,131 @@
+"""What the terminal shows of a live run: a panel that is drawn over, or elsewhere a line every few seconds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from graphvio.events import Incident
+from graphvio.live.broadcast import Subscription
+
+if TYPE_CHECKING:
+    from graphvio.live.source import DeviceHealth
+
+Figures = Mapping[str, float | int | str | None]
+
+_REFRESH_S, _PLAIN_S = 0.25, 5.0
+_MESSAGES = 6
+_COLOURS = {"tracking": "green", "coasting": "yellow", "initialising": "cyan", "lost": "red"}
+
+
+class Dashboard:
+    """Draws figures; a context manager.
+
+    Args:
+        title: of the run.
+        incidents: to be shown as they come.
+    """
+
+    def __init__(self, title: str, incidents: Subscription[Incident]) -> None:
+        self._title = title
+        self._incidents = incidents
+        self._messages: list[str] = []
+        self._console = Console(stderr=True)
+        self._live = Live(console=self._console, auto_refresh=False, transient=True)
+        self._next_s = 0.0
+
+    def __enter__(self) -> Dashboard:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+
+    def draw(self, figures: Figures, devices: Sequence[DeviceHealth]) -> None:
+        """Show the newest, if it is time to."""
+        while (incident := self._incidents.get(0.0)) is not None:
+            self._messages = [*self._messages, f"{incident.kind}: {incident.detail}"][-_MESSAGES:]
+            if not self._console.is_terminal:
+                self._console.print(self._messages[-1], soft_wrap=True, highlight=False, markup=False)
+        now = time.monotonic()
+        if now < self._next_s:
+            return
+        if self._console.is_terminal:
+            self._next_s = now + _REFRESH_S
+            self._live.update(self._panel(figures, devices), refresh=True)
+        else:
+            self._next_s = now + _PLAIN_S
+            self._console.print(line_of(figures), soft_wrap=True, highlight=False)
+
+    def _panel(self, figures: Figures, devices: Sequence[DeviceHealth]) -> Table:
+        table = Table(title=self._title, show_header=False, expand=False)
+        table.add_column(style="bold")
+        table.add_column()
+        status = str(figures.get("status", "waiting"))
+        table.add_row("status", Text(f"{status}, epoch {figures.get('epoch', 0)}", _COLOURS.get(status, "white")))
+        for name, value in rows_of(figures):
+            table.add_row(name, value)
+        for device in devices:
+            told = "connected" if device.connected else "lost"
+            lost = "".join(f", {kind} {count}" for kind, count in sorted(device.counts.items()))
+            table.add_row(device.name, f"{told}  {device.detail}{lost}")
+        for message in self._messages:
+            table.add_row("", Text(message, "yellow", no_wrap=True, overflow="ellipsis"))
+        return table
+
+
+def rows_of(figures: Figures) -> list[tuple[str, str]]:
+    """Name and text of each row but the status."""
+    pairs = sorted(name.removesuffix("_points") for name in figures if name.endswith("_points"))
+    rows = [
+        (
+            "rate",
+            f"{_number(figures, 'estimate_hz', '.1f')} of {_number(figures, 'frameset_hz', '.1f')} framesets/s, "
+            f"IMU {_number(figures, 'imu_hz', '.0f')} Hz",
+        ),
+        (
+            "latency",
+            f"p50 {_number(figures, 'latency_p50_ms', '.1f')} ms, p99 {_number(figures, 'latency_p99_ms', '.1f')} ms, "
+            f"longest {_number(figures, 'latency_max_ms', '.0f')} ms",
+        ),
+        (
+            "given up",
+            f"{_number(figures, 'skipped_late', 'd')} framesets late, {_number(figures, 'skipped_no_room', 'd')} "
+            f"without room; corners {100 * float(figures.get('corner_share') or 1.0):.0f} %",
+        ),
+        ("points", "  ".join(f"{figures[f'{pair}_inliers']}/{figures[f'{pair}_points']}" for pair in pairs) or "-"),
+        (
+            "bias",
+            f"gyro {_number(figures, 'gyro_bias_rad_s', '.4f')} rad/s, "
+            f"accelerometer {_number(figures, 'accel_bias_m_s2', '.3f')} m/s^2",
+        ),
+        ("memory", f"{_number(figures, 'memory_mb', '.0f')} MB"),
+    ]
+    if figures.get("temperature_c") is not None:
+        rows.append(("temperature", f"{_number(figures, 'temperature_c', '.1f')} C"))
+    if "recorded_framesets" in figures:
+        stopped = figures.get("recording_stopped")
+        free = _number(figures, "disk_free_gb", ".1f")
+        told = f"{_number(figures, 'recorded_framesets', 'd')} framesets, {free} GB free"
+        rows.append(("recording", str(stopped) if stopped else told))
+    if figures.get("stuck"):
+        rows.append(("stuck", str(figures["stuck"])))
+    return rows
+
+
+def line_of(figures: Figures) -> str:
+    """All of it in one line."""
+    return f"{figures.get('status', 'waiting'):<12} " + "  ".join(f"{name} {value}" for name, value in rows_of(figures))
+
+
+def _number(figures: Figures, name: str, form: str) -> str:
+    value: Any = figures.get(name)
+    return "-" if value is None else format(value, form)

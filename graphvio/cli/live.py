@@ -1,0 +1,176 @@
+"""``graphvio live``: the odometry on sensors, in real time."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from graphvio.cli import options
+
+if TYPE_CHECKING:
+    from graphvio.cli.services import Services
+    from graphvio.rig import Rig
+    from graphvio.viewer import Viewer
+
+EXIT_STOPPED = 3
+
+
+def live(
+    source: Annotated[
+        str | None,
+        typer.Argument(help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator."),
+    ] = None,
+    list_devices: Annotated[bool, typer.Option("--list", help="Show what is connected, and end.")] = False,
+    rig: options.RigFile = None,
+    config: options.ConfigName = "default",
+    record: Annotated[
+        Path | None, typer.Option("--record", help="Record everything as a session, .mcap.", metavar="FILE")
+    ] = None,
+    png: options.Png = False,
+    view: Annotated[bool, typer.Option("--view", help="Watch it in the rerun viewer.")] = False,
+    serve: Annotated[
+        bool, typer.Option("--serve", help="Offer it to other programs of this machine, see graphvio serve.")
+    ] = False,
+    health_port: Annotated[
+        int | None, typer.Option("--health-port", help="Answer /metrics and /healthz on this port.", min=0, max=65535)
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option("--for", help="Stop after so many seconds.", metavar="SECONDS")
+    ] = None,
+    verbose: options.Verbose = False,
+) -> None:
+    """Run the odometry on live sensors until they end, or Ctrl-C or SIGTERM: what was recorded is whole then.
+
+    When there is no time for everything, fewer corners are followed, and then framesets are skipped, which is counted;
+    samples of the IMU never are. Ends with exit code 3 where the disk became full.
+
+    Examples:
+
+        graphvio live --list
+
+        graphvio live simulator
+
+        graphvio live realsense --record walk.mcap
+
+        graphvio live "replay:walk.mcap?speed=2" --view
+    """
+    from graphvio.cli.services import Services
+
+    if list_devices:
+        _list()
+        return
+    if source is None:
+        raise typer.BadParameter("give a SOURCE, or --list to see what is connected")
+    run_live(
+        source, rig, config, record=record, png=png, view=view, health_port=health_port, duration_s=duration,
+        services=Services() if serve else None,
+    )  # fmt: skip
+
+
+def run_live(
+    source: str,
+    rig: Path | None,
+    config: str,
+    *,
+    record: Path | None,
+    png: bool,
+    view: bool,
+    health_port: int | None,
+    duration_s: float | None,
+    services: Services | None,
+) -> None:
+    """Open a source, run the odometry on it with what is asked for around it, and save everything at the end."""
+    from time import monotonic
+
+    from graphvio.cli.dashboard import Dashboard, line_of
+    from graphvio.cli.stopping import StopSignals
+    from graphvio.config import Config
+    from graphvio.errors import SessionError
+    from graphvio.live.health import HealthServer
+    from graphvio.live.output import Output
+    from graphvio.live.running import LiveOdometry
+    from graphvio.live.session_recorder import SessionRecorder
+    from graphvio.live.sources import open_live_source
+    from graphvio.live.view_output import ViewOutput
+    from graphvio.rig import Rig
+    from graphvio.simulation.default_rig import default_rig
+    from graphvio.warmup import warm_up
+
+    if record is not None and record.suffix != ".mcap":
+        raise SessionError(f"{record}: is recorded as MCAP, which is read by its name; name it .mcap")
+    settings = Config.load(config)
+    if services is not None:
+        settings = services.settings(settings)
+    opened = open_live_source(source, None if rig is None else Rig.load(rig))
+    warm_up(default_rig(), settings)  # before sensors deliver: kernels are the same for every rig
+    recorder: SessionRecorder | None = None
+    with StopSignals() as signals, ExitStack() as stack:
+        used = opened.open()
+        stack.callback(opened.close)
+        outputs: list[Output] = []
+        if record is not None:
+            recorder = SessionRecorder(record, used, "png" if png else "raw")
+            stack.callback(recorder.close)
+            outputs.append(recorder)
+        viewer = _viewer(stack, used, view, services)
+        if viewer is not None:
+            outputs.append(ViewOutput(viewer))
+        running = LiveOdometry(opened, used, settings, outputs, wants_keyframes=services is not None)
+        stack.callback(running.stop)
+        if health_port is not None:
+            health = HealthServer(running.status, port=health_port)
+            stack.callback(health.close)
+            typer.echo(f"health: http://{health.address}/healthz, metrics: http://{health.address}/metrics", err=True)
+        if services is not None:
+            for line in services.start(running, stack):
+                typer.echo(line, err=True)
+        running.start()
+        until = None if duration_s is None else monotonic() + duration_s
+        with Dashboard(opened.name, running.incidents.subscribe(64)) as dashboard:
+            while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):
+                dashboard.draw(running.status(), running.devices)
+        running.stop()
+        figures = running.status()
+    typer.echo(line_of(figures))
+    lost = {name: count for name, count in figures.items() if name.startswith(("skipped", "images_not", "imu_lost"))}
+    typer.echo(
+        f"{figures['estimates']} estimates of {figures['framesets']} framesets, latency p99 "
+        f"{figures['latency_p99_all_ms']} ms; " + ", ".join(f"{name} {count}" for name, count in lost.items())
+    )
+    if recorder is not None and record is not None:
+        told = recorder.status()
+        typer.echo(f"{record}: {record.stat().st_size / 1e6:.1f} MB, {told['recorded_framesets']} framesets")
+        if told["recording_stopped"] or told["framesets_not_recorded"]:
+            typer.echo(
+                f"graphvio: {told['recording_stopped'] or 'the disk was too slow'}; "
+                f"{told['framesets_not_recorded']} framesets are not in the recording",
+                err=True,
+            )
+            raise typer.Exit(EXIT_STOPPED)
+
+
+def _viewer(stack: ExitStack, rig: Rig, view: bool, services: Services | None) -> Viewer | None:
+    """The viewer that is asked for, or None."""
+    from graphvio.viewer import Viewer
+
+    return stack.enter_context(Viewer(rig, spawn=True)) if view else None
+
+
+def _list() -> None:
+    """What is connected, and which libraries are missing."""
+    from graphvio.errors import GraphvioError
+    from graphvio.live.sources import KINDS, kind_of
+
+    for kind in KINDS:
+        try:
+            devices = kind_of(kind).list_devices()
+        except GraphvioError as error:
+            typer.echo(f"{kind:<10} {error}")
+            continue
+        for device in devices:
+            typer.echo(f"{kind:<10} {device.spec}   {device.description}")
+        if not devices:
+            typer.echo(f"{kind:<10} nothing is connected")

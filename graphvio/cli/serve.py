@@ -1,0 +1,75 @@
+"""``graphvio serve``: the odometry on live sensors as the front-end of other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from graphvio.cli import options
+from graphvio.cli.live import run_live
+
+
+def serve(
+    source: Annotated[
+        str, typer.Argument(help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator.")
+    ],
+    rig: options.RigFile = None,
+    config: options.ConfigName = "default",
+    host: Annotated[str, typer.Option("--host", help="Address of gRPC; others need TLS and a token.")] = "127.0.0.1",
+    port: Annotated[
+        int | None, typer.Option("--port", help="Port of gRPC; 0 takes any.  [default: 50551]", min=0, max=65535)
+    ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option("--tls-cert", help="PEM file of the server's certificate.", metavar="FILE")
+    ] = None,
+    key: Annotated[Path | None, typer.Option("--tls-key", help="PEM file of its private key.", metavar="FILE")] = None,
+    token_file: Annotated[
+        Path | None,
+        typer.Option("--token-file", help="What clients have to know, in a file only you can read.", metavar="FILE"),
+    ] = None,
+    ros2: Annotated[
+        int | None,
+        typer.Option("--ros2", help="Publish ROS 2 topics in this domain.", metavar="DOMAIN", min=0, max=232),
+    ] = None,
+    web: Annotated[
+        int | None, typer.Option("--web", help="Let a browser watch, on this port; 0 takes any.", min=0, max=65535)
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option("--record", help="Record everything as a session, .mcap.", metavar="FILE")
+    ] = None,
+    png: options.Png = False,
+    health_port: Annotated[
+        int | None, typer.Option("--health-port", help="Answer /metrics and /healthz on this port.", min=0, max=65535)
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option("--for", help="Stop after so many seconds.", metavar="SECONDS")
+    ] = None,
+    verbose: options.Verbose = False,
+) -> None:
+    """Run the odometry on live sensors and serve estimates and keyframes by gRPC, ROS 2 topics and to browsers.
+
+    Clients send corrections back. Without TLS and a token only this machine is served.
+
+    Examples:
+
+        graphvio serve simulator
+
+        graphvio serve realsense --ros2 0 --web 9090
+
+        graphvio serve oak --host 0.0.0.0 --tls-cert cert.pem --tls-key key.pem --token-file token
+    """
+    from graphvio.cli.services import Services
+
+    run_live(
+        source,
+        rig,
+        config,
+        record=record,
+        png=png,
+        view=False,
+        health_port=health_port,
+        duration_s=duration,
+        services=Services(host, port, certificate, key, token_file, ros2, web),
+    )

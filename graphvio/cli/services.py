@@ -1,0 +1,59 @@
+"""What a live run offers to other programs: gRPC, ROS 2 topics, a page for browsers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from contextlib import ExitStack
+
+    from graphvio.config import Config
+    from graphvio.live.running import LiveOdometry
+
+
+@dataclass(frozen=True)
+class Services:
+    """Which of them, and for whom.
+
+    Attributes:
+        host: address for gRPC; others than this machine's own need TLS and a token.
+        port: for gRPC; None takes the usual one.
+        certificate: PEM file of the server.
+        key: its key.
+        token_file: holds what clients have to know.
+        ros2_domain: domain of the topics, or None for none.
+        web_port: of the page for browsers, or None for none.
+    """
+
+    host: str = "127.0.0.1"
+    port: int | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+    token_file: Path | None = None
+    ros2_domain: int | None = None
+    web_port: int | None = None
+
+    def settings(self, config: Config) -> Config:
+        """The configuration with keyframes that carry their images: clients choose what they are sent."""
+        return replace(config, keyframes=replace(config.keyframes, images=True))
+
+    def start(self, running: LiveOdometry, stack: ExitStack) -> list[str]:
+        """Offer an odometry that is about to run, until the stack ends; a line for each service.
+
+        Raises:
+            ServiceError: if an address cannot be used, or would be open to all.
+            MissingExtraError: if a service's extra is not installed.
+        """
+        from graphvio.slam.service import GrpcServer, ServiceOptions
+
+        options = ServiceOptions(
+            host=self.host,
+            certificate=self.certificate,
+            key=self.key,
+            token_file=self.token_file,
+            **({} if self.port is None else {"port": self.port}),
+        )
+        server = stack.enter_context(GrpcServer(running, options))
+        return [f"gRPC: {server.address}" + (" (TLS)" if self.certificate else "")]

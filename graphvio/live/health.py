@@ -1,0 +1,102 @@
+"""Health over HTTP: Prometheus metrics at ``/metrics``, and at ``/healthz`` whether all stages live."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from http import HTTPStatus
+from typing import Any
+from wsgiref.simple_server import WSGIRequestHandler, make_server
+
+from graphvio.errors import MissingExtraError, ServiceError
+
+Figures = Mapping[str, float | int | str | None]
+
+_TOTALS = ("images", "imu_samples", "framesets", "estimates", "imu_lost")
+_TOTAL_PREFIXES = ("skipped", "incident", "status_", "recorded", "framesets_not", "images_not", "results_not")
+
+
+class HealthServer:
+    """Answers from threads of its own.
+
+    Args:
+        status: how it runs, by name; ``health`` is ``ok`` where all is well.
+        host: address to listen on; by default nobody else's machine reaches it.
+        port: 0 takes a free one.
+
+    Attributes:
+        address: ``HOST:PORT`` that it listens on.
+
+    Raises:
+        ServiceError: if the address cannot be used.
+        MissingExtraError: if the extra ``live`` is not installed.
+    """
+
+    def __init__(self, status: Callable[[], Figures], host: str = "127.0.0.1", port: int = 0) -> None:
+        try:
+            from prometheus_client import CollectorRegistry, make_wsgi_app
+        except ImportError:
+            raise MissingExtraError("prometheus-client", "live", "metrics of a live run") from None
+        registry = CollectorRegistry(auto_describe=False)
+        registry.register(_Collector(status))
+        self._status = status
+        self._metrics = make_wsgi_app(registry)
+        try:
+            self._server = make_server(host, port, self._answer, handler_class=_QuietHandler)
+        except OSError as error:
+            raise ServiceError(
+                f"{host}:{port}: cannot be listened on ({error.strerror}); choose another port"
+            ) from None
+        self.address = f"{host}:{self._server.server_port}"
+        self._thread = threading.Thread(target=self._server.serve_forever, name="graphvio-health", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Answer no more."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def _answer(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        path = environ.get("PATH_INFO", "")
+        if path == "/metrics":
+            return list(self._metrics(environ, start_response))
+        if path == "/healthz":
+            status = self._status()
+            good = status.get("health") == "ok"
+            return _reply(start_response, HTTPStatus.OK if good else HTTPStatus.SERVICE_UNAVAILABLE, status)
+        return _reply(start_response, HTTPStatus.NOT_FOUND, {"there is": "/metrics and /healthz"})
+
+
+def _reply(start_response: Callable[..., Any], status: HTTPStatus, content: Mapping[str, Any]) -> list[bytes]:
+    start_response(f"{status.value} {status.phrase}", [("Content-Type", "application/json; charset=utf-8")])
+    return [json.dumps(content, indent=1).encode() + b"\n"]
+
+
+class _Collector:
+    """Figures as metrics; texts become labels of a metric that is 1."""
+
+    def __init__(self, status: Callable[[], Figures]) -> None:
+        self._status = status
+
+    def collect(self) -> Iterator[Any]:
+        """All metrics."""
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
+
+        figures = self._status()
+        for name, value in figures.items():
+            if isinstance(value, int | float):
+                is_total = name in _TOTALS or name.startswith(_TOTAL_PREFIXES)
+                kind = CounterMetricFamily if is_total else GaugeMetricFamily
+                yield kind(f"graphvio_{name}", f"{name} of the odometry", value=float(value))
+        texts = {name: value for name, value in figures.items() if isinstance(value, str)}
+        yield InfoMetricFamily("graphvio", "texts of the odometry's status", value=texts)
+        yield GaugeMetricFamily("graphvio_up", "1 while all stages live", value=float(figures.get("health") == "ok"))
+
+
+class _QuietHandler(WSGIRequestHandler):
+    """Writes no log."""
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Nothing."""

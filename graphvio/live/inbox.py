@@ -1,0 +1,87 @@
+"""What waits for the odometry: samples and framesets in the order in which they came."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+
+from graphvio.events import Event, FrameSet
+from graphvio.live.source import host_ns
+
+_MOST_SAMPLES = 50_000  # minutes: when so many wait, whoever takes them is dead
+
+
+class Inbox:
+    """Between the threads that bring events and the one that takes them.
+
+    Args:
+        most_framesets: that may wait.
+        waits: whether `put` waits for room, or the oldest frameset goes.
+
+    Attributes:
+        dropped_framesets: for which there was no room.
+        dropped_samples: likewise.
+    """
+
+    def __init__(self, most_framesets: int, waits: bool) -> None:
+        self._most = most_framesets
+        self._waits = waits
+        self._changed = threading.Condition()
+        self._waiting: deque[tuple[Event, int]] = deque()
+        self._framesets = 0
+        self._is_closed = False
+        self.dropped_framesets = 0
+        self.dropped_samples = 0
+
+    def put(self, event: Event, arrival_ns: int | None = None) -> None:
+        """Bring an event that came just now, or then."""
+        with self._changed:
+            if isinstance(event, FrameSet):
+                if self._waits:
+                    self._changed.wait_for(lambda: self._framesets < self._most or self._is_closed)
+                elif self._framesets >= self._most:
+                    self._drop_oldest_frameset()
+                self._framesets += 1
+            elif len(self._waiting) >= _MOST_SAMPLES:
+                self.dropped_samples += 1
+                return
+            self._waiting.append((event, host_ns() if arrival_ns is None else arrival_ns))
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float) -> tuple[Event, int] | None:
+        """The oldest event and when it came, or None when there is none by the end of the time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._is_closed, timeout_s)
+            if not self._waiting:
+                return None
+            event, arrival_ns = self._waiting.popleft()
+            if isinstance(event, FrameSet):
+                self._framesets -= 1
+                self._changed.notify_all()
+            return event, arrival_ns
+
+    def close(self) -> None:
+        """Nothing more will come; what waits can still be taken."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether it is closed, and all has been taken."""
+        with self._changed:
+            return self._is_closed and not self._waiting
+
+    @property
+    def framesets(self) -> int:
+        """That wait."""
+        return self._framesets
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def _drop_oldest_frameset(self) -> None:
+        at = next(i for i, (event, _) in enumerate(self._waiting) if isinstance(event, FrameSet))
+        del self._waiting[at]
+        self._framesets -= 1
+        self.dropped_framesets += 1

@@ -1,0 +1,81 @@
+"""Real time: what is given up, and in which order, when work takes longer than there is time for.
+
+First corners: fewer are followed. Then framesets: old ones are skipped where a newer one waits. Never IMU samples.
+"""
+
+from __future__ import annotations
+
+_SHARES = (1.0, 0.7, 0.5, 0.35)
+_LOWER_FROM = 0.5  # of the latency's limit
+_BUSY, _IDLE = 0.85, 0.5  # shares of the time between framesets that work takes
+_RAISE_AFTER_NS = 5_000_000_000
+_SETTLE_FRAMESETS = 5  # before the next change, so that the last one shows
+_FORGET = 0.1  # share of the newest in running means
+
+
+class LoadControl:
+    """Decides how many corners are followed and which framesets are skipped; a function of what it is told alone.
+
+    Args:
+        max_latency_ms: from a frameset's arrival to its estimate.
+
+    Attributes:
+        corner_share: of the corners that the configuration asks for.
+    """
+
+    def __init__(self, max_latency_ms: float) -> None:
+        self._limit_ms = max_latency_ms
+        self._level = 0
+        self._work_ms: float | None = None  # running mean
+        self._interval_ms: float | None = None  # the same, between stamps
+        self._last_ns: int | None = None
+        self._since_change = 0
+        self._idle_since_ns: int | None = None
+
+    @property
+    def corner_share(self) -> float:
+        """Of the corners that the configuration asks for."""
+        return _SHARES[self._level]
+
+    def must_skip(self, waited_ms: float, is_newest: bool) -> bool:
+        """Whether a frameset that has waited so long is skipped: it would be late, and a newer one waits.
+
+        As long as fewer corners would help they are lowered instead, unless it is late already.
+        """
+        if is_newest or waited_ms + (self._work_ms or 0.0) <= self._limit_ms:
+            return False
+        if self._level < len(_SHARES) - 1:
+            self._change(1)
+            return waited_ms > self._limit_ms
+        return True
+
+    def note(self, stamp_ns: int, waited_ms: float, work_ms: float) -> None:
+        """A frameset has been worked on."""
+        if self._last_ns is not None:
+            self._interval_ms = _mean(self._interval_ms, 1e-6 * (stamp_ns - self._last_ns))
+        self._last_ns = stamp_ns
+        self._work_ms = _mean(self._work_ms, work_ms)
+        self._since_change += 1
+        if self._since_change < _SETTLE_FRAMESETS or self._interval_ms is None:
+            return
+        share = self._work_ms / max(self._interval_ms, 1e-3)
+        late = waited_ms + self._work_ms > _LOWER_FROM * self._limit_ms
+        if share >= _IDLE or late:
+            self._idle_since_ns = None
+        elif self._idle_since_ns is None:
+            self._idle_since_ns = stamp_ns
+        if (share > _BUSY or late) and self._level < len(_SHARES) - 1:
+            self._change(1)
+        elif self._level and self._idle_since_ns is not None and stamp_ns - self._idle_since_ns > _RAISE_AFTER_NS:
+            self._change(-1)
+
+    def _change(self, by: int) -> None:
+        self._level += by
+        self._since_change = 0
+        self._idle_since_ns = None
+        if self._work_ms is not None:
+            self._work_ms *= _SHARES[self._level] / _SHARES[self._level - by]
+
+
+def _mean(before: float | None, newest: float) -> float:
+    return newest if before is None else before + _FORGET * (newest - before)

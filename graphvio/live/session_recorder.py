@@ -1,0 +1,92 @@
+"""Records a live run as a session, in a thread of its own: a disk that is slow never holds up the odometry."""
+
+from __future__ import annotations
+
+import queue
+import shutil
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from graphvio.events import Estimate, Event, FrameSet, Incident
+from graphvio.rig import Rig
+from graphvio.sessions.topics import ImageFormat
+from graphvio.sessions.writer import SessionWriter
+
+_WAITING = 20_000  # samples, poses and messages: a minute of them
+_WAITING_IMAGES = 120  # framesets
+
+
+class SessionRecorder:
+    """An output (`graphvio.live.output.Output`) that writes all that comes and all that is made of it.
+
+    When the disk does not keep up, framesets are left out of the recording and counted; samples and poses are not.
+
+    Args:
+        path: of the session, new.
+        rig: of the framesets.
+        image_format: images as they are, or as PNG.
+
+    Raises:
+        SessionError: if the file exists or cannot be made.
+        MissingExtraError: if the extra ``sessions`` is not installed.
+    """
+
+    def __init__(self, path: Path, rig: Rig, image_format: ImageFormat = "raw") -> None:
+        self._path = path
+        self._writer = SessionWriter(path, rig, image_format)
+        self._waiting: queue.Queue[Callable[[], None] | None] = queue.Queue(_WAITING)
+        self._images = threading.Semaphore(_WAITING_IMAGES)
+        self._left_out = 0
+        self._framesets = 0
+        self.failure: Exception | None = None
+        self._thread = threading.Thread(target=self._write, name="graphvio-record", daemon=True)
+        self._thread.start()
+
+    def add_event(self, event: Event) -> None:
+        """See `Output`."""
+        if isinstance(event, FrameSet):
+            if not self._images.acquire(blocking=False):
+                self._left_out += 1
+                return
+            self._waiting.put(lambda: self._write_frameset(event))
+        else:
+            self._waiting.put(lambda: self._writer.add(event))
+
+    def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
+        """See `Output`."""
+        self._waiting.put(lambda: self._writer.add_estimate(estimate))
+
+    def add_incident(self, incident: Incident) -> None:
+        """See `Output`."""
+        self._waiting.put(lambda: self._writer.add_incident(incident))
+
+    def status(self) -> Mapping[str, float | int | str | None]:
+        """See `Output`."""
+        return {
+            "recorded_framesets": self._framesets,
+            "recorded_poses": self._writer.poses,
+            "framesets_not_recorded": self._left_out,
+            "recording_stopped": self._writer.stopped or (str(self.failure) if self.failure else ""),
+            "disk_free_gb": shutil.disk_usage(self._path.parent).free / 1e9,
+        }
+
+    def close(self) -> None:
+        """Write what waits, and finish the file."""
+        self._waiting.put(None)
+        self._thread.join()
+
+    def _write_frameset(self, frameset: FrameSet) -> None:
+        try:
+            self._writer.add(frameset)
+            self._framesets += self._writer.stopped is None
+        finally:
+            self._images.release()
+
+    def _write(self) -> None:
+        with self._writer:
+            while (write := self._waiting.get()) is not None:
+                try:
+                    write()
+                except Exception as error:  # a message that cannot be written is no reason to stop the others
+                    self.failure = error

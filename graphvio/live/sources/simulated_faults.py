@@ -1,0 +1,130 @@
+"""What simulated devices do wrong: clocks of their own, late arrival, and being unplugged for a while."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import count
+
+import numpy as np
+
+from graphvio.errors import SourceError
+from graphvio.live.source import CameraFrame, ImuReading, Notice, Reading, host_ns
+from graphvio.rig import Rig
+
+IMU = "imu"
+OPTIONS = ("drift_ppm", "jitter_ms", "unplug")
+_CLOCK_OFFSET_NS = 7_000_000_000_000  # by which each further device's clock is off
+
+
+@dataclass(frozen=True)
+class Outage:
+    """A device is unplugged from one second of the walk to another."""
+
+    device: str
+    from_s: float
+    to_s: float
+
+
+@dataclass(frozen=True)
+class DeviceFaults:
+    """How the devices of a rig fail: each pair is one, and the IMU is one.
+
+    Attributes:
+        drift_ppm: of the first device's clock; the others' are in between, by turns of the other sign. None gives all
+            one clock.
+        jitter_ms: mean of the exponential part of the time that a reading takes to the host.
+        outages: when which device is gone.
+    """
+
+    drift_ppm: float | None = None
+    jitter_ms: float = 0.0
+    outages: tuple[Outage, ...] = ()
+
+    @staticmethod
+    def parse(options: Mapping[str, str], rig_devices: tuple[str, ...]) -> DeviceFaults:
+        """From a source's options, such as ``drift_ppm=100``, ``jitter_ms=2`` and ``unplug=back@5-8,imu@20-21``.
+
+        Raises:
+            SourceError: if a device is not there, or a value is not valid.
+        """
+        try:
+            drift = float(options["drift_ppm"]) if "drift_ppm" in options else None
+            jitter = float(options.get("jitter_ms", "0"))
+            outages = []
+            for text in filter(None, options.get("unplug", "").split(",")):
+                device, _, span = text.partition("@")
+                begin, _, end = span.partition("-")
+                outages.append(Outage(device, float(begin), float(end)))
+        except ValueError:
+            raise SourceError(
+                "simulator: a fault's value is no number; write drift_ppm=100, jitter_ms=2, unplug=DEVICE@FROM-TO"
+            ) from None
+        for outage in outages:
+            if outage.device not in rig_devices:
+                raise SourceError(
+                    f"simulator: there is no device {outage.device!r}; there are {', '.join(rig_devices)}"
+                )
+        if jitter < 0.0 or abs(drift or 0.0) > 1000.0:
+            raise SourceError("simulator: jitter_ms is negative, or drift_ppm beyond 1000, which no clock has")
+        return DeviceFaults(drift, jitter, tuple(outages))
+
+
+def devices_of(rig: Rig) -> tuple[str, ...]:
+    """Names of the pairs and, if there is one, the IMU."""
+    return (*(pair.name for pair in rig.pairs), *((IMU,) if rig.imu is not None else ()))
+
+
+def with_faults(
+    readings: Iterable[Reading], rig: Rig, faults: DeviceFaults, start_ns: int, seed: int
+) -> Iterator[Reading]:
+    """Readings as devices that fail would give them.
+
+    Args:
+        readings: of devices that do not, stamped by one clock.
+        rig: of them.
+        faults: what goes wrong.
+        start_ns: stamp from which outages count.
+        seed: of the jitter.
+    """
+    devices = devices_of(rig)
+    device_of = {camera.name: pair.name for pair in rig.pairs for camera in (pair.left, pair.right)}
+    rng, number = np.random.default_rng(seed), count()
+    late: list[tuple[int, int, Reading]] = []
+    last_ns = dict.fromkeys(devices, 0)  # a device's readings keep their order
+    gone: frozenset[str] = frozenset()
+    for reading in readings:
+        if isinstance(reading, Notice):
+            yield reading
+            continue
+        device = device_of[reading.camera] if isinstance(reading, CameraFrame) else IMU
+        now_s = (reading.stamp_ns - start_ns) * 1e-9
+        absent = frozenset(each.device for each in faults.outages if each.from_s <= now_s < each.to_s)
+        for name in sorted(absent ^ gone):
+            kind = "device_lost" if name in absent else "device_back"
+            yield Notice(kind, f"{name} was {'un' * (name in absent)}plugged", host_ns(), name)
+        gone = absent
+        if device in gone:
+            continue
+        if faults.drift_ppm is not None:
+            reading = _by_own_clock(reading, device, devices.index(device), faults.drift_ppm, start_ns)
+        if not faults.jitter_ms:
+            yield reading
+            continue
+        arrival_ns = max(reading.arrival_ns + round(1e6 * rng.exponential(faults.jitter_ms)), last_ns[device])
+        last_ns[device] = arrival_ns
+        heapq.heappush(late, (arrival_ns, next(number), replace(reading, arrival_ns=arrival_ns)))
+        while late and late[0][0] <= host_ns():
+            yield heapq.heappop(late)[2]
+    while late:
+        yield heapq.heappop(late)[2]
+
+
+def _by_own_clock(
+    reading: ImuReading | CameraFrame, device: str, place: int, drift_ppm: float, start_ns: int
+) -> ImuReading | CameraFrame:
+    drift = 1e-6 * drift_ppm * (-1.0) ** place / (1.0 + place // 2)
+    elapsed_ns = reading.stamp_ns - start_ns
+    stamp_ns = place * _CLOCK_OFFSET_NS + elapsed_ns + round(drift * elapsed_ns)
+    return replace(reading, stamp_ns=stamp_ns, clock=device)

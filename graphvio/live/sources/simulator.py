@@ -1,0 +1,225 @@
+"""The simulator as a live device: a walk that is rendered once, by a process of its own, and then walked to and fro.
+
+On the way back time runs backwards: positions and attitudes are those of the way there, velocities and rates have the
+other sign, accelerations are the same. Where a walk begins and ends at rest, to and fro is one smooth motion.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from graphvio.errors import SourceError
+from graphvio.events import Event, FrameSet, ImuSample
+from graphvio.kernels import cache_root
+from graphvio.live.source import DeviceHealth, DeviceInfo, Reading
+from graphvio.live.sources import SourceSpec, check_options
+from graphvio.live.sources.pacing import Pace, read_speed
+from graphvio.live.sources.replay import paced
+from graphvio.live.sources.simulated_faults import OPTIONS as FAULT_OPTIONS
+from graphvio.live.sources.simulated_faults import DeviceFaults, devices_of, with_faults
+from graphvio.rig import Rig
+from graphvio.simulation import SCENE_NAMES
+from graphvio.sources import Source
+from graphvio.sources import open_source as open_recording
+from graphvio.sources.read_ahead import read_ahead
+from graphvio.sources.sequencer import merge
+
+if TYPE_CHECKING:
+    from graphvio.simulation.imu import ImuTrack
+
+_OPTIONS = ("speed", "duration_s", "legs", "seed", "rate_hz", "recording", *FAULT_OPTIONS)
+_STILL_M_S = 1e-3
+
+
+def list_devices() -> Sequence[DeviceInfo]:
+    """A device for each scene that ends at rest, so that it can be walked for ever."""
+    return [DeviceInfo(f"simulator:{name}", f"simulated rig, scene {name}") for name in ("room", "loop")]
+
+
+def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
+    """A scene by its name, ``room`` if there is none.
+
+    Raises:
+        SourceError: if there is no such scene, or an option is not valid.
+    """
+    check_options(spec, _OPTIONS)
+    scene = spec.what or "room"
+    if scene not in SCENE_NAMES:
+        raise SourceError(f"simulator: there is no scene {scene!r}; there are {', '.join(SCENE_NAMES)}")
+    try:
+        speed = read_speed(spec.options.get("speed", "1"))
+        duration_s = float(spec.options["duration_s"]) if "duration_s" in spec.options else None
+        legs = int(spec.options["legs"]) if "legs" in spec.options else None
+        seed, rate_hz = int(spec.options.get("seed", "0")), float(spec.options.get("rate_hz", "20"))
+    except ValueError as error:
+        raise SourceError(f"simulator: an option is no number ({error}); speed is 0.01 to 100, or max") from None
+    recording = Path(spec.options["recording"]) if "recording" in spec.options else None
+    return SimulatedRig(
+        scene,
+        rig,
+        speed,
+        duration_s=duration_s,
+        legs=legs,
+        seed=seed,
+        rate_hz=rate_hz,
+        recording=recording,
+        faults=spec.options,
+    )
+
+
+class SimulatedRig:
+    """A scene (`graphvio.live.source.LiveSource`).
+
+    Args:
+        scene: its name.
+        rig: takes the place of the scene's own, such as one with fewer pairs, or None.
+        speed: of its time, or None for as fast as it is taken.
+        duration_s: when it ends; None goes on for ever.
+        legs: how often it is walked, there and back counting as two; None goes on for ever.
+        seed: of all noise.
+        rate_hz: framesets per second.
+        recording: where it was rendered before, by `graphvio simulate` with the same scene, seed and rate; None renders
+            it, once, in graphvio's folder of the user's cache.
+        faults: options of `DeviceFaults.parse`.
+    """
+
+    def __init__(
+        self,
+        scene: str,
+        rig: Rig | None,
+        speed: float | None,
+        *,
+        duration_s: float | None = None,
+        legs: int | None = None,
+        seed: int = 0,
+        rate_hz: float = 20.0,
+        recording: Path | None = None,
+        faults: Mapping[str, str] | None = None,
+    ) -> None:
+        self.name = f"simulator-{scene}"
+        self.is_realtime = speed is not None
+        self._scene = scene
+        self._rig = rig
+        self._pace = Pace(speed)
+        self._duration_s = duration_s
+        self._legs = legs
+        self._seed = seed
+        self._rate_hz = rate_hz
+        self._folder = recording
+        self._fault_options = faults or {}
+        self._faults = DeviceFaults()
+        self._opened: Source | None = None
+        self._track: ImuTrack | None = None
+
+    def open(self) -> Rig:
+        """Render the scene if it has not been, which takes minutes, and read it.
+
+        Raises:
+            SourceError: if it cannot be rendered, does not end at rest and is to be walked back, or has no such fault.
+        """
+        folder = self._folder if self._folder is not None else self._rendered()
+        self._opened = open_recording(folder, self._rig)
+        self._track = self._inertial(self._opened)
+        self._faults = DeviceFaults.parse(self._fault_options, devices_of(self._opened.rig))
+        return self._opened.rig
+
+    def readings(self) -> Iterator[Reading]:
+        """Samples and images, each when it is due."""
+        assert self._opened is not None, "it was opened"
+        with closing(self._events(self._opened)) as events:
+            readings = paced(events, self._opened.rig, self._pace)
+            yield from with_faults(readings, self._opened.rig, self._faults, self._opened.start_ns, self._seed)
+
+    def health(self) -> Sequence[DeviceHealth]:
+        """It is always there."""
+        return [DeviceHealth(self.name, True, "simulated")]
+
+    def close(self) -> None:
+        """Walk no further."""
+        self._pace.stop()
+
+    def _events(self, recording: Source) -> Generator[Event, None, None]:
+        leg = 0
+        while self._legs is None or leg < self._legs:
+            for event in _leg(recording, self._track, leg):
+                if self._duration_s is not None and event.stamp_ns - recording.start_ns > self._duration_s * 1e9:
+                    return
+                yield event
+            leg += 1
+
+    def _inertial(self, recording: Source) -> ImuTrack | None:
+        """The IMU with its biases, which a recording does not tell apart."""
+        from graphvio.simulation.simulator import make_simulator
+
+        if recording.rig.imu is None:
+            return None
+        simulator = make_simulator(self._scene, seed=self._seed, rate_hz=self._rate_hz)
+        ends = simulator.scene.motion.at(np.array([0.0, simulator.scene.motion.duration_s])).velocity
+        if self._legs != 1 and np.abs(ends).max() > _STILL_M_S and not self._ends_early(recording):
+            raise SourceError(
+                f"simulator: {self._scene} does not end at rest, so that it cannot be walked back: ?legs=1"
+            )
+        return simulator.imu_track
+
+    def _ends_early(self, recording: Source) -> bool:
+        return self._duration_s is not None and self._duration_s * 1e9 <= recording.end_ns - recording.start_ns
+
+    def _rendered(self) -> Path:
+        """The folder of the rendered scene."""
+        root = cache_root().parent / "simulator"
+        folder = root / f"{self._scene}-seed{self._seed}-{self._rate_hz:g}hz-{_digest()}"
+        if folder.is_dir():
+            return folder
+        unfinished = folder.with_name(f"{folder.name}.{hashlib.sha256(str(id(self)).encode()).hexdigest()[:8]}")
+        arguments = ["simulate", self._scene, "--out", unfinished, "--seed", self._seed, "--rate", f"{self._rate_hz:g}"]
+        command = [sys.executable, "-c", "from graphvio.cli import main; main()", *map(str, arguments)]
+        root.mkdir(parents=True, exist_ok=True)
+        if subprocess.run(command, check=False).returncode:
+            raise SourceError(f"simulator: {self._scene} could not be rendered; try  graphvio simulate {self._scene}")
+        if not folder.is_dir():  # else another process was faster
+            unfinished.rename(folder)
+        return folder
+
+
+def _leg(recording: Source, track: ImuTrack | None, leg: int) -> Iterator[Event]:
+    """One walk through, there if the leg is even, back if it is odd; what stands at the turn is not given twice."""
+    start_ns, end_ns = recording.start_ns, recording.end_ns
+    shift_ns, is_back = leg * (end_ns - start_ns), bool(leg % 2)
+    origin_ns = end_ns if is_back else start_ns
+
+    def restamped(stamp_ns: int) -> int:
+        return start_ns + shift_ns + abs(stamp_ns - origin_ns)
+
+    def samples() -> Iterator[ImuSample]:
+        if track is None:
+            return
+        inside = np.flatnonzero((track.stamps_ns >= start_ns) & (track.stamps_ns <= end_ns))
+        for k in inside[::-1] if is_back else inside:
+            stamp_ns, rate, bias = int(track.stamps_ns[k]), track.angular_velocity[k], track.gyro_bias[k]
+            if leg and stamp_ns == origin_ns:
+                continue
+            yield ImuSample(
+                restamped(stamp_ns), 2.0 * bias - rate if is_back else rate, np.copy(track.linear_acceleration[k])
+            )
+
+    stamps = recording.stamps_ns
+    ordered = (stamps[::-1] if is_back else stamps)[1 if leg else 0 :].tolist()
+    with closing(read_ahead(recording.frameset_at, ordered)) as framesets:
+        renewed = (FrameSet(restamped(frameset.stamp_ns), frameset.images) for frameset in framesets)
+        yield from merge(samples(), renewed)
+
+
+def _digest() -> str:
+    """Of the simulator's own files: another simulator renders anew."""
+    import graphvio.simulation
+
+    files = sorted(Path(graphvio.simulation.__file__).parent.rglob("*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:8]

@@ -1,0 +1,64 @@
+"""Notices stages that are stuck or dead, and sensors that are silent."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+
+from graphvio.live.stage import Stage
+
+_ROUND_S = 0.25
+
+Tell = Callable[[str, str], None]
+"""Takes kind and detail of an incident."""
+
+
+class Watchdog:
+    """Looks at stages from time to time, from a thread of its own.
+
+    Args:
+        stages: to look at.
+        stuck_s: a piece of work that takes longer is stuck.
+        tell: is told when one is stuck, and when it goes on.
+    """
+
+    def __init__(self, stages: Sequence[Stage], stuck_s: float, tell: Tell) -> None:
+        self._stages = stages
+        self._stuck_s = stuck_s
+        self._tell = tell
+        self._stuck: frozenset[str] = frozenset()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="graphvio-watchdog", daemon=True)
+
+    @property
+    def stuck(self) -> frozenset[str]:
+        """Names of the stages that are stuck now."""
+        return frozenset(stage.name for stage in self._stages if stage.busy_s > self._stuck_s)
+
+    @property
+    def dead(self) -> frozenset[str]:
+        """Names of the stages that failed."""
+        return frozenset(stage.name for stage in self._stages if stage.failure is not None)
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it looks."""
+        return self._thread.is_alive()
+
+    def start(self) -> None:
+        """Begin to look."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Look no more."""
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.wait(_ROUND_S):
+            stuck = self.stuck
+            for name in sorted(stuck - self._stuck):
+                self._tell("stage_stuck", f"{name} has worked on one thing for more than {self._stuck_s:g} s")
+            for name in sorted(self._stuck - stuck):
+                self._tell("stage_recovered", f"{name} goes on")
+            self._stuck = stuck

@@ -1,0 +1,152 @@
+"""``scripts/campaign soak``: does the live system stay as it is, over thousands of framesets?
+
+The whole live system, from the source to the listeners, on the simulated room that is walked to and fro. Memory is that
+of the process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from benchmarks.command_line import Subparsers, add_command, add_report_options
+from benchmarks.recordings import add_data_option, simulated
+from benchmarks.report import Report, machine, tell
+
+from graphvio.arrays import Float
+from graphvio.config import Config
+from graphvio.errors import GraphvioError
+from graphvio.geometry import se3_inverse
+from graphvio.live.running import LiveOdometry
+from graphvio.live.sources.simulator import SimulatedRig
+from graphvio.sources import open_source
+from graphvio.trajectory import Trajectory
+from graphvio.warmup import warm_up
+
+_SCENE = "room"
+_PARTS = 10
+_LOOK_S = 0.2
+_HEAD = ("framesets", "minutes", "framesets/s", "memory, MB", "error, mm", "epoch", "lost")
+_STAGES = ("predict", "track", "motion", "judge", "renew", "update")
+_Figures = Mapping[str, float | int | str | None]
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add ``soak``."""
+    parser = add_command(subparsers, "soak", "memory, latency and losses of the live system over hours", __doc__)
+    parser.add_argument("--framesets", type=int, default=20_000, help="as many (default: 20000)")
+    parser.add_argument("--real-time", action="store_true", help="at the sensors' pace, not as fast as possible")
+    add_report_options(parser)
+    add_data_option(parser)
+    parser.set_defaults(run=main)
+
+
+def main(args: argparse.Namespace) -> None:
+    """Run and report."""
+    if args.framesets < 100:
+        raise GraphvioError("--framesets wants 100 or more")
+    folder = simulated(args.data, _SCENE)
+    report = Report()
+    how = "at the sensors' pace" if args.real_time else "as fast as possible"
+    report.add(machine(), "", f"`--framesets {args.framesets}`{' --real-time' if args.real_time else ''}: {how}.")
+    rows, figures, growth_mb = _soak(folder, args.framesets, args.real_time)
+    report.table(_HEAD, rows)
+    lost = _lost(figures)
+    told = f"p50 {figures['latency_p50_ms']:.1f} ms (newest), p99 {figures['latency_p99_all_ms']:.1f} ms (all)"
+    report.add(
+        f"Memory grew by {growth_mb:.1f} MB after the first tenth. Lost: {lost or 'nothing'}. "
+        + (f"Latency: {told}." if args.real_time else f"Work on a frameset: {_work_told(figures)}.")
+    )
+    if args.out is not None:
+        report.save(args.out)
+    if args.docs:
+        report.save_to_docs("soak")
+
+
+def _soak(folder: Path, framesets: int, is_real_time: bool) -> tuple[list[list[str]], _Figures, float]:
+    config = Config()
+    seconds = framesets / 20.0
+    source = SimulatedRig(_SCENE, None, 1.0 if is_real_time else None, duration_s=seconds, recording=folder)
+    rig = source.open()
+    warm_up(rig, config)
+    running = LiveOdometry(source, rig, config)
+    listener = _Listener(running, folder)
+    running.start()
+    begun_s, due = time.monotonic(), framesets / _PARTS
+    rows: list[list[str]] = []
+    memories: list[float] = []
+    while not running.wait(_LOOK_S):
+        figures = running.status()
+        if int(figures["estimates"] or 0) >= due * (len(rows) + 1):
+            memories.append(float(figures["memory_mb"] or np.nan))
+            rows.append(_row(figures, listener.error_mm, time.monotonic() - begun_s))
+            tell(f"{figures['estimates']} of {framesets}")
+    running.stop()
+    listener.thread.join()
+    figures = dict(running.status())
+    figures |= {f"work_p{percent}_ms": float(np.percentile(listener.work_ms, percent)) for percent in (50, 99)}
+    rows.append(_row(figures, listener.error_mm, time.monotonic() - begun_s))
+    memories.append(float(figures["memory_mb"] or np.nan))
+    return rows, figures, max(memories) - memories[0]
+
+
+class _Listener:
+    """What the odometry took for each frameset, and how wrong its newest position is, from the first pose on."""
+
+    def __init__(self, running: LiveOdometry, folder: Path) -> None:
+        source = open_source(folder)
+        assert source.truth is not None
+        self.work_ms: list[float] = []
+        self.error_mm = 0.0
+        self._start_ns, self._end_ns = source.start_ns, source.end_ns
+        self._truth = Trajectory.read(source.truth)
+        self._nav_T_world: Float | None = None
+        self._estimates = running.estimates.subscribe(256)
+        self.thread = threading.Thread(target=self._listen, daemon=True)
+        self.thread.start()
+
+    def _listen(self) -> None:
+        while not self._estimates.is_closed:
+            estimate = self._estimates.get(0.5)
+            if estimate is None or estimate.nav_T_body is None:
+                continue
+            self.work_ms.append(sum(estimate.stage_ms.get(stage, 0.0) for stage in _STAGES))
+            world_T_body = self._true_pose(estimate.stamp_ns)
+            if self._nav_T_world is None:
+                self._nav_T_world = estimate.nav_T_body @ se3_inverse(world_T_body)
+            apart = estimate.nav_T_body[:3, 3] - (self._nav_T_world @ world_T_body)[:3, 3]
+            self.error_mm = 1e3 * float(np.linalg.norm(apart))
+
+    def _true_pose(self, stamp_ns: int) -> Float:
+        """At the true pose's stamp nearest to this one's place in the walk to and fro."""
+        length_ns = self._end_ns - self._start_ns
+        along_ns = (stamp_ns - self._start_ns) % (2 * length_ns)
+        wanted_ns = self._start_ns + min(along_ns, 2 * length_ns - along_ns)
+        at = int(np.argmin(np.abs(self._truth.stamps_ns - wanted_ns)))
+        return np.ascontiguousarray(self._truth.nav_T_body[at])
+
+
+def _row(figures: _Figures, error_mm: float, elapsed_s: float) -> list[str]:
+    done = int(figures["estimates"] or 0)
+    return [
+        str(done),
+        f"{elapsed_s / 60.0:.1f}",
+        f"{done / elapsed_s:.1f}",
+        f"{figures['memory_mb']:.0f}",
+        f"{error_mm:.0f}",
+        str(figures.get("epoch")),
+        str(sum(_lost(figures).values())),
+    ]
+
+
+def _lost(figures: _Figures) -> dict[str, int]:
+    kinds = ("skipped", "images_not", "imu_lost", "results_not", "incident_")
+    return {name: int(value) for name, value in figures.items() if name.startswith(kinds) and value}
+
+
+def _work_told(figures: _Figures) -> str:
+    return f"p50 {figures['work_p50_ms']:.1f} ms, p99 {figures['work_p99_ms']:.1f} ms"
