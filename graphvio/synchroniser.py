@@ -14,6 +14,7 @@ from graphvio.events import FrameSet, ImuSample
 from graphvio.rig import Rig
 
 _LEAST_INTERVAL_NS = 1_000_000  # between framesets: less is of one instant, and no motion can be told from it
+_SILENT_WAITS = 2.0  # an IMU so far behind is not waited for until it goes on
 _SUSPICIOUS_JUMP_NS = 5_000_000_000
 
 
@@ -160,8 +161,12 @@ class Synchroniser:
                 return True
             enough = self.initial_span(frameset.stamp_ns) is not None
             return enough or waited_ns > 2.0 * self._initialisation.min_window_s * 1e9
-        covered = self._imu.covers(frameset.stamp_ns + self._offset_ns)
-        return covered or waited_ns > self._timing.max_imu_wait_ms * 1e6
+        at_ns, newest_ns = frameset.stamp_ns + self._offset_ns, self._imu.newest_ns
+        if newest_ns is None or newest_ns >= at_ns:
+            return True
+        longest_ns = self._timing.max_imu_wait_ms * 1e6
+        is_silent = at_ns - newest_ns > _SILENT_WAITS * longest_ns
+        return is_silent or waited_ns > longest_ns
 
 
 class JumpGuard(Generic[Stamped]):

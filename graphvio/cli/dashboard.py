@@ -36,6 +36,7 @@ class Dashboard:
         self._title = title
         self._incidents = incidents
         self._messages: list[str] = []
+        self._told: dict[str, tuple[float, int]] = {}  # kind -> when it was told last, and how often it came since
         self._console = Console(stderr=True)
         self._live = Live(console=self._console, auto_refresh=False, transient=True)
         self._next_s = 0.0
@@ -51,11 +52,9 @@ class Dashboard:
 
     def draw(self, figures: Figures, devices: Sequence[DeviceHealth]) -> None:
         """Show the newest, if it is time to."""
-        while (incident := self._incidents.get(0.0)) is not None:
-            self._messages = [*self._messages, f"{incident.kind}: {incident.detail}"][-_MESSAGES:]
-            if not self._console.is_terminal:
-                self._console.print(self._messages[-1], soft_wrap=True, highlight=False, markup=False)
         now = time.monotonic()
+        while (incident := self._incidents.get(0.0)) is not None:
+            self._tell(incident, now)
         if now < self._next_s:
             return
         if self._console.is_terminal:
@@ -64,6 +63,18 @@ class Dashboard:
         else:
             self._next_s = now + _PLAIN_S
             self._console.print(line_of(figures), soft_wrap=True, highlight=False)
+
+    def _tell(self, incident: Incident, now: float) -> None:
+        """Show a message; of those of one kind, one in a few seconds, and how many there were."""
+        last, passed_over = self._told.get(incident.kind, (-_PLAIN_S, 0))
+        if now - last < _PLAIN_S:
+            self._told[incident.kind] = last, passed_over + 1
+            return
+        self._told[incident.kind] = now, 0
+        more = f" (and {passed_over} more before)" if passed_over else ""
+        self._messages = [*self._messages, f"{incident.kind}: {incident.detail}{more}"][-_MESSAGES:]
+        if not self._console.is_terminal:
+            self._console.print(self._messages[-1], soft_wrap=True, highlight=False, markup=False)
 
     def _panel(self, figures: Figures, devices: Sequence[DeviceHealth]) -> Table:
         table = Table(title=self._title, show_header=False, expand=False)
