@@ -98,6 +98,11 @@ class Odometry:
                 self._go_on(sample)
         else:
             self._synchroniser.add_frameset(event)
+        return self.process_due()
+
+    def process_due(self) -> Estimate | None:
+        """The estimate of the oldest frameset that is held though it is due, or None while there is none: after
+        `process`, where several became due at once and later events are not to be waited for."""
         frameset = self._synchroniser.next_due(started=self._belief.has_started)
         return None if frameset is None else self._estimate(frameset)
 

@@ -264,6 +264,8 @@ class LiveOdometry:
             try:
                 return self._images.get(timeout=_ROUND_S)
             except queue.Empty:
+                if not self._source.is_realtime:
+                    continue  # its images come when they are taken: time tells nothing of them
                 now_ns = host_ns()
                 for frameset in self._assembler.advance(now_ns):
                     self._bring(frameset, now_ns)
@@ -301,9 +303,15 @@ class LiveOdometry:
             if len(self._under_way) > _KEPT_FRAMESETS:
                 self._under_way.popitem(last=False)
         estimate = self._odometry.process(event)
+        while estimate is not None:
+            self._conclude(estimate, begun_ns)
+            begun_ns = host_ns()
+            estimate = self._odometry.process_due()
         self._tell_incidents()
-        if estimate is None:
-            return
+
+    def _conclude(self, estimate: Estimate, begun_ns: int) -> None:
+        """An estimate has been made since then."""
+        self._tell_incidents()
         under_way = self._under_way.get(estimate.stamp_ns)
         if under_way is not None and self._is_limited(under_way.arrival_ns):
             self._load.note(estimate.stamp_ns, under_way.waited_ms, 1e-6 * (host_ns() - begun_ns))

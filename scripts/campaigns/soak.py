@@ -7,7 +7,6 @@ of the process.
 from __future__ import annotations
 
 import argparse
-import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,21 +16,17 @@ from benchmarks.command_line import Subparsers, add_command, add_report_options
 from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, machine, tell
 
-from graphvio.arrays import Float
+from campaigns.live_listener import Listener
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
-from graphvio.geometry import se3_inverse
 from graphvio.live.running import LiveOdometry
 from graphvio.live.sources.simulator import SimulatedRig
-from graphvio.sources import open_source
-from graphvio.trajectory import Trajectory
 from graphvio.warmup import warm_up
 
 _SCENE = "room"
 _PARTS = 10
 _LOOK_S = 0.2
 _HEAD = ("framesets", "minutes", "framesets/s", "memory, MB", "error, mm", "epoch", "lost")
-_STAGES = ("predict", "track", "motion", "judge", "renew", "update")
 _Figures = Mapping[str, float | int | str | None]
 
 
@@ -74,7 +69,7 @@ def _soak(folder: Path, framesets: int, is_real_time: bool) -> tuple[list[list[s
     rig = source.open()
     warm_up(rig, config)
     running = LiveOdometry(source, rig, config)
-    listener = _Listener(running, folder)
+    listener = Listener(running, folder)
     running.start()
     begun_s, due = time.monotonic(), framesets / _PARTS
     rows: list[list[str]] = []
@@ -92,42 +87,6 @@ def _soak(folder: Path, framesets: int, is_real_time: bool) -> tuple[list[list[s
     rows.append(_row(figures, listener.error_mm, time.monotonic() - begun_s))
     memories.append(float(figures["memory_mb"] or np.nan))
     return rows, figures, max(memories) - memories[0]
-
-
-class _Listener:
-    """What the odometry took for each frameset, and how wrong its newest position is, from the first pose on."""
-
-    def __init__(self, running: LiveOdometry, folder: Path) -> None:
-        source = open_source(folder)
-        assert source.truth is not None
-        self.work_ms: list[float] = []
-        self.error_mm = 0.0
-        self._start_ns, self._end_ns = source.start_ns, source.end_ns
-        self._truth = Trajectory.read(source.truth)
-        self._nav_T_world: Float | None = None
-        self._estimates = running.estimates.subscribe(256)
-        self.thread = threading.Thread(target=self._listen, daemon=True)
-        self.thread.start()
-
-    def _listen(self) -> None:
-        while not self._estimates.is_closed:
-            estimate = self._estimates.get(0.5)
-            if estimate is None or estimate.nav_T_body is None:
-                continue
-            self.work_ms.append(sum(estimate.stage_ms.get(stage, 0.0) for stage in _STAGES))
-            world_T_body = self._true_pose(estimate.stamp_ns)
-            if self._nav_T_world is None:
-                self._nav_T_world = estimate.nav_T_body @ se3_inverse(world_T_body)
-            apart = estimate.nav_T_body[:3, 3] - (self._nav_T_world @ world_T_body)[:3, 3]
-            self.error_mm = 1e3 * float(np.linalg.norm(apart))
-
-    def _true_pose(self, stamp_ns: int) -> Float:
-        """At the true pose's stamp nearest to this one's place in the walk to and fro."""
-        length_ns = self._end_ns - self._start_ns
-        along_ns = (stamp_ns - self._start_ns) % (2 * length_ns)
-        wanted_ns = self._start_ns + min(along_ns, 2 * length_ns - along_ns)
-        at = int(np.argmin(np.abs(self._truth.stamps_ns - wanted_ns)))
-        return np.ascontiguousarray(self._truth.nav_T_body[at])
 
 
 def _row(figures: _Figures, error_mm: float, elapsed_s: float) -> list[str]:

@@ -1,0 +1,166 @@
+"""``scripts/campaign live``: the live system in real time, with all that can go wrong with sensors and machine.
+
+Each case runs the simulated room, walked to and fro, through the whole live system at the sensors' pace.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.command_line import Subparsers, add_command, add_report_options
+from benchmarks.recordings import add_data_option, simulated
+from benchmarks.report import Report, machine, tell
+
+from campaigns.live_listener import Listener
+from graphvio.config import Config
+from graphvio.errors import GraphvioError
+from graphvio.events import Estimate, Event, FrameSet, ImuSample, Incident
+from graphvio.live.output import Output
+from graphvio.live.running import LiveOdometry
+from graphvio.live.sources import open_live_source
+from graphvio.sources import open_source
+from graphvio.warmup import warm_up
+
+_SCENE = "room"
+_HEAD = ("case", "framesets", "skipped", "least corners, %", "p50, ms", "p99, ms", "longest, ms", "epochs", "error, mm",
+         "what was told")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Case:
+    """Options of the simulated devices; ``stalls_s`` holds the output up for so long, once."""
+
+    name: str
+    options: str = ""
+    stalls_s: float = 0.0
+
+
+_CASES = (
+    _Case("nothing"),
+    _Case("clocks drift by 100 ppm, readings come 2 ms late on average", "drift_ppm=100&jitter_ms=2"),
+    _Case("back pair unplugged for 3 s", "unplug=back@8-11"),
+    _Case("both pairs unplugged for 3 s, the IMU is not", "unplug=front@8-11,back@8-11"),
+    _Case("IMU unplugged for 3 s", "unplug=imu@8-11"),
+    _Case("all unplugged for 3 s", "unplug=front@8-11,back@8-11,imu@8-11"),
+    _Case("output stalls for 7 s", stalls_s=7.0),
+    _Case("overload: 80 framesets a second", "speed=4"),
+    _Case("more overload: 160 framesets a second", "speed=8"),
+)
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add ``live``."""
+    parser = add_command(subparsers, "live", "unplugged, drifting, stalled, overloaded and killed", __doc__)
+    parser.add_argument("--seconds", type=float, default=25.0, help="of each case (default: 25)")
+    parser.add_argument("--kills", type=int, default=5, help="recordings that are killed (default: 5)")
+    add_report_options(parser)
+    add_data_option(parser)
+    parser.set_defaults(run=main)
+
+
+def main(args: argparse.Namespace) -> None:
+    """Run all cases and report."""
+    if args.seconds < 15.0:
+        raise GraphvioError("--seconds wants 15 or more")
+    folder = simulated(args.data, _SCENE)
+    report = Report()
+    report.add(machine(), "", f"`--seconds {args.seconds:g} --kills {args.kills}`")
+    rows = []
+    for case in _CASES:
+        rows.append([case.name, *_run(case, folder, args.seconds)])
+        tell(case.name)
+    report.table(_HEAD, rows)
+    lost_s = [_killed(folder, 4.0 + 1.3 * k) for k in range(args.kills)]
+    if lost_s:
+        report.add(
+            f"Recordings killed at {len(lost_s)} moments: all could be read, to {max(lost_s):.2f} s before the newest "
+            "frameset at most."
+        )
+    if args.out is not None:
+        report.save(args.out)
+    if args.docs:
+        report.save_to_docs("live")
+
+
+def _run(case: _Case, folder: Path, seconds: float) -> list[str]:
+    config, options = Config(), f"&{case.options}" if case.options else ""
+    speed = float(dict(each.split("=") for each in case.options.split("&") if each).get("speed", "1"))
+    source = open_live_source(f"simulator:{_SCENE}?recording={folder}&duration_s={seconds * speed:g}{options}")
+    rig = source.open()
+    warm_up(rig, config)
+    stall = _Stall(case.stalls_s)
+    running = LiveOdometry(source, rig, config, [stall])
+    listener = Listener(running, folder)
+    running.start()
+    least = 1.0
+    while not running.wait(0.05):
+        least = min(least, float(running.status()["corner_share"] or 0.0))
+    running.stop()
+    listener.thread.join()
+    figures = running.status()
+    told = {name.removeprefix("incident_"): value for name, value in figures.items() if name.startswith("incident_")}
+    return [
+        str(figures["framesets"]),
+        str(int(figures["skipped_late"] or 0) + int(figures["skipped_no_room"] or 0)),
+        f"{100 * least:.0f}",
+        *(f"{figures[name]:.1f}" for name in ("latency_p50_ms", "latency_p99_all_ms", "latency_max_ms")),
+        str(listener.epochs),
+        f"{listener.error_mm:.0f}",
+        ", ".join(f"{kind} {count}" for kind, count in told.items()) or "nothing",
+    ]
+
+
+class _Stall(Output):
+    """Holds the output up, once."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._results = 0
+
+    def add_event(self, event: Event) -> None:
+        """Nothing."""
+
+    def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
+        """Sleep at the hundredth."""
+        self._results += 1
+        if self._seconds and self._results == 100:
+            time.sleep(self._seconds)
+
+    def add_incident(self, incident: Incident) -> None:
+        """Nothing."""
+
+    def status(self) -> Mapping[str, float | int | str | None]:
+        """Nothing."""
+        return {}
+
+
+def _killed(folder: Path, after_s: float) -> float:
+    """How much of a recording is lost, seconds, when the process is killed so long after its file appeared."""
+    with tempfile.TemporaryDirectory() as made:
+        out = Path(made) / "killed.mcap"
+        command = [sys.executable, "-c", "from graphvio.cli import main; main()", "live"]
+        process = subprocess.Popen(
+            [*command, f"simulator:{_SCENE}?recording={folder}", "--record", str(out)],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        while not out.exists() or not out.stat().st_size:
+            time.sleep(0.01)
+        begun_s = time.monotonic()
+        time.sleep(after_s)
+        os.kill(process.pid, signal.SIGKILL)
+        elapsed_s = time.monotonic() - begun_s
+        process.wait()
+        session = open_source(out)
+        framesets = [event for event in session if not isinstance(event, ImuSample)]
+        recorded_s = 1e-9 * (framesets[-1].stamp_ns - framesets[0].stamp_ns)
+        return max(0.0, elapsed_s - recorded_s)

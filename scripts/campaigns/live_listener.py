@@ -1,0 +1,78 @@
+"""Listens to a live run of a simulated scene that is walked to and fro, and holds it against the truth."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.geometry import se3_inverse
+from graphvio.live.running import LiveOdometry
+from graphvio.sources import open_source
+from graphvio.trajectory import Trajectory
+
+_STAGES = ("predict", "track", "motion", "judge", "renew", "update")
+
+
+class Listener:
+    """A thread that listens until the run has ended.
+
+    Args:
+        running: not started yet.
+        folder: of the recording, whose first frameset is the first estimate's.
+
+    Attributes:
+        work_ms: that the odometry took for each frameset.
+        statuses: of each.
+        error_mm: of the newest position, from the first pose on.
+        longest_gap_s: between estimates.
+        epochs: until now.
+        thread: that listens.
+    """
+
+    def __init__(self, running: LiveOdometry, folder: Path) -> None:
+        source = open_source(folder)
+        assert source.truth is not None
+        self.work_ms: list[float] = []
+        self.statuses: list[str] = []
+        self.error_mm = 0.0
+        self.longest_gap_s = 0.0
+        self.epochs = 0
+        self._first_ns: int | None = None
+        self._last_ns: int | None = None
+        self._start_ns, self._end_ns = source.start_ns, source.end_ns
+        self._truth = Trajectory.read(source.truth)
+        self._nav_T_world: Float | None = None
+        self._estimates = running.estimates.subscribe(256)
+        self.thread = threading.Thread(target=self._listen, daemon=True)
+        self.thread.start()
+
+    def _listen(self) -> None:
+        while not self._estimates.is_closed:
+            estimate = self._estimates.get(0.5)
+            if estimate is None:
+                continue
+            self._first_ns = estimate.stamp_ns if self._first_ns is None else self._first_ns
+            self.statuses.append(str(estimate.status))
+            if self._last_ns is not None:
+                self.longest_gap_s = max(self.longest_gap_s, 1e-9 * (estimate.stamp_ns - self._last_ns))
+            self._last_ns, self.epochs = estimate.stamp_ns, estimate.epoch + 1
+            if estimate.nav_T_body is None:
+                continue
+            self.work_ms.append(sum(estimate.stage_ms.get(stage, 0.0) for stage in _STAGES))
+            world_T_body = self._true_pose(estimate.stamp_ns)
+            if self._nav_T_world is None:
+                self._nav_T_world = estimate.nav_T_body @ se3_inverse(world_T_body)
+            apart = estimate.nav_T_body[:3, 3] - (self._nav_T_world @ world_T_body)[:3, 3]
+            self.error_mm = 1e3 * float(np.linalg.norm(apart))
+
+    def _true_pose(self, stamp_ns: int) -> Float:
+        """At the true pose's stamp nearest to this one's place in the walk to and fro."""
+        length_ns = self._end_ns - self._start_ns
+        assert self._first_ns is not None
+        along_ns = (stamp_ns - self._first_ns) % (2 * length_ns)  # whatever clock the stamps are of
+        wanted_ns = self._start_ns + min(along_ns, 2 * length_ns - along_ns)
+        at = int(np.argmin(np.abs(self._truth.stamps_ns - wanted_ns)))
+        return np.ascontiguousarray(self._truth.nav_T_body[at])
