@@ -205,6 +205,16 @@ def test_a_clock_that_goes_forward_a_little_is_followed_slowly() -> None:
     assert np.abs(rate[200:] - 1.0).max() < 1.1e-3
 
 
+def test_a_device_that_was_silent_goes_on() -> None:
+    """For ten minutes; its drift was known to a fraction of a ppm."""
+    before = drawn(60.0, seed=1, drift_ppm=150.0)
+    later = drawn(20.0, seed=2, begin_s=660.0, drift_ppm=150.0)
+    after = Messages(later.stamps_ns + round(660 * S / 1.00015), later.arrivals_ns, later.truth_ns)
+    run = feed(joined(before, after))
+    assert not run.reports
+    assert np.abs(errors_us(run, joined(before, after))[2000:]).max() < 300.0
+
+
 def test_a_busy_host_changes_nothing() -> None:
     """For ten seconds nothing comes less than 30 ms late."""
     messages = drawn(60.0, drift_ppm=50.0)

@@ -283,6 +283,14 @@ def test_a_pair_dies_and_returns() -> None:
     assert waits[72:].max() < 6.0
 
 
+def test_a_rig_that_was_silent_goes_on() -> None:
+    """For ten seconds, so that the first stamps afterwards have to be confirmed by the next ones."""
+    shots = [shot for shot in steady(count=300) if not 2000.0 <= shot.stamp_ms < 12000.0]
+    run = play(shots)
+    assert run.pairs == [[0, 1]] * 100
+    assert not run.reports
+
+
 def test_a_pair_that_never_came_is_not_waited_for() -> None:
     run = play([shot for shot in steady(count=60) if shot.camera < 2])
     assert run.pairs == [[0]] * 60
