@@ -15,6 +15,7 @@ from recordings import small_rig
 
 from graphvio.arrays import Image
 from graphvio.events import FrameSet
+from graphvio.live.clock import ClockMaps
 from graphvio.live.pairing import FramesetAssembler
 from graphvio.sources.matching import group_pairs, match_sides
 
@@ -143,7 +144,7 @@ def shuffled(draw: st.DrawFn) -> list[Shot]:
     """
     shots = []
     for pair in range(draw(st.integers(1, 3))):
-        stamp_ms = draw(st.sampled_from([0.0, 0.5, 1.5, 10.0, 25.0]))
+        stamp_ms = draw(st.sampled_from([0.0, 0.5, 1.5, 3.0, 10.0, 25.0]))
         period_ms = draw(st.sampled_from([20.0, 50.0]))
         skew_ms = draw(st.sampled_from([-2.0, 0.0, 0.7]))
         came = [0.0, 0.0]
@@ -186,6 +187,53 @@ def test_rules_hold_for_any_images(shots: list[Shot]) -> None:
     run = play(sorted(shots))
     again = play(sorted(shots))
     assert (run.numbers, run.reports) == (again.numbers, again.reports)
+
+
+def test_pairs_that_follow_each_other_within_the_tolerance() -> None:
+    """At 1.5, 0 and 3 ms: the third is none of the first two's, and their frameset steps back to make room."""
+    shots = [
+        Shot(50.0 * k + 10.0 + 0.1 * camera, camera, 50.0 * k + (1.5, 0.0, 3.0)[camera // 2])
+        for k in range(5)
+        for camera in range(6)
+    ]
+    run = play(shots, pairs=3)
+    assert run.stamps_ms == [50.0 * k + at for k in range(5) for at in (0.0, 3.0)]
+    assert [(f.stamp_ns, sorted(f.images)) for f in run.framesets] == as_recorded(shots, pairs=3)
+    assert not run.reports
+
+
+def test_two_devices_with_clocks_of_their_own() -> None:
+    """Pairs that are triggered together, on clocks 200 ppm apart; each has an IMU, too, and sends with jitter."""
+    rng = np.random.default_rng(4)
+    maps = ClockMaps(lambda *_: None)
+    messages = []  # arrival, device, stamp by it, camera or none
+    for device, drift in enumerate((-1e-4, 1e-4)):
+        for k in range(4000):
+            true_ms = 5.0 * k
+            stamp_ns = round(true_ms * MS * (1.0 + drift)) + device * 10**12
+            messages.append((true_ms + 1.0 + rng.exponential(1.0), device, stamp_ns, -1))
+            if k % 10 == 0:
+                for camera in (2 * device, 2 * device + 1):
+                    messages.append((true_ms + 25.0 + rng.exponential(3.0), device, stamp_ns, camera))
+    kinds: Counter[str] = Counter()
+    assembler = FramesetAssembler(
+        small_rig(2), TOLERANCE_MS, WAIT_MS, lambda stamp_ns, kind, detail: kinds.update([kind])
+    )
+    framesets = []
+    for arrival_ms, device, stamp_ns, camera in sorted(messages):
+        mapped = maps.map(f"device {device}", stamp_ns, ns(arrival_ms))
+        assert mapped is not None
+        if camera < 0:
+            framesets += assembler.advance(ns(arrival_ms))
+        else:
+            framesets += assembler.add(f"cam{camera}", mapped, numbered(0), ns(arrival_ms))
+    framesets += assembler.flush()
+    assert not kinds
+    settled = [each for each in framesets if each.stamp_ns > ns(980.0)]
+    assert [sorted(each.images) for each in settled] == [[0, 1]] * 380
+    errors_ms = [(each.stamp_ns - ns(1001.0 + 50.0 * k)) / MS for k, each in enumerate(settled)]
+    assert np.abs(errors_ms).max() < 1.0
+    assert np.abs(errors_ms[180:]).max() < 0.1
 
 
 # ------------------------------------------------------------------ what a frameset waits for
@@ -233,6 +281,14 @@ def test_a_pair_dies_and_returns() -> None:
     assert waits[20:40].max() <= WAIT_MS + 50.0 + 6.0  # the time is told by what comes
     assert waits[45:69].max() < 6.0  # nobody waits any more
     assert waits[72:].max() < 6.0
+
+
+def test_a_rig_that_was_silent_goes_on() -> None:
+    """For ten seconds, so that the first stamps afterwards have to be confirmed by the next ones."""
+    shots = [shot for shot in steady(count=300) if not 2000.0 <= shot.stamp_ms < 12000.0]
+    run = play(shots)
+    assert run.pairs == [[0, 1]] * 100
+    assert not run.reports
 
 
 def test_a_pair_that_never_came_is_not_waited_for() -> None:
@@ -291,6 +347,29 @@ def test_one_wild_stamp_stops_nothing() -> None:
     run = play(shots)
     assert run.stamps_ms == [50.0 * k for k in range(10) if k != 4]
     assert run.reports == {"image_future_stamp": 4}
+
+
+def test_a_stamp_that_is_wild_by_little_costs_a_pair_two_framesets() -> None:
+    """Its camera is not believed to be past all that follows, but for its next image."""
+    shots = [
+        Shot(
+            shot.arrival_ms,
+            shot.camera,
+            shot.stamp_ms + (3000.0 if (shot.camera, shot.stamp_ms) == (2, 200.0) else 0.0),
+        )
+        for shot in steady(count=20)
+    ]
+    run = play(shots)
+    assert run.pairs == [[0] if k in (4, 5) else [0, 1] for k in range(20)]
+    assert run.reports == {"image_without_partner": 3, "late_image": 1}
+
+
+def test_an_image_without_partner_does_not_move_the_stamp() -> None:
+    """Pair 1 is half a millisecond before pair 0, whose stamp counts."""
+    shots = steady(count=10, offset_ms=-0.5)
+    run = play(sorted([*shots, Shot(200.0, 2, 180.0)]))
+    assert run.stamps_ms == [50.0 * k for k in range(10)]
+    assert run.reports == {"image_without_partner": 1}
 
 
 def test_a_camera_that_is_not_in_the_rig() -> None:
