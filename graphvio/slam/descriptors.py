@@ -26,7 +26,7 @@ def describer(kind: Literal["orb", "sift", "none"]) -> Describe | None:
     if kind == "orb":
         orb = cv2.ORB.create(nlevels=1, edgeThreshold=_BORDER_PX - 1)
         return lambda image, pixels: _described(orb, 32, 2.0 * _RADIUS + 1.0, image, pixels)
-    sift = cv2.SIFT.create(0, 3, 0.04, 10.0, 1.6, cv2.CV_8U)  # type: ignore[call-overload]
+    sift = cv2.SIFT.create(0, 3, 0.04, 10.0, 1.6, cv2.CV_8U)
     return lambda image, pixels: _described(sift, 128, _SIFT_SIZE_PX, image, pixels)
 
 
