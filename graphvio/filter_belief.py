@@ -19,11 +19,12 @@ from graphvio.belief import Belief
 from graphvio.config import Config
 from graphvio.events import Status
 from graphvio.frontend.motion import RelativeMotion, VisualResult
-from graphvio.geometry import se3_inverse, skew
+from graphvio.geometry import se3_adjoint, se3_inverse, skew
 from graphvio.rig import Rig
 from graphvio.synchroniser import Report
 
 _ANCHOR_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
+_LEAST_GROWTH = 1e-4  # of a pose's covariance from frameset to frameset, as a share of it
 _UNKNOWN_RATE_SIGMA_RAD_S = 3.0
 _FORGOTTEN_SPEED_SIGMA_M_S = 30.0  # on foot or on the road
 
@@ -42,6 +43,7 @@ class FilterBelief(Belief):
         self._forgotten = np.zeros((3, 3))  # position covariance, nav, that resets took out of the filter
         self._before_outage = np.zeros((3, 3))  # position covariance, nav, when vision was last used
         self._poses: dict[int, Float] = {}  # nav_T_body at stamps that motions are measured from
+        self._covariances: dict[int, Float] = {}  # of these poses as they were known then
 
     # ------------------------------------------------------------------ what is known
 
@@ -76,8 +78,16 @@ class FilterBelief(Belief):
         return se3_inverse(self._filter.state.nav_T_body) @ self._poses[then_ns]
 
     def covariance_since(self, then_ns: int) -> Float | None:
-        """None: a filter knows no state but the newest."""
-        return None
+        """By what the pose's covariance has grown: a filter knows no state but the newest, and so no correlation. In
+        directions in which it has not grown, a little remains."""
+        now_T_then = self.motion_since(then_ns)
+        if now_T_then is None:
+            return None
+        to_now, now = se3_adjoint(now_T_then), self.covariance.pose
+        sigmas = np.sqrt(np.diag(now))
+        growth = (now - to_now @ self._covariances[then_ns] @ to_now.T) / np.outer(sigmas, sigmas)
+        sizes, directions = np.linalg.eigh(growth)
+        return np.asarray((directions * np.maximum(sizes, _LEAST_GROWTH)) @ directions.T * np.outer(sigmas, sigmas))
 
     def end(self) -> None:
         """See `Belief`: a filter never corrects a pose later."""
@@ -163,6 +173,8 @@ class FilterBelief(Belief):
         self._final.append((stamp_ns, pose))
         position = running.covariance[POSITION, POSITION] + self._forgotten
         self.covariance = self._state_covariance(position)
+        self._covariances = {ns: self._covariances[ns] for ns in self._poses if ns != stamp_ns}
+        self._covariances[stamp_ns] = self.covariance.pose
         if used:
             if self._lost:
                 self.epoch += 1

@@ -14,7 +14,7 @@ from graphvio.backend.initialisation import is_at_rest
 from graphvio.backend.propagation import Propagator
 from graphvio.belief import Belief
 from graphvio.config import Config
-from graphvio.errors import EventError
+from graphvio.errors import ConfigError, EventError
 from graphvio.events import (
     Estimate,
     Event,
@@ -77,6 +77,7 @@ class Odometry:
         self._rates = AngularRates()
         self._incidents: deque[Incident] = deque()  # appended to by any thread that corrects
         self._first_ns: int | None = None
+        self._newest_ns = 0  # stamp of the newest frameset that was worked on
         self._finished = False
 
     def process(self, event: Event) -> Estimate | None:
@@ -142,7 +143,13 @@ class Odometry:
 
     def limit_corners(self, share: float) -> None:
         """Follow only a share, above 0 and up to 1, of the corners that the configuration asks for, from now on: for
-        real time, where time does not suffice. From the thread that calls `process`."""
+        real time, where time does not suffice. From the thread that calls `process`.
+
+        Raises:
+            ConfigError: if it is no such share.
+        """
+        if not 0.0 < share <= 1.0:
+            raise ConfigError(f"a share of {share} of the corners cannot be followed; give more than 0, and at most 1")
         self._frontend.limit_corners(share)
 
     # ------------------------------------------------------------------ for SLAM
@@ -177,7 +184,7 @@ class Odometry:
         result = self._keyframes.map_frame.correct(keyframe_id, map_T_body, covariance)
         if result.reason:
             kind = "map_moved" if result.accepted else "correction_refused"
-            self._report(self._belief.latest_ns if self._belief.has_started else 0, kind, result.reason)
+            self._report(self._newest_ns, kind, result.reason)
         return result
 
     @property
@@ -187,17 +194,16 @@ class Odometry:
 
     def map_T_body(self, stamp_ns: int) -> Float | None:
         """Where the rig is in the map (4, 4), or None where `predict` has no pose or the map is not known."""
-        prediction, map_T_odom = self.predict(stamp_ns), self.map_T_odom
-        if prediction is None or map_T_odom is None or prediction.epoch != self._keyframes.map_frame.epoch:
-            return None
-        return map_T_odom @ prediction.nav_T_body
+        prediction = self.predict(stamp_ns)
+        map_T_odom = None if prediction is None else self._keyframes.map_frame.of_epoch(prediction.epoch)
+        return None if prediction is None or map_T_odom is None else map_T_odom @ prediction.nav_T_body
 
     # ------------------------------------------------------------------ one frameset
 
     def _estimate(self, frameset: FrameSet) -> Estimate:
         """Start or predict, measure the motion, gate and insert it, update."""
         start = perf_counter()
-        stamp_ns = frameset.stamp_ns
+        stamp_ns = self._newest_ns = frameset.stamp_ns
         if self._must_wait_for_imu(stamp_ns):
             return self._without_pose(stamp_ns, self._frontend.process(frameset, self._belief.motion_since))
         starting, span, starts = self._must_start(stamp_ns), None, self._belief.starts
@@ -214,9 +220,11 @@ class Odometry:
         at_rest = visual.at_rest and self._imu_is_at_rest(span)
         motion = self._belief.use(visual, at_rest)
         used = motion is not None or starting
-        references, before = self._frontend.reference_stamps_ns, self._keyframes.previous_ns
-        is_reference = stamp_ns in references
-        status = self._belief.update(stamp_ns, used, references | {before} if is_reference and before else references)
+        before_ns = self._keyframes.previous_ns
+        kept = self._frontend.reference_stamps_ns | (set() if before_ns is None else {before_ns})
+        status = self._belief.update(stamp_ns, used, kept)
+        self._keyframes.map_frame.begin(self._belief.epoch)
+        references = self._frontend.reference_stamps_ns  # others than before where the window was rebuilt
         self._synchroniser.forget_before(stamp_ns)
         self._predict_from(stamp_ns, status)
         self._time_offset.update(stamp_ns, visual)
@@ -239,8 +247,8 @@ class Odometry:
                     references=references,
                 )
             )
-        if is_reference:
-            self._add_keyframe(estimate, frameset, before)
+        if stamp_ns in references:
+            self._add_keyframe(estimate, frameset, before_ns)
         return estimate
 
     def _add_keyframe(self, estimate: Estimate, frameset: FrameSet, before_ns: int | None) -> None:

@@ -156,7 +156,9 @@ def test_a_switch_is_true_or_false(value: str) -> None:
 def another(value: object) -> object:
     """Another value in the same range."""
     if isinstance(value, str):
-        return {"joint": "best_pair", "previous": "keyframe", "smoother": "filter", "estimated": "none"}[value]
+        return {"joint": "best_pair", "previous": "keyframe", "smoother": "filter", "estimated": "none", "orb": "sift"}[
+            value
+        ]
     if isinstance(value, bool):
         return not value
     if isinstance(value, int):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterator
 
@@ -64,7 +65,7 @@ class KeyframeLog:
                 self._changed.wait(left)
             if self._next_id <= from_id or not self._kept:
                 return None
-            return self._kept[max(from_id - self._kept[0].id, 0)]
+            return self._kept[bisect_left(self._kept, from_id, key=lambda kept: kept.id)]
 
     def follow(self, from_id: int) -> Iterator[Keyframe]:
         """Keyframes from an id on as they come, until the log is closed; ids that are gone are passed over."""

@@ -77,8 +77,10 @@ class Keyframes:
         if self._previous is None or self._previous.stamp_ns != self.previous_ns:
             motion = None  # it is from a reference that was no keyframe
         self.previous_ns = estimate.stamp_ns
-        if not self._are_wanted or estimate.nav_T_body is None or estimate.status is Status.INITIALISING:
+        if not self._are_wanted or estimate.nav_T_body is None:
             return
+        if estimate.status is Status.INITIALISING and self._rig.imu is not None:
+            return  # attitude and velocity may jump yet; vision alone has nothing that could
         assert estimate.covariance is not None
         previous = self._previous
         if previous is not None and previous.epoch != estimate.epoch:

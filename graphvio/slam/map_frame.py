@@ -2,14 +2,15 @@
 
 The unknown is ``map_T_odom``. What odometry drifts from one keyframe to the next makes it walk; a correction measures
 it at its keyframe. All covariances are taken to the tangent in odom, where they add up, so that corrections may come in
-any order: they are taken in by a Kalman filter in the order of their keyframes, anew from the one that came late.
+any order: a Kalman filter takes them in by the order of their keyframes, anew when one came late. Corrections are taken
+for independent of each other.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -35,11 +36,23 @@ class _Passed:
 
 @dataclass(frozen=True, eq=False)
 class _Correction:
-    """``map_T_odom`` as a correction of a keyframe has it, and its covariance (6, 6), tangent in odom."""
+    """``map_T_odom`` as a correction of a keyframe, or several up to there, have it.
 
+    Attributes:
+        epoch: of the keyframe.
+        keyframe_id: of it.
+        map_T_odom: (4, 4).
+        covariance: (6, 6), tangent in odom.
+        drift: the odometry's until there, (6, 6); kept here because the keyframe may be forgotten sooner.
+        is_many: whether it stands for several.
+    """
+
+    epoch: int
     keyframe_id: int
     map_T_odom: Float
     covariance: Float
+    drift: Float
+    is_many: bool = False
 
 
 class MapFrame:
@@ -55,7 +68,7 @@ class MapFrame:
         self._epoch: int | None = None
         self._passed: dict[int, _Passed] = {}
         self._accepted: list[_Correction] = []  # in the order of keyframes
-        self._refused: list[_Correction] = []  # since the last one that was accepted
+        self._refused: list[_Correction] = []  # since the last one that was accepted, the newest of each keyframe
         self._agreement = _FIRST_AGREEMENT
         self._belief: _Correction | None = None  # what all that were accepted say together, at the last one's keyframe
 
@@ -63,25 +76,29 @@ class MapFrame:
     def map_T_odom(self) -> Float | None:
         """(4, 4), or None before the epoch's first correction."""
         belief = self._belief
-        return None if belief is None else belief.map_T_odom
+        return None if belief is None else belief.map_T_odom.copy()
 
-    @property
-    def epoch(self) -> int | None:
-        """The epoch that it is of."""
-        return self._epoch
+    def of_epoch(self, epoch: int) -> Float | None:
+        """The same (4, 4) for an epoch's odom frame; None if it is known of none or of another one."""
+        belief = self._belief  # read once: with its epoch, since the next one may begin at any time
+        return None if belief is None or belief.epoch != epoch else belief.map_T_odom.copy()
 
-    def add(self, keyframe: Keyframe) -> None:
-        """The next keyframe; one of a new epoch ends what was known of the old one."""
-        with self._lock:
-            if keyframe.epoch != self._epoch:
-                self._epoch = keyframe.epoch
+    def begin(self, epoch: int) -> None:
+        """An epoch runs; a new one ends what was known of the old one."""
+        if epoch != self._epoch:
+            with self._lock:
+                self._epoch = epoch
                 self._passed, self._accepted, self._refused = {}, [], []
                 self._agreement, self._belief = _FIRST_AGREEMENT, None
+
+    def add(self, keyframe: Keyframe) -> None:
+        """The next keyframe."""
+        self.begin(keyframe.epoch)
+        with self._lock:
             drift = np.zeros((6, 6))
-            if self._passed and keyframe.relative_covariance is not None:
-                to_odom = se3_adjoint(keyframe.odom_T_body)
-                step = to_odom @ keyframe.relative_covariance @ to_odom.T
-                drift = self._passed[next(reversed(self._passed))].drift + step
+            if self._passed:
+                last = self._passed[next(reversed(self._passed))]
+                drift = last.drift + _drifted(last.odom_T_body, keyframe)
             self._passed[keyframe.id] = _Passed(keyframe.odom_T_body, drift)
             if len(self._passed) > _MOST_KEYFRAMES:
                 del self._passed[next(iter(self._passed))]
@@ -104,19 +121,27 @@ class MapFrame:
         with self._lock:
             if keyframe_id not in self._passed:
                 return self._refusal(f"keyframe {keyframe_id} is not of the newest epoch, or too old, or never was")
-            odom_T_body = self._passed[keyframe_id].odom_T_body
-            to_odom = se3_adjoint(odom_T_body)
-            offered = _Correction(keyframe_id, map_T_body @ se3_inverse(odom_T_body), to_odom @ covariance @ to_odom.T)
+            assert self._epoch is not None
+            passed = self._passed[keyframe_id]
+            to_odom = se3_adjoint(passed.odom_T_body)
+            offered = _Correction(
+                self._epoch,
+                keyframe_id,
+                map_T_body @ se3_inverse(passed.odom_T_body),
+                to_odom @ covariance @ to_odom.T,
+                passed.drift,
+            )
             if self._belief is None:
                 return self._accept(offered, None)
-            statistic = self._distance(self._belief, offered)
+            statistic = _distance(self._expected_at(offered), offered)
             if statistic <= self._threshold:
                 return self._accept(offered, statistic)
-            self._refused.append(offered)
+            # Said again of one keyframe, it is no second witness.
+            self._refused = [*(each for each in self._refused if each.keyframe_id != keyframe_id), offered]
             newest = self._refused[-self._agreement :]
             if len(newest) == self._agreement and self._agree(newest):
                 self._agreement *= 2
-                self._accepted = newest[:-1]
+                self._accepted, self._belief = newest[:-1], None
                 return self._accept(
                     offered, statistic, f"{len(newest)} refused corrections in a row agree: the map moves"
                 )
@@ -127,51 +152,81 @@ class MapFrame:
             )
 
     def _accept(self, offered: _Correction, statistic: float | None, reason: str = "") -> CorrectionResult:
-        others = [each for each in self._accepted if each.keyframe_id != offered.keyframe_id]
+        others = [each for each in self._accepted if each.is_many or each.keyframe_id != offered.keyframe_id]
+        belief, count = self._belief, len(self._accepted)
         self._accepted = sorted([*others, offered], key=lambda each: each.keyframe_id)
         self._refused = []
-        self._belief = self._fused(self._accepted)
+        if belief is None or belief.keyframe_id > offered.keyframe_id or len(self._accepted) != count + 1:
+            self._belief = _fused(self._accepted)
+        else:
+            self._belief = _fused([belief, offered])
         if len(self._accepted) > _MOST_CORRECTIONS:  # the older half becomes one
             half = self._accepted[: _MOST_CORRECTIONS // 2]
-            self._accepted = [self._fused(half), *self._accepted[len(half) :]]
-        return CorrectionResult(True, reason, statistic, self._threshold, self._belief.map_T_odom)
+            self._accepted = [replace(_fused(half), is_many=True), *self._accepted[len(half) :]]
+        return CorrectionResult(True, reason, statistic, self._threshold, self.map_T_odom)
 
     def _refusal(self, reason: str, statistic: float | None = None) -> CorrectionResult:
         return CorrectionResult(False, reason, statistic, self._threshold, self.map_T_odom)
 
-    def _fused(self, corrections: Sequence[_Correction]) -> _Correction:
-        """What corrections in the order of their keyframes say together, at the last one's."""
-        belief = corrections[0]
-        for offered in corrections[1:]:
-            prior = belief.covariance + self._drift(belief, offered)
-            gain = np.linalg.solve(prior + offered.covariance, prior).T
-            step = gain @ _difference(belief, offered)
-            rest = np.eye(6) - gain
-            belief = _Correction(
-                offered.keyframe_id,
-                belief.map_T_odom @ se3_exp(step),
-                rest @ prior @ rest.T + gain @ offered.covariance @ gain.T,
-            )
-        return belief
+    def _expected_at(self, offered: _Correction) -> _Correction:
+        """What all that were accepted say at the keyframe of one more: those before it and those after it."""
+        assert self._belief is not None
+        if self._belief.keyframe_id <= offered.keyframe_id:
+            return _carried(self._belief, offered)
+        before = [each for each in self._accepted if each.keyframe_id <= offered.keyframe_id]
+        after = [each for each in self._accepted if each.keyframe_id > offered.keyframe_id]
+        return _fused([_carried(_fused(side), offered) for side in (before, after[::-1]) if side])
 
     def _agree(self, corrections: Sequence[_Correction]) -> bool:
         last = corrections[-1]
-        return all(self._distance(each, last) <= self._threshold for each in corrections[:-1])
+        return all(_distance(each, last) <= self._threshold for each in corrections[:-1])
 
-    def _distance(self, one: _Correction, other: _Correction) -> float:
-        """Squared Mahalanobis distance."""
-        difference = _difference(one, other)
-        covariance = one.covariance + other.covariance + self._drift(one, other)
-        return float(difference @ np.linalg.solve(covariance, difference))
 
-    def _drift(self, one: _Correction, other: _Correction) -> Float:
-        """What odometry may have drifted between two keyframes, (6, 6), tangent in odom."""
-        oldest = next(iter(self._passed.values()))
-        first, last = (
-            self._passed.get(each.keyframe_id, oldest).drift
-            for each in sorted((one, other), key=lambda each: each.keyframe_id)
+def _fused(corrections: Sequence[_Correction]) -> _Correction:
+    """What corrections say together at the last one's keyframe; their keyframes go forward, or all back."""
+    belief = corrections[0]
+    for offered in corrections[1:]:
+        prior = belief.covariance + _drift(belief, offered)
+        gain = np.linalg.solve(prior + offered.covariance, prior).T
+        step = gain @ _difference(belief, offered)
+        rest = np.eye(6) - gain
+        belief = replace(
+            offered,
+            map_T_odom=belief.map_T_odom @ se3_exp(step),
+            covariance=rest @ prior @ rest.T + gain @ offered.covariance @ gain.T,
         )
-        return np.asarray(last - first)
+    return belief
+
+
+def _carried(belief: _Correction, to: _Correction) -> _Correction:
+    """A belief at another's keyframe."""
+    return replace(to, map_T_odom=belief.map_T_odom, covariance=belief.covariance + _drift(belief, to))
+
+
+def _distance(one: _Correction, other: _Correction) -> float:
+    """Squared Mahalanobis distance."""
+    difference = _difference(one, other)
+    covariance = one.covariance + other.covariance + _drift(one, other)
+    return float(difference @ np.linalg.solve(covariance, difference))
+
+
+def _drift(one: _Correction, other: _Correction) -> Float:
+    """What odometry may have drifted between two keyframes, (6, 6), tangent in odom."""
+    first, last = sorted((one, other), key=lambda each: each.keyframe_id)
+    return np.asarray(last.drift - first.drift)
+
+
+def _drifted(odom_T_previous: Float, keyframe: Keyframe) -> Float:
+    """What odometry may have drifted from the keyframe before to this one, (6, 6), tangent in odom.
+
+    Poses in odom are causal. By what the keyframe before has been corrected since then, odom moved: no part of the
+    relative covariance, and often more than it.
+    """
+    if keyframe.previous_T_body is None or keyframe.relative_covariance is None:
+        return np.zeros((6, 6))
+    moved = se3_inverse(keyframe.previous_T_body) @ se3_inverse(odom_T_previous) @ keyframe.odom_T_body
+    shift, to_odom = se3_log(moved), se3_adjoint(keyframe.odom_T_body)
+    return np.asarray(to_odom @ (keyframe.relative_covariance + np.outer(shift, shift)) @ to_odom.T)
 
 
 def _difference(one: _Correction, other: _Correction) -> Float:
@@ -179,7 +234,10 @@ def _difference(one: _Correction, other: _Correction) -> Float:
 
 
 def _checked(map_T_body: Float, covariance: Float) -> tuple[Float, Float]:
-    pose, spread = (np.array(each, dtype=np.float64) for each in (map_T_body, covariance))
+    try:
+        pose, spread = (np.array(each, dtype=np.float64) for each in (map_T_body, covariance))
+    except (TypeError, ValueError):
+        raise EventError("map_T_body or covariance is no array of numbers; give (4, 4) and (6, 6)") from None
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise EventError(f"map_T_body has shape {pose.shape}, or holds NaN; give a rigid transform (4, 4)")
     rotation = pose[:3, :3]
