@@ -15,7 +15,6 @@ from graphvio.sessions import cdr
 
 _DOMAIN_VARIABLE: Final = "ROS_DOMAIN_ID"
 _LAST_DOMAIN: Final = 232
-_AT_ONCE: Final = 64
 _NS_PER_S: Final = 1_000_000_000
 
 
@@ -68,7 +67,7 @@ class Reader:
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
         from cyclonedds.sub import DataReader
 
-        self.topic, self.type_name = topic, type_name
+        self.topic, self.type_name, self._depth = topic, type_name, profile.depth
         self._reader = DataReader(node.participant, node.topic(topic, type_name), qos=profile.dds())
         self.ready = ReadCondition(self._reader, SampleState.Any | ViewState.Any | InstanceState.Any)
 
@@ -76,7 +75,7 @@ class Reader:
         """What came since the last call, the oldest first."""
         return [
             Sample(each.data, each.sample_info.source_timestamp)
-            for each in self._reader.take(_AT_ONCE)
+            for each in self._reader.take(self._depth)
             if each.sample_info.valid_data
         ]
 

@@ -158,17 +158,24 @@ def _frame(info: Any, topic: str) -> str:
 
 
 def _transforms(store: Store) -> dict[tuple[str, str], Float]:
-    """(parent, child) -> ``parent_T_child`` of all static transforms, both ways."""
+    """All static transforms, as `transforms_in` has them."""
     made: dict[tuple[str, str], Float] = {}
     for topic in store.topics.values():
         if topic.type_name != TRANSFORMS or not topic.name.endswith("tf_static"):
             continue
         for place in topic.places:
-            for each in cdr.decode(store.read(place), TRANSFORMS, store.path).transforms:
-                q, t = each.transform.rotation, each.transform.translation
-                pose = se3(rotation_from_quat_wxyz(np.array([q.w, q.x, q.y, q.z])), np.array([t.x, t.y, t.z]))
-                parent, child = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
-                made[parent, child], made[child, parent] = pose, se3_inverse(pose)
+            made.update(transforms_in(cdr.decode(store.read(place), TRANSFORMS, store.path)))
+    return made
+
+
+def transforms_in(message: Any) -> dict[tuple[str, str], Float]:
+    """(parent, child) -> ``parent_T_child`` (4, 4) of a ``TFMessage``, both ways."""
+    made: dict[tuple[str, str], Float] = {}
+    for each in message.transforms:
+        q, t = each.transform.rotation, each.transform.translation
+        pose = se3(rotation_from_quat_wxyz(np.array([q.w, q.x, q.y, q.z])), np.array([t.x, t.y, t.z]))
+        parent, child = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
+        made[parent, child], made[child, parent] = pose, se3_inverse(pose)
     return made
 
 
