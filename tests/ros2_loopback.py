@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -175,8 +177,38 @@ def robot(domain: int) -> None:
         print("sent", flush=True)
 
 
+def slam(domain: int) -> None:
+    """Hears the odometry, and corrects it; a line is a command, as JSON."""
+    here = Participant(domain)
+    kinds = {
+        "/graphvio/odometry": "nav_msgs/msg/Odometry",
+        "/graphvio/path": "nav_msgs/msg/Path",
+        "/graphvio/landmarks": "sensor_msgs/msg/PointCloud2",
+        "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+        "/tf": "tf2_msgs/msg/TFMessage",
+        "/tf_static": "tf2_msgs/msg/TFMessage",
+    }
+    readers = {name: here.reader(name, kind, is_latched=name == "/tf_static") for name, kind in kinds.items()}
+    corrections = here.writer("/graphvio/correction", "geometry_msgs/msg/PoseWithCovarianceStamped")
+    print(until(lambda: all(each.get_matched_publications() for each in readers.values())), flush=True)
+    for line in sys.stdin:
+        command = json.loads(line)
+        if "take" in command:
+            got = [asdict(sample) for sample in readers[command["take"]].take(1000)]
+            print(json.dumps(got), flush=True)
+            continue
+        from graphvio.sessions import cdr, messages
+
+        pose = messages.pose_with_covariance(np.array(command["map_T_body"]), np.eye(6))
+        pose.covariance = np.array(command["covariance"])  # as ROS has it
+        stamped = messages.header(command["stamp_ns"], command["frame"])
+        until(lambda: bool(corrections.get_matched_subscriptions()))
+        corrections.write(foreign(cdr.make("geometry_msgs/msg/PoseWithCovarianceStamped", header=stamped, pose=pose)))
+        print("{}", flush=True)
+
+
 IMU_PLACE = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """``base_link_T_imu_link``: turned to the left."""
 
 if __name__ == "__main__":
-    {"robot": robot}[sys.argv[1]](int(sys.argv[2]))
+    {"robot": robot, "slam": slam}[sys.argv[1]](int(sys.argv[2]))

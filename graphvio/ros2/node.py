@@ -140,7 +140,7 @@ class Node:
 
         self.domain = domain
         try:
-            self.participant = DomainParticipant(domain)
+            self.participant: Any = DomainParticipant(domain)
         except DDSException as error:
             raise SourceError(
                 f"DDS domain {domain}: cannot be joined ({error.msg or error}); check the network, and what "
@@ -149,7 +149,7 @@ class Node:
         self._lock = threading.Lock()
         self._topics: dict[tuple[str, str], Any] = {}
         self._waitset_class = WaitSet
-        self._stop = GuardCondition(self.participant)
+        self._stop: Any = GuardCondition(self.participant)
 
     def topic(self, name: str, type_name: str) -> Any:
         """The topic of DDS; one object for all who use it."""
@@ -192,7 +192,14 @@ class Node:
 
     def stop(self) -> None:
         """Wake all waiters, now and from now on; from any thread."""
-        self._stop.set(True)
+        if self._stop is not None:
+            self._stop.set(True)
+
+    def leave(self) -> None:
+        """Hold the domain no more: it is left when readers and writers are gone, too."""
+        with self._lock:
+            self._topics.clear()
+            self._stop = self.participant = None
 
 
 class Waiter:
