@@ -127,7 +127,8 @@ def _qos(is_latched: bool, is_reliable: bool) -> Any:
 def robot(domain: int) -> None:
     """Publishes a rig's cameras, in several encodings, its IMU, camera_info and tf_static.
 
-    ``K`` sends frameset K; ``await /A /B`` waits until somebody listens to all topics whose names begin so.
+    ``K`` sends frameset K; ``cut`` an image without its end; ``await /A /B`` waits until somebody listens to all
+    topics whose names begin so.
     """
     import cv2
     from recordings import SIZE_PX, noise_image, small_rig
@@ -153,6 +154,12 @@ def robot(domain: int) -> None:
             named = zip([*topics, "/imu"], [*images, imu], strict=True)
             awaited = [writer for topic, writer in named if topic.startswith(tuple(line.split()[1:]))]
             print(until(lambda: all(writer.get_matched_subscriptions() for writer in awaited)), flush=True)  # noqa: B023
+            continue
+        if line.strip() == "cut":
+            message = messages.image(START_NS, "cam0", noise_image(0, SIZE_PX))
+            message.data = message.data[:100]
+            images[0].write(foreign(message))
+            print("sent", flush=True)
             continue
         number = int(line)
         stamp_ns = START_NS + number * PERIOD_NS

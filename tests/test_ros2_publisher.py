@@ -35,7 +35,9 @@ class Running:
     """What is served of an odometry, with poses that the test makes."""
 
     def __init__(self) -> None:
-        self.rig = small_rig()
+        rig = small_rig()
+        first = replace(rig.pairs[0], left=replace(rig.pairs[0].left, name="/front/left/image_raw"))
+        self.rig = replace(rig, pairs=(first, rig.pairs[1]))
         self.estimates: Broadcast[Estimate] = Broadcast()
         self.predictions: Broadcast[Prediction] = Broadcast()
         self.incidents: Broadcast[Incident] = Broadcast()
@@ -91,7 +93,7 @@ class System:
 
     def __init__(self, domain: int) -> None:
         self.running = Running()
-        self.publisher = Publisher(self.running, domain)
+        self.publisher = Publisher(self.running, domain, body="imu_link")
         self.other = Other("slam", domain)
         assert self.other.hear() == "True"
         self._taken: dict[str, list[Any]] = {}
@@ -150,7 +152,7 @@ def test_poses_transforms_and_path_are_published(system: System) -> None:
         assert each.covariance is not None
         assert each.velocity_nav is not None
         assert (stamp_of(told["header"]), told["header"]["frame_id"]) == (each.stamp_ns, "odom")
-        assert told["child_frame_id"] == "base_link"
+        assert told["child_frame_id"] == "imu_link"
         np.testing.assert_allclose(pose_in(told["pose"]["pose"], "orientation", "position"), each.nav_T_body)
         covariance = np.array(told["pose"]["covariance"]).reshape(6, 6)
         R = each.nav_T_body[:3, :3]
@@ -159,7 +161,7 @@ def test_poses_transforms_and_path_are_published(system: System) -> None:
         linear = told["twist"]["twist"]["linear"]
         np.testing.assert_allclose([linear["x"], linear["y"], linear["z"]], R.T @ each.velocity_nav)
         (link,) = moved["transforms"]
-        assert (link["header"]["frame_id"], link["child_frame_id"]) == ("odom", "base_link")
+        assert (link["header"]["frame_id"], link["child_frame_id"]) == ("odom", "imu_link")
         assert stamp_of(link["header"]) == each.stamp_ns
         np.testing.assert_allclose(pose_in(link["transform"], "rotation", "translation"), each.nav_T_body)
     assert until(lambda: any(len(each["poses"]) == 10 for each in system.all_of(PATH)))
@@ -173,7 +175,7 @@ def test_the_cameras_places_are_told_to_those_who_come_late(system: System) -> N
     assert until(lambda: len(system.all_of("/tf_static")) == 1)
     (told,) = system.all_of("/tf_static")
     for link, camera in zip(told["transforms"], system.running.rig.cameras, strict=True):
-        assert (link["header"]["frame_id"], link["child_frame_id"]) == ("base_link", camera.name)
+        assert (link["header"]["frame_id"], link["child_frame_id"]) == ("imu_link", camera.name.lstrip("/"))
         np.testing.assert_allclose(pose_in(link["transform"], "rotation", "translation"), camera.body_T_cam, atol=1e-12)
 
 
@@ -194,7 +196,7 @@ def test_keyframes_go_out_and_their_corrections_come_in(system: System) -> None:
         system.running.keyframe_log.add(each)
     assert until(lambda: len(system.all_of(LANDMARKS)) == 4)
     for cloud, each in zip(system.all_of(LANDMARKS), keyframes, strict=True):
-        assert (stamp_of(cloud["header"]), cloud["header"]["frame_id"]) == (each.stamp_ns, "base_link")
+        assert (stamp_of(cloud["header"]), cloud["header"]["frame_id"]) == (each.stamp_ns, "imu_link")
         columns = {field["name"]: (field["offset"], field["datatype"]) for field in cloud["fields"]}
         assert columns == {"x": (0, 7), "y": (4, 7), "z": (8, 7), "track_id": (12, 6), "pair": (16, 6)}
         rows = np.array(cloud["data"], dtype=np.uint8).reshape(3, cloud["point_step"])

@@ -139,6 +139,23 @@ def test_samples_are_turned_into_body(domain: int, robot: Other) -> None:
     listening.end()
 
 
+def test_what_is_late_or_damaged_is_told(domain: int, robot: Other) -> None:
+    source = open_live_source(f"ros2:?domain={domain}", small_rig().with_pairs([0]))
+    source.open()
+    listening = Listening(source)
+    assert robot.do("await /imu /pair0") == "True"
+    for number in (7, 6, 8):
+        assert robot.do(str(number)) == "sent"
+    assert until(lambda: listening.count(ImuReading) == 30 and listening.count(CameraFrame) == 6)
+    assert until(lambda: [each.counts.get("late", 0) for each in source.health()] == [10, 1, 1])
+    assert robot.do("cut") == "sent"
+    assert until(lambda: listening.count(CameraFrame) == 7)
+    cut = [each for each in listening.heard if isinstance(each, CameraFrame)][-1]
+    with pytest.raises(SourceError, match=r"/pair0/left/image_raw: an image cannot be decoded .*cut short"):
+        cut.decode()
+    listening.end()
+
+
 def test_a_publisher_that_vanishes_is_told_and_read_on_when_it_is_back() -> None:
     domain = free_domain()
     robot = robot_on(domain)
@@ -200,3 +217,10 @@ def test_topics_that_are_not_published_are_named(domain: int, robot: Other) -> N
 def test_options_that_are_none_are_refused(text: str, told: str) -> None:
     with pytest.raises(SourceError, match=told):
         open_live_source(text, small_rig())
+
+
+def test_options_must_suit_the_rig() -> None:
+    with pytest.raises(SourceError, match="small has no IMU"):
+        open_live_source("ros2:?imu=/imu", small_rig().without_imu())
+    with pytest.raises(SourceError, match="body says what a rig that is given means"):
+        open_live_source("ros2:?body=base_link")

@@ -14,6 +14,7 @@ from rosbags.interfaces import Nodetype
 
 from graphvio.errors import SourceError
 from graphvio.ros2.node import domain_of
+from graphvio.ros2.qos import DEFAULT, SENSOR_DATA, TF, TF_STATIC, Profile
 from graphvio.ros2.types import (
     dds_topic,
     dds_type_name,
@@ -99,6 +100,24 @@ def test_names_are_those_of_ros() -> None:
     assert ros_topic("rt/front/image_raw") == "/front/image_raw"
     assert ros_topic("rq/some_serviceRequest") is None
     assert wire_type("sensor_msgs/msg/Image").__idl_typename__ == "sensor_msgs.msg.dds_.Image_"
+
+
+@pytest.mark.parametrize(
+    ("profile", "is_reliable", "is_latched"),
+    [(SENSOR_DATA, False, False), (DEFAULT, True, False), (TF, True, False), (TF_STATIC, True, True)],
+)
+def test_endpoints_offer_what_those_of_ros_do(profile: Profile, is_reliable: bool, is_latched: bool) -> None:
+    from cyclonedds.qos import Policy
+
+    offered = profile.dds("sensor_msgs/msg/Imu")
+    assert (offered[Policy.Reliability] == Policy.Reliability.BestEffort) != is_reliable
+    durability = Policy.Durability.TransientLocal if is_latched else Policy.Durability.Volatile
+    assert offered[Policy.Durability] == durability
+    assert offered[Policy.History] == Policy.History.KeepLast(profile.depth)
+    assert Policy.Partition not in offered
+    assert offered[Policy.Userdata].data == (  # of sensor_msgs/msg/Imu in ROS 2 Jazzy
+        b"typehash=RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b;"
+    )
 
 
 def test_the_domain_is_that_of_ros(monkeypatch: pytest.MonkeyPatch) -> None:

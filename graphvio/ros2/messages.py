@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from graphvio.sessions.cdr import make
-from graphvio.sessions.messages import BODY, ODOM, TRANSFORMS, header
+from graphvio.sessions.messages import ODOM, TRANSFORMS, header
 from graphvio.slam.keyframe import Keyframe
 
 PATH, POINTS = "nav_msgs/msg/Path", "sensor_msgs/msg/PointCloud2"
@@ -40,8 +40,8 @@ def path(stamp_ns: int, poses: Sequence[Any]) -> Any:
     return make(PATH, header=header(stamp_ns, ODOM), poses=list(poses))
 
 
-def landmarks(keyframe: Keyframe) -> Any:
-    """A keyframe's points as a ``sensor_msgs/PointCloud2`` in body, with the identities of their tracks."""
+def landmarks(keyframe: Keyframe, body: str) -> Any:
+    """A keyframe's points as a ``sensor_msgs/PointCloud2`` in body, a frame, with the identities of their tracks."""
     marks = keyframe.landmarks
     points = np.zeros(len(marks), dtype=_POINT)
     for k, axis in enumerate("xyz"):
@@ -60,7 +60,7 @@ def landmarks(keyframe: Keyframe) -> Any:
     ]
     return make(
         POINTS,
-        header=header(keyframe.stamp_ns, BODY),
+        header=header(keyframe.stamp_ns, body),
         height=1,
         width=len(points),
         fields=fields,

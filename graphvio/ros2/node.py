@@ -68,7 +68,7 @@ class Reader:
         from cyclonedds.sub import DataReader
 
         self.topic, self.type_name, self._depth = topic, type_name, profile.depth
-        self._reader = DataReader(node.participant, node.topic(topic, type_name), qos=profile.dds())
+        self._reader = DataReader(node.participant, node.topic(topic, type_name), qos=profile.dds(type_name))
         self.ready = ReadCondition(self._reader, SampleState.Any | ViewState.Any | InstanceState.Any)
 
     def take(self) -> list[Sample]:
@@ -102,11 +102,11 @@ class Writer:
         from cyclonedds.pub import DataWriter
 
         self._type = wire_type(type_name)
-        self._writer = DataWriter(node.participant, node.topic(topic, type_name), qos=profile.dds())
+        self._writer = DataWriter(node.participant, node.topic(topic, type_name), qos=profile.dds(type_name))
         self.refused = 0
 
     def write(self, message: Any) -> None:
-        """Publish a message; it is dropped, and counted in ``refused``, where the reader does not keep up."""
+        """Publish a message; it is dropped, and counted in ``refused``, where there is no room for it."""
         from cyclonedds.core import DDSException
 
         try:

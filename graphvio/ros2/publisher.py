@@ -24,7 +24,6 @@ from graphvio.sessions.messages import (
     TRANSFORMS,
     odometry,
     pose_stamped,
-    static_transforms,
     transform,
 )
 from graphvio.slam.interface import Served
@@ -51,14 +50,17 @@ class Publisher:
         served: the odometry.
         domain: of DDS, or None for that of ``ROS_DOMAIN_ID``.
         namespace: what the names of graphvio's own topics begin with.
+        body: the name of the rig's body, which is the IMU's frame, among the frames of ROS.
 
     Raises:
         SourceError: if the domain cannot be joined.
         MissingExtraError: if the extra ``ros2`` is not installed.
     """
 
-    def __init__(self, served: Served, domain: int | None = None, namespace: str = "/graphvio") -> None:
-        self._served = served
+    def __init__(
+        self, served: Served, domain: int | None = None, namespace: str = "/graphvio", body: str = BODY
+    ) -> None:
+        self._served, self._body = served, body
         self._node = node = Node(domain_of(None) if domain is None else domain)
         self._writers = {
             ODOMETRY: node.writer(f"{namespace}/odometry", ODOMETRY, DEFAULT),
@@ -77,7 +79,7 @@ class Publisher:
         self._newest_s = time.monotonic()
         self._trouble = ""
         self._closing = threading.Event()
-        self._attempt(lambda: self._writers[_STATIC].write(static_transforms(host_ns(), served.rig)))
+        self._attempt(self._publish_places)
         tasks: dict[str, tuple[Callable[..., None], tuple[Any, ...]]] = {
             "poses": (self._publish_poses, ()),
             "keyframes": (self._publish_keyframes, ()),
@@ -110,6 +112,15 @@ class Publisher:
         """Close it."""
         self.close()
 
+    def _publish_places(self) -> None:
+        now_ns = host_ns()
+        # tf2 refuses names that begin with a slash, as those of cameras do that are called by their topics
+        stamped = [
+            transform(now_ns, self._body, camera.name.lstrip("/"), camera.body_T_cam)
+            for camera in self._served.rig.cameras
+        ]
+        self._writers[_STATIC].write(messages.transforms(stamped))
+
     def _publish_poses(self) -> None:
         due_s = time.monotonic()
         while not self._closing.is_set():
@@ -131,8 +142,10 @@ class Publisher:
         if estimate.epoch != self._epoch:
             self._epoch = estimate.epoch
             self._path.clear()
-        self._writers[ODOMETRY].write(odometry(estimate))
-        stamped = [transform(estimate.stamp_ns, ODOM, BODY, estimate.nav_T_body)]
+        told = odometry(estimate)
+        told.child_frame_id = self._body
+        self._writers[ODOMETRY].write(told)
+        stamped = [transform(estimate.stamp_ns, ODOM, self._body, estimate.nav_T_body)]
         map_T_odom = self._served.map_T_odom
         if map_T_odom is not None:
             stamped.append(transform(estimate.stamp_ns, MAP, ODOM, map_T_odom))
@@ -197,7 +210,7 @@ class Publisher:
             next_id = keyframe.id + 1
             self._corrections.know(keyframe)  # first: the landmarks may be answered by a correction at once
             if self._writers[POINTS].readers:
-                self._attempt(lambda: self._writers[POINTS].write(messages.landmarks(keyframe)))  # noqa: B023
+                self._attempt(lambda: self._writers[POINTS].write(messages.landmarks(keyframe, self._body)))  # noqa: B023
 
     def _take_corrections(self, waiter: Waiter, reader: Reader) -> None:
         while not self._closing.is_set():

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from graphvio.sessions import cdr
+
 
 @dataclass(frozen=True, slots=True)
 class Profile:
@@ -20,8 +22,11 @@ class Profile:
     is_reliable: bool = True
     is_latched: bool = False
 
-    def dds(self) -> Any:
-        """The policies; writers never wait: what a slow reader has no room for is refused to the one who writes."""
+    def dds(self, type_name: str) -> Any:
+        """The policies of an endpoint; a writer never waits for readers that do not keep up.
+
+        ROS 2 from Iron on expects the type's hash in the user data; older ones ignore it.
+        """
         from cyclonedds.qos import Policy, Qos
 
         return Qos(
@@ -29,6 +34,7 @@ class Profile:
             Policy.Durability.TransientLocal if self.is_latched else Policy.Durability.Volatile,
             Policy.History.KeepLast(self.depth),
             Policy.DataRepresentation(use_cdrv0_representation=True),
+            Policy.Userdata(f"typehash={cdr.types().hash_rihs01(type_name)};".encode()),
         )
 
 

@@ -48,7 +48,7 @@ class SensorTopic:
         self.reader: Reader = node.reader(name, self.type_name, Profile(self.depth, is_reliable=is_reliable))
         self.frame = ""
         self._is_there = True
-        self._last_ns: int | None = None
+        self._newest_ns: int | None = None
         self._counts: dict[str, int] = {}
         self.health = DeviceHealth(name, True, self.type_name)
 
@@ -83,9 +83,10 @@ class SensorTopic:
             except SessionError:
                 self.count("damaged")
                 continue
-            if self._last_ns is not None and reading.stamp_ns <= self._last_ns:
+            if self._newest_ns is not None and reading.stamp_ns <= self._newest_ns:
                 self.count("late")
-            self._last_ns = reading.stamp_ns
+            else:
+                self._newest_ns = reading.stamp_ns
             yield reading
 
     def _reading(self, data: bytes, arrival_ns: int) -> ImuReading | CameraFrame:

@@ -60,6 +60,8 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> LiveSource:
     for name, topic in spec.options.items():
         if (name not in _OPTIONS or name == "imu") and not topic.startswith("/"):
             raise SourceError(f"ros2: {name}={topic} is no topic; topics begin with a slash, such as /{topic}")
+    if rig is not None and rig.imu is None and {"imu", "body"} & spec.options.keys():
+        raise SourceError(f"ros2: {rig.name} has no IMU; leave out imu and body, or give a rig that has one")
     if rig is None and "body" in spec.options:
         raise SourceError("ros2: body says what a rig that is given means; without one, body is the IMU's frame")
     return Ros2Source(spec, rig)
