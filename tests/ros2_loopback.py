@@ -147,7 +147,9 @@ def robot(domain: int) -> None:
     infos = [here.writer(f"{name}/camera_info", messages.CAMERA_INFO) for name in names]
     kinds = [messages.IMAGE, messages.IMAGE, messages.COMPRESSED, messages.COMPRESSED]
     topics = [f"{name}/image_raw" + ("/compressed" if k > 1 else "") for k, name in enumerate(names)]
-    images = [here.writer(name, kind, is_reliable=False) for name, kind in zip(topics, kinds, strict=True)]
+    images = [
+        here.writer(name, kind, is_reliable=k > 1) for k, (name, kind) in enumerate(zip(topics, kinds, strict=True))
+    ]
     print("ready", flush=True)
     for line in sys.stdin:
         if line.startswith("await"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Iterator
 
@@ -14,7 +15,7 @@ pytest.importorskip("rosbags")
 from recordings import SIZE_PX, noise_image, small_rig
 from ros2_loopback import PERIOD_NS, START_NS, URI, Other, free_domain, until
 
-from graphvio.errors import RigError, SourceError
+from graphvio.errors import MissingExtraError, RigError, SourceError
 from graphvio.live.source import CameraFrame, ImuReading, LiveSource, Notice, Reading
 from graphvio.live.sources import open_live_source
 from graphvio.live.sources.ros2 import list_devices
@@ -139,6 +140,24 @@ def test_samples_are_turned_into_body(domain: int, robot: Other) -> None:
     listening.end()
 
 
+def test_lost_samples_may_be_asked_for_again(domain: int, robot: Other) -> None:
+    rig = small_rig().with_pairs([1]).without_imu()
+    source = open_live_source(f"ros2:?domain={domain}&reliable=1", rig)
+    source.open()
+    listening = Listening(source)
+    assert robot.do("await /pair1") == "True"
+    assert robot.do("4") == "sent"
+    assert until(lambda: listening.count(CameraFrame) == 2)
+    listening.end()
+
+
+def test_a_network_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", URI.replace("'lo'", "'nosuch0'"))
+    source = open_live_source(f"ros2:?domain={free_domain()}", small_rig())
+    with pytest.raises(SourceError, match=r"DDS domain \d+: cannot be joined .*CYCLONEDDS_URI"):
+        source.open()
+
+
 def test_what_is_late_or_damaged_is_told(domain: int, robot: Other) -> None:
     source = open_live_source(f"ros2:?domain={domain}", small_rig().with_pairs([0]))
     source.open()
@@ -189,16 +208,16 @@ def test_what_is_published_is_listed(domain: int, robot: Other, monkeypatch: pyt
 
 def test_topics_that_are_not_published_are_named(domain: int, robot: Other) -> None:
     rig = small_rig()
-    absent = open_live_source(f"ros2:?domain={domain}&cam0=/front/image_raw&wait_s=1.5", rig)
+    absent = open_live_source(f"ros2:?domain={domain}&cam0=/front/image_raw&wait_s=2.5", rig)
     with pytest.raises(SourceError, match=r"nobody publishes /front/image_raw; topics on domain .* are .*/imu"):
         absent.open()
-    of_another_type = open_live_source(f"ros2:?domain={domain}&cam0=/imu&wait_s=2", rig)
+    of_another_type = open_live_source(f"ros2:?domain={domain}&cam0=/imu", rig)
     with pytest.raises(SourceError, match=r"/imu: has messages of type sensor_msgs/msg/Imu"):
         of_another_type.open()
-    reliable = open_live_source(f"ros2:?domain={domain}&reliable=1&wait_s=1.5", rig)
+    reliable = open_live_source(f"ros2:?domain={domain}&reliable=1", rig)
     with pytest.raises(SourceError, match="best effort"):
         reliable.open()
-    no_pair = open_live_source(f"ros2:?domain={domain}&left=/pair0/left/image_raw&wait_s=1.5")
+    no_pair = open_live_source(f"ros2:?domain={domain}&left=/pair0/left/image_raw&wait_s=2.5")
     with pytest.raises(RigError, match="no rig is told"):
         no_pair.open()
 
@@ -224,3 +243,10 @@ def test_options_must_suit_the_rig() -> None:
         open_live_source("ros2:?imu=/imu", small_rig().without_imu())
     with pytest.raises(SourceError, match="body says what a rig that is given means"):
         open_live_source("ros2:?body=base_link")
+
+
+def test_the_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cyclonedds", None)
+    for act in (lambda: open_live_source("ros2:", small_rig()), list_devices):
+        with pytest.raises(MissingExtraError, match=r"cyclonedds: install it with .*graphvio\[ros2\]"):
+            act()

@@ -124,9 +124,9 @@ class Ros2Source:
         topics = [SensorTopic(node, cameras[each.name], types, each.name, self._is_reliable) for each in rig.cameras]
         if rig.imu is not None and imu is not None:
             topics.insert(0, SensorTopic(node, imu, types, None, self._is_reliable))
-        while not all(each.reader.writers for each in topics):
-            if not wait(_POLL_S):
-                raise _no_writer(next(each for each in topics if not each.reader.writers), self.name)
+        while silent := [each for each in topics if not each.reader.writers]:
+            if silent[0].reader.refused_writers or not wait(_POLL_S):
+                raise _no_writer(silent[0], self.name)
         for each in topics:
             each.look()
         self._node, self._topics = node, topics
