@@ -128,7 +128,7 @@ def robot(domain: int) -> None:
     """Publishes a rig's cameras, in several encodings, its IMU, camera_info and tf_static.
 
     ``K`` sends frameset K; ``cut`` an image without its end; ``await /A /B`` waits until somebody listens to all
-    topics whose names begin so.
+    topics whose names begin so, and ``alone`` until nobody listens to any.
     """
     import cv2
     from recordings import SIZE_PX, noise_image, small_rig
@@ -152,6 +152,9 @@ def robot(domain: int) -> None:
     ]
     print("ready", flush=True)
     for line in sys.stdin:
+        if line.strip() == "alone":
+            print(until(lambda: not any(each.get_matched_subscriptions() for each in [*images, imu])), flush=True)
+            continue
         if line.startswith("await"):
             named = zip([*topics, "/imu"], [*images, imu], strict=True)
             awaited = [writer for topic, writer in named if topic.startswith(tuple(line.split()[1:]))]
@@ -205,6 +208,10 @@ def slam(domain: int) -> None:
         if "take" in command:
             got = [asdict(sample) for sample in readers[command["take"]].take(1000)]
             print(json.dumps(got), flush=True)
+            continue
+        if "alone" in command:
+            left = until(lambda: not any(each.get_matched_publications() for each in readers.values()))
+            print(json.dumps(left), flush=True)
             continue
         from graphvio.sessions import cdr, messages
 

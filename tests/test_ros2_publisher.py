@@ -121,7 +121,9 @@ class System:
     def close(self) -> None:
         self.publisher.close()
         self.publisher.close()
+        has_left = self.other.do(json.dumps({"alone": True}))
         self.other.end()
+        assert has_left == "true"
 
 
 @pytest.fixture

@@ -40,10 +40,17 @@ def domain() -> int:
 
 
 @pytest.fixture(scope="module")
-def robot(domain: int) -> Iterator[Other]:
+def robot_of_all(domain: int) -> Iterator[Other]:
     other = robot_on(domain)
     yield other
     other.end()
+
+
+@pytest.fixture
+def robot(robot_of_all: Other) -> Other:
+    """The robot of all tests, once it has seen that nobody listens any more."""
+    assert robot_of_all.do("alone") == "True"
+    return robot_of_all
 
 
 class Listening:
