@@ -46,3 +46,7 @@ class OptimizationError(GraphvioError):
 
 class FleetError(GraphvioError):
     """Sessions cannot be listed, their files not be reached, or the workers not be used."""
+
+
+class ServiceError(GraphvioError):
+    """A service cannot be offered or reached, refuses a client, or was told something malformed."""
