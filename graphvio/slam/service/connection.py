@@ -164,6 +164,7 @@ def _transport() -> list[tuple[str, int]]:
         ("grpc.max_reconnect_backoff_ms", 2_000),
         ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
         ("grpc.keepalive_timeout_ms", _PONG_MS),
+        ("grpc.http2.ping_timeout_ms", _PONG_MS),  # else any other ping on its way puts it off to a minute
         ("grpc.http2.max_pings_without_data", 0),
     ]
 
