@@ -254,7 +254,7 @@ def test_a_slow_client_gets_new_estimates_and_all_that_it_missed_are_counted(
     assert numbers == sorted(numbers)
     assert numbers[-1] == published - 1
     assert sum(missed for _, missed in got) + len(got) == published
-    assert len(got) < 1000  # what the sockets hold, not what was published
+    assert len(got) < 50  # what is on its way, not what was published
 
 
 def test_publishing_never_waits_for_a_client_that_does_not_read(

@@ -17,6 +17,7 @@ from graphvio.slam.service.security import bearer
 from graphvio.slam.service.streams import RUN_KEY
 
 _MESSAGE_BYTES = 256 * 2**20
+_WINDOW_BYTES = 4096
 _KEEPALIVE_MS, _PONG_MS = 10_000, 5_000
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 2.0
 _TOO_LARGE = "larger than max"
@@ -156,6 +157,9 @@ def _may_pass(error: Any, has_begun: bool) -> bool:
 def _transport() -> list[tuple[str, int]]:
     return [
         ("grpc.max_receive_message_length", _MESSAGE_BYTES),
+        # With gRPC's own window, which grows, a slow client would read what is half a minute old and more.
+        ("grpc.http2.lookahead_bytes", _WINDOW_BYTES),
+        ("grpc.http2.bdp_probe", 0),
         ("grpc.enable_http_proxy", 0),  # robots are reached directly
         ("grpc.use_local_subchannel_pool", 1),  # one connection a client, not a process
         ("grpc.enable_retries", 0),

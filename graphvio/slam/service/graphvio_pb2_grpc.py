@@ -85,7 +85,9 @@ class FrontEndServicer:
 
     def StreamEstimates(self, request, context):
         """Where the rig is, from now on, until the odometry has ended. A client that is slow gets new ones and is told how
-        many it missed.
+        many it missed, as far as its own library lets it: what fits into its HTTP/2 window has left the server, and is
+        read however old it is. Take a small one (in gRPC's core: lookahead_bytes 4096, bdp_probe 0), or read in a thread
+        that keeps the newest.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

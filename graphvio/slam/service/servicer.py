@@ -20,7 +20,7 @@ from graphvio.slam.service.libraries import grpc, messages, stubs
 from graphvio.slam.service.streams import RUN_KEY, StreamLimit
 
 _LOOK_S = 0.25  # how soon a stream sees that its client is gone or the server stops
-_WAITING = {messages.RATE_FRAME: 4, messages.RATE_IMU: 16}
+_WAITING = {messages.RATE_FRAME: 2, messages.RATE_IMU: 16}
 _INCIDENTS_WAITING = 256
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
