@@ -189,8 +189,8 @@ def _read_certificates(path: Path) -> bytes:
     try:
         content = path.read_bytes()
         ssl.create_default_context(cadata=content.decode("ascii"))
+    except (ssl.SSLError, ValueError):  # before OSError, which SSLError is, too
+        raise ServiceError(f"{path}: holds no certificates; give a PEM file of those to be trusted") from None
     except OSError as error:
         raise ServiceError(f"{path}: cannot be read ({error.strerror}); give a PEM file of certificates") from None
-    except (ssl.SSLError, ValueError):
-        raise ServiceError(f"{path}: holds no certificates; give a PEM file of those to be trusted") from None
     return content

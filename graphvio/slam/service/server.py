@@ -10,6 +10,7 @@ from typing import Any, Self
 from graphvio.errors import ServiceError
 from graphvio.slam.interface import Served
 from graphvio.slam.service.libraries import grpc, stubs
+from graphvio.slam.service.malformed import MalformedInterceptor
 from graphvio.slam.service.options import ServiceOptions
 from graphvio.slam.service.security import read_token, server_credentials, token_interceptor
 from graphvio.slam.service.servicer import Servicer
@@ -73,6 +74,7 @@ class GrpcServer:
         options = self._options
         credentials = server_credentials(options)
         interceptors = [] if options.token_file is None else [token_interceptor(read_token(options.token_file))]
+        interceptors.append(MalformedInterceptor())
         threads = STREAMS_OF_A_CLIENT * options.max_clients + _CALL_THREADS
         pool = ThreadPoolExecutor(threads, thread_name_prefix="grpc")
         server = grpc.server(
