@@ -124,9 +124,9 @@ def run_live(
             health = HealthServer(running.status, port=health_port)
             stack.callback(health.close)
             typer.echo(f"health: http://{health.address}/healthz, metrics: http://{health.address}/metrics", err=True)
-        if services is not None:
-            for line in services.start(running, stack):
-                typer.echo(line, err=True)
+        started = None if services is None else services.start(running, stack)
+        for line in () if started is None else started.lines:
+            typer.echo(line, err=True)
         running.start()
         until = None if duration_s is None else monotonic() + duration_s
         with Dashboard(opened.name, running.incidents.subscribe(64)) as dashboard:
@@ -134,6 +134,8 @@ def run_live(
                 dashboard.draw(running.status(), running.devices)
         running.stop()
         figures = running.status()
+        if started is not None:
+            started.finish()
     typer.echo(line_of(figures))
     lost = {name: count for name, count in figures.items() if name.startswith(("skipped", "images_not", "imu_lost"))}
     typer.echo(
@@ -154,9 +156,12 @@ def run_live(
 
 def _viewer(stack: ExitStack, rig: Rig, view: bool, services: Services | None) -> Viewer | None:
     """The viewer that is asked for, or None."""
-    from graphvio.viewer import Viewer
+    from graphvio.viewer import Viewer, WebOptions
 
-    return stack.enter_context(Viewer(rig, spawn=True)) if view else None
+    web = None if services is None or services.web_port is None else WebOptions(port=services.web_port)
+    if web is not None:
+        typer.echo(f"browser: {web.url}", err=True)
+    return stack.enter_context(Viewer(rig, spawn=view, web=web)) if view or web is not None else None
 
 
 def _list() -> None:

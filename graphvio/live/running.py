@@ -93,7 +93,7 @@ class LiveOdometry:
         self.keyframe_log = KeyframeLog()
         self._source = source
         self._config = config
-        self._outputs = outputs
+        self._outputs = list(outputs)
         self._meter = Meter()
         self._odometry = Odometry(rig, config, on_prediction=self.predictions.publish)
         if wants_keyframes:
@@ -124,6 +124,10 @@ class LiveOdometry:
         self._watchdog = Watchdog(self._stages, config.live.stuck_s, self._tell_now)
 
     # ------------------------------------------------------------------ for its owner
+
+    def add_output(self, output: Output) -> None:
+        """Hand all to one more; before `start`."""
+        self._outputs.append(output)
 
     def start(self) -> None:
         """Start all threads."""
