@@ -146,9 +146,7 @@ def test_counters_of_32_bits_go_on_for_all_sensors_of_a_device() -> None:
     start_us = wrap - 1000.0
     assert counter.stamp_ns(start_us) == round(1e3 * start_us)
     assert counter.stamp_ns(500.0) == 1000 * (wrap + 500)
-    assert counter.stamp_ns(start_us + 900.0) == round(
-        1e3 * (start_us + 900.0)
-    )  # another sensor, not wrapped yet
+    assert counter.stamp_ns(start_us + 900.0) == round(1e3 * (start_us + 900.0))  # another sensor, not wrapped yet
     for k in range(1, 10):  # an hour and more, in steps of ten minutes
         stamp_us = 500 + 600_000_000 * k
         assert counter.stamp_ns(stamp_us % wrap) == 1000 * (wrap + stamp_us)

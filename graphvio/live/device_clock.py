@@ -41,4 +41,13 @@ def host_ns_of_monotonic(monotonic_ns: int) -> int:
 
 def host_ns_of_realtime(realtime_ns: int) -> int:
     """`host_ns` of an instant of a moment ago that was stamped by ``CLOCK_REALTIME``, which may have been set since."""
-    return realtime_ns + host_ns() - time.time_ns()
+    return realtime_ns + realtime_to_host_ns()
+
+
+def realtime_to_host_ns() -> int:
+    """What to add to ``CLOCK_REALTIME`` of this moment; the tightest of three looks, as threads are interrupted."""
+    looks = []
+    for _ in range(3):
+        before_ns, realtime_ns, after_ns = host_ns(), time.time_ns(), host_ns()
+        looks.append((after_ns - before_ns, (before_ns + after_ns) // 2 - realtime_ns))
+    return min(looks)[1]
