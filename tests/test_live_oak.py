@@ -353,6 +353,17 @@ def test_two_cameras() -> None:
     np.testing.assert_allclose(se3_inverse(rig.pairs[1].left.cam_T_body), rig.pairs[1].left.body_T_cam, atol=1e-12)
 
 
+def test_messages_that_cannot_be_used_are_counted() -> None:
+    camera = Queues(calibration(PLAIN))
+    source, _, readings = begun("oak:A", Plugs(A=camera))
+    assert camera.imu is not None
+    camera.imu.send(dai.ImgFrame())
+    camera.image(0, smooth(0), timedelta(seconds=1))
+    assert isinstance(next(readings), CameraFrame)
+    assert source.health()[0].counts == {"bad_message": 1}
+    source.close()
+
+
 def test_closing_does_not_wait_for_messages() -> None:
     camera = Queues(calibration(PLAIN))
     source, _, readings = begun("oak:A", Plugs(A=camera))

@@ -21,7 +21,7 @@ from graphvio.live.source import CameraFrame, ImuReading, host_ns
 from graphvio.live.sources.oak_calibration import factory_rig, fitted_lens
 from graphvio.rig import Rig
 
-_POLL = timedelta(milliseconds=100)
+_POLL_S = 0.1
 _SILENCE_NS = 5_000_000_000
 _MICROSECOND = timedelta(microseconds=1)
 _IMAGES_WAITING = 8
@@ -126,7 +126,7 @@ class DepthAiConnection:
 
 
 class OakDevice:
-    """A `Device`; its own thread takes the messages from depthai's queues."""
+    """A `Device`; depthai's threads hand over, its own thread only watches."""
 
     def __init__(self, device_id: str, cameras: tuple[str, str], settings: StreamSettings, connect: Connect) -> None:
         self.name = f"oak:{device_id}"
@@ -139,6 +139,7 @@ class OakDevice:
         self._counts: Counter[str] = Counter()
         self._numbers: dict[str, int] = {}
         self._detail = ""
+        self._newest_ns = 0
 
     def start(self, hand_over: HandOver) -> None:
         """See `Device.start`."""
@@ -158,6 +159,7 @@ class OakDevice:
             self._calibrate(self._connection.calibration)
         except RigError as error:  # it matters only if no rig is given
             self._factory_rig = error
+        self._listen(self._connection, hand_over)
 
     def _calibrate(self, calibration: Any) -> None:
         import depthai as dai
@@ -187,29 +189,30 @@ class OakDevice:
 
     def run(self, hand_over: HandOver, stopping: threading.Event) -> None:
         """See `Device.run`."""
-        import depthai as dai
-
         assert self._connection is not None
         left, right = self._connection.images
-        imu = self._connection.imu
-        queues = [queue for queue in (left, right, imu) if queue is not None]
-        newest_ns = host_ns()
-        while not stopping.is_set():
-            try:
-                is_there = dai.MessageQueue.waitAny(queues, _POLL)
-                arrival_ns = host_ns()
-                for side, queue in enumerate((left, right)):
-                    while (frame := queue.tryGet()) is not None:
-                        newest_ns = arrival_ns
-                        hand_over(self._frame(side, frame, arrival_ns))
-                while imu is not None and (data := imu.tryGet()) is not None:
-                    self._take_imu(data, arrival_ns)
-            except dai.MessageQueue.QueueException as error:
-                raise DeviceLostError(f"unplugged, or it has crashed ({error})") from None
-            if not is_there and not self._connection.is_alive():
+        self._newest_ns = host_ns()
+        while not stopping.wait(_POLL_S):
+            if left.isClosed() or right.isClosed() or not self._connection.is_alive():
                 raise DeviceLostError("unplugged, or it has crashed")
-            if arrival_ns - newest_ns > _SILENCE_NS:
+            if host_ns() - self._newest_ns > _SILENCE_NS:
                 raise DeviceLostError("no image for 5 s")
+
+    def _listen(self, connection: Connection, hand_over: HandOver) -> None:
+        """Take messages in the threads that bring them; what depthai's queues keep besides is not read."""
+        for side, queue in enumerate(connection.images):
+            queue.addCallback(self._guarded(partial(self._on_image, side, hand_over)))
+        if connection.imu is not None:
+            connection.imu.addCallback(self._guarded(self._on_imu))
+
+    def _guarded(self, on_message: Callable[[Any], None]) -> Callable[[Any], None]:
+        def guarded(message: Any) -> None:
+            try:
+                on_message(message)
+            except Exception:  # an exception in depthai's thread would end the process
+                self._counts["bad_message"] += 1
+
+        return guarded
 
     def stop(self) -> None:
         """See `Device.stop`."""
@@ -226,9 +229,10 @@ class OakDevice:
         """See `Device.counts`."""
         return self._counts + (self._merging.counts if self._merging is not None else Counter())
 
-    def _frame(self, side: int, frame: Any, arrival_ns: int) -> CameraFrame:
+    def _on_image(self, side: int, hand_over: HandOver, frame: Any) -> None:
         import depthai as dai
 
+        arrival_ns = self._newest_ns = host_ns()
         camera, number = self._cameras[side], frame.getSequenceNum()
         self._counts["frames_lost"] += max(number - self._numbers.get(camera, number - 1) - 1, 0)
         self._numbers[camera] = number
@@ -236,10 +240,11 @@ class OakDevice:
         stamp_ns = _ns(frame.getTimestampDevice(dai.CameraExposureOffset.MIDDLE))
         lens = self._lenses[side] if self._lenses is not None else None
         decode = partial(np.asarray, image) if lens is None else partial(lens.corrected, image)
-        return CameraFrame(camera, stamp_ns, decode, arrival_ns, self.clock)
+        hand_over(CameraFrame(camera, stamp_ns, decode, arrival_ns, self.clock))
 
-    def _take_imu(self, data: Any, arrival_ns: int) -> None:
+    def _on_imu(self, data: Any) -> None:
         assert self._merging is not None
+        arrival_ns = host_ns()
         for packet in data.packets:
             accel, gyro = packet.acceleroMeter, packet.gyroscope
             self._merging.add_accel(_ns(accel.getTimestampDevice()), np.array([accel.x, accel.y, accel.z]))

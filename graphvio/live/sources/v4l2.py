@@ -104,7 +104,7 @@ def open_source(spec: SourceSpec, rig: Rig | None, open_capture: OpenCapture = o
     check_options(spec, OPTIONS)
     paths = names_of(spec)
     if not paths:
-        raise SourceError("v4l2: name the devices, such as v4l2:/dev/video0; `ls /dev/v4l/by-id` tells them")
+        raise SourceError("v4l2: name the devices, such as v4l2:/dev/video0; `graphvio live --list` tells them")
     settings = CaptureSettings(
         size_px=size_of(spec, "size") or (0, 0),
         fps=number_of(spec, "fps", 1, 1000),

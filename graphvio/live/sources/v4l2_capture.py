@@ -84,7 +84,7 @@ def open_v4l2(path: str, settings: CaptureSettings) -> Capture:
         SourceError: if it is not there, is in use, or does not do what is asked for.
     """
     if not Path(path).exists():
-        raise SourceError(f"{path}: is not there; check the cable, and `ls /dev/v4l/by-id`")
+        raise SourceError(f"{path}: is not there; check the cable, and `graphvio live --list`")
     capture = cv2.VideoCapture(path, cv2.CAP_V4L2)
     if not capture.isOpened():
         raise SourceError(
