@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from graphvio.errors import MissingExtraError, RigError, SourceError
 from graphvio.live.source import CameraFrame, ImuReading, LiveSource, Notice, Reading
 from graphvio.live.sources import open_live_source
 from graphvio.live.sources.ros2 import list_devices
+from graphvio.rig import Rig
 
 FRAMESETS = 5
 
@@ -213,6 +215,32 @@ def test_what_is_published_is_listed(domain: int, robot: Other, monkeypatch: pyt
     assert "IMU: /imu" in device.description
 
 
+def test_publishers_may_start_later() -> None:
+    domain = free_domain()
+    source = open_live_source(f"ros2:?domain={domain}&wait_s=60", small_rig())
+    opened = threading.Event()
+
+    def run() -> None:
+        source.open()
+        opened.set()
+
+    opening = threading.Thread(target=run)
+    opening.start()
+    assert not opened.wait(1.5)
+    robot = robot_on(domain)
+    try:
+        assert opened.wait(20.0)
+    finally:
+        source.close()
+        robot.end()
+        opening.join()
+
+
+def rig_of_other_names() -> Rig:
+    (pair,) = small_rig(pairs=1, imu=False).pairs
+    return Rig((replace(pair, name="other", left=replace(pair.left, name="north")),))
+
+
 def test_topics_that_are_not_published_are_named(domain: int, robot: Other) -> None:
     rig = small_rig()
     absent = open_live_source(f"ros2:?domain={domain}&cam0=/front/image_raw&wait_s=2.5", rig)
@@ -224,6 +252,9 @@ def test_topics_that_are_not_published_are_named(domain: int, robot: Other) -> N
     reliable = open_live_source(f"ros2:?domain={domain}&reliable=1", rig)
     with pytest.raises(SourceError, match="best effort"):
         reliable.open()
+    nameless = open_live_source(f"ros2:?domain={domain}&wait_s=2.5", rig_of_other_names())
+    with pytest.raises(SourceError, match=r"images of north; say north=/TOPIC\. Topics with images: /pair0/left"):
+        nameless.open()
     no_pair = open_live_source(f"ros2:?domain={domain}&left=/pair0/left/image_raw&wait_s=2.5")
     with pytest.raises(RigError, match="no rig is told"):
         no_pair.open()

@@ -35,7 +35,7 @@ def list_devices() -> Sequence[DeviceInfo]:
     node = Node(domain)
     time.sleep(_SETTLED_S)
     types = {each.topic: each.type_name for each in node.publications()}
-    images = sorted(name for name, kind in types.items() if kind in (IMAGE, COMPRESSED))
+    images = _images(types)
     if not images:
         return []
     pairs = [f"pair {name}: {left}, {right}" for name, (left, right) in stereo_topics(images).items()]
@@ -116,8 +116,8 @@ class Ros2Source:
             cameras = _topics_of(rig, self._chosen, types, self.name)
             if rig.imu is not None and imu is None:
                 raise SourceError(
-                    f"{self.name}: nobody publishes samples of an IMU, and the rig has one; say imu=TOPIC if its "
-                    "publisher has yet to start, or give a rig without"
+                    f"{self.name}: nobody publishes samples of an IMU, and the rig has one; start its publisher, or "
+                    "give a rig without"
                 )
         if self._body is not None:
             self._transforms = listen_for_transforms(node, published, wait)
@@ -175,8 +175,8 @@ class Ros2Source:
             if len(published) != count:
                 count, since_s = len(published), time.monotonic()
             missing = named - {each.topic for each in published}
-            is_settled = has_all or (count > 0 and time.monotonic() - since_s >= _SETTLED_S)
-            if is_settled and not missing:
+            is_settled = has_all or time.monotonic() - since_s >= _SETTLED_S
+            if is_settled and not missing and self._suffices({each.topic: each.type_name for each in published}):
                 return published
             if not wait(_POLL_S):
                 break
@@ -188,6 +188,20 @@ class Ros2Source:
             )
         return published
 
+    def _suffices(self, types: Mapping[str, str]) -> bool:
+        """Whether each sensor has a topic; else its publisher may yet start."""
+        if self._rig is None:
+            return bool(stereo_topics(_images(types)))
+        try:
+            _topics_of(self._rig, self._chosen, types, self.name)
+        except SourceError:
+            return False
+        return self._rig.imu is None or self._imu is not None or IMU in types.values()
+
+
+def _images(types: Mapping[str, str]) -> list[str]:
+    return sorted(name for name, kind in types.items() if kind in (IMAGE, COMPRESSED))
+
 
 def _topics_of(rig: Rig, chosen: Mapping[str, str], types: Mapping[str, str], where: str) -> dict[str, str]:
     """The topic of each camera: as given, as graphvio names it, or the one that has the camera's name in it.
@@ -195,7 +209,7 @@ def _topics_of(rig: Rig, chosen: Mapping[str, str], types: Mapping[str, str], wh
     Raises:
         SourceError: if a camera has none.
     """
-    images = sorted(name for name, kind in types.items() if kind in (IMAGE, COMPRESSED))
+    images = _images(types)
     found = dict(chosen)
     for pair in rig.pairs:
         for side, camera in (("left", pair.left), ("right", pair.right)):
