@@ -48,6 +48,7 @@ class Viewer:
         self, rig: Rig, *, spawn: bool = False, save: Path | None = None, web: WebOptions | None = None
     ) -> None:
         recording = _open_recording(rig, spawn, save, web)
+        self._web = web
         self._changed = threading.Condition()
         self._estimates: deque[Estimate] = deque()
         self._extras: deque[Callable[[Recording], None]] = deque()
@@ -69,6 +70,11 @@ class Viewer:
         except GraphvioError:
             if value is None:  # else what went wrong first is what matters
                 raise
+
+    @property
+    def url(self) -> str | None:
+        """What to open in a browser, or None if browsers are not served."""
+        return None if self._web is None else self._web.url
 
     @property
     def dropped(self) -> int:
