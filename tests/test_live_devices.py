@@ -11,6 +11,7 @@ import pytest
 from recordings import small_rig
 
 from graphvio.errors import SourceError
+from graphvio.live.counts import Counts
 from graphvio.live.device_clock import MicrosecondCounter, host_ns_of_monotonic, host_ns_of_realtime
 from graphvio.live.devices import DeviceLostError, DeviceSource, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
@@ -162,7 +163,8 @@ def test_clocks_of_the_kernel_become_the_hosts() -> None:
 
 def test_acceleration_is_interpolated_at_the_stamps_of_the_gyro() -> None:
     found: list[ImuReading] = []
-    merging = AccelOntoGyro(found.append)
+    counts = Counts()
+    merging = AccelOntoGyro(found.append, counts)
     merging.add_gyro(imu_reading(5_000_000))  # before any acceleration
     for stamp_ns in (10_000_000, 20_000_000, 30_000_000):
         merging.add_accel(stamp_ns, np.array([0.0, 1e-6 * stamp_ns, 9.81]))
@@ -177,20 +179,21 @@ def test_acceleration_is_interpolated_at_the_stamps_of_the_gyro() -> None:
     for reading in found:
         np.testing.assert_allclose(reading.linear_acceleration, [0.0, 1e-6 * reading.stamp_ns, 9.81])
         np.testing.assert_allclose(reading.angular_velocity, [1e-9 * reading.stamp_ns, 0.0, 0.0])
-    assert merging.counts == {"imu_unpaired": 1, "imu_out_of_order": 2}
+    assert counts.totals() == {"imu_unpaired": 1, "imu_out_of_order": 2}
 
 
 def test_nothing_is_interpolated_over_a_gap() -> None:
     found: list[ImuReading] = []
-    merging = AccelOntoGyro(found.append)
+    counts = Counts()
+    merging = AccelOntoGyro(found.append, counts)
     merging.add_accel(0, np.zeros(3))
     merging.add_gyro(imu_reading(60_000_000))
     merging.add_accel(101_000_000, np.zeros(3))
     assert found == []
-    assert merging.counts["imu_unpaired"] == 1
+    assert counts.totals()["imu_unpaired"] == 1
     for stamp_ns in range(200_000_000, 200_000_300):  # an accelerometer that has stopped
         merging.add_gyro(imu_reading(stamp_ns))
-    assert merging.counts["imu_unpaired"] == 1 + 300 - 256
+    assert counts.totals()["imu_unpaired"] == 1 + 300 - 256
 
 
 def test_options_are_checked() -> None:

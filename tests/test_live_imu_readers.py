@@ -16,6 +16,7 @@ import pytest
 from recordings import small_rig
 
 from graphvio.errors import SourceError
+from graphvio.live.counts import Counts
 from graphvio.live.devices import Device, DeviceSource
 from graphvio.live.imu_readers.iio_imu import IioImu
 from graphvio.live.imu_readers.iio_scan import ScanElement, ScanFormat, mount_matrix
@@ -36,7 +37,8 @@ def imu_readings(found: list[ImuReading | Notice]) -> list[ImuReading]:
 
 @pytest.mark.parametrize("cut", [1, 7, 1000])
 def test_lines_become_samples_however_they_are_cut(cut: int) -> None:
-    lines = ImuLines("mcu")
+    counts = Counts()
+    lines = ImuLines("mcu", counts)
     data = b"5,1.0,2.0\n" + line(1000) + line(6000, temperature=",31.5").replace(b"\n", b"\r\n") + line(11000)[:9]
     found = []
     for begin in range(0, len(data), cut):
@@ -46,7 +48,7 @@ def test_lines_become_samples_however_they_are_cut(cut: int) -> None:
     np.testing.assert_array_equal(found[0].linear_acceleration, [1.5, -2.5, 9.81])
     assert (found[0].clock, found[0].arrival_ns) == ("mcu", 77)
     assert (found[0].temperature_c, found[1].temperature_c) == (None, 31.5)
-    assert not lines.counts
+    assert not counts.totals()
 
 
 @pytest.mark.parametrize(
@@ -67,31 +69,35 @@ def test_lines_become_samples_however_they_are_cut(cut: int) -> None:
     ],
 )
 def test_what_is_no_sample_is_counted_and_passed_over(garbage: bytes) -> None:
-    lines = ImuLines("mcu")
+    counts = Counts()
+    lines = ImuLines("mcu", counts)
     found = imu_readings(lines.take(b"\n" + line(1000) + garbage + line(2000), 0))
     assert [reading.stamp_ns for reading in found] == [1_000_000, 2_000_000]
-    assert lines.counts == {"bad_line": 1}
+    assert counts.totals() == {"bad_line": 1}
 
 
 def test_a_stream_without_line_ends_is_not_kept() -> None:
-    lines = ImuLines("mcu")
+    counts = Counts()
+    lines = ImuLines("mcu", counts)
     lines.take(b"\n", 0)
     for _ in range(100):
         assert lines.take(b"\x00" * 100, 0) == []
-    assert lines.counts["bad_line"] == 1
+    assert counts.totals()["bad_line"] == 1
     assert imu_readings(lines.take(b"00\n" + line(3000), 0))[0].stamp_ns == 3_000_000
 
 
 def test_checksums_are_optional_but_once_there_are_needed() -> None:
-    lines = ImuLines("mcu")
+    counts = Counts()
+    lines = ImuLines("mcu", counts)
     sound, damaged = line(1000, checksum=True), line(2000, checksum=True).replace(b"9.81", b"8.81")
     found = imu_readings(lines.take(b"\n" + sound + damaged + line(3000) + line(4000, checksum=True), 0))
     assert [reading.stamp_ns for reading in found] == [1_000_000, 4_000_000]
-    assert lines.counts == {"bad_checksum": 2}
+    assert counts.totals() == {"bad_checksum": 2}
 
 
 def test_a_counter_that_wraps_goes_on_and_one_that_begins_anew_is_told() -> None:
-    lines = ImuLines("mcu")
+    counts = Counts()
+    lines = ImuLines("mcu", counts)
     found = lines.take(b"\n" + line((1 << 32) - 1000) + line(1000) + line(5_000_000) + line(70), 9)
     stamps = [each.stamp_ns if isinstance(each, ImuReading) else each.kind for each in found]
     wrap_us = 1 << 32

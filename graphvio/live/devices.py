@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Protocol
 
 from graphvio.errors import SourceError
+from graphvio.live.counts import Counts
 from graphvio.live.mailbox import Mailbox
 from graphvio.live.source import DeviceHealth, Notice, Reading, host_ns
 from graphvio.rig import Rig
@@ -80,7 +80,7 @@ class DeviceSource:
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
         self._lost: dict[str, str] = {}
-        self._losses: Counter[str] = Counter()
+        self._losses = Counts()
 
     def open(self) -> Rig:
         """See `LiveSource.open`."""
@@ -93,6 +93,7 @@ class DeviceSource:
         except BaseException:
             for device in started:
                 _stop(device)
+            self.close()
             raise
         for device in self._devices:
             thread = threading.Thread(target=self._attend, args=(device,), name=device.name, daemon=True)
@@ -121,7 +122,7 @@ class DeviceSource:
         return partial(self._mailbox.put, device.name)
 
     def _health(self, device: Device) -> DeviceHealth:
-        counts = {**device.counts(), "device_lost": self._losses[device.name]}
+        counts = {**device.counts(), "device_lost": self._losses.totals().get(device.name, 0)}
         counts["not_taken"] = self._mailbox.dropped(device.name)
         lost = self._lost.get(device.name)
         detail = device.detail() if lost is None else f"lost: {lost}"
@@ -135,7 +136,7 @@ class DeviceSource:
                 if self._stopping.is_set():
                     return
                 self._lost[device.name] = reason
-                self._losses[device.name] += 1
+                self._losses.add(device.name)
                 self._tell(device, "device_lost", reason)
                 _stop(device)
                 if not self._bring_back(device):

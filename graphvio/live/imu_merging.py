@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import threading
 from bisect import bisect_left
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from operator import itemgetter
 
 from graphvio.arrays import Float
+from graphvio.live.counts import Counts
 from graphvio.live.source import ImuReading
 
 _LONGEST_GAP_NS = 100_000_000
@@ -23,12 +24,13 @@ class AccelOntoGyro:
     A rate thus waits for the acceleration after it: 4 to 16 ms with accelerometers of 250 to 63 Hz. Both may come from
     threads of their own. Rates without accelerations on both sides, 100 ms apart at most, are dropped and counted.
 
-    Attributes:
-        counts: ``imu_unpaired``, ``imu_out_of_order``.
+    Args:
+        hand_over: takes the samples.
+        counts: of ``imu_unpaired`` and ``imu_out_of_order``.
     """
 
-    def __init__(self, hand_over: Callable[[ImuReading], None]) -> None:
-        self.counts: Counter[str] = Counter()
+    def __init__(self, hand_over: Callable[[ImuReading], None], counts: Counts) -> None:
+        self._counts = counts
         self._hand_over = hand_over
         self._lock = threading.Lock()
         self._waiting: deque[ImuReading] = deque()
@@ -39,20 +41,20 @@ class AccelOntoGyro:
         """Take a rate, whose ``linear_acceleration`` is not read; a stamp that was there already is ignored."""
         with self._lock:
             if self._newest_gyro_ns is not None and reading.stamp_ns <= self._newest_gyro_ns:
-                self.counts["imu_out_of_order"] += reading.stamp_ns < self._newest_gyro_ns
+                self._counts.add("imu_out_of_order", reading.stamp_ns < self._newest_gyro_ns)
                 return
             self._newest_gyro_ns = reading.stamp_ns
             self._waiting.append(reading)
             if len(self._waiting) > _MOST_WAITING:
                 self._waiting.popleft()
-                self.counts["imu_unpaired"] += 1
+                self._counts.add("imu_unpaired")
             self._hand_over_ready()
 
     def add_accel(self, stamp_ns: int, acceleration: Float) -> None:
         """Take an acceleration (3,), frame body; a stamp that was there already is ignored."""
         with self._lock:
             if self._accels and stamp_ns <= self._accels[-1][0]:
-                self.counts["imu_out_of_order"] += stamp_ns < self._accels[-1][0]
+                self._counts.add("imu_out_of_order", stamp_ns < self._accels[-1][0])
                 return
             self._accels.append((stamp_ns, acceleration))
             self._hand_over_ready()
@@ -62,7 +64,7 @@ class AccelOntoGyro:
             gyro = self._waiting.popleft()
             acceleration = self._at(gyro.stamp_ns)
             if acceleration is None:
-                self.counts["imu_unpaired"] += 1
+                self._counts.add("imu_unpaired")
             else:
                 self._hand_over(replace(gyro, linear_acceleration=acceleration))
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 
 from graphvio.arrays import AnyArray, Float, Image
 from graphvio.cameras import MODEL_NAMES, project_points, unproject_pixels
@@ -95,6 +94,8 @@ def _samples(matrix: Float, coefficients: Float, size_px: tuple[int, int]) -> tu
 
 
 def _fit(model: str, intrinsics: Float, points: Float, pixels: Float) -> FittedLens:
+    from scipy.optimize import least_squares
+
     free = 5 if model == "radial-tangential" else 4
 
     def residuals(parameters: Float) -> Float:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter, deque
+from collections import deque
 
+from graphvio.live.counts import Counts
 from graphvio.live.source import Notice, Reading
 
 _LONGEST_NS = 2_000_000_000
@@ -22,7 +23,7 @@ class Mailbox:
         self._kept: deque[Notice] = deque()
         self._waiting: deque[tuple[str, Reading]] = deque()
         self._is_closed = False
-        self._dropped: Counter[str] = Counter()
+        self._dropped = Counts()
 
     def put(self, owner: str, reading: Reading) -> None:
         """Add a reading of a device; returns at once, and does nothing after `close`."""
@@ -35,7 +36,7 @@ class Mailbox:
                 if isinstance(oldest, Notice):
                     self._kept.append(oldest)
                 else:
-                    self._dropped[of] += 1
+                    self._dropped.add(of)
             self._changed.notify()
 
     def get(self) -> Reading | None:
@@ -56,5 +57,4 @@ class Mailbox:
 
     def dropped(self, owner: str) -> int:
         """How many readings of a device were not taken in time."""
-        with self._changed:
-            return self._dropped[owner]
+        return self._dropped.totals().get(owner, 0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import select
 import threading
-from collections import Counter
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.errors import SourceError
+from graphvio.live.counts import Counts
 from graphvio.live.device_clock import host_ns_of_monotonic, realtime_to_host_ns
 from graphvio.live.devices import DeviceLostError, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
@@ -44,13 +44,11 @@ class IioImu:
         self._names, self._rate_hz, self._sysfs, self._dev = names, rate_hz, sysfs, dev
         self._buffers: list[_Buffer] = []
         self._merging: AccelOntoGyro | None = None
-        self._earlier: Counter[str] = Counter()
+        self._counts = Counts()
 
     def start(self, hand_over: HandOver) -> None:
         """See `Device.start`."""
-        if self._merging is not None:
-            self._earlier.update(self._merging.counts)
-        self._merging = AccelOntoGyro(hand_over)
+        self._merging = AccelOntoGyro(hand_over, self._counts)
         try:
             for name in self._names:
                 self._buffers.append(_Buffer(_find(self._sysfs, name), self._dev, self._rate_hz))
@@ -93,7 +91,7 @@ class IioImu:
 
     def counts(self) -> Mapping[str, int]:
         """See `Device.counts`."""
-        return self._earlier + (self._merging.counts if self._merging is not None else Counter())
+        return self._counts.totals()
 
 
 class _Buffer:

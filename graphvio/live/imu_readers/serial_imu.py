@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import re
 import threading
-from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import reduce
 from operator import xor
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from graphvio.errors import MissingExtraError, SourceError
+from graphvio.live.counts import Counts
 from graphvio.live.device_clock import MicrosecondCounter
 from graphvio.live.devices import DeviceLostError, HandOver
 from graphvio.live.source import ImuReading, Notice, host_ns
@@ -36,12 +36,13 @@ _LINE = re.compile(rb"([-+0-9.eE, ]+)(?:\*([0-9A-Fa-f]{2}))?\r?")
 class ImuLines:
     """Samples from the bytes of a serial port, however they are cut; what is no sample is counted.
 
-    Attributes:
-        counts: ``bad_line``, ``bad_checksum``, ``clock_restarted``.
+    Args:
+        clock: its name.
+        counts: of ``bad_line``, ``bad_checksum`` and ``clock_restarted``.
     """
 
-    def __init__(self, clock: str) -> None:
-        self.counts: Counter[str] = Counter()
+    def __init__(self, clock: str, counts: Counts) -> None:
+        self._counts = counts
         self._clock = clock
         self._counter = MicrosecondCounter()
         self._newest_ns: int | None = None
@@ -57,7 +58,7 @@ class ImuLines:
             del lines[0]
         if len(self._rest) > _LONGEST_LINE:
             self._rest = b""
-            self.counts["bad_line"] += self._is_in_step
+            self._counts.add("bad_line", self._is_in_step)
             self._is_in_step = False
         found: list[ImuReading | Notice] = []
         for line in lines:
@@ -67,7 +68,7 @@ class ImuLines:
     def _take_line(self, line: bytes, arrival_ns: int, found: list[ImuReading | Notice]) -> None:
         matched = _LINE.fullmatch(line)
         if matched is None or len(line) > _LONGEST_LINE:
-            self.counts["bad_line"] += 1
+            self._counts.add("bad_line")
             return
         if matched[2] is None:
             is_sound = not self._has_checksums
@@ -75,23 +76,23 @@ class ImuLines:
             is_sound = reduce(xor, matched[1], 0) == int(matched[2], 16)
             self._has_checksums |= is_sound
         if not is_sound:
-            self.counts["bad_checksum"] += 1
+            self._counts.add("bad_checksum")
             return
         try:
             stamp, *texts = matched[1].split(b",")
             stamp_us, values = int(stamp), np.array([float(text) for text in texts])
         except ValueError:
-            self.counts["bad_line"] += 1
+            self._counts.add("bad_line")
             return
         rate, acceleration = values[:3], values[3:6]
         too_large = np.abs(rate).max(initial=0.0) > _LARGEST_RATE
         too_large |= np.abs(acceleration).max(initial=0.0) > _LARGEST_ACCELERATION
         if len(values) not in (6, 7) or stamp_us < 0 or too_large or not np.isfinite(values).all():
-            self.counts["bad_line"] += 1
+            self._counts.add("bad_line")
             return
         stamp_ns = self._counter.stamp_ns(stamp_us)
         if self._newest_ns is not None and stamp_ns < self._newest_ns - _BACKWARDS_NS:
-            self.counts["clock_restarted"] += 1
+            self._counts.add("clock_restarted")
             self._counter = MicrosecondCounter()
             stamp_ns = self._counter.stamp_ns(stamp_us)
             detail = f"{self._clock}: its clock went back to {stamp_us} us; it has begun anew"
@@ -115,13 +116,12 @@ class SerialImu:
         self._path, self._baud = path, baud
         self._open_port = open_port or _pyserial()
         self._port: Any = None
-        self._lines = ImuLines(self.clock)
-        self._earlier: Counter[str] = Counter()
+        self._counts = Counts()
+        self._lines = ImuLines(self.clock, self._counts)
 
     def start(self, hand_over: HandOver) -> None:
         """See `Device.start`."""
-        self._earlier.update(self._lines.counts)
-        self._lines = ImuLines(self.clock)
+        self._lines = ImuLines(self.clock, self._counts)
         try:
             self._port = self._open_port(self._path, self._baud)
         except (OSError, ValueError) as error:
@@ -156,7 +156,7 @@ class SerialImu:
 
     def counts(self) -> Mapping[str, int]:
         """See `Device.counts`."""
-        return self._earlier + self._lines.counts
+        return self._counts.totals()
 
 
 def _pyserial() -> Callable[[str, int], Any]:

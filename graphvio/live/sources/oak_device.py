@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from graphvio.errors import RigError, SourceError
+from graphvio.live.counts import Counts
 from graphvio.live.devices import DeviceLostError, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
 from graphvio.live.lens_fit import FittedLens
@@ -136,16 +136,14 @@ class OakDevice:
         self._lenses: tuple[FittedLens, FittedLens] | None = None
         self._factory_rig: Rig | RigError = RigError(f"{self.name}: was not started")
         self._merging: AccelOntoGyro | None = None
-        self._counts: Counter[str] = Counter()
+        self._counts = Counts()
         self._numbers: dict[str, int] = {}
         self._detail = ""
         self._newest_ns = 0
 
     def start(self, hand_over: HandOver) -> None:
         """See `Device.start`."""
-        if self._merging is not None:
-            self._counts.update(self._merging.counts)
-        self._merging = AccelOntoGyro(hand_over)
+        self._merging = AccelOntoGyro(hand_over, self._counts)
         self._numbers = {}
         try:
             self._connection = self._connect(self._id, self._settings)
@@ -210,7 +208,7 @@ class OakDevice:
             try:
                 on_message(message)
             except Exception:  # an exception in depthai's thread would end the process
-                self._counts["bad_message"] += 1
+                self._counts.add("bad_message")
 
         return guarded
 
@@ -227,14 +225,14 @@ class OakDevice:
 
     def counts(self) -> Mapping[str, int]:
         """See `Device.counts`."""
-        return self._counts + (self._merging.counts if self._merging is not None else Counter())
+        return self._counts.totals()
 
     def _on_image(self, side: int, hand_over: HandOver, frame: Any) -> None:
         import depthai as dai
 
         arrival_ns = self._newest_ns = host_ns()
         camera, number = self._cameras[side], frame.getSequenceNum()
-        self._counts["frames_lost"] += max(number - self._numbers.get(camera, number - 1) - 1, 0)
+        self._counts.add("frames_lost", max(number - self._numbers.get(camera, number - 1) - 1, 0))
         self._numbers[camera] = number
         image = np.asarray(frame.getCvFrame(), dtype=np.uint8)  # always a copy
         stamp_ns = _ns(frame.getTimestampDevice(dai.CameraExposureOffset.MIDDLE))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Image
 from graphvio.errors import RigError, SourceError
+from graphvio.live.counts import Counts
 from graphvio.live.device_clock import MicrosecondCounter, host_ns_of_realtime
 from graphvio.live.devices import DeviceLostError, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
@@ -75,7 +75,7 @@ class RealSenseDevice:
         self._removed = threading.Event()
         self._newest_ns = 0
         self._detail = ""
-        self._counts: Counter[str] = Counter()
+        self._counts = Counts()
         self._merging: AccelOntoGyro | None = None
         self._frame_numbers: dict[int, int] = {}
         self._counter = MicrosecondCounter()
@@ -89,9 +89,7 @@ class RealSenseDevice:
         # A camera that was unplugged counts from zero again.
         self._counter, self._removed = MicrosecondCounter(), threading.Event()
         self._frame_numbers = {}
-        if self._merging is not None:
-            self._counts.update(self._merging.counts)
-        self._merging = AccelOntoGyro(hand_over)
+        self._merging = AccelOntoGyro(hand_over, self._counts)
         self._bus.watch(device, self._removed.set)
         try:
             self._start(device, hand_over)
@@ -154,11 +152,11 @@ class RealSenseDevice:
     def detail(self) -> str:
         """See `Device.detail`."""
         host_stamps = "; no hardware stamps: librealsense's kernel patch or its RSUSB build is needed"
-        return self._detail + (host_stamps if self._counts["host_stamp"] else "")
+        return self._detail + (host_stamps if "host_stamp" in self._counts.totals() else "")
 
     def counts(self) -> Mapping[str, int]:
         """See `Device.counts`."""
-        return self._counts + (self._merging.counts if self._merging is not None else Counter())
+        return self._counts.totals()
 
     def _sensor(self, device: Any, wanted: Callable[[Any], bool], count: int, what: str) -> tuple[Any, list[Any]]:
         """The sensor that has so many different streams as wanted, and their profiles."""
@@ -199,7 +197,7 @@ class RealSenseDevice:
             try:
                 on_frame(frame)
             except Exception:  # an exception in librealsense's thread would end the process
-                self._counts["bad_frame"] += 1
+                self._counts.add("bad_frame")
 
         self._open.append(sensor)
         sensor.open(profiles)
@@ -210,7 +208,7 @@ class RealSenseDevice:
         index = frame.get_profile().stream_index()
         number = frame.get_frame_number()
         before = self._frame_numbers.get(index, number - 1)
-        self._counts["frames_lost"] += max(number - before - 1, 0)
+        self._counts.add("frames_lost", max(number - before - 1, 0))
         self._frame_numbers[index] = number
         # librealsense has few buffers and waits for those that are not given back: the copy is what is handed on.
         image = np.array(frame.get_data(), dtype=np.uint8)
@@ -237,7 +235,7 @@ class RealSenseDevice:
 
         stamp_ms = frame.get_timestamp()
         if frame.get_frame_timestamp_domain() != rs.timestamp_domain.hardware_clock:
-            self._counts["host_stamp"] += 1
+            self._counts.add("host_stamp")
             return host_ns_of_realtime(round(1e6 * stamp_ms)), None
         # The stamp is of the readout's begin; the driver tells the middle of the exposure besides.
         readout, middle = rs.frame_metadata_value.frame_timestamp, rs.frame_metadata_value.sensor_timestamp

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 from graphvio.errors import RigError, SourceError
+from graphvio.live.counts import Counts
 from graphvio.live.devices import Device, DeviceLostError, DeviceSource, HandOver
 from graphvio.live.imu_readers.iio_imu import IioImu
 from graphvio.live.imu_readers.serial_imu import SerialImu
@@ -44,7 +44,7 @@ class V4l2Camera:
         self.name = path
         self._parts, self._settings, self._open_capture = tuple(parts), settings, open_capture
         self._capture: Capture | None = None
-        self._counts: Counter[str] = Counter()
+        self._counts = Counts()
 
     def start(self, hand_over: HandOver) -> None:
         """See `Device.start`."""
@@ -59,11 +59,11 @@ class V4l2Camera:
             arrival_ns = host_ns()
             stamp_ns = stamp_of(self._capture)
             if stamp_ns is None:
-                self._counts["no_kernel_stamp"] += 1
+                self._counts.add("no_kernel_stamp")
                 stamp_ns = arrival_ns
             is_there, raw = self._capture.retrieve()
             if not is_there:
-                self._counts["no_image"] += 1
+                self._counts.add("no_image")
                 continue
             image = GreyImage(raw, self._settings.pixel_format, self._settings.size_px, self.name)
             for camera, rows, columns in self._parts:
@@ -78,14 +78,14 @@ class V4l2Camera:
     def detail(self) -> str:
         """See `Device.detail`."""
         width, height = self._settings.size_px
-        stamps = "; its driver does not stamp, arrivals are used" if self._counts["no_kernel_stamp"] else ""
+        stamps = "; its driver does not stamp, arrivals are used" if "no_kernel_stamp" in self._counts.totals() else ""
         return (
             f"{', '.join(name for name, _, _ in self._parts)}, {width}x{height} {self._settings.pixel_format}{stamps}"
         )
 
     def counts(self) -> Mapping[str, int]:
         """See `Device.counts`."""
-        return self._counts
+        return self._counts.totals()
 
 
 def list_devices(nodes: Path = _NODES, by_id: Path = Path("/dev/v4l/by-id")) -> Sequence[DeviceInfo]:
