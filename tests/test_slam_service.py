@@ -27,6 +27,7 @@ pytest.importorskip("grpc")
 
 from graphvio.slam.client import Client, Update
 from graphvio.slam.service.options import ServiceOptions
+from graphvio.slam.service.pool import DaemonPool
 from graphvio.slam.service.server import GrpcServer
 
 ANY_PORT = ServiceOptions(port=0)
@@ -466,6 +467,58 @@ def test_a_port_that_is_taken_and_a_second_start(server: GrpcServer, odometry: s
         GrpcServer(odometry, ServiceOptions(port=port)).start()
     with pytest.raises(ServiceError, match="is served already"):
         server.start()
+
+
+def test_a_program_with_open_streams_ends_though_nobody_stops_the_server() -> None:
+    code = """
+import served
+from graphvio.slam.client import Client
+from graphvio.slam.service.options import ServiceOptions
+from graphvio.slam.service.server import GrpcServer
+
+odometry = served.DrawnOdometry()
+odometry.keyframe_log.add(served.keyframe(0))
+server = GrpcServer(odometry, ServiceOptions(port=0))
+server.start()
+client = Client(server.address)
+stream = client.keyframes()
+print(next(stream).id)
+raise ValueError("the program's own failure")
+"""
+    folder = Path(__file__).parent
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+        env={**os.environ, "PYTHONPATH": f"{folder.parent}{os.pathsep}{folder}"},
+    )
+    assert (done.returncode, done.stdout) == (1, "0\n"), done.stderr
+    assert "the program's own failure" in done.stderr
+
+
+def test_the_pool_has_room_for_so_many_calls_and_ends_with_all_of_them_done() -> None:
+    pool = DaemonPool(3)
+    may_end = threading.Event()
+    begun = threading.Semaphore(0)
+
+    def work(number: int) -> int:
+        begun.release()
+        may_end.wait()
+        return number
+
+    futures = [pool.submit(work, number) for number in range(10)]
+    assert all(begun.acquire(timeout=10.0) for _ in range(3))
+    assert not begun.acquire(timeout=0.05)
+    may_end.set()
+    failed = pool.submit(lambda: 1 // 0)
+    pool.shutdown()
+    assert [future.result(0.0) for future in futures] == list(range(10))
+    with pytest.raises(ZeroDivisionError):
+        failed.result(0.0)
+    with pytest.raises(RuntimeError):
+        pool.submit(work, 0)
 
 
 def test_without_grpcio_the_remedy_is_named() -> None:
