@@ -8,7 +8,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -352,6 +354,51 @@ def test_keyframes_go_on_where_they_were_when_the_server_was_away(odometry: serv
         assert got == list(range(60))
     server.stop()
     server.stop()
+
+
+class CuttingProxy:
+    """Passes bytes on to a server, and cuts each connection after so many of them."""
+
+    def __init__(self, port: int, cut_after: Iterator[int]) -> None:
+        self._port = port
+        self._cut_after = cut_after
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
+        self.cuts = 0
+        in_thread(self._accept)
+
+    def _accept(self) -> None:
+        while True:
+            client, _ = self._listener.accept()
+            server = socket.create_connection(("127.0.0.1", self._port))
+            in_thread(partial(self._pass_on, client, server, 2**60))
+            in_thread(partial(self._pass_on, server, client, next(self._cut_after, 2**60)))
+
+    def _pass_on(self, one: socket.socket, other: socket.socket, most: int) -> None:
+        with suppress(OSError):
+            while most > 0 and (data := one.recv(min(most, 4096))):
+                other.sendall(data)
+                most -= len(data)
+            self.cuts += most == 0
+        for each in (one, other):
+            with suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+
+
+def test_connections_cut_within_messages_cost_no_keyframe_and_give_none_twice(
+    odometry: served.DrawnOdometry, server: GrpcServer
+) -> None:
+    for number in range(80):
+        odometry.keyframe_log.add(served.keyframe(number))
+    odometry.end()
+    rng = np.random.default_rng(6)
+    proxy = CuttingProxy(int(server.address.rpartition(":")[2]), iter(rng.integers(50_000, 200_000, 8).tolist()))
+    with Client(proxy.address) as client:
+        got = list(client.keyframes(with_images=True))
+    assert proxy.cuts >= 5
+    assert [keyframe.id for keyframe in got] == list(range(80))
+    for number, keyframe in enumerate(got):
+        assert_same(keyframe, served.keyframe(number))
 
 
 def test_another_run_of_the_odometry_is_not_taken_for_the_same(odometry: served.DrawnOdometry) -> None:
