@@ -3,12 +3,16 @@
 import random
 import socket
 import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 import served
+
+from graphvio.errors import ServiceError
 
 pytest.importorskip("grpc")
 
@@ -144,6 +148,23 @@ def test_connections_that_say_nothing_do_not_keep_others_out(server: GrpcServer)
     silent = [socket.create_connection(("127.0.0.1", port), timeout=5.0) for _ in range(40)]
     with Client(server.address) as client:
         assert client.info().next_keyframe_id == 1
+    for connection in silent:
+        connection.close()
+
+
+def test_strangers_that_take_all_connections_lose_them_in_seconds(server: GrpcServer) -> None:
+    port = int(server.address.rpartition(":")[2])
+    silent = [socket.create_connection(("127.0.0.1", port), timeout=5.0) for _ in range(150)]
+    with pytest.raises(ServiceError, match="it may have too many clients"):
+        Client(server.address)
+    deadline = time.monotonic() + 30.0
+    while time.monotonic() < deadline:
+        time.sleep(0.5)
+        with suppress(ServiceError), Client(server.address) as client:
+            assert client.info().next_keyframe_id == 1
+            break
+    else:
+        pytest.fail("nobody else is let in")
     for connection in silent:
         connection.close()
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import served
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graphvio.errors import ServiceError
@@ -138,6 +138,7 @@ def test_messages_with_arrays_of_a_wrong_size_are_refused_with_the_place() -> No
         convert.estimate_of(messages.Estimate())
 
 
+@settings(deadline=None)
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=36, max_size=36))
 def test_whatever_the_numbers_are_a_check_ends_in_an_answer(numbers: list[float]) -> None:
     for check, matrix in (

@@ -8,7 +8,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ pytest.importorskip("grpc")
 
 from graphvio.slam.client import Client, Update
 from graphvio.slam.service.options import ServiceOptions
+from graphvio.slam.service.pool import DaemonPool
 from graphvio.slam.service.server import GrpcServer
 
 ANY_PORT = ServiceOptions(port=0)
@@ -353,6 +356,51 @@ def test_keyframes_go_on_where_they_were_when_the_server_was_away(odometry: serv
     server.stop()
 
 
+class CuttingProxy:
+    """Passes bytes on to a server, and cuts each connection after so many of them."""
+
+    def __init__(self, port: int, cut_after: Iterator[int]) -> None:
+        self._port = port
+        self._cut_after = cut_after
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
+        self.cuts = 0
+        in_thread(self._accept)
+
+    def _accept(self) -> None:
+        while True:
+            client, _ = self._listener.accept()
+            server = socket.create_connection(("127.0.0.1", self._port))
+            in_thread(partial(self._pass_on, client, server, 2**60))
+            in_thread(partial(self._pass_on, server, client, next(self._cut_after, 2**60)))
+
+    def _pass_on(self, one: socket.socket, other: socket.socket, most: int) -> None:
+        with suppress(OSError):
+            while most > 0 and (data := one.recv(min(most, 4096))):
+                other.sendall(data)
+                most -= len(data)
+            self.cuts += most == 0
+        for each in (one, other):
+            with suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+
+
+def test_connections_cut_within_messages_cost_no_keyframe_and_give_none_twice(
+    odometry: served.DrawnOdometry, server: GrpcServer
+) -> None:
+    for number in range(80):
+        odometry.keyframe_log.add(served.keyframe(number))
+    odometry.end()
+    rng = np.random.default_rng(6)
+    proxy = CuttingProxy(int(server.address.rpartition(":")[2]), iter(rng.integers(50_000, 200_000, 8).tolist()))
+    with Client(proxy.address) as client:
+        got = list(client.keyframes(with_images=True))
+    assert proxy.cuts >= 5
+    assert [keyframe.id for keyframe in got] == list(range(80))
+    for number, keyframe in enumerate(got):
+        assert_same(keyframe, served.keyframe(number))
+
+
 def test_another_run_of_the_odometry_is_not_taken_for_the_same(odometry: served.DrawnOdometry) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -466,6 +514,58 @@ def test_a_port_that_is_taken_and_a_second_start(server: GrpcServer, odometry: s
         GrpcServer(odometry, ServiceOptions(port=port)).start()
     with pytest.raises(ServiceError, match="is served already"):
         server.start()
+
+
+def test_a_program_with_open_streams_ends_though_nobody_stops_the_server() -> None:
+    code = """
+import served
+from graphvio.slam.client import Client
+from graphvio.slam.service.options import ServiceOptions
+from graphvio.slam.service.server import GrpcServer
+
+odometry = served.DrawnOdometry()
+odometry.keyframe_log.add(served.keyframe(0))
+server = GrpcServer(odometry, ServiceOptions(port=0))
+server.start()
+client = Client(server.address)
+stream = client.keyframes()
+print(next(stream).id)
+raise ValueError("the program's own failure")
+"""
+    folder = Path(__file__).parent
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+        env={**os.environ, "PYTHONPATH": f"{folder.parent}{os.pathsep}{folder}"},
+    )
+    assert (done.returncode, done.stdout) == (1, "0\n"), done.stderr
+    assert "the program's own failure" in done.stderr
+
+
+def test_the_pool_has_room_for_so_many_calls_and_ends_with_all_of_them_done() -> None:
+    pool = DaemonPool(3)
+    may_end = threading.Event()
+    begun = threading.Semaphore(0)
+
+    def work(number: int) -> int:
+        begun.release()
+        may_end.wait()
+        return number
+
+    futures = [pool.submit(work, number) for number in range(10)]
+    assert all(begun.acquire(timeout=10.0) for _ in range(3))
+    assert not begun.acquire(timeout=0.05)
+    may_end.set()
+    failed = pool.submit(lambda: 1 // 0)
+    pool.shutdown()
+    assert [future.result(0.0) for future in futures] == list(range(10))
+    with pytest.raises(ZeroDivisionError):
+        failed.result(0.0)
+    with pytest.raises(RuntimeError):
+        pool.submit(work, 0)
 
 
 def test_without_grpcio_the_remedy_is_named() -> None:

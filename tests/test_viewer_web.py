@@ -84,7 +84,7 @@ def test_a_browser_shows_the_path(served: WebOptions, tmp_path: Path) -> None:
             return bool((np.abs(world.astype(int) - colour).max(axis=2) < 12).sum() > 30)
 
         # A processor draws what a graphics card would: seconds a picture.
-        until(has_path, "the path is not on the page", 90.0)
+        until(has_path, "the path is not on the page", 180.0)
         assert browser.value("document.querySelectorAll('canvas').length") == 1
         assert len(np.unique(shown.reshape(-1, 3), axis=0)) > 100
 

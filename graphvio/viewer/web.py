@@ -13,6 +13,8 @@ import sys
 import time
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
 from urllib.parse import quote
 
 from graphvio.errors import GraphvioError
@@ -73,7 +75,7 @@ class WebHost:
         for port in (options.port, options.data_port):
             _check_free(port)
         command = [
-            *(sys.executable, "-m", "rerun_cli", "--serve-web", "--bind", _HOST),
+            *(*_program(), "--serve-web", "--bind", _HOST),
             *("--port", str(options.data_port), "--web-viewer-port", str(options.port)),
             *("--server-memory-limit", f"{options.memory_mb}MB"),
         ]
@@ -109,6 +111,13 @@ class WebHost:
                 return
             time.sleep(0.05)
         raise GraphvioError(f"web view: rerun does not serve on {_HOST}:{port}; does  rerun --serve-web  work here?")
+
+
+def _program() -> list[str]:
+    """rerun itself where it is found: its launcher would be gone before it when both are ended."""
+    package = find_spec("rerun_cli")
+    beside = None if package is None or package.origin is None else Path(package.origin).with_name("rerun")
+    return [str(beside)] if beside is not None and beside.is_file() else [sys.executable, "-m", "rerun_cli"]
 
 
 def _check_free(port: int) -> None:

@@ -40,7 +40,7 @@ def _why_no_service(connection: socket.socket, host: str, ca: bytes | None) -> s
         )
     except OSError:
         if ca is None:
-            return "something listens there that does not answer as graphvio's service; check the port"
+            return "it does not answer as graphvio's service; check the port, or it may have too many clients"
         return "it does not use TLS, or is no graphvio service; check the port, or leave ca out on the same machine"
     if ca is None:
         return "it demands TLS; give the certificate of whoever signed its own as ca"

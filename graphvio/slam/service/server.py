@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import uuid
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self
 
 from graphvio.errors import ServiceError
@@ -12,6 +11,7 @@ from graphvio.slam.interface import Served
 from graphvio.slam.service.libraries import grpc, stubs
 from graphvio.slam.service.malformed import MalformedInterceptor
 from graphvio.slam.service.options import ServiceOptions
+from graphvio.slam.service.pool import DaemonPool
 from graphvio.slam.service.security import read_token, server_credentials, token_interceptor
 from graphvio.slam.service.servicer import Servicer
 from graphvio.slam.service.streams import STREAMS_OF_A_CLIENT, StreamLimit
@@ -43,7 +43,7 @@ class GrpcServer:
         self._limit = StreamLimit(self._options.max_clients)
         self._stopping = threading.Event()
         self._server: Any = None
-        self._pool: ThreadPoolExecutor | None = None
+        self._pool: DaemonPool | None = None
         self._port = 0
 
     def __enter__(self) -> Self:
@@ -76,7 +76,7 @@ class GrpcServer:
         interceptors = [] if options.token_file is None else [token_interceptor(read_token(options.token_file))]
         interceptors.append(MalformedInterceptor())
         threads = STREAMS_OF_A_CLIENT * options.max_clients + _CALL_THREADS
-        pool = ThreadPoolExecutor(threads, thread_name_prefix="grpc")
+        pool = DaemonPool(threads)
         server = grpc.server(
             pool,
             interceptors=interceptors,
