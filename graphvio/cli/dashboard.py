@@ -137,6 +137,16 @@ def line_of(figures: Figures) -> str:
     return f"{figures.get('status', 'waiting'):<12} " + "  ".join(f"{name} {value}" for name, value in rows_of(figures))
 
 
+def summary_of(figures: Figures) -> str:
+    """What came of a run, and what was lost, in one line."""
+    kinds = ("skipped", "images_not", "results_not", "imu_lost")
+    lost = "".join(f", {name} {count}" for name, count in figures.items() if name.startswith(kinds))
+    return (
+        f"{figures.get('estimates', 0)} estimates of {figures.get('framesets', 0)} framesets, "
+        f"latency p99 {_number(figures, 'latency_p99_all_ms', '.1f')} ms{lost}"
+    )
+
+
 def _number(figures: Figures, name: str, form: str) -> str:
     value: Any = figures.get(name)
     return "-" if value is None else format(value, form)

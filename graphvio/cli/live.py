@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -85,7 +86,7 @@ def run_live(
     """Open a source, run the odometry on it with what is asked for around it, and save everything at the end."""
     from time import monotonic
 
-    from graphvio.cli.dashboard import Dashboard, line_of
+    from graphvio.cli.dashboard import Dashboard, line_of, summary_of
     from graphvio.cli.stopping import StopSignals
     from graphvio.config import Config
     from graphvio.errors import SessionError
@@ -107,12 +108,12 @@ def run_live(
     opened = open_live_source(source, None if rig is None else Rig.load(rig))
     warm_up(default_rig(), settings)  # before sensors deliver: kernels are the same for every rig
     recorder: SessionRecorder | None = None
+    used = opened.open()  # nothing is there yet that would have to be saved
     with StopSignals() as signals, ExitStack() as stack:
-        used = opened.open()
         stack.callback(opened.close)
         outputs: list[Output] = []
         if record is not None:
-            recorder = SessionRecorder(record, used, "png" if png else "raw")
+            recorder = SessionRecorder(record, used, "png" if png else "raw", waits=not opened.is_realtime)
             stack.callback(recorder.close)
             outputs.append(recorder)
         viewer = _viewer(stack, used, view, services)
@@ -137,21 +138,23 @@ def run_live(
         if started is not None:
             started.finish()
     typer.echo(line_of(figures))
-    lost = {name: count for name, count in figures.items() if name.startswith(("skipped", "images_not", "imu_lost"))}
-    typer.echo(
-        f"{figures['estimates']} estimates of {figures['framesets']} framesets, latency p99 "
-        f"{figures['latency_p99_all_ms']} ms; " + ", ".join(f"{name} {count}" for name, count in lost.items())
-    )
+    typer.echo(summary_of(figures))
     if recorder is not None and record is not None:
-        told = recorder.status()
-        typer.echo(f"{record}: {record.stat().st_size / 1e6:.1f} MB, {told['recorded_framesets']} framesets")
-        if told["recording_stopped"] or told["framesets_not_recorded"]:
-            typer.echo(
-                f"graphvio: {told['recording_stopped'] or 'the disk was too slow'}; "
-                f"{told['framesets_not_recorded']} framesets are not in the recording",
-                err=True,
-            )
-            raise typer.Exit(EXIT_STOPPED)
+        _tell_recorded(record, recorder.status())
+
+
+def _tell_recorded(path: Path, told: Mapping[str, float | int | str | None]) -> None:
+    """What is in the recording; exit code 3 where something is not."""
+    size = f"{path.stat().st_size / 1e6:.1f} MB, " if path.exists() else ""
+    typer.echo(f"{path}: {size}{told['recorded_framesets']} framesets")
+    if told["recording_stopped"] or told["framesets_not_recorded"] or told["messages_not_recorded"]:
+        typer.echo(
+            f"graphvio: {told['recording_stopped'] or 'the disk was too slow'}; "
+            f"{told['framesets_not_recorded']} framesets and {told['messages_not_recorded']} samples, poses and "
+            "messages were left out",
+            err=True,
+        )
+        raise typer.Exit(EXIT_STOPPED)
 
 
 def _viewer(stack: ExitStack, rig: Rig, view: bool, services: Services | None) -> Viewer | None:

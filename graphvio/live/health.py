@@ -6,15 +6,25 @@ import json
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from http import HTTPStatus
+from socketserver import ThreadingMixIn
 from typing import Any
-from wsgiref.simple_server import WSGIRequestHandler, make_server
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from graphvio.errors import MissingExtraError, ServiceError
 
 Figures = Mapping[str, float | int | str | None]
 
 _TOTALS = ("images", "imu_samples", "framesets", "estimates", "imu_lost")
-_TOTAL_PREFIXES = ("skipped", "incident", "status_", "recorded", "framesets_not", "images_not", "results_not")
+_TOTAL_PREFIXES = (
+    "skipped",
+    "incident",
+    "status_",
+    "recorded",
+    "framesets_not",
+    "images_not",
+    "messages_not",
+    "results_not",
+)
 
 
 class HealthServer:
@@ -43,7 +53,7 @@ class HealthServer:
         self._status = status
         self._metrics = make_wsgi_app(registry)
         try:
-            self._server = make_server(host, port, self._answer, handler_class=_QuietHandler)
+            self._server = make_server(host, port, self._answer, _ThreadingServer, _QuietHandler)
         except OSError as error:
             raise ServiceError(
                 f"{host}:{port}: cannot be listened on ({error.strerror}); choose another port"
@@ -95,8 +105,17 @@ class _Collector:
         yield GaugeMetricFamily("graphvio_up", "1 while all stages live", value=float(figures.get("health") == "ok"))
 
 
+class _ThreadingServer(ThreadingMixIn, WSGIServer):
+    """Somebody who connects and asks nothing holds up nobody else, nor the end."""
+
+    daemon_threads = True
+    block_on_close = False
+
+
 class _QuietHandler(WSGIRequestHandler):
-    """Writes no log."""
+    """Writes no log, and waits for a question for some seconds only."""
+
+    timeout = 10.0
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing."""

@@ -16,7 +16,8 @@ class Inbox:
 
     Args:
         most_framesets: that may wait.
-        waits: whether `put` waits for room, or the oldest frameset goes.
+        waits: whether `put` waits for room; else the oldest frameset goes, and samples are lost only where whoever
+            takes them is dead.
 
     Attributes:
         dropped_framesets: for which there was no room.
@@ -34,15 +35,18 @@ class Inbox:
         self.dropped_samples = 0
 
     def put(self, event: Event, arrival_ns: int | None = None) -> None:
-        """Bring an event that came just now, or then."""
+        """Bring an event that came just now, or then; once it is closed nothing is taken in."""
+        is_frameset = isinstance(event, FrameSet)
         with self._changed:
-            if isinstance(event, FrameSet):
-                if self._waits:
-                    self._changed.wait_for(lambda: self._framesets < self._most or self._is_closed)
-                elif self._framesets >= self._most:
+            if self._waits:
+                self._changed.wait_for(lambda: self._has_room(is_frameset) or self._is_closed)
+            if self._is_closed:
+                return
+            if is_frameset:
+                if self._framesets >= self._most:
                     self._drop_oldest_frameset()
                 self._framesets += 1
-            elif len(self._waiting) >= _MOST_SAMPLES:
+            elif not self._has_room(is_frameset):
                 self.dropped_samples += 1
                 return
             self._waiting.append((event, host_ns() if arrival_ns is None else arrival_ns))
@@ -55,8 +59,8 @@ class Inbox:
             if not self._waiting:
                 return None
             event, arrival_ns = self._waiting.popleft()
-            if isinstance(event, FrameSet):
-                self._framesets -= 1
+            self._framesets -= isinstance(event, FrameSet)
+            if self._waits:
                 self._changed.notify_all()
             return event, arrival_ns
 
@@ -65,6 +69,13 @@ class Inbox:
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
+
+    def abandon(self) -> None:
+        """Nothing more will be taken: whoever waits for room goes on, and what waits is forgotten."""
+        with self._changed:
+            self._waiting.clear()
+            self._framesets = 0
+            self.close()
 
     @property
     def is_finished(self) -> bool:
@@ -79,6 +90,9 @@ class Inbox:
 
     def __len__(self) -> int:
         return len(self._waiting)
+
+    def _has_room(self, is_frameset: bool) -> bool:
+        return self._framesets < self._most if is_frameset else len(self._waiting) < _MOST_SAMPLES
 
     def _drop_oldest_frameset(self) -> None:
         at = next(i for i, (event, _) in enumerate(self._waiting) if isinstance(event, FrameSet))

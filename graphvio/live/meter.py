@@ -46,6 +46,7 @@ class Meter:
 
     def add_latency(self, latency_ms: float) -> None:
         """A frameset has an estimate, so long after it came."""
+        latency_ms = max(latency_ms, 0.0)  # when it came is what its source says
         with self._lock:
             self._latencies_ms.append(latency_ms)
             self._histogram[min(int(latency_ms / _BIN_MS), _BINS)] += 1
@@ -68,10 +69,10 @@ class Meter:
             return float(np.percentile(self._latencies_ms, percent)) if self._latencies_ms else None
 
     def overall_ms(self, percent: float) -> float | None:
-        """Percentile of all latencies, to half a millisecond."""
+        """Percentile of all latencies, to half a millisecond; beyond two seconds, the longest of all."""
         with self._lock:
             total = int(self._histogram.sum())
             if not total:
                 return None
             rank = np.searchsorted(np.cumsum(self._histogram), percent / 100.0 * total)
-            return float((rank + 1) * _BIN_MS)
+            return self._longest_ms if rank >= _BINS else float((rank + 1) * _BIN_MS)

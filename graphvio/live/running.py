@@ -6,10 +6,11 @@ so that neither has anything to do while the other works. The front-end itself h
 
 from __future__ import annotations
 
-import queue
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from graphvio.arrays import Float
@@ -25,6 +26,7 @@ from graphvio.live.meter import Meter
 from graphvio.live.ordering import SampleOrder
 from graphvio.live.output import Output
 from graphvio.live.pairing import FramesetAssembler
+from graphvio.live.pipe import Pipe
 from graphvio.live.source import CameraFrame, DeviceHealth, ImuReading, LiveSource, Notice, host_ns
 from graphvio.live.stage import Stage
 from graphvio.live.watchdog import Watchdog
@@ -105,23 +107,22 @@ class LiveOdometry:
         self._order = SampleOrder(_MISSING_SAMPLE_MS)
         self._load = LoadControl(config.live.max_latency_ms)
         self._corner_share = 1.0
-        self._images: queue.Queue[tuple[CameraFrame, int] | None] = queue.Queue(_WAITING_IMAGES)
+        self._images: Pipe[tuple[CameraFrame, int]] = Pipe(_WAITING_IMAGES)
         self._inbox = Inbox(_WAITING_FRAMESETS, waits=not source.is_realtime)
-        self._results: queue.Queue[Result | None] = queue.Queue(_WAITING_RESULTS)
+        self._results: Pipe[Result] = Pipe(_WAITING_RESULTS)
         self._under_way: OrderedDict[int, _UnderWay] = OrderedDict()
         self._first_pose_ns: int | None = None  # when it was made
         self._temperature_c: float | None = None
         self._latest: Estimate | None = None
         self._last_reading_ns = self._started_ns = host_ns()
-        self._failed = threading.Event()
         self._ended = threading.Event()
         self._stages = [
-            Stage("capture", self._capture, self._fail),
-            Stage("decode", self._decode, self._fail),
-            Stage("odometry", self._estimate, self._fail),
-            Stage("output", self._put_out, self._fail),
+            Stage("capture", self._capture, self._fail, self._images.close),
+            Stage("decode", self._decode, self._fail, self._end_decode),
+            Stage("odometry", self._estimate, self._fail, self._end_odometry),
+            Stage("output", self._put_out, self._fail, self._end_output),
         ]
-        self._watchdog = Watchdog(self._stages, config.live.stuck_s, self._tell_now)
+        self._watchdog = Watchdog(self._stages, config.live.stuck_s, self._tell_now, self._silent_s)
 
     # ------------------------------------------------------------------ for its owner
 
@@ -148,18 +149,36 @@ class LiveOdometry:
     def stop(self) -> None:
         """Stop the source, work on what has come, and end all threads; a second time does nothing.
 
+        Threads are waited for as long as anything gets on. One that does not is told as ``stage_stuck`` and left
+        behind, and those after it end without what it has.
+
         Raises:
             GraphvioError: what ended a stage before its time.
         """
         self._source.close()
-        for stage in self._stages:
-            if stage.is_alive and not stage.join(_END_S):
+        feeds = (self._images.close, self._inbox.close, self._results.close, self._results.abandon)
+        for stage, end_next in zip(self._stages, feeds, strict=True):
+            if stage.is_alive and not self._ends(stage):
                 self._tell_now("stage_stuck", f"{stage.name} does not end; left behind")
-        if not self._ended.is_set():
-            self._close_listeners()
+                end_next()
+        self._close_listeners()
+        self._ended.set()
         if self._watchdog.is_running:
             self._watchdog.stop()
         self._raise_failure()
+
+    def _ends(self, stage: Stage) -> bool:
+        """Whether a stage ends; it may take long as long as it gets on, or what it waits for does. Capture has to end
+        at once where it need not wait, as its source was closed."""
+        capture, *later = self._stages
+        counted = later if not self._source.is_realtime else [stage] if stage is not capture else []
+        done, since_s = -1, 0.0
+        while not stage.join(_ROUND_S):
+            if (now_done := sum(each.done for each in counted)) != done:
+                done, since_s = now_done, time.monotonic()
+            elif time.monotonic() - since_s > _END_S:
+                return False
+        return True
 
     @property
     def odometry(self) -> Odometry:
@@ -195,9 +214,9 @@ class LiveOdometry:
             "stuck": ",".join(sorted(self._watchdog.stuck | self._watchdog.dead)),
             "uptime_s": (now_ns - self._started_ns) * 1e-9,
             "silent_s": (now_ns - self._last_reading_ns) * 1e-9,
-            "waiting_images": self._images.qsize(),
+            "waiting_images": len(self._images),
             "waiting_framesets": self._inbox.framesets,
-            "waiting_results": self._results.qsize(),
+            "waiting_results": len(self._results),
             "corner_share": self._load.corner_share,
             "temperature_c": self._temperature_c,
             "skipped_no_room": self._inbox.dropped_framesets,
@@ -210,17 +229,14 @@ class LiveOdometry:
 
     def _capture(self, stage: Stage) -> None:
         """Sort what the source gives."""
-        try:
-            for reading in self._source.readings():
-                with stage.working():
-                    self._last_reading_ns = host_ns()
-                    self._take(reading)
-            for sample in self._order.flush():
-                self._bring(sample, host_ns())
-        finally:
-            self._images.put(None)
+        for reading in self._source.readings():
+            with stage.working():
+                self._last_reading_ns = host_ns()
+                self._take(stage, reading)
+        for sample in self._order.flush():
+            self._bring(stage, sample, host_ns())
 
-    def _take(self, reading: ImuReading | CameraFrame | Notice) -> None:
+    def _take(self, stage: Stage, reading: ImuReading | CameraFrame | Notice) -> None:
         if isinstance(reading, Notice):
             self._clocks.doubt(reading.clock)
             self._report(reading.arrival_ns, reading.kind, reading.detail)
@@ -233,70 +249,71 @@ class LiveOdometry:
             self._temperature_c = reading.temperature_c
             came = ImuSample(stamp_ns, reading.angular_velocity, reading.linear_acceleration)
             for sample in self._order.add(came):
-                self._bring(sample, reading.arrival_ns)
+                self._bring(stage, sample, reading.arrival_ns)
             return
         self._meter.came("images", reading.arrival_ns)
-        if not self._source.is_realtime:
-            self._images.put((reading, stamp_ns))
-            return
-        try:
-            self._images.put_nowait((reading, stamp_ns))
-        except queue.Full:
+        with stage.waiting():
+            has_room = self._images.put((reading, stamp_ns), waits=not self._source.is_realtime)
+        if not has_room:
             self._meter.count("images_not_decoded")
 
     def _decode(self, stage: Stage) -> None:
         """Decode images, and put them together to framesets."""
-        try:
-            while (item := self._next_image()) is not None:
-                frame, stamp_ns = item
-                with stage.working():
-                    try:
-                        image = frame.decode()
-                    except SourceError as error:
-                        self._report(stamp_ns, "image_damaged", str(error))
-                        continue
-                    for frameset in self._assembler.add(frame.camera, stamp_ns, image, frame.arrival_ns):
-                        self._bring(frameset, frame.arrival_ns)
-            for frameset in self._assembler.flush():
-                self._bring(frameset, host_ns())
-        finally:
-            self._inbox.close()
+        while (item := self._next_image(stage)) is not None:
+            frame, stamp_ns = item
+            with stage.working():
+                try:
+                    image = frame.decode()
+                except SourceError as error:
+                    self._report(stamp_ns, "image_damaged", str(error))
+                    continue
+                for frameset in self._assembler.add(frame.camera, stamp_ns, image, frame.arrival_ns):
+                    self._bring(stage, frameset, frame.arrival_ns)
+        for frameset in self._assembler.flush():
+            self._bring(stage, frameset, host_ns())
 
-    def _next_image(self) -> tuple[CameraFrame, int] | None:
+    def _end_decode(self) -> None:
+        self._images.abandon()
+        self._inbox.close()
+
+    def _next_image(self, stage: Stage) -> tuple[CameraFrame, int] | None:
         """The next image; None at the end. While none comes, framesets that have waited long enough go on."""
-        while True:
-            try:
-                return self._images.get(timeout=_ROUND_S)
-            except queue.Empty:
-                if not self._source.is_realtime:
-                    continue  # its images come when they are taken: time tells nothing of them
-                now_ns = host_ns()
-                for frameset in self._assembler.advance(now_ns):
-                    self._bring(frameset, now_ns)
+        while (item := self._images.take(_ROUND_S)) is None and not self._images.is_finished:
+            if not self._source.is_realtime:
+                continue  # its images come when they are taken: time tells nothing of them
+            now_ns = host_ns()
+            for frameset in self._assembler.advance(now_ns):
+                self._bring(stage, frameset, now_ns)
+        return item
 
-    def _bring(self, event: ImuSample | FrameSet, arrival_ns: int) -> None:
+    def _bring(self, stage: Stage, event: ImuSample | FrameSet, arrival_ns: int) -> None:
         if isinstance(event, FrameSet):
             self._meter.came("framesets", arrival_ns)
         for output in self._outputs:
             output.add_event(event)
-        self._inbox.put(event, arrival_ns)
+        with stage.waiting():
+            self._inbox.put(event, arrival_ns)
 
     def _estimate(self, stage: Stage) -> None:
         """Feed the odometry, and give up what there is no time for."""
-        try:
-            while not self._inbox.is_finished and not self._failed.is_set():
-                taken = self._inbox.take(_ROUND_S)
-                if taken is None:
-                    continue
-                with stage.working():
-                    self._process(*taken)
+        while not self._inbox.is_finished:
+            taken = self._inbox.take(_ROUND_S)
+            if taken is None:
+                continue
             with stage.working():
-                for estimate in self._odometry.finish():
-                    self._deliver(estimate)
-        finally:
-            self._results.put(None)
+                self._process(stage, *taken)
+        with stage.working():
+            for estimate in self._odometry.finish():
+                self._deliver(stage, estimate)
 
-    def _process(self, event: ImuSample | FrameSet, arrival_ns: int) -> None:
+    def _end_odometry(self) -> None:
+        self._inbox.abandon()
+        try:
+            self._tell_incidents()
+        finally:
+            self._results.close()
+
+    def _process(self, stage: Stage, event: ImuSample | FrameSet, arrival_ns: int) -> None:
         begun_ns = host_ns()
         if isinstance(event, FrameSet):
             waited_ms = 1e-6 * (begun_ns - arrival_ns)
@@ -308,12 +325,13 @@ class LiveOdometry:
                 self._under_way.popitem(last=False)
         estimate = self._odometry.process(event)
         while estimate is not None:
-            self._conclude(estimate, begun_ns)
+            self._conclude(stage, estimate, begun_ns)
+            stage.get_on()
             begun_ns = host_ns()
             estimate = self._odometry.process_due()
         self._tell_incidents()
 
-    def _conclude(self, estimate: Estimate, begun_ns: int) -> None:
+    def _conclude(self, stage: Stage, estimate: Estimate, begun_ns: int) -> None:
         """An estimate has been made since then."""
         self._tell_incidents()
         under_way = self._under_way.get(estimate.stamp_ns)
@@ -322,9 +340,9 @@ class LiveOdometry:
             if self._load.corner_share != self._corner_share:
                 self._corner_share = self._load.corner_share
                 self._odometry.limit_corners(self._corner_share)
-        self._deliver(estimate)
+        self._deliver(stage, estimate)
 
-    def _deliver(self, estimate: Estimate) -> None:
+    def _deliver(self, stage: Stage, estimate: Estimate) -> None:
         under_way, now_ns = self._under_way.pop(estimate.stamp_ns, None), host_ns()
         self._odometry.take_smoothed()  # else they would gather
         self._latest = estimate
@@ -336,12 +354,9 @@ class LiveOdometry:
             self._meter.add_latency(1e-6 * (now_ns - under_way.arrival_ns))
         self.estimates.publish(estimate)
         result = Result(estimate, None if under_way is None else under_way.frameset)
-        if not self._source.is_realtime:
-            self._results.put(result)
-            return
-        try:
-            self._results.put_nowait(result)
-        except queue.Full:
+        with stage.waiting():
+            has_room = self._results.put(result, waits=not self._source.is_realtime)
+        if not has_room:
             self._meter.count("results_not_put_out")
 
     def _is_after_start(self, arrival_ns: int) -> bool:
@@ -355,11 +370,15 @@ class LiveOdometry:
 
     def _put_out(self, stage: Stage) -> None:
         """Hand estimates to the outputs."""
-        while (result := self._results.get()) is not None:
+        while (result := self._results.take()) is not None:
             with stage.working():
                 for output in self._outputs:
                     output.add_result(result.estimate, result.frameset)
+
+    def _end_output(self) -> None:
+        self._results.abandon()
         self._close_listeners()
+        self._ended.set()
 
     # ------------------------------------------------------------------ what is told
 
@@ -378,10 +397,16 @@ class LiveOdometry:
             self._report(incident.stamp_ns, incident.kind, incident.detail)
 
     def _fail(self, stage: Stage, error: BaseException) -> None:
-        self._tell_now("stage_failed", f"{stage.name}: {error}")
-        self._failed.set()
+        """A stage is dead: the source ends, by which all others come to their end."""
+        with suppress(Exception):  # an output may be what failed
+            self._tell_now("stage_failed", f"{stage.name}: {error}")
         self._ended.set()
         self._source.close()
+
+    def _silent_s(self) -> float:
+        """How long nothing has come from sensors that should deliver."""
+        is_awaited = self._source.is_realtime and self._stages[0].is_alive
+        return 1e-9 * (host_ns() - self._last_reading_ns) if is_awaited else 0.0
 
     def _raise_failure(self) -> None:
         for stage in self._stages:
@@ -389,8 +414,6 @@ class LiveOdometry:
                 raise stage.failure
 
     def _close_listeners(self) -> None:
-        self._tell_incidents()
         self.keyframe_log.close()
         for broadcast in (self.estimates, self.predictions, self.incidents):
             broadcast.close()
-        self._ended.set()

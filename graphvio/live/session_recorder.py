@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import queue
 import shutil
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from graphvio.events import Estimate, Event, FrameSet, Incident
+from graphvio.live.pipe import Pipe
 from graphvio.rig import Rig
 from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
@@ -20,24 +20,28 @@ _WAITING_IMAGES = 120  # framesets
 class SessionRecorder:
     """An output (`graphvio.live.output.Output`) that writes all that comes and all that is made of it.
 
-    When the disk does not keep up, framesets are left out of the recording and counted; samples and poses are not.
+    When the disk does not keep up, framesets are left out of the recording and counted; samples and poses are, too,
+    when it has stood still for more than a minute.
 
     Args:
         path: of the session, new.
         rig: of the framesets.
         image_format: images as they are, or as PNG.
+        waits: for the disk instead, as for a source that waits itself.
 
     Raises:
         SessionError: if the file exists or cannot be made.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
 
-    def __init__(self, path: Path, rig: Rig, image_format: ImageFormat = "raw") -> None:
+    def __init__(self, path: Path, rig: Rig, image_format: ImageFormat = "raw", waits: bool = False) -> None:
         self._path = path
+        self._waits = waits
         self._writer = SessionWriter(path, rig, image_format)
-        self._waiting: queue.Queue[Callable[[], None] | None] = queue.Queue(_WAITING)
+        self._waiting: Pipe[Callable[[], None]] = Pipe(_WAITING)
         self._images = threading.Semaphore(_WAITING_IMAGES)
-        self._left_out = 0
+        self._left_out = 0  # framesets
+        self._lost = 0  # samples, poses, messages
         self._framesets = 0
         self.failure: Exception | None = None
         self._thread = threading.Thread(target=self._write, name="graphvio-record", daemon=True)
@@ -46,20 +50,21 @@ class SessionRecorder:
     def add_event(self, event: Event) -> None:
         """See `Output`."""
         if isinstance(event, FrameSet):
-            if not self._images.acquire(blocking=False):
+            if not self._images.acquire(blocking=self._waits):
                 self._left_out += 1
-                return
-            self._waiting.put(lambda: self._write_frameset(event))
+            elif not self._waiting.put(lambda: self._write_frameset(event), self._waits):
+                self._images.release()
+                self._left_out += 1
         else:
-            self._waiting.put(lambda: self._writer.add(event))
+            self._put(lambda: self._writer.add(event))
 
     def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
         """See `Output`."""
-        self._waiting.put(lambda: self._writer.add_estimate(estimate))
+        self._put(lambda: self._writer.add_estimate(estimate))
 
     def add_incident(self, incident: Incident) -> None:
         """See `Output`."""
-        self._waiting.put(lambda: self._writer.add_incident(incident))
+        self._put(lambda: self._writer.add_incident(incident))
 
     def status(self) -> Mapping[str, float | int | str | None]:
         """See `Output`."""
@@ -67,14 +72,24 @@ class SessionRecorder:
             "recorded_framesets": self._framesets,
             "recorded_poses": self._writer.poses,
             "framesets_not_recorded": self._left_out,
+            "messages_not_recorded": self._lost,
             "recording_stopped": self._writer.stopped or (str(self.failure) if self.failure else ""),
-            "disk_free_gb": shutil.disk_usage(self._path.parent).free / 1e9,
+            "disk_free_gb": self._free_gb(),
         }
 
     def close(self) -> None:
         """Write what waits, and finish the file."""
-        self._waiting.put(None)
+        self._waiting.close()
         self._thread.join()
+
+    def _put(self, write: Callable[[], None]) -> None:
+        self._lost += not self._waiting.put(write, self._waits)
+
+    def _free_gb(self) -> float | None:
+        try:
+            return shutil.disk_usage(self._path.parent).free / 1e9
+        except OSError:  # the disk was taken away
+            return None
 
     def _write_frameset(self, frameset: FrameSet) -> None:
         try:
@@ -85,7 +100,7 @@ class SessionRecorder:
 
     def _write(self) -> None:
         with self._writer:
-            while (write := self._waiting.get()) is not None:
+            while (write := self._waiting.take()) is not None:
                 try:
                     write()
                 except Exception as error:  # a message that cannot be written is no reason to stop the others

@@ -1,4 +1,4 @@
-"""Notices stages that are stuck or dead, and sensors that are silent."""
+"""Notices stages that are stuck or dead, and tells when sensors are silent."""
 
 from __future__ import annotations
 
@@ -18,14 +18,17 @@ class Watchdog:
 
     Args:
         stages: to look at.
-        stuck_s: a piece of work that takes longer is stuck.
-        tell: is told when one is stuck, and when it goes on.
+        stuck_s: a piece of work that takes longer is stuck, and sensors from which nothing came for longer are silent.
+        tell: is told when it begins, and when it is over.
+        silent_s: tells for how long nothing has come, 0 where that means nothing.
     """
 
-    def __init__(self, stages: Sequence[Stage], stuck_s: float, tell: Tell) -> None:
+    def __init__(self, stages: Sequence[Stage], stuck_s: float, tell: Tell, silent_s: Callable[[], float]) -> None:
         self._stages = stages
         self._stuck_s = stuck_s
         self._tell = tell
+        self._silent_s = silent_s
+        self._was_silent = False
         self._stuck: frozenset[str] = frozenset()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="graphvio-watchdog", daemon=True)
@@ -62,3 +65,8 @@ class Watchdog:
             for name in sorted(self._stuck - stuck):
                 self._tell("stage_recovered", f"{name} goes on")
             self._stuck = stuck
+            is_silent = self._silent_s() > self._stuck_s
+            if is_silent != self._was_silent:
+                kind = "sensors_silent" if is_silent else "sensors_back"
+                self._tell(kind, f"nothing came for {self._stuck_s:g} s" if is_silent else "readings come again")
+            self._was_silent = is_silent

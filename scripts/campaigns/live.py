@@ -154,6 +154,8 @@ def _killed(folder: Path, after_s: float) -> float:
             stderr=subprocess.DEVNULL,
         )
         while not out.exists() or not out.stat().st_size:
+            if process.poll() is not None:
+                raise GraphvioError(f"graphvio live ended with exit code {process.returncode} before it recorded")
             time.sleep(0.01)
         begun_s = time.monotonic()
         time.sleep(after_s)

@@ -50,10 +50,7 @@ class Listener:
         self.thread.start()
 
     def _listen(self) -> None:
-        while not self._estimates.is_closed:
-            estimate = self._estimates.get(0.5)
-            if estimate is None:
-                continue
+        while (estimate := self._estimates.get()) is not None:
             self._first_ns = estimate.stamp_ns if self._first_ns is None else self._first_ns
             self.statuses.append(str(estimate.status))
             if self._last_ns is not None:

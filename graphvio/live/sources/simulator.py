@@ -7,6 +7,7 @@ other sign, accelerations are the same. Where a walk begins and ends at rest, to
 from __future__ import annotations
 
 import hashlib
+import shutil
 import subprocess
 import sys
 from collections.abc import Generator, Iterator, Mapping, Sequence
@@ -182,10 +183,15 @@ class SimulatedRig:
         arguments = ["simulate", self._scene, "--out", unfinished, "--seed", self._seed, "--rate", f"{self._rate_hz:g}"]
         command = [sys.executable, "-c", "from graphvio.cli import main; main()", *map(str, arguments)]
         root.mkdir(parents=True, exist_ok=True)
-        if subprocess.run(command, check=False).returncode:
-            raise SourceError(f"simulator: {self._scene} could not be rendered; try  graphvio simulate {self._scene}")
-        if not folder.is_dir():  # else another process was faster
-            unfinished.rename(folder)
+        try:
+            if subprocess.run(command, check=False).returncode:
+                raise SourceError(
+                    f"simulator: {self._scene} could not be rendered; try  graphvio simulate {self._scene}"
+                )
+            if not folder.is_dir():  # else another process was faster
+                unfinished.rename(folder)
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)
         return folder
 
 
