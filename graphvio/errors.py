@@ -46,3 +46,7 @@ class OptimizationError(GraphvioError):
 
 class FleetError(GraphvioError):
     """Sessions cannot be listed, their files not be reached, or the workers not be used."""
+
+
+class MapError(GraphvioError):
+    """A map cannot be read or written, or does not fit the rig; or keyframes cannot be mapped."""

@@ -1,0 +1,259 @@
+"""The map's pose graph: chains of places, and the closures between them that are believed.
+
+A closure is refused at once where the odometry between its ends refutes it. One that the present solution bears out is
+used; what it does not is kept, and when such doubts or closures between unjoined fragments have grown, all are judged
+anew together, as for recorded sessions (`graphvio.optimization.consistency`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.factors import x
+from graphvio.backend.gating import chi_square_quantile
+from graphvio.mapping.chains import Chains
+from graphvio.mapping.places import composed
+from graphvio.optimization.consistency import Joined, consistent, join_fragments
+from graphvio.optimization.loops.search import LoopClosure
+from graphvio.optimization.marginals import Marginals
+from graphvio.optimization.solve import solve
+from graphvio.optimization.tie import Tie
+
+_MOST_VOTES = 30  # of two fragments: votes are compared with each other
+_LEAST_DOUBTS = 3  # before all closures are judged anew,
+_DOUBTED_SHARE = 0.1  # and this share of those that are used
+_LATEST = 50  # closures that are doubted no more if the solution comes to bear them out
+_IN_SIGHT_M = 10.0  # two places further apart have little in common that stereo measures well,
+_SIGMAS = 4.0  # and so many standard deviations of both places' positions
+_MOST_JUDGED_AGAIN = 3  # rounds in which refused closures are taken up that the solution bears out
+
+
+@dataclass(eq=False)
+class Judged:
+    """A closure between places of the graph, whose numbers are their rows.
+
+    Attributes:
+        closure: as it was found.
+        tie: the same as a factor.
+        is_used: whether the solution rests on it.
+        is_refuted: whether the odometry alone refutes it, for good.
+    """
+
+    closure: LoopClosure
+    tie: Tie
+    is_used: bool = False
+    is_refuted: bool = False
+
+
+class PoseGraph:
+    """Places, and where they are: those of joined fragments in the frame of the first of them.
+
+    Args:
+        probability: a closure beyond this share of the chi-square distribution is refused.
+        chains: of an earlier map.
+        closures: of it.
+        poses: (N, 4, 4) its solution.
+        component: of each of its fragments, the one whose frame it is in.
+        bounds: (N, 6, 6) covariances of the poses.
+    """
+
+    def __init__(
+        self,
+        probability: float,
+        chains: Chains | None = None,
+        closures: Sequence[Judged] = (),
+        poses: Sequence[Float] = (),
+        component: Sequence[int] = (),
+        bounds: Sequence[Float] = (),
+    ) -> None:
+        self.chains = Chains() if chains is None else chains
+        self.closures = list(closures)
+        self._probability = probability
+        self._limit = chi_square_quantile(probability, 6)
+        self._poses = list(poses)
+        self._component = list(component)
+        self._bounds = list(bounds)
+        self._marginals: Marginals | None = None
+        self._doubts = 0
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    def begin(self, odom_T_body: Float, covariance: Float) -> int:
+        """Add a place that begins a fragment, by its pose (4, 4) in odom and its covariance; returns its number."""
+        self.chains.begin(odom_T_body, covariance)
+        self._poses.append(odom_T_body)
+        self._component.append(len(self._component))
+        self._bounds.append(covariance)
+        self._marginals = None
+        return len(self) - 1
+
+    def add(self, previous_T_body: Float, covariance: Float) -> int:
+        """Add a place to the last fragment, by its motion (4, 4) since the place before it; returns its number."""
+        self.chains.add(previous_T_body, covariance)
+        pose, bound = composed(self._poses[-1], self._bounds[-1], previous_T_body, covariance)
+        self._poses.append(pose)
+        self._bounds.append(bound)
+        self._marginals = None
+        return len(self) - 1
+
+    @property
+    def component(self) -> list[int]:
+        """Of each fragment, the fragment whose odom frame it is in; 0 is the map's."""
+        return list(self._component)
+
+    def is_in_map(self, place: int) -> bool:
+        """Whether a place is in the map's frame, which is the first fragment's odom frame."""
+        return self._component[self.chains.fragment(place)] == 0
+
+    def pose(self, place: int) -> Float:
+        """(4, 4) of a place in its component's frame."""
+        return self._poses[place]
+
+    def covariance(self, place: int) -> Float:
+        """Covariance (6, 6) of that, tangent ``[rotation, translation]`` in body; of the frame's origin it is free."""
+        return self._known().pose(place)
+
+    def may_see(self, one: int, other: int) -> bool:
+        """Whether two places are perhaps near enough to see the same; always, as long as nothing joins them."""
+        if self._component[self.chains.fragment(one)] != self._component[self.chains.fragment(other)]:
+            return True
+        sigma_m = sum(float(np.sqrt(np.trace(self._bounds[place][3:, 3:]))) for place in (one, other))
+        distance_m = np.linalg.norm(self._poses[one][:3, 3] - self._poses[other][:3, 3])
+        return bool(distance_m <= _IN_SIGHT_M + _SIGMAS * sigma_m)
+
+    def add_closures(self, found: Sequence[LoopClosure]) -> bool:
+        """Judge closures whose places' rows are numbers of the graph; returns whether the solution has changed.
+
+        Raises:
+            OptimizationError: if the graph cannot be solved.
+        """
+        is_new, asks_votes = False, False
+        for closure in found:
+            one, other = closure.reference.row, closure.current.row
+            judged = Judged(closure, Tie(one, other, closure.reference_T_current, closure.covariance))
+            self.closures.append(judged)
+            fragments = self.chains.fragment(one), self.chains.fragment(other)
+            if fragments[0] == fragments[1] and self.chains.distance(judged.tie) > self._limit:
+                judged.is_refuted = True
+            elif self._component[fragments[0]] != self._component[fragments[1]]:
+                asks_votes = True
+            elif self._known().distance(judged.tie) <= self._limit:
+                judged.is_used = is_new = True
+            else:
+                self._doubts += 1
+        is_new |= self._take_up_doubted()
+        used = sum(each.is_used for each in self.closures)
+        if asks_votes and self._joined().component != self._component:
+            return self._judge_all()
+        if self._doubts >= max(_LEAST_DOUBTS, _DOUBTED_SHARE * used):
+            return self._judge_all()
+        if is_new:
+            self._solve()
+        return is_new
+
+    def _take_up_doubted(self) -> bool:
+        """Use closures that were doubted once, and that the solution bears out by now."""
+        known, taken = self._known(), False
+        doubted = [
+            each
+            for each in self.closures[-_LATEST:]
+            if not each.is_used
+            and not each.is_refuted
+            and len({self._component[self.chains.fragment(end)] for end in (each.tie.first, each.tie.second)}) == 1
+        ]
+        for each in doubted:
+            if known.distance(each.tie) <= self._limit:
+                each.is_used = taken = True
+        return taken
+
+    def _judge_all(self) -> bool:
+        """Which closures to believe, from the odometry on; all of it as for recorded sessions."""
+        self._doubts = 0
+        before = [each.is_used for each in self.closures], self._component
+        joined = self._joined()
+        fragments = self.chains.fragments
+        moved = [
+            frame @ pose
+            for frame, states in zip(joined.frames, fragments, strict=True)
+            for pose in self.chains.poses[states.start : states.stop]
+        ]
+        asked = [each for each in self.closures if not each.is_refuted]
+        believed, distances = consistent(
+            fragments, joined, np.array(moved), [each.tie for each in asked], self.chains, self._probability
+        )
+        changed: list[int] = []
+        for number, states in enumerate(fragments):
+            if joined.component[number] != self._component[number]:
+                self._poses[states.start : states.stop] = moved[states.start : states.stop]
+                changed += states
+        self._component = list(joined.component)
+        for _ in range(_MOST_JUDGED_AGAIN):
+            for each, is_believed in zip(asked, believed, strict=True):
+                each.is_used = bool(is_believed)
+            self._solve()
+            # Refused too soon: the odometry does not refute them, and the solution without them bears them out.
+            doubted = np.flatnonzero(~believed & (distances <= self._limit))
+            known = self._known()
+            again = [k for k in doubted.tolist() if known.distance(asked[k].tie) <= self._limit]
+            if not again:
+                break
+            believed[again] = True
+        for place in changed:
+            self._bounds[place] = self.covariance(place)
+        return before != ([each.is_used for each in self.closures], self._component)
+
+    def _joined(self) -> Joined:
+        """How the fragments lie to each other, by votes: one of each place, so that no single look decides."""
+        strongest: dict[tuple[int, int], Judged] = {}
+        for each in self.closures:
+            first, second = self.chains.fragment(each.tie.first), self.chains.fragment(each.tie.second)
+            if first != second:
+                known = strongest.get((first, each.tie.second))
+                if known is None or each.closure.inliers > known.closure.inliers:
+                    strongest[first, each.tie.second] = each
+        votes: dict[tuple[int, int], list[Judged]] = {}
+        for (first, place), each in strongest.items():
+            votes.setdefault((first, self.chains.fragment(place)), []).append(each)
+        heard = [
+            each
+            for of_two in votes.values()
+            for each in sorted(of_two, key=lambda each: -each.closure.inliers)[:_MOST_VOTES]
+        ]
+        return join_fragments(
+            self.chains.fragments,
+            np.array(self.chains.poses),
+            [each.tie for each in heard],
+            [each.closure.inliers for each in heard],
+        )
+
+    def _graph(self) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph(self.chains.graph)
+        for root in sorted(set(self._component)):
+            graph.add(self.chains.prior(root))
+        for each in self.closures:
+            if each.is_used:
+                graph.add(each.tie.factor())
+        return graph
+
+    def _values(self) -> gtsam.Values:
+        values = gtsam.Values()
+        for k, pose in enumerate(self._poses):
+            values.insert(x(k), gtsam.Pose3(pose))
+        return values
+
+    def _solve(self) -> None:
+        solved = solve(self._graph(), self._values())
+        self._poses = [np.asarray(solved.atPose3(x(k)).matrix()) for k in range(len(self))]
+        self._marginals = None
+        self._bounds[-1] = self._known().pose(len(self) - 1)  # of older places, what was known before is a bound
+
+    def _known(self) -> Marginals:
+        if self._marginals is None:
+            self._marginals = Marginals(self._graph(), self._values())
+        return self._marginals
