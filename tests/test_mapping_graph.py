@@ -60,7 +60,7 @@ def test_chains_know_motions_as_the_solved_graph_does() -> None:
     truth, rng = circle(1.0, 30), np.random.default_rng(0)
     graph = PoseGraph(PROBABILITY)
     walked(graph, truth, rng)
-    known = Marginals(graph._graph(), graph._values())
+    known = Marginals(*graph._graph(0))
     for first, second in ((3, 4), (2, 25), (25, 2)):
         motion, covariance = graph.chains.motion(first, second)
         expected_motion, expected = known.motion(first, second)

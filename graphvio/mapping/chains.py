@@ -29,7 +29,7 @@ class Chains:
         self.covariances: list[Float] = []
         self.poses: list[Float] = []
         self._sums: list[Float] = []
-        self.graph = gtsam.NonlinearFactorGraph()
+        self._factors: dict[int, gtsam.NonlinearFactor] = {}  # place -> its motion from the one before
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -57,7 +57,7 @@ class Chains:
         adjoint = se3_adjoint(pose)
         n = len(self)
         self._append(previous_T_body, covariance, pose, self._sums[-1] + adjoint @ covariance @ adjoint.T)
-        self.graph.add(Tie(n - 1, n, previous_T_body, covariance).factor())
+        self._factors[n] = Tie(n - 1, n, previous_T_body, covariance).factor()
 
     def motion(self, first: int, second: int) -> tuple[Float, Float]:
         """``first_T_second`` (4, 4) of two places of a fragment, and its covariance (6, 6), in body at the second."""
@@ -72,6 +72,11 @@ class Chains:
         relative, covariance = self.motion(tie.first, tie.second)
         error = se3_log(se3_inverse(relative) @ tie.first_T_second)
         return float(error @ np.linalg.solve(covariance + tie.covariance, error))
+
+    def add_to(self, graph: gtsam.NonlinearFactorGraph, fragment: int) -> None:
+        """Add a fragment's motions to a graph, whose variables are the places' numbers."""
+        for place in self.fragments[fragment][1:]:
+            graph.add(self._factors[place])
 
     def prior(self, fragment: int) -> gtsam.NonlinearFactor:
         """Where a fragment's odometry began, which is what its odom frame is."""

@@ -16,6 +16,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.backend.factors import x
 from graphvio.backend.gating import chi_square_quantile
+from graphvio.geometry import se3_inverse
 from graphvio.mapping.chains import Chains
 from graphvio.mapping.places import composed
 from graphvio.optimization.consistency import Joined, consistent, join_fragments
@@ -78,7 +79,7 @@ class PoseGraph:
         self._poses = list(poses)
         self._component = list(component)
         self._bounds = list(bounds)
-        self._marginals: Marginals | None = None
+        self._known_of: dict[int, Marginals] = {}  # of components, as far as they have not changed
         self._doubts = 0
 
     def __len__(self) -> int:
@@ -90,7 +91,6 @@ class PoseGraph:
         self._poses.append(odom_T_body)
         self._component.append(len(self._component))
         self._bounds.append(covariance)
-        self._marginals = None
         return len(self) - 1
 
     def add(self, previous_T_body: Float, covariance: Float) -> int:
@@ -99,7 +99,7 @@ class PoseGraph:
         pose, bound = composed(self._poses[-1], self._bounds[-1], previous_T_body, covariance)
         self._poses.append(pose)
         self._bounds.append(bound)
-        self._marginals = None
+        self._known_of.pop(self._component[-1], None)
         return len(self) - 1
 
     @property
@@ -109,7 +109,7 @@ class PoseGraph:
 
     def is_in_map(self, place: int) -> bool:
         """Whether a place is in the map's frame, which is the first fragment's odom frame."""
-        return self._component[self.chains.fragment(place)] == 0
+        return self._component_of(place) == 0
 
     def pose(self, place: int) -> Float:
         """(4, 4) of a place in its component's frame."""
@@ -117,11 +117,11 @@ class PoseGraph:
 
     def covariance(self, place: int) -> Float:
         """Covariance (6, 6) of that, tangent ``[rotation, translation]`` in body; of the frame's origin it is free."""
-        return self._known().pose(place)
+        return self._known(self._component_of(place)).pose(place)
 
     def may_see(self, one: int, other: int) -> bool:
         """Whether two places are perhaps near enough to see the same; always, as long as nothing joins them."""
-        if self._component[self.chains.fragment(one)] != self._component[self.chains.fragment(other)]:
+        if self._component_of(one) != self._component_of(other):
             return True
         sigma_m = sum(float(np.sqrt(np.trace(self._bounds[place][3:, 3:]))) for place in (one, other))
         distance_m = np.linalg.norm(self._poses[one][:3, 3] - self._poses[other][:3, 3])
@@ -138,37 +138,35 @@ class PoseGraph:
             one, other = closure.reference.row, closure.current.row
             judged = Judged(closure, Tie(one, other, closure.reference_T_current, closure.covariance))
             self.closures.append(judged)
-            fragments = self.chains.fragment(one), self.chains.fragment(other)
-            if fragments[0] == fragments[1] and self.chains.distance(judged.tie) > self._limit:
+            is_inside = self.chains.fragment(one) == self.chains.fragment(other)
+            if is_inside and self.chains.distance(judged.tie) > self._limit:
                 judged.is_refuted = True
-            elif self._component[fragments[0]] != self._component[fragments[1]]:
+            elif self._component_of(one) != self._component_of(other):
                 asks_votes = True
-            elif self._known().distance(judged.tie) <= self._limit:
+            elif self._known(self._component_of(one)).distance(judged.tie) <= self._limit:
                 judged.is_used = is_new = True
             else:
                 self._doubts += 1
-        is_new |= self._take_up_doubted()
+        newest = self._component[-1]
+        is_new |= self._take_up_doubted(newest)
         used = sum(each.is_used for each in self.closures)
-        if asks_votes and self._joined().component != self._component:
-            return self._judge_all()
-        if self._doubts >= max(_LEAST_DOUBTS, _DOUBTED_SHARE * used):
+        if (asks_votes and self._joined().component != self._component) or self._doubts >= max(
+            _LEAST_DOUBTS, _DOUBTED_SHARE * used
+        ):
             return self._judge_all()
         if is_new:
-            self._solve()
+            self._solve(newest)
+            self._bounds[-1] = self.covariance(len(self) - 1)  # of older places, what was known before is a bound
         return is_new
 
-    def _take_up_doubted(self) -> bool:
-        """Use closures that were doubted once, and that the solution bears out by now."""
-        known, taken = self._known(), False
-        doubted = [
-            each
-            for each in self.closures[-_LATEST:]
-            if not each.is_used
-            and not each.is_refuted
-            and len({self._component[self.chains.fragment(end)] for end in (each.tie.first, each.tie.second)}) == 1
-        ]
-        for each in doubted:
-            if known.distance(each.tie) <= self._limit:
+    def _take_up_doubted(self, root: int) -> bool:
+        """Use closures of a component that were doubted once, and that the solution bears out by now."""
+        taken = False
+        for each in self.closures[-_LATEST:]:
+            ends = {self._component_of(each.tie.first), self._component_of(each.tie.second)}
+            if each.is_used or each.is_refuted or ends != {root}:
+                continue
+            if self._known(root).distance(each.tie) <= self._limit:
                 each.is_used = taken = True
         return taken
 
@@ -176,37 +174,51 @@ class PoseGraph:
         """Which closures to believe, from the odometry on; all of it as for recorded sessions."""
         self._doubts = 0
         before = [each.is_used for each in self.closures], self._component
-        joined = self._joined()
-        fragments = self.chains.fragments
-        moved = [
-            frame @ pose
-            for frame, states in zip(joined.frames, fragments, strict=True)
-            for pose in self.chains.poses[states.start : states.stop]
-        ]
+        joined, fragments = self._joined(), self.chains.fragments
         asked = [each for each in self.closures if not each.is_refuted]
-        believed, distances = consistent(
-            fragments, joined, np.array(moved), [each.tie for each in asked], self.chains, self._probability
-        )
+        ties = [each.tie for each in asked]
+        believed, distances = consistent(fragments, joined, self._moved(joined), ties, self.chains, self._probability)
+        joined = self._held_together(joined, [tie for tie, is_used in zip(ties, believed, strict=True) if is_used])
+        moved = self._moved(joined)
         changed: list[int] = []
         for number, states in enumerate(fragments):
             if joined.component[number] != self._component[number]:
                 self._poses[states.start : states.stop] = moved[states.start : states.stop]
                 changed += states
-        self._component = list(joined.component)
+        self._component, self._known_of = list(joined.component), {}
         for _ in range(_MOST_JUDGED_AGAIN):
             for each, is_believed in zip(asked, believed, strict=True):
                 each.is_used = bool(is_believed)
-            self._solve()
+            for root in set(self._component):
+                self._solve(root)
             # Refused too soon: the odometry does not refute them, and the solution without them bears them out.
-            doubted = np.flatnonzero(~believed & (distances <= self._limit))
-            known = self._known()
-            again = [k for k in doubted.tolist() if known.distance(asked[k].tie) <= self._limit]
+            again = [k for k in np.flatnonzero(~believed & (distances <= self._limit)).tolist() if self._fits(ties[k])]
             if not again:
                 break
             believed[again] = True
         for place in changed:
             self._bounds[place] = self.covariance(place)
         return before != ([each.is_used for each in self.closures], self._component)
+
+    def _fits(self, tie: Tie) -> bool:
+        root = self._component_of(tie.first)
+        return root == self._component_of(tie.second) and self._known(root).distance(tie) <= self._limit
+
+    def _moved(self, joined: Joined) -> Float:
+        """Poses (N, 4, 4) by the odometry alone, in the frames that are common."""
+        poses = np.array(self.chains.poses)
+        for frame, states in zip(joined.frames, self.chains.fragments, strict=True):
+            poses[states.start : states.stop] = frame @ poses[states.start : states.stop]
+        return poses
+
+    def _held_together(self, joined: Joined, used: Sequence[Tie]) -> Joined:
+        """Only those fragments joined that closures which are believed hold together: the others would be free."""
+        root = list(range(len(joined.component)))
+        for tie in used:
+            ends = root[self.chains.fragment(tie.first)], root[self.chains.fragment(tie.second)]
+            root = [min(ends) if of in ends else of for of in root]
+        frames = [se3_inverse(joined.frames[of]) @ frame for of, frame in zip(root, joined.frames, strict=True)]
+        return Joined(frames, root)
 
     def _joined(self) -> Joined:
         """How the fragments lie to each other, by votes: one of each place, so that no single look decides."""
@@ -232,28 +244,35 @@ class PoseGraph:
             [each.closure.inliers for each in heard],
         )
 
-    def _graph(self) -> gtsam.NonlinearFactorGraph:
-        graph = gtsam.NonlinearFactorGraph(self.chains.graph)
-        for root in sorted(set(self._component)):
-            graph.add(self.chains.prior(root))
+    def _component_of(self, place: int) -> int:
+        return self._component[self.chains.fragment(place)]
+
+    def _fragments_of(self, root: int) -> list[int]:
+        return [number for number, of in enumerate(self._component) if of == root]
+
+    def _graph(self, root: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Of one component: METIS, which orders variables, breaks on graphs that fall apart."""
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        graph.add(self.chains.prior(root))
+        fragments = self.chains.fragments
+        for number in self._fragments_of(root):
+            self.chains.add_to(graph, number)
+            for place in fragments[number]:
+                values.insert(x(place), gtsam.Pose3(self._poses[place]))
         for each in self.closures:
-            if each.is_used:
+            if each.is_used and self._component_of(each.tie.first) == root:
                 graph.add(each.tie.factor())
-        return graph
+        return graph, values
 
-    def _values(self) -> gtsam.Values:
-        values = gtsam.Values()
-        for k, pose in enumerate(self._poses):
-            values.insert(x(k), gtsam.Pose3(pose))
-        return values
+    def _solve(self, root: int) -> None:
+        solved = solve(*self._graph(root))
+        fragments = self.chains.fragments
+        for number in self._fragments_of(root):
+            for place in fragments[number]:
+                self._poses[place] = np.asarray(solved.atPose3(x(place)).matrix())
+        self._known_of.pop(root, None)
 
-    def _solve(self) -> None:
-        solved = solve(self._graph(), self._values())
-        self._poses = [np.asarray(solved.atPose3(x(k)).matrix()) for k in range(len(self))]
-        self._marginals = None
-        self._bounds[-1] = self._known().pose(len(self) - 1)  # of older places, what was known before is a bound
-
-    def _known(self) -> Marginals:
-        if self._marginals is None:
-            self._marginals = Marginals(self._graph(), self._values())
-        return self._marginals
+    def _known(self, root: int) -> Marginals:
+        if root not in self._known_of:
+            self._known_of[root] = Marginals(*self._graph(root))
+        return self._known_of[root]

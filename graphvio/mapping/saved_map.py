@@ -1,15 +1,14 @@
 """A map on disk: a folder of places with their poses, what they look like, and the graph that holds them together.
 
 ``map.json`` is the header, with the version and the digests of the files that must be whole; ``map.npz`` the places
-and chains; ``closures.npz``; ``features.db`` COLMAP's database; ``rig.yaml``; ``images/``, which may be removed:
-closures on its places rest on features alone then.
+and chains; ``closures.npz``; ``features.db`` COLMAP's database; ``rig.yaml``. Images are not kept: closures on places
+of a map rest on features, and several of them place a session as well as patches would, in a third of the space.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import tempfile
 import zipfile
@@ -21,7 +20,7 @@ import numpy as np
 from graphvio import __version__
 from graphvio.arrays import AnyArray, Bool, Float, Int
 from graphvio.errors import GraphvioError, MapError
-from graphvio.mapping.store import DATABASE, IMAGES, PlaceStore, copy_database
+from graphvio.mapping.store import DATABASE, PlaceStore, copy_database
 from graphvio.optimization.loops import saved
 from graphvio.optimization.loops.search import LoopClosure
 from graphvio.rig import Rig
@@ -137,17 +136,12 @@ def load(folder: Path, rig: Rig) -> SavedMap:
 
 
 def copy_files(folder: Path, into: Path) -> None:
-    """Bring a map's features and images where they can be added to.
+    """Bring a map's features where they can be added to.
 
     Raises:
         MapError: if they cannot be copied.
     """
     copy_database(folder / DATABASE, into / DATABASE)
-    if (folder / IMAGES).is_dir():
-        try:
-            shutil.copytree(folder / IMAGES, into / IMAGES, copy_function=_link)
-        except (OSError, shutil.Error) as error:
-            raise MapError(f"{folder / IMAGES}: cannot be copied to {into} ({error}); is the disk full?") from None
 
 
 def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
@@ -158,8 +152,6 @@ def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
     np.savez(folder / _PLACES, **columns)
     (folder / _CLOSURES).write_bytes(saved.to_bytes(kept.closures))
     without_masks(rig).save(folder / _RIG)
-    if store.images.is_dir():
-        shutil.copytree(store.images, folder / IMAGES, copy_function=_link)
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -194,11 +186,3 @@ def _digest(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return ""
-
-
-def _link(source: str, target: str) -> None:
-    """Images never change: a second name will do, where the file system is the same."""
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)

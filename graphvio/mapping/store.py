@@ -18,11 +18,12 @@ from graphvio.optimization.loops.place_images import read_place, write_place
 from graphvio.optimization.loops.verification import StoredView
 from graphvio.rig import Rig
 
-DATABASE, IMAGES = "features.db", "images"
+DATABASE = "features.db"
+_IMAGES = "images"
 
 
 class PlaceStore:
-    """COLMAP's database of the places' features, and their images beside it.
+    """COLMAP's database of the places' features, and the images of those that were added here beside it.
 
     Args:
         folder: that holds them; what is missing is made.
@@ -48,13 +49,13 @@ class PlaceStore:
         try:
             with self._lock:
                 store_place(self._database, self._rig, session, frameset.stamp_ns, seen)
-            write_place(self._folder / IMAGES, self._rig, session, frameset)
+            write_place(self._folder / _IMAGES, self._rig, session, frameset)
         except (OSError, RuntimeError) as error:
             raise MapError(f"{self._folder}: a place cannot be kept ({error}); is the disk full?") from None
 
     def view(self, session: str, stamp_ns: int) -> StoredView:
         """A place that was kept, for verification."""
-        frameset_at = partial(read_place, self._folder / IMAGES, self._rig, session)
+        frameset_at = partial(read_place, self._folder / _IMAGES, self._rig, session)
         return StoredView(self._rig, session, stamp_ns, self._database, self._lock, frameset_at)
 
     def descriptors(self, session: str, stamp_ns: int, j: int) -> AnyArray:
@@ -66,10 +67,6 @@ class PlaceStore:
         """Of pair j's left image at a place."""
         return image_name(session, self._rig.pairs[j].left.name, stamp_ns)
 
-    def holds(self, name: str) -> bool:
-        """Whether there are features of an image."""
-        return name in self._database.names
-
     def copy_to(self, folder: Path) -> None:
         """Write the database as it is now, whole, into another folder.
 
@@ -78,11 +75,6 @@ class PlaceStore:
         """
         with self._lock:
             copy_database(self._folder / DATABASE, folder / DATABASE)
-
-    @property
-    def images(self) -> Path:
-        """Folder of the images."""
-        return self._folder / IMAGES
 
     def close(self) -> None:
         """Nothing more is kept or read."""
