@@ -162,3 +162,25 @@ def test_a_joined_fragment_uses_single_closures() -> None:
     assert graph.add_closures([closure(truth, 15, 55, rng)])
     assert np.trace(graph.covariance(55)) < 0.8 * np.trace(before)
     assert not graph.add_closures([closure(truth, 16, 56, rng, np.array([0.0, 0.0, 0.4, 1.0, 0.0, 0.0]))])
+
+
+def test_votes_are_compared_in_the_solution_not_in_what_has_drifted() -> None:
+    """The first session's two rounds lie metres apart by the odometry; another one sees places of both."""
+    truth, rng = circle(3.0, 120), np.random.default_rng(9)
+    graph = PoseGraph(PROBABILITY)
+    sigmas = 30.0 * STEP_SIGMAS
+    graph.begin(truth[0], FIRST)
+    for one, other in pairwise(truth[:80]):
+        graph.add(se3_inverse(one) @ other @ se3_exp(sigmas * rng.standard_normal(6)), np.diag(sigmas**2))
+    spacing = 119.0 / 3.0  # places of a round
+    for k in range(1, 30, 3):
+        graph.add_closures([closure(truth, k, round(k + spacing), rng)])
+    drifted = np.linalg.norm((graph.chains.poses[50] - truth[50])[:3, 3])
+    assert drifted > 1.0
+    walked(graph, truth[80:], rng, origin=truth[80])
+    for first, second in ((3, 82), (43, 83), (4, 84)):
+        graph.add_closures([closure(truth, first, second, rng)])
+    assert graph.is_in_map(119)
+    assert [each.is_used for each in graph.closures[-3:]] == [True, True, True]
+    error = se3_inverse(graph.pose(43)) @ graph.pose(83) - se3_inverse(truth[43]) @ truth[83]
+    assert np.linalg.norm(error[:3, 3]) < 0.02

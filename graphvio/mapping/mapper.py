@@ -13,6 +13,7 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Float
 from graphvio.config import Config
+from graphvio.errors import GraphvioError
 from graphvio.events import FrameSet
 from graphvio.mapping import saved_map
 from graphvio.mapping.intake import Intake
@@ -238,8 +239,12 @@ class Mapper:
             if not self._graph.add_closures(found) or not self._graph.is_in_map(number):
                 return
             pose, covariance = self._graph.pose(number), self._graph.covariance(number)
-        result = self._front_end.correct(self._keyframe_ids[number - self._first], pose, covariance)
         self._sent += 1
+        try:
+            result = self._front_end.correct(self._keyframe_ids[number - self._first], pose, covariance)
+        except GraphvioError as error:  # one that has ended takes none; its keyframes tell whether it has
+            self._refused.append(str(error))
+            return
         if not result.accepted:
             self._refused.append(result.reason)
 

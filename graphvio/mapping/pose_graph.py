@@ -237,12 +237,16 @@ class PoseGraph:
             for of_two in votes.values()
             for each in sorted(of_two, key=lambda each: -each.closure.inliers)[:_MOST_VOTES]
         ]
-        return join_fragments(
-            self.chains.fragments,
-            np.array(self.chains.poses),
-            [each.tie for each in heard],
-            [each.closure.inliers for each in heard],
-        )
+        fragments, ties = self.chains.fragments, [each.tie for each in heard]
+        # In the present solution: by the odometry alone, two views of a place may lie further apart than votes may.
+        now = join_fragments(fragments, np.array(self._poses), ties, [each.closure.inliers for each in heard])
+        seen_at = {self.chains.fragment(tie.second): tie.second for tie in reversed(ties)}
+        frames = []
+        for number, states in enumerate(fragments):
+            place = seen_at.get(number, states.start)
+            by_odometry = now.frames[number] @ self._poses[place] @ se3_inverse(self.chains.poses[place])
+            frames.append(np.eye(4) if now.component[number] == number else by_odometry)
+        return Joined(frames, now.component)
 
     def _component_of(self, place: int) -> int:
         return self._component[self.chains.fragment(place)]
