@@ -97,7 +97,6 @@ def run_live(
     from graphvio.live.sources import open_live_source
     from graphvio.live.view_output import ViewOutput
     from graphvio.rig import Rig
-    from graphvio.simulation.default_rig import default_rig
     from graphvio.warmup import warm_up
 
     if record is not None and record.suffix != ".mcap":
@@ -106,11 +105,11 @@ def run_live(
     if services is not None:
         settings = services.settings(settings)
     opened = open_live_source(source, None if rig is None else Rig.load(rig))
-    warm_up(default_rig(), settings)  # before sensors deliver: kernels are the same for every rig
     recorder: SessionRecorder | None = None
     used = opened.open()  # nothing is there yet that would have to be saved
     with StopSignals() as signals, ExitStack() as stack:
         stack.callback(opened.close)
+        warm_up(used, settings)  # what sensors deliver meanwhile is not wanted
         outputs: list[Output] = []
         if record is not None:
             recorder = SessionRecorder(record, used, "png" if png else "raw", waits=not opened.is_realtime)

@@ -131,7 +131,8 @@ class LiveOdometry:
         self._outputs.append(output)
 
     def start(self) -> None:
-        """Start all threads."""
+        """Start all threads; what came before is not taken."""
+        self._started_ns = host_ns()
         for stage in self._stages:
             stage.start()
         self._watchdog.start()
@@ -241,6 +242,8 @@ class LiveOdometry:
             self._clocks.doubt(reading.clock)
             self._report(reading.arrival_ns, reading.kind, reading.detail)
             return
+        if self._source.is_realtime and reading.arrival_ns < self._started_ns:
+            return  # sensors may have been started long before
         stamp_ns = self._clocks.map(reading.clock, reading.stamp_ns, reading.arrival_ns)
         if stamp_ns is None:
             return  # one wild stamp, or the first of a clock that begins anew: told by the clock
