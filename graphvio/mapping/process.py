@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from graphvio.mapping.mapper import Mapper
 
 from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
+from graphvio.mapping.mapper import Mapper
 from graphvio.slam.client import Client
 from graphvio.trajectory import Trajectory
 from graphvio.viewer import Viewer, WebOptions
