@@ -132,6 +132,8 @@ def run_live(
         with Dashboard(opened.name, running.incidents.subscribe(64)) as dashboard:
             while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):
                 dashboard.draw(running.status(), running.devices)
+                if started is not None:
+                    started.check()
         running.stop()
         figures = running.status()
         if started is not None:

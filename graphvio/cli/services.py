@@ -20,10 +20,12 @@ class Started:
 
     Attributes:
         lines: for people, one for each.
+        check: raises what has become of one that failed.
         finish: waits for those that go on when the odometry has ended.
     """
 
     lines: Sequence[str]
+    check: Callable[[], None] = lambda: None
     finish: Callable[[], None] = lambda: None
 
 

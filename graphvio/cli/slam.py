@@ -108,7 +108,19 @@ class _WithMapping(Services):
         process = get_context("spawn").Process(target=run_mapping, args=(task,), name="graphvio-slam")
         process.start()
         stack.callback(process.kill)
-        return Started([f"gRPC: {address}"], lambda: _finish(process, path, self.out))
+        return Started([f"gRPC: {address}"], lambda: _check(process), lambda: _finish(process, path, self.out))
+
+
+def _check(process: SpawnProcess) -> None:
+    """Notice a SLAM that failed.
+
+    Raises:
+        ServiceError: if it did.
+    """
+    from graphvio.errors import ServiceError
+
+    if process.exitcode:
+        raise ServiceError(f"the SLAM failed (exit code {process.exitcode}); what it said is above")
 
 
 def _finish(process: SpawnProcess, path: PathOutput, out: Path | None) -> None:
@@ -122,8 +134,7 @@ def _finish(process: SpawnProcess, path: PathOutput, out: Path | None) -> None:
     process.join(_PATIENCE_S)
     if process.exitcode is None:
         raise ServiceError(f"the SLAM is not done {_PATIENCE_S:g} s after the odometry; its map is not saved")
-    if process.exitcode:
-        raise ServiceError(f"the SLAM failed (exit code {process.exitcode}); what it said is above")
+    _check(process)
     if out is not None:
         path.write(out)
         typer.echo(f"map: {out}; paths in it: odometry.txt, online.txt as it was known, trajectory.txt as it is now")

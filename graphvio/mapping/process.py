@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.mapping.mapper import Mapper
 from graphvio.slam.client import Client
+from graphvio.slam.keyframe import Keyframe
 from graphvio.trajectory import Trajectory
 from graphvio.viewer import Viewer, WebOptions
 
@@ -51,7 +53,7 @@ def run_mapping(task: MappingTask) -> None:
     """Map until the odometry ends, and save the map; for a process of its own, which it ends by its exit code."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the odometry, with which this ends
     try:
-        with Client(task.address) as client, Mapper(client, task.config, task.map) as mapper:
+        with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map) as mapper:
             _follow(client, mapper, task)
             if task.out is not None:
                 mapper.save(task.out)
@@ -60,6 +62,19 @@ def run_mapping(task: MappingTask) -> None:
     except GraphvioError as error:
         print(f"graphvio: mapping: {error}", file=sys.stderr)
         sys.exit(EXIT_FAILED)
+
+
+class _WithImages:
+    """The client as a front-end whose keyframes carry images: places are recognised by features of their own."""
+
+    def __init__(self, client: Client) -> None:
+        self.rig = client.rig
+        self.correct = client.correct
+        self._client = client
+
+    def keyframes(self, from_id: int = 0) -> Iterator[Keyframe]:
+        """See `graphvio.slam.interface.FrontEnd`."""
+        return self._client.keyframes(from_id, with_images=True, with_descriptors=False)
 
 
 def told(mapper: Mapper) -> str:
