@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mapping_walks import CONFIG, front_end, mapped
+from mapping_walks import CONFIG, Refusing, front_end, mapped
 
 from graphvio.arrays import Float
 from graphvio.errors import MapError
@@ -133,9 +133,12 @@ def test_nothing_is_corrected_before_three_places_agree(made: Made) -> None:
 
 
 def test_a_new_epoch_is_found_in_the_map(tmp_path: Path) -> None:
-    """Its keyframes stay out of the trajectory until then; afterwards they are all in."""
-    walk, truth = front_end(0, 200, seed=3, breaks={40})
+    """Its keyframes stay out of the trajectory until then; afterwards they are all in, whatever the odometry says."""
+    walk, truth = front_end(0, 200, seed=3, breaks={40}, kind=Refusing)
     mapper = mapped(walk)
+    assert min(number for number, _, _ in walk.corrections if number >= 40) > 41  # three places must agree
+    assert count(mapper, "corrections_sent") == count(mapper, "corrections_refused") == len(walk.corrections) > 1
+    assert mapper.summary()["last_refusal"] == "too far off"
     assert mapper.is_localised
     found = mapper.trajectory
     assert len(found) == len(truth)
