@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from mapping_walks import CONFIG, Refusing, front_end, mapped
 from graphvio.arrays import Float
 from graphvio.errors import MapError
 from graphvio.geometry import se3_inverse, se3_log
+from graphvio.mapping import saved_map
 from graphvio.mapping.drawn_front_end import DrawnFrontEnd
 from graphvio.mapping.mapper import Mapper
 from graphvio.trajectory import Trajectory
@@ -204,6 +206,23 @@ def test_stop_ends_the_work_and_the_map_can_be_saved(tmp_path: Path) -> None:
     assert not kept.exists()
     with Mapper(front_end(0, 4, seed=0)[0], CONFIG, tmp_path / "one") as again:
         assert again.summary()["places_of_map"] == 1
+
+
+def test_a_map_can_be_saved_while_it_is_made(tmp_path: Path) -> None:
+    """From another thread, again and again; each is whole."""
+    walk, _ = front_end(0, 60, seed=1)
+    sizes: list[int] = []
+    with Mapper(walk, CONFIG) as mapper:
+        walk.has_room = lambda: mapper.summary()["places_waiting"] in (0, 1)
+        worker = threading.Thread(target=mapper.run)
+        worker.start()
+        while worker.is_alive():
+            mapper.save(tmp_path / "now")
+            sizes.append(len(saved_map.load(tmp_path / "now", walk.rig).stamp_ns))
+        worker.join()
+        mapper.save(tmp_path / "now")
+    assert sizes == sorted(sizes)
+    assert len(saved_map.load(tmp_path / "now", walk.rig).stamp_ns) == count(mapper, "places") > 3
 
 
 def test_an_empty_map_can_be_saved_and_used(tmp_path: Path) -> None:
