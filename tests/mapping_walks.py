@@ -12,11 +12,13 @@ from calibration_walks import walk_simulator
 
 from graphvio.arrays import Float
 from graphvio.config import Config, OptimizationConfig
+from graphvio.errors import SourceError
 from graphvio.events import FrameSet
 from graphvio.geometry import se3_inverse
 from graphvio.mapping.drawn_front_end import DrawnFrontEnd
 from graphvio.mapping.mapper import Mapper
 from graphvio.simulation import Simulator
+from graphvio.slam.keyframe import CorrectionResult
 
 ROUND_S = 8.0
 SIGMAS = (np.deg2rad(0.2), 0.03)  # much for the few metres that are walked
@@ -45,8 +47,24 @@ def rendered(index: int) -> FrameSet:
     return simulator().frameset(index)
 
 
+class Refusing(DrawnFrontEnd):
+    """Refuses corrections; to the first one it does not even answer."""
+
+    def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
+        result = super().correct(keyframe_id, map_T_body, covariance)
+        if len(self.corrections) == 1:
+            raise SourceError("the wire is cut")
+        return replace(result, accepted=False, reason="too far off")
+
+
 def front_end(
-    first: int, last: int, seed: int, step: int = 4, session: int = 0, breaks: Collection[int] = ()
+    first: int,
+    last: int,
+    seed: int,
+    step: int = 4,
+    session: int = 0,
+    breaks: Collection[int] = (),
+    kind: type[DrawnFrontEnd] = DrawnFrontEnd,
 ) -> tuple[DrawnFrontEnd, Float]:
     """Keyframes of some framesets, 20 a second, and their true poses in the first one's.
 
@@ -57,6 +75,7 @@ def front_end(
         step: from keyframe to keyframe.
         session: tells its stamps from those of others.
         breaks: keyframes with which epochs begin.
+        kind: of front-end.
     """
     indices = np.arange(first, last, step)
     truth = simulator().world_T_body[indices]
@@ -67,7 +86,7 @@ def front_end(
         return FrameSet(stamp_ns, rendered(index_of[stamp_ns]).images)
 
     odom_T_body = se3_inverse(truth[0]) @ truth
-    made = DrawnFrontEnd(simulator().rig, stamps.tolist(), odom_T_body, frameset_at, SIGMAS, seed, breaks)
+    made = kind(simulator().rig, stamps.tolist(), odom_T_body, frameset_at, SIGMAS, seed, breaks)
     return made, truth
 
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mapping_walks import CONFIG, front_end, mapped
+from mapping_walks import CONFIG, Refusing, front_end, mapped
 
 from graphvio.arrays import Float
 from graphvio.errors import MapError
 from graphvio.geometry import se3_inverse, se3_log
+from graphvio.mapping import saved_map
 from graphvio.mapping.drawn_front_end import DrawnFrontEnd
 from graphvio.mapping.mapper import Mapper
 from graphvio.trajectory import Trajectory
@@ -133,9 +135,12 @@ def test_nothing_is_corrected_before_three_places_agree(made: Made) -> None:
 
 
 def test_a_new_epoch_is_found_in_the_map(tmp_path: Path) -> None:
-    """Its keyframes stay out of the trajectory until then; afterwards they are all in."""
-    walk, truth = front_end(0, 200, seed=3, breaks={40})
+    """Its keyframes stay out of the trajectory until then; afterwards they are all in, whatever the odometry says."""
+    walk, truth = front_end(0, 200, seed=3, breaks={40}, kind=Refusing)
     mapper = mapped(walk)
+    assert min(number for number, _, _ in walk.corrections if number >= 40) > 41  # three places must agree
+    assert count(mapper, "corrections_sent") == count(mapper, "corrections_refused") == len(walk.corrections) > 1
+    assert mapper.summary()["last_refusal"] == "too far off"
     assert mapper.is_localised
     found = mapper.trajectory
     assert len(found) == len(truth)
@@ -201,6 +206,23 @@ def test_stop_ends_the_work_and_the_map_can_be_saved(tmp_path: Path) -> None:
     assert not kept.exists()
     with Mapper(front_end(0, 4, seed=0)[0], CONFIG, tmp_path / "one") as again:
         assert again.summary()["places_of_map"] == 1
+
+
+def test_a_map_can_be_saved_while_it_is_made(tmp_path: Path) -> None:
+    """From another thread, again and again; each is whole."""
+    walk, _ = front_end(0, 60, seed=1)
+    sizes: list[int] = []
+    with Mapper(walk, CONFIG) as mapper:
+        walk.has_room = lambda: mapper.summary()["places_waiting"] in (0, 1)
+        worker = threading.Thread(target=mapper.run)
+        worker.start()
+        while worker.is_alive():
+            mapper.save(tmp_path / "now")
+            sizes.append(len(saved_map.load(tmp_path / "now", walk.rig).stamp_ns))
+        worker.join()
+        mapper.save(tmp_path / "now")
+    assert sizes == sorted(sizes)
+    assert len(saved_map.load(tmp_path / "now", walk.rig).stamp_ns) == count(mapper, "places") > 3
 
 
 def test_an_empty_map_can_be_saved_and_used(tmp_path: Path) -> None:

@@ -81,6 +81,7 @@ class Mapper:
         self._intake = Intake(self._front_end, settings, lambda: self._share)
         self._keyframe_ids: list[int] = []
         self._lock = threading.RLock()  # held while the graph changes, or is read from another thread
+        self._working = threading.Lock()  # held while a place is worked on
         self._is_stopped = False
         self._times = StageTimes()
         self._tried = 0
@@ -106,7 +107,8 @@ class Mapper:
         """
         self._intake.start()
         while not self._is_stopped and (place := self._intake.next()) is not None:
-            self._take(place)
+            with self._working:
+                self._take(place)
             if on_place is not None:
                 on_place(self)
 
@@ -118,16 +120,17 @@ class Mapper:
     def close(self) -> None:
         """Remove what was kept on disk; a map that is wanted is saved before."""
         self.stop()
-        self._store.close()
+        with self._working:
+            self._store.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def save(self, folder: Path | str) -> None:
-        """Write the map; one that was in the folder is replaced.
+        """Write the map; one that was in the folder is replaced. From any thread, while it runs between two places.
 
         Raises:
             MapError: if the folder holds something else, or cannot be written.
         """
-        with self._lock:
+        with self._working, self._lock:
             saved_map.save(to_saved(self._graph, self._recognition, self._places), self._store, self._rig, Path(folder))
 
     @property
@@ -189,15 +192,18 @@ class Mapper:
             seen = self._observer.look(frameset)
         with clock.stage("keep"):
             self._store.add(self._name(self._session), frameset, seen)
+        number = len(self._graph)
+        with clock.stage("description"):
+            self._recognition.add({j: each.descriptors for j, each in seen.items()})
         with self._lock:
-            if new.previous_T_body is None or new.covariance is None:
-                number = self._graph.begin(keyframe.odom_T_body, keyframe.covariance)
-            else:
-                number = self._graph.add(new.previous_T_body, new.covariance)
             self._places.append(Place(self._session, number, keyframe.stamp_ns))
             self._keyframe_ids.append(keyframe.id)
+            # The graph comes last: what is saved after an interruption is what it holds.
+            if new.previous_T_body is None or new.covariance is None:
+                self._graph.begin(keyframe.odom_T_body, keyframe.covariance)
+            else:
+                self._graph.add(new.previous_T_body, new.covariance)
         with clock.stage("retrieval"):
-            self._recognition.add({j: each.descriptors for j, each in seen.items()})
             similar = self._recognition.similar(number, self._may, self._config.optimization.loop_candidates)
         found = []
         for earlier in similar:

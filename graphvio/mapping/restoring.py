@@ -16,13 +16,13 @@ from graphvio.optimization.tie import Tie
 
 
 def to_saved(graph: PoseGraph, recognition: Recognition, places: Sequence[Place]) -> SavedMap:
-    """All that has to be kept."""
+    """All that has to be kept, of the places that the graph holds."""
     chains, closures, n = graph.chains, graph.closures, len(graph)
     pairs = [recognition.pairs(place) for place in range(n)]
     size = recognition.words.size
     return SavedMap(
-        session=np.array([place.session for place in places], dtype=np.int64),
-        stamp_ns=np.array([place.stamp_ns for place in places], dtype=np.int64),
+        session=np.array([place.session for place in places[:n]], dtype=np.int64),
+        stamp_ns=np.array([place.stamp_ns for place in places[:n]], dtype=np.int64),
         map_T_body=np.array([graph.pose(k) for k in range(n)]).reshape(-1, 4, 4),
         covariance=np.array([graph.covariance(k) for k in range(n)]).reshape(-1, 6, 6),
         starts=np.array(chains.starts, dtype=np.int64),
