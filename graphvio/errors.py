@@ -50,3 +50,7 @@ class FleetError(GraphvioError):
 
 class ServiceError(GraphvioError):
     """A service cannot be offered or reached, refuses a client, or was told something malformed."""
+
+
+class MapError(GraphvioError):
+    """A map cannot be read or written, or does not fit the rig; or keyframes cannot be mapped."""

@@ -13,6 +13,8 @@ from synthetic import random_covariance, transform, two_pair_rig
 
 from graphvio import Config, ConfigError, Estimate, FrameSet, Odometry, Prediction, Status, open_source
 from graphvio.arrays import AnyArray, Float, Image
+from graphvio.backend.smoother import Smoother
+from graphvio.backend.window import WindowError
 from graphvio.events import Event
 from graphvio.frontend.stereo import triangulate
 from graphvio.frontend.tracks import PairFrame, common_rows
@@ -185,6 +187,34 @@ def test_where_nothing_is_known_of_the_way_all_of_the_poses_covariance_is_told(r
     assert made[2].previous_T_body is not None
     np.testing.assert_allclose(poses[1] @ made[2].previous_T_body, poses[2], atol=1e-12)
     assert all(len(k.landmarks) == 0 for k in made)
+
+
+def test_where_the_window_is_rebuilt_a_keyframe_begins(
+    rig: Rig, events: list[Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is measured from there on is measured from there, and steps say so, too."""
+
+    def fail(*_: object) -> None:
+        patch.undo()
+        raise WindowError("made to fail")
+
+    steps, keyframes = list[Step](), list[Keyframe]()
+    odometry = Odometry(rig, on_step=steps.append)
+    odometry.on_keyframe(keyframes.append)
+    begun = until(events, 30)
+    for event in begun:
+        odometry.process(event)
+    count = len(steps)
+    with monkeypatch.context() as patch:
+        patch.setattr(Smoother, "settle", fail)
+        for event in events[len(begun) : len(until(events, 35))]:
+            odometry.process(event)
+    odometry.finish()
+    assert "window_rebuilt" in {i.kind for i in odometry.take_incidents()}
+    rebuilt = steps[count].estimate
+    assert steps[count].references == {rebuilt.stamp_ns}
+    assert [k.stamp_ns for k in keyframes] == [steps[0].estimate.stamp_ns, rebuilt.stamp_ns]
+    np.testing.assert_array_equal(keyframes[1].relative_covariance, rebuilt.covariance)
 
 
 def test_a_start_in_motion_has_no_keyframe_until_it_is_known(rig: Rig, events: list[Event]) -> None:

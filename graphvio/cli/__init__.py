@@ -19,6 +19,7 @@ from graphvio.cli.record import convert, record
 from graphvio.cli.run import EXIT_INTERRUPTED, run
 from graphvio.cli.serve import serve
 from graphvio.cli.simulate import simulate
+from graphvio.cli.slam import slam
 from graphvio.cli.view import view
 from graphvio.errors import GraphvioError
 
@@ -36,6 +37,7 @@ app = typer.Typer(
 app.command()(run)
 app.command()(live)
 app.command()(serve)
+app.command()(slam)
 app.command()(calibrate)
 app.command(name="calibrate-trajectories")(calibrate_trajectories)
 app.command()(optimize)

@@ -97,7 +97,6 @@ def run_live(
     from graphvio.live.sources import open_live_source
     from graphvio.live.view_output import ViewOutput
     from graphvio.rig import Rig
-    from graphvio.simulation.default_rig import default_rig
     from graphvio.warmup import warm_up
 
     if record is not None and record.suffix != ".mcap":
@@ -106,11 +105,11 @@ def run_live(
     if services is not None:
         settings = services.settings(settings)
     opened = open_live_source(source, None if rig is None else Rig.load(rig))
-    warm_up(default_rig(), settings)  # before sensors deliver: kernels are the same for every rig
     recorder: SessionRecorder | None = None
     used = opened.open()  # nothing is there yet that would have to be saved
     with StopSignals() as signals, ExitStack() as stack:
         stack.callback(opened.close)
+        warm_up(used, settings)  # what sensors deliver meanwhile is not wanted
         outputs: list[Output] = []
         if record is not None:
             recorder = SessionRecorder(record, used, "png" if png else "raw", waits=not opened.is_realtime)
@@ -125,16 +124,20 @@ def run_live(
             health = HealthServer(running.status, port=health_port)
             stack.callback(health.close)
             typer.echo(f"health: http://{health.address}/healthz, metrics: http://{health.address}/metrics", err=True)
-        if services is not None:
-            for line in services.start(running, stack):
-                typer.echo(line, err=True)
+        started = None if services is None else services.start(running, stack)
+        for line in () if started is None else started.lines:
+            typer.echo(line, err=True)
         running.start()
         until = None if duration_s is None else monotonic() + duration_s
         with Dashboard(opened.name, running.incidents.subscribe(64)) as dashboard:
             while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):
                 dashboard.draw(running.status(), running.devices)
+                if started is not None:
+                    started.check()
         running.stop()
         figures = running.status()
+        if started is not None:
+            started.finish()
     typer.echo(line_of(figures))
     typer.echo(summary_of(figures))
     if recorder is not None and record is not None:
@@ -157,9 +160,12 @@ def _tell_recorded(path: Path, told: Mapping[str, float | int | str | None]) -> 
 
 def _viewer(stack: ExitStack, rig: Rig, view: bool, services: Services | None) -> Viewer | None:
     """The viewer that is asked for, or None."""
-    from graphvio.viewer import Viewer
+    from graphvio.viewer import Viewer, WebOptions
 
-    return stack.enter_context(Viewer(rig, spawn=True)) if view else None
+    web = None if services is None or services.web_port is None else WebOptions(port=services.web_port)
+    if web is not None:
+        typer.echo(f"browser: {web.url}", err=True)
+    return stack.enter_context(Viewer(rig, spawn=view, web=web)) if view or web is not None else None
 
 
 def _list() -> None:

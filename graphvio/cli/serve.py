@@ -34,7 +34,7 @@ def serve(
         typer.Option("--ros2", help="Publish ROS 2 topics in this domain.", metavar="DOMAIN", min=0, max=232),
     ] = None,
     web: Annotated[
-        int | None, typer.Option("--web", help="Let a browser watch, on this port; 0 takes any.", min=0, max=65535)
+        int | None, typer.Option("--web", help="Let a browser of this machine watch, on this port.", min=1, max=65535)
     ] = None,
     record: Annotated[
         Path | None, typer.Option("--record", help="Record everything as a session, .mcap.", metavar="FILE")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +12,21 @@ if TYPE_CHECKING:
 
     from graphvio.config import Config
     from graphvio.live.running import LiveOdometry
+
+
+@dataclass(frozen=True)
+class Started:
+    """Services that run.
+
+    Attributes:
+        lines: for people, one for each.
+        check: raises what has become of one that failed.
+        finish: waits for those that go on when the odometry has ended.
+    """
+
+    lines: Sequence[str]
+    check: Callable[[], None] = lambda: None
+    finish: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True)
@@ -39,14 +55,25 @@ class Services:
         """The configuration with keyframes that carry their images: clients choose what they are sent."""
         return replace(config, keyframes=replace(config.keyframes, images=True))
 
-    def start(self, running: LiveOdometry, stack: ExitStack) -> list[str]:
-        """Offer an odometry that is about to run, until the stack ends; a line for each service.
+    def start(self, running: LiveOdometry, stack: ExitStack) -> Started:
+        """Offer an odometry that is about to run, until the stack ends.
 
         Raises:
             ServiceError: if an address cannot be used, or would be open to all.
             MissingExtraError: if a service's extra is not installed.
         """
-        from graphvio.slam.service import GrpcServer, ServiceOptions
+        lines = [f"gRPC: {self.start_grpc(running, stack)}" + (" (TLS)" if self.certificate else "")]
+        if self.ros2_domain is not None:
+            from graphvio.ros2.publisher import Publisher
+
+            stack.enter_context(Publisher(running, self.ros2_domain))
+            lines.append(f"ROS 2: topics below /graphvio in domain {self.ros2_domain}")
+        return Started(lines)
+
+    def start_grpc(self, running: LiveOdometry, stack: ExitStack) -> str:
+        """Offer it by gRPC alone; the address."""
+        from graphvio.slam.service.options import ServiceOptions
+        from graphvio.slam.service.server import GrpcServer
 
         options = ServiceOptions(
             host=self.host,
@@ -55,5 +82,4 @@ class Services:
             token_file=self.token_file,
             **({} if self.port is None else {"port": self.port}),
         )
-        server = stack.enter_context(GrpcServer(running, options))
-        return [f"gRPC: {server.address}" + (" (TLS)" if self.certificate else "")]
+        return stack.enter_context(GrpcServer(running, options)).address

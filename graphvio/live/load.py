@@ -26,8 +26,9 @@ class LoadControl:
     def __init__(self, max_latency_ms: float) -> None:
         self._limit_ms = max_latency_ms
         self._level = 0
-        self._work_ms: float | None = None  # running mean
-        self._interval_ms: float | None = None  # the same, between stamps
+        self._waited_ms = 0.0  # running mean, as the two below
+        self._work_ms: float | None = None
+        self._interval_ms: float | None = None  # between stamps
         self._last_ns: int | None = None
         self._since_change = 0
         self._idle_since_ns: int | None = None
@@ -54,12 +55,13 @@ class LoadControl:
         if self._last_ns is not None:
             self._interval_ms = _mean(self._interval_ms, 1e-6 * (stamp_ns - self._last_ns))
         self._last_ns = stamp_ns
+        self._waited_ms = _mean(self._waited_ms, waited_ms)
         self._work_ms = _mean(self._work_ms, work_ms)
         self._since_change += 1
         if self._since_change < _SETTLE_FRAMESETS or self._interval_ms is None:
             return
         share = self._work_ms / max(self._interval_ms, 1e-3)
-        late = waited_ms + self._work_ms > _LOWER_FROM * self._limit_ms
+        late = self._waited_ms + self._work_ms > _LOWER_FROM * self._limit_ms
         if share >= _IDLE or late:
             self._idle_since_ns = None
         elif self._idle_since_ns is None:

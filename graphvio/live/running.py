@@ -95,7 +95,7 @@ class LiveOdometry:
         self.keyframe_log = KeyframeLog()
         self._source = source
         self._config = config
-        self._outputs = outputs
+        self._outputs = list(outputs)
         self._meter = Meter()
         self._odometry = Odometry(rig, config, on_prediction=self.predictions.publish)
         if wants_keyframes:
@@ -127,8 +127,13 @@ class LiveOdometry:
 
     # ------------------------------------------------------------------ for its owner
 
+    def add_output(self, output: Output) -> None:
+        """Hand all to one more; before `start`."""
+        self._outputs.append(output)
+
     def start(self) -> None:
-        """Start all threads."""
+        """Start all threads; what came before is not taken."""
+        self._started_ns = host_ns()
         for stage in self._stages:
             stage.start()
         self._watchdog.start()
@@ -238,6 +243,8 @@ class LiveOdometry:
             self._clocks.doubt(reading.clock)
             self._report(reading.arrival_ns, reading.kind, reading.detail)
             return
+        if self._source.is_realtime and reading.arrival_ns < self._started_ns:
+            return  # sensors may have been started long before
         stamp_ns = self._clocks.map(reading.clock, reading.stamp_ns, reading.arrival_ns)
         if stamp_ns is None:
             return  # one wild stamp, or the first of a clock that begins anew: told by the clock

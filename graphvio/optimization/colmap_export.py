@@ -13,15 +13,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from graphvio.arrays import Float, Image
+from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.covisibility import verify_matches
 from graphvio.optimization.loops.database import FeatureDatabase, colmap, image_name
+from graphvio.optimization.loops.place_images import write_image
 from graphvio.optimization.loops.search import Place, SessionInput
 from graphvio.optimization.optimize import Optimization
 
@@ -29,7 +29,6 @@ Progress = Callable[[str, int, int], None]
 """Called with what is done, how many of it are, and how many there are."""
 
 _THREADS = 2
-_PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # the noise of images hardly shrinks any further
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,20 +145,11 @@ def _write_images(
             for camera, image in zip((pair.left, pair.right), images, strict=True):
                 name = image_name(session.name, camera.name, place.stamp_ns)
                 if name in missing:
-                    _write_image(folder / name, image)
+                    write_image(folder / name, image)
 
     with ThreadPoolExecutor(_THREADS, thread_name_prefix="graphvio-images") as pool:
         for done, _ in enumerate(pool.map(write, asked), start=1):
             on_progress(done, len(asked))
-
-
-def _write_image(path: Path, image: Image) -> None:
-    """Write a file that is either whole or absent."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.tmp")
-    _, encoded = cv2.imencode(".png", image, _PNG_OPTIONS)
-    unfinished.write_bytes(encoded.tobytes())
-    unfinished.replace(path)
 
 
 def _posed(

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -29,6 +30,16 @@ _LEAST_VOTES = 3
 _STRONG_POINTS = 100  # of a closure that may vote: fewer may be one thing that two places have alike
 _FRAME_SIGMA = 1e-6
 _JOINED_SIGMAS = np.repeat([_AGREE_RAD, _AGREE_M], 3)  # of how fragments lie to each other before closures are weighed
+
+
+class KnownMotions(Protocol):
+    """Who knows the motion between any two states of a fragment; `Marginals` of a solution do."""
+
+    def motion(self, first: int, second: int) -> tuple[Float, Float]:
+        """``first_T_second`` (4, 4) and its covariance (6, 6), in body at the second."""
+
+    def distance(self, tie: Tie) -> float:
+        """Squared Mahalanobis distance of a closure that it does not rest on, 6 degrees of freedom."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +102,12 @@ def fragment_of(fragments: Sequence[range]) -> Int:
 
 
 def consistent(
-    fragments: Sequence[range], joined: Joined, poses: Float, ties: Sequence[Tie], alone: Marginals, probability: float
+    fragments: Sequence[range],
+    joined: Joined,
+    poses: Float,
+    ties: Sequence[Tie],
+    alone: KnownMotions,
+    probability: float,
 ) -> tuple[Bool, Float]:
     """Which closures (L,) agree with the odometry and with each other.
 
@@ -162,7 +178,7 @@ def _ends_only(
     return graph, values
 
 
-def _odometry_between(marginals: Marginals, fragments: Sequence[range], ends: Sequence[int]) -> list[Tie]:
+def _odometry_between(marginals: KnownMotions, fragments: Sequence[range], ends: Sequence[int]) -> list[Tie]:
     """The motion between the states of each fragment that are ends of closures, with its covariance.
 
     Args:

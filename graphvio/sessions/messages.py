@@ -108,19 +108,21 @@ def static_transforms(stamp_ns: int, rig: Rig) -> Any:
     """``body_T_cam`` of all cameras."""
     return make(
         TRANSFORMS,
-        transforms=[
-            make(
-                "geometry_msgs/msg/TransformStamped",
-                header=header(stamp_ns, BODY),
-                child_frame_id=camera.name,
-                transform=make(
-                    "geometry_msgs/msg/Transform",
-                    translation=_vector(camera.body_T_cam[:3, 3]),
-                    rotation=_quaternion(camera.body_T_cam[:3, :3]),
-                ),
-            )
-            for camera in rig.cameras
-        ],
+        transforms=[transform(stamp_ns, BODY, camera.name, camera.body_T_cam) for camera in rig.cameras],
+    )
+
+
+def transform(stamp_ns: int, parent: str, child: str, parent_T_child: Float) -> Any:
+    """A ``geometry_msgs/TransformStamped``."""
+    return make(
+        "geometry_msgs/msg/TransformStamped",
+        header=header(stamp_ns, parent),
+        child_frame_id=child,
+        transform=make(
+            "geometry_msgs/msg/Transform",
+            translation=_vector(parent_T_child[:3, 3]),
+            rotation=_quaternion(parent_T_child[:3, :3]),
+        ),
     )
 
 
@@ -129,8 +131,6 @@ def odometry(estimate: Estimate) -> Any:
     assert estimate.nav_T_body is not None
     assert estimate.covariance is not None
     R = estimate.nav_T_body[:3, :3]
-    turned = np.zeros((6, 6))
-    turned[:3, 3:], turned[3:, :3] = R, R
     velocity, velocity_covariance = np.zeros(3), np.full((3, 3), np.nan)
     if estimate.velocity_nav is not None and estimate.velocity_covariance is not None:
         velocity = R.T @ estimate.velocity_nav
@@ -141,13 +141,7 @@ def odometry(estimate: Estimate) -> Any:
         ODOMETRY,
         header=header(estimate.stamp_ns, ODOM),
         child_frame_id=BODY,
-        pose=make(
-            "geometry_msgs/msg/PoseWithCovariance",
-            pose=make(
-                "geometry_msgs/msg/Pose", position=_point(estimate.nav_T_body[:3, 3]), orientation=_quaternion(R)
-            ),
-            covariance=(turned @ estimate.covariance @ turned.T).reshape(-1),
-        ),
+        pose=pose_with_covariance(estimate.nav_T_body, estimate.covariance),
         twist=make(
             "geometry_msgs/msg/TwistWithCovariance",
             twist=make("geometry_msgs/msg/Twist", linear=_vector(velocity), angular=_vector(np.zeros(3))),
@@ -156,21 +150,34 @@ def odometry(estimate: Estimate) -> Any:
     )
 
 
-def true_pose(stamp_ns: int, world_T_body: Float) -> Any:
-    """A pose (4, 4) of the true trajectory."""
+def pose_with_covariance(a_T_body: Float, covariance: Float) -> Any:
+    """A ``geometry_msgs/PoseWithCovariance`` of a covariance (6, 6), tangent ``[rotation, translation]`` in body."""
+    turned = _fixed_axes(a_T_body)
     return make(
-        POSE,
-        header=header(stamp_ns, WORLD),
-        pose=make(
-            "geometry_msgs/msg/Pose",
-            position=_point(world_T_body[:3, 3]),
-            orientation=_quaternion(world_T_body[:3, :3]),
-        ),
+        "geometry_msgs/msg/PoseWithCovariance",
+        pose=_pose(a_T_body),
+        covariance=(turned @ covariance @ turned.T).reshape(-1),
     )
 
 
+def covariance_of(message: Any) -> Float:
+    """The covariance (6, 6), tangent ``[rotation, translation]`` in body, of a message that has one with its pose."""
+    turned = _fixed_axes(pose_of(message))
+    return np.asarray(turned.T @ np.asarray(message.pose.covariance, dtype=np.float64).reshape(6, 6) @ turned)
+
+
+def pose_stamped(stamp_ns: int, frame: str, frame_T_body: Float) -> Any:
+    """A ``geometry_msgs/PoseStamped``."""
+    return make(POSE, header=header(stamp_ns, frame), pose=_pose(frame_T_body))
+
+
+def true_pose(stamp_ns: int, world_T_body: Float) -> Any:
+    """A pose (4, 4) of the true trajectory."""
+    return pose_stamped(stamp_ns, WORLD, world_T_body)
+
+
 def pose_of(message: Any) -> Float:
-    """The pose (4, 4) in a ``PoseStamped`` or an ``Odometry``."""
+    """The pose (4, 4) in a ``PoseStamped``, a ``PoseWithCovarianceStamped`` or an ``Odometry``."""
     pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
     q, t = pose.orientation, pose.position
     return se3(rotation_from_quat_wxyz(np.array([q.w, q.x, q.y, q.z])), np.array([t.x, t.y, t.z]))
@@ -205,6 +212,17 @@ def _time(stamp_ns: int) -> Any:
     if not 0 <= seconds < _STAMP_END_S:
         raise SessionError(f"stamp {stamp_ns} ns is no time that ROS messages hold: they hold 1970 to 2038")
     return make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+
+
+def _fixed_axes(a_T_body: Float) -> Float:
+    """(6, 6): from a tangent ``[rotation, translation]`` in body to ROS's ``[translation, rotation]`` in a's axes."""
+    turned = np.zeros((6, 6))
+    turned[:3, 3:] = turned[3:, :3] = a_T_body[:3, :3]
+    return turned
+
+
+def _pose(a_T_body: Float) -> Any:
+    return make("geometry_msgs/msg/Pose", position=_point(a_T_body[:3, 3]), orientation=_quaternion(a_T_body[:3, :3]))
 
 
 def _vector(values: Float) -> Any:

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 
 from graphvio.arrays import Image
-from graphvio.sources.images import ImageError, decode_grey
 
 _TO_GREY = {
     "bgr8": cv2.COLOR_BGR2GRAY,
@@ -34,6 +33,8 @@ def grey(message: Any, where: str) -> Image:
     Raises:
         ImageError: if it is damaged, or its encoding is not known.
     """
+    from graphvio.sources.images import ImageError, decode_grey  # whose package imports this module
+
     if hasattr(message, "format"):
         return decode_grey(bytes(message.data), where)
     height, width, step, encoding = message.height, message.width, message.step, message.encoding

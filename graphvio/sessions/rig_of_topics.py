@@ -56,19 +56,19 @@ def rig_of_topics(store: Store, name: str) -> Rig | None:
         return None
     body = _first(store, imu).header.frame_id if imu is not None else ""
     first = _frame(found[0][3], found[0][1])
-    if imu is not None and _path(transforms, body, first) is None:
+    if imu is not None and path_between(transforms, body, first) is None:
         raise RigError(
             f"{name}: no transform leads from the IMU ({body}) to the camera {first}; give a rig of your own"
         )
     body = body if imu is not None else first
     pairs = []
     for pair, left, right, left_info, right_info in found:
-        body_T_left = _path(transforms, body, _frame(left_info, left))
+        body_T_left = path_between(transforms, body, _frame(left_info, left))
         if body_T_left is None:
             raise RigError(
                 f"{name}: no transform leads from {body} to {_frame(left_info, left)}; give a rig of your own"
             )
-        left_T_right = _path(transforms, _frame(left_info, left), _frame(right_info, right))
+        left_T_right = path_between(transforms, _frame(left_info, left), _frame(right_info, right))
         if left_T_right is None or np.allclose(left_T_right, np.eye(4)):
             left_T_right = np.eye(4)
             left_T_right[0, 3] = -right_info.p[3] / right_info.p[0] if right_info.p[0] else 0.0
@@ -111,11 +111,16 @@ def _without_side(camera: str) -> str:
     return "-".join(rest) or "-".join(parts)
 
 
+def info_topics(image_topic: str) -> list[str]:
+    """Where the calibration of a topic with images may be, the nearest first."""
+    parts = image_topic.split("/")
+    return ["/".join([*parts[:depth], "camera_info"]) for depth in range(len(parts) - 1, 0, -1)]
+
+
 def _info(store: Store, image_topic: str) -> Any:
     """The calibration beside a topic with images."""
-    parts = image_topic.split("/")
-    for depth in range(len(parts) - 1, 0, -1):
-        topic = store.topics.get("/".join([*parts[:depth], "camera_info"]))
+    for name in info_topics(image_topic):
+        topic = store.topics.get(name)
         if topic is not None and topic.type_name == CAMERA_INFO and topic.places:
             return _first(store, topic)
     return None
@@ -153,21 +158,28 @@ def _frame(info: Any, topic: str) -> str:
 
 
 def _transforms(store: Store) -> dict[tuple[str, str], Float]:
-    """(parent, child) -> ``parent_T_child`` of all static transforms, both ways."""
+    """All static transforms, as `transforms_in` has them."""
     made: dict[tuple[str, str], Float] = {}
     for topic in store.topics.values():
         if topic.type_name != TRANSFORMS or not topic.name.endswith("tf_static"):
             continue
         for place in topic.places:
-            for each in cdr.decode(store.read(place), TRANSFORMS, store.path).transforms:
-                q, t = each.transform.rotation, each.transform.translation
-                pose = se3(rotation_from_quat_wxyz(np.array([q.w, q.x, q.y, q.z])), np.array([t.x, t.y, t.z]))
-                parent, child = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
-                made[parent, child], made[child, parent] = pose, se3_inverse(pose)
+            made.update(transforms_in(cdr.decode(store.read(place), TRANSFORMS, store.path)))
     return made
 
 
-def _path(transforms: dict[tuple[str, str], Float], start: str, end: str) -> Float | None:
+def transforms_in(message: Any) -> dict[tuple[str, str], Float]:
+    """(parent, child) -> ``parent_T_child`` (4, 4) of a ``TFMessage``, both ways."""
+    made: dict[tuple[str, str], Float] = {}
+    for each in message.transforms:
+        q, t = each.transform.rotation, each.transform.translation
+        pose = se3(rotation_from_quat_wxyz(np.array([q.w, q.x, q.y, q.z])), np.array([t.x, t.y, t.z]))
+        parent, child = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
+        made[parent, child], made[child, parent] = pose, se3_inverse(pose)
+    return made
+
+
+def path_between(transforms: dict[tuple[str, str], Float], start: str, end: str) -> Float | None:
     """``start_T_end`` along transforms, or None."""
     start, end = start.lstrip("/"), end.lstrip("/")
     reached = {start: np.eye(4)}

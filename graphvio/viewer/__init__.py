@@ -19,31 +19,36 @@ from typing import TYPE_CHECKING
 from graphvio.errors import GraphvioError, MissingExtraError
 from graphvio.events import Estimate, FrameSet, Incident
 from graphvio.rig import Rig
+from graphvio.viewer.web import WebOptions
 
 if TYPE_CHECKING:
     from graphvio.trajectory import Trajectory
     from graphvio.viewer.recording import Recording
 
-__all__ = ["Viewer", "check_display"]
+__all__ = ["Viewer", "WebOptions", "check_display"]
 
 _ROUND_S = 0.03
 
 
 class Viewer:
-    """Shows a run in a window, writes it to a file, or both; a context manager.
+    """Shows a run in a window or in browsers, writes it to a file, or several of these; a context manager.
 
     Args:
         rig: what is shown; its cameras are drawn where they are.
         spawn: open rerun's window and stream to it.
         save: write a recording (``.rrd``) here; needs no display.
+        web: serve browsers at ``web.url``, until the viewer is closed; needs no display.
 
     Raises:
         MissingExtraError: if rerun is not installed.
-        GraphvioError: if there is no display to open a window on, or the file cannot be written.
+        GraphvioError: if there is no display to open a window on, the file cannot be written, or a port not be used.
     """
 
-    def __init__(self, rig: Rig, *, spawn: bool = False, save: Path | None = None) -> None:
-        recording = _open_recording(rig, spawn, save)
+    def __init__(
+        self, rig: Rig, *, spawn: bool = False, save: Path | None = None, web: WebOptions | None = None
+    ) -> None:
+        recording = _open_recording(rig, spawn, save, web)
+        self._web = web
         self._changed = threading.Condition()
         self._estimates: deque[Estimate] = deque()
         self._extras: deque[Callable[[Recording], None]] = deque()
@@ -65,6 +70,11 @@ class Viewer:
         except GraphvioError:
             if value is None:  # else what went wrong first is what matters
                 raise
+
+    @property
+    def url(self) -> str | None:
+        """What to open in a browser, or None if browsers are not served."""
+        return None if self._web is None else self._web.url
 
     @property
     def dropped(self) -> int:
@@ -158,7 +168,7 @@ def check_display() -> None:
         )
 
 
-def _open_recording(rig: Rig, spawn: bool, save: Path | None) -> Recording:
+def _open_recording(rig: Rig, spawn: bool, save: Path | None, web: WebOptions | None) -> Recording:
     try:
         from graphvio.viewer.recording import Recording
     except ModuleNotFoundError as error:
@@ -170,7 +180,7 @@ def _open_recording(rig: Rig, spawn: bool, save: Path | None) -> Recording:
     if save is not None and not Path(save).parent.is_dir():
         raise GraphvioError(f"{save}: cannot be written (there is no folder {Path(save).parent}); make it first")
     try:
-        return Recording(rig, spawn=spawn, save=save)
+        return Recording(rig, spawn=spawn, save=save, web=web)
     except (OSError, RuntimeError, ValueError) as error:
         raise GraphvioError(f"viewer: cannot be opened ({_first_line(error)})") from None
 

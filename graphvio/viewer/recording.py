@@ -37,6 +37,7 @@ from graphvio.geometry import quat_wxyz_from_rotation
 from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
 from graphvio.viewer.layout import AXES, RATE_COLOURS, STATUS_COLOURS, TIMELINE, blueprint
+from graphvio.viewer.web import WebHost, WebOptions
 
 _PIECE_POSES = 100
 _SIGMAS = 3.0
@@ -57,18 +58,20 @@ _XYZ_COLOURS = [(220, 70, 60), (60, 170, 75), (70, 110, 230)]
 
 
 class Recording:
-    """A stream to rerun's window, a file or both. All but construction belongs to one thread.
+    """A stream to rerun's window, browsers, a file or several of these. All but construction belongs to one thread.
 
     Args:
         rig: drawn once, and its cameras get images.
         spawn: open a window.
         save: file to write.
+        web: serve browsers.
 
     Raises:
+        GraphvioError: if browsers cannot be served.
         OSError, RuntimeError: whatever rerun raises when the file or the window cannot be opened.
     """
 
-    def __init__(self, rig: Rig, *, spawn: bool, save: Path | None) -> None:
+    def __init__(self, rig: Rig, *, spawn: bool, save: Path | None, web: WebOptions | None = None) -> None:
         self._rig = rig
         self._is_saved = save is not None
         self._stream = rr.RecordingStream("graphvio", recording_id=None, make_default=False)
@@ -80,6 +83,9 @@ class Recording:
             rr.spawn(port=_PORT, connect=False, recording=self._stream, **_executable())
             _wait_for_window()
             sinks.append(rr.GrpcSink(f"rerun+http://127.0.0.1:{_PORT}/proxy"))
+        self._web = None if web is None else WebHost(web)
+        if web is not None:
+            sinks.append(rr.GrpcSink(web.data_url))
         self._stream.set_sinks(*sinks, default_blueprint=layout)
         self._start_ns: int | None = None
         self._unsent: list[Estimate] = []
@@ -94,11 +100,13 @@ class Recording:
         self._send_curves()
         try:
             self._stream.flush(timeout_sec=_FLUSH_S)
-        except RuntimeError:
-            if self._is_saved:  # else somebody has closed the window, which is no failure
+        except RuntimeError as error:
+            if self._is_saved and "gRPC" not in str(error):  # who looked on may have gone, which is no failure
                 raise
         finally:
             self._stream.disconnect()
+            if self._web is not None:
+                self._web.close()
 
     def add_estimates(self, estimates: Sequence[Estimate]) -> None:
         """Poses, scalars and changes of status; a batch costs hardly more than one."""

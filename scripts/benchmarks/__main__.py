@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks import accuracy, backend, faults, frontend, optimize
+from benchmarks import accuracy, backend, faults, frontend, optimize, slam
 from benchmarks.command_line import run_command_line
 
 if __name__ == "__main__":
@@ -10,7 +10,7 @@ if __name__ == "__main__":
         run_command_line(
             "scripts/benchmark",
             "Measures speed, accuracy and behaviour under faults. docs/benchmarks.md tells what is compared.",
-            (frontend.add_parser, backend.add_parser, accuracy.add_parser, faults.add_parser, optimize.add_parser),
+            tuple(module.add_parser for module in (frontend, backend, accuracy, faults, optimize, slam)),
             "Timings mean something only on a machine that does nothing else meanwhile.",
         )
     )

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Image, Int
 from graphvio.config import Config
+from graphvio.events import FrameSet
 from graphvio.optimization.loops.database import CENTRE_PX, FeatureDatabase, colmap, image_name
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.rig import Rig
@@ -46,6 +48,64 @@ class Extractor:
         return pixels.reshape(-1, 2), np.asarray(descriptors.data, dtype=np.uint8).reshape(-1, 128)
 
 
+@dataclass(frozen=True, eq=False)
+class PairFeatures:
+    """What one pair shows at a place.
+
+    Attributes:
+        left: (K, 2) pixels in its left image.
+        descriptors: (K, 128) uint8 of them.
+        right: (M, 2) pixels in its right image, of those that are found there.
+        in_right: (M,) which of the K they are.
+    """
+
+    left: Float
+    descriptors: AnyArray
+    right: Float
+    in_right: Int
+
+    @property
+    def rows(self) -> Int:
+        """(M, 2) features of the left image and of the right one that are one."""
+        return np.column_stack([self.in_right, np.arange(len(self.in_right))])
+
+
+class PlaceObserver:
+    """Finds the features of a place's images, in any thread, and where they are in the right ones.
+
+    Args:
+        rig: of the cameras.
+        config: of this stage and of the stereo matching.
+    """
+
+    def __init__(self, rig: Rig, config: Config) -> None:
+        self._rig = rig
+        self._config = config
+        self._extractor = Extractor(config.optimization.features)
+        self._of_thread = threading.local()
+
+    @property
+    def pairs(self) -> Sequence[PairObserver]:
+        """Of each pair of the rig; those of the calling thread."""
+        if not hasattr(self._of_thread, "pairs"):
+            self._of_thread.pairs = [PairObserver(pair, self._config) for pair in self._rig.pairs]
+        made: Sequence[PairObserver] = self._of_thread.pairs
+        return made
+
+    def look(self, frameset: FrameSet) -> dict[int, PairFeatures]:
+        """Pair -> what it shows."""
+        seen = {}
+        for j, images in frameset.images.items():
+            observer = self.pairs[j]
+            pixels, descriptors = self._extractor.extract(images[0])
+            usable = observer.usable(pixels)
+            pixels, descriptors = pixels[usable], descriptors[usable]
+            frame = observer.observe(frameset.stamp_ns, images, pixels)
+            right, _ = observer.pair.right.project(np.column_stack([frame.right, np.ones(len(pixels))]))
+            seen[j] = PairFeatures(pixels, descriptors, right[frame.has_depth], np.flatnonzero(frame.has_depth))
+        return seen
+
+
 def extract_places(
     source: Source,
     rig: Rig,
@@ -68,22 +128,10 @@ def extract_places(
         config: of this stage and of the stereo matching.
         on_progress: called with the number of places done.
     """
-    extractor = Extractor(config.optimization.features)
-    of_thread = threading.local()
+    observer = PlaceObserver(rig, config)
 
-    def look(stamp_ns: int) -> dict[int, _Seen]:
-        if not hasattr(of_thread, "observers"):
-            of_thread.observers = [PairObserver(pair, config) for pair in rig.pairs]
-        seen = {}
-        for j, images in source.frameset_at(stamp_ns).images.items():
-            observer = of_thread.observers[j]
-            pixels, descriptors = extractor.extract(images[0])
-            usable = observer.usable(pixels)
-            pixels, descriptors = pixels[usable], descriptors[usable]
-            frame = observer.observe(stamp_ns, images, pixels)
-            right, _ = rig.pairs[j].right.project(np.column_stack([frame.right, np.ones(len(pixels))]))
-            seen[j] = _Seen(pixels, descriptors, right[frame.has_depth], np.flatnonzero(frame.has_depth))
-        return seen
+    def look(stamp_ns: int) -> dict[int, PairFeatures]:
+        return observer.look(source.frameset_at(stamp_ns))
 
     missing = [ns for ns in stamps_ns if not _is_there(database, rig, session, ns)]
     done = len(stamps_ns) - len(missing)
@@ -92,27 +140,28 @@ def extract_places(
         for at, stamp_ns in enumerate(missing):
             while len(pending) < _AHEAD and at + len(pending) < len(missing):
                 pending.append(pool.submit(look, missing[at + len(pending)]))
-            _store(database, rig, session, stamp_ns, pending.pop(0).result())
+            store_place(database, rig, session, stamp_ns, pending.pop(0).result())
             done += 1
             if on_progress is not None:
                 on_progress(done)
-
-
-class _Seen:
-    """What one pair shows: left features (K, 2), and which of them (M,) are where (M, 2) in the right image."""
-
-    def __init__(self, left: Float, descriptors: AnyArray, right: Float, in_right: Int) -> None:
-        self.left = left
-        self.descriptors = descriptors
-        self.right = right
-        self.in_right = in_right
 
 
 def _is_there(database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int) -> bool:
     return any(image_name(session, pair.left.name, stamp_ns) in database.names for pair in rig.pairs)
 
 
-def _store(database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int, seen: dict[int, _Seen]) -> None:
+def store_place(
+    database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int, seen: Mapping[int, PairFeatures]
+) -> None:
+    """Put a place into the database, as a whole: what its pairs show.
+
+    Args:
+        database: to write.
+        rig: that looked around.
+        session: its name, unique in the database.
+        stamp_ns: of the place.
+        seen: by pair.
+    """
     names = {
         camera.name: image_name(session, camera.name, stamp_ns)
         for j in seen
@@ -125,5 +174,4 @@ def _store(database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int, see
             left, right = names[rig.pairs[j].left.name], names[rig.pairs[j].right.name]
             database.add_features(left, found.left, found.descriptors)
             database.add_features(right, found.right)
-            rows = np.column_stack([found.in_right, np.arange(len(found.in_right))])
-            database.add_matches(left, right, rows)
+            database.add_matches(left, right, found.rows)

@@ -7,6 +7,7 @@ H. Jegou, M. Douze, C. Schmid, P. Perez, *Aggregating local descriptors into a c
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import cv2
 import numpy as np
@@ -56,6 +57,31 @@ def describe(descriptors: AnyArray, words: AnyArray) -> AnyArray:
     return np.asarray(vector / length if length > 0.0 else vector)
 
 
+def most_similar(
+    own: AnyArray, vectors: AnyArray, starts: Int, may: Callable[[int], bool], most: int
+) -> list[tuple[float, int]]:
+    """The P known places that a place is most alike, by those of their images that are.
+
+    Args:
+        own: (K, D) of the place's images, of length one.
+        vectors: (N, D) of the known places' images, place by place.
+        starts: (P,) first row of each of them.
+        may: whether it may be compared with one of these.
+        most: places.
+
+    Returns:
+        Similarity and number, 0 to P - 1, the most similar first.
+    """
+    by_place = np.maximum.reduceat(np.max(own @ vectors.T, axis=0), starts)
+    found: list[tuple[float, int]] = []
+    for k in np.argsort(-by_place, kind="stable").tolist():
+        if len(found) == most:
+            break
+        if may(k):
+            found.append((float(by_place[k]), k))
+    return found
+
+
 def candidates(vectors: AnyArray, place: Int, may: Callable[[int, int], bool], most: int) -> list[tuple[int, int]]:
     """For each place its most similar ones among those before it: places are as alike as their images most alike.
 
@@ -72,15 +98,10 @@ def candidates(vectors: AnyArray, place: Int, may: Callable[[int, int], bool], m
     numbers, starts = np.unique(place, return_index=True)
     ends = np.append(starts[1:], len(place))
     for at in range(1, len(numbers)):  # a row at a time: all of them would not fit for hours of images
-        own = vectors[starts[at] : ends[at]]
-        alike = np.max(own @ vectors[: starts[at]].T, axis=0)
-        by_place = np.maximum.reduceat(alike, starts[:at])
-        taken = 0
-        for k in np.argsort(-by_place, kind="stable").tolist():
-            if taken == most:
-                break
-            if may(int(numbers[k]), int(numbers[at])):
-                found.append((float(by_place[k]), int(numbers[k]), int(numbers[at])))
-                taken += 1
+        later = int(numbers[at])
+        allowed = partial(lambda later, k: may(int(numbers[k]), later), later)
+        own, before = vectors[starts[at] : ends[at]], vectors[: starts[at]]
+        for similarity, earlier in most_similar(own, before, starts[:at], allowed, most):
+            found.append((similarity, int(numbers[earlier]), later))
     found.sort(key=lambda each: (-each[0], each[1], each[2]))
     return [(earlier, later) for _, earlier, later in found]

@@ -12,19 +12,15 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Int
 from graphvio.config import Config
-from graphvio.frontend.stereo import triangulate
-from graphvio.frontend.tracks import PairFrame
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
-from graphvio.optimization.loops.matching import alike, estimated_geometry
 from graphvio.optimization.loops.places import PairObserver
-from graphvio.optimization.loops.resection import Resection, register_again, resect_features
+from graphvio.optimization.loops.resection import Resection
 from graphvio.optimization.loops.retrieval import candidates, describe, vocabulary
-from graphvio.rig import Camera, Rig, StereoPair
+from graphvio.optimization.loops.verification import StoredView, crossings, verified
+from graphvio.rig import Rig
 from graphvio.sources import Source
 
-_LEAST_MATCHES = 20
-_MOST_CROSSINGS = 2  # pairs of images of a candidate that are matched
 _INDEPENDENT_POINTS = 10  # errors of lenses' calibrations are alike across much of an image: more points help no more
 
 
@@ -193,26 +189,16 @@ class _Verifier:
     def verify(self, candidate: tuple[int, int]) -> LoopClosure | None:
         """The loop closure of an earlier and a later place, or None."""
         earlier, later = (self._places[number] for number in candidate)
-        crossings = self._crossings(*candidate)
-        matches = {}
-        for (a, b), names in crossings.items():
-            rows = self._matched(earlier, later, a, b, names)
-            if len(rows) < _LEAST_MATCHES:
-                break  # the others are less alike
-            matches[a, b] = rows
-        if not matches:
-            return None
-        reference = {a: self._frame(earlier, a) for a, _ in matches}
-        current = {b: self._frame(later, b) for _, b in matches}
+        then, now = self._view(earlier), self._view(later)
         seed = [self._config.motion.seed, *candidate]
-        rig = self._sessions[later.session].rig
-        found = resect_features(rig, reference, current, matches, self._config, seed)
-        if found is None or found.inliers < self._config.optimization.loop_min_inliers:
-            return None
-        if self._sessions[earlier.session].rig is rig:
-            images = (self._frameset(earlier), self._frameset(later))
-            found = register_again(self._observers(later.session), found, reference, images, self._config, seed)
-        return _closure(earlier, later, found)
+        observers = self._observers(later.session) if then.rig is now.rig else None
+
+        def keep(a: int, b: int, rows: Int, geometry: Any) -> None:
+            with self._lock:
+                self._verified.append((then.name(a), now.name(b), rows, geometry))
+
+        found = verified(then, now, self._crossings(*candidate), observers, self._config, seed, keep)
+        return None if found is None else closure_of(earlier, later, found)
 
     def store(self) -> None:
         """Put the verified matches into the database, in an order that does not depend on threads."""
@@ -220,49 +206,16 @@ class _Verifier:
             if not self._database.has_matches(first, second):
                 self._database.add_matches(first, second, rows, geometry)
 
-    def _crossings(self, earlier: int, later: int) -> dict[tuple[int, int], tuple[str, str]]:
-        """The images of two places that are most alike: (a, b) -> their names."""
+    def _view(self, place: Place) -> StoredView:
+        session = self._sessions[place.session]
+        return StoredView(
+            session.rig, session.name, place.stamp_ns, self._database, self._lock, session.source.frameset_at
+        )
+
+    def _crossings(self, earlier: int, later: int) -> list[tuple[int, int]]:
         images = self._images
         ones, others = np.flatnonzero(images.place == earlier), np.flatnonzero(images.place == later)
-        alike = images.vectors[ones] @ images.vectors[others].T
-        ranked = sorted(
-            (-float(alike[row, column]), i, k)
-            for row, i in enumerate(ones.tolist())
-            for column, k in enumerate(others.tolist())
-        )[:_MOST_CROSSINGS]
-        return {(int(images.pair[i]), int(images.pair[k])): (images.names[i], images.names[k]) for _, i, k in ranked}
-
-    def _matched(self, earlier: Place, later: Place, a: int, b: int, names: tuple[str, str]) -> Int:
-        """Rows (M, 2) of features that are one by their descriptors and COLMAP's two-view geometry."""
-        with self._lock:
-            pixels = (self._database.pixels(names[0]), self._database.pixels(names[1]))
-            descriptors = [self._database.descriptors(name) for name in names]
-        rows = alike(*descriptors)
-        if len(rows) < _LEAST_MATCHES:
-            return np.zeros((0, 2), dtype=np.int64)
-        cameras = (self._left(earlier, a), self._left(later, b))
-        geometry = estimated_geometry(cameras, pixels, rows)
-        verified = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
-        if len(verified) >= _LEAST_MATCHES:
-            with self._lock:
-                self._verified.append((*names, rows, geometry))
-        return verified
-
-    def _frame(self, place: Place, j: int) -> PairFrame:
-        """A pair's features at a place, triangulated."""
-        session = self._sessions[place.session]
-        pair = session.rig.pairs[j]
-        left, right = (image_name(session.name, camera.name, place.stamp_ns) for camera in (pair.left, pair.right))
-        with self._lock:
-            pixels, in_right = self._database.pixels(left), self._database.pixels(right)
-            rows = self._database.matches(left, right)
-        return frame_of(pair, place.stamp_ns, pixels, in_right, rows)
-
-    def _left(self, place: Place, j: int) -> Camera:
-        return self._sessions[place.session].rig.pairs[j].left
-
-    def _frameset(self, place: Place) -> Any:
-        return self._sessions[place.session].source.frameset_at(place.stamp_ns)
+        return crossings(images.pair[ones], images.vectors[ones], images.pair[others], images.vectors[others])
 
     def _observers(self, session: int) -> list[PairObserver]:
         known: dict[int, list[PairObserver]] = self._of_thread.__dict__.setdefault("observers", {})
@@ -271,23 +224,8 @@ class _Verifier:
         return known[session]
 
 
-def frame_of(pair: StereoPair, stamp_ns: int, pixels: Float, in_right: Float, rows: Int) -> PairFrame:
-    """Features (K, 2) of a left image, of which those that rows (M, 2) match to the right one's have a depth."""
-    n = len(pixels)
-    left, has_ray = pair.left.unproject(pixels)
-    right = np.zeros((n, 2))
-    right[rows[:, 0]], seen = pair.right.unproject(in_right[rows[:, 1]])
-    has_depth = np.zeros(n, dtype=bool)
-    has_depth[rows[:, 0]] = seen
-    points, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
-    none = np.zeros(n, dtype=np.int64)
-    return PairFrame(
-        stamp_ns, np.arange(n), none, pixels, left, right, points, covariances, np.zeros((n, 2)), has_depth & has_ray,
-        none,
-    )  # fmt: skip
-
-
-def _closure(earlier: Place, later: Place, found: Resection) -> LoopClosure:
+def closure_of(earlier: Place, later: Place, found: Resection) -> LoopClosure:
+    """What a resection of the later place on the earlier one's points says, with a covariance that is honest."""
     return LoopClosure(
         earlier,
         later,

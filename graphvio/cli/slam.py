@@ -1,0 +1,140 @@
+"""``graphvio slam``: the odometry with the reference SLAM behind it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from graphvio.cli import options
+from graphvio.cli.live import run_live
+from graphvio.cli.services import Services, Started
+
+if TYPE_CHECKING:
+    from contextlib import ExitStack
+    from multiprocessing.context import SpawnProcess
+
+    from graphvio.live.path_output import PathOutput
+    from graphvio.live.running import LiveOdometry
+
+_PATIENCE_S = 300.0  # for a SLAM that is behind when the odometry ends
+
+
+def slam(
+    source: Annotated[
+        str, typer.Argument(help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator.")
+    ],
+    rig: options.RigFile = None,
+    config: options.ConfigName = "default",
+    saved_map: Annotated[
+        Path | None, typer.Option("--map", help="Saved map to find the way in, and to go on with.", metavar="DIR")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Save the map, and the trajectory in it.", metavar="DIR")
+    ] = None,
+    view: Annotated[bool, typer.Option("--view", help="Watch both trajectories in the rerun viewer.")] = False,
+    web: Annotated[
+        int | None, typer.Option("--web", help="Let a browser of this machine watch, on this port.", min=1, max=65535)
+    ] = None,
+    save_rrd: Annotated[
+        Path | None, typer.Option("--save-rrd", help="Save what the viewer would show; needs no display.")
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option("--record", help="Record everything as a session, .mcap.", metavar="FILE")
+    ] = None,
+    png: options.Png = False,
+    duration: Annotated[
+        float | None, typer.Option("--for", help="Stop after so many seconds.", metavar="SECONDS")
+    ] = None,
+    verbose: options.Verbose = False,
+) -> None:
+    """Run the odometry with a small SLAM system behind it, in a process of its own, that corrects its place in the map.
+
+    The SLAM recognises places, optimises a graph of them and sends corrections by gRPC, as any other would do. With
+    --map the rig finds its place in a saved map.
+
+    Examples:
+
+        graphvio slam simulator:loop --out map
+
+        graphvio slam realsense --map map --view
+    """
+    services = _WithMapping(port=0, saved_map=saved_map, out=out, view=view, map_web_port=web, save_rrd=save_rrd)
+    run_live(
+        source, rig, config, record=record, png=png, view=False, health_port=None, duration_s=duration,
+        services=services,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _WithMapping(Services):
+    """gRPC on this machine, and the SLAM as its client.
+
+    Attributes:
+        saved_map: to begin with.
+        out: for the map.
+        view: open a window.
+        map_web_port: of the page for browsers.
+        save_rrd: for what is shown.
+    """
+
+    saved_map: Path | None = None
+    out: Path | None = None
+    view: bool = False
+    map_web_port: int | None = None
+    save_rrd: Path | None = None
+
+    def start(self, running: LiveOdometry, stack: ExitStack) -> Started:
+        """Offer the odometry, and start the SLAM."""
+        from multiprocessing import get_context
+
+        from graphvio.live.path_output import PathOutput
+        from graphvio.mapping.process import MappingTask, run_mapping
+
+        address = self.start_grpc(running, stack)
+        task = MappingTask(
+            address,
+            running.odometry.config,
+            self.saved_map,
+            self.out,
+            self.view,
+            self.map_web_port,
+            self.save_rrd,
+        )
+        path = PathOutput(lambda: running.map_T_odom)
+        running.add_output(path)
+        process = get_context("spawn").Process(target=run_mapping, args=(task,), name="graphvio-slam")
+        process.start()
+        stack.callback(process.kill)
+        return Started([f"gRPC: {address}"], lambda: _check(process), lambda: _finish(process, path, self.out))
+
+
+def _check(process: SpawnProcess) -> None:
+    """Notice a SLAM that failed.
+
+    Raises:
+        ServiceError: if it did.
+    """
+    from graphvio.errors import ServiceError
+
+    if process.exitcode:
+        raise ServiceError(f"the SLAM failed (exit code {process.exitcode}); what it said is above")
+
+
+def _finish(process: SpawnProcess, path: PathOutput, out: Path | None) -> None:
+    """Wait until the SLAM has worked on all keyframes and saved the map, and put the odometry's path beside it.
+
+    Raises:
+        ServiceError: if it failed.
+    """
+    from graphvio.errors import ServiceError
+
+    process.join(_PATIENCE_S)
+    if process.exitcode is None:
+        raise ServiceError(f"the SLAM is not done {_PATIENCE_S:g} s after the odometry; its map is not saved")
+    _check(process)
+    if out is not None:
+        path.write(out)
+        typer.echo(f"map: {out}; paths in it: odometry.txt, online.txt as it was known, trajectory.txt as it is now")

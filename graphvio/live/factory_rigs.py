@@ -1,0 +1,67 @@
+"""Rigs of cameras that each know their own calibration: one, or several whose places to each other are guessed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from graphvio.errors import RigError
+from graphvio.geometry import se3, se3_inverse, so3_exp
+from graphvio.rig import Rig, StereoPair
+
+
+def checked_rig(rig: Rig, size_px: tuple[int, int], has_imu: bool, kind: str) -> Rig:
+    """A rig that was given, as cameras of one size deliver it.
+
+    Raises:
+        RigError: if it is for images of another size.
+    """
+    for camera in rig.cameras:
+        if camera.size_px != size_px:
+            raise RigError(
+                f"{kind}: images are {size_px[0]}x{size_px[1]}, but the rig has {camera.name} with "
+                f"{camera.size_px[0]}x{camera.size_px[1]}; choose size= as in the rig, or calibrate at this size"
+            )
+    return rig if has_imu else rig.without_imu()
+
+
+def refuse_unknown_places(kind: str, devices: Sequence[str]) -> Rig:
+    """What to say where several cameras are asked for and nobody told how they are mounted.
+
+    Raises:
+        RigError: always.
+    """
+    names = ",".join(devices)
+    raise RigError(
+        f"{kind}: each camera knows its own calibration, but not where {len(devices)} of them are to each other; give "
+        f"a rig file (--rig rig.yaml). To make one, record a walk from '{kind}:{names}?places=guess' and calibrate it: "
+        "graphvio calibrate RECORDING --out rig.yaml"
+    )
+
+
+def guessed_rig(rigs: Sequence[Rig], name: str) -> Rig:
+    """One rig of several of one pair each, fit to record what `graphvio calibrate` needs, and for nothing else.
+
+    The first keeps its place and its IMU; the others look from the same spot, turned about the vertical by equal steps:
+    two look forwards and backwards. Cameras are named ``cam0``, ``cam1`` and so on.
+    """
+    body_T_left0 = rigs[0].pairs[0].left.body_T_cam
+    pairs = []
+    for k, rig in enumerate(rigs):
+        pair = rig.pairs[0]
+        left0_R_leftk = so3_exp(np.array([0.0, 2.0 * np.pi * k / len(rigs), 0.0]))
+        body_T_left = body_T_left0 @ se3(left0_R_leftk, np.zeros(3))
+        body_T_right = body_T_left @ se3_inverse(pair.right_T_left)
+        left = replace(pair.left, name=f"cam{2 * k}", body_T_cam=body_T_left)
+        right = replace(pair.right, name=f"cam{2 * k + 1}", body_T_cam=body_T_right)
+        pairs.append(StereoPair(f"pair{k}", left, right))
+    return Rig(tuple(pairs), rigs[0].imu, name)
+
+
+def camera_names(rig: Rig | None, k: int) -> tuple[str, str]:
+    """Names of the cameras of device ``k``: the rig's, or those that `guessed_rig` gives."""
+    if rig is None:
+        return f"cam{2 * k}", f"cam{2 * k + 1}"
+    return rig.pairs[k].left.name, rig.pairs[k].right.name

@@ -1,0 +1,1 @@
+"""Inertial sensors that are no part of a camera."""

@@ -1,0 +1,173 @@
+"""An IMU behind a serial port, as lines of text: a microcontroller's few lines of code are enough to speak it.
+
+    stamp_us,gx,gy,gz,ax,ay,az[,temperature][*HH]
+
+``stamp_us`` is the microcontroller's clock, a whole number that may wrap at 32 bits; rates are rad/s, accelerations
+m/s^2, the temperature degrees Celsius. ``HH`` is the exclusive or of all bytes before the star, two hexadecimal digits,
+as in NMEA 0183; once a line has had one, lines without are damaged. Lines end in LF or CRLF.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Mapping
+from functools import reduce
+from operator import xor
+from typing import Any
+
+import numpy as np
+
+from graphvio.errors import MissingExtraError, SourceError
+from graphvio.live.counts import Counts
+from graphvio.live.device_clock import MicrosecondCounter
+from graphvio.live.devices import DeviceLostError, HandOver
+from graphvio.live.source import ImuReading, Notice, host_ns
+
+_POLL_S = 0.05
+_SILENCE_NS = 3_000_000_000
+_LONGEST_LINE = 256
+_LARGEST_RATE = 100.0  # rad/s; a digit that was lost or doubled makes most values larger than any IMU's range
+_LARGEST_ACCELERATION = 1000.0  # m/s^2
+_BACKWARDS_NS = 1_000_000_000
+_LINE = re.compile(rb"([-+0-9.eE, ]+)(?:\*([0-9A-Fa-f]{2}))?\r?")
+
+
+class ImuLines:
+    """Samples from the bytes of a serial port, however they are cut; what is no sample is counted.
+
+    Args:
+        clock: its name.
+        counts: of ``bad_line``, ``bad_checksum`` and ``clock_restarted``.
+    """
+
+    def __init__(self, clock: str, counts: Counts) -> None:
+        self._counts = counts
+        self._clock = clock
+        self._counter = MicrosecondCounter()
+        self._newest_ns: int | None = None
+        self._rest = b""
+        self._is_in_step = False
+        self._has_checksums = False
+
+    def take(self, data: bytes, arrival_ns: int) -> list[ImuReading | Notice]:
+        """What the lines say that end in these bytes; the first of all is left out, as it may be half a line."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        if lines and not self._is_in_step:
+            self._is_in_step = True
+            del lines[0]
+        if len(self._rest) > _LONGEST_LINE:
+            self._rest = b""
+            self._counts.add("bad_line", self._is_in_step)
+            self._is_in_step = False
+        found: list[ImuReading | Notice] = []
+        for line in lines:
+            self._take_line(line, arrival_ns, found)
+        return found
+
+    def _take_line(self, line: bytes, arrival_ns: int, found: list[ImuReading | Notice]) -> None:
+        matched = _LINE.fullmatch(line)
+        if matched is None or len(line) > _LONGEST_LINE:
+            self._counts.add("bad_line")
+            return
+        if matched[2] is None:
+            is_sound = not self._has_checksums
+        else:
+            is_sound = reduce(xor, matched[1], 0) == int(matched[2], 16)
+            self._has_checksums |= is_sound
+        if not is_sound:
+            self._counts.add("bad_checksum")
+            return
+        try:
+            stamp, *texts = matched[1].split(b",")
+            stamp_us, values = int(stamp), np.array([float(text) for text in texts])
+        except ValueError:
+            self._counts.add("bad_line")
+            return
+        rate, acceleration = values[:3], values[3:6]
+        too_large = np.abs(rate).max(initial=0.0) > _LARGEST_RATE
+        too_large |= np.abs(acceleration).max(initial=0.0) > _LARGEST_ACCELERATION
+        if len(values) not in (6, 7) or stamp_us < 0 or too_large or not np.isfinite(values).all():
+            self._counts.add("bad_line")
+            return
+        stamp_ns = self._counter.stamp_ns(stamp_us)
+        if self._newest_ns is not None and stamp_ns < self._newest_ns - _BACKWARDS_NS:
+            self._counts.add("clock_restarted")
+            self._counter = MicrosecondCounter()
+            stamp_ns = self._counter.stamp_ns(stamp_us)
+            detail = f"{self._clock}: its clock went back to {stamp_us} us; it has begun anew"
+            found.append(Notice("clock_restarted", detail, arrival_ns, self._clock))
+        self._newest_ns = stamp_ns
+        temperature_c = float(values[6]) if len(values) == 7 else None
+        found.append(ImuReading(stamp_ns, rate, acceleration, arrival_ns, self._clock, temperature_c))
+
+
+class SerialImu:
+    """A `Device` that reads such lines from a port, by pyserial."""
+
+    def __init__(self, path: str, baud: int, open_port: Callable[[str, int], Any] | None = None) -> None:
+        """See module.
+
+        Raises:
+            MissingExtraError: if pyserial is not installed.
+        """
+        self.name = f"serial:{path}"
+        self.clock = self.name
+        self._path, self._baud = path, baud
+        self._open_port = open_port or _pyserial()
+        self._port: Any = None
+        self._counts = Counts()
+        self._lines = ImuLines(self.clock, self._counts)
+
+    def start(self, hand_over: HandOver) -> None:
+        """See `Device.start`."""
+        self._lines = ImuLines(self.clock, self._counts)
+        try:
+            self._port = self._open_port(self._path, self._baud)
+        except (OSError, ValueError) as error:
+            raise SourceError(
+                f"{self._path}: cannot be opened as a serial port ({error}); check the cable, and that you are in "
+                "the group 'dialout'"
+            ) from None
+
+    def run(self, hand_over: HandOver, stopping: threading.Event) -> None:
+        """See `Device.run`."""
+        newest_ns = host_ns()
+        while not stopping.is_set():
+            data = self._port.read(max(self._port.in_waiting, 1))
+            arrival_ns = host_ns()
+            found = self._lines.take(data, arrival_ns)
+            for reading in found:
+                hand_over(reading)
+            if found:
+                newest_ns = arrival_ns
+            elif arrival_ns - newest_ns > _SILENCE_NS:
+                raise DeviceLostError("no sample for 3 s; check the rate of the port (baud=...) and the lines' format")
+
+    def stop(self) -> None:
+        """See `Device.stop`."""
+        if self._port is not None:
+            self._port.close()
+            self._port = None
+
+    def detail(self) -> str:
+        """See `Device.detail`."""
+        return f"IMU, lines at {self._baud} baud"
+
+    def counts(self) -> Mapping[str, int]:
+        """See `Device.counts`."""
+        return self._counts.totals()
+
+
+def _pyserial() -> Callable[[str, int], Any]:
+    try:
+        import serial
+    except ImportError:
+        raise MissingExtraError("pyserial", "live", "an IMU on a serial port") from None
+
+    def open_port(path: str, baud: int) -> Any:
+        port = serial.Serial(path, baud, timeout=_POLL_S, exclusive=True)
+        port.reset_input_buffer()  # what waited has no arrival that is worth anything
+        return port
+
+    return open_port

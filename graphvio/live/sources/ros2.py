@@ -1,0 +1,251 @@
+"""Cameras and an IMU that publish on ROS 2, heard over DDS: no ROS need be installed here."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Final
+
+from graphvio.arrays import Float
+from graphvio.errors import SourceError
+from graphvio.live.source import DeviceHealth, DeviceInfo, ImuReading, LiveSource, Reading
+from graphvio.live.sources import SourceSpec, check_options
+from graphvio.rig import Rig
+from graphvio.ros2.node import Node, Publication, domain_of
+from graphvio.ros2.rig import listen_for_rig, listen_for_transforms
+from graphvio.ros2.sensor_topic import SensorTopic
+from graphvio.ros2.turn import Turn
+from graphvio.ros2.types import dds
+from graphvio.sessions import cdr
+from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU
+from graphvio.sessions.rig_of_topics import stereo_topics
+from graphvio.sessions.topics import image_topic, preference
+
+_OPTIONS: Final = ("domain", "imu", "body", "reliable", "wait_s")
+_WAIT_S: Final = 10.0
+_SETTLED_S: Final = 1.0  # nothing new is published for so long: all who are there have been heard of
+_POLL_S: Final = 0.05
+_LOOK_S: Final = 0.2  # between looks at who is there
+
+
+def list_devices() -> Sequence[DeviceInfo]:
+    """The domain of ``ROS_DOMAIN_ID``, if there are images on it."""
+    domain = domain_of(None)
+    node = Node(domain)
+    time.sleep(_SETTLED_S)
+    types = {each.topic: each.type_name for each in node.publications()}
+    images = _images(types)
+    if not images:
+        return []
+    pairs = [f"pair {name}: {left}, {right}" for name, (left, right) in stereo_topics(images).items()]
+    imus = [f"IMU: {name}" for name, kind in sorted(types.items()) if kind == IMU]
+    described = "; ".join([*(pairs or [f"images: {', '.join(images)}"]), *imus])
+    return [DeviceInfo(f"ros2:?domain={domain}", described)]
+
+
+def open_source(spec: SourceSpec, rig: Rig | None) -> LiveSource:
+    """Topics of ROS 2: ``ros2:?domain=0&CAMERA=/TOPIC&imu=/imu``.
+
+    Options are ``domain``; ``imu``, the topic of the samples; a topic for each camera by its name, where names do not
+    tell; ``body``, the frame that the rig given calls body, where that is not the IMU's: samples are then turned as
+    ``tf_static`` says; ``reliable=1`` to have lost samples sent again; ``wait_s``, how long topics may take to come.
+    """
+    dds()
+    cdr.types()
+    if spec.what:
+        raise SourceError(f"ros2:{spec.what}: topics are named by options, such as ros2:?imu=/{spec.what.lstrip('/')}")
+    if rig is not None:
+        check_options(spec, [*_OPTIONS, *(camera.name for camera in rig.cameras)])
+    for name, topic in spec.options.items():
+        if (name not in _OPTIONS or name == "imu") and not topic.startswith("/"):
+            raise SourceError(f"ros2: {name}={topic} is no topic; topics begin with a slash, such as /{topic}")
+    if rig is not None and rig.imu is None and {"imu", "body"} & spec.options.keys():
+        raise SourceError(f"ros2: {rig.name} has no IMU; leave out imu and body, or give a rig that has one")
+    if rig is None and "body" in spec.options:
+        raise SourceError("ros2: body says what a rig that is given means; without one, body is the IMU's frame")
+    return Ros2Source(spec, rig)
+
+
+class Ros2Source:
+    """See `open_source`; stamps are the messages' own, and taken to be of one clock."""
+
+    is_realtime = True
+
+    def __init__(self, spec: SourceSpec, rig: Rig | None) -> None:
+        options = spec.options
+        self._rig, self._domain = rig, domain_of(options.get("domain"))
+        self._chosen = {name: topic for name, topic in options.items() if name not in _OPTIONS}
+        self._imu, self._body = options.get("imu"), options.get("body")
+        self._is_reliable = _flag(options.get("reliable", "0"))
+        self._wait_s = _seconds(options.get("wait_s", str(_WAIT_S)))
+        self._closing = threading.Event()
+        self._node: Node | None = None
+        self._topics: list[SensorTopic] = []
+        self._last_health: Sequence[DeviceHealth] = []
+        self._transforms: dict[tuple[str, str], Float] = {}
+
+    @property
+    def name(self) -> str:
+        """For people, and fit for the name of a file."""
+        return f"ros2-domain{self._domain}"
+
+    def open(self) -> Rig:
+        """Find the topics, and listen to them.
+
+        Raises:
+            SourceError: if one that is asked for is not published.
+            RigError: if no rig is given, and camera_info and transforms tell none.
+        """
+        node = Node(self._domain)
+        deadline_s = time.monotonic() + self._wait_s
+
+        def wait(seconds: float) -> bool:
+            return not self._closing.wait(seconds) and time.monotonic() < deadline_s
+
+        published = self._published(node, wait)
+        types = {each.topic: each.type_name for each in published}
+        imus = sorted(name for name, kind in types.items() if kind == IMU)
+        imu = self._imu if self._imu is not None else next(iter(imus), None)
+        if self._rig is None:
+            rig, cameras = listen_for_rig(node, published, self._chosen, imu, wait)
+            if imu is not None and rig.imu is None:
+                raise SourceError(f"{self.name}: nothing came on {imu}, though it is published; start the IMU")
+        else:
+            rig = self._rig
+            cameras = _topics_of(rig, self._chosen, types, self.name)
+            if rig.imu is not None and imu is None:
+                raise SourceError(
+                    f"{self.name}: nobody publishes samples of an IMU, and the rig has one; start its publisher, or "
+                    "give a rig without"
+                )
+        if self._body is not None:
+            self._transforms = listen_for_transforms(node, published, wait)
+        topics = [SensorTopic(node, cameras[each.name], types, each.name, self._is_reliable) for each in rig.cameras]
+        if rig.imu is not None and imu is not None:
+            topics.insert(0, SensorTopic(node, imu, types, None, self._is_reliable))
+        while silent := [each for each in topics if not each.reader.writers]:
+            if silent[0].reader.refused_writers or not wait(_POLL_S):
+                raise _no_writer(silent[0], self.name)
+        for each in topics:
+            each.look()
+        self._node, self._topics = node, topics
+        return rig
+
+    def readings(self) -> Iterator[Reading]:
+        """What comes, in the order in which it comes, until `close`."""
+        node, topics = self._node, self._topics
+        if node is None:
+            return
+        waiter = node.waiter([each.reader for each in topics])
+        turn = None if self._body is None else Turn(self._body, self._transforms)
+        looked_s = time.monotonic()
+        while not self._closing.is_set():
+            waiter.wait(_LOOK_S)
+            for topic in topics:
+                for reading in topic.take():
+                    if turn is not None and isinstance(reading, ImuReading):
+                        yield from turn(reading, topic)
+                    else:
+                        yield reading
+            if time.monotonic() - looked_s >= _LOOK_S:
+                looked_s = time.monotonic()
+                yield from filter(None, [each.look() for each in topics])
+
+    def health(self) -> Sequence[DeviceHealth]:
+        """Each topic; from any thread."""
+        return [each.health for each in self._topics] or self._last_health
+
+    def close(self) -> None:
+        """Listen no more; from any thread."""
+        self._closing.set()
+        node, self._node = self._node, None
+        if node is not None:
+            node.stop()
+            self._last_health, self._topics = self.health(), []  # what DDS holds goes with the topics
+
+    def _published(self, node: Node, wait: Callable[[float], bool]) -> list[Publication]:
+        """What is published, once all is there that is asked for by name; where something is not, once all is still."""
+        named = {*self._chosen.values(), *filter(None, [self._imu])}
+        has_all = self._rig is not None and self._chosen.keys() >= {each.name for each in self._rig.cameras}
+        has_all = has_all and self._body is None and (self._imu is not None or self._rig is None or not self._rig.imu)
+        count, since_s = -1, time.monotonic()
+        while True:
+            published = node.publications()
+            if len(published) != count:
+                count, since_s = len(published), time.monotonic()
+            missing = named - {each.topic for each in published}
+            is_settled = has_all or time.monotonic() - since_s >= _SETTLED_S
+            if is_settled and not missing and self._suffices({each.topic: each.type_name for each in published}):
+                return published
+            if not wait(_POLL_S):
+                break
+        if missing or not published:
+            raise SourceError(
+                f"{self.name}: nobody publishes {min(missing, default='anything')}; topics on domain {self._domain} "
+                f"are {', '.join(sorted({each.topic for each in published})) or 'none'}. Start the publisher, or check "
+                "ROS_DOMAIN_ID and the network"
+            )
+        return published
+
+    def _suffices(self, types: Mapping[str, str]) -> bool:
+        """Whether each sensor has a topic; else its publisher may yet start."""
+        if self._rig is None:
+            return bool(stereo_topics(_images(types)))
+        try:
+            _topics_of(self._rig, self._chosen, types, self.name)
+        except SourceError:
+            return False
+        return self._rig.imu is None or self._imu is not None or IMU in types.values()
+
+
+def _images(types: Mapping[str, str]) -> list[str]:
+    return sorted(name for name, kind in types.items() if kind in (IMAGE, COMPRESSED))
+
+
+def _topics_of(rig: Rig, chosen: Mapping[str, str], types: Mapping[str, str], where: str) -> dict[str, str]:
+    """The topic of each camera: as given, as graphvio names it, or the one that has the camera's name in it.
+
+    Raises:
+        SourceError: if a camera has none.
+    """
+    images = _images(types)
+    found = dict(chosen)
+    for pair in rig.pairs:
+        for side, camera in (("left", pair.left), ("right", pair.right)):
+            usual = [image_topic(pair.name, side, "raw"), image_topic(pair.name, side, "png"), camera.name]
+            named = [name for name in usual if name in images]
+            named += sorted((name for name in images if camera.name in name.split("/")), key=preference)
+            if camera.name not in found and not named:
+                raise SourceError(
+                    f"{where}: no topic tells by its name that it has the images of {camera.name}; say "
+                    f"{camera.name}=/TOPIC. Topics with images: {', '.join(images) or 'none'}"
+                )
+            if camera.name not in found:
+                found[camera.name] = named[0]
+    return found
+
+
+def _no_writer(topic: SensorTopic, where: str) -> SourceError:
+    if topic.reader.refused_writers:
+        return SourceError(
+            f"{where}: who publishes {topic.name} sends nothing again (best effort), and reliable=1 asks for it; "
+            "leave that out"
+        )
+    return SourceError(f"{where}: nobody publishes {topic.name} any more; start its publisher again")
+
+
+def _flag(text: str) -> bool:
+    if text not in ("0", "1"):
+        raise SourceError(f"ros2: reliable is {text!r}; it is 0 or 1")
+    return text == "1"
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = -1.0
+    if not 0.0 <= seconds < 1e6:
+        raise SourceError(f"ros2: wait_s is {text!r}; it is a number of seconds")
+    return seconds

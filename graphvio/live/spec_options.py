@@ -1,0 +1,71 @@
+"""Values of a live source's options, as what they should be."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+
+from graphvio.errors import SourceError
+from graphvio.live.sources import SourceSpec
+
+_SIZE = re.compile(r"([1-9]\d{1,4})x([1-9]\d{1,4})")
+
+
+def size_of(spec: SourceSpec, key: str) -> tuple[int, int] | None:
+    """A size ``WIDTHxHEIGHT`` in pixels, or None where it is not given.
+
+    Raises:
+        SourceError: if it is none.
+    """
+    text = spec.options.get(key)
+    if text is None:
+        return None
+    found = _SIZE.fullmatch(text)
+    if found is None:
+        raise SourceError(f"{spec.kind}: {key} is {text!r}; write WIDTHxHEIGHT in pixels, such as 1280x720")
+    return int(found[1]), int(found[2])
+
+
+def number_of(spec: SourceSpec, key: str, least: float, most: float) -> float | None:
+    """A number in a range, or None where it is not given.
+
+    Raises:
+        SourceError: if it is none, or out of range.
+    """
+    text = spec.options.get(key)
+    if text is None:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not least <= value <= most:  # also refuses NaN
+        raise SourceError(f"{spec.kind}: {key} is {text!r}; write a number from {least:g} to {most:g}")
+    return value
+
+
+def choice_of(spec: SourceSpec, key: str, choices: Sequence[str]) -> str:
+    """One of several words, of which the first is taken where none is given.
+
+    Raises:
+        SourceError: if it is none of them.
+    """
+    text = spec.options.get(key, choices[0])
+    if text not in choices:
+        raise SourceError(f"{spec.kind}: {key} is {text!r}; choose one of {', '.join(choices)}")
+    return text
+
+
+def names_of(spec: SourceSpec) -> list[str]:
+    """The devices that a spec names, separated by commas.
+
+    Raises:
+        SourceError: if one is named twice or a name is empty.
+    """
+    if not spec.what:
+        return []
+    names = spec.what.split(",")
+    if not all(names) or len(set(names)) < len(names):
+        raise SourceError(f"{spec.kind}: {spec.what!r} names a device twice or not at all; write A,B")
+    return names

@@ -1,0 +1,114 @@
+"""The odometry's chains of places by themselves, and how well they know the motion between any two places of one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.factors import x
+from graphvio.backend.noise import gaussian
+from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
+from graphvio.optimization.tie import Tie
+
+_LEAST_VARIANCE = 1e-12  # a micrometre, a microradian: keeps a covariance that says nothing is uncertain invertible
+
+
+class Chains:
+    """Places in the order of time, in fragments: each is a chain of motions whose errors are independent.
+
+    The covariance of a motion between two places is a difference of two sums: it costs the same over any length.
+    """
+
+    def __init__(self) -> None:
+        self.starts: list[int] = []
+        self.priors: list[Float] = []
+        self.motions: list[Float] = []
+        self.covariances: list[Float] = []
+        self.poses: list[Float] = []
+        self._sums: list[Float] = []
+        self._factors: dict[int, gtsam.NonlinearFactor] = {}  # place -> its motion from the one before
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    @property
+    def fragments(self) -> list[range]:
+        """Places of each."""
+        ends = [*self.starts[1:], len(self)]
+        return [range(start, end) for start, end in zip(self.starts, ends, strict=True)]
+
+    def fragment(self, place: int) -> int:
+        """The fragment of a place."""
+        return int(np.searchsorted(self.starts, place, side="right")) - 1
+
+    def begin(self, odom_T_body: Float, covariance: Float) -> None:
+        """Add a fragment with its first place (4, 4), in its odom frame, and that pose's covariance (6, 6)."""
+        self.starts.append(len(self))
+        self.priors.append(_regular(covariance))
+        self._append(np.eye(4), np.zeros((6, 6)), odom_T_body, np.zeros((6, 6)))
+
+    def add(self, previous_T_body: Float, covariance: Float) -> None:
+        """Add a place to the last fragment: its motion (4, 4) from the place before it, and its covariance (6, 6)."""
+        covariance = _regular(covariance)
+        pose = self.poses[-1] @ previous_T_body
+        adjoint = se3_adjoint(pose)
+        n = len(self)
+        self._append(previous_T_body, covariance, pose, self._sums[-1] + adjoint @ covariance @ adjoint.T)
+        self._factors[n] = Tie(n - 1, n, previous_T_body, covariance).factor()
+
+    def motion(self, first: int, second: int) -> tuple[Float, Float]:
+        """``first_T_second`` (4, 4) of two places of a fragment, and its covariance (6, 6), in body at the second."""
+        relative = se3_inverse(self.poses[first]) @ self.poses[second]
+        low, high = sorted((first, second))
+        adjoint = se3_adjoint(se3_inverse(self.poses[second]))
+        covariance = adjoint @ (self._sums[high] - self._sums[low]) @ adjoint.T
+        return relative, 0.5 * (covariance + covariance.T)
+
+    def distance(self, tie: Tie) -> float:
+        """Squared Mahalanobis distance of a closure within a fragment, 6 degrees of freedom."""
+        relative, covariance = self.motion(tie.first, tie.second)
+        error = se3_log(se3_inverse(relative) @ tie.first_T_second)
+        return float(error @ np.linalg.solve(covariance + tie.covariance, error))
+
+    def add_to(self, graph: gtsam.NonlinearFactorGraph, fragment: int) -> None:
+        """Add a fragment's motions to a graph, whose variables are the places' numbers."""
+        for place in self.fragments[fragment][1:]:
+            graph.add(self._factors[place])
+
+    def prior(self, fragment: int) -> gtsam.NonlinearFactor:
+        """Where a fragment's odometry began, which is what its odom frame is."""
+        start = self.starts[fragment]
+        return gtsam.PriorFactorPose3(x(start), gtsam.Pose3(self.poses[start]), gaussian(self.priors[fragment]))
+
+    @staticmethod
+    def of(starts: Sequence[int], priors: Float, firsts: Float, motions: Float, covariances: Float) -> Chains:
+        """Chains again from what they were made of.
+
+        Args:
+            starts: first place of each of F fragments.
+            priors: (F, 6, 6).
+            firsts: (F, 4, 4) poses of these.
+            motions: (N, 4, 4) of all places; those of the first ones are not used.
+            covariances: (N, 6, 6).
+        """
+        made = Chains()
+        for n, (motion, covariance) in enumerate(zip(motions, covariances, strict=True)):
+            if n in starts:
+                k = list(starts).index(n)
+                made.begin(firsts[k], priors[k])
+            else:
+                made.add(motion, covariance)
+        return made
+
+    def _append(self, motion: Float, covariance: Float, pose: Float, total: Float) -> None:
+        self.motions.append(motion)
+        self.covariances.append(covariance)
+        self.poses.append(pose)
+        self._sums.append(total)
+
+
+def _regular(covariance: Float) -> Float:
+    return np.asarray(0.5 * (covariance + covariance.T) + _LEAST_VARIANCE * np.eye(6))

@@ -1,0 +1,263 @@
+"""The SLAM system: places are recognised, the pose graph is optimised, and the odometry is told where it is."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from graphvio.arrays import AnyArray, Float
+from graphvio.config import Config
+from graphvio.errors import GraphvioError
+from graphvio.events import FrameSet
+from graphvio.mapping import saved_map
+from graphvio.mapping.intake import Intake
+from graphvio.mapping.keyframe_poses import spread_keyframes
+from graphvio.mapping.places import NewPlace
+from graphvio.mapping.pose_graph import PoseGraph
+from graphvio.mapping.recognition import Recognition
+from graphvio.mapping.restoring import restored, to_saved
+from graphvio.mapping.stages import StageTimes
+from graphvio.mapping.store import PlaceStore
+from graphvio.optimization.loops.features import PlaceObserver
+from graphvio.optimization.loops.search import LoopClosure, Place, closure_of
+from graphvio.optimization.loops.verification import FreshView, crossings, verified
+from graphvio.slam.interface import FrontEnd
+from graphvio.trajectory import Trajectory
+
+_SEARCHING_SHARE = 0.25  # of the places' distance, as long as a fragment is not found in the map,
+_SEARCHING_PLACES = 20  # at its first places: what is unknown by then is not found sooner by looking more often
+
+
+class Mapper:
+    """Makes a map of what a front-end sees, and corrects it; a context manager that removes what it keeps meanwhile.
+
+    The map's frame is the odom frame of the first epoch, or the loaded map's. An epoch that begins later, or a session
+    in a loaded map, is a part of its own until closures of three of its places agree on where it is; only then the
+    front-end is told.
+
+    Args:
+        front_end: its keyframes must carry images.
+        config: its ``optimization`` says what places and closures are.
+        map: folder of a saved map to begin with, or None.
+
+    Raises:
+        MapError: if the map cannot be used with the front-end's rig.
+        MissingExtraError: if the extra ``maps`` is not installed.
+    """
+
+    def __init__(self, front_end: FrontEnd, config: Config, map: Path | str | None = None) -> None:
+        self._front_end = front_end
+        self._rig = front_end.rig
+        self._config = config
+        self._folder = Path(tempfile.mkdtemp(prefix="graphvio-map-"))
+        try:
+            self._begin(None if map is None else Path(map))
+        except BaseException:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise
+
+    def _begin(self, folder: Path | None) -> None:
+        settings = self._config.optimization
+        self._graph = PoseGraph(settings.loop_probability)
+        self._recognition = Recognition(self._config.motion.seed)
+        self._places: list[Place] = []
+        if folder is not None:
+            kept = saved_map.load(folder, self._rig)
+            saved_map.copy_files(folder, self._folder)
+            self._graph, self._recognition, self._places = restored(kept, self._config)
+        self._first = len(self._places)  # place of this session
+        self._session = 1 + max((place.session for place in self._places), default=-1)
+        self._store = PlaceStore(self._folder, self._rig)
+        self._observer = PlaceObserver(self._rig, self._config)
+        self._share = (
+            _SEARCHING_SHARE if self._first else 1.0
+        )  # of the places' distance that is enough for the next one
+        self._intake = Intake(self._front_end, settings, lambda: self._share)
+        self._keyframe_ids: list[int] = []
+        self._lock = threading.RLock()  # held while the graph changes, or is read from another thread
+        self._working = threading.Lock()  # held while a place is worked on
+        self._is_stopped = False
+        self._times = StageTimes()
+        self._tried = 0
+        self._sent = 0
+        self._refused: list[str] = []
+
+    def __enter__(self) -> Mapper:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def run(self, on_place: Callable[[Mapper], None] | None = None) -> None:
+        """Work until the front-end's keyframes have ended, or `stop`.
+
+        Args:
+            on_place: called after each place, in this thread.
+
+        Raises:
+            GraphvioError: if the front-end fails, or a place cannot be kept.
+        """
+        self._intake.start()
+        while not self._is_stopped and (place := self._intake.next()) is not None:
+            with self._working:
+                self._take(place)
+            if on_place is not None:
+                on_place(self)
+
+    def stop(self) -> None:
+        """End `run` after the place that it works on; from any thread."""
+        self._is_stopped = True
+        self._intake.stop()
+
+    def close(self) -> None:
+        """Remove what was kept on disk; a map that is wanted is saved before."""
+        self.stop()
+        with self._working:
+            self._store.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def save(self, folder: Path | str) -> None:
+        """Write the map; one that was in the folder is replaced. From any thread, while it runs between two places.
+
+        Raises:
+            MapError: if the folder holds something else, or cannot be written.
+        """
+        with self._working, self._lock:
+            saved_map.save(to_saved(self._graph, self._recognition, self._places), self._store, self._rig, Path(folder))
+
+    @property
+    def is_localised(self) -> bool:
+        """Whether the newest place is in the map's frame."""
+        with self._lock:
+            newest = len(self._graph) - 1
+            return newest >= self._first and self._graph.is_in_map(newest)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """All keyframes of this session that are in the map, where they are now in its frame."""
+        with self._lock:
+            poses = [
+                self._graph.pose(k) if self._graph.is_in_map(k) else None for k in range(self._first, len(self._graph))
+            ]
+            begins = {start - self._first for start in self._graph.chains.starts}
+            motions = self._graph.chains.motions[self._first :]
+        return spread_keyframes(self._intake.keyframes, poses, motions, begins)
+
+    @property
+    def place_poses(self) -> Float:
+        """(N, 4, 4) of all places that are in the map, those of earlier sessions too."""
+        with self._lock:
+            poses = [self._graph.pose(k) for k in range(len(self._graph)) if self._graph.is_in_map(k)]
+        return np.array(poses).reshape(-1, 4, 4)
+
+    @property
+    def closures(self) -> list[tuple[LoopClosure, bool]]:
+        """All closures, and whether the map rests on them; rows of their places are numbers of the map's places."""
+        with self._lock:
+            return [(each.closure, each.is_used) for each in self._graph.closures]
+
+    def summary(self) -> Mapping[str, float | int | str | None]:
+        """How it went, by name."""
+        with self._lock:
+            in_map = sum(self._graph.is_in_map(k) for k in range(len(self._graph)))
+            found, used = len(self._graph.closures), sum(each.is_used for each in self._graph.closures)
+            return {
+                "keyframes": len(self._intake.keyframes),
+                "keyframes_lost": self._intake.lost,
+                "places": len(self._graph) - self._first,
+                "places_of_map": self._first,
+                "places_in_map_frame": in_map,
+                "places_skipped": self._intake.skipped,
+                "places_waiting": self._intake.waiting,
+                "candidates_tried": self._tried,
+                "closures_found": found,
+                "closures_used": used,
+                "corrections_sent": self._sent,
+                "corrections_refused": len(self._refused),
+                "last_refusal": self._refused[-1] if self._refused else None,
+            } | self._times.summary()
+
+    def _take(self, new: NewPlace) -> None:
+        keyframe, clock = new.keyframe, self._times
+        frameset = FrameSet(keyframe.stamp_ns, keyframe.images)
+        with clock.stage("features"):
+            seen = self._observer.look(frameset)
+        with clock.stage("keep"):
+            self._store.add(self._name(self._session), frameset, seen)
+        number = len(self._graph)
+        with clock.stage("description"):
+            self._recognition.add({j: each.descriptors for j, each in seen.items()})
+        with self._lock:
+            self._places.append(Place(self._session, number, keyframe.stamp_ns))
+            self._keyframe_ids.append(keyframe.id)
+            # The graph comes last: what is saved after an interruption is what it holds.
+            if new.previous_T_body is None or new.covariance is None:
+                self._graph.begin(keyframe.odom_T_body, keyframe.covariance)
+            else:
+                self._graph.add(new.previous_T_body, new.covariance)
+        with clock.stage("retrieval"):
+            similar = self._recognition.similar(number, self._may, self._config.optimization.loop_candidates)
+        found = []
+        for earlier in similar:
+            with clock.stage("verification"):
+                closure = self._verified(earlier, number, FreshView(self._rig, frameset, seen))
+            self._tried += 1
+            if closure is not None:
+                found.append(closure)
+        if found:
+            self._close_loops(found, number)
+        start = self._graph.chains.starts[-1]
+        is_searching = not self._graph.is_in_map(start) and len(self._graph) - start < _SEARCHING_PLACES
+        self._share = _SEARCHING_SHARE if is_searching else 1.0
+        if self._recognition.is_due:
+            with clock.stage("vocabulary"):
+                self._recognition.learn(self._descriptors)
+
+    def _may(self, earlier: int) -> bool:
+        """Whether a place may be compared with the newest one."""
+        one, newest = self._places[earlier], self._places[-1]
+        if not self._graph.may_see(earlier, newest.row):
+            return False
+        chains = self._graph.chains
+        if one.session != newest.session or chains.fragment(earlier) != len(chains.starts) - 1:
+            return True
+        return abs(newest.stamp_ns - one.stamp_ns) > round(self._config.optimization.loop_interval_s * 1e9)
+
+    def _verified(self, earlier: int, later: int, view: FreshView) -> LoopClosure | None:
+        one, recognition = self._places[earlier], self._recognition
+        images = [(recognition.pairs(place), recognition.vectors(place)) for place in (earlier, later)]
+        tried = crossings(*images[0], *images[1])
+        seed = [self._config.motion.seed, earlier, later]
+        stored = self._store.view(self._name(one.session), one.stamp_ns)
+        found = verified(stored, view, tried, self._observer.pairs, self._config, seed)
+        return None if found is None else closure_of(one, self._places[later], found)
+
+    def _close_loops(self, found: list[LoopClosure], number: int) -> None:
+        with self._times.stage("graph"), self._lock:
+            if not self._graph.add_closures(found) or not self._graph.is_in_map(number):
+                return
+            pose, covariance = self._graph.pose(number), self._graph.covariance(number)
+        self._sent += 1
+        try:
+            result = self._front_end.correct(self._keyframe_ids[number - self._first], pose, covariance)
+        except GraphvioError as error:  # one that has ended takes none; its keyframes tell whether it has
+            self._refused.append(str(error))
+            return
+        if not result.accepted:
+            self._refused.append(result.reason)
+
+    def _descriptors(self, place: int, j: int) -> AnyArray:
+        of = self._places[place]
+        return self._store.descriptors(self._name(of.session), of.stamp_ns, j)
+
+    @staticmethod
+    def _name(session: int) -> str:
+        return f"session{session}"

@@ -1,0 +1,124 @@
+"""The reference SLAM in a process of its own, at the other end of the odometry's gRPC service."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.config import Config
+from graphvio.errors import GraphvioError
+from graphvio.mapping.mapper import Mapper
+from graphvio.slam.client import Client
+from graphvio.slam.keyframe import Keyframe
+from graphvio.trajectory import Trajectory
+from graphvio.viewer import Viewer, WebOptions
+
+EXIT_FAILED = 2
+
+_MAP_COLOUR, _ODOM_COLOUR = (40, 190, 90), (150, 150, 150)
+_SHOWN_EVERY = 3  # places
+
+
+@dataclass(frozen=True)
+class MappingTask:
+    """What the process is to do.
+
+    Attributes:
+        address: of the odometry's service.
+        config: of the odometry, whose ``optimization`` says what places and closures are.
+        map: folder of a saved map to begin with, or None.
+        out: folder for the map, or None.
+        view: open rerun's window.
+        web_port: let a browser watch on this port, or None.
+        save_rrd: write what the viewer shows, or None.
+    """
+
+    address: str
+    config: Config
+    map: Path | None = None
+    out: Path | None = None
+    view: bool = False
+    web_port: int | None = None
+    save_rrd: Path | None = None
+
+
+def run_mapping(task: MappingTask) -> None:
+    """Map until the odometry ends, and save the map; for a process of its own, which it ends by its exit code."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the odometry, with which this ends
+    try:
+        with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map) as mapper:
+            _follow(client, mapper, task)
+            if task.out is not None:
+                mapper.save(task.out)
+                mapper.trajectory.write(task.out / "trajectory.txt")
+            print(told(mapper), file=sys.stderr)
+    except GraphvioError as error:
+        print(f"graphvio: mapping: {error}", file=sys.stderr)
+        sys.exit(EXIT_FAILED)
+
+
+class _WithImages:
+    """The client as a front-end whose keyframes carry images: places are recognised by features of their own."""
+
+    def __init__(self, client: Client) -> None:
+        self.rig = client.rig
+        self.correct = client.correct
+        self._client = client
+
+    def keyframes(self, from_id: int = 0) -> Iterator[Keyframe]:
+        """See `graphvio.slam.interface.FrontEnd`."""
+        return self._client.keyframes(from_id, with_images=True, with_descriptors=False)
+
+
+def told(mapper: Mapper) -> str:
+    """The summary in one line."""
+    return "map: " + ", ".join(f"{name} {value}" for name, value in mapper.summary().items() if value is not None)
+
+
+def _follow(client: Client, mapper: Mapper, task: MappingTask) -> None:
+    if not (task.view or task.web_port is not None or task.save_rrd is not None):
+        mapper.run()
+        return
+    web = None if task.web_port is None else WebOptions(port=task.web_port)
+    with Viewer(client.rig, spawn=task.view, save=task.save_rrd, web=web) as viewer:
+        odom = _OdomPath(client, viewer)
+        odom.thread.start()
+
+        def show(at: Mapper) -> None:
+            if len(at.place_poses) % _SHOWN_EVERY == 0:
+                viewer.show_path("map", at.trajectory, _MAP_COLOUR)
+
+        mapper.run(show)
+        viewer.show_path("map", mapper.trajectory, _MAP_COLOUR)
+        odom.thread.join()
+        viewer.show_path("odom", odom.path, _ODOM_COLOUR)
+
+
+class _OdomPath:
+    """Shows the estimates as they come, and keeps their path."""
+
+    def __init__(self, client: Client, viewer: Viewer) -> None:
+        self._client = client
+        self._viewer = viewer
+        self._stamps: list[int] = []
+        self._poses: list[Float] = []
+        self.thread = threading.Thread(target=self._listen, daemon=True)
+
+    @property
+    def path(self) -> Trajectory:
+        """All of it."""
+        return Trajectory(np.array(self._stamps, dtype=np.int64), np.array(self._poses).reshape(-1, 4, 4))
+
+    def _listen(self) -> None:
+        for update in self._client.estimates():
+            self._viewer.show(None, update.state)
+            if update.state.nav_T_body is not None:
+                self._stamps.append(update.state.stamp_ns)
+                self._poses.append(update.state.nav_T_body)

@@ -1,0 +1,188 @@
+"""A map on disk: a folder of places with their poses, what they look like, and the graph that holds them together.
+
+``map.json`` is the header, with the version and the digests of the files that must be whole; ``map.npz`` the places
+and chains; ``closures.npz``; ``features.db`` COLMAP's database; ``rig.yaml``. Images are not kept: closures on places
+of a map rest on features, and several of them place a session as well as patches would, in a third of the space.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from graphvio import __version__
+from graphvio.arrays import AnyArray, Bool, Float, Int
+from graphvio.errors import GraphvioError, MapError
+from graphvio.mapping.store import DATABASE, PlaceStore, copy_database
+from graphvio.optimization.loops import saved
+from graphvio.optimization.loops.search import LoopClosure
+from graphvio.rig import Rig
+from graphvio.rig_files.same import difference, without_masks
+
+FORMAT, VERSION = "graphvio map", 1
+_HEADER, _RIG, _PLACES, _CLOSURES = "map.json", "rig.yaml", "map.npz", "closures.npz"
+_CHECKED = (_PLACES, _CLOSURES, DATABASE)
+
+
+@dataclass(frozen=True, eq=False)
+class SavedMap:
+    """N places in F fragments.
+
+    Attributes:
+        session: (N,) number of the session that saw each.
+        stamp_ns: (N,).
+        map_T_body: (N, 4, 4), each in its component's frame.
+        covariance: (N, 6, 6) of these, tangent ``[rotation, translation]`` in body.
+        starts: (F,) first place of each fragment.
+        component: (F,) the fragment in whose frame each is; 0 is the map's.
+        priors: (F, 6, 6) of the first places.
+        firsts: (F, 4, 4) of these in their odom frames.
+        motions: (N, 4, 4) from the place before.
+        motion_covariances: (N, 6, 6).
+        words: (W, 128) of the vocabulary.
+        learnt_from: places that it was made of.
+        vectors: (M, D) of the places' images.
+        vector_place: (M,) their places,
+        vector_pair: (M,) and pairs.
+        closures: all that were found.
+        is_used: (L,) which of them the poses rest on,
+        is_refuted: (L,) and which the odometry refutes.
+    """
+
+    session: Int
+    stamp_ns: Int
+    map_T_body: Float
+    covariance: Float
+    starts: Int
+    component: Int
+    priors: Float
+    firsts: Float
+    motions: Float
+    motion_covariances: Float
+    words: AnyArray
+    learnt_from: int
+    vectors: AnyArray
+    vector_place: Int
+    vector_pair: Int
+    closures: list[LoopClosure]
+    is_used: Bool
+    is_refuted: Bool
+
+
+def save(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
+    """Write a map, whole or not at all; one that was there before is replaced.
+
+    Raises:
+        MapError: if the folder holds something else, or cannot be written.
+    """
+    if folder.exists() and not (folder / _HEADER).is_file() and (not folder.is_dir() or any(folder.iterdir())):
+        raise MapError(f"{folder}: holds something else than a map; name another folder")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        made = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        try:
+            _write(kept, store, rig, made)
+            if folder.exists():
+                old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+                folder.replace(old / folder.name)
+                made.replace(folder)
+                shutil.rmtree(old)
+            else:
+                made.replace(folder)
+        finally:
+            shutil.rmtree(made, ignore_errors=True)
+    except OSError as error:
+        raise MapError(f"{folder}: cannot be written ({error}); choose another place, or make room") from None
+
+
+def load(folder: Path, rig: Rig) -> SavedMap:
+    """Read a map.
+
+    Args:
+        folder: of it.
+        rig: whose map it must be.
+
+    Raises:
+        MapError: if it is none, of another version or rig, or damaged.
+    """
+    header = _header(folder)
+    try:
+        other = Rig.load(folder / _RIG)
+    except GraphvioError as error:
+        raise MapError(f"{folder}: the map's rig cannot be read ({error}); restore the folder") from None
+    differs = difference(rig, other)
+    if differs:
+        raise MapError(
+            f"{folder}: is a map of another rig ({differs}); use the rig.yaml in it, or make a new map with this rig"
+        )
+    for name in _CHECKED:
+        if _digest(folder / name) != header["files"].get(name):
+            raise MapError(f"{folder / name}: is damaged or missing; restore the map from a copy, or make a new one")
+    try:
+        with np.load(folder / _PLACES, allow_pickle=False) as file:
+            columns = {name: file[name] for name in file.files}
+        columns["vectors"] = columns["vectors"].astype(np.float32)
+        learnt_from = int(columns.pop("learnt_from"))
+        return SavedMap(**columns, learnt_from=learnt_from, closures=saved.load(folder / _CLOSURES))
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, GraphvioError) as error:
+        raise MapError(f"{folder / _PLACES}: holds no places ({error}); restore the map from a copy") from None
+
+
+def copy_files(folder: Path, into: Path) -> None:
+    """Bring a map's features where they can be added to.
+
+    Raises:
+        MapError: if they cannot be copied.
+    """
+    copy_database(folder / DATABASE, into / DATABASE)
+
+
+def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
+    folder.chmod(0o755)
+    store.copy_to(folder)
+    columns = {name: value for name, value in vars(kept).items() if name != "closures"}
+    columns["vectors"] = kept.vectors.astype(np.float16)  # their ranking does not need more
+    np.savez(folder / _PLACES, **columns)
+    (folder / _CLOSURES).write_bytes(saved.to_bytes(kept.closures))
+    without_masks(rig).save(folder / _RIG)
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "graphvio": __version__,
+        "rig": rig.name,
+        "places": len(kept.stamp_ns),
+        "sessions": len(set(kept.session.tolist())),
+        "files": {name: _digest(folder / name) for name in _CHECKED},
+    }
+    (folder / _HEADER).write_text(json.dumps(header, indent=2) + "\n", encoding="utf-8")
+
+
+def _header(folder: Path) -> dict[str, dict[str, str]]:
+    path = folder / _HEADER
+    try:
+        header = json.loads(path.read_text(encoding="utf-8"))
+        form, version, files = header["format"], header["version"], dict(header["files"])
+    except OSError:
+        raise MapError(f"{folder}: is no map, {_HEADER} is missing; give the folder that a map was saved in") from None
+    except (ValueError, KeyError, TypeError):
+        raise MapError(f"{path}: is damaged; restore the map from a copy, or make a new one") from None
+    if form != FORMAT:
+        raise MapError(f"{path}: is of something else than a map; give the folder that a map was saved in")
+    if version != VERSION:
+        raise MapError(f"{folder}: is a map of version {version}, this graphvio reads {VERSION}; make a new map")
+    return {"files": files}
+
+
+def _digest(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return ""

@@ -1,0 +1,63 @@
+"""Images of places, as files that are named as in the database."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from graphvio.arrays import Image
+from graphvio.events import FrameSet
+from graphvio.optimization.loops.database import image_name
+from graphvio.rig import Rig
+
+_PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # the noise of images hardly shrinks any further
+
+
+def write_image(path: Path, image: Image) -> None:
+    """Write a file that is either whole or absent.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.tmp")
+    _, encoded = cv2.imencode(".png", image, _PNG_OPTIONS)
+    unfinished.write_bytes(encoded.tobytes())
+    unfinished.replace(path)
+
+
+def write_place(folder: Path, rig: Rig, session: str, frameset: FrameSet) -> None:
+    """Write all images of a place.
+
+    Raises:
+        OSError: if one cannot be written.
+    """
+    for j, images in frameset.images.items():
+        pair = rig.pairs[j]
+        for camera, image in zip((pair.left, pair.right), images, strict=True):
+            write_image(folder / image_name(session, camera.name, frameset.stamp_ns), image)
+
+
+def read_place(folder: Path, rig: Rig, session: str, stamp_ns: int) -> FrameSet:
+    """The images of a place, of those pairs whose both files are there and can be read."""
+    images = {}
+    for j, pair in enumerate(rig.pairs):
+        both = [
+            _read(folder / image_name(session, each.name, stamp_ns), each.size_px) for each in (pair.left, pair.right)
+        ]
+        if both[0] is not None and both[1] is not None:
+            images[j] = (both[0], both[1])
+    return FrameSet(stamp_ns, images)
+
+
+def _read(path: Path, size_px: tuple[int, int]) -> Image | None:
+    try:
+        data = np.fromfile(path, dtype=np.uint8)
+    except OSError:
+        return None
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+    if image is None or image.shape != size_px[::-1]:
+        return None
+    return np.asarray(image, dtype=np.uint8)

@@ -1,0 +1,208 @@
+"""Whether two places are one, and how they lie to each other: matches, two-view geometry, resection, patches."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from graphvio.arrays import AnyArray, Float, Int
+from graphvio.config import Config
+from graphvio.events import FrameSet
+from graphvio.frontend.stereo import triangulate
+from graphvio.frontend.tracks import PairFrame
+from graphvio.optimization.loops.database import FeatureDatabase, image_name
+from graphvio.optimization.loops.features import PairFeatures
+from graphvio.optimization.loops.matching import alike, estimated_geometry
+from graphvio.optimization.loops.places import PairObserver
+from graphvio.optimization.loops.resection import Resection, register_again, resect_features
+from graphvio.rig import Rig, StereoPair
+
+_LEAST_MATCHES = 20
+_MOST_CROSSINGS = 2  # pairs of images of a candidate that are matched
+
+
+class View(Protocol):
+    """A place as verification looks at it, wherever its features are kept."""
+
+    @property
+    def rig(self) -> Rig:
+        """That looked around."""
+
+    def features(self, j: int) -> tuple[Float, AnyArray]:
+        """Pixels (K, 2) and descriptors (K, 128), uint8, of pair j's left image."""
+
+    def frame(self, j: int) -> PairFrame:
+        """The same features, triangulated."""
+
+    def frameset(self) -> FrameSet:
+        """The place's images, of those pairs whose images there still are."""
+
+
+class StoredView:
+    """A place in a database.
+
+    Args:
+        rig: that looked around.
+        session: its name in the database.
+        stamp_ns: of the place.
+        database: of features.
+        lock: held while it is read.
+        frameset_at: reads the images again.
+    """
+
+    def __init__(
+        self, rig: Rig, session: str, stamp_ns: int, database: FeatureDatabase, lock: threading.Lock,
+        frameset_at: Callable[[int], FrameSet],
+    ) -> None:  # fmt: skip
+        self._rig = rig
+        self._session = session
+        self._stamp_ns = stamp_ns
+        self._database = database
+        self._lock = lock
+        self._frameset_at = frameset_at
+
+    @property
+    def rig(self) -> Rig:
+        """See `View`."""
+        return self._rig
+
+    def name(self, j: int) -> str:
+        """Of pair j's left image in the database."""
+        return image_name(self._session, self._rig.pairs[j].left.name, self._stamp_ns)
+
+    def features(self, j: int) -> tuple[Float, AnyArray]:
+        """See `View`."""
+        name = self.name(j)
+        with self._lock:
+            return self._database.pixels(name), self._database.descriptors(name)
+
+    def frame(self, j: int) -> PairFrame:
+        """See `View`."""
+        pair, left = self._rig.pairs[j], self.name(j)
+        right = image_name(self._session, pair.right.name, self._stamp_ns)
+        with self._lock:
+            pixels, in_right = self._database.pixels(left), self._database.pixels(right)
+            rows = self._database.matches(left, right)
+        return frame_of(pair, self._stamp_ns, pixels, in_right, rows)
+
+    def frameset(self) -> FrameSet:
+        """See `View`."""
+        return self._frameset_at(self._stamp_ns)
+
+
+class FreshView:
+    """A place that is looked at now, in memory.
+
+    Args:
+        rig: that looks around.
+        frameset: of the place.
+        seen: what its pairs show.
+    """
+
+    def __init__(self, rig: Rig, frameset: FrameSet, seen: Mapping[int, PairFeatures]) -> None:
+        self._rig = rig
+        self._frameset = frameset
+        self._seen = seen
+
+    @property
+    def rig(self) -> Rig:
+        """See `View`."""
+        return self._rig
+
+    def features(self, j: int) -> tuple[Float, AnyArray]:
+        """See `View`."""
+        return self._seen[j].left, self._seen[j].descriptors
+
+    def frame(self, j: int) -> PairFrame:
+        """See `View`."""
+        seen = self._seen[j]
+        return frame_of(self._rig.pairs[j], self._frameset.stamp_ns, seen.left, seen.right, seen.rows)
+
+    def frameset(self) -> FrameSet:
+        """See `View`."""
+        return self._frameset
+
+
+def crossings(pairs: Int, vectors: AnyArray, other_pairs: Int, other_vectors: AnyArray) -> list[tuple[int, int]]:
+    """Pairs (a, b) of the images of two places that are most alike, the most similar first.
+
+    Args:
+        pairs: (P,) of the earlier place's images.
+        vectors: (P, D) that describe them.
+        other_pairs: (Q,) of the later place's images.
+        other_vectors: (Q, D).
+    """
+    similar = vectors @ other_vectors.T
+    ranked = sorted((-float(similar[i, k]), i, k) for i in range(len(pairs)) for k in range(len(other_pairs)))[
+        :_MOST_CROSSINGS
+    ]
+    return [(int(pairs[i]), int(other_pairs[k])) for _, i, k in ranked]
+
+
+def verified(
+    earlier: View, later: View, tried: Sequence[tuple[int, int]], observers: Sequence[PairObserver] | None,
+    config: Config, seed: Sequence[int], on_matched: Callable[[int, int, Int, Any], None] | None = None,
+) -> Resection | None:  # fmt: skip
+    """The motion between two places by what they have in common, or None where that is too little.
+
+    Args:
+        earlier: whose points are used.
+        later: that sees them again.
+        tried: `crossings`.
+        observers: of the rig's pairs, to register patches; None where the two rigs are not the same.
+        config: of the search and the motion.
+        seed: of the random triples.
+        on_matched: called with (a, b), rows (M, 2) of features that look alike, and the two-view geometry that
+            verifies them.
+    """
+    matches = {}
+    for a, b in tried:
+        rows, geometry = _matched(earlier, later, a, b)
+        if len(rows) < _LEAST_MATCHES:
+            break  # the others are less alike
+        inliers = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
+        if len(inliers) < _LEAST_MATCHES:
+            break
+        if on_matched is not None:
+            on_matched(a, b, rows, geometry)
+        matches[a, b] = inliers
+    if not matches:
+        return None
+    reference = {a: earlier.frame(a) for a, _ in matches}
+    current = {b: later.frame(b) for _, b in matches}
+    found = resect_features(later.rig, reference, current, matches, config, seed)
+    if found is None or found.inliers < config.optimization.loop_min_inliers:
+        return None
+    if observers is not None:
+        framesets = (earlier.frameset(), later.frameset())
+        found = register_again(observers, found, reference, framesets, config, seed)
+    return found
+
+
+def _matched(earlier: View, later: View, a: int, b: int) -> tuple[Int, Any]:
+    """Rows (M, 2) of features that are one by their descriptors, and COLMAP's geometry; None where they are few."""
+    (first, first_descriptors), (second, second_descriptors) = earlier.features(a), later.features(b)
+    rows = alike(first_descriptors, second_descriptors)
+    if len(rows) < _LEAST_MATCHES:
+        return rows, None
+    cameras = (earlier.rig.pairs[a].left, later.rig.pairs[b].left)
+    return rows, estimated_geometry(cameras, (first, second), rows)
+
+
+def frame_of(pair: StereoPair, stamp_ns: int, pixels: Float, in_right: Float, rows: Int) -> PairFrame:
+    """Features (K, 2) of a left image, of which those that rows (M, 2) match to the right one's have a depth."""
+    n = len(pixels)
+    left, has_ray = pair.left.unproject(pixels)
+    right = np.zeros((n, 2))
+    right[rows[:, 0]], seen = pair.right.unproject(in_right[rows[:, 1]])
+    has_depth = np.zeros(n, dtype=bool)
+    has_depth[rows[:, 0]] = seen
+    points, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
+    none = np.zeros(n, dtype=np.int64)
+    return PairFrame(
+        stamp_ns, np.arange(n), none, pixels, left, right, points, covariances, np.zeros((n, 2)), has_depth & has_ray,
+        none,
+    )  # fmt: skip

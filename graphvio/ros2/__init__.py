@@ -1,0 +1,1 @@
+"""ROS 2 topics over DDS, without a ROS installation."""

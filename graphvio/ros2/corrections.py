@@ -1,0 +1,108 @@
+"""Corrections that come as ROS 2 messages: which keyframe is meant, and where it is in the map."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from graphvio.errors import GraphvioError
+from graphvio.ros2.messages import CORRECTION, MAP
+from graphvio.sessions import cdr
+from graphvio.sessions.messages import covariance_of, pose_of, stamp_of
+from graphvio.slam.interface import Served
+from graphvio.slam.keyframe import Keyframe
+
+_TOLERANCE_NS: Final = 500_000  # stamps that went through seconds as floating-point numbers are off by less
+_REMEMBERED: Final = 20_000
+_UNIT: Final = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Outcomes:
+    """What became of the corrections so far.
+
+    Attributes:
+        accepted: how many.
+        refused: how many.
+        is_refused: whether the newest one was.
+        newest: one line for people on the newest one.
+    """
+
+    accepted: int = 0
+    refused: int = 0
+    is_refused: bool = False
+    newest: str = "none came"
+
+
+class Corrections:
+    """Hands corrections on to the odometry; it is told of the keyframes in another thread.
+
+    Args:
+        served: takes them.
+    """
+
+    def __init__(self, served: Served) -> None:
+        self._served = served
+        self._lock = threading.Lock()
+        self._stamps: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)  # with the keyframe's id
+        self.outcomes = Outcomes()
+
+    def know(self, keyframe: Keyframe) -> None:
+        """Corrections of this keyframe may come from now on."""
+        with self._lock:
+            self._stamps.append((keyframe.stamp_ns, keyframe.id))
+
+    def take(self, data: bytes) -> None:
+        """Take a ``geometry_msgs/PoseWithCovarianceStamped``; what becomes of it is in ``outcomes``."""
+        try:
+            said = self._taken(data)
+            self.outcomes = Outcomes(self.outcomes.accepted + 1, self.outcomes.refused, False, said)
+        except GraphvioError as error:
+            self.outcomes = Outcomes(self.outcomes.accepted, self.outcomes.refused + 1, True, str(error))
+
+    def _taken(self, data: bytes) -> str:
+        message = cdr.decode(data, CORRECTION, "a correction")
+        frame = message.header.frame_id.lstrip("/")
+        if frame != MAP:
+            raise _RefusedError(f"a correction in frame {frame!r}; give the pose of {MAP} to body")
+        q = message.pose.pose.orientation
+        norm = float(np.linalg.norm([q.x, q.y, q.z, q.w]))
+        if not abs(norm - 1.0) < _UNIT:
+            raise _RefusedError(f"a correction whose orientation has norm {norm:.3g}; give a unit quaternion")
+        map_T_body, covariance = pose_of(message), covariance_of(message)
+        if not np.isfinite(map_T_body).all() or not _is_positive(covariance):
+            raise _RefusedError(
+                "a correction whose position is not finite, or whose covariance is not positive definite"
+            )
+        keyframe_id = self._keyframe_at(stamp_of(message.header))
+        result = self._served.correct(keyframe_id, map_T_body, 0.5 * (covariance + covariance.T))
+        if not result.accepted:
+            raise _RefusedError(f"the correction of keyframe {keyframe_id}: {result.reason}")
+        distance = "" if result.statistic is None else f", statistic {result.statistic:.3g} of {result.threshold:.3g}"
+        return f"keyframe {keyframe_id} accepted{distance}"
+
+    def _keyframe_at(self, stamp_ns: int) -> int:
+        with self._lock:
+            nearest = min(self._stamps, key=lambda each: abs(each[0] - stamp_ns), default=None)
+        if nearest is None:
+            raise _RefusedError("a correction before the first keyframe")
+        if abs(nearest[0] - stamp_ns) > _TOLERANCE_NS:
+            raise _RefusedError(
+                f"a correction at {stamp_ns} ns: the nearest keyframe is {1e-6 * abs(nearest[0] - stamp_ns):.3g} ms "
+                "off; give the stamp of a keyframe's landmarks"
+            )
+        return nearest[1]
+
+
+class _RefusedError(GraphvioError):
+    """A correction that the odometry is not even asked to take."""
+
+
+def _is_positive(covariance: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> bool:
+    if not np.isfinite(covariance).all():
+        return False
+    return bool(np.linalg.eigvalsh(0.5 * (covariance + covariance.T)).min() > 0.0)

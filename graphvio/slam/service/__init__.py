@@ -1,0 +1,1 @@
+"""The odometry as a gRPC service, described by ``graphvio.proto``; needs the optional part ``serve``."""

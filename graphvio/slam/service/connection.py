@@ -1,0 +1,196 @@
+"""A client's connection: channel, token, calls, and gRPC's failures as typed errors."""
+
+from __future__ import annotations
+
+import ssl
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from graphvio.errors import ServiceError
+from graphvio.slam.service.diagnosis import why_unreachable
+from graphvio.slam.service.libraries import grpc, stubs
+from graphvio.slam.service.options import DEFAULT_PORT, is_loopback
+from graphvio.slam.service.security import bearer
+from graphvio.slam.service.streams import RUN_KEY
+
+_MESSAGE_BYTES = 256 * 2**20
+_WINDOW_BYTES = 4096
+_KEEPALIVE_MS, _PONG_MS = 10_000, 5_000
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 2.0
+_TOO_LARGE = "larger than max"
+
+
+class Connection:
+    """Calls a server, and opens streams again that break.
+
+    Args:
+        address: ``HOST:PORT``, or ``HOST`` with the usual port.
+        ca: PEM file of the certificates that are trusted, or None for no TLS.
+        token: what the server demands, or None.
+        timeout_s: how long an answer may take.
+        patience_s: how long a broken stream is tried again.
+
+    Raises:
+        ServiceError: if the address is none, the certificates cannot be read, or the token would go unencrypted.
+    """
+
+    def __init__(
+        self, address: str, ca: str | Path | None, token: str | None, timeout_s: float, patience_s: float
+    ) -> None:
+        self._host, self._port = _split(address)
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        self.address = f"{host}:{self._port}"
+        self._ca = None if ca is None else _read_certificates(Path(ca))
+        if token is not None and ca is None and not is_loopback(self._host):
+            raise ServiceError(f"{self.address}: the token would go through the network for all to read; give a ca")
+        self._metadata = () if token is None else (bearer(token),)
+        self._timeout_s = timeout_s
+        self._patience_s = patience_s
+        self._closing = threading.Event()
+        self._lock = threading.Lock()
+        self._calls: set[Any] = set()
+        options = _transport()
+        if self._ca is None:
+            self._channel = grpc.insecure_channel(self.address, options)
+        else:
+            self._channel = grpc.secure_channel(self.address, grpc.ssl_channel_credentials(self._ca), options)
+        self.stub = stubs.FrontEndStub(self._channel)
+
+    def call(self, method: Any, request: Any) -> Any:
+        """The answer to a request.
+
+        Raises:
+            ServiceError: if there is none.
+        """
+        self._check_open()
+        try:
+            return method(request, timeout=self._timeout_s, metadata=self._metadata)
+        except grpc.RpcError as error:
+            raise self._error(error) from None
+
+    def follow(self, method: Any, next_request: Callable[[], Any]) -> Iterator[Any]:
+        """Messages of a stream until the server ends it; when it breaks, it is opened again with the next request.
+
+        Raises:
+            ServiceError: if the server refuses, or stays away for longer than the patience.
+        """
+        self._check_open()
+        broken_at: float | None = None
+        wait_s = _FIRST_WAIT_S
+        has_begun = False
+        while True:
+            call = self._open(method, next_request())
+            if call is None:
+                return
+            try:
+                if any(key == RUN_KEY for key, _ in call.initial_metadata() or ()):
+                    has_begun, broken_at, wait_s = True, None, _FIRST_WAIT_S
+                yield from call
+                return
+            except grpc.RpcError as error:
+                if self._closing.is_set():
+                    return
+                broken_at = broken_at or time.monotonic()
+                is_over = time.monotonic() - broken_at > self._patience_s
+                if is_over or not _may_pass(error, has_begun):
+                    raise self._error(error) from None
+            finally:
+                self._end(call)
+            self._closing.wait(wait_s)
+            wait_s = min(2.0 * wait_s, _LONGEST_WAIT_S)
+
+    def close(self) -> None:
+        """End all streams and the connection; from any thread, a second time does nothing."""
+        with self._lock:
+            self._closing.set()
+            calls = list(self._calls)
+        for call in calls:
+            call.cancel()
+        self._channel.close()
+
+    def _open(self, method: Any, request: Any) -> Any | None:
+        with self._lock:
+            if self._closing.is_set():
+                return None
+            call = method(request, metadata=self._metadata)
+            self._calls.add(call)
+            return call
+
+    def _end(self, call: Any) -> None:
+        call.cancel()
+        with self._lock:
+            self._calls.discard(call)
+
+    def _check_open(self) -> None:
+        if self._closing.is_set():
+            raise ServiceError(f"{self.address}: this client is closed; make a new one")
+
+    def _error(self, error: Any) -> ServiceError:
+        code, details = error.code(), error.details() or ""
+        if code is grpc.StatusCode.UNAVAILABLE and not self._closing.is_set():
+            text = why_unreachable(self._host, self._port, self._ca)
+        elif code is grpc.StatusCode.UNAUTHENTICATED:
+            text = f"{details}; give the one in the server's token file"
+        elif code is grpc.StatusCode.DEADLINE_EXCEEDED:
+            text = f"did not answer within {self._timeout_s:g} s; is the machine or the network overloaded?"
+        elif code is grpc.StatusCode.UNIMPLEMENTED:
+            text = "does not know this call; is it graphvio's service, and of the same version?"
+        elif code is grpc.StatusCode.RESOURCE_EXHAUSTED and _TOO_LARGE in details:
+            text = f"sent a message of more than {_MESSAGE_BYTES >> 20} MB; ask for keyframes without images"
+        else:
+            text = details or code.name.lower().replace("_", " ")
+        return ServiceError(f"{self.address}: {text}")
+
+
+def _may_pass(error: Any, has_begun: bool) -> bool:
+    """Whether the same stream may be had a moment later."""
+    code, details = error.code(), error.details() or ""
+    if code is grpc.StatusCode.RESOURCE_EXHAUSTED:  # the server may still count the stream that has just broken
+        return has_begun and _TOO_LARGE not in details
+    is_broken = code in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED)
+    return has_begun and (is_broken or "RST_STREAM" in details)
+
+
+def _transport() -> list[tuple[str, int]]:
+    return [
+        ("grpc.max_receive_message_length", _MESSAGE_BYTES),
+        # With gRPC's own window, which grows, a slow client would read what is half a minute old and more.
+        ("grpc.http2.lookahead_bytes", _WINDOW_BYTES),
+        ("grpc.http2.bdp_probe", 0),
+        ("grpc.enable_http_proxy", 0),  # robots are reached directly
+        ("grpc.use_local_subchannel_pool", 1),  # one connection a client, not a process
+        ("grpc.enable_retries", 0),
+        ("grpc.initial_reconnect_backoff_ms", 200),
+        ("grpc.min_reconnect_backoff_ms", 3_000),
+        ("grpc.max_reconnect_backoff_ms", 2_000),
+        ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
+        ("grpc.keepalive_timeout_ms", _PONG_MS),
+        ("grpc.http2.ping_timeout_ms", _PONG_MS),  # else any other ping on its way puts it off to a minute
+        ("grpc.http2.max_pings_without_data", 0),
+    ]
+
+
+def _split(address: str) -> tuple[str, int]:
+    host, colon, port = address.rpartition(":")
+    if not colon or address.endswith("]"):
+        host, port = address, str(DEFAULT_PORT)
+    elif ":" in host and not host.startswith("["):
+        host, port = "", ""
+    host = host.strip("[]")
+    if not host or not port.isascii() or not port.isdigit() or not 0 < int(port) < 2**16:
+        raise ServiceError(f"{address!r}: is no address; give HOST:PORT, an IPv6 host in brackets")
+    return host, int(port)
+
+
+def _read_certificates(path: Path) -> bytes:
+    try:
+        content = path.read_bytes()
+        ssl.create_default_context(cadata=content.decode("ascii"))
+    except (ssl.SSLError, ValueError):  # before OSError, which SSLError is, too
+        raise ServiceError(f"{path}: holds no certificates; give a PEM file of those to be trusted") from None
+    except OSError as error:
+        raise ServiceError(f"{path}: cannot be read ({error.strerror}); give a PEM file of certificates") from None
+    return content

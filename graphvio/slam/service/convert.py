@@ -1,0 +1,260 @@
+"""Keyframes, estimates and the like as messages, and back; nothing is lost that the messages have a field for."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphvio.arrays import AnyArray, Image
+from graphvio.errors import ServiceError
+from graphvio.events import Estimate, Incident, Prediction, Quality, Status
+from graphvio.rig import Camera, Rig, StereoPair, as_written
+from graphvio.rig_files import native
+from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
+from graphvio.slam.service.arrays import byte_rows, floats, maybe_floats, packed, whole_numbers
+from graphvio.slam.service.libraries import messages
+
+_STATUS_OF = {getattr(messages, f"TRACKING_STATUS_{each.name}"): each for each in Status}
+_NUMBER_OF_STATUS = {status: number for number, status in _STATUS_OF.items()}
+_QUALITY_OF = {getattr(messages, f"VISION_QUALITY_{each.name}"): each for each in Quality}
+_NUMBER_OF_QUALITY = {quality: number for number, quality in _QUALITY_OF.items()}
+_INT64 = 2**63
+
+Value = float | int | str | None
+
+
+def rig_text(rig: Rig) -> str:
+    """The text of a ``rig.yaml`` without masks, which are files of the machine that has the cameras."""
+    pairs = tuple(StereoPair(pair.name, _bare(pair.left), _bare(pair.right)) for pair in rig.pairs)
+    return native.to_text(replace(rig, pairs=pairs), Path("/"))
+
+
+def rig_of(text: str, origin: str) -> Rig:
+    """The rig that a service has told.
+
+    Raises:
+        RigError: if this version of graphvio cannot read it.
+    """
+    return native.parse(text, Path(origin))
+
+
+def _bare(camera: Camera) -> Camera:
+    return as_written(replace(camera, mask=None), camera.body_T_cam)
+
+
+def estimate_message(estimate: Estimate) -> Any:
+    """``Estimate`` of the proto."""
+    return messages.Estimate(
+        stamp_ns=estimate.stamp_ns,
+        status=_NUMBER_OF_STATUS[estimate.status],
+        epoch=estimate.epoch,
+        odom_T_body=packed(estimate.nav_T_body),
+        covariance=packed(estimate.covariance),
+        velocity_odom=packed(estimate.velocity_nav),
+        velocity_covariance=packed(estimate.velocity_covariance),
+        gyro_bias=packed(estimate.gyro_bias),
+        gyro_bias_covariance=packed(estimate.gyro_bias_covariance),
+        accel_bias=packed(estimate.accel_bias),
+        accel_bias_covariance=packed(estimate.accel_bias_covariance),
+        time_offset_s=estimate.time_offset_s,
+        time_offset_sigma_s=estimate.time_offset_sigma_s,
+        vision=_NUMBER_OF_QUALITY[estimate.vision],
+        vision_reason=estimate.vision_reason,
+        at_rest=bool(estimate.at_rest),
+    )
+
+
+def estimate_of(message: Any) -> Estimate:
+    """The estimate; what diagnoses the odometry is not in the message, and empty.
+
+    Raises:
+        ServiceError: if the message is malformed, as with all functions below that take one.
+    """
+    return Estimate(
+        stamp_ns=message.stamp_ns,
+        status=_known(_STATUS_OF, message.status, "estimate: status"),
+        nav_T_body=maybe_floats(message.odom_T_body, (4, 4), "estimate: odom_T_body"),
+        covariance=maybe_floats(message.covariance, (6, 6), "estimate: covariance"),
+        epoch=message.epoch,
+        velocity_nav=maybe_floats(message.velocity_odom, (3,), "estimate: velocity_odom"),
+        gyro_bias=maybe_floats(message.gyro_bias, (3,), "estimate: gyro_bias"),
+        accel_bias=maybe_floats(message.accel_bias, (3,), "estimate: accel_bias"),
+        velocity_covariance=maybe_floats(message.velocity_covariance, (3, 3), "estimate: velocity_covariance"),
+        gyro_bias_covariance=maybe_floats(message.gyro_bias_covariance, (3, 3), "estimate: gyro_bias_covariance"),
+        accel_bias_covariance=maybe_floats(message.accel_bias_covariance, (3, 3), "estimate: accel_bias_covariance"),
+        time_offset_s=_maybe(message, "time_offset_s"),
+        time_offset_sigma_s=_maybe(message, "time_offset_sigma_s"),
+        vision=_known(_QUALITY_OF, message.vision, "estimate: vision"),
+        vision_reason=message.vision_reason,
+        at_rest=message.at_rest,
+    )
+
+
+def prediction_message(prediction: Prediction) -> Any:
+    """``Prediction`` of the proto."""
+    return messages.Prediction(
+        stamp_ns=prediction.stamp_ns,
+        epoch=prediction.epoch,
+        odom_T_body=packed(prediction.nav_T_body),
+        velocity_odom=packed(prediction.velocity_nav),
+        angular_velocity=packed(prediction.angular_velocity),
+    )
+
+
+def prediction_of(message: Any) -> Prediction:
+    """The prediction."""
+    return Prediction(
+        stamp_ns=message.stamp_ns,
+        nav_T_body=floats(message.odom_T_body, (4, 4), "prediction: odom_T_body"),
+        velocity_nav=floats(message.velocity_odom, (3,), "prediction: velocity_odom"),
+        angular_velocity=floats(message.angular_velocity, (3,), "prediction: angular_velocity"),
+        epoch=message.epoch,
+    )
+
+
+def incident_message(incident: Incident, missed: int) -> Any:
+    """``IncidentUpdate`` of the proto."""
+    return messages.IncidentUpdate(
+        stamp_ns=incident.stamp_ns, kind=incident.kind, detail=incident.detail, missed=missed
+    )
+
+
+def keyframe_message(keyframe: Keyframe, with_images: bool, with_descriptors: bool) -> Any:
+    """``Keyframe`` of the proto."""
+    message = messages.Keyframe(
+        id=keyframe.id,
+        epoch=keyframe.epoch,
+        stamp_ns=keyframe.stamp_ns,
+        status=_NUMBER_OF_STATUS[keyframe.status],
+        odom_T_body=packed(keyframe.odom_T_body),
+        covariance=packed(keyframe.covariance),
+        previous_id=keyframe.previous_id,
+        previous_T_body=packed(keyframe.previous_T_body),
+        relative_covariance=packed(keyframe.relative_covariance),
+        landmarks=_landmarks_message(keyframe.landmarks, with_descriptors),
+    )
+    for pair, (left, right) in sorted(keyframe.images.items()) if with_images else ():
+        message.images.add(pair=pair, left=_image_message(left), right=_image_message(right))
+    return message
+
+
+def keyframe_of(message: Any) -> Keyframe:
+    """The keyframe."""
+    where = f"keyframe {message.id}"
+    return Keyframe(
+        id=message.id,
+        epoch=message.epoch,
+        stamp_ns=message.stamp_ns,
+        status=_known(_STATUS_OF, message.status, f"{where}: status"),
+        odom_T_body=floats(message.odom_T_body, (4, 4), f"{where}: odom_T_body"),
+        covariance=floats(message.covariance, (6, 6), f"{where}: covariance"),
+        previous_id=_maybe(message, "previous_id"),
+        previous_T_body=maybe_floats(message.previous_T_body, (4, 4), f"{where}: previous_T_body"),
+        relative_covariance=maybe_floats(message.relative_covariance, (6, 6), f"{where}: relative_covariance"),
+        landmarks=_landmarks_of(message.landmarks, where),
+        images={each.pair: (_image_of(each.left, where), _image_of(each.right, where)) for each in message.images},
+    )
+
+
+def _landmarks_message(landmarks: Landmarks, with_descriptors: bool) -> Any:
+    descriptors = np.asarray(landmarks.descriptors, dtype=np.uint8)
+    return messages.Landmarks(
+        pair=np.asarray(landmarks.pair, dtype=np.int64).tolist(),
+        track_id=np.asarray(landmarks.track_id, dtype=np.int64).tolist(),
+        points_body=packed(landmarks.points_body),
+        covariances=packed(landmarks.covariances),
+        left_px=packed(landmarks.left_px),
+        right_px=packed(landmarks.right_px),
+        descriptor_size=descriptors.shape[1] if with_descriptors else 0,
+        descriptors=descriptors.tobytes() if with_descriptors else b"",
+    )
+
+
+def _landmarks_of(message: Any, where: str) -> Landmarks:
+    count = len(message.pair)
+    return Landmarks(
+        pair=whole_numbers(message.pair, f"{where}: pair", count),
+        track_id=whole_numbers(message.track_id, f"{where}: track_id", count),
+        points_body=floats(message.points_body, (count, 3), f"{where}: points_body"),
+        covariances=floats(message.covariances, (count, 3, 3), f"{where}: covariances"),
+        left_px=floats(message.left_px, (count, 2), f"{where}: left_px"),
+        right_px=floats(message.right_px, (count, 2), f"{where}: right_px"),
+        descriptors=byte_rows(message.descriptors, (count, message.descriptor_size), f"{where}: descriptors"),
+    )
+
+
+def _image_message(image: Image) -> Any:
+    height, width = image.shape
+    return messages.Image(width=width, height=height, pixels=np.ascontiguousarray(image).tobytes())
+
+
+def _image_of(message: Any, where: str) -> AnyArray:
+    return byte_rows(message.pixels, (message.height, message.width), f"{where}: image")
+
+
+def result_message(result: CorrectionResult) -> Any:
+    """``CorrectResponse`` of the proto."""
+    return messages.CorrectResponse(
+        accepted=bool(result.accepted),
+        reason=result.reason,
+        statistic=result.statistic,
+        threshold=result.threshold,
+        map_T_odom=packed(result.map_T_odom),
+    )
+
+
+def result_of(message: Any) -> CorrectionResult:
+    """What became of a correction."""
+    return CorrectionResult(
+        accepted=message.accepted,
+        reason=message.reason,
+        statistic=_maybe(message, "statistic"),
+        threshold=message.threshold,
+        map_T_odom=maybe_floats(message.map_T_odom, (4, 4), "correction: map_T_odom"),
+    )
+
+
+def status_message(status: Mapping[str, Value]) -> Any:
+    """``StatusReport`` of the proto."""
+    report = messages.StatusReport()
+    for name, value in status.items():
+        _set_value(report.values[name], value)
+    return report
+
+
+def status_of(message: Any) -> dict[str, Value]:
+    """Figures by name, in alphabetical order."""
+    values = ((name, message.values[name]) for name in sorted(message.values))
+    return {name: _maybe(value, value.WhichOneof("value") or "number") for name, value in values}
+
+
+def _set_value(message: Any, value: Any) -> None:
+    if value is None:
+        return
+    if isinstance(value, str):
+        message.text = value
+        return
+    try:
+        whole = operator.index(value)  # numpy's integers are no int
+    except TypeError:
+        message.number = float(value)
+        return
+    if -_INT64 <= whole < _INT64:
+        message.count = whole
+    else:
+        message.number = float(whole)
+
+
+def _maybe(message: Any, name: str) -> Any:
+    return getattr(message, name) if message.HasField(name) else None
+
+
+def _known(table: Mapping[int, Any], number: int, what: str) -> Any:
+    if number not in table:
+        raise ServiceError(f"{what} is {number}, which this version does not know; update graphvio on both sides")
+    return table[number]

@@ -1,0 +1,109 @@
+"""Tokens and certificates of the service."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import os
+import re
+import ssl
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from graphvio.errors import ServiceError
+from graphvio.slam.service.libraries import grpc
+from graphvio.slam.service.options import ServiceOptions
+
+TOKEN_KEY = "authorization"
+_TOKEN = re.compile(r"[!-~]{16,4096}")
+
+
+def bearer(token: str) -> tuple[str, str]:
+    """What a client sends with each call."""
+    return (TOKEN_KEY, f"Bearer {token}")
+
+
+def read_token(path: str | Path) -> str:
+    """The token in a file, without the line's end.
+
+    Raises:
+        ServiceError: if the file cannot be read, can be read by others than its owner, or holds no token.
+    """
+    text = _read_private(Path(path), "token", stat.S_IRWXG | stat.S_IRWXO).decode("utf-8", "replace").strip()
+    if not _TOKEN.fullmatch(text):
+        raise ServiceError(
+            f"{path}: is no token: one line of 16 to 4096 printable ASCII characters without spaces; make one with  "
+            f"(umask 077; openssl rand -hex 32 > {path})"
+        )
+    return text
+
+
+def server_credentials(options: ServiceOptions) -> Any | None:
+    """TLS of the server, or None if it is to have none.
+
+    Raises:
+        ServiceError: if certificate or key cannot be read, do not belong to each other, or the key is open to all.
+    """
+    if options.certificate is None or options.key is None:
+        return None
+    key = _read_private(options.key, "TLS key", stat.S_IRWXO)
+    try:
+        certificate = options.certificate.read_bytes()
+        # gRPC would take anything here, and fail at each client.
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(options.certificate, options.key, password=_no_password)
+    except (OSError, ssl.SSLError) as error:
+        raise ServiceError(
+            f"{options.certificate}, {options.key}: are no TLS certificate and key ({_reason(error)}); give PEM files "
+            "that belong to each other, the key without a password"
+        ) from None
+    return grpc.ssl_server_credentials([(key, certificate)])
+
+
+def token_interceptor(token: str) -> Any:
+    """Refuses every call, also of methods that do not exist, that does not carry the token."""
+
+    def refuse(_: Any, context: Any) -> Any:
+        return context.abort(grpc.StatusCode.UNAUTHENTICATED, "the token is missing or wrong")
+
+    # As a stream of requests: for a single one, a thread would wait until the stranger chooses to send it.
+    refusal = grpc.stream_stream_rpc_method_handler(refuse)
+    expected = _digest(bearer(token)[1])
+
+    class TokenInterceptor(grpc.ServerInterceptor):  # type: ignore[misc]
+        def intercept_service(self, continuation: Callable[[Any], Any], details: Any) -> Any:
+            given = [value for name, value in details.invocation_metadata if name == TOKEN_KEY]
+            is_known = len(given) == 1 and hmac.compare_digest(_digest(given[0]), expected)
+            return continuation(details) if is_known else refusal
+
+    return TokenInterceptor()
+
+
+def _digest(text: str | bytes) -> bytes:
+    """Of one length whatever was given, so that the comparison's time tells nothing of the token's."""
+    return hashlib.sha256(text.encode() if isinstance(text, str) else text).digest()
+
+
+def _read_private(path: Path, what: str, forbidden: int) -> bytes:
+    try:
+        with path.open("rb") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            if mode & forbidden:
+                raise ServiceError(
+                    f"{path}: the {what} can be read or changed by other users (mode {stat.S_IMODE(mode):03o}); "
+                    f"run  chmod 600 {path}"
+                )
+            return file.read(2**20)
+    except OSError as error:
+        raise ServiceError(f"{path}: the {what} cannot be read ({error.strerror}); check the path") from None
+
+
+def _no_password() -> str:
+    return ""  # else OpenSSL asks at the terminal
+
+
+def _reason(error: OSError | ssl.SSLError) -> str:
+    if isinstance(error, ssl.SSLError):
+        return (error.reason or "not PEM").lower().replace("_", " ")
+    return error.strerror or type(error).__name__

@@ -1,0 +1,137 @@
+"""The server: opens the port, lets clients in, and answers them beside the odometry."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from typing import Any, Self
+
+from graphvio.errors import ServiceError
+from graphvio.slam.interface import Served
+from graphvio.slam.service.libraries import grpc, stubs
+from graphvio.slam.service.malformed import MalformedInterceptor
+from graphvio.slam.service.options import ServiceOptions
+from graphvio.slam.service.pool import DaemonPool
+from graphvio.slam.service.security import read_token, server_credentials, token_interceptor
+from graphvio.slam.service.servicer import Servicer
+from graphvio.slam.service.streams import STREAMS_OF_A_CLIENT, StreamLimit
+
+_CALL_THREADS = 8  # for calls that are no streams, however many streams there are
+_CALLS_WAITING = 64
+_REQUEST_BYTES = 64 * 2**10
+_METADATA_BYTES = 16 * 2**10
+_HANDSHAKE_MS = 5_000
+_IDLE_MS = 300_000
+_LEAST_PING_MS = 4_000
+
+
+class GrpcServer:
+    """Serves a running odometry; a context manager.
+
+    Args:
+        served: the odometry. It is only read from, and told corrections.
+        options: where, and for whom.
+
+    Raises:
+        MissingExtraError: when the module is imported, if grpcio is not installed.
+    """
+
+    def __init__(self, served: Served, options: ServiceOptions | None = None) -> None:
+        self._options = options or ServiceOptions()
+        self._served = served
+        self._run_id = uuid.uuid4().hex
+        self._limit = StreamLimit(self._options.max_clients)
+        self._stopping = threading.Event()
+        self._server: Any = None
+        self._pool: DaemonPool | None = None
+        self._port = 0
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    @property
+    def address(self) -> str:
+        """``HOST:PORT`` where it listens, with the port that was found if any was asked for."""
+        return f"{self._options.address.rpartition(':')[0]}:{self._port or self._options.port}"
+
+    @property
+    def open_streams(self) -> int:
+        """How many streams clients have open."""
+        return self._limit.open_streams
+
+    def start(self) -> None:
+        """Listen; clients are served from here on, in threads of the server.
+
+        Raises:
+            ServiceError: if the address is taken or not this machine's, or token, certificate or key cannot be used.
+        """
+        if self._server is not None:
+            raise ServiceError(f"{self.address}: is served already; stop it first")
+        options = self._options
+        credentials = server_credentials(options)
+        interceptors = [] if options.token_file is None else [token_interceptor(read_token(options.token_file))]
+        interceptors.append(MalformedInterceptor())
+        threads = STREAMS_OF_A_CLIENT * options.max_clients + _CALL_THREADS
+        pool = DaemonPool(threads)
+        server = grpc.server(
+            pool,
+            interceptors=interceptors,
+            options=_transport(options),
+            maximum_concurrent_rpcs=threads + _CALLS_WAITING,
+        )
+        self._stopping = threading.Event()
+        stubs.add_FrontEndServicer_to_server(Servicer(self._served, self._run_id, self._limit, self._stopping), server)
+        try:
+            if credentials is None:
+                self._port = server.add_insecure_port(options.address)
+            else:
+                self._port = server.add_secure_port(options.address, credentials)
+        except RuntimeError:
+            self._port = 0
+        if not self._port:
+            server.stop(None)
+            pool.shutdown()
+            raise ServiceError(
+                f"{options.address}: cannot be listened on; choose a port that nobody uses, and an address of this "
+                "machine"
+            )
+        server.start()
+        self._server, self._pool = server, pool
+
+    def stop(self, grace_s: float = 2.0) -> None:
+        """Listen no more, and end all streams; a second time does nothing.
+
+        Args:
+            grace_s: streams of an odometry that has ended may go on for so long, to be read to their end.
+        """
+        if self._server is None or self._pool is None:
+            return
+        self._stopping.set()
+        self._server.stop(grace_s).wait()
+        self._pool.shutdown()
+        self._server = self._pool = None
+
+
+def _transport(options: ServiceOptions) -> list[tuple[str, int]]:
+    keepalive_ms = int(1e3 * options.keepalive_s)
+    return [
+        ("grpc.so_reuseport", 0),  # else a second server on the same port would take half of the clients
+        ("grpc.max_receive_message_length", _REQUEST_BYTES),
+        ("grpc.max_send_message_length", -1),
+        ("grpc.max_metadata_size", _METADATA_BYTES),
+        ("grpc.max_concurrent_streams", STREAMS_OF_A_CLIENT + _CALL_THREADS),
+        # What takes a connection without ever asking for anything must not keep others out.
+        ("grpc.max_allowed_incoming_connections", 4 * options.max_clients + 32),
+        ("grpc.server_handshake_timeout_ms", _HANDSHAKE_MS),
+        ("grpc.max_connection_idle_ms", _IDLE_MS),
+        ("grpc.keepalive_time_ms", keepalive_ms),
+        ("grpc.keepalive_timeout_ms", keepalive_ms // 2),
+        ("grpc.http2.ping_timeout_ms", keepalive_ms // 2),  # else any other ping on its way puts it off to a minute
+        ("grpc.keepalive_permit_without_calls", 1),
+        ("grpc.http2.max_pings_without_data", 0),
+        ("grpc.http2.min_recv_ping_interval_without_data_ms", _LEAST_PING_MS),
+    ]

@@ -1,0 +1,188 @@
+"""What the service answers to each call. Each runs in a thread of the server's pool, never in the odometry's."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import graphvio
+from graphvio.arrays import Float
+from graphvio.errors import GraphvioError, ServiceError
+from graphvio.events import Estimate, Prediction
+from graphvio.live.broadcast import Broadcast
+from graphvio.slam.interface import Served
+from graphvio.slam.service import convert
+from graphvio.slam.service.arrays import checked_covariance, checked_pose, floats, packed
+from graphvio.slam.service.libraries import grpc, messages, stubs
+from graphvio.slam.service.streams import RUN_KEY, StreamLimit
+
+_LOOK_S = 0.25  # how soon a stream sees that its client is gone or the server stops
+_WAITING = {messages.RATE_FRAME: 2, messages.RATE_IMU: 16}
+_INCIDENTS_WAITING = 256
+_log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+
+class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
+    """Answers for one odometry.
+
+    Args:
+        served: the odometry.
+        run_id: names it.
+        limit: of streams.
+        stopping: set when streams are to end though the odometry goes on.
+    """
+
+    def __init__(self, served: Served, run_id: str, limit: StreamLimit, stopping: threading.Event) -> None:
+        self._served = served
+        self._run_id = run_id
+        self._limit = limit
+        self._stopping = stopping
+        self._rig_text = convert.rig_text(served.rig)
+
+    def GetInfo(self, request: Any, context: Any) -> Any:
+        """What is served; as with all below, the proto tells what is asked and answered."""
+        log = self._served.keyframe_log
+        return messages.Info(
+            version=graphvio.__version__,
+            rig_yaml=self._rig_text,
+            run_id=self._run_id,
+            epoch=self._epoch(),
+            oldest_keyframe_id=log.oldest_id,
+            next_keyframe_id=log.next_id,
+            has_ended=log.is_closed,
+        )
+
+    def GetStatus(self, request: Any, context: Any) -> Any:
+        """How the odometry runs."""
+        return _answer(context, lambda: convert.status_message(self._served.status()))
+
+    def StreamEstimates(self, request: Any, context: Any) -> Iterator[Any]:
+        """Where the rig is, from now on."""
+        broadcast: Broadcast[Any]
+        if request.rate == messages.RATE_FRAME:
+            broadcast = self._served.estimates
+        elif request.rate == messages.RATE_IMU:
+            broadcast = self._served.predictions
+        else:
+            context.abort(grpc.StatusCode.INVALID_ARGUMENT, "rate: choose RATE_FRAME or RATE_IMU")
+        with self._stream(request, context):
+            for state, missed in self._listen(broadcast, _WAITING[request.rate], context):
+                yield self._update(state, missed)
+
+    def StreamKeyframes(self, request: Any, context: Any) -> Iterator[Any]:
+        """Keyframes from an id on."""
+        if request.from_id < 0:
+            context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"from_id is {request.from_id}; the first keyframe is 0")
+        log = self._served.keyframe_log
+        next_id = request.from_id
+        with self._stream(request, context):
+            while context.is_active():
+                keyframe = log.read(next_id, _LOOK_S)
+                if keyframe is not None:
+                    message = convert.keyframe_message(keyframe, request.with_images, request.with_descriptors)
+                    yield messages.KeyframeUpdate(keyframe=message, gone=keyframe.id - next_id)
+                    next_id = keyframe.id + 1
+                elif log.is_closed and log.next_id <= next_id:
+                    return
+                if not log.is_closed:  # else what is left of it may still be read
+                    self._abort_if_stopping(context)
+
+    def StreamIncidents(self, request: Any, context: Any) -> Iterator[Any]:
+        """What happens, from now on."""
+        with self._stream(request, context):
+            for incident, missed in self._listen(self._served.incidents, _INCIDENTS_WAITING, context):
+                yield convert.incident_message(incident, missed)
+
+    def Correct(self, request: Any, context: Any) -> Any:
+        """A correction: checked for its form here, judged by the odometry."""
+        self._check_run(request, context)
+        try:
+            if request.keyframe_id < 0:
+                raise ServiceError(f"keyframe_id is {request.keyframe_id}; the first keyframe is 0")
+            map_T_body = checked_pose(floats(request.map_T_body, (4, 4), "map_T_body"), "map_T_body")
+            covariance = checked_covariance(floats(request.covariance, (6, 6), "covariance"), "covariance")
+        except ServiceError as error:
+            context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
+        return _answer(
+            context,
+            lambda: convert.result_message(self._served.correct(request.keyframe_id, map_T_body, covariance)),
+        )
+
+    def _update(self, state: Estimate | Prediction, missed: int) -> Any:
+        update = messages.EstimateUpdate(map_T_odom=packed(self._map_T_odom(state.epoch)), missed=missed)
+        if isinstance(state, Estimate):
+            update.estimate.CopyFrom(convert.estimate_message(state))
+        else:
+            update.prediction.CopyFrom(convert.prediction_message(state))
+        return update
+
+    def _listen(self, broadcast: Broadcast[T], depth: int, context: Any) -> Iterator[tuple[T, int]]:
+        """Items as they come, each with the number of those left out before it."""
+        subscription = broadcast.subscribe(depth)
+        told = 0
+        try:
+            while context.is_active():
+                was_closed = subscription.is_closed
+                item = subscription.get(_LOOK_S)
+                if item is not None:
+                    missed = subscription.missed
+                    yield item, missed - told
+                    told = missed
+                elif was_closed:
+                    return
+                if not was_closed:
+                    self._abort_if_stopping(context)
+        finally:
+            subscription.close()
+
+    def _map_T_odom(self, epoch: int) -> Float | None:
+        """The one in force, unless it is another epoch's than that of an estimate that waited."""
+        before = self._epoch()
+        map_T_odom = self._served.map_T_odom
+        return map_T_odom if before == epoch == self._epoch() else None
+
+    def _epoch(self) -> int | None:
+        log = self._served.keyframe_log
+        newest = log.read(max(log.next_id - 1, 0), timeout_s=0.0)
+        return None if newest is None else newest.epoch
+
+    @contextmanager
+    def _stream(self, request: Any, context: Any) -> Iterator[None]:
+        self._check_run(request, context)
+        client = context.peer()
+        try:
+            self._limit.enter(client)
+        except ServiceError as error:
+            context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, str(error))
+        try:
+            # Sent before there is a first message, which may be long in coming: the client knows that it is through.
+            context.send_initial_metadata(((RUN_KEY, self._run_id),))
+            yield
+        finally:
+            self._limit.leave(client)
+
+    def _check_run(self, request: Any, context: Any) -> None:
+        if request.run_id not in ("", self._run_id):
+            context.abort(
+                grpc.StatusCode.FAILED_PRECONDITION,
+                "another run of the odometry is served now, in which ids of keyframes mean something else; begin anew",
+            )
+
+    def _abort_if_stopping(self, context: Any) -> None:
+        if self._stopping.is_set():
+            context.abort(grpc.StatusCode.UNAVAILABLE, "the server stops")
+
+
+def _answer(context: Any, make: Callable[[], Any]) -> Any:
+    try:
+        return make()
+    except GraphvioError as error:
+        code, text = grpc.StatusCode.FAILED_PRECONDITION, str(error)
+    except Exception as error:
+        _log.exception("a call failed")
+        code, text = grpc.StatusCode.INTERNAL, f"the server failed ({type(error).__name__}); its log tells more"
+    return context.abort(code, text)

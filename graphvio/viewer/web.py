@@ -1,0 +1,131 @@
+"""The view in a browser: rerun's web viewer and the server of its data, in a process of their own.
+
+rerun can serve from within a program, too, but then listens on all addresses (0.41), and has no password.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from urllib.parse import quote
+
+from graphvio.errors import GraphvioError
+
+_HOST = "127.0.0.1"
+_START_S, _END_S = 20.0, 5.0
+# Ends the server when its input ends, which it also does when this process is killed.
+_SCRIPT = 'trap : TERM; "$@" & read -r _; kill -TERM 0; wait'
+
+
+@dataclass(frozen=True)
+class WebOptions:
+    """Where the view is served: on this machine only. From elsewhere both ports are reached by an SSH tunnel.
+
+    Attributes:
+        port: of the page.
+        data_port: from which the page takes what it shows.
+        memory_mb: kept for browsers that come later; beyond it the oldest is forgotten.
+
+    Raises:
+        GraphvioError: if a value is not valid.
+    """
+
+    port: int = 9090
+    data_port: int = 9876
+    memory_mb: int = 512
+
+    def __post_init__(self) -> None:
+        if not all(0 < port < 2**16 for port in (self.port, self.data_port)) or self.port == self.data_port:
+            raise GraphvioError(
+                f"web view: ports {self.port} and {self.data_port}: choose two different ones from 1 to 65535"
+            )
+        if self.memory_mb < 1:
+            raise GraphvioError(f"web view: memory_mb is {self.memory_mb}; choose at least 1")
+
+    @property
+    def data_url(self) -> str:
+        """Where data goes to, and is taken from."""
+        return f"rerun+http://{_HOST}:{self.data_port}/proxy"
+
+    @property
+    def url(self) -> str:
+        """What to open in a browser."""
+        return f"http://{_HOST}:{self.port}/?url={quote(self.data_url, safe='')}"
+
+
+class WebHost:
+    """The process that serves; ended by `close`, or with this one.
+
+    Args:
+        options: where.
+
+    Raises:
+        GraphvioError: if a port is taken, or rerun does not start.
+    """
+
+    def __init__(self, options: WebOptions) -> None:
+        for port in (options.port, options.data_port):
+            _check_free(port)
+        command = [
+            *(*_program(), "--serve-web", "--bind", _HOST),
+            *("--port", str(options.data_port), "--web-viewer-port", str(options.port)),
+            *("--server-memory-limit", f"{options.memory_mb}MB"),
+        ]
+        self._process = subprocess.Popen(
+            ["sh", "-c", _SCRIPT, "sh", *command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for the odometry, which then ends this
+        )
+        try:
+            for port in (options.port, options.data_port):
+                self._wait_for(port)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """End the process; a second time does nothing."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            with suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+
+    def _wait_for(self, port: int) -> None:
+        until = time.monotonic() + _START_S
+        while time.monotonic() < until:
+            with suppress(OSError), socket.create_connection((_HOST, port), timeout=1.0):
+                return
+            time.sleep(0.05)
+        raise GraphvioError(f"web view: rerun does not serve on {_HOST}:{port}; does  rerun --serve-web  work here?")
+
+
+def _program() -> list[str]:
+    """rerun itself where it is found: its launcher would be gone before it when both are ended."""
+    package = find_spec("rerun_cli")
+    beside = None if package is None or package.origin is None else Path(package.origin).with_name("rerun")
+    return [str(beside)] if beside is not None and beside.is_file() else [sys.executable, "-m", "rerun_cli"]
+
+
+def _check_free(port: int) -> None:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # one that has just been closed is free
+        try:
+            probe.bind((_HOST, port))
+        except OSError as error:
+            raise GraphvioError(
+                f"web view: port {port} of {_HOST} cannot be used ({error.strerror}); choose another one"
+            ) from None

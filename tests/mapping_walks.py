@@ -1,0 +1,100 @@
+"""A front-end of rendered images and drawn drift: a rig that goes round and round in the calibration room."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from calibration_walks import walk_simulator
+
+from graphvio.arrays import Float
+from graphvio.config import Config, OptimizationConfig
+from graphvio.errors import SourceError
+from graphvio.events import FrameSet
+from graphvio.geometry import se3_inverse
+from graphvio.mapping.drawn_front_end import DrawnFrontEnd
+from graphvio.mapping.mapper import Mapper
+from graphvio.simulation import Simulator
+from graphvio.slam.keyframe import CorrectionResult
+
+ROUND_S = 8.0
+SIGMAS = (np.deg2rad(0.2), 0.03)  # much for the few metres that are walked
+LATER_NS = 10**15  # between two sessions
+CONFIG = replace(
+    Config(),
+    optimization=OptimizationConfig(place_distance_m=0.3, place_angle_deg=20.0, features=400, loop_interval_s=5.0),
+)
+
+
+def around(t: Float) -> Float:
+    """A circle once in `ROUND_S`, looking along it."""
+    angle, zero = 2.0 * np.pi / ROUND_S * t, np.zeros_like(t)
+    return np.column_stack(
+        [0.9 * np.cos(angle), 0.9 * np.sin(angle), 1.45 + zero, angle + 0.5 * np.pi, zero, 0.03 * np.sin(3.0 * t)]
+    )
+
+
+@cache
+def simulator() -> Simulator:
+    return walk_simulator(12.0, around)
+
+
+@cache
+def rendered(index: int) -> FrameSet:
+    return simulator().frameset(index)
+
+
+class Refusing(DrawnFrontEnd):
+    """Refuses corrections; to the first one it does not even answer."""
+
+    def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
+        result = super().correct(keyframe_id, map_T_body, covariance)
+        if len(self.corrections) == 1:
+            raise SourceError("the wire is cut")
+        return replace(result, accepted=False, reason="too far off")
+
+
+def front_end(
+    first: int,
+    last: int,
+    seed: int,
+    step: int = 4,
+    session: int = 0,
+    breaks: Collection[int] = (),
+    kind: type[DrawnFrontEnd] = DrawnFrontEnd,
+) -> tuple[DrawnFrontEnd, Float]:
+    """Keyframes of some framesets, 20 a second, and their true poses in the first one's.
+
+    Args:
+        first: frameset.
+        last: not taken any more.
+        seed: of the drift.
+        step: from keyframe to keyframe.
+        session: tells its stamps from those of others.
+        breaks: keyframes with which epochs begin.
+        kind: of front-end.
+    """
+    indices = np.arange(first, last, step)
+    truth = simulator().world_T_body[indices]
+    stamps = simulator().stamps_ns[indices] + session * LATER_NS
+    index_of = dict(zip(stamps.tolist(), indices.tolist(), strict=True))
+
+    def frameset_at(stamp_ns: int) -> FrameSet:
+        return FrameSet(stamp_ns, rendered(index_of[stamp_ns]).images)
+
+    odom_T_body = se3_inverse(truth[0]) @ truth
+    made = kind(simulator().rig, stamps.tolist(), odom_T_body, frameset_at, SIGMAS, seed, breaks)
+    return made, truth
+
+
+def mapped(made: DrawnFrontEnd, map_folder: Path | None = None, save: Path | None = None) -> Mapper:
+    """A mapper that has worked on all keyframes; what it kept on disk is gone, or saved."""
+    with Mapper(made, CONFIG, map_folder) as mapper:
+        made.has_room = lambda: mapper.summary()["places_waiting"] in (0, 1)
+        mapper.run()
+        if save is not None:
+            mapper.save(save)
+    return mapper

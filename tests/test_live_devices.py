@@ -1,0 +1,219 @@
+"""What live sources of sensors share: losses and returns, counters that wrap, IMUs whose parts tick apart."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import pytest
+from recordings import small_rig
+
+from graphvio.errors import SourceError
+from graphvio.live.counts import Counts
+from graphvio.live.device_clock import MicrosecondCounter, host_ns_of_monotonic, host_ns_of_realtime
+from graphvio.live.devices import DeviceLostError, DeviceSource, HandOver
+from graphvio.live.imu_merging import AccelOntoGyro
+from graphvio.live.mailbox import Mailbox
+from graphvio.live.source import ImuReading, Notice, Reading, host_ns
+from graphvio.live.sources import SourceSpec
+from graphvio.live.spec_options import choice_of, names_of, number_of, size_of
+from graphvio.rig import Rig
+
+QUICK = (0.01, 0.02)
+
+
+def imu_reading(stamp_ns: int, arrival_ns: int | None = None) -> ImuReading:
+    arrival_ns = stamp_ns if arrival_ns is None else arrival_ns
+    return ImuReading(stamp_ns, np.array([1e-9 * stamp_ns, 0.0, 0.0]), np.zeros(3), arrival_ns, "clock")
+
+
+class Script:
+    """A device whose lives are told: the readings of each, then how it ends."""
+
+    clock = "script"
+
+    def __init__(self, name: str, lives: list[tuple[int, Exception | None]], absences: int = 0) -> None:
+        self.name = name
+        self.lives, self.absences = iter(lives), absences
+        self.starts, self.stops = 0, 0
+
+    def start(self, hand_over: HandOver) -> None:
+        if self.starts and self.absences:
+            self.absences -= 1
+            raise SourceError(f"{self.name}: is not there")
+        self.starts += 1
+
+    def run(self, hand_over: HandOver, stopping: threading.Event) -> None:
+        count, end = next(self.lives)
+        for k in range(count):
+            hand_over(imu_reading(k, host_ns()))
+        if end is not None:
+            raise end
+        stopping.wait()
+
+    def stop(self) -> None:
+        self.stops += 1
+        raise RuntimeError("it is gone")  # as drivers do; it must not matter
+
+    def detail(self) -> str:
+        return "model"
+
+    def counts(self) -> Mapping[str, int]:
+        return {"frames_lost": 3, "other": 0}
+
+
+def take(readings: Iterator[Reading], count: int) -> list[Reading]:
+    return [next(readings) for _ in range(count)]
+
+
+def test_a_lost_device_is_told_looked_for_and_read_on() -> None:
+    device = Script(
+        "a", [(2, DeviceLostError("unplugged")), (1, ValueError("what drivers say")), (1, None)], absences=2
+    )
+    source = DeviceSource("test", [device], lambda: small_rig(1), QUICK)
+    assert isinstance(source.open(), Rig)
+    found = take(source.readings(), 8)
+    kinds = [reading.kind if isinstance(reading, Notice) else "imu" for reading in found]
+    assert kinds == ["imu", "imu", "device_lost", "device_back", "imu", "device_lost", "device_back", "imu"]
+    notices = [reading for reading in found if isinstance(reading, Notice)]
+    assert notices[0].detail == "a: unplugged"
+    assert notices[2].detail == "a: ValueError: what drivers say"
+    assert {notice.clock for notice in notices} == {"script"}
+    (health,) = source.health()
+    assert health.connected
+    assert health.counts == {"frames_lost": 3, "device_lost": 2}
+    source.close()
+    assert device.starts == 3
+    assert device.stops >= 3
+
+
+def test_a_device_that_stays_away_is_told_as_lost() -> None:
+    device = Script("a", [(0, DeviceLostError("unplugged"))], absences=10**9)
+    source = DeviceSource("test", [device], lambda: small_rig(1), QUICK)
+    source.open()
+    take(source.readings(), 1)
+    limit_s = time.monotonic() + 10.0
+    while "is not there" not in source.health()[0].detail:
+        assert time.monotonic() < limit_s
+        time.sleep(0.005)
+    assert not source.health()[0].connected
+    source.close()
+
+
+def test_closing_from_another_thread_ends_the_readings() -> None:
+    source = DeviceSource("test", [Script("a", [(1, None)])], lambda: small_rig(1), QUICK)
+    source.open()
+    readings = source.readings()
+    take(readings, 1)
+    rest: list[Reading] = []
+    reader = threading.Thread(target=lambda: rest.extend(readings))
+    reader.start()
+    source.close()
+    source.close()
+    reader.join(10.0)
+    assert not reader.is_alive()
+    assert rest == []
+    assert list(source.readings()) == []
+
+
+def test_what_cannot_be_opened_leaves_nothing_running() -> None:
+    first, second = Script("a", [(0, None)]), Script("b", [])
+    second.starts, second.absences = 1, 1
+    source = DeviceSource("test", [first, second], lambda: small_rig(1), QUICK)
+    with pytest.raises(SourceError, match="b: is not there"):
+        source.open()
+    assert first.stops == 1
+    assert not any(thread.name in "ab" for thread in threading.enumerate())
+    source.close()
+
+
+def test_who_does_not_take_readings_loses_the_oldest_but_no_notice() -> None:
+    mailbox = Mailbox(longest_ns=100)
+    notice = Notice("device_lost", "a", 5)
+    mailbox.put("a", imu_reading(0))
+    mailbox.put("a", notice)
+    for stamp_ns in (50, 150, 200):
+        mailbox.put("b", imu_reading(stamp_ns))
+    assert mailbox.get() is notice
+    stamps = [reading.stamp_ns for _ in range(2) if isinstance(reading := mailbox.get(), ImuReading)]
+    assert stamps == [150, 200]
+    assert (mailbox.dropped("a"), mailbox.dropped("b")) == (1, 1)
+
+
+def test_counters_of_32_bits_go_on_for_all_sensors_of_a_device() -> None:
+    counter, wrap = MicrosecondCounter(), 1 << 32
+    start_us = wrap - 1000.0
+    assert counter.stamp_ns(start_us) == round(1e3 * start_us)
+    assert counter.stamp_ns(500.0) == 1000 * (wrap + 500)
+    assert counter.stamp_ns(start_us + 900.0) == round(1e3 * (start_us + 900.0))  # another sensor, not wrapped yet
+    for k in range(1, 10):  # an hour and more, in steps of ten minutes
+        stamp_us = 500 + 600_000_000 * k
+        assert counter.stamp_ns(stamp_us % wrap) == 1000 * (wrap + stamp_us)
+    assert MicrosecondCounter().stamp_ns(7.5 * wrap) == 7500 * wrap  # a wider counter is taken as it is
+
+
+def test_clocks_of_the_kernel_become_the_hosts() -> None:
+    before_ns, monotonic_ns, after_ns = host_ns(), time.monotonic_ns(), host_ns()
+    assert before_ns - 100_000 <= host_ns_of_monotonic(monotonic_ns) <= after_ns + 100_000
+    before_ns, realtime_ns = host_ns(), time.time_ns()
+    assert abs(host_ns_of_realtime(realtime_ns) - before_ns) < 100_000_000
+
+
+def test_acceleration_is_interpolated_at_the_stamps_of_the_gyro() -> None:
+    found: list[ImuReading] = []
+    counts = Counts()
+    merging = AccelOntoGyro(found.append, counts)
+    merging.add_gyro(imu_reading(5_000_000))  # before any acceleration
+    for stamp_ns in (10_000_000, 20_000_000, 30_000_000):
+        merging.add_accel(stamp_ns, np.array([0.0, 1e-6 * stamp_ns, 9.81]))
+    for stamp_ns in (12_500_000, 20_000_000, 27_500_000, 32_500_000):  # late, as of another thread
+        merging.add_gyro(imu_reading(stamp_ns))
+    merging.add_gyro(imu_reading(32_500_000))
+    merging.add_gyro(imu_reading(31_000_000))
+    merging.add_accel(25_000_000, np.zeros(3))
+    assert [reading.stamp_ns for reading in found] == [12_500_000, 20_000_000, 27_500_000]
+    merging.add_accel(40_000_000, np.array([0.0, 40.0, 9.81]))
+    assert [reading.stamp_ns for reading in found] == [12_500_000, 20_000_000, 27_500_000, 32_500_000]
+    for reading in found:
+        np.testing.assert_allclose(reading.linear_acceleration, [0.0, 1e-6 * reading.stamp_ns, 9.81])
+        np.testing.assert_allclose(reading.angular_velocity, [1e-9 * reading.stamp_ns, 0.0, 0.0])
+    assert counts.totals() == {"imu_unpaired": 1, "imu_out_of_order": 2}
+
+
+def test_nothing_is_interpolated_over_a_gap() -> None:
+    found: list[ImuReading] = []
+    counts = Counts()
+    merging = AccelOntoGyro(found.append, counts)
+    merging.add_accel(0, np.zeros(3))
+    merging.add_gyro(imu_reading(60_000_000))
+    merging.add_accel(101_000_000, np.zeros(3))
+    assert found == []
+    assert counts.totals()["imu_unpaired"] == 1
+    for stamp_ns in range(200_000_000, 200_000_300):  # an accelerometer that has stopped
+        merging.add_gyro(imu_reading(stamp_ns))
+    assert counts.totals()["imu_unpaired"] == 1 + 300 - 256
+
+
+def test_options_are_checked() -> None:
+    spec = SourceSpec.parse("v4l2:a,b?size=1280x720&fps=30&layout=separate")
+    assert size_of(spec, "size") == (1280, 720)
+    assert size_of(spec, "other") is None
+    assert number_of(spec, "fps", 1, 60) == 30.0
+    assert choice_of(spec, "layout", ("one", "separate")) == "separate"
+    assert choice_of(spec, "other", ("one", "separate")) == "one"
+    assert names_of(spec) == ["a", "b"]
+    with pytest.raises(SourceError, match="from 1 to 20"):
+        number_of(spec, "fps", 1, 20)
+    with pytest.raises(SourceError, match="write a number"):
+        number_of(spec, "size", 1, 20)
+    with pytest.raises(SourceError, match="write a number"):
+        number_of(SourceSpec.parse("v4l2:a?fps=nan"), "fps", 1, 20)
+    with pytest.raises(SourceError, match="WIDTHxHEIGHT"):
+        size_of(spec, "fps")
+    with pytest.raises(SourceError, match="choose one of one"):
+        choice_of(spec, "layout", ("one",))
+    for text in ("v4l2:a,a", "v4l2:a,", "v4l2:,"):
+        with pytest.raises(SourceError, match="twice or not at all"):
+            names_of(SourceSpec.parse(text))

@@ -1,0 +1,235 @@
+"""The SLAM system on rendered images: loops, epochs, saved maps, and finding the way in them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mapping_walks import CONFIG, Refusing, front_end, mapped
+
+from graphvio.arrays import Float
+from graphvio.errors import MapError
+from graphvio.geometry import se3_inverse, se3_log
+from graphvio.mapping import saved_map
+from graphvio.mapping.drawn_front_end import DrawnFrontEnd
+from graphvio.mapping.mapper import Mapper
+from graphvio.trajectory import Trajectory
+
+pytest.importorskip("pycolmap", reason="maps need the extra maps")
+
+
+@dataclass(frozen=True, eq=False)
+class Made:
+    front_end: DrawnFrontEnd
+    truth: Float
+    mapper: Mapper
+    folder: Path
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """A map of a round and a half."""
+    folder = tmp_path_factory.mktemp("map") / "room"
+    walk, truth = front_end(0, 240, seed=1)
+    return Made(walk, se3_inverse(truth[0]) @ truth, mapped(walk, save=folder), folder)
+
+
+@pytest.fixture
+def copied(made: Made, tmp_path: Path) -> Path:
+    """A copy of the map, to be damaged."""
+    folder = tmp_path / "room"
+    shutil.copytree(made.folder, folder)
+    return folder
+
+
+def count(mapper: Mapper, name: str) -> int:
+    value = mapper.summary()[name]
+    assert isinstance(value, int)
+    return value
+
+
+def far(poses: Float, truth: Float) -> Float:
+    """Metres (N,)."""
+    return np.asarray(np.linalg.norm((poses - truth)[:, :3, 3], axis=1))
+
+
+def test_a_round_is_closed(made: Made) -> None:
+    drift = far(made.front_end.odom_T_body, made.truth)
+    found = made.mapper.trajectory
+    assert len(found) == len(made.truth)
+    error = far(found.nav_T_body, made.truth)
+    assert drift[-1] > 0.03
+    assert error[-1] < 0.2 * drift[-1]
+    assert np.sqrt((error**2).mean()) < 0.7 * np.sqrt((drift**2).mean())
+    summary = made.mapper.summary()
+    used = sum(is_used for _, is_used in made.mapper.closures)
+    assert summary["closures_used"] == used
+    assert used >= 5
+    assert summary["places_skipped"] == summary["corrections_refused"] == 0
+
+
+def test_corrections_are_as_good_as_they_say(made: Made) -> None:
+    assert len(made.front_end.corrections) >= 3
+    squares = []
+    for number, pose, covariance in made.front_end.corrections:
+        error = se3_log(se3_inverse(pose) @ made.truth[number])
+        squares.append(error @ np.linalg.solve(covariance, error))
+        assert np.linalg.eigvalsh(covariance)[0] > 0.0
+    assert np.linalg.norm(error[3:]) < 0.005
+    assert max(squares) < 40.0
+    assert np.median(squares) < 12.0
+
+
+def test_no_closure_that_is_used_is_wrong(made: Made) -> None:
+    row_of = {stamp: k for k, stamp in enumerate(made.mapper.trajectory.stamps_ns.tolist())}
+    for closure, is_used in made.mapper.closures:
+        one, other = (made.truth[row_of[end.stamp_ns]] for end in (closure.reference, closure.current))
+        error = se3_log(se3_inverse(se3_inverse(one) @ other) @ closure.reference_T_current)
+        assert not is_used or np.linalg.norm(error[3:]) < 0.03
+
+
+def test_the_map_on_disk_is_whole(made: Made) -> None:
+    header = json.loads((made.folder / "map.json").read_text())
+    assert (header["format"], header["version"]) == ("graphvio map", 1)
+    assert header["places"] == made.mapper.summary()["places"]
+    assert {path.name for path in made.folder.parent.iterdir()} == {"room"}  # nothing unfinished is left
+
+
+@pytest.mark.parametrize("first", [40, 112])
+def test_another_session_finds_its_way_in_the_map(made: Made, tmp_path: Path, first: int) -> None:
+    """From two starts, where the map says that they are; and a third session would find both."""
+    walk, truth = front_end(first, first + 49, seed=2, step=2, session=1)
+    again = mapped(walk, made.folder, save=tmp_path / "both")
+    in_map = se3_inverse(front_end(0, 1, seed=0)[1][0]) @ truth
+    assert again.is_localised
+    number, pose, covariance = walk.corrections[0]
+    assert number <= 12
+    error = se3_log(se3_inverse(pose) @ in_map[number])
+    assert error @ np.linalg.solve(covariance, error) < 40.0
+    # The map has drifted itself where no loop holds it: what counts is where the newest place is among its places.
+    stamps = made.mapper.trajectory.stamps_ns.tolist()
+    was = np.array([made.truth[stamps.index(place.stamp_ns)] for place in again._places if place.session == 0])
+    newest = in_map[again.trajectory.stamps_ns.tolist().index(again._places[-1].stamp_ns)]
+    nearest = int(np.argmin(far(was, newest)))
+    found = se3_inverse(again.place_poses[nearest]) @ again.place_poses[-1]
+    assert far(found[None], (se3_inverse(was[nearest]) @ newest)[None])[0] < 0.01
+    header = json.loads((tmp_path / "both" / "map.json").read_text())
+    assert header["sessions"] == 2
+    assert header["places"] == len(again.place_poses) > count(made.mapper, "places")
+    np.testing.assert_allclose(again.place_poses[0], np.eye(4), atol=1e-4)
+
+
+def test_nothing_is_corrected_before_three_places_agree(made: Made) -> None:
+    """The session's first places alone: the very first is recognised, and that is not enough."""
+    walk, _ = front_end(40, 43, seed=2, step=2, session=1)
+    again = mapped(walk, made.folder)
+    assert count(again, "closures_found") > count(made.mapper, "closures_found")
+    assert not walk.corrections
+    assert not again.is_localised
+    assert len(again.trajectory) == 0
+
+
+def test_a_new_epoch_is_found_in_the_map(tmp_path: Path) -> None:
+    """Its keyframes stay out of the trajectory until then; afterwards they are all in, whatever the odometry says."""
+    walk, truth = front_end(0, 200, seed=3, breaks={40}, kind=Refusing)
+    mapper = mapped(walk)
+    assert min(number for number, _, _ in walk.corrections if number >= 40) > 41  # three places must agree
+    assert count(mapper, "corrections_sent") == count(mapper, "corrections_refused") == len(walk.corrections) > 1
+    assert mapper.summary()["last_refusal"] == "too far off"
+    assert mapper.is_localised
+    found = mapper.trajectory
+    assert len(found) == len(truth)
+    assert far(found.nav_T_body[-1:], (se3_inverse(truth[0]) @ truth)[-1:])[0] < 0.06
+    found.write(tmp_path / "map.txt")
+    assert len(Trajectory.read(tmp_path / "map.txt")) == len(truth)
+
+
+def test_a_map_of_another_rig_is_refused(made: Made) -> None:
+    walk, _ = front_end(0, 4, seed=0)
+    left = walk.rig.pairs[0].left
+    moved = replace(left, intrinsics=left.intrinsics + 1.0)
+    pairs = (replace(walk.rig.pairs[0], left=moved), *walk.rig.pairs[1:])
+    other = DrawnFrontEnd(replace(walk.rig, pairs=pairs), [], np.zeros((0, 4, 4)), walk._frameset_at, (0.0, 0.0), 0)
+    with pytest.raises(MapError, match=r"another rig .intrinsics of cam0 differ"):
+        Mapper(other, CONFIG, made.folder)
+
+
+@pytest.mark.parametrize("name", ["map.npz", "closures.npz", "features.db"])
+def test_a_damaged_map_is_refused(copied: Path, name: str) -> None:
+    data = bytearray((copied / name).read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    (copied / name).write_bytes(data)
+    with pytest.raises(MapError, match=f"{name}: is damaged or missing"):
+        Mapper(front_end(0, 4, seed=0)[0], CONFIG, copied)
+    (copied / name).unlink()
+    with pytest.raises(MapError, match=f"{name}: is damaged or missing"):
+        Mapper(front_end(0, 4, seed=0)[0], CONFIG, copied)
+
+
+def test_what_is_no_map_is_refused(copied: Path, tmp_path: Path) -> None:
+    walk, _ = front_end(0, 4, seed=0)
+    with pytest.raises(MapError, match=r"is no map, map.json is missing"):
+        Mapper(walk, CONFIG, tmp_path)
+    header = json.loads((copied / "map.json").read_text())
+    (copied / "map.json").write_text(json.dumps(header | {"version": 99}))
+    with pytest.raises(MapError, match="of version 99, this graphvio reads 1"):
+        Mapper(walk, CONFIG, copied)
+    (copied / "map.json").write_text("{")
+    with pytest.raises(MapError, match=r"map.json: is damaged"):
+        Mapper(walk, CONFIG, copied)
+
+
+def test_something_else_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with (
+        Mapper(front_end(0, 4, seed=0)[0], CONFIG) as mapper,
+        pytest.raises(MapError, match="something else than a map"),
+    ):
+        mapper.save(tmp_path)
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+def test_stop_ends_the_work_and_the_map_can_be_saved(tmp_path: Path) -> None:
+    walk, _ = front_end(0, 240, seed=1)
+    with Mapper(walk, CONFIG) as mapper:
+        mapper.run(lambda each: each.stop())
+        assert mapper.summary()["places"] == 1
+        mapper.save(tmp_path / "one")
+        mapper.save(tmp_path / "one")
+        kept = mapper._folder
+    assert json.loads((tmp_path / "one" / "map.json").read_text())["places"] == 1
+    assert not kept.exists()
+    with Mapper(front_end(0, 4, seed=0)[0], CONFIG, tmp_path / "one") as again:
+        assert again.summary()["places_of_map"] == 1
+
+
+def test_a_map_can_be_saved_while_it_is_made(tmp_path: Path) -> None:
+    """From another thread, again and again; each is whole."""
+    walk, _ = front_end(0, 60, seed=1)
+    sizes: list[int] = []
+    with Mapper(walk, CONFIG) as mapper:
+        walk.has_room = lambda: mapper.summary()["places_waiting"] in (0, 1)
+        worker = threading.Thread(target=mapper.run)
+        worker.start()
+        while worker.is_alive():
+            mapper.save(tmp_path / "now")
+            sizes.append(len(saved_map.load(tmp_path / "now", walk.rig).stamp_ns))
+        worker.join()
+        mapper.save(tmp_path / "now")
+    assert sizes == sorted(sizes)
+    assert len(saved_map.load(tmp_path / "now", walk.rig).stamp_ns) == count(mapper, "places") > 3
+
+
+def test_an_empty_map_can_be_saved_and_used(tmp_path: Path) -> None:
+    with Mapper(front_end(0, 4, seed=0)[0], CONFIG) as mapper:
+        mapper.save(tmp_path / "empty")
+        assert len(mapper.trajectory) == 0
+        assert not mapper.is_localised
+    with Mapper(front_end(0, 4, seed=0)[0], CONFIG, tmp_path / "empty") as again:
+        again.run()
+        assert again.is_localised

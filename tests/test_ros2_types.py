@@ -1,0 +1,133 @@
+"""Types on the wire: two libraries must make the same bytes of a message, and the same message of the bytes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds")
+pytest.importorskip("rosbags")
+
+from rosbags.interfaces import Nodetype
+
+from graphvio.errors import SourceError
+from graphvio.ros2.node import domain_of
+from graphvio.ros2.qos import DEFAULT, SENSOR_DATA, TF, TF_STATIC, Profile
+from graphvio.ros2.types import (
+    dds_topic,
+    dds_type_name,
+    idl_struct,
+    ros_topic,
+    ros_type_name,
+    wire_type,
+)
+from graphvio.sessions import cdr
+
+TYPES = [
+    "std_msgs/msg/Header",
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/CompressedImage",
+    "sensor_msgs/msg/CameraInfo",
+    "sensor_msgs/msg/Imu",
+    "sensor_msgs/msg/PointCloud2",
+    "nav_msgs/msg/Odometry",
+    "nav_msgs/msg/Path",
+    "tf2_msgs/msg/TFMessage",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "diagnostic_msgs/msg/DiagnosticArray",
+]
+WORDS = ["", "a", "odom", "base_link", "Köln"]
+
+
+def drawn(rng: np.random.Generator, type_name: str, length: int) -> Any:
+    """A message with values by chance; texts of all lengths put what follows at all alignments."""
+
+    def value(kind: Any) -> Any:
+        node, what = kind
+        if node == Nodetype.NAME:
+            return drawn(rng, what, length)
+        if node == Nodetype.BASE:
+            name = what[0]
+            if name == "string":
+                return str(rng.choice(WORDS))
+            if name == "bool":
+                return bool(rng.integers(2))
+            return float(rng.normal()) if name.startswith("float") else int(rng.integers(0, 100))
+        of, count = what
+        count = count if node == Nodetype.ARRAY else length
+        if of[0] == Nodetype.NAME:
+            return [value(of) for _ in range(count)]
+        return np.array([value(of) for _ in range(count)], dtype=of[1][0])
+
+    _, fields = cdr.types().fielddefs[type_name]
+    return cdr.make(type_name, **{name: value(kind) for name, kind in fields})
+
+
+def same(one: Any, other: Any) -> None:
+    """A message of rosbags and one of cyclonedds hold the same."""
+    if hasattr(one, "__msgtype__"):
+        for name, _ in cdr.types().fielddefs[one.__msgtype__][1]:
+            same(getattr(one, name), getattr(other, name))
+    elif isinstance(one, list | np.ndarray):
+        assert len(one) == len(other)
+        for first, second in zip(one, other, strict=True):
+            same(first, second)
+    else:
+        assert one == other
+
+
+@pytest.mark.parametrize("length", [0, 1, 3])
+@pytest.mark.parametrize("type_name", TYPES)
+def test_both_libraries_agree(type_name: str, length: int) -> None:
+    rng = np.random.default_rng(length)
+    for _ in range(10):
+        message = drawn(rng, type_name, length)
+        data = cdr.encode(message)
+        told = idl_struct(type_name).deserialize(data)
+        same(message, told)
+        made = told.serialize(use_version_2=False)
+        assert made == data
+        same(cdr.decode(made, type_name), told)
+
+
+def test_names_are_those_of_ros() -> None:
+    assert dds_type_name("sensor_msgs/msg/Image") == "sensor_msgs::msg::dds_::Image_"
+    assert ros_type_name("sensor_msgs::msg::dds_::Image_") == "sensor_msgs/msg/Image"
+    assert ros_type_name("DDS::Chatter") is None
+    assert dds_topic("/front/image_raw") == "rt/front/image_raw"
+    assert ros_topic("rt/front/image_raw") == "/front/image_raw"
+    assert ros_topic("rq/some_serviceRequest") is None
+    assert wire_type("sensor_msgs/msg/Image").__idl_typename__ == "sensor_msgs.msg.dds_.Image_"
+
+
+@pytest.mark.parametrize(
+    ("profile", "is_reliable", "is_latched"),
+    [(SENSOR_DATA, False, False), (DEFAULT, True, False), (TF, True, False), (TF_STATIC, True, True)],
+)
+def test_endpoints_offer_what_those_of_ros_do(profile: Profile, is_reliable: bool, is_latched: bool) -> None:
+    from cyclonedds.qos import Policy
+
+    offered = profile.dds("sensor_msgs/msg/Imu")
+    assert (offered[Policy.Reliability] == Policy.Reliability.BestEffort) != is_reliable
+    durability = Policy.Durability.TransientLocal if is_latched else Policy.Durability.Volatile
+    assert offered[Policy.Durability] == durability
+    assert offered[Policy.History] == Policy.History.KeepLast(profile.depth)
+    assert Policy.Partition not in offered
+    assert offered[Policy.Userdata].data == (  # of sensor_msgs/msg/Imu in ROS 2 Jazzy
+        b"typehash=RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b;"
+    )
+
+
+def test_the_domain_is_that_of_ros(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "17")
+    assert domain_of(None) == 17
+    assert domain_of("3") == 3
+    monkeypatch.setenv("ROS_DOMAIN_ID", "seventeen")
+    with pytest.raises(SourceError, match="ROS_DOMAIN_ID is 'seventeen'"):
+        domain_of(None)
+    monkeypatch.delenv("ROS_DOMAIN_ID")
+    assert domain_of(None) == 0
+    with pytest.raises(SourceError, match="from 0 to 232"):
+        domain_of("233")

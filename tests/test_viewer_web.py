@@ -1,0 +1,147 @@
+"""The view in a browser: what listens where, and what a real browser shows of it."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from browser import CHROMIUM, Browser
+from test_viewer import estimate, frameset, rows_of, some_rig
+
+from graphvio.arrays import AnyArray
+from graphvio.errors import GraphvioError
+from graphvio.events import Status
+from graphvio.viewer import Viewer, WebOptions
+from graphvio.viewer.layout import STATUS_COLOURS
+from graphvio.viewer.web import WebHost
+
+pytest.importorskip("rerun")
+
+ROOT = Path(__file__).parents[1]
+
+
+def free_options() -> WebOptions:
+    with socket.socket() as one, socket.socket() as other:
+        for each in (one, other):
+            each.bind(("127.0.0.1", 0))
+        return WebOptions(one.getsockname()[1], other.getsockname()[1], memory_mb=64)
+
+
+def listening_hosts(port: int) -> set[str]:
+    """Addresses, in hexadecimal as Linux tells them, at which something listens."""
+    hosts = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            local, state = line.split()[1], line.split()[3]
+            if state == "0A" and int(local.rpartition(":")[2], 16) == port:
+                hosts.add(local.rpartition(":")[0])
+    return hosts
+
+
+def until(condition: Callable[[], object], what: str, seconds: float = 20.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[WebOptions]:
+    options = free_options()
+    with Viewer(some_rig(), web=options) as viewer:
+        for k in range(40):
+            viewer.show(frameset(k), estimate(k))
+        yield options
+
+
+def test_page_and_data_are_served_on_the_loopback_only(served: WebOptions) -> None:
+    with urllib.request.urlopen(served.url, timeout=10.0) as page:
+        assert page.status == 200
+        assert b"<canvas" in page.read()
+    for port in (served.port, served.data_port):
+        assert listening_hosts(port) == {"0100007F"}  # 127.0.0.1
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
+def test_a_browser_shows_the_path(served: WebOptions, tmp_path: Path) -> None:
+    with Browser(tmp_path, (800, 600)) as browser:
+        browser.open(served.url)
+        shown: AnyArray = np.zeros((0, 0, 3), dtype=np.uint8)
+
+        def has_path() -> bool:
+            nonlocal shown
+            shown = np.asarray(cv2.imdecode(np.frombuffer(browser.screenshot(), np.uint8), cv2.IMREAD_COLOR))
+            colour = np.array(STATUS_COLOURS[Status.TRACKING])[::-1]
+            world = shown[60:540, :470]  # the left part of the page
+            return bool((np.abs(world.astype(int) - colour).max(axis=2) < 12).sum() > 30)
+
+        # A processor draws what a graphics card would: seconds a picture.
+        until(has_path, "the path is not on the page", 180.0)
+        assert browser.value("document.querySelectorAll('canvas').length") == 1
+        assert len(np.unique(shown.reshape(-1, 3), axis=0)) > 100
+
+
+def test_closing_ends_what_served_and_the_ports_can_be_used_again() -> None:
+    options = free_options()
+    for _ in range(2):
+        with Viewer(some_rig(), web=options) as viewer:
+            viewer.show(None, estimate(0))
+        assert not listening_hosts(options.port)
+        assert not listening_hosts(options.data_port)
+
+
+def test_a_killed_odometry_leaves_nothing_that_serves() -> None:
+    options = free_options()
+    code = f"""
+import time
+from graphvio.viewer.web import WebHost, WebOptions
+host = WebHost(WebOptions({options.port}, {options.data_port}))
+print("serves", flush=True)
+time.sleep(60)
+"""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "serves\n"
+    assert listening_hosts(options.port)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    until(lambda: not listening_hosts(options.port) and not listening_hosts(options.data_port), "it is still served")
+
+
+def test_a_viewer_goes_on_when_what_serves_is_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hosts = []
+
+    class Host(WebHost):
+        def __init__(self, options: WebOptions) -> None:
+            super().__init__(options)
+            hosts.append(self)
+
+    monkeypatch.setattr("graphvio.viewer.recording.WebHost", Host)
+    with Viewer(some_rig(), web=free_options(), save=tmp_path / "run.rrd") as viewer:
+        viewer.show(None, estimate(0))
+        hosts[0].close()
+        for k in range(1, 20):
+            viewer.show(frameset(k), estimate(k))
+    assert rows_of(tmp_path / "run.rrd")["/world/rig"] == 20
+
+
+def test_ports_that_are_taken_or_none() -> None:
+    options = free_options()
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", options.data_port))
+        other.listen()
+        with pytest.raises(GraphvioError, match=f"port {options.data_port} of 127.0.0.1 cannot be used"):
+            Viewer(some_rig(), web=options)
+    for wrong in ((0, 1), (1, 70000), (9090, 9090)):
+        with pytest.raises(GraphvioError, match="choose two different ones"):
+            WebOptions(*wrong)
+    with pytest.raises(GraphvioError, match="memory_mb is 0"):
+        WebOptions(memory_mb=0)
