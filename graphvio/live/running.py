@@ -133,7 +133,7 @@ class LiveOdometry:
 
     def start(self) -> None:
         """Start all threads; what came before is not taken."""
-        self._started_ns = host_ns()
+        self._started_ns = self._last_reading_ns = host_ns()
         for stage in self._stages:
             stage.start()
         self._watchdog.start()
