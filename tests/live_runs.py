@@ -127,6 +127,7 @@ def run(
     estimates, incidents = running.estimates.subscribe(100_000), running.incidents.subscribe(100_000)
     running.start()
     assert running.wait(SOON_S)
+    assert estimates.is_closed  # all can go home without anybody's stopping it
     running.stop()
     told = []
     while (incident := incidents.get()) is not None:

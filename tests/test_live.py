@@ -249,6 +249,25 @@ def test_a_stage_that_fails_ends_the_run_and_holds_up_nobody(
     assert "stage_stuck" not in kinds
 
 
+@pytest.mark.parametrize("is_realtime", [False, True], ids=["waits", "realtime"])
+def test_a_decoder_that_fails_lets_go_of_a_capture_that_waits_for_room(is_realtime: bool) -> None:
+    runs: list[LiveOdometry] = []
+
+    def decode(i: int, image: Image) -> Image:
+        until(lambda: runs[0].status()["waiting_images"] == 64)
+        raise ValueError("no image")
+
+    source = Scripted(small_rig(1), lambda: small_readings(small_rig(1), 400, decode), is_realtime)
+    runs.append(LiveOdometry(source, source.open(), Config()))
+    runs[0].start()
+    with pytest.raises(ValueError, match="no image"):
+        runs[0].wait(SOON_S)
+    with pytest.raises(ValueError, match="no image"):
+        runs[0].stop()
+    assert threads_of_a_run() == []
+    assert "incident_stage_stuck" not in runs[0].status()
+
+
 def test_what_came_before_a_failure_is_put_out() -> None:
     """A recording that breaks off has all estimates until then."""
     put_out: list[int] = []
@@ -484,8 +503,9 @@ def test_failing_health_and_other_paths() -> None:
     health.close()
 
 
-def test_a_client_that_asks_nothing_holds_up_nobody() -> None:
+def test_a_client_that_asks_nothing_holds_up_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("prometheus_client")
+    monkeypatch.setattr("graphvio.live.health._QuietHandler.timeout", 10.0 * SOON_S)
     health = HealthServer(lambda: FIGURES)
     host, port = health.address.split(":")
     with socket.create_connection((host, int(port))):
