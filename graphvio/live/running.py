@@ -115,6 +115,7 @@ class LiveOdometry:
         self._temperature_c: float | None = None
         self._latest: Estimate | None = None
         self._last_reading_ns = self._started_ns = host_ns()
+        self._failures: list[BaseException] = []  # as they came
         self._ended = threading.Event()
         self._stages = [
             Stage("capture", self._capture, self._fail, self._images.close),
@@ -401,6 +402,7 @@ class LiveOdometry:
 
     def _fail(self, stage: Stage, error: BaseException) -> None:
         """A stage is dead: the source ends, by which all others come to their end."""
+        self._failures.append(error)
         with suppress(Exception):  # an output may be what failed
             self._tell_now("stage_failed", f"{stage.name}: {error}")
         self._ended.set()
@@ -412,9 +414,8 @@ class LiveOdometry:
         return 1e-9 * (host_ns() - self._last_reading_ns) if is_awaited else 0.0
 
     def _raise_failure(self) -> None:
-        for stage in self._stages:
-            if stage.failure is not None:
-                raise stage.failure
+        if self._failures:
+            raise self._failures[0]  # what came after may be for that
 
     def _close_listeners(self) -> None:
         self.keyframe_log.close()

@@ -62,6 +62,8 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
         seed, rate_hz = int(spec.options.get("seed", "0")), float(spec.options.get("rate_hz", "20"))
     except ValueError as error:
         raise SourceError(f"simulator: an option is no number ({error}); speed is 0.01 to 100, or max") from None
+    if "drift_ppm" in spec.options and speed != 1.0:
+        raise SourceError("simulator: clocks that drift are told from when readings arrive: drift_ppm needs speed=1")
     recording = Path(spec.options["recording"]) if "recording" in spec.options else None
     return SimulatedRig(
         scene,
@@ -163,10 +165,12 @@ class SimulatedRig:
         if recording.rig.imu is None:
             return None
         simulator = make_simulator(self._scene, seed=self._seed, rate_hz=self._rate_hz)
-        ends = simulator.scene.motion.at(np.array([0.0, simulator.scene.motion.duration_s])).velocity
+        first_ns = simulator.stamps_ns[0]
+        ends_s = 1e-9 * np.array([recording.start_ns - first_ns, recording.end_ns - first_ns])
+        ends = simulator.scene.motion.at(np.clip(ends_s, 0.0, simulator.scene.motion.duration_s)).velocity
         if self._legs != 1 and np.abs(ends).max() > _STILL_M_S and not self._ends_early(recording):
             raise SourceError(
-                f"simulator: {self._scene} does not end at rest, so that it cannot be walked back: ?legs=1"
+                f"simulator: the walk {recording.name} does not end at rest, so that it cannot be walked back: ?legs=1"
             )
         return simulator.imu_track
 

@@ -1,0 +1,377 @@
+"""``graphvio live``, as it is typed: results, ends, and what cannot be done in one line."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from recordings import write_euroc
+from rich.console import Console
+from typer.testing import CliRunner
+
+from graphvio import FrameSet, open_source
+from graphvio.cli import app
+from graphvio.cli.dashboard import Dashboard, line_of, summary_of
+from graphvio.cli.stopping import StopSignals
+from graphvio.errors import GraphvioError, RigError
+from graphvio.events import Incident
+from graphvio.live import sources
+from graphvio.live.broadcast import Broadcast
+from graphvio.live.source import DeviceHealth
+from graphvio.sessions.mcap_file import McapFile
+
+pytest.importorskip("mcap")
+pytest.importorskip("prometheus_client")
+
+SOON_S = 100.0  # until then an end is waited for; only a test that fails takes so long
+MAIN = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from graphvio.cli import main
+main()
+"""
+
+
+def graphvio(*arguments: object) -> list[str]:
+    return [sys.executable, "-c", MAIN, *map(str, arguments)]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twenty seconds of noise at rest."""
+    return write_euroc(tmp_path_factory.mktemp("cli_live") / "walk", frames=400, pairs=1)
+
+
+@pytest.fixture
+def cold(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("graphvio.warmup.warm_up", lambda *_: None)
+
+
+def live(*arguments: object) -> Any:
+    return CliRunner().invoke(app, ["live", *map(str, arguments)])
+
+
+def refused(*arguments: object) -> str:
+    """The one line, exit code 2; as `graphvio.cli.main` makes it of the error."""
+    done = subprocess.run(graphvio("live", *arguments), capture_output=True, text=True, timeout=SOON_S)
+    assert done.returncode == 2, (done.stdout, done.stderr)
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("graphvio: ")
+    return line
+
+
+def until(is_so: Callable[[], Any], process: subprocess.Popen[Any]) -> None:
+    end_s = time.monotonic() + SOON_S
+    while not is_so():
+        assert process.poll() is None
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+# ---------------------------------------------------------------- real processes
+
+
+def recording_process(recording: Path, out: Path, *options: object) -> subprocess.Popen[str]:
+    """One that records, and has begun to."""
+    process = subprocess.Popen(
+        graphvio("live", f"replay:{recording}", "--record", out, *options),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    until(lambda: out.exists() and out.stat().st_size > 200_000, process)
+    return process
+
+
+def framesets_in(session: Path) -> int:
+    return sum(isinstance(event, FrameSet) for event in open_source(session))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])
+def test_a_signal_ends_it_with_everything_saved(recording: Path, tmp_path: Path, number: signal.Signals) -> None:
+    out = tmp_path / "walk.mcap"
+    process = recording_process(recording, out)
+    process.send_signal(number)
+    told, errors = process.communicate(timeout=SOON_S)
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+    assert McapFile(out).is_whole
+    framesets = framesets_in(out)
+    assert 0 < framesets < 400
+    assert f"{out}: " in told.splitlines()[-1]
+    assert told.splitlines()[-1].endswith(f" {framesets} framesets")
+    assert f" of {framesets} framesets, latency p99 " in told.splitlines()[-2]
+
+
+def test_what_a_killed_one_recorded_can_be_read(recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "walk.mcap"
+    process = recording_process(recording, out)
+    process.kill()
+    process.communicate(timeout=SOON_S)
+    assert process.returncode == -signal.SIGKILL
+    assert not McapFile(out).is_whole
+    assert framesets_in(out) > 5
+
+
+_LIMITED = """
+import resource, signal, sys
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+import graphvio.warmup
+graphvio.warmup.warm_up = lambda *_: None
+from graphvio.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, resource.RLIM_INFINITY))
+main()
+"""
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_run(recording: Path, tmp_path: Path) -> None:
+    """A limit on the size of files is as good as a full disk."""
+    out = tmp_path / "full.mcap"
+    done = subprocess.run(
+        [sys.executable, "-c", _LIMITED, "live", f"replay:{recording}?speed=max&to_s=5", "--record", str(out)],
+        capture_output=True,
+        text=True,
+        timeout=SOON_S,
+    )
+    assert done.returncode == 3, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "recording stopped" in done.stderr.splitlines()[-1]
+    assert "101 estimates of 101 framesets" in done.stdout
+    assert framesets_in(out) > 5
+
+
+def test_a_panel_is_drawn_in_a_terminal(recording: Path) -> None:
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        graphvio("live", f"replay:{recording}", "--health-port", 0),
+        stdout=theirs,
+        stderr=theirs,
+        env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "120", "LINES": "40"},
+    )
+    os.close(theirs)
+    shown = bytearray()
+
+    def read() -> None:
+        try:
+            while part := os.read(ours, 4096):
+                shown.extend(part)
+        except OSError:  # the other end is closed
+            return
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    until(lambda: shown.count(b"latency") >= 2 and b"given up" in shown, process)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(SOON_S) == 0
+    reader.join(SOON_S)
+    os.close(ours)
+    text = shown.decode()
+    for name in ("status", "rate", "points", "bias", "memory", "framesets/s", "connected"):
+        assert name in text
+    assert "health: http://127.0.0.1:" in text
+    assert "Traceback" not in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["simulater"], "there is no live source 'simulater'"),
+        (["replay:nowhere"], "nowhere"),
+        ([], "give a SOURCE, or --list"),
+    ],
+)
+def test_what_cannot_be_run_is_one_line(arguments: list[str], told: str) -> None:
+    assert told in refused(*arguments)
+
+
+# ---------------------------------------------------------------- in this process
+
+
+@pytest.mark.usefixtures("cold")
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["replay:{recording}?sped=2"], "replay has no option 'sped'"),
+        (["replay:{recording}", "--record", "walk.bag"], "name it .mcap"),
+        (["replay:{recording}", "--record", "nowhere/walk.mcap"], "nowhere"),
+        (["replay:{recording}", "--config", "nothing"], "nothing"),
+        (["replay:{recording}", "--rig", "nothing.yaml"], "nothing.yaml"),
+    ],
+)
+def test_what_cannot_be_opened_is_an_error_that_is_told(recording: Path, arguments: list[str], told: str) -> None:
+    done = live(*(each.format(recording=recording) for each in arguments))
+    assert isinstance(done.exception, GraphvioError)
+    assert told in str(done.exception)
+
+
+@pytest.mark.usefixtures("cold")
+def test_what_fails_in_a_thread_is_told_and_what_came_is_saved(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from graphvio.odometry import Odometry
+
+    process = Odometry.process
+    count = 0
+
+    def wrong(odometry: Odometry, event: Any) -> Any:
+        nonlocal count
+        count += isinstance(event, FrameSet)
+        if count == 20:
+            raise RigError("camera cam0: images are 32 x 24 px, the rig says 64 x 48; give the right rig")
+        return process(odometry, event)
+
+    monkeypatch.setattr(Odometry, "process", wrong)
+    out = tmp_path / "walk.mcap"
+    done = live(f"replay:{recording}?speed=max", "--record", out)
+    assert isinstance(done.exception, RigError)
+    assert McapFile(out).is_whole
+    assert framesets_in(out) >= 20
+
+
+@pytest.mark.usefixtures("cold")
+def test_it_ends_after_the_time_that_was_asked_for(recording: Path) -> None:
+    done = live(f"replay:{recording}?speed=0.1", "--for", "0.5")
+    assert done.exit_code == 0, done.exception
+    assert "estimates of" in done.stdout
+
+
+@pytest.mark.usefixtures("cold")
+def test_a_wrong_port_leaves_no_thread(recording: Path) -> None:
+    from graphvio.live.health import HealthServer
+
+    taken = HealthServer(dict)
+    done = live(f"replay:{recording}", "--health-port", taken.address.split(":")[1])
+    taken.close()
+    assert "cannot be listened on" in str(done.exception)
+    assert not [t.name for t in threading.enumerate() if t.name in ("graphvio-capture", "graphvio-odometry")]
+
+
+def test_all_kinds_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Path(str(sources.__file__)).parent
+    there = tuple(kind for kind in sources.KINDS if (folder / f"{kind}.py").exists())
+    assert {"replay", "simulator"} <= set(there)
+    monkeypatch.setattr(sources, "KINDS", there)
+    done = live("--list")
+    assert done.exit_code == 0, done.exception
+    assert {line.split()[0] for line in done.stdout.splitlines()} == set(there)
+    assert "simulator  simulator:room   simulated rig, scene room" in done.stdout
+
+
+def test_a_library_that_is_missing_is_listed_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    from graphvio.errors import MissingExtraError
+    from graphvio.live.sources import replay, simulator
+
+    def missing() -> Any:
+        raise MissingExtraError("pyrealsense2", "realsense", "a RealSense camera")
+
+    monkeypatch.setattr(sources, "KINDS", ("replay", "simulator"))
+    monkeypatch.setattr(replay, "list_devices", missing)
+    monkeypatch.setattr(simulator, "list_devices", list)
+    done = live("--list")
+    assert done.exit_code == 0
+    assert done.stdout.splitlines() == [
+        "replay     a RealSense camera needs pyrealsense2: install it with  pip install 'graphvio[realsense]'",
+        "simulator  nothing is connected",
+    ]
+
+
+# ---------------------------------------------------------------- signals
+
+
+def test_the_first_signal_is_a_wish_and_the_second_acts_as_ever() -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with StopSignals() as signals:
+            signal.raise_signal(signal.SIGINT)
+            assert signals.came
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_signal_that_is_ignored_stays_so() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with StopSignals() as signals:
+            signal.raise_signal(signal.SIGINT)
+            came = [signals.came]
+            signal.raise_signal(signal.SIGTERM)
+            came.append(signals.came)
+        assert came == [False, True]
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+# ---------------------------------------------------------------- what is shown
+
+FIGURES: dict[str, float | int | str | None] = {
+    "status": "tracking", "epoch": 1, "estimate_hz": 19.5, "frameset_hz": 20.0, "imu_hz": 200.0, "latency_p50_ms": 31.2,
+    "latency_p99_ms": 55.0, "latency_p99_all_ms": 60.5, "latency_max_ms": 70.0, "skipped_late": 2, "skipped_no_room": 1,
+    "corner_share": 0.7, "pair0_points": 150, "pair0_inliers": 140, "pair1_points": 90, "pair1_inliers": 80,
+    "gyro_bias_rad_s": 0.0123, "accel_bias_m_s2": 0.05, "memory_mb": 700.0, "temperature_c": 41.25,
+    "recorded_framesets": 12, "disk_free_gb": 3.5, "recording_stopped": "", "stuck": "output", "framesets": 43,
+    "estimates": 40, "imu_lost": 0,
+}  # fmt: skip
+
+
+def test_all_of_it_in_one_line() -> None:
+    line = line_of(FIGURES)
+    assert "\n" not in line
+    for part in (
+        "tracking ", "19.5 of 20.0 framesets/s", "IMU 200 Hz", "p50 31.2 ms, p99 55.0 ms, longest 70 ms",
+        "2 framesets late, 1 without room; corners 70 %", "140/150  80/90", "gyro 0.0123 rad/s", "700 MB", "41.2 C",
+        "12 framesets, 3.5 GB free", "stuck output",
+    ):  # fmt: skip
+        assert part in line
+    assert summary_of(FIGURES) == (
+        "40 estimates of 43 framesets, latency p99 60.5 ms, skipped_late 2, skipped_no_room 1, imu_lost 0"
+    )
+
+
+def test_before_anything_is_known() -> None:
+    assert line_of({}).startswith("waiting ")
+    assert "None" not in line_of({"temperature_c": None, "latency_p50_ms": None, "corner_share": 1.0})
+    assert summary_of({}) == "0 estimates of 0 framesets, latency p99 - ms"
+
+
+def test_why_a_recording_stopped_takes_the_place_of_its_size() -> None:
+    line = line_of({**FIGURES, "recording_stopped": "walk.mcap: recording stopped (No space left on device)"})
+    assert "No space left on device" in line
+    assert "GB free" not in line
+
+
+def test_messages_of_one_kind_do_not_flood_the_terminal() -> None:
+    incidents: Broadcast[Incident] = Broadcast()
+    dashboard = Dashboard("walk", incidents.subscribe(64))
+    shown = Console(record=True, file=open(os.devnull, "w"), width=200)  # noqa: PTH123, SIM115
+    dashboard._console = shown
+    for i in range(20):
+        incidents.publish(Incident(i, "vision_gated", f"[{i}]"))
+    incidents.publish(Incident(20, "device_lost", "front was unplugged"))
+    dashboard.draw(FIGURES, [])
+    lines = shown.export_text().splitlines()
+    assert lines[:2] == ["vision_gated: [0]", "device_lost: front was unplugged"]
+    assert lines[2].startswith("tracking")
+    assert len(lines) == 3
+
+
+def test_the_panel_has_devices_and_messages() -> None:
+    dashboard = Dashboard("walk", Broadcast[Incident]().subscribe(1))
+    dashboard._tell(Incident(0, "stage_stuck", "output has worked on one thing"), 100.0)
+    console = Console(record=True, file=open(os.devnull, "w"), width=150)  # noqa: PTH123, SIM115
+    console.print(dashboard._panel(FIGURES, [DeviceHealth("front", False, "unplugged", {"dropped": 3})]))
+    text = console.export_text()
+    for part in ("walk", "tracking, epoch 1", "lost  unplugged, dropped 3", "stage_stuck: output has worked"):
+        assert part in text

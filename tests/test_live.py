@@ -1,0 +1,598 @@
+"""The live system: threads that come to the same as the plain odometry, and that end whatever happens."""
+
+from __future__ import annotations
+
+import gc
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from http.client import HTTPConnection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from live_runs import SOON_S, Figures, Scripted, Stalling, Watched, assert_same, plain, run, run_spec, small_readings
+from recordings import noise_image, small_rig
+
+from graphvio import FrameSet, open_source
+from graphvio.arrays import Image
+from graphvio.config import Config, LiveConfig
+from graphvio.errors import GraphvioError, RigError, ServiceError, SourceError
+from graphvio.events import Estimate, Event, ImuSample, Incident
+from graphvio.live import running as running_module
+from graphvio.live import session_recorder
+from graphvio.live.health import HealthServer
+from graphvio.live.running import LiveOdometry
+from graphvio.live.session_recorder import SessionRecorder
+from graphvio.live.source import Notice, Reading
+from graphvio.live.stage import Stage
+from graphvio.sessions.mcap_file import McapFile
+
+with_room = pytest.mark.xdist_group("room_walk")
+
+
+def until(is_so: Callable[[], Any]) -> None:
+    """Wait; only a test that fails waits long."""
+    end_s = time.monotonic() + SOON_S
+    while not is_so():
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def threads_of_a_run() -> list[str]:
+    names = ("capture", "decode", "odometry", "output", "watchdog", "record")
+    return [t.name for t in threading.enumerate() if t.name in {f"graphvio-{name}" for name in names}]
+
+
+@pytest.fixture(autouse=True)
+def no_thread_is_left() -> Iterator[None]:
+    yield
+    gc.collect()
+    until(lambda: not threads_of_a_run())
+
+
+# ---------------------------------------------------------------- the same estimates
+
+
+@with_room
+def test_a_replay_is_the_plain_odometry_bit_for_bit_and_so_is_what_it_recorded(room_walk: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    rig, expected = open_source(room_walk).rig, plain(room_walk)
+    recorder = SessionRecorder(tmp_path / "live.mcap", rig, waits=True)
+    estimates, _, figures = run_spec(f"replay:{room_walk}?speed=max", [recorder])
+    recorder.close()
+    assert_same(estimates, expected)
+    assert figures["framesets"] == figures["estimates"] == recorder.status()["recorded_framesets"] == len(expected)
+    assert figures["health"] == "ok"
+    assert recorder.status()["recorded_poses"] == sum(each.nav_T_body is not None for each in expected)
+    assert McapFile(tmp_path / "live.mcap").is_whole
+    assert_same(plain(tmp_path / "live.mcap"), expected)
+
+
+@with_room
+@pytest.mark.parametrize("speed", ["4", "40"])
+def test_in_real_time_each_frameset_is_estimated_or_counted_and_no_sample_is_lost(room_walk: Path, speed: str) -> None:
+    """At forty times its speed there is no time for all of it on any machine."""
+    source = open_source(room_walk)
+    samples = sum(isinstance(event, ImuSample) for event in source)
+    estimates, _, figures = run_spec(f"replay:{room_walk}?speed={speed}")
+    skipped = int(figures["skipped_late"] or 0) + int(figures["skipped_no_room"] or 0)
+    assert figures["estimates"] == len(estimates) > 5
+    assert len(estimates) + skipped == figures["framesets"]
+    assert figures["imu_samples"] == samples
+    assert figures["imu_lost"] == 0
+    given_up = skipped + int(figures.get("images_not_decoded") or 0)
+    assert figures["framesets"] == 100 or given_up
+    if speed == "40":
+        assert given_up
+    stamps = [each.stamp_ns for each in estimates]
+    assert stamps == sorted(stamps)
+
+
+@with_room
+def test_devices_that_come_back_go_on_in_the_same_epoch_if_the_imu_lives(room_walk: Path) -> None:
+    simulator = f"simulator:room?recording={room_walk}&seed=3&speed=max&legs=1"
+    estimates, told, figures = run_spec(f"{simulator}&unplug=front@2-3,back@2-3")
+    assert {each.epoch for each in estimates} == {0}
+    assert estimates[-1].status == "tracking"
+    assert figures["framesets"] == 80
+    kinds = [incident.kind for incident in told]
+    assert kinds.count("device_lost") == kinds.count("device_back") == 2
+
+
+@with_room
+def test_one_pair_goes_on_alone(room_walk: Path) -> None:
+    estimates, _, figures = run_spec(f"simulator:room?recording={room_walk}&seed=3&speed=max&legs=1&unplug=back@2-3")
+    assert {(each.epoch, each.status) for each in estimates[-60:]} == {(0, "tracking")}
+    assert sum(set(each.pairs) == {0} for each in estimates) >= 20
+    assert set(estimates[-1].pairs) == {0, 1}
+    assert figures["framesets"] == 100
+
+
+@with_room
+def test_after_everything_was_gone_for_too_long_a_new_epoch_begins(room_walk: Path) -> None:
+    gone = "@1.5-4.7"
+    estimates, told, _ = run_spec(
+        f"simulator:room?recording={room_walk}&seed=3&speed=max&legs=1&unplug=front{gone},back{gone},imu{gone}"
+    )
+    assert sorted({each.epoch for each in estimates}) == [0, 1]
+    assert "time_jump" in {incident.kind for incident in told}
+
+
+@with_room
+def test_clocks_that_drift_and_readings_that_come_late(room_walk: Path) -> None:
+    """With the times of arrival that a host would have noted, whatever this machine has to do meanwhile."""
+    from graphvio.live.sources.pacing import Pace
+    from graphvio.live.sources.replay import paced
+    from graphvio.live.sources.simulated_faults import DeviceFaults, with_faults
+    from graphvio.trajectory import Trajectory
+
+    source = open_source(room_walk)
+    rig = source.rig
+    host_start_ns = source.start_ns + 3_600_000_000_000
+
+    def readings() -> Iterator[Reading]:
+        rng = np.random.default_rng(0)
+        for reading in with_faults(
+            paced(source, rig, Pace(None)), rig, DeviceFaults(drift_ppm=200.0), source.start_ns, seed=0
+        ):
+            assert not isinstance(reading, Notice)
+            stamp_ns = reading.stamp_ns % 7_000_000_000_000
+            late_ns = 1_000_000 + round(rng.exponential(2e6))
+            yield replace(reading, arrival_ns=host_start_ns + stamp_ns + late_ns)
+
+    estimates, told, figures = run(Scripted(rig, readings))
+    assert [i.kind for i in told if i.kind.startswith(("clock", "stamp", "image", "late", "imu"))] == []
+    assert figures["framesets"] == len(estimates)
+    assert figures["imu_samples"] == 1001
+    second = [each for each in estimates if each.stamp_ns - estimates[0].stamp_ns > 1_000_000_000]
+    assert all(set(each.pairs) == {0, 1} for each in second)  # at first the delays of both are not known
+    assert 78 <= len(second) <= 80
+    assert {each.epoch for each in estimates} == {0}
+    assert source.truth is not None
+    truth = Trajectory.read(source.truth)
+    true_m = truth.around(source.start_ns, source.end_ns).nav_T_body[[0, -1], :3, 3]  # at rest for the first second
+    found_m = np.array([e.nav_T_body[:3, 3] for e in estimates if e.nav_T_body is not None])[[0, -1]]
+    walked_m = [np.linalg.norm(at[1] - at[0]) for at in (true_m, found_m)]
+    assert walked_m[0] > 1.0
+    assert walked_m[1] == pytest.approx(walked_m[0], abs=0.03)
+
+
+# ---------------------------------------------------------------- what ends a run
+
+
+def damaged_at(frame: int, error: Exception) -> Callable[[int, Image], Image]:
+    def decode(i: int, image: Image) -> Image:
+        if i >= frame * 10:
+            raise error
+        return image
+
+    return decode
+
+
+def wrong_size_at(frame: int) -> Callable[[int, Image], Image]:
+    return lambda i, image: image if i < frame * 10 else noise_image(0, (32, 24))
+
+
+def broken_source() -> Iterator[Reading]:
+    yield from small_readings(small_rig(1), 20)
+    raise SourceError("the driver is gone")
+
+
+class Failing(Watched):
+    """Fails at its third result, and from then on at everything that happens."""
+
+    def __init__(self) -> None:
+        self._results = 0
+
+    def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
+        self._results += 1
+        if self._results == 3:
+            raise GraphvioError("the window was closed")
+
+    def add_incident(self, incident: Incident) -> None:
+        if self._results >= 3:
+            raise GraphvioError("nothing can be shown")
+
+
+@pytest.mark.parametrize("is_realtime", [False, True], ids=["waits", "realtime"])
+@pytest.mark.parametrize(
+    ("make", "outputs", "error", "told", "stage"),
+    [
+        (broken_source, [], SourceError, "the driver is gone", "capture"),
+        (
+            lambda: small_readings(small_rig(1), 400, damaged_at(10, ValueError("no image"))),
+            [],
+            ValueError,
+            "no image",
+            "decode",
+        ),
+        (lambda: small_readings(small_rig(1), 400, wrong_size_at(40)), [], RigError, "32", "odometry"),
+        (lambda: small_readings(small_rig(1), 400), [Failing()], GraphvioError, "the window was closed", "output"),
+    ],
+    ids=["capture", "decode", "odometry", "output"],
+)
+def test_a_stage_that_fails_ends_the_run_and_holds_up_nobody(
+    make: Callable[[], Iterator[Reading]],
+    outputs: list[Watched],
+    error: type[Exception],
+    told: str,
+    stage: str,
+    is_realtime: bool,
+) -> None:
+    """More readings follow than fit into all the queues."""
+    outputs = [Failing()] if outputs else []
+    source = Scripted(small_rig(1), make, is_realtime, interval_s=0.0005 if is_realtime else 0.0)
+    running = LiveOdometry(source, source.open(), Config(), outputs)
+    incidents, estimates = running.incidents.subscribe(1000), running.estimates.subscribe(1)
+    running.start()
+    with pytest.raises(error, match=told):
+        running.wait(SOON_S)
+    assert running.status()["health"] == "failing"
+    assert stage in str(running.status()["stuck"])
+    for _ in range(2):
+        with pytest.raises(error, match=told):
+            running.stop()
+    assert threads_of_a_run() == []
+    assert incidents.is_closed
+    assert estimates.is_closed
+    assert running.keyframe_log.is_closed
+    kinds, failed = [], []
+    while (incident := incidents.get()) is not None:
+        kinds.append(incident.kind)
+        failed += [incident.detail] if incident.kind == "stage_failed" else []
+    assert failed[0].startswith(f"{stage}: ")  # an output that fails at everything takes others along
+    assert "stage_stuck" not in kinds
+
+
+def test_what_came_before_a_failure_is_put_out() -> None:
+    """A recording that breaks off has all estimates until then."""
+    put_out: list[int] = []
+
+    class Noting(Watched):
+        def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
+            put_out.append(estimate.stamp_ns)
+            assert frameset is not None
+            assert frameset.stamp_ns == estimate.stamp_ns
+
+    source = Scripted(small_rig(1), broken_source)
+    running = LiveOdometry(source, source.open(), Config(), [Noting()])
+    running.start()
+    with pytest.raises(SourceError):
+        running.wait(SOON_S)
+    with pytest.raises(SourceError):
+        running.stop()
+    assert len(put_out) == 20
+    assert put_out == sorted(put_out)
+
+
+def test_a_damaged_image_is_told_and_the_run_goes_on() -> None:
+    def decode(i: int, image: Image) -> Image:
+        if i == 50:
+            raise SourceError("half a JPEG")
+        return image
+
+    estimates, told, figures = run(Scripted(small_rig(1), lambda: small_readings(small_rig(1), 20, decode)))
+    assert len(estimates) == 19
+    assert figures["incident_image_damaged"] == 2
+    assert [i.detail for i in told if i.kind == "image_damaged"] == ["half a JPEG"] * 2
+
+
+def test_a_run_that_is_stopped_works_on_what_has_come() -> None:
+    source = Scripted(small_rig(1), lambda: small_readings(small_rig(1), 100_000))
+    running = LiveOdometry(source, source.open(), Config())
+    estimates = running.estimates.subscribe(100_000)
+    running.start()
+    assert estimates.get(SOON_S) is not None
+    running.stop()
+    running.stop()
+    figures = running.status()
+    assert figures["estimates"] == figures["framesets"]
+    assert figures["health"] == "ok"
+    assert running.wait(0.0)
+    assert threads_of_a_run() == []
+
+
+def test_one_that_was_never_started_can_be_stopped() -> None:
+    source = Scripted(small_rig(1), lambda: small_readings(small_rig(1)))
+    running = LiveOdometry(source, source.open(), Config())
+    listener = running.estimates.subscribe(1)
+    running.stop()
+    assert listener.is_closed
+
+
+@pytest.mark.parametrize("is_realtime", [False, True], ids=["waits", "realtime"])
+def test_an_output_that_never_goes_on_is_left_behind(is_realtime: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(running_module, "_END_S", 0.5)
+    stalling = Stalling()
+    source = Scripted(small_rig(1), lambda: small_readings(small_rig(1), 2000), is_realtime, 0.001 * is_realtime)
+    running = LiveOdometry(source, source.open(), Config(), [stalling])
+    incidents = running.incidents.subscribe(1000)
+    running.start()
+    assert stalling.is_held.wait(SOON_S)
+    running.stop()
+    assert incidents.is_closed
+    told = []
+    while (incident := incidents.get()) is not None:
+        told.append(incident)
+    assert "output does not end; left behind" in [each.detail for each in told if each.kind == "stage_stuck"]
+    stalling.may_go_on.set()  # and is gone when it does go on, see `no_thread_is_left`
+
+
+def test_a_source_that_does_not_close_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(running_module, "_END_S", 0.5)
+    is_hanging, goes_on = threading.Event(), threading.Event()
+
+    def hanging() -> Iterator[Reading]:
+        yield from small_readings(small_rig(1), 10)
+        is_hanging.set()
+        goes_on.wait(SOON_S)
+
+    source = Scripted(small_rig(1), hanging, is_realtime=True)
+    running = LiveOdometry(source, source.open(), Config())
+    estimates = running.estimates.subscribe(100)
+    running.start()
+    assert is_hanging.wait(SOON_S)
+    running.stop()
+    assert running.status()["incident_stage_stuck"] == 1
+    goes_on.set()
+    figures = running.status()
+    assert int(figures["estimates"] or 0) + int(figures["skipped_no_room"] or 0) == figures["framesets"] == 10
+    assert estimates.is_closed
+
+
+def test_a_stage_tells_what_ended_it_and_cleans_up_last() -> None:
+    happened: list[str] = []
+
+    def body(stage: Stage) -> None:
+        with stage.working():
+            assert stage.busy_s >= 0.0
+            stage.get_on()
+            with stage.waiting():
+                assert stage.busy_s == 0.0
+        with stage.waiting():
+            pass
+        assert (stage.busy_s, stage.done) == (0.0, 2)
+        raise SourceError("gone")
+
+    stage = Stage("test", body, lambda s, error: happened.append(f"{s.name} {error}"), lambda: happened.append("end"))
+    stage.start()
+    assert stage.join(SOON_S)
+    assert happened == ["test gone", "end"]
+    assert isinstance(stage.failure, SourceError)
+    assert not stage.is_alive
+
+
+# ---------------------------------------------------------------- health
+
+
+def asked(address: str, path: str) -> tuple[int, str]:
+    connection = HTTPConnection(address, timeout=SOON_S)
+    connection.request("GET", path)
+    response = connection.getresponse()
+    text = response.read().decode()
+    connection.close()
+    return response.status, text
+
+
+def test_a_stalled_output_is_stuck_until_it_goes_on() -> None:
+    pytest.importorskip("prometheus_client")
+    stalling = Stalling()
+    config = Config(live=LiveConfig(stuck_s=0.3))
+    source = Scripted(small_rig(1), lambda: small_readings(small_rig(1), 100_000), is_realtime=True, interval_s=0.005)
+    running = LiveOdometry(source, source.open(), config, [stalling])
+    incidents = running.incidents.subscribe(1000)
+    health = HealthServer(running.status)
+    running.start()
+    assert stalling.is_held.wait(SOON_S)
+    until(lambda: asked(health.address, "/healthz")[0] == 503)
+    status, text = asked(health.address, "/healthz")
+    until(lambda: "incident_stage_stuck" in running.status())
+    if status == 503:
+        assert "output" in json.loads(text)["stuck"]
+    stalling.may_go_on.set()
+    until(lambda: asked(health.address, "/healthz")[0] == 200)
+    until(lambda: "incident_stage_recovered" in running.status())
+    running.stop()
+    health.close()
+    told = []
+    while (incident := incidents.get()) is not None:
+        told.append((incident.kind, incident.detail.split()[0]))
+    assert told.index(("stage_stuck", "output")) < told.index(("stage_recovered", "output"))
+
+
+def test_silent_sensors_are_told_and_no_reason_to_begin_anew() -> None:
+    may_go_on = threading.Event()
+
+    def readings() -> Iterator[Reading]:
+        yield from small_readings(small_rig(1), 5)
+        may_go_on.wait(SOON_S)
+        yield from small_readings(small_rig(1), 100_000)
+
+    source = Scripted(small_rig(1), readings, is_realtime=True, interval_s=0.002)
+    running = LiveOdometry(source, source.open(), Config(live=LiveConfig(stuck_s=0.3)))
+    running.start()
+    until(lambda: "incident_sensors_silent" in running.status())
+    assert running.is_healthy
+    may_go_on.set()
+    until(lambda: "incident_sensors_back" in running.status())
+    running.stop()
+
+
+FIGURES: Figures = {
+    "health": "ok", "status": "tracking", "stuck": "", "estimates": 12, "skipped_late": 3, "incident_device_lost": 2,
+    "status_tracking": 10, "recorded_framesets": 7, "latency_p99_ms": 41.5, "temperature_c": None, "epoch": 1,
+}  # fmt: skip
+
+
+def test_metrics_are_what_prometheus_reads() -> None:
+    pytest.importorskip("prometheus_client")
+    from prometheus_client.parser import text_string_to_metric_families
+
+    health = HealthServer(lambda: FIGURES)
+    code, text = asked(health.address, "/metrics")
+    health.close()
+    assert code == 200
+    families = {family.name: family for family in text_string_to_metric_families(text)}
+    values = {each.name: each.value for family in families.values() for each in family.samples}
+    assert values["graphvio_up"] == 1.0
+    assert values["graphvio_estimates_total"] == 12.0
+    assert values["graphvio_latency_p99_ms"] == 41.5
+    counters = {name for name, family in families.items() if family.type == "counter"}
+    assert counters == {f"graphvio_{name}" for name in (
+        "estimates", "skipped_late", "incident_device_lost", "status_tracking", "recorded_framesets"
+    )}  # fmt: skip
+    (info,) = families["graphvio_info"].samples
+    assert info.labels == {"health": "ok", "status": "tracking", "stuck": ""}
+    assert "graphvio_temperature_c" not in values
+
+
+def test_a_whole_runs_status_is_metrics_and_json() -> None:
+    pytest.importorskip("prometheus_client")
+    from prometheus_client.parser import text_string_to_metric_families
+
+    source = Scripted(small_rig(1), lambda: small_readings(small_rig(1), 30))
+    running = LiveOdometry(source, source.open(), Config())
+    health = HealthServer(running.status)
+    running.start()
+    running.wait(SOON_S)
+    running.stop()
+    values = {
+        each.name: each.value
+        for family in text_string_to_metric_families(asked(health.address, "/metrics")[1])
+        for each in family.samples
+    }
+    told = json.loads(asked(health.address, "/healthz")[1])
+    health.close()
+    assert values["graphvio_framesets_total"] == told["framesets"] == 30
+    assert values["graphvio_imu_samples_total"] == told["imu_samples"] == 300
+    assert values["graphvio_corner_share"] == 1.0
+    assert told["latency_p99_all_ms"] is None or told["latency_p99_all_ms"] > 0.0
+
+
+def test_failing_health_and_other_paths() -> None:
+    pytest.importorskip("prometheus_client")
+    health = HealthServer(lambda: {"health": "failing", "stuck": "odometry"})
+    assert asked(health.address, "/healthz")[0] == 503
+    assert "graphvio_up 0.0" in asked(health.address, "/metrics")[1]
+    assert asked(health.address, "/")[0] == 404
+    assert health.address.startswith("127.0.0.1:")
+    health.close()
+
+
+def test_a_client_that_asks_nothing_holds_up_nobody() -> None:
+    pytest.importorskip("prometheus_client")
+    health = HealthServer(lambda: FIGURES)
+    host, port = health.address.split(":")
+    with socket.create_connection((host, int(port))):
+        assert asked(health.address, "/healthz")[0] == 200
+        closing = threading.Thread(target=health.close, daemon=True)
+        closing.start()
+        closing.join(SOON_S)
+        assert not closing.is_alive()
+
+
+def test_a_port_that_is_taken() -> None:
+    pytest.importorskip("prometheus_client")
+    health = HealthServer(lambda: FIGURES)
+    port = int(health.address.split(":")[1])
+    with pytest.raises(ServiceError, match=f"127.0.0.1:{port}: cannot be listened on"):
+        HealthServer(lambda: FIGURES, port=port)
+    health.close()
+
+
+# ---------------------------------------------------------------- recording
+
+
+class SlowDisk:
+    """The writer is held up by the first thing that it writes, until it may go on."""
+
+    def __init__(self, recorder: SessionRecorder) -> None:
+        self.may_go_on = threading.Event()
+        self.is_held = threading.Event()
+        write = recorder._writer.add
+
+        def add(event: Event) -> None:
+            self.is_held.set()
+            assert self.may_go_on.wait(SOON_S)
+            write(event)
+
+        recorder._writer.add = add  # type: ignore[method-assign]
+
+
+def events(framesets: int) -> Iterator[Event]:
+    rig = small_rig(1)
+    image = noise_image(0)
+    for i in range(framesets):
+        yield ImuSample(i * 50_000_000, np.zeros(3), np.zeros(3))
+        yield FrameSet(i * 50_000_000, {0: (image, image)})
+    assert len(rig.pairs) == 1
+
+
+def test_a_slow_disk_costs_framesets_of_the_recording_and_holds_up_nobody(tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    recorder = SessionRecorder(tmp_path / "slow.mcap", small_rig(1))
+    disk = SlowDisk(recorder)
+    for event in events(200):
+        recorder.add_event(event)
+    assert disk.is_held.wait(SOON_S)
+    assert recorder.status()["framesets_not_recorded"] == 80
+    disk.may_go_on.set()
+    recorder.close()
+    told = recorder.status()
+    assert (told["recorded_framesets"], told["messages_not_recorded"], told["recording_stopped"]) == (120, 0, "")
+    recorded = list(open_source(tmp_path / "slow.mcap"))
+    assert sum(isinstance(event, ImuSample) for event in recorded) == 200
+    assert sum(isinstance(event, FrameSet) for event in recorded) == 120
+
+
+def test_a_disk_that_stands_still_for_long_costs_samples_too_and_they_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mcap")
+    monkeypatch.setattr(session_recorder, "_WAITING", 50)
+    recorder = SessionRecorder(tmp_path / "still.mcap", small_rig(1))
+    disk = SlowDisk(recorder)
+    recorder.add_event(ImuSample(0, np.zeros(3), np.zeros(3)))
+    assert disk.is_held.wait(SOON_S)
+    for i in range(1, 101):
+        recorder.add_event(ImuSample(i, np.zeros(3), np.zeros(3)))
+    assert recorder.status()["messages_not_recorded"] == 50
+    disk.may_go_on.set()
+    recorder.close()
+
+
+def test_a_recorder_that_waits_records_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mcap")
+    monkeypatch.setattr(session_recorder, "_WAITING", 5)
+    recorder = SessionRecorder(tmp_path / "all.mcap", small_rig(1), waits=True)
+    for event in events(200):
+        recorder.add_event(event)
+    recorder.close()
+    told = recorder.status()
+    assert (told["recorded_framesets"], told["framesets_not_recorded"], told["messages_not_recorded"]) == (200, 0, 0)
+
+
+def test_a_message_that_cannot_be_written_stops_no_other(tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    recorder = SessionRecorder(tmp_path / "odd.mcap", small_rig(1))
+    recorder.add_event(ImuSample(-1, np.zeros(3), np.zeros(3)))
+    for event in events(3):
+        recorder.add_event(event)
+    recorder.close()
+    assert recorder.status()["recorded_framesets"] == 3
+    assert "-1" in str(recorder.status()["recording_stopped"])
+
+
+def test_a_disk_that_was_taken_away_is_no_failure_of_the_run(tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    folder = tmp_path / "stick"
+    folder.mkdir()
+    recorder = SessionRecorder(folder / "walk.mcap", small_rig(1))
+    folder.rename(tmp_path / "gone")
+    assert recorder.status()["disk_free_gb"] is None
+    recorder.close()

@@ -1,0 +1,354 @@
+"""What is given up where time does not suffice, and what never is: load, queues, and the order of samples."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from graphvio.events import FrameSet, ImuSample
+from graphvio.live import inbox as inbox_module
+from graphvio.live.inbox import Inbox
+from graphvio.live.load import LoadControl
+from graphvio.live.meter import Meter
+from graphvio.live.ordering import SampleOrder
+from graphvio.live.pipe import Pipe
+
+SOON_S = 20.0  # until then a thread is waited for; only a test that fails takes so long
+PERIOD_NS = 50_000_000
+LIMIT_MS = 100.0
+SHARES = [1.0, 0.7, 0.5, 0.35]
+
+
+def in_thread(work: Callable[[], object]) -> tuple[threading.Thread, list[object]]:
+    results: list[object] = []
+    thread = threading.Thread(target=lambda: results.append(work()), daemon=True)
+    thread.start()
+    return thread, results
+
+
+def sample(stamp_ns: int) -> ImuSample:
+    return ImuSample(stamp_ns, np.zeros(3), np.zeros(3))
+
+
+def frameset(stamp_ns: int) -> FrameSet:
+    return FrameSet(stamp_ns, {})
+
+
+# ---------------------------------------------------------------- corners and framesets
+
+
+def worked(control: LoadControl, framesets: int, work_ms: float, waited_ms: float = 0.0, first: int = 0) -> list[float]:
+    """Shares after each of so many framesets at 20 Hz."""
+    shares = []
+    for i in range(first, first + framesets):
+        control.note(i * PERIOD_NS, waited_ms, work_ms)
+        shares.append(control.corner_share)
+    return shares
+
+
+def test_nothing_is_given_up_where_there_is_time() -> None:
+    control = LoadControl(LIMIT_MS)
+    assert set(worked(control, 500, work_ms=30.0)) == {1.0}
+    assert not control.must_skip(20.0, is_newest=False)
+
+
+def test_corners_are_lowered_step_by_step_before_anything_is_late() -> None:
+    control = LoadControl(LIMIT_MS)
+    shares = worked(control, 200, work_ms=48.0)
+    assert [share for i, share in enumerate(shares) if i == 0 or share != shares[i - 1]] == SHARES
+    assert not control.must_skip(50.0, is_newest=False)  # 48 + 50 is less than 100
+
+
+def test_a_skip_that_lowering_can_avoid_lowers_instead() -> None:
+    control = LoadControl(LIMIT_MS)
+    worked(control, 3, work_ms=60.0)
+    before = control.corner_share
+    assert not control.must_skip(70.0, is_newest=False)
+    assert control.corner_share < before
+
+
+def test_one_that_is_late_already_is_skipped_for_a_newer_one() -> None:
+    control = LoadControl(LIMIT_MS)
+    assert control.must_skip(LIMIT_MS + 1.0, is_newest=False)
+    assert not control.must_skip(10.0 * LIMIT_MS, is_newest=True)
+
+
+def test_corners_come_back_after_five_idle_seconds_and_not_before() -> None:
+    control = LoadControl(LIMIT_MS)
+    worked(control, 200, work_ms=48.0)
+    assert control.corner_share == SHARES[-1]
+    shares = worked(control, 1000, work_ms=5.0, first=200)
+    assert set(shares[:100]) == {SHARES[-1]}
+    assert shares[-1] == 1.0
+    assert shares == sorted(shares)
+
+
+def test_work_that_is_neither_much_nor_little_changes_nothing() -> None:
+    control = LoadControl(LIMIT_MS)
+    worked(control, 200, work_ms=48.0)
+    assert set(worked(control, 1000, work_ms=35.0, first=200)) == {SHARES[-1]}
+
+
+moments = st.tuples(
+    st.booleans(),  # is it a question, or a frameset that was worked on?
+    st.integers(1, 500_000_000),  # since the last stamp, ns
+    st.floats(0.0, 500.0),  # waited, ms
+    st.floats(0.1, 500.0),  # work, ms
+    st.booleans(),  # newest
+)
+
+
+@given(st.lists(moments, max_size=200))
+def test_whatever_comes_the_newest_is_never_skipped_and_corners_go_first(
+    history: list[tuple[bool, int, float, float, bool]],
+) -> None:
+    control, stamp_ns = LoadControl(LIMIT_MS), 0
+    for is_question, step_ns, waited_ms, work_ms, is_newest in history:
+        before = control.corner_share
+        stamp_ns += step_ns
+        if is_question:
+            if control.must_skip(waited_ms, is_newest):
+                assert not is_newest
+                assert before == SHARES[-1] or waited_ms > LIMIT_MS
+            assert control.corner_share <= before
+        else:
+            control.note(stamp_ns, waited_ms, work_ms)
+        assert control.corner_share in SHARES
+        assert abs(SHARES.index(control.corner_share) - SHARES.index(before)) <= 1
+
+
+# ---------------------------------------------------------------- what waits for the odometry
+
+
+def taken(inbox: Inbox) -> list[int]:
+    stamps = []
+    while (item := inbox.take(0.0)) is not None:
+        stamps.append(item[0].stamp_ns)
+    return stamps
+
+
+def test_the_oldest_frameset_goes_and_samples_stay() -> None:
+    inbox = Inbox(2, waits=False)
+    for i in range(4):
+        inbox.put(sample(10 * i))
+        inbox.put(frameset(10 * i + 5))
+    assert (inbox.framesets, len(inbox), inbox.dropped_framesets) == (2, 6, 2)
+    assert taken(inbox) == [0, 10, 20, 25, 30, 35]
+    assert (inbox.framesets, inbox.dropped_samples) == (0, 0)
+
+
+@given(st.lists(st.booleans(), max_size=60), st.integers(1, 5), st.integers(1, 9))
+def test_no_sample_is_lost_and_every_frameset_is_taken_or_counted(
+    are_framesets: list[bool], most: int, taken_every: int
+) -> None:
+    inbox = Inbox(most, waits=False)
+    came: list[int] = []
+    for i, is_frameset in enumerate(are_framesets):
+        inbox.put(frameset(i) if is_frameset else sample(i))
+        if i % taken_every == 0 and (item := inbox.take(0.0)) is not None:
+            came.append(item[0].stamp_ns)
+        assert inbox.framesets <= most
+    came += taken(inbox)
+    assert came == sorted(came)
+    assert {i for i in came if not are_framesets[i]} == {i for i, each in enumerate(are_framesets) if not each}
+    assert sum(are_framesets[i] for i in came) + inbox.dropped_framesets == sum(are_framesets)
+    if came and inbox.dropped_framesets and are_framesets[-1]:
+        assert came[-1] == len(are_framesets) - 1  # never the newest
+
+
+def test_arrival_goes_along() -> None:
+    inbox = Inbox(1, waits=False)
+    inbox.put(sample(1), arrival_ns=77)
+    assert inbox.take(0.0) is not None
+    inbox.put(frameset(2), arrival_ns=78)
+    item = inbox.take(0.0)
+    assert item is not None
+    assert item[1] == 78
+
+
+def test_one_that_waits_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither framesets nor samples, however slowly they are taken."""
+    monkeypatch.setattr(inbox_module, "_MOST_SAMPLES", 5)
+    inbox = Inbox(2, waits=True)
+
+    def bring() -> None:
+        for i in range(300):
+            inbox.put(frameset(i) if i % 7 == 0 else sample(i))
+        inbox.close()
+
+    thread, _ = in_thread(bring)
+    came = []
+    while not inbox.is_finished:
+        assert len(inbox) <= 7
+        assert inbox.framesets <= 2
+        item = inbox.take(0.01)
+        came += [] if item is None else [item[0].stamp_ns]
+    thread.join(SOON_S)
+    assert came == list(range(300))
+    assert inbox.dropped_framesets == inbox.dropped_samples == 0
+
+
+def test_samples_that_nobody_takes_are_counted_at_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inbox_module, "_MOST_SAMPLES", 5)
+    inbox = Inbox(2, waits=False)
+    for i in range(9):
+        inbox.put(sample(i))
+    assert (taken(inbox), inbox.dropped_samples) == ([0, 1, 2, 3, 4], 4)
+
+
+@pytest.mark.parametrize("event", [frameset(1), sample(1)], ids=["frameset", "sample"])
+def test_whoever_waits_for_room_goes_on_when_nothing_is_taken_any_more(
+    event: FrameSet | ImuSample, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inbox_module, "_MOST_SAMPLES", 1)
+    inbox = Inbox(1, waits=True)
+    inbox.put(frameset(0))
+    thread, _ = in_thread(lambda: inbox.put(event))
+    inbox.abandon()
+    thread.join(SOON_S)
+    assert not thread.is_alive()
+    inbox.put(frameset(2))
+    assert (len(inbox), inbox.framesets, inbox.is_finished) == (0, 0, True)
+
+
+# ---------------------------------------------------------------- between stages
+
+
+def test_a_pipe_hands_on_in_order_until_it_is_closed() -> None:
+    pipe: Pipe[int] = Pipe(3)
+
+    def bring() -> None:
+        for i in range(200):
+            assert pipe.put(i, waits=True)
+        pipe.close()
+
+    thread, _ = in_thread(bring)
+    came = []
+    while (item := pipe.take()) is not None:
+        assert len(pipe) <= 3
+        came.append(item)
+    thread.join(SOON_S)
+    assert came == list(range(200))
+    assert pipe.is_finished
+    assert not pipe.put(1, waits=True)
+
+
+def test_a_pipe_without_room_refuses_whoever_does_not_wait() -> None:
+    pipe: Pipe[int] = Pipe(1)
+    assert pipe.put(0, waits=False)
+    assert not pipe.put(1, waits=False)
+    pipe.close()
+    assert not pipe.is_finished
+    assert pipe.take() == 0
+    assert pipe.take() is None
+
+
+def test_both_ends_of_a_pipe_can_leave() -> None:
+    full: Pipe[int] = Pipe(1)
+    full.put(0, waits=False)
+    bringing, told = in_thread(lambda: full.put(1, waits=True))
+    empty: Pipe[int] = Pipe(1)
+    taking, got = in_thread(empty.take)
+    full.abandon()
+    empty.close()
+    for thread in (bringing, taking):
+        thread.join(SOON_S)
+    assert (told, got) == ([False], [None])
+    assert full.take() is None
+
+
+# ---------------------------------------------------------------- samples that overtake
+
+
+def order_of(stamps: list[int], max_wait_ms: float = 10.0) -> tuple[list[int], SampleOrder, list[int]]:
+    """Stamps as they go on, and how many are held after each came."""
+    order = SampleOrder(max_wait_ms)
+    given_out: list[int] = []
+    held = []
+    for i, stamp in enumerate(stamps):
+        given_out += [each.stamp_ns for each in order.add(sample(stamp))]
+        held.append(i + 1 - len(given_out))
+    return given_out, order, held
+
+
+@given(st.integers(0, 2**31), st.integers(2, 80), st.sampled_from([2_500_000, 5_000_000, 10_000_000]))
+def test_samples_that_overtake_others_are_put_in_order(seed: int, count: int, period_ns: int) -> None:
+    """Each comes up to two and a half periods late: no more than is waited for."""
+    rng = np.random.default_rng(seed)
+    stamps = np.arange(count, dtype=np.int64) * period_ns
+    lateness = np.where(np.arange(count) < 3, 0.0, rng.uniform(0.0, 2.4 * period_ns, count))
+    came = stamps[np.argsort(stamps + lateness, kind="stable")].tolist()
+    given_out, order, _ = order_of(came, max_wait_ms=3e-6 * period_ns)
+    given_out += [each.stamp_ns for each in order.flush()]
+    assert given_out == stamps.tolist()
+
+
+@given(st.lists(st.integers(0, 200), max_size=100))
+def test_none_is_lost_or_given_twice_whatever_comes(ticks: list[int]) -> None:
+    stamps = [5_000_000 * tick for tick in ticks]
+    given_out, order, _ = order_of(stamps)
+    given_out += [each.stamp_ns for each in order.flush()]
+    assert sorted(given_out) == sorted(stamps)
+    assert order.flush() == []
+
+
+@given(st.lists(st.integers(-1_000_000, 1_000_000), min_size=1, max_size=100))
+def test_nothing_waits_where_nothing_is_missing(jitter_ns: list[int]) -> None:
+    stamps = [5_000_000 * i + off for i, off in enumerate(jitter_ns)]
+    given_out, _, held = order_of(stamps)
+    assert given_out == stamps
+    assert set(held) == {0}
+
+
+def test_a_lost_sample_is_waited_for_no_longer_than_is_said() -> None:
+    stamps = [5_000_000 * i for i in range(20) if i != 10]
+    given_out, _, held = order_of(stamps)
+    assert given_out == stamps
+    assert max(held) == 2  # the next two; with the third, 10 ms are over
+    assert held[-1] == 0
+
+
+def test_one_that_comes_too_late_goes_on_for_the_odometry_to_tell_of() -> None:
+    stamps = [5_000_000 * i for i in range(20)]
+    given_out, _, held = order_of([*stamps, stamps[3]])
+    assert given_out == [*stamps, stamps[3]]
+    assert held[-1] == 0
+
+
+# ---------------------------------------------------------------- figures
+
+
+def test_latencies_of_the_whole_run() -> None:
+    meter = Meter()
+    assert meter.recent_ms(50) is meter.overall_ms(99) is None
+    for latency_ms in [*([10.2] * 990), *([300.0] * 10)]:
+        meter.add_latency(latency_ms)
+    assert meter.recent_ms(50) == pytest.approx(10.2)
+    assert meter.overall_ms(98) == pytest.approx(10.5)
+    assert meter.overall_ms(99.5) == pytest.approx(300.5)
+    assert meter.longest_ms == 300.0
+
+
+def test_latencies_beyond_the_histogram_and_below_zero() -> None:
+    meter = Meter()
+    meter.add_latency(-3.0)
+    assert meter.overall_ms(99) == pytest.approx(0.5)
+    for _ in range(9):
+        meter.add_latency(7000.0)
+    assert meter.overall_ms(99) == 7000.0
+
+
+def test_rates_are_those_of_the_last_two_seconds() -> None:
+    meter = Meter()
+    for i in range(100):
+        meter.came("estimates", i * PERIOD_NS)
+    assert meter.rate_hz("estimates", 99 * PERIOD_NS) == pytest.approx(20.0)
+    assert meter.rate_hz("estimates", 99 * PERIOD_NS + 3_000_000_000) == 0.0
+    assert meter.rate_hz("imu_samples", 0) == 0.0
+    meter.count("skipped_late", 3)
+    assert meter.counts == {"estimates": 100, "skipped_late": 3}

@@ -1,0 +1,300 @@
+"""Live sources without devices: what is written on the command line, replays, and the simulated rig."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_runs import SOON_S
+from recordings import write_euroc
+
+from graphvio import FrameSet, open_source
+from graphvio.errors import SourceError
+from graphvio.events import Event, ImuSample
+from graphvio.geometry import so3_exp
+from graphvio.live.source import CameraFrame, ImuReading, Notice, Reading, host_ns
+from graphvio.live.sources import SourceSpec, open_live_source
+from graphvio.live.sources.pacing import Pace, read_speed
+from graphvio.live.sources.replay import paced
+from graphvio.live.sources.simulated_faults import DeviceFaults, Outage, devices_of, with_faults
+from graphvio.live.sources.simulator import _leg
+from graphvio.simulation import simulate
+from graphvio.simulation.simulator import make_simulator
+
+with_room = pytest.mark.xdist_group("room_walk")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_euroc(tmp_path_factory.mktemp("replays") / "walk", frames=20)
+
+
+@pytest.fixture(scope="module")
+def resting(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Half a second of the room, at rest."""
+    out = tmp_path_factory.mktemp("simulated") / "resting"
+    simulate("room", out, duration_s=0.5, seed=3)
+    return out
+
+
+def all_of(spec: str) -> list[Reading]:
+    source = open_live_source(spec)
+    source.open()
+    return list(source.readings())
+
+
+def images_and_samples(readings: list[Reading]) -> tuple[list[CameraFrame], list[ImuReading]]:
+    return [r for r in readings if isinstance(r, CameraFrame)], [r for r in readings if isinstance(r, ImuReading)]
+
+
+# ---------------------------------------------------------------- what is written
+
+
+def test_a_spec_is_taken_apart() -> None:
+    spec = SourceSpec.parse("realsense:0123,4567?rate_hz=30&width=640")
+    assert spec == SourceSpec("realsense", "0123,4567", {"rate_hz": "30", "width": "640"})
+    assert SourceSpec.parse("simulator") == SourceSpec("simulator")
+    assert SourceSpec.parse("replay:/data/a:b=c.mcap").what == "/data/a:b=c.mcap"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("simulater", "there is no live source 'simulater'.*simulator"),
+        ("walk.mcap", "there is no live source 'walk.mcap'.*replay"),
+        ("", "there is no live source ''"),
+        ("simulator:room?speed", "option 'speed' has no value; write KEY=VALUE"),
+        ("simulator:room?=3", "has no value"),
+        ("simulator:room?sped=2", "simulator has no option 'sped'.*speed"),
+        ("simulator:rom", "there is no scene 'rom'; there are .*room"),
+        ("simulator:room?speed=fast", "an option is no number"),
+        ("simulator:room?legs=1.5", "an option is no number"),
+        ("simulator:room?speed=1000", "speed is 0.01 to 100, or max"),
+        ("simulator:room?speed=2&drift_ppm=10", "drift_ppm needs speed=1"),
+        ("replay", "names no recording"),
+        ("replay:nowhere", "nowhere"),
+        ("replay:nowhere?legs=2", "replay has no option 'legs'"),
+    ],
+)
+def test_what_cannot_be_opened_is_told(text: str, told: str) -> None:
+    with pytest.raises(SourceError, match=told):
+        open_live_source(text)
+
+
+@pytest.mark.parametrize(
+    ("option", "told"),
+    [
+        ("unplug=left@1-2", "there is no device 'left'; there are front, back, imu"),
+        ("unplug=back@1", "a fault's value is no number"),
+        ("jitter_ms=-1", "jitter_ms is negative"),
+        ("drift_ppm=5000", "beyond 1000"),
+        ("seed=-1&legs=1", "seed -1 is negative"),
+        ("rate_hz=0&legs=1", "a rate of 0.0 Hz"),
+    ],
+)
+def test_what_the_simulated_devices_cannot_do_is_told(resting: Path, option: str, told: str) -> None:
+    with pytest.raises(SourceError, match=told):
+        open_live_source(f"simulator:room?recording={resting}&{option}").open()
+
+
+# ---------------------------------------------------------------- replays
+
+
+def test_a_replay_gives_all_of_a_recording(recording: Path) -> None:
+    source = open_source(recording)
+    expected = list(source)
+    frames, samples = images_and_samples(all_of(f"replay:{recording}?speed=max"))
+    assert [(s.stamp_ns, s.clock) for s in samples] == [
+        (e.stamp_ns, None) for e in expected if isinstance(e, ImuSample)
+    ]
+    framesets = [e for e in expected if isinstance(e, FrameSet)]
+    assert [f.stamp_ns for f in frames] == [e.stamp_ns for e in framesets for _ in range(4)]
+    assert [f.camera for f in frames[:4]] == ["cam0", "cam1", "cam2", "cam3"]
+    np.testing.assert_array_equal(frames[6].decode(), framesets[1].images[1][0])
+
+
+def test_faults_of_a_recording_are_told(recording: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    broken.symlink_to(write_euroc(tmp_path / "walk", frames=4, pairs=1))
+    next((broken / "mav0/cam1/data").glob("*.png")).write_bytes(b"no image")
+    notices = [r for r in all_of(f"replay:{broken}?speed=max") if isinstance(r, Notice)]
+    assert notices
+    source = open_live_source(f"replay:{broken}?speed=max")
+    source.open()
+    list(source.readings())
+    (health,) = source.health()
+    assert sum(health.counts.values()) == len(notices)
+
+
+def test_a_replay_keeps_the_recordings_pace(recording: Path) -> None:
+    """Never faster, however busy the machine is: one second of images at ten times the pace."""
+    begun_s = time.monotonic()
+    readings = all_of(f"replay:{recording}?speed=10")
+    assert time.monotonic() - begun_s > 0.18
+    assert open_live_source(f"replay:{recording}?speed=10").is_realtime
+    assert not open_live_source(f"replay:{recording}?speed=max").is_realtime
+    frames, _ = images_and_samples(readings)
+    apart_ns = frames[-1].arrival_ns - frames[0].arrival_ns
+    assert apart_ns > 0.8 * (frames[-1].stamp_ns - frames[0].stamp_ns) / 10
+
+
+def test_closing_wakes_a_replay_that_waits(recording: Path) -> None:
+    source = open_live_source(f"replay:{recording}?speed=0.01")
+    source.open()
+    thread = threading.Thread(target=lambda: list(source.readings()), daemon=True)
+    thread.start()
+    source.close()
+    source.close()
+    thread.join(SOON_S)
+    assert not thread.is_alive()
+
+
+def test_a_pace_does_not_make_up_for_time_that_was_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [10_000_000_000]
+    monkeypatch.setattr("graphvio.live.sources.pacing.host_ns", lambda: now[0])
+    pace = Pace(1.0)
+    waits: list[float] = []
+    monkeypatch.setattr(pace._stop, "wait", waits.append)
+    pace.wait_for(0)
+    now[0] += 5_000_000_000  # the machine slept
+    pace.wait_for(1_000_000_000)
+    pace.wait_for(1_500_000_000)
+    assert waits == pytest.approx([0.5])
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "101", "nan", "x", ""])
+def test_impossible_speeds(text: str) -> None:
+    with pytest.raises(ValueError, match=r"^(could not convert .*|-?\w+)$"):
+        read_speed(text)
+
+
+def test_speeds() -> None:
+    assert (read_speed("max"), read_speed("2.5")) == (None, 2.5)
+
+
+# ---------------------------------------------------------------- the simulated rig, to and fro
+
+
+@with_room
+def test_there_and_back_is_the_same_way(room_walk: Path) -> None:
+    """Rotations that the gyro tells cancel, accelerations and images come in the other order."""
+    source = open_source(room_walk)
+    track = make_simulator("room", seed=3).imu_track
+    there, back = ([*_leg(source, track, leg)] for leg in (0, 1))
+
+    def samples(events: list[Event]) -> list[ImuSample]:
+        return [e for e in events if isinstance(e, ImuSample)]
+
+    def framesets(events: list[Event]) -> list[FrameSet]:
+        return [e for e in events if isinstance(e, FrameSet)]
+
+    stamps = [e.stamp_ns for e in (*samples(there), *samples(back))]
+    assert np.ptp(np.diff(stamps)) <= 1
+    image_stamps = [e.stamp_ns for e in (*framesets(there), *framesets(back))]
+    assert set(np.diff(image_stamps).tolist()) == {50_000_000}
+    assert len(framesets(there)) == len(framesets(back)) + 1 == 100
+    for going, coming in zip(framesets(there)[:-1], framesets(back)[::-1], strict=True):
+        for j in (0, 1):
+            for one, other in zip(going.images[j], coming.images[j], strict=True):
+                np.testing.assert_array_equal(one, other)
+    begin_R_now = np.eye(3)
+    farthest_rad = 0.0
+    ways = [*samples(there), *samples(back)]
+    for k in range(len(ways) - 1):
+        mean = 0.5 * (ways[k].angular_velocity + ways[k + 1].angular_velocity)
+        bias = track.gyro_bias[min(k, 2 * (len(samples(there)) - 1) - k)]
+        begin_R_now = begin_R_now @ so3_exp((mean - bias) * 0.005)
+        farthest_rad = max(farthest_rad, float(np.arccos(np.clip((np.trace(begin_R_now) - 1) / 2, -1, 1))))
+    left_rad = float(np.arccos(np.clip((np.trace(begin_R_now) - 1) / 2, -1, 1)))
+    assert farthest_rad > 0.2
+    assert left_rad < 0.01  # at the turn, where this walk does not rest, the rate jumps
+    for one_way, other_way in zip(samples(there)[:-1], samples(back)[::-1], strict=True):
+        np.testing.assert_array_equal(one_way.linear_acceleration, other_way.linear_acceleration)
+
+
+@with_room
+def test_a_walk_that_ends_in_motion_is_not_walked_back(room_walk: Path) -> None:
+    spec = f"simulator:room?recording={room_walk}&seed=3"
+    with pytest.raises(SourceError, match="does not end at rest, so that it cannot be walked back"):
+        open_live_source(spec).open()
+    open_live_source(f"{spec}&legs=1").open()
+    open_live_source(f"{spec}&duration_s=4").open()
+
+
+def test_it_goes_on_for_as_long_as_is_asked(resting: Path) -> None:
+    spec = f"simulator:room?recording={resting}&seed=3&speed=max"
+    frames, samples = images_and_samples(all_of(f"{spec}&legs=3"))
+    assert len(frames) == 4 * (10 + 9 + 9)
+    assert np.ptp(np.diff([s.stamp_ns for s in samples])) <= 1
+    frames, _ = images_and_samples(all_of(f"{spec}&duration_s=2"))
+    assert frames[-1].stamp_ns - frames[0].stamp_ns == 2_000_000_000
+    source = open_live_source(spec)
+    source.open()
+    count = 0
+    for _ in source.readings():
+        count += 1
+        if count == 2000:
+            source.close()
+    assert count == 2000
+
+
+# ---------------------------------------------------------------- faults
+
+
+def test_faults_are_read() -> None:
+    faults = DeviceFaults.parse({"unplug": "back@5-8,imu@20-21.5", "jitter_ms": "2"}, ("front", "back", "imu"))
+    assert faults == DeviceFaults(None, 2.0, (Outage("back", 5.0, 8.0), Outage("imu", 20.0, 21.5)))
+
+
+def faulty(recording: Path, faults: DeviceFaults) -> Iterator[Reading]:
+    source = open_source(recording)
+    readings = paced(source, source.rig, Pace(None))
+    return with_faults(readings, source.rig, faults, source.start_ns, seed=1)
+
+
+def test_an_unplugged_device_gives_nothing_and_is_told_once(recording: Path) -> None:
+    start_ns = open_source(recording).start_ns
+    outages = (Outage("pair1", 0.2, 0.6), Outage("imu", 0.3, 0.4))
+    readings = list(faulty(recording, DeviceFaults(outages=outages)))
+    told = [(r.kind, r.clock) for r in readings if isinstance(r, Notice)]
+    assert told == [("device_lost", "pair1"), ("device_lost", "imu"), ("device_back", "imu"), ("device_back", "pair1")]
+    frames, samples = images_and_samples(readings)
+    gone = {f.stamp_ns - start_ns for f in frames if f.camera == "cam0"} - {
+        f.stamp_ns - start_ns for f in frames if f.camera == "cam2"
+    }
+    assert sorted(gone) == [50_000_000 * i for i in range(4, 12)]
+    assert max(np.diff([s.stamp_ns for s in samples])) == 105_000_000
+
+
+def test_each_device_has_a_clock_of_its_own(recording: Path) -> None:
+    source = open_source(recording)
+    assert devices_of(source.rig) == ("pair0", "pair1", "imu")
+    readings = list(faulty(recording, DeviceFaults(drift_ppm=100.0)))
+    frames, samples = images_and_samples(readings)
+    spans = {}
+    for device in ("pair0", "pair1", "imu"):
+        of_device: list[CameraFrame | ImuReading] = [*frames, *samples]
+        stamps = [r.stamp_ns for r in of_device if r.clock == device]
+        spans[device] = (stamps[-1] - stamps[0]) / 1e9
+    assert spans["pair0"] == pytest.approx(0.95 * (1 + 1e-4), abs=1e-8)
+    assert spans["pair1"] == pytest.approx(0.95 * (1 - 1e-4), abs=1e-8)
+    assert {f.clock for f in frames if f.camera in ("cam2", "cam3")} == {"pair1"}
+
+
+def test_late_readings_keep_the_order_of_their_device_and_none_is_lost(recording: Path) -> None:
+    expected_frames, expected_samples = images_and_samples(list(faulty(recording, DeviceFaults())))
+    begun_ns = host_ns()
+    frames, samples = images_and_samples(list(faulty(recording, DeviceFaults(jitter_ms=5.0))))
+    assert [s.stamp_ns for s in samples] == [s.stamp_ns for s in expected_samples]
+    for camera in ("cam0", "cam1", "cam2", "cam3"):
+        assert [f.stamp_ns for f in frames if f.camera == camera] == [
+            f.stamp_ns for f in expected_frames if f.camera == camera
+        ]
+    assert [(f.camera, f.stamp_ns) for f in frames] != [(f.camera, f.stamp_ns) for f in expected_frames]
+    arrivals = [s.arrival_ns for s in samples]
+    assert arrivals == sorted(arrivals)
+    assert arrivals[0] > begun_ns
