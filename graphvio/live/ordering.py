@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections import deque
 from heapq import heappop, heappush
 
-import numpy as np
-
 from graphvio.events import ImuSample
 
 _MISSING_PERIODS = 1.5  # between samples: something is missing, or late
-_PERIODS = 50  # from which the usual one is known
+_PERIODS = 50  # whose mean is the usual one, once
+_LEAST_STEPS = 8  # are known
 _MOST_HELD = 1000
 
 
@@ -52,7 +51,7 @@ class SampleOrder:
 
     def _may_go_on(self, stamp_ns: int) -> bool:
         assert self._newest_ns is not None
-        if self._given_ns is None or not self._steps_ns or len(self._held) > _MOST_HELD:
+        if self._given_ns is None or len(self._steps_ns) < _LEAST_STEPS or len(self._held) > _MOST_HELD:
             return True
-        follows = stamp_ns - self._given_ns < _MISSING_PERIODS * float(np.median(self._steps_ns))
+        follows = stamp_ns - self._given_ns < _MISSING_PERIODS * sum(self._steps_ns) / len(self._steps_ns)
         return follows or self._newest_ns - stamp_ns >= self._max_wait_ns
