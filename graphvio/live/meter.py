@@ -75,4 +75,4 @@ class Meter:
             if not total:
                 return None
             rank = np.searchsorted(np.cumsum(self._histogram), percent / 100.0 * total)
-            return self._longest_ms if rank >= _BINS else float((rank + 1) * _BIN_MS)
+            return self._longest_ms if rank >= _BINS else min(float((rank + 1) * _BIN_MS), self._longest_ms)

@@ -14,7 +14,7 @@ from graphvio.live.pairing import FramesetAssembler
 from graphvio.live.pipe import Pipe
 from graphvio.live.source import CameraFrame, ImuReading, LiveSource, Notice, host_ns
 from graphvio.live.stage import Stage
-from graphvio.rig import Rig
+from graphvio.rig import Imu, Rig
 from graphvio.synchroniser import Report
 
 _WAITING_IMAGES = 64  # for decoding
@@ -54,7 +54,7 @@ class Reception:
         self._report = report
         self._bring = bring
         self._clocks = ClockMaps(report)
-        self._order = SampleOrder(_MISSING_SAMPLE_MS)
+        self._order = SampleOrder(_MISSING_SAMPLE_MS, (rig.imu or Imu()).rate_hz)
         self._assembler = FramesetAssembler(rig, config.timing.simultaneous_ms, config.live.max_image_wait_ms, report)
 
     def begin(self) -> None:
