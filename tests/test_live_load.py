@@ -265,9 +265,11 @@ def test_both_ends_of_a_pipe_can_leave() -> None:
 # ---------------------------------------------------------------- samples that overtake
 
 
-def order_of(stamps: list[int], max_wait_ms: float = 10.0) -> tuple[list[int], SampleOrder, list[int]]:
+def order_of(
+    stamps: list[int], max_wait_ms: float = 10.0, rate_hz: float = 200.0
+) -> tuple[list[int], SampleOrder, list[int]]:
     """Stamps as they go on, and how many are held after each came."""
-    order = SampleOrder(max_wait_ms)
+    order = SampleOrder(max_wait_ms, rate_hz)
     given_out: list[int] = []
     held = []
     for i, stamp in enumerate(stamps):
@@ -283,7 +285,7 @@ def test_samples_that_overtake_others_are_put_in_order(seed: int, count: int, pe
     stamps = np.arange(count, dtype=np.int64) * period_ns
     lateness = np.where(np.arange(count) < 3, 0.0, rng.uniform(0.0, 2.4 * period_ns, count))
     came = stamps[np.argsort(stamps + lateness, kind="stable")].tolist()
-    given_out, order, _ = order_of(came, max_wait_ms=3e-6 * period_ns)
+    given_out, order, _ = order_of(came, max_wait_ms=3e-6 * period_ns, rate_hz=1e9 / period_ns)
     given_out += [each.stamp_ns for each in order.flush()]
     assert given_out == stamps.tolist()
 

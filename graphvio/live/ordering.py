@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections import deque
 from heapq import heappop, heappush
 
-import numpy as np
-
 from graphvio.events import ImuSample
 
 _MISSING_PERIODS = 1.5  # between samples: something is missing, or late
-_PERIODS = 50  # from which the usual one is known
+_PERIODS = 50  # whose mean is the usual one, once
+_LEAST_STEPS = 8  # are known
 _MOST_HELD = 1000
 
 
@@ -19,10 +18,12 @@ class SampleOrder:
 
     Args:
         max_wait_ms: so long the missing one is waited for, by the stamps of those that come.
+        rate_hz: of the samples, as far as it is known before they come.
     """
 
-    def __init__(self, max_wait_ms: float) -> None:
+    def __init__(self, max_wait_ms: float, rate_hz: float) -> None:
         self._max_wait_ns = round(1e6 * max_wait_ms)
+        self._nominal_ns = 1e9 / rate_hz
         self._held: list[tuple[int, int, ImuSample]] = []
         self._came = 0
         self._given_ns: int | None = None
@@ -52,7 +53,9 @@ class SampleOrder:
 
     def _may_go_on(self, stamp_ns: int) -> bool:
         assert self._newest_ns is not None
-        if self._given_ns is None or not self._steps_ns or len(self._held) > _MOST_HELD:
+        if self._given_ns is None or len(self._held) > _MOST_HELD:
             return True
-        follows = stamp_ns - self._given_ns < _MISSING_PERIODS * float(np.median(self._steps_ns))
+        steps = self._steps_ns
+        period_ns = self._nominal_ns if len(steps) < _LEAST_STEPS else sum(steps) / len(steps)
+        follows = stamp_ns - self._given_ns < _MISSING_PERIODS * period_ns
         return follows or self._newest_ns - stamp_ns >= self._max_wait_ns

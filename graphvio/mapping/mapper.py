@@ -203,6 +203,8 @@ class Mapper:
                 self._graph.begin(keyframe.odom_T_body, keyframe.covariance)
             else:
                 self._graph.add(new.previous_T_body, new.covariance)
+        if number == 0:
+            self._correct(number)  # here the map begins
         with clock.stage("retrieval"):
             similar = self._recognition.similar(number, self._may, self._config.optimization.loop_candidates)
         found = []
@@ -242,8 +244,13 @@ class Mapper:
 
     def _close_loops(self, found: list[LoopClosure], number: int) -> None:
         with self._times.stage("graph"), self._lock:
-            if not self._graph.add_closures(found) or not self._graph.is_in_map(number):
-                return
+            is_changed = self._graph.add_closures(found) and self._graph.is_in_map(number)
+        if is_changed:
+            self._correct(number)
+
+    def _correct(self, number: int) -> None:
+        """Tell the front-end where a place of this session is in the map."""
+        with self._lock:
             pose, covariance = self._graph.pose(number), self._graph.covariance(number)
         self._sent += 1
         try:

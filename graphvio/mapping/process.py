@@ -19,6 +19,7 @@ from graphvio.slam.client import Client
 from graphvio.slam.keyframe import Keyframe
 from graphvio.trajectory import Trajectory
 from graphvio.viewer import Viewer, WebOptions
+from graphvio.warmup import warm_up
 
 EXIT_FAILED = 2
 
@@ -54,6 +55,7 @@ def run_mapping(task: MappingTask) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the odometry, with which this ends
     try:
         with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map) as mapper:
+            warm_up(client.rig, task.config)  # keyframes wait meanwhile
             _follow(client, mapper, task)
             if task.out is not None:
                 mapper.save(task.out)

@@ -1,0 +1,152 @@
+"""The odometry as a stage: it is fed, what there is no time for is given up, and estimates are handed on.
+
+Front-end and back-end are one stage: the front-end looks for points where the back-end's newest state foretells them,
+so that neither has anything to do while the other works. The front-end itself has a thread for each pair.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from graphvio.config import LiveConfig
+from graphvio.events import Estimate, Event, FrameSet
+from graphvio.live.inbox import Inbox
+from graphvio.live.load import LoadControl
+from graphvio.live.meter import Meter
+from graphvio.live.pipe import Pipe
+from graphvio.live.source import host_ns
+from graphvio.live.stage import Stage
+from graphvio.odometry import Odometry
+
+_WAITING_FRAMESETS = 8
+_WAITING_RESULTS = 64  # for output
+_KEPT_FRAMESETS = 64  # until they are estimated
+_ROUND_S = 0.05
+_START_NS = 500_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Result:
+    """An estimate with the images that it was made from, if they are still known."""
+
+    estimate: Estimate
+    frameset: FrameSet | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _UnderWay:
+    """A frameset in the odometry: when it came, and how long it had waited when it was taken."""
+
+    frameset: FrameSet
+    arrival_ns: int
+    waited_ms: float
+
+
+class Estimation:
+    """The stage ``odometry``.
+
+    Args:
+        odometry: to be fed.
+        config: the limit of the latency.
+        is_realtime: whether there is one, and framesets for which there is no room go; else whoever brings them waits.
+        meter: counts what is given up and how long the rest took.
+        publish: is handed each estimate, in this thread.
+        tell_incidents: passes on what the odometry has to tell.
+
+    Attributes:
+        inbox: what waits for the odometry.
+        results: what waits for the output.
+        load: what is given up.
+        latest: newest estimate, or None.
+    """
+
+    def __init__(
+        self,
+        odometry: Odometry,
+        config: LiveConfig,
+        is_realtime: bool,
+        meter: Meter,
+        publish: Callable[[Estimate], None],
+        tell_incidents: Callable[[], None],
+    ) -> None:
+        self.inbox = Inbox(_WAITING_FRAMESETS, waits=not is_realtime)
+        self.results: Pipe[Result] = Pipe(_WAITING_RESULTS)
+        self.load = LoadControl(config.max_latency_ms)
+        self.latest: Estimate | None = None
+        self._odometry = odometry
+        self._is_realtime = is_realtime
+        self._meter = meter
+        self._publish = publish
+        self._tell_incidents = tell_incidents
+        self._corner_share = 1.0
+        self._under_way: OrderedDict[int, _UnderWay] = OrderedDict()
+        self._first_pose_ns: int | None = None  # when it was made
+
+    def estimate(self, stage: Stage) -> None:
+        """Work on what comes, until its end."""
+        while not self.inbox.is_finished:
+            taken = self.inbox.take(_ROUND_S)
+            if taken is None:
+                continue
+            with stage.working():
+                self._process(stage, *taken)
+        with stage.working():
+            for estimate in self._odometry.finish():
+                self._deliver(stage, estimate)
+
+    def _process(self, stage: Stage, event: Event, arrival_ns: int) -> None:
+        begun_ns = host_ns()
+        if isinstance(event, FrameSet):
+            waited_ms = 1e-6 * (begun_ns - arrival_ns)
+            if self._is_limited(arrival_ns) and self.load.must_skip(waited_ms, is_newest=not self.inbox.framesets):
+                self._meter.count("skipped_late")
+                return
+            self._under_way[event.stamp_ns] = _UnderWay(event, arrival_ns, waited_ms)
+            if len(self._under_way) > _KEPT_FRAMESETS:
+                self._under_way.popitem(last=False)
+        estimate = self._odometry.process(event)
+        while estimate is not None:
+            self._conclude(stage, estimate, begun_ns)
+            stage.get_on()
+            begun_ns = host_ns()
+            estimate = self._odometry.process_due()
+        self._tell_incidents()
+
+    def _conclude(self, stage: Stage, estimate: Estimate, begun_ns: int) -> None:
+        """An estimate has been made since then."""
+        self._tell_incidents()
+        under_way = self._under_way.get(estimate.stamp_ns)
+        if under_way is not None and self._is_limited(under_way.arrival_ns):
+            self.load.note(estimate.stamp_ns, under_way.waited_ms, 1e-6 * (host_ns() - begun_ns))
+            if self.load.corner_share != self._corner_share:
+                self._corner_share = self.load.corner_share
+                self._odometry.limit_corners(self._corner_share)
+        self._deliver(stage, estimate)
+
+    def _deliver(self, stage: Stage, estimate: Estimate) -> None:
+        under_way, now_ns = self._under_way.pop(estimate.stamp_ns, None), host_ns()
+        self._odometry.take_smoothed()  # else they would gather
+        self.latest = estimate
+        self._meter.came("estimates", now_ns)
+        self._meter.count(f"status_{estimate.status}")
+        if self._first_pose_ns is None and estimate.nav_T_body is not None:
+            self._first_pose_ns = now_ns
+        if under_way is not None and self._is_after_start(under_way.arrival_ns):
+            self._meter.add_latency(1e-6 * (now_ns - under_way.arrival_ns))
+        self._publish(estimate)
+        result = Result(estimate, None if under_way is None else under_way.frameset)
+        with stage.waiting():
+            has_room = self.results.put(result, waits=not self._is_realtime)
+        if not has_room:
+            self._meter.count("results_not_put_out")
+
+    def _is_after_start(self, arrival_ns: int) -> bool:
+        """Whether a frameset need not wait for what went before the first pose: those until then are held until the
+        IMU has told the attitude to start from, and worked on all at once."""
+        return self._first_pose_ns is not None and arrival_ns > self._first_pose_ns + _START_NS
+
+    def _is_limited(self, arrival_ns: int) -> bool:
+        """Whether the limit of the latency holds for a frameset."""
+        return self._is_realtime and self._is_after_start(arrival_ns)
