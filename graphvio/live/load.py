@@ -10,6 +10,7 @@ _LOWER_FROM = 0.5  # of the latency's limit
 _BUSY, _IDLE = 0.85, 0.5  # shares of the time between framesets that work takes
 _RAISE_AFTER_NS = 5_000_000_000
 _SETTLE_FRAMESETS = 5  # before the next change, so that the last one shows
+_DEVIATIONS = 2.5  # mean absolute ones: two standard deviations
 _FORGET = 0.1  # share of the newest in running means
 
 
@@ -26,7 +27,8 @@ class LoadControl:
     def __init__(self, max_latency_ms: float) -> None:
         self._limit_ms = max_latency_ms
         self._level = 0
-        self._waited_ms = 0.0  # running mean, as the two below
+        self._waited_ms = 0.0  # running mean, as the three below
+        self._deviation_ms = 0.0  # of the work from its mean
         self._work_ms: float | None = None
         self._interval_ms: float | None = None  # between stamps
         self._last_ns: int | None = None
@@ -43,12 +45,17 @@ class LoadControl:
 
         As long as fewer corners would help they are lowered instead, unless it is late already.
         """
-        if is_newest or waited_ms + (self._work_ms or 0.0) <= self._limit_ms:
+        if is_newest or waited_ms + self._likely_ms <= self._limit_ms:
             return False
         if self._level < len(_SHARES) - 1:
             self._change(1)
             return waited_ms > self._limit_ms
         return True
+
+    @property
+    def _likely_ms(self) -> float:
+        """What the work on a frameset will hardly exceed."""
+        return (self._work_ms or 0.0) + _DEVIATIONS * self._deviation_ms
 
     def note(self, stamp_ns: int, waited_ms: float, work_ms: float) -> None:
         """A frameset has been worked on."""
@@ -56,6 +63,7 @@ class LoadControl:
             self._interval_ms = _mean(self._interval_ms, 1e-6 * (stamp_ns - self._last_ns))
         self._last_ns = stamp_ns
         self._waited_ms = _mean(self._waited_ms, waited_ms)
+        self._deviation_ms = _mean(self._deviation_ms, abs(work_ms - (self._work_ms or work_ms)))
         self._work_ms = _mean(self._work_ms, work_ms)
         self._since_change += 1
         if self._since_change < _SETTLE_FRAMESETS or self._interval_ms is None:

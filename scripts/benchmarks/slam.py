@@ -20,6 +20,7 @@ from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, machine, tell
 from graphvio.arrays import Float
 from graphvio.errors import GraphvioError
+from graphvio.evaluation import evaluate
 from graphvio.evaluation.measures import align
 from graphvio.geometry import se3_inverse
 from graphvio.sources import open_source
@@ -74,13 +75,12 @@ def _slam(source: str, *arguments: str | Path) -> None:
 
 
 def _errors(folder: Path, out: Path) -> list[list[str]]:
-    """Of the positions, each path fitted to the truth as a whole."""
-    rows: list[list[str]] = [["root mean square"], ["at the end"], ["largest"]]
+    """As ``graphvio evaluate`` has them."""
+    rows: list[list[str]] = [["ATE, rmse"], ["drift: the end's error where the start is aligned"]]
     for name in ("odometry.txt", "online.txt", "trajectory.txt"):
-        found = Trajectory.read(out / name)
-        errors = _off(found, _truth(folder), _truth_T(found, _truth(folder)))
-        for row, error in zip(rows, (np.sqrt((errors**2).mean()), errors[-1], errors.max()), strict=True):
-            row.append(f"{1e3 * error:.1f}")
+        found = evaluate(Trajectory.read(out / name), _truth(folder))
+        rows[0].append(f"{1e3 * found.ate_position_m.rmse:.1f}")
+        rows[1].append(f"{10.0 * (found.drift_percent or np.nan) * found.path_length_m:.2f}")
     return rows
 
 
