@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -83,6 +84,7 @@ def _only_id() -> str:
 
 
 def _library() -> Any:
+    os.environ.setdefault("DEPTHAI_LEVEL", "error")  # it warns of what is nobody's concern where no camera is
     try:
         import depthai
     except ImportError:
