@@ -27,20 +27,14 @@ def live(
     list_devices: Annotated[bool, typer.Option("--list", help="Show what is connected, and end.")] = False,
     rig: options.RigFile = None,
     config: options.ConfigName = "default",
-    record: Annotated[
-        Path | None, typer.Option("--record", help="Record everything as a session, .mcap.", metavar="FILE")
-    ] = None,
+    record: options.Record = None,
     png: options.Png = False,
     view: Annotated[bool, typer.Option("--view", help="Watch it in the rerun viewer.")] = False,
     serve: Annotated[
         bool, typer.Option("--serve", help="Offer it to other programs of this machine, see graphvio serve.")
     ] = False,
-    health_port: Annotated[
-        int | None, typer.Option("--health-port", help="Answer /metrics and /healthz on this port.", min=0, max=65535)
-    ] = None,
-    duration: Annotated[
-        float | None, typer.Option("--for", help="Stop after so many seconds.", metavar="SECONDS")
-    ] = None,
+    health_port: options.HealthPort = None,
+    duration: options.Duration = None,
     verbose: options.Verbose = False,
 ) -> None:
     """Run the odometry on live sensors until they end, or Ctrl-C or SIGTERM: what was recorded is whole then.

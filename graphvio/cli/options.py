@@ -31,6 +31,17 @@ FromS = Annotated[float | None, typer.Option("--from", help="Begin at this secon
 ToS = Annotated[float | None, typer.Option("--to", help="End at this second of the recording.")]
 Png = Annotated[bool, typer.Option("--png", help="Pack images as PNG: smaller and slower.")]
 SessionOut = Annotated[Path, typer.Option("--out", help="Session to write; a new file, .mcap.", metavar="FILE")]
+LiveSource = Annotated[
+    str, typer.Argument(help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator.")
+]
+Record = Annotated[Path | None, typer.Option("--record", help="Record everything as a session, .mcap.", metavar="FILE")]
+HealthPort = Annotated[
+    int | None, typer.Option("--health-port", help="Answer /metrics and /healthz on this port.", min=0, max=65535)
+]
+Duration = Annotated[float | None, typer.Option("--for", help="Stop after so many seconds.", metavar="SECONDS")]
+WebPort = Annotated[
+    int | None, typer.Option("--web", help="Let a browser of this machine watch, on this port.", min=1, max=65535)
+]
 ReportFolder = Annotated[
     Path | None, typer.Option("--report", help="Folder for a report: page, pictures, all numbers.", metavar="DIR")
 ]

@@ -12,9 +12,7 @@ from graphvio.cli.live import run_live
 
 
 def serve(
-    source: Annotated[
-        str, typer.Argument(help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator.")
-    ],
+    source: options.LiveSource,
     rig: options.RigFile = None,
     config: options.ConfigName = "default",
     host: Annotated[str, typer.Option("--host", help="Address of gRPC; others need TLS and a token.")] = "127.0.0.1",
@@ -33,19 +31,11 @@ def serve(
         int | None,
         typer.Option("--ros2", help="Publish ROS 2 topics in this domain.", metavar="DOMAIN", min=0, max=232),
     ] = None,
-    web: Annotated[
-        int | None, typer.Option("--web", help="Let a browser of this machine watch, on this port.", min=1, max=65535)
-    ] = None,
-    record: Annotated[
-        Path | None, typer.Option("--record", help="Record everything as a session, .mcap.", metavar="FILE")
-    ] = None,
+    web: options.WebPort = None,
+    record: options.Record = None,
     png: options.Png = False,
-    health_port: Annotated[
-        int | None, typer.Option("--health-port", help="Answer /metrics and /healthz on this port.", min=0, max=65535)
-    ] = None,
-    duration: Annotated[
-        float | None, typer.Option("--for", help="Stop after so many seconds.", metavar="SECONDS")
-    ] = None,
+    health_port: options.HealthPort = None,
+    duration: options.Duration = None,
     verbose: options.Verbose = False,
 ) -> None:
     """Run the odometry on live sensors and serve estimates and keyframes by gRPC, ROS 2 topics and to browsers.

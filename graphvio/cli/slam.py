@@ -23,9 +23,7 @@ _PATIENCE_S = 300.0  # for a SLAM that is behind when the odometry ends
 
 
 def slam(
-    source: Annotated[
-        str, typer.Argument(help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator.")
-    ],
+    source: options.LiveSource,
     rig: options.RigFile = None,
     config: options.ConfigName = "default",
     saved_map: Annotated[
@@ -35,19 +33,13 @@ def slam(
         Path | None, typer.Option("--out", help="Save the map, and the trajectory in it.", metavar="DIR")
     ] = None,
     view: Annotated[bool, typer.Option("--view", help="Watch both trajectories in the rerun viewer.")] = False,
-    web: Annotated[
-        int | None, typer.Option("--web", help="Let a browser of this machine watch, on this port.", min=1, max=65535)
-    ] = None,
+    web: options.WebPort = None,
     save_rrd: Annotated[
         Path | None, typer.Option("--save-rrd", help="Save what the viewer would show; needs no display.")
     ] = None,
-    record: Annotated[
-        Path | None, typer.Option("--record", help="Record everything as a session, .mcap.", metavar="FILE")
-    ] = None,
+    record: options.Record = None,
     png: options.Png = False,
-    duration: Annotated[
-        float | None, typer.Option("--for", help="Stop after so many seconds.", metavar="SECONDS")
-    ] = None,
+    duration: options.Duration = None,
     verbose: options.Verbose = False,
 ) -> None:
     """Run the odometry with a small SLAM system behind it, in a process of its own, that corrects its place in the map.
