@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from graphvio.live.path_output import PathOutput
     from graphvio.live.running import LiveOdometry
 
+_LOOK_S = 0.1
 _PATIENCE_S = 300.0  # for a SLAM that is behind when the odometry ends
 
 
@@ -97,9 +98,13 @@ class _WithMapping(Services):
         )
         path = PathOutput(lambda: running.map_T_odom)
         running.add_output(path)
-        process = get_context("spawn").Process(target=run_mapping, args=(task,), name="graphvio-slam")
+        context = get_context("spawn")
+        ready = context.Event()
+        process = context.Process(target=run_mapping, args=(task, ready), name="graphvio-slam")
         process.start()
         stack.callback(process.kill)
+        while not ready.wait(_LOOK_S):  # places that are seen before would be lost
+            _check(process)
         return Started([f"gRPC: {address}"], lambda: _check(process), lambda: _finish(process, path, self.out))
 
 

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import numpy as np
@@ -50,12 +51,18 @@ class MappingTask:
     save_rrd: Path | None = None
 
 
-def run_mapping(task: MappingTask) -> None:
-    """Map until the odometry ends, and save the map; for a process of its own, which it ends by its exit code."""
+def run_mapping(task: MappingTask, ready: Event) -> None:
+    """Map until the odometry ends, and save the map; for a process of its own, which it ends by its exit code.
+
+    Args:
+        task: what to do.
+        ready: is set when keyframes may come.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the odometry, with which this ends
     try:
         with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map) as mapper:
-            warm_up(client.rig, task.config)  # keyframes wait meanwhile
+            warm_up(client.rig, task.config)
+            ready.set()
             _follow(client, mapper, task)
             if task.out is not None:
                 mapper.save(task.out)

@@ -105,17 +105,17 @@ class FeatureDatabase:
         """What is written inside is written as a whole or not at all."""
         return self._colmap.DatabaseTransaction(self._file)  # type: ignore[no-any-return]
 
-    def rig_of(self, session: str) -> tuple[int, dict[str, int]] | None:
-        """The number of the rig that took a session's images, and those of its cameras by name; None without images."""
-        numbers = {}
-        for name, number in self._ids.items():
-            of, camera, _ = name.rsplit("/", 2)
-            if of == session and camera not in numbers:
-                numbers[camera] = self._file.read_image(number).camera_id
-        if not numbers:
+    def rig_of(self, session: str, rig: Rig) -> tuple[int, dict[str, int]] | None:
+        """What `add_rig` gave for the rig that took a session's images, some of which may be of some of its cameras
+        only; None without images."""
+        taken = next((number for name, number in self._ids.items() if name.rsplit("/", 2)[0] == session), None)
+        if taken is None:
             return None
-        sensor = self._colmap.sensor_t(self._colmap.SensorType.CAMERA, next(iter(numbers.values())))
-        return self._file.read_rig_with_sensor(sensor).rig_id, numbers
+        sensor = self._colmap.sensor_t(self._colmap.SensorType.CAMERA, self._file.read_image(taken).camera_id)
+        found = self._file.read_rig_with_sensor(sensor)
+        others = sorted(each.id for each in found.non_ref_sensors)  # as they were written
+        names = [camera.name for camera in rig.cameras]
+        return found.rig_id, dict(zip(names, [found.ref_sensor_id.id, *others], strict=True))
 
     def add_rig(self, rig: Rig) -> tuple[int, dict[str, int]]:
         """Add a rig, whose first camera is the reference of COLMAP's.
@@ -128,7 +128,7 @@ class FeatureDatabase:
 
     def move_cameras(self, session: str, rig: Rig) -> None:
         """Put the cameras of a session, if it has images, where a rig has them."""
-        known = self.rig_of(session)
+        known = self.rig_of(session, rig)
         if known is not None:
             made = self._rig(rig, known[1])
             made.rig_id = known[0]

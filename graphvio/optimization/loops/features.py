@@ -168,7 +168,7 @@ def store_place(
         for camera in (rig.pairs[j].left, rig.pairs[j].right)
     }
     with database.transaction():
-        rig_id, cameras = database.rig_of(session) or database.add_rig(rig)
+        rig_id, cameras = database.rig_of(session, rig) or database.add_rig(rig)
         database.add_place(rig_id, {cameras[camera]: name for camera, name in names.items()})
         for j, found in seen.items():
             left, right = names[rig.pairs[j].left.name], names[rig.pairs[j].right.name]

@@ -32,7 +32,7 @@ def merge_places(
         if not names:
             continue
         with whole.transaction():
-            rig_id, cameras = whole.rig_of(session) or whole.add_rig(rig)
+            rig_id, cameras = whole.rig_of(session, rig) or whole.add_rig(rig)
             whole.add_place(rig_id, {cameras[camera]: name for camera, name in names.items()})
             for pair in rig.pairs:
                 if pair.left.name in names:
