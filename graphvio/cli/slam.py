@@ -54,6 +54,10 @@ def slam(
 
         graphvio slam realsense --map map --view
     """
+    from graphvio.mapping.saved_map import check_target
+
+    if out is not None:
+        check_target(out)
     services = _WithMapping(port=0, saved_map=saved_map, out=out, view=view, map_web_port=web, save_rrd=save_rrd)
     run_live(
         source, rig, config, record=record, png=png, view=False, health_port=None, duration_s=duration,

@@ -82,8 +82,7 @@ def save(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
     Raises:
         MapError: if the folder holds something else, or cannot be written.
     """
-    if folder.exists() and not (folder / _HEADER).is_file() and (not folder.is_dir() or any(folder.iterdir())):
-        raise MapError(f"{folder}: holds something else than a map; name another folder")
+    check_target(folder)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         made = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
@@ -133,6 +132,16 @@ def load(folder: Path, rig: Rig) -> SavedMap:
         return SavedMap(**columns, learnt_from=learnt_from, closures=saved.load(folder / _CLOSURES))
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, GraphvioError) as error:
         raise MapError(f"{folder / _PLACES}: holds no places ({error}); restore the map from a copy") from None
+
+
+def check_target(folder: Path) -> None:
+    """Make sure that a map may be written to a folder: a new or empty one, or one that holds a map.
+
+    Raises:
+        MapError: if it holds something else.
+    """
+    if folder.exists() and not (folder / _HEADER).is_file() and (not folder.is_dir() or any(folder.iterdir())):
+        raise MapError(f"{folder}: holds something else than a map; name another folder")
 
 
 def copy_files(folder: Path, into: Path) -> None:
