@@ -18,7 +18,7 @@ from graphvio.events import Event, ImuSample
 from graphvio.geometry import so3_exp
 from graphvio.live.source import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.live.sources import SourceSpec, open_live_source
-from graphvio.live.sources.pacing import Pace, read_speed
+from graphvio.live.sources.pacing import Pace, speed_of
 from graphvio.live.sources.replay import paced
 from graphvio.live.sources.simulated_faults import DeviceFaults, Outage, devices_of, with_faults
 from graphvio.live.sources.simulator import _leg
@@ -71,8 +71,10 @@ def test_a_spec_is_taken_apart() -> None:
         ("simulator:room?=3", "has no value"),
         ("simulator:room?sped=2", "simulator has no option 'sped'.*speed"),
         ("simulator:rom", "there is no scene 'rom'; there are .*room"),
-        ("simulator:room?speed=fast", "an option is no number"),
-        ("simulator:room?legs=1.5", "an option is no number"),
+        ("simulator:room?speed=fast", "speed is 'fast'"),
+        ("simulator:room?legs=1.5", "a whole number"),
+        ("simulator:room?legs=0", "from 1"),
+        ("simulator:room?duration_s=nan", "duration_s is 'nan'"),
         ("simulator:room?speed=1000", "speed is 0.01 to 100, or max"),
         ("simulator:room?speed=2&drift_ppm=10", "drift_ppm needs speed=1"),
         ("replay", "names no recording"),
@@ -90,10 +92,13 @@ def test_what_cannot_be_opened_is_told(text: str, told: str) -> None:
     [
         ("unplug=left@1-2", "there is no device 'left'; there are front, back, imu"),
         ("unplug=back@1", "a fault's value is no number"),
-        ("jitter_ms=-1", "jitter_ms is negative"),
-        ("drift_ppm=5000", "beyond 1000"),
-        ("seed=-1&legs=1", "seed -1 is negative"),
-        ("rate_hz=0&legs=1", "a rate of 0.0 Hz"),
+        ("unplug=back@8-5", "for no time"),
+        ("jitter_ms=nan", "jitter_ms is not from 0"),
+        ("drift_ppm=nan", "drift_ppm not from"),
+        ("jitter_ms=-1", "jitter_ms is not from 0"),
+        ("drift_ppm=5000", "drift_ppm not from"),
+        ("seed=-1&legs=1", "seed is '-1'"),
+        ("rate_hz=0&legs=1", "rate_hz is '0'"),
     ],
 )
 def test_what_the_simulated_devices_cannot_do_is_told(resting: Path, option: str, told: str) -> None:
@@ -166,14 +171,15 @@ def test_a_pace_does_not_make_up_for_time_that_was_lost(monkeypatch: pytest.Monk
     assert waits == pytest.approx([0.5])
 
 
-@pytest.mark.parametrize("text", ["0", "-1", "101", "nan", "x", ""])
+@pytest.mark.parametrize("text", ["0", "-1", "101", "nan", "x"])
 def test_impossible_speeds(text: str) -> None:
-    with pytest.raises(ValueError, match=r"^(could not convert .*|-?\w+)$"):
-        read_speed(text)
+    with pytest.raises(SourceError, match=r"speed is .*; write a number from 0\.01 to 100"):
+        speed_of(SourceSpec("replay", "walk", {"speed": text}))
 
 
 def test_speeds() -> None:
-    assert (read_speed("max"), read_speed("2.5")) == (None, 2.5)
+    given = [{}, {"speed": "max"}, {"speed": "2.5"}]
+    assert [speed_of(SourceSpec("replay", "walk", options)) for options in given] == [1.0, None, 2.5]
 
 
 # ---------------------------------------------------------------- the simulated rig, to and fro

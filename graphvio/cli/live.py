@@ -81,7 +81,7 @@ def run_live(
     from time import monotonic
 
     from graphvio.cli.dashboard import Dashboard, line_of, summary_of
-    from graphvio.cli.stopping import StopSignals
+    from graphvio.cli.stopping import StopSignals, sigterm_as_interrupt
     from graphvio.config import Config
     from graphvio.errors import SessionError
     from graphvio.live.health import HealthServer
@@ -93,6 +93,10 @@ def run_live(
     from graphvio.rig import Rig
     from graphvio.warmup import warm_up
 
+    if duration_s is not None and not duration_s > 0.0:
+        raise typer.BadParameter(f"--for is {duration_s:g}; give seconds")
+    if png and record is None:
+        raise typer.BadParameter("--png is how images are recorded; give --record FILE, too")
     if record is not None and record.suffix != ".mcap":
         raise SessionError(f"{record}: is recorded as MCAP, which is read by its name; name it .mcap")
     settings = Config.load(config)
@@ -100,10 +104,14 @@ def run_live(
         settings = services.settings(settings)
     opened = open_live_source(source, None if rig is None else Rig.load(rig))
     recorder: SessionRecorder | None = None
-    used = opened.open()  # nothing is there yet that would have to be saved
-    with StopSignals() as signals, ExitStack() as stack:
+    if services is not None:
+        services.check()
+    with ExitStack() as stack:
         stack.callback(opened.close)
-        warm_up(used, settings)  # what sensors deliver meanwhile is not wanted
+        with sigterm_as_interrupt():  # nothing is there yet that would have to be saved
+            used = opened.open()
+            warm_up(used, settings)  # what sensors deliver meanwhile is not wanted
+        signals = stack.enter_context(StopSignals())
         outputs: list[Output] = []
         if record is not None:
             recorder = SessionRecorder(record, used, "png" if png else "raw", waits=not opened.is_realtime)
@@ -128,6 +136,8 @@ def run_live(
                 dashboard.draw(running.status(), running.devices)
                 if started is not None:
                     started.check()
+        if signals.came:
+            typer.echo("stopping: what has come is worked on and saved", err=True)
         running.stop()
         figures = running.status()
         if started is not None:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from graphvio.config import Config
     from graphvio.live.running import LiveOdometry
+    from graphvio.slam.service.options import ServiceOptions
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,19 @@ class Services:
         """The configuration with keyframes that carry their images: clients choose what they are sent."""
         return replace(config, keyframes=replace(config.keyframes, images=True))
 
+    def check(self) -> None:
+        """Find out what cannot be, before sensors are started.
+
+        Raises:
+            ServiceError: if an address would be open to all, or files are missing.
+            MissingExtraError: if a service's extra is not installed.
+        """
+        from graphvio.slam.service.server import GrpcServer  # noqa: F401 - tells whether its library is there
+
+        self._options()
+        if self.ros2_domain is not None:
+            from graphvio.ros2.publisher import Publisher  # noqa: F401
+
     def start(self, running: LiveOdometry, stack: ExitStack) -> Started:
         """Offer an odometry that is about to run, until the stack ends.
 
@@ -72,14 +86,12 @@ class Services:
 
     def start_grpc(self, running: LiveOdometry, stack: ExitStack) -> str:
         """Offer it by gRPC alone; the address."""
-        from graphvio.slam.service.options import ServiceOptions
         from graphvio.slam.service.server import GrpcServer
 
-        options = ServiceOptions(
-            host=self.host,
-            certificate=self.certificate,
-            key=self.key,
-            token_file=self.token_file,
-            **({} if self.port is None else {"port": self.port}),
-        )
-        return stack.enter_context(GrpcServer(running, options)).address
+        return stack.enter_context(GrpcServer(running, self._options())).address
+
+    def _options(self) -> ServiceOptions:
+        from graphvio.slam.service.options import DEFAULT_PORT, ServiceOptions
+
+        port = DEFAULT_PORT if self.port is None else self.port
+        return ServiceOptions(self.host, port, self.certificate, self.key, self.token_file)

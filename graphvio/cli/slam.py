@@ -54,10 +54,13 @@ def slam(
 
         graphvio slam realsense --map map --view
     """
+    from graphvio.errors import MapError
     from graphvio.mapping.saved_map import check_target
 
     if out is not None:
         check_target(out)
+        if out.exists() and any(out.iterdir()) and (saved_map is None or out.resolve() != saved_map.resolve()):
+            raise MapError(f"{out}: holds a map already; name another folder, or go on with it by  --map {out}")
     services = _WithMapping(port=0, saved_map=saved_map, out=out, view=view, map_web_port=web, save_rrd=save_rrd)
     run_live(
         source, rig, config, record=record, png=png, view=False, health_port=None, duration_s=duration,
@@ -101,7 +104,8 @@ class _WithMapping(Services):
             self.save_rrd,
         )
         path = PathOutput(lambda: running.map_T_odom)
-        running.add_output(path)
+        if self.out is not None:
+            running.add_output(path)
         context = get_context("spawn")
         ready = context.Event()
         process = context.Process(target=run_mapping, args=(task, ready), name="graphvio-slam")
@@ -132,6 +136,8 @@ def _finish(process: SpawnProcess, path: PathOutput, out: Path | None) -> None:
     """
     from graphvio.errors import ServiceError
 
+    if process.is_alive():
+        typer.echo("waiting for the SLAM, which works on the last keyframes", err=True)
     process.join(_PATIENCE_S)
     if process.exitcode is None:
         raise ServiceError(f"the SLAM is not done {_PATIENCE_S:g} s after the odometry; its map is not saved")

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from graphvio.events import Estimate
 from graphvio.live.meter import Meter
+from graphvio.live.source import DeviceHealth
 
 _STATM = Path("/proc/self/statm")
 _PAGE_BYTES = 4096
+_NO_NAME = re.compile(r"[^A-Za-z0-9]+")  # what names of figures, which become metrics, must not have
 
 Figures = dict[str, float | int | str | None]
 
@@ -49,6 +53,16 @@ def _of_estimate(estimate: Estimate) -> Figures:
         told["accel_bias_m_s2"] = float(np.linalg.norm(estimate.accel_bias))
     if estimate.covariance is not None:
         told["position_sigma_m"] = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[3:, 3:])[-1]))
+    return told
+
+
+def device_figures(devices: Sequence[DeviceHealth]) -> Figures:
+    """Whether each device is connected, 1 or 0, and what was lost in its driver."""
+    told: Figures = {}
+    for device in devices:
+        name = "device_" + _NO_NAME.sub("_", device.name)
+        told[f"{name}_connected"] = int(device.connected)
+        told |= {f"{name}_{_NO_NAME.sub('_', kind)}": count for kind, count in sorted(device.counts.items())}
     return told
 
 

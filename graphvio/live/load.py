@@ -7,8 +7,8 @@ from __future__ import annotations
 
 _SHARES = (1.0, 0.7, 0.5, 0.35)
 _LOWER_FROM = 0.5  # of the latency's limit
-_BUSY, _IDLE = 0.85, 0.5  # shares of the time between framesets that work takes
-_RAISE_AFTER_NS = 5_000_000_000
+_BUSY, _IDLE = 0.85, 0.7  # shares of the time between framesets that work takes, or would with more corners
+_RAISE_AFTER_NS = 2_000_000_000
 _SETTLE_FRAMESETS = 5  # before the next change, so that the last one shows
 _DEVIATIONS = 2.5  # mean absolute ones: two standard deviations
 _FORGET = 0.1  # share of the newest in running means
@@ -70,7 +70,8 @@ class LoadControl:
             return
         share = self._work_ms / max(self._interval_ms, 1e-3)
         late = self._waited_ms + self._work_ms > _LOWER_FROM * self._limit_ms
-        if share >= _IDLE or late:
+        higher = _SHARES[max(self._level - 1, 0)] / _SHARES[self._level]
+        if share * higher >= _IDLE or late:
             self._idle_since_ns = None
         elif self._idle_since_ns is None:
             self._idle_since_ns = stamp_ns

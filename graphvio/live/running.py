@@ -12,7 +12,7 @@ from graphvio.config import Config
 from graphvio.events import Estimate, FrameSet, ImuSample, Incident, Prediction
 from graphvio.live.broadcast import Broadcast
 from graphvio.live.estimation import Estimation
-from graphvio.live.figures import figures
+from graphvio.live.figures import device_figures, figures
 from graphvio.live.meter import Meter
 from graphvio.live.output import Output
 from graphvio.live.reception import Reception
@@ -185,6 +185,7 @@ class LiveOdometry:
             "skipped_no_room": self._estimation.inbox.dropped_framesets,
             "imu_lost": self._estimation.inbox.dropped_samples,
             **figures(self._meter, self._estimation.latest, now_ns),
+            **device_figures(self._source.health()),
             **{name: value for output in self._outputs for name, value in output.status().items()},
         }
 

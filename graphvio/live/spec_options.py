@@ -45,6 +45,18 @@ def number_of(spec: SourceSpec, key: str, least: float, most: float) -> float | 
     return value
 
 
+def whole_number_of(spec: SourceSpec, key: str, least: int, most: int) -> int | None:
+    """A whole number in a range, or None where it is not given.
+
+    Raises:
+        SourceError: if it is none, or out of range.
+    """
+    value = number_of(spec, key, least, most)
+    if value is not None and not value.is_integer():
+        raise SourceError(f"{spec.kind}: {key} is {spec.options[key]!r}; write a whole number")
+    return None if value is None else int(value)
+
+
 def choice_of(spec: SourceSpec, key: str, choices: Sequence[str]) -> str:
     """One of several words, of which the first is taken where none is given.
 

@@ -58,7 +58,8 @@ def run_mapping(task: MappingTask, ready: Event) -> None:
         task: what to do.
         ready: is set when keyframes may come.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the odometry, with which this ends
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # they are for the odometry, with which this ends
     try:
         with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map) as mapper:
             warm_up(client.rig, task.config)
@@ -88,7 +89,10 @@ class _WithImages:
 
 def told(mapper: Mapper) -> str:
     """The summary in one line."""
-    return "map: " + ", ".join(f"{name} {value}" for name, value in mapper.summary().items() if value is not None)
+    figures = {name: value for name, value in mapper.summary().items() if value is not None}
+    return "map: " + ", ".join(
+        f"{name} {value:.1f}" if isinstance(value, float) else f"{name} {value}" for name, value in figures.items()
+    )
 
 
 def _follow(client: Client, mapper: Mapper, task: MappingTask) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 
 from graphvio.live.source import host_ns
+from graphvio.live.sources import SourceSpec
+from graphvio.live.spec_options import number_of
 
 _LATE_NS = 1_000_000_000
 
@@ -39,15 +41,12 @@ class Pace:
         self._stop.set()
 
 
-def read_speed(text: str) -> float | None:
-    """A factor such as ``2``, or None for ``max``.
+def speed_of(spec: SourceSpec) -> float | None:
+    """The option ``speed``: a factor such as ``2``, 1 where it is not given, or None for ``max``.
 
     Raises:
-        ValueError: if it is neither.
+        SourceError: if it is neither.
     """
-    if text == "max":
+    if spec.options.get("speed") == "max":
         return None
-    speed = float(text)
-    if not 0.01 <= speed <= 100.0:
-        raise ValueError(text)
-    return speed
+    return number_of(spec, "speed", 0.01, 100.0) or 1.0

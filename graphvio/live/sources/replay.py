@@ -10,7 +10,8 @@ from graphvio.errors import SourceError
 from graphvio.events import Event, ImuSample
 from graphvio.live.source import CameraFrame, DeviceHealth, DeviceInfo, ImuReading, Notice, Reading, host_ns
 from graphvio.live.sources import SourceSpec, check_options
-from graphvio.live.sources.pacing import Pace, read_speed
+from graphvio.live.sources.pacing import Pace, speed_of
+from graphvio.live.spec_options import number_of
 from graphvio.rig import Rig
 from graphvio.sources import Source
 from graphvio.sources import open_source as open_recording
@@ -35,11 +36,8 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> Replay:
     check_options(spec, _OPTIONS)
     if not spec.what:
         raise SourceError("replay: names no recording; write replay:FOLDER or replay:FILE")
-    try:
-        speed = read_speed(spec.options.get("speed", "1"))
-        from_s, to_s = (float(spec.options[key]) if key in spec.options else None for key in ("from_s", "to_s"))
-    except ValueError as error:
-        raise SourceError(f"replay: an option is no number ({error}); speed is 0.01 to 100, or max") from None
+    speed = speed_of(spec)
+    from_s, to_s = (number_of(spec, key, 0.0, 1e7) for key in ("from_s", "to_s"))
     return Replay(open_recording(Path(spec.what), rig, from_s=from_s, to_s=to_s), speed)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import count
@@ -66,8 +67,10 @@ class DeviceFaults:
                 raise SourceError(
                     f"simulator: there is no device {outage.device!r}; there are {', '.join(rig_devices)}"
                 )
-        if jitter < 0.0 or abs(drift or 0.0) > 1000.0:
-            raise SourceError("simulator: jitter_ms is negative, or drift_ppm beyond 1000, which no clock has")
+            if not 0.0 <= outage.from_s < outage.to_s < math.inf:
+                raise SourceError(f"simulator: {outage.device} is unplugged for no time; write unplug=DEVICE@FROM-TO")
+        if not 0.0 <= jitter <= 1000.0 or not abs(drift or 0.0) <= 1000.0:  # also refuses NaN
+            raise SourceError("simulator: jitter_ms is not from 0 to 1000, or drift_ppm not from -1000 to 1000")
         return DeviceFaults(drift, jitter, tuple(outages))
 
 

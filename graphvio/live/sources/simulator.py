@@ -7,6 +7,7 @@ other sign, accelerations are the same. Where a walk begins and ends at rest, to
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 import subprocess
 import sys
@@ -22,10 +23,11 @@ from graphvio.events import Event, FrameSet, ImuSample
 from graphvio.kernels import cache_root
 from graphvio.live.source import DeviceHealth, DeviceInfo, Reading
 from graphvio.live.sources import SourceSpec, check_options
-from graphvio.live.sources.pacing import Pace, read_speed
+from graphvio.live.sources.pacing import Pace, speed_of
 from graphvio.live.sources.replay import paced
 from graphvio.live.sources.simulated_faults import OPTIONS as FAULT_OPTIONS
 from graphvio.live.sources.simulated_faults import DeviceFaults, devices_of, with_faults
+from graphvio.live.spec_options import number_of, whole_number_of
 from graphvio.rig import Rig
 from graphvio.simulation import SCENE_NAMES
 from graphvio.sources import Source
@@ -55,13 +57,8 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
     scene = spec.what or "room"
     if scene not in SCENE_NAMES:
         raise SourceError(f"simulator: there is no scene {scene!r}; there are {', '.join(SCENE_NAMES)}")
-    try:
-        speed = read_speed(spec.options.get("speed", "1"))
-        duration_s = float(spec.options["duration_s"]) if "duration_s" in spec.options else None
-        legs = int(spec.options["legs"]) if "legs" in spec.options else None
-        seed, rate_hz = int(spec.options.get("seed", "0")), float(spec.options.get("rate_hz", "20"))
-    except ValueError as error:
-        raise SourceError(f"simulator: an option is no number ({error}); speed is 0.01 to 100, or max") from None
+    speed = speed_of(spec)
+    rate_hz = number_of(spec, "rate_hz", 0.1, 200.0)
     if "drift_ppm" in spec.options and speed != 1.0:
         raise SourceError("simulator: clocks that drift are told from when readings arrive: drift_ppm needs speed=1")
     recording = Path(spec.options["recording"]) if "recording" in spec.options else None
@@ -69,10 +66,10 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
         scene,
         rig,
         speed,
-        duration_s=duration_s,
-        legs=legs,
-        seed=seed,
-        rate_hz=rate_hz,
+        duration_s=number_of(spec, "duration_s", 0.1, 1e7),
+        legs=whole_number_of(spec, "legs", 1, 1_000_000),
+        seed=whole_number_of(spec, "seed", 0, 2**31) or 0,
+        rate_hz=rate_hz or 20.0,
         recording=recording,
         faults=spec.options,
     )
@@ -172,6 +169,8 @@ class SimulatedRig:
             raise SourceError(
                 f"simulator: the walk {recording.name} does not end at rest, so that it cannot be walked back: ?legs=1"
             )
+        if not first_ns <= recording.start_ns <= recording.end_ns <= simulator.stamps_ns[-1]:
+            raise SourceError(f"simulator: {recording.name} is no recording of {self._scene}, whose walk is shorter")
         return simulator.imu_track
 
     def _ends_early(self, recording: Source) -> bool:
@@ -183,7 +182,7 @@ class SimulatedRig:
         folder = root / f"{self._scene}-seed{self._seed}-{self._rate_hz:g}hz-{_digest()}"
         if folder.is_dir():
             return folder
-        unfinished = folder.with_name(f"{folder.name}.{hashlib.sha256(str(id(self)).encode()).hexdigest()[:8]}")
+        unfinished = folder.with_name(f"{folder.name}.{os.getpid()}")
         arguments = ["simulate", self._scene, "--out", unfinished, "--seed", self._seed, "--rate", f"{self._rate_hz:g}"]
         command = [sys.executable, "-c", "from graphvio.cli import main; main()", *map(str, arguments)]
         root.mkdir(parents=True, exist_ok=True)
