@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -70,3 +72,24 @@ def test_a_map_that_is_none_ends_it_at_once(room_walk: Path, tmp_path: Path) -> 
     assert "nowhere" in done.stderr
     assert "Traceback" not in done.stderr
     assert done.stderr.rstrip().splitlines()[-1].startswith("graphvio: ")
+
+
+@pytest.mark.xdist_group("slam")
+def test_a_signal_to_both_processes_ends_it_with_the_map_saved(room_walk: Path, tmp_path: Path) -> None:
+    """As service managers send it."""
+    command = [sys.executable, "-c", "from graphvio.cli import main; main()", "slam", f"replay:{room_walk}?speed=0.2"]
+    process = subprocess.Popen(
+        [*command, "--out", str(tmp_path / "map")], stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if line.startswith("tracking"):
+                os.killpg(process.pid, signal.SIGTERM)
+                break
+        rest = process.stderr.read()
+        assert process.wait(SOON_S) == 0, rest
+    finally:
+        process.kill()
+    assert (tmp_path / "map/map.json").is_file()
+    assert len(Trajectory.read(tmp_path / "map/odometry.txt")) > 3

@@ -16,6 +16,7 @@ from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.mapping.mapper import Mapper
+from graphvio.optimization.loops.database import colmap
 from graphvio.slam.client import Client
 from graphvio.slam.keyframe import Keyframe
 from graphvio.trajectory import Trajectory
@@ -58,9 +59,10 @@ def run_mapping(task: MappingTask, ready: Event) -> None:
         task: what to do.
         ready: is set when keyframes may come.
     """
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # they are for the odometry, with which this ends
     try:
+        colmap()  # takes SIGTERM for itself when it is loaded
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)  # they are for the odometry, with which this ends
         with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map) as mapper:
             warm_up(client.rig, task.config)
             ready.set()
