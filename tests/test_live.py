@@ -465,8 +465,8 @@ def test_metrics_are_what_prometheus_reads() -> None:
     assert counters == {f"graphvio_{name}" for name in (
         "estimates", "skipped_late", "incident_device_lost", "status_tracking", "recorded_framesets"
     )}  # fmt: skip
-    (info,) = families["graphvio_info"].samples
-    assert info.labels == {"health": "ok", "status": "tracking", "stuck": ""}
+    told = {each.labels["status"]: each.value for each in families["graphvio_status"].samples}
+    assert told == {"initialising": 0.0, "tracking": 1.0, "coasting": 0.0, "lost": 0.0}
     assert "graphvio_temperature_c" not in values
 
 

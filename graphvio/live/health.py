@@ -11,6 +11,7 @@ from typing import Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from graphvio.errors import MissingExtraError, ServiceError
+from graphvio.events import Status
 
 Figures = Mapping[str, float | int | str | None]
 
@@ -85,14 +86,14 @@ def _reply(start_response: Callable[..., Any], status: HTTPStatus, content: Mapp
 
 
 class _Collector:
-    """Figures as metrics; texts become labels of a metric that is 1."""
+    """Figures as metrics; of the texts, the status."""
 
     def __init__(self, status: Callable[[], Figures]) -> None:
         self._status = status
 
     def collect(self) -> Iterator[Any]:
         """All metrics."""
-        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         figures = self._status()
         for name, value in figures.items():
@@ -100,8 +101,10 @@ class _Collector:
                 is_total = name in _TOTALS or name.startswith(_TOTAL_PREFIXES)
                 kind = CounterMetricFamily if is_total else GaugeMetricFamily
                 yield kind(f"graphvio_{name}", f"{name} of the odometry", value=float(value))
-        texts = {name: value for name, value in figures.items() if isinstance(value, str)}
-        yield InfoMetricFamily("graphvio", "texts of the odometry's status", value=texts)
+        status = GaugeMetricFamily("graphvio_status", "1 for the newest estimate's status", labels=["status"])
+        for each in Status:
+            status.add_metric([str(each)], float(figures.get("status") == each))
+        yield status
         yield GaugeMetricFamily("graphvio_up", "1 while all stages live", value=float(figures.get("health") == "ok"))
 
 

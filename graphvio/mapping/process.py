@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.errors import GraphvioError
+from graphvio.errors import GraphvioError, ServiceError
 from graphvio.mapping.mapper import Mapper
 from graphvio.optimization.loops.database import colmap
 from graphvio.slam.client import Client
@@ -132,8 +133,9 @@ class _OdomPath:
         return Trajectory(np.array(self._stamps, dtype=np.int64), np.array(self._poses).reshape(-1, 4, 4))
 
     def _listen(self) -> None:
-        for update in self._client.estimates():
-            self._viewer.show(None, update.state)
-            if update.state.nav_T_body is not None:
-                self._stamps.append(update.state.stamp_ns)
-                self._poses.append(update.state.nav_T_body)
+        with suppress(ServiceError):  # the service has gone, which the mapping itself tells of
+            for update in self._client.estimates():
+                self._viewer.show(None, update.state)
+                if update.state.nav_T_body is not None:
+                    self._stamps.append(update.state.stamp_ns)
+                    self._poses.append(update.state.nav_T_body)

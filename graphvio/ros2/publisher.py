@@ -26,6 +26,7 @@ from graphvio.sessions.messages import (
     pose_stamped,
     transform,
 )
+from graphvio.slam.epochs import map_of_epoch
 from graphvio.slam.interface import Served
 
 _STATIC: Final = "static"  # transforms that stay, among the writers by type
@@ -146,7 +147,7 @@ class Publisher:
         told.child_frame_id = self._body
         self._writers[ODOMETRY].write(told)
         stamped = [transform(estimate.stamp_ns, ODOM, self._body, estimate.nav_T_body)]
-        map_T_odom = self._served.map_T_odom
+        map_T_odom = map_of_epoch(self._served, estimate.epoch)
         if map_T_odom is not None:
             stamped.append(transform(estimate.stamp_ns, MAP, ODOM, map_T_odom))
         self._writers[TRANSFORMS].write(messages.transforms(stamped))

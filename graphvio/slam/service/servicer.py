@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import graphvio
-from graphvio.arrays import Float
 from graphvio.errors import GraphvioError, ServiceError
 from graphvio.events import Estimate, Prediction
 from graphvio.live.broadcast import Broadcast
+from graphvio.slam.epochs import map_of_epoch, newest_epoch
 from graphvio.slam.interface import Served
 from graphvio.slam.service import convert
 from graphvio.slam.service.arrays import checked_covariance, checked_pose, floats, packed
@@ -50,7 +50,7 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
             version=graphvio.__version__,
             rig_yaml=self._rig_text,
             run_id=self._run_id,
-            epoch=self._epoch(),
+            epoch=newest_epoch(self._served),
             oldest_keyframe_id=log.oldest_id,
             next_keyframe_id=log.next_id,
             has_ended=log.is_closed,
@@ -113,7 +113,7 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
         )
 
     def _update(self, state: Estimate | Prediction, missed: int) -> Any:
-        update = messages.EstimateUpdate(map_T_odom=packed(self._map_T_odom(state.epoch)), missed=missed)
+        update = messages.EstimateUpdate(map_T_odom=packed(map_of_epoch(self._served, state.epoch)), missed=missed)
         if isinstance(state, Estimate):
             update.estimate.CopyFrom(convert.estimate_message(state))
         else:
@@ -138,17 +138,6 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
                     self._abort_if_stopping(context)
         finally:
             subscription.close()
-
-    def _map_T_odom(self, epoch: int) -> Float | None:
-        """The one in force, unless it is another epoch's than that of an estimate that waited."""
-        before = self._epoch()
-        map_T_odom = self._served.map_T_odom
-        return map_T_odom if before == epoch == self._epoch() else None
-
-    def _epoch(self) -> int | None:
-        log = self._served.keyframe_log
-        newest = log.read(max(log.next_id - 1, 0), timeout_s=0.0)
-        return None if newest is None else newest.epoch
 
     @contextmanager
     def _stream(self, request: Any, context: Any) -> Iterator[None]:
