@@ -65,8 +65,9 @@ def test_the_client_of_the_page_ends_with_one_line_where_nothing_is_served() -> 
 
 
 def test_other_pieces_of_code_on_the_page_can_be_parsed() -> None:
-    for block in re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL):
-        ast.parse(block)
+    blocks = re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL)
+    assert blocks
+    assert all(ast.parse(block).body for block in blocks)
 
 
 def test_the_calls_of_the_page_are_those_of_the_proto() -> None:

@@ -6,11 +6,10 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from graphvio.cli.redrawn import Redrawn
 from graphvio.events import Incident
 from graphvio.live.broadcast import Subscription
 
@@ -24,7 +23,7 @@ _MESSAGES = 6
 _COLOURS = {"tracking": "green", "coasting": "yellow", "initialising": "cyan", "lost": "red"}
 
 
-class Dashboard:
+class Dashboard(Redrawn):
     """Draws figures; a context manager.
 
     Args:
@@ -33,22 +32,11 @@ class Dashboard:
     """
 
     def __init__(self, title: str, incidents: Subscription[Incident]) -> None:
+        super().__init__()
         self._title = title
         self._incidents = incidents
         self._messages: list[str] = []
         self._told: dict[str, tuple[float, int]] = {}  # kind -> when it was told last, and how often it came since
-        self._console = Console(stderr=True)
-        self._live = Live(console=self._console, auto_refresh=False, transient=True)
-        self._next_s = 0.0
-
-    def __enter__(self) -> Dashboard:
-        if self._console.is_terminal:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._console.is_terminal:
-            self._live.stop()
 
     def draw(self, figures: Figures, devices: Sequence[DeviceHealth]) -> None:
         """Show the newest, if it is time to."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.redrawn import Redrawn
 
 if TYPE_CHECKING:
     from graphvio.config import Config
@@ -132,29 +133,15 @@ def _choose(rig: Rig, pairs: str | None, no_imu: bool) -> Rig:
     return rig.without_imu() if no_imu else rig
 
 
-class _ProgressLine:
+class _ProgressLine(Redrawn):
     """One line that is drawn over on a terminal, and every few seconds a line of its own elsewhere."""
 
     _REFRESH_S = 0.1
     _PLAIN_S = 5.0
 
     def __init__(self) -> None:
-        from rich.console import Console
-        from rich.live import Live
-
-        self._console = Console(stderr=True)
-        self._live = Live(console=self._console, auto_refresh=False, transient=True)
+        super().__init__()
         self._period_s = self._REFRESH_S if self._console.is_terminal else self._PLAIN_S
-        self._next_s = 0.0
-
-    def __enter__(self) -> _ProgressLine:
-        if self._console.is_terminal:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._console.is_terminal:
-            self._live.stop()
 
     def show(self, progress: Progress) -> None:
         """Draw the line, if it is time to."""

@@ -15,10 +15,13 @@ from graphvio.cli.services import Services, Started
 if TYPE_CHECKING:
     from contextlib import ExitStack
     from multiprocessing.context import SpawnProcess
+    from multiprocessing.synchronize import Event
 
     from graphvio.live.path_output import PathOutput
     from graphvio.live.running import LiveOdometry
+    from graphvio.mapping.process import MappingTask
 
+EXIT_FAILED = 2
 _LOOK_S = 0.1
 _PATIENCE_S = 300.0  # for a SLAM that is behind when the odometry ends
 
@@ -91,7 +94,7 @@ class _WithMapping(Services):
         from multiprocessing import get_context
 
         from graphvio.live.path_output import PathOutput
-        from graphvio.mapping.process import MappingTask, run_mapping
+        from graphvio.mapping.process import MappingTask
 
         address = self.start_grpc(running, stack)
         task = MappingTask(
@@ -108,12 +111,24 @@ class _WithMapping(Services):
             running.add_output(path)
         context = get_context("spawn")
         ready = context.Event()
-        process = context.Process(target=run_mapping, args=(task, ready), name="graphvio-slam")
+        process = context.Process(target=_map, args=(task, ready), name="graphvio-slam")
         process.start()
         stack.callback(process.kill)
         while not ready.wait(_LOOK_S):  # places that are seen before would be lost
             _check(process)
         return Started([f"gRPC: {address}"], lambda: _check(process), lambda: _finish(process, path, self.out))
+
+
+def _map(task: MappingTask, ready: Event) -> None:
+    """What the SLAM's process does."""
+    from graphvio.errors import GraphvioError
+    from graphvio.mapping.process import run_mapping
+
+    try:
+        typer.echo(run_mapping(task, ready), err=True)
+    except GraphvioError as error:
+        typer.echo(f"graphvio: mapping: {error}", err=True)
+        raise SystemExit(EXIT_FAILED) from None
 
 
 def _check(process: SpawnProcess) -> None:

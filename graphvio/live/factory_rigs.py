@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphvio.errors import RigError
+from graphvio.errors import RigError, SourceError
 from graphvio.geometry import se3, se3_inverse, so3_exp
 from graphvio.rig import Rig, StereoPair
 
@@ -65,3 +65,22 @@ def camera_names(rig: Rig | None, k: int) -> tuple[str, str]:
     if rig is None:
         return f"cam{2 * k}", f"cam{2 * k + 1}"
     return rig.pairs[k].left.name, rig.pairs[k].right.name
+
+
+def check_one_for_each_pair(kind: str, names: Sequence[str], rig: Rig | None, named: str) -> None:
+    """Make sure that there is a camera for each pair of a rig that is given.
+
+    Args:
+        kind: of source.
+        names: of the cameras.
+        rig: or None.
+        named: what a camera is named by.
+
+    Raises:
+        SourceError: if there is not.
+    """
+    if rig is not None and len(names) != len(rig.pairs):
+        raise SourceError(
+            f"{kind}: {len(names)} cameras, but the rig has {len(rig.pairs)} pairs; name the {named} of one for each "
+            f"pair, in the rig's order: {kind}:FIRST,SECOND"
+        )

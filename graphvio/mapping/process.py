@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
@@ -15,7 +14,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.errors import GraphvioError, ServiceError
+from graphvio.errors import ServiceError
 from graphvio.mapping.mapper import Mapper
 from graphvio.optimization.loops.database import colmap
 from graphvio.slam.client import Client
@@ -23,8 +22,6 @@ from graphvio.slam.keyframe import Keyframe
 from graphvio.trajectory import Trajectory
 from graphvio.viewer import Viewer, WebOptions
 from graphvio.warmup import warm_up
-
-EXIT_FAILED = 2
 
 _MAP_COLOUR, _ODOM_COLOUR = (40, 190, 90), (150, 150, 150)
 _SHOWN_EVERY = 3  # places
@@ -53,28 +50,30 @@ class MappingTask:
     save_rrd: Path | None = None
 
 
-def run_mapping(task: MappingTask, ready: Event) -> None:
-    """Map until the odometry ends, and save the map; for a process of its own, which it ends by its exit code.
+def run_mapping(task: MappingTask, ready: Event) -> str:
+    """Map until the odometry ends, and save the map; in a process of its own, whose signals it ignores from here on.
 
     Args:
         task: what to do.
         ready: is set when keyframes may come.
+
+    Returns:
+        The summary, in one line.
+
+    Raises:
+        GraphvioError: if the odometry cannot be reached, or the map not be used or written.
     """
-    try:
-        colmap()  # takes SIGTERM for itself when it is loaded
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)  # they are for the odometry, with which this ends
-        with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map) as mapper:
-            warm_up(client.rig, task.config)
-            ready.set()
-            _follow(client, mapper, task)
-            if task.out is not None:
-                mapper.save(task.out)
-                mapper.trajectory.write(task.out / "trajectory.txt")
-            print(told(mapper), file=sys.stderr)
-    except GraphvioError as error:
-        print(f"graphvio: mapping: {error}", file=sys.stderr)
-        sys.exit(EXIT_FAILED)
+    colmap()  # takes SIGTERM for itself when it is loaded
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # they are for the odometry, with which this ends
+    with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map) as mapper:
+        warm_up(client.rig, task.config)
+        ready.set()
+        _follow(client, mapper, task)
+        if task.out is not None:
+            mapper.save(task.out)
+            mapper.trajectory.write(task.out / "trajectory.txt")
+        return told(mapper)
 
 
 class _WithImages:

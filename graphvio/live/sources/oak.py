@@ -10,7 +10,13 @@ from typing import Any
 
 from graphvio.errors import MissingExtraError, SourceError
 from graphvio.live.devices import DeviceSource
-from graphvio.live.factory_rigs import camera_names, checked_rig, guessed_rig, refuse_unknown_places
+from graphvio.live.factory_rigs import (
+    camera_names,
+    check_one_for_each_pair,
+    checked_rig,
+    guessed_rig,
+    refuse_unknown_places,
+)
 from graphvio.live.source import DeviceInfo, LiveSource
 from graphvio.live.sources import SourceSpec, check_options
 from graphvio.live.sources.oak_device import Connect, DepthAiConnection, OakDevice, StreamSettings
@@ -53,11 +59,7 @@ def open_source(spec: SourceSpec, rig: Rig | None, connect: Connect = DepthAiCon
         is_imu_guessed=is_guessed,
     )
     ids = names_of(spec) or [_only_id()]
-    if rig is not None and len(ids) != len(rig.pairs):
-        raise SourceError(
-            f"oak: {len(ids)} cameras, but the rig has {len(rig.pairs)} pairs; name the id of one for each pair, in "
-            "the rig's order: oak:FIRST,SECOND"
-        )
+    check_one_for_each_pair("oak", ids, rig, "id")
     name = f"oak-{'-'.join(ids)}"
     if rig is None and len(ids) > 1 and not is_guessed:
         return DeviceSource(name, [], partial(refuse_unknown_places, "oak", ids))

@@ -11,7 +11,13 @@ from typing import Any
 
 from graphvio.errors import MissingExtraError, SourceError
 from graphvio.live.devices import DeviceSource
-from graphvio.live.factory_rigs import camera_names, checked_rig, guessed_rig, refuse_unknown_places
+from graphvio.live.factory_rigs import (
+    camera_names,
+    check_one_for_each_pair,
+    checked_rig,
+    guessed_rig,
+    refuse_unknown_places,
+)
 from graphvio.live.source import DeviceInfo, LiveSource
 from graphvio.live.sources import SourceSpec, check_options
 from graphvio.live.sources.realsense_device import Bus, RealSenseDevice, StreamSettings
@@ -96,11 +102,7 @@ def open_source(spec: SourceSpec, rig: Rig | None, bus: Bus | None = None) -> Li
     bus = bus or ContextBus()
     if not serials:
         serials = [_only_serial(bus)]
-    if rig is not None and len(serials) != len(rig.pairs):
-        raise SourceError(
-            f"realsense: {len(serials)} cameras, but the rig has {len(rig.pairs)} pairs; name the serial number of one "
-            "for each pair, in the rig's order: realsense:FIRST,SECOND"
-        )
+    check_one_for_each_pair("realsense", serials, rig, "serial number")
     name = f"realsense-{'-'.join(serials)}"
     if rig is None and len(serials) > 1 and not is_guessed:
         return DeviceSource(name, [], partial(refuse_unknown_places, "realsense", serials))
