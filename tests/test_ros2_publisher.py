@@ -19,6 +19,7 @@ from ros2_loopback import PERIOD_NS, START_NS, URI, Other, free_domain, until
 from synthetic import random_covariance, transform
 
 from graphvio.arrays import Float
+from graphvio.errors import ServiceError
 from graphvio.events import Estimate, Incident, Prediction, Status
 from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_exp
 from graphvio.live.broadcast import Broadcast
@@ -236,6 +237,24 @@ def test_keyframes_go_out_and_their_corrections_come_in(system: System) -> None:
         values = system.tells("graphvio: corrections", 1, why)
         assert values == {"accepted": "1", "refused": str(count)}
     assert [number for number, _, _ in system.running.corrections] == [2, 0]
+
+
+def test_a_thread_that_ends_before_its_time_is_told_of(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    system.publisher.check()
+
+    def broken() -> dict[str, float]:
+        raise ZeroDivisionError("no figures")
+
+    monkeypatch.setattr(system.running, "status", broken)
+
+    def is_told() -> bool:
+        try:
+            system.publisher.check()
+        except ServiceError as error:
+            return "nothing of poses" in str(error) and "no figures" in str(error)
+        return False
+
+    assert until(is_told)
 
 
 def test_a_path_covers_the_whole_way_in_a_bounded_number_of_poses() -> None:

@@ -38,9 +38,13 @@ Record = Annotated[Path | None, typer.Option("--record", help="Record everything
 HealthPort = Annotated[
     int | None, typer.Option("--health-port", help="Answer /metrics and /healthz on this port.", min=0, max=65535)
 ]
+Ros2Domain = Annotated[
+    int | None, typer.Option("--ros2", help="Publish ROS 2 topics in this domain.", metavar="DOMAIN", min=0, max=232)
+]
 Duration = Annotated[float | None, typer.Option("--for", help="Stop after so many seconds.", metavar="SECONDS")]
 WebPort = Annotated[
-    int | None, typer.Option("--web", help="Let a browser of this machine watch, on this port.", min=1, max=65535)
+    int | None,
+    typer.Option("--web", help="Let a browser of this machine watch, on this port and the next.", min=1, max=65534),
 ]
 ReportFolder = Annotated[
     Path | None, typer.Option("--report", help="Folder for a report: page, pictures, all numbers.", metavar="DIR")

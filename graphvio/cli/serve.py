@@ -27,10 +27,7 @@ def serve(
         Path | None,
         typer.Option("--token-file", help="What clients have to know, in a file only you can read.", metavar="FILE"),
     ] = None,
-    ros2: Annotated[
-        int | None,
-        typer.Option("--ros2", help="Publish ROS 2 topics in this domain.", metavar="DOMAIN", min=0, max=232),
-    ] = None,
+    ros2: options.Ros2Domain = None,
     web: options.WebPort = None,
     record: options.Record = None,
     png: options.Png = False,

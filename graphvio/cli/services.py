@@ -20,11 +20,13 @@ class Started:
     """Services that run.
 
     Attributes:
+        address: of gRPC.
         lines: for people, one for each.
         check: raises what has become of one that failed.
         finish: waits for those that go on when the odometry has ended.
     """
 
+    address: str
     lines: Sequence[str]
     check: Callable[[], None] = lambda: None
     finish: Callable[[], None] = lambda: None
@@ -76,19 +78,17 @@ class Services:
             ServiceError: if an address cannot be used, or would be open to all.
             MissingExtraError: if a service's extra is not installed.
         """
-        lines = [f"gRPC: {self.start_grpc(running, stack)}" + (" (TLS)" if self.certificate else "")]
-        if self.ros2_domain is not None:
-            from graphvio.ros2.publisher import Publisher
-
-            stack.enter_context(Publisher(running, self.ros2_domain))
-            lines.append(f"ROS 2: topics below /graphvio in domain {self.ros2_domain}")
-        return Started(lines)
-
-    def start_grpc(self, running: LiveOdometry, stack: ExitStack) -> str:
-        """Offer it by gRPC alone; the address."""
         from graphvio.slam.service.server import GrpcServer
 
-        return stack.enter_context(GrpcServer(running, self._options())).address
+        address = stack.enter_context(GrpcServer(running, self._options())).address
+        lines = [f"gRPC: {address}" + (" (TLS)" if self.certificate else "")]
+        if self.ros2_domain is None:
+            return Started(address, lines)
+        from graphvio.ros2.publisher import Publisher
+
+        publisher = stack.enter_context(Publisher(running, self.ros2_domain))
+        lines.append(f"ROS 2: topics below /graphvio in domain {self.ros2_domain}")
+        return Started(address, lines, publisher.check)
 
     def _options(self) -> ServiceOptions:
         from graphvio.slam.service.options import DEFAULT_PORT, ServiceOptions

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,12 +37,14 @@ def slam(
         Path | None, typer.Option("--out", help="Save the map, and the trajectory in it.", metavar="DIR")
     ] = None,
     view: Annotated[bool, typer.Option("--view", help="Watch both trajectories in the rerun viewer.")] = False,
+    ros2: options.Ros2Domain = None,
     web: options.WebPort = None,
     save_rrd: Annotated[
         Path | None, typer.Option("--save-rrd", help="Save what the viewer would show; needs no display.")
     ] = None,
     record: options.Record = None,
     png: options.Png = False,
+    health_port: options.HealthPort = None,
     duration: options.Duration = None,
     verbose: options.Verbose = False,
 ) -> None:
@@ -64,16 +66,18 @@ def slam(
         check_target(out)
         if out.exists() and any(out.iterdir()) and (saved_map is None or out.resolve() != saved_map.resolve()):
             raise MapError(f"{out}: holds a map already; name another folder, or go on with it by  --map {out}")
-    services = _WithMapping(port=0, saved_map=saved_map, out=out, view=view, map_web_port=web, save_rrd=save_rrd)
+    services = _WithMapping(
+        port=0, ros2_domain=ros2, saved_map=saved_map, out=out, view=view, map_web_port=web, save_rrd=save_rrd
+    )
     run_live(
-        source, rig, config, record=record, png=png, view=False, health_port=None, duration_s=duration,
+        source, rig, config, record=record, png=png, view=False, health_port=health_port, duration_s=duration,
         services=services,
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _WithMapping(Services):
-    """gRPC on this machine, and the SLAM as its client.
+    """gRPC on this machine, ROS 2 topics where asked for, and the SLAM as a client of gRPC.
 
     Attributes:
         saved_map: to begin with.
@@ -90,15 +94,15 @@ class _WithMapping(Services):
     save_rrd: Path | None = None
 
     def start(self, running: LiveOdometry, stack: ExitStack) -> Started:
-        """Offer the odometry, and start the SLAM."""
+        """Offer the odometry, and start the SLAM; see `Services.start`."""
         from multiprocessing import get_context
 
         from graphvio.live.path_output import PathOutput
         from graphvio.mapping.process import MappingTask
 
-        address = self.start_grpc(running, stack)
+        offered = super().start(running, stack)
         task = MappingTask(
-            address,
+            offered.address,
             running.odometry.config,
             self.saved_map,
             self.out,
@@ -116,7 +120,12 @@ class _WithMapping(Services):
         stack.callback(process.kill)
         while not ready.wait(_LOOK_S):  # places that are seen before would be lost
             _check(process)
-        return Started([f"gRPC: {address}"], lambda: _check(process), lambda: _finish(process, path, self.out))
+
+        def check() -> None:
+            offered.check()
+            _check(process)
+
+        return replace(offered, check=check, finish=lambda: _finish(process, path, self.out))
 
 
 def _map(task: MappingTask, ready: Event) -> None:

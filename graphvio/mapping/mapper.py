@@ -75,9 +75,7 @@ class Mapper:
         self._session = 1 + max((place.session for place in self._places), default=-1)
         self._store = PlaceStore(self._folder, self._rig)
         self._observer = PlaceObserver(self._rig, self._config)
-        self._share = (
-            _SEARCHING_SHARE if self._first else 1.0
-        )  # of the places' distance that is enough for the next one
+        self._share = _SEARCHING_SHARE if self._first else 1.0  # of the places' distance that makes the next one
         self._intake = Intake(self._front_end, settings, lambda: self._share)
         self._keyframe_ids: list[int] = []
         self._lock = threading.RLock()  # held while the graph changes, or is read from another thread

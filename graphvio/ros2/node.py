@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from graphvio.errors import SourceError
+from graphvio.errors import ServiceError, SourceError
 from graphvio.ros2.qos import Profile
 from graphvio.ros2.types import dds, dds_topic, ros_topic, ros_type_name, wire_type
 from graphvio.sessions import cdr
@@ -101,19 +101,23 @@ class Writer:
     def __init__(self, node: Node, topic: str, type_name: str, profile: Profile) -> None:
         from cyclonedds.pub import DataWriter
 
-        self._type = wire_type(type_name)
+        self.topic, self._type = topic, wire_type(type_name)
         self._writer = DataWriter(node.participant, node.topic(topic, type_name), qos=profile.dds(type_name))
         self.refused = 0
 
     def write(self, message: Any) -> None:
-        """Publish a message; it is dropped, and counted in ``refused``, where there is no room for it."""
+        """Publish a message; it is dropped, and counted in ``refused``, where there is no room for it.
+
+        Raises:
+            ServiceError: if DDS does not take it for another reason.
+        """
         from cyclonedds.core import DDSException
 
         try:
             self._writer.write(self._type(cdr.encode(message)))
         except DDSException as error:
             if error.code != DDSException.DDS_RETCODE_TIMEOUT:
-                raise
+                raise ServiceError(f"{self.topic}: cannot be published ({error.msg or error})") from None
             self.refused += 1
 
     @property

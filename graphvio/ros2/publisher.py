@@ -8,7 +8,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Final
 
-from graphvio.errors import GraphvioError
+from graphvio.errors import GraphvioError, ServiceError
 from graphvio.events import Estimate, Status
 from graphvio.live.source import host_ns
 from graphvio.ros2 import messages
@@ -79,6 +79,7 @@ class Publisher:
         self._newest: Estimate | None = None
         self._newest_s = time.monotonic()
         self._trouble = ""
+        self._failure: tuple[str, Exception] | None = None  # of a thread, with its name
         self._closing = threading.Event()
         self._attempt(self._publish_places)
         tasks: dict[str, tuple[Callable[..., None], tuple[Any, ...]]] = {
@@ -87,11 +88,23 @@ class Publisher:
             "corrections": (self._take_corrections, (node.waiter([correction_reader]), correction_reader)),
         }
         self._threads = [
-            threading.Thread(target=task, args=args, name=f"graphvio-ros2-{name}", daemon=True)
+            threading.Thread(target=self._run, args=(name, task, *args), name=f"graphvio-ros2-{name}", daemon=True)
             for name, (task, args) in tasks.items()
         ]
         for thread in self._threads:
             thread.start()
+
+    def check(self) -> None:
+        """Find out whether all threads live.
+
+        Raises:
+            ServiceError: if one ended before its time.
+        """
+        if self._failure is not None:
+            name, error = self._failure
+            raise ServiceError(
+                f"ROS 2: nothing of {name} is published or taken any more ({type(error).__name__}: {error})"
+            ) from error
 
     def close(self) -> None:
         """End the threads, and leave the domain; a second time does nothing."""
@@ -112,6 +125,13 @@ class Publisher:
     ) -> None:
         """Close it."""
         self.close()
+
+    def _run(self, name: str, task: Callable[..., None], *args: object) -> None:
+        """What a thread does; one that ends in an error is told of by `check`."""
+        try:
+            task(*args)
+        except Exception as error:
+            self._failure = name, error
 
     def _publish_places(self) -> None:
         now_ns = host_ns()

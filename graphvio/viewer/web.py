@@ -30,8 +30,7 @@ class WebOptions:
     """Where the view is served: on this machine only. From elsewhere both ports are reached by an SSH tunnel.
 
     Attributes:
-        port: of the page.
-        data_port: from which the page takes what it shows.
+        port: of the page, which takes what it shows from the next one, ``data_port``.
         memory_mb: kept for browsers that come later; beyond it the oldest is forgotten.
 
     Raises:
@@ -39,16 +38,20 @@ class WebOptions:
     """
 
     port: int = 9090
-    data_port: int = 9876
     memory_mb: int = 512
 
     def __post_init__(self) -> None:
-        if not all(0 < port < 2**16 for port in (self.port, self.data_port)) or self.port == self.data_port:
+        if not 1 <= self.port <= 65534:
             raise GraphvioError(
-                f"web view: ports {self.port} and {self.data_port}: choose two different ones from 1 to 65535"
+                f"web view: port {self.port}: choose one from 1 to 65534, as the next one is used for its data"
             )
         if self.memory_mb < 1:
             raise GraphvioError(f"web view: memory_mb is {self.memory_mb}; choose at least 1")
+
+    @property
+    def data_port(self) -> int:
+        """From which the page takes what it shows."""
+        return self.port + 1
 
     @property
     def data_url(self) -> str:

@@ -4,9 +4,9 @@ import sys
 
 from benchmarks.command_line import run_command_line
 
-from campaigns import calibration, consistency, endurance, lags, live, outages, rates, real_imu, soak
+from campaigns import calibration, consistency, endurance, lags, live, mapping, outages, rates, real_imu, soak
 
-_MODULES = (consistency, real_imu, outages, endurance, rates, lags, calibration, live, soak)
+_MODULES = (consistency, real_imu, outages, endurance, rates, lags, calibration, live, soak, mapping)
 
 if __name__ == "__main__":
     sys.exit(

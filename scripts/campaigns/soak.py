@@ -1,14 +1,17 @@
 """``scripts/campaign soak``: does the live system stay as it is, over thousands of framesets?
 
 The whole live system, from the source to the listeners, on the simulated room that is walked to and fro. Memory is that
-of the process.
+of the process. With ``--beside``, it is recorded and offered to other programs meanwhile, and one takes all keyframes.
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,7 @@ from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, machine, tell
 
 from campaigns.live_listener import Listener
+from campaigns.live_services import Beside
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.live.running import LiveOdometry
@@ -35,6 +39,9 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = add_command(subparsers, "soak", "memory, latency and losses of the live system over hours", __doc__)
     parser.add_argument("--framesets", type=int, default=20_000, help="as many (default: 20000)")
     parser.add_argument("--real-time", action="store_true", help="at the sensors' pace, not as fast as possible")
+    parser.add_argument(
+        "--beside", action="store_true", help="record it, and offer it by gRPC and ROS 2 (25 GB of disk for 20000)"
+    )
     add_report_options(parser)
     add_data_option(parser)
     parser.set_defaults(run=main)
@@ -47,46 +54,61 @@ def main(args: argparse.Namespace) -> None:
     folder = simulated(args.data, _SCENE)
     report = Report()
     how = "at the sensors' pace" if args.real_time else "as fast as possible"
-    report.add(machine(), "", f"`--framesets {args.framesets}`{' --real-time' if args.real_time else ''}: {how}.")
-    rows, figures, growth_mb = _soak(folder, args.framesets, args.real_time)
+    given = "".join(f" --{name}" for name in ("real-time", "beside") if vars(args)[name.replace("-", "_")])
+    report.add(machine(), "", f"`--framesets {args.framesets}{given}`: {how}.")
+    with tempfile.TemporaryDirectory() as made:
+        target = Path(made) / "soak.mcap" if args.beside else None
+        rows, figures, growth_mb, told_beside = _soak(folder, args.framesets, args.real_time, target)
     report.table(_HEAD, rows)
     lost = _lost(figures)
     told = f"p50 {figures['latency_p50_ms']:.1f} ms (newest), p99 {figures['latency_p99_all_ms']:.1f} ms (all)"
     report.add(
-        f"Memory grew by {growth_mb:.1f} MB after the first tenth. Lost: {lost or 'nothing'}. "
+        f"Memory grew by {growth_mb:.1f} MB after {'three tenths' if args.beside else 'the first tenth'}. "
+        f"Lost: {lost or 'nothing'}. "
         + (f"Latency: {told}." if args.real_time else f"Work on a frameset: {_work_told(figures)}.")
     )
+    if told_beside:
+        report.add(told_beside)
     if args.out is not None:
         report.save(args.out)
     if args.docs:
-        report.save_to_docs("soak")
+        report.save_to_docs("soak-beside" if args.beside else "soak")
 
 
-def _soak(folder: Path, framesets: int, is_real_time: bool) -> tuple[list[list[str]], _Figures, float]:
+def _soak(
+    folder: Path, framesets: int, is_real_time: bool, target: Path | None
+) -> tuple[list[list[str]], _Figures, float, str]:
+    """Rows by tenths, the figures at the end, by how much memory grew, and what ran beside: none without a target."""
     config = Config()
+    if target is not None:
+        config = replace(config, keyframes=replace(config.keyframes, images=True))
     seconds = framesets / 20.0
     source = SimulatedRig(_SCENE, None, 1.0 if is_real_time else None, duration_s=seconds, recording=folder)
     rig = source.open()
     warm_up(rig, config)
-    running = LiveOdometry(source, rig, config)
+    running = LiveOdometry(source, rig, config, wants_keyframes=target is not None)
     listener = Listener(running, folder)
-    running.start()
-    begun_s, due = time.monotonic(), framesets / _PARTS
-    rows: list[list[str]] = []
-    memories: list[float] = []
-    while not running.wait(_LOOK_S):
-        figures = running.status()
-        if int(figures["estimates"] or 0) >= due * (len(rows) + 1):
-            memories.append(float(figures["memory_mb"] or np.nan))
-            rows.append(_row(figures, listener.error_mm, time.monotonic() - begun_s))
-            tell(f"{figures['estimates']} of {framesets}")
-    running.stop()
-    listener.thread.join()
+    with ExitStack() as stack:
+        beside = None if target is None else Beside.start(running, target, not is_real_time, stack)
+        running.start()
+        begun_s, due = time.monotonic(), framesets / _PARTS
+        rows: list[list[str]] = []
+        memories: list[float] = []
+        while not running.wait(_LOOK_S):
+            figures = running.status()
+            if int(figures["estimates"] or 0) >= due * (len(rows) + 1):
+                memories.append(float(figures["memory_mb"] or np.nan))
+                rows.append(_row(figures, listener.error_mm, time.monotonic() - begun_s))
+                tell(f"{figures['estimates']} of {framesets}")
+        running.stop()
+        listener.thread.join()
+        told_beside = "" if beside is None else beside.told()
     figures = dict(running.status())
     figures |= {f"work_p{percent}_ms": float(np.percentile(listener.work_ms, percent)) for percent in (50, 99)}
     rows.append(_row(figures, listener.error_mm, time.monotonic() - begun_s))
     memories.append(float(figures["memory_mb"] or np.nan))
-    return rows, figures, max(memories) - memories[0]
+    warm = 2 if beside is not None else 0  # keyframes are kept up to 256 MB, which takes a while to fill
+    return rows, figures, max(memories[warm:]) - memories[warm], told_beside
 
 
 def _row(figures: _Figures, error_mm: float, elapsed_s: float) -> list[str]:

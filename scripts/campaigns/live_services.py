@@ -1,0 +1,71 @@
+"""All that can run beside a live odometry: it is recorded, offered by gRPC and ROS 2, and another process listens."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from graphvio.live.health import HealthServer
+from graphvio.live.running import LiveOdometry
+from graphvio.live.session_recorder import SessionRecorder
+from graphvio.ros2.publisher import Publisher
+from graphvio.slam.client import Client
+from graphvio.slam.service.options import ServiceOptions
+from graphvio.slam.service.server import GrpcServer
+
+_DOMAIN = 97
+_LISTENS = "from campaigns.live_services import listen; import sys; listen(sys.argv[1])"
+_END_S = 60.0
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What runs beside.
+
+    Attributes:
+        recorder: of all, in a file that is removed at the end.
+        client: the process that listens.
+        publisher: on ROS 2.
+    """
+
+    recorder: SessionRecorder
+    client: subprocess.Popen[str]
+    publisher: Publisher
+
+    @classmethod
+    def start(cls, running: LiveOdometry, path: Path, waits: bool, stack: ExitStack) -> Beside:
+        """Start all of it, until the stack ends; before the odometry is started."""
+        recorder = SessionRecorder(path, running.rig, waits=waits)
+        stack.callback(recorder.close)
+        running.add_output(recorder)
+        stack.callback(HealthServer(running.status).close)
+        server = stack.enter_context(GrpcServer(running, ServiceOptions(port=0)))
+        publisher = stack.enter_context(Publisher(running, _DOMAIN))
+        client = subprocess.Popen([sys.executable, "-c", _LISTENS, server.address], stdout=subprocess.PIPE, text=True)
+        stack.callback(client.kill)
+        assert client.stdout is not None
+        client.stdout.readline()  # it listens
+        return cls(recorder, client, publisher)
+
+    def told(self) -> str:
+        """What each has seen, after the end."""
+        self.publisher.check()
+        heard, _ = self.client.communicate(timeout=_END_S)
+        self.recorder.close()
+        recorded = self.recorder.status()
+        return (
+            f"Recorded: {recorded['recorded_framesets']} framesets, {recorded['framesets_not_recorded']} left out. "
+            f"The client by gRPC: {heard.strip()}."
+        )
+
+
+def listen(address: str) -> None:
+    """What the client does: keyframes with their images, all of them, until there are no more."""
+    with Client(address) as client:
+        print("listens", flush=True)
+        ids = [keyframe.id for keyframe in client.keyframes(with_images=True)]
+    missing = len(set(range(ids[0], ids[-1] + 1)) - set(ids)) if ids else 0
+    print(f"{len(ids)} keyframes with their images, {missing} missing", flush=True)
