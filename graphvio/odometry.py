@@ -27,7 +27,6 @@ from graphvio.events import (
     checked_event,
 )
 from graphvio.filter_belief import FilterBelief
-from graphvio.frontend.alignment import misplaced
 from graphvio.frontend.motion import VisualResult
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import se3_inverse
@@ -39,6 +38,7 @@ from graphvio.slam.keyframes import Keyframes
 from graphvio.smoother_belief import SmootherBelief
 from graphvio.step import Step
 from graphvio.synchroniser import Synchroniser
+from graphvio.vision_reports import VisionReports
 
 
 class Odometry:
@@ -72,8 +72,7 @@ class Odometry:
         self._on_step = on_step
         self._time_offset = OffsetCorrection(rig, self.config, self._synchroniser, self._report)
         self._keyframes = Keyframes(rig, self.config)
-        self._told_misaligned: set[int] = set()
-        self._frozen: frozenset[int] = frozenset()
+        self._vision_reports = VisionReports(rig, self._report)
         self._rates = AngularRates()
         self._incidents: deque[Incident] = deque()  # appended to by any thread that corrects
         self._first_ns: int | None = None
@@ -216,7 +215,7 @@ class Odometry:
         visual = self._frontend.process(frameset, self._belief.motion_since)
         measured = perf_counter()
         if not starting:
-            self._tell_of_vision(stamp_ns, visual)
+            self._vision_reports.update(stamp_ns, visual, self._frontend.misaligned)
         at_rest = visual.at_rest and self._imu_is_at_rest(span)
         motion = self._belief.use(visual, at_rest)
         used = motion is not None or starting
@@ -364,27 +363,10 @@ class Odometry:
             stage_ms=stage_ms,
         )
 
-    def _tell_of_vision(self, stamp_ns: int, visual: VisualResult) -> None:
-        if visual.quality is not Quality.GOOD:
-            self._report(stamp_ns, f"vision_{visual.quality}", visual.reason)
-        for j in sorted(visual.frozen - self._frozen):
-            self._report(
-                stamp_ns,
-                "camera_frozen",
-                f"pair {self.rig.pairs[j].name} is left out: a camera repeats its image while others do not",
-            )
-        self._frozen = visual.frozen
-        for j, misalignment in self._frontend.misaligned.items():
-            if j in self._told_misaligned:
-                continue
-            self._told_misaligned.add(j)
-            self._report(stamp_ns, "extrinsics_off", f"{misplaced(self.rig, j, misalignment)}; corrected for this run")
-
     @property
     def rig_warnings(self) -> list[str]:
         """What the motions until now refute of the rig, a sentence each, with its size and one standard deviation."""
-        found = sorted(self._frontend.misaligned.items())
-        return [f"{misplaced(self.rig, j, misalignment)}; corrected for this run" for j, misalignment in found]
+        return self._vision_reports.rig_warnings
 
     def _report(self, stamp_ns: int, kind: str, detail: str) -> None:
         self._incidents.append(Incident(stamp_ns, kind, detail))

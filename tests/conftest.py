@@ -10,6 +10,11 @@ from graphvio.simulation import simulate
 matplotlib.use("Agg")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files that take minutes come first, so that no process is left with one at the end."""
+    items.sort(key=lambda item: item.get_closest_marker("heavy") is None)
+
+
 @pytest.fixture(scope="session")
 def room_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated recording: 5 s in the room, the first of them at rest, both pairs and the IMU."""

@@ -22,7 +22,8 @@ from graphvio.cli import app
 from graphvio.config import Config
 from graphvio.geometry import se3_exp, se3_inverse, se3_log, so3_exp, so3_log
 
-pytestmark = pytest.mark.xdist_group("calibrate")
+pytestmark = pytest.mark.heavy
+
 
 SECONDS = 6.0
 

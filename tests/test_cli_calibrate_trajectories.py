@@ -15,8 +15,6 @@ from graphvio.cli import app
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.trajectory import Trajectory
 
-pytestmark = pytest.mark.xdist_group("calibrate_trajectories")
-
 
 def command(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["calibrate-trajectories", *map(str, arguments)], env={"COLUMNS": "160"})

@@ -14,6 +14,8 @@ import pytest
 from graphvio import Trajectory, open_source
 from graphvio.geometry import se3_inverse
 
+pytestmark = pytest.mark.heavy
+
 pytest.importorskip("pycolmap")
 pytest.importorskip("grpc")
 
@@ -34,7 +36,6 @@ def made(room_walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.mark.xdist_group("slam")
 def test_a_map_is_made_and_its_paths_are_those_of_the_odometry_until_a_loop_is_closed(
     made: Path, room_walk: Path
 ) -> None:
@@ -48,7 +49,6 @@ def test_a_map_is_made_and_its_paths_are_those_of_the_odometry_until_a_loop_is_c
     assert (made.parent / "shown.rrd").stat().st_size > 10_000
 
 
-@pytest.mark.xdist_group("slam")
 def test_the_way_is_found_in_a_saved_map(made: Path, room_walk: Path, tmp_path: Path) -> None:
     """From the middle of the walk, where the new odom frame has nothing to do with the map's."""
     done = slam(f"replay:{room_walk}?from_s=1.5&speed=0.3", "--map", made, "--out", tmp_path / "again")
@@ -65,7 +65,6 @@ def test_the_way_is_found_in_a_saved_map(made: Path, room_walk: Path, tmp_path: 
     assert np.linalg.norm(online.positions[0] - start) > 0.2
 
 
-@pytest.mark.xdist_group("slam")
 def test_a_map_that_is_none_ends_it_at_once(room_walk: Path, tmp_path: Path) -> None:
     done = slam(f"replay:{room_walk}", "--map", tmp_path / "nowhere")
     assert done.returncode == 2
@@ -74,7 +73,6 @@ def test_a_map_that_is_none_ends_it_at_once(room_walk: Path, tmp_path: Path) -> 
     assert done.stderr.rstrip().splitlines()[-1].startswith("graphvio: ")
 
 
-@pytest.mark.xdist_group("slam")
 def test_a_signal_to_both_processes_ends_it_with_the_map_saved(room_walk: Path, tmp_path: Path) -> None:
     """As service managers send it."""
     command = [sys.executable, "-c", "from graphvio.cli import main; main()", "slam", f"replay:{room_walk}?speed=0.2"]

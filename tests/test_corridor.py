@@ -11,7 +11,8 @@ from graphvio.results import ResultWriter
 from graphvio.simulation import simulate
 from graphvio.sources import open_source
 
-pytestmark = pytest.mark.xdist_group("corridor")
+pytestmark = pytest.mark.heavy
+
 DURATION_S = 30.0
 
 

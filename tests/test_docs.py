@@ -6,15 +6,12 @@ import sys
 from dataclasses import fields
 from pathlib import Path
 
-import pytest
-
 from graphvio.config import Config, profiles
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 
 
-@pytest.mark.xdist_group("room_walk")
 def test_the_readmes_python_runs_as_typed(room_walk: Path, tmp_path: Path) -> None:
     blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len(blocks) == 1

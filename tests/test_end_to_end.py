@@ -17,7 +17,8 @@ from recordings import REAL_DATA
 from graphvio import FrameSet, open_source
 from graphvio.trajectory import Trajectory
 
-pytestmark = pytest.mark.xdist_group("room_walk")
+pytestmark = pytest.mark.heavy
+
 
 CLIP = REAL_DATA / "euroc_mh01_clip"
 needs_clip = pytest.mark.skipif(not CLIP.is_dir(), reason=f"the real recording {CLIP.name} is not beside the project")

@@ -198,7 +198,6 @@ def test_it_needs_motions_over_one_step() -> None:
         Config.from_yaml("fusion: {estimator: filter}")
 
 
-@pytest.mark.xdist_group("room_walk")
 @pytest.mark.parametrize("bias", ["estimated", "none"])
 def test_the_odometry_runs_with_it(room_walk: Path, bias: str) -> None:
     source = open_source(room_walk)

@@ -21,8 +21,6 @@ from graphvio.geometry import se3_inverse, se3_log
 from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
 
-pytestmark = pytest.mark.xdist_group("room_walk")
-
 Change = Callable[[float, FrameSet], FrameSet]
 """Takes seconds since the first frameset, and a frameset."""
 

@@ -29,8 +29,6 @@ from graphvio.slam.map_frame import MapFrame
 from graphvio.step import Step
 from graphvio.trajectory import Trajectory
 
-pytestmark = pytest.mark.xdist_group("room_walk")
-
 SOON_S = 30.0  # until then a thread is waited for; only a test that fails takes so long
 TIGHT = np.diag(np.repeat([1e-3, 1e-2], 3) ** 2)
 

@@ -32,8 +32,6 @@ from graphvio.live.source import Notice, Reading
 from graphvio.live.stage import Stage
 from graphvio.sessions.mcap_file import McapFile
 
-with_room = pytest.mark.xdist_group("room_walk")
-
 
 def until(is_so: Callable[[], Any]) -> None:
     """Wait; only a test that fails waits long."""
@@ -58,7 +56,6 @@ def no_thread_is_left() -> Iterator[None]:
 # ---------------------------------------------------------------- the same estimates
 
 
-@with_room
 def test_a_replay_is_the_plain_odometry_bit_for_bit_and_so_is_what_it_recorded(room_walk: Path, tmp_path: Path) -> None:
     pytest.importorskip("mcap")
     rig, expected = open_source(room_walk).rig, plain(room_walk)
@@ -73,7 +70,6 @@ def test_a_replay_is_the_plain_odometry_bit_for_bit_and_so_is_what_it_recorded(r
     assert_same(plain(tmp_path / "live.mcap"), expected)
 
 
-@with_room
 @pytest.mark.parametrize("speed", ["4", "40"])
 def test_in_real_time_each_frameset_is_estimated_or_counted_and_no_sample_is_lost(room_walk: Path, speed: str) -> None:
     """At forty times its speed there is no time for all of it on any machine."""
@@ -93,7 +89,6 @@ def test_in_real_time_each_frameset_is_estimated_or_counted_and_no_sample_is_los
     assert stamps == sorted(stamps)
 
 
-@with_room
 def test_devices_that_come_back_go_on_in_the_same_epoch_if_the_imu_lives(room_walk: Path) -> None:
     simulator = f"simulator:room?recording={room_walk}&seed=3&speed=max&legs=1"
     estimates, told, figures = run_spec(f"{simulator}&unplug=front@2-3,back@2-3")
@@ -104,7 +99,6 @@ def test_devices_that_come_back_go_on_in_the_same_epoch_if_the_imu_lives(room_wa
     assert kinds.count("device_lost") == kinds.count("device_back") == 2
 
 
-@with_room
 def test_one_pair_goes_on_alone(room_walk: Path) -> None:
     estimates, _, figures = run_spec(f"simulator:room?recording={room_walk}&seed=3&speed=max&legs=1&unplug=back@2-3")
     assert {(each.epoch, each.status) for each in estimates[-60:]} == {(0, "tracking")}
@@ -113,7 +107,6 @@ def test_one_pair_goes_on_alone(room_walk: Path) -> None:
     assert figures["framesets"] == 100
 
 
-@with_room
 def test_after_everything_was_gone_for_too_long_a_new_epoch_begins(room_walk: Path) -> None:
     gone = "@1.5-4.7"
     estimates, told, _ = run_spec(
@@ -123,7 +116,6 @@ def test_after_everything_was_gone_for_too_long_a_new_epoch_begins(room_walk: Pa
     assert "time_jump" in {incident.kind for incident in told}
 
 
-@with_room
 def test_clocks_that_drift_and_readings_that_come_late(room_walk: Path) -> None:
     """With the times of arrival that a host would have noted, whatever this machine has to do meanwhile."""
     from graphvio.live.sources.pacing import Pace

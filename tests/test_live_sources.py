@@ -25,8 +25,6 @@ from graphvio.live.sources.simulator import _leg
 from graphvio.simulation import simulate
 from graphvio.simulation.simulator import make_simulator
 
-with_room = pytest.mark.xdist_group("room_walk")
-
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -185,7 +183,6 @@ def test_speeds() -> None:
 # ---------------------------------------------------------------- the simulated rig, to and fro
 
 
-@with_room
 def test_there_and_back_is_the_same_way(room_walk: Path) -> None:
     """Rotations that the gyro tells cancel, accelerations and images come in the other order."""
     source = open_source(room_walk)
@@ -222,7 +219,6 @@ def test_there_and_back_is_the_same_way(room_walk: Path) -> None:
         np.testing.assert_array_equal(one_way.linear_acceleration, other_way.linear_acceleration)
 
 
-@with_room
 def test_a_walk_that_ends_in_motion_is_not_walked_back(room_walk: Path) -> None:
     spec = f"simulator:room?recording={room_walk}&seed=3"
     with pytest.raises(SourceError, match="does not end at rest, so that it cannot be walked back"):

@@ -28,8 +28,6 @@ from graphvio.backend.window import Window, WindowError
 from graphvio.events import Event, Quality
 from graphvio.trajectory import Trajectory
 
-pytestmark = pytest.mark.xdist_group("room_walk")
-
 
 @pytest.fixture(scope="module")
 def events(room_walk: Path) -> list[Event]:

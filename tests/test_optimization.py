@@ -265,7 +265,6 @@ def test_other_tools_find_the_same_optimum_in_the_pose_graph(walk: DrawnSession,
     assert found.values.exists(x(0))
 
 
-@pytest.mark.xdist_group("room_walk")
 def test_an_imu_that_is_found_wrong_does_not_bend_the_trajectory(room_walk: Path) -> None:
     """From 2.5 s on its biases are others: vision is refused for a second, and then believed, also in what it said."""
     source = open_source(room_walk)

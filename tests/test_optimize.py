@@ -27,6 +27,8 @@ from graphvio.optimization.pipeline import optimize_sessions
 from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
 
+pytestmark = pytest.mark.heavy
+
 pycolmap: Any = pytest.importorskip("pycolmap", reason="loop closure needs the extra maps")
 CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 SECONDS = 7.0

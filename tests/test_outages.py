@@ -18,7 +18,8 @@ from graphvio.rig import Rig
 from graphvio.simulation import simulate
 from graphvio.trajectory import Trajectory
 
-pytestmark = pytest.mark.xdist_group("outages")
+pytestmark = pytest.mark.heavy
+
 START_S = 3.0  # of what goes wrong
 PERIOD_S = 0.05
 DURATION_S = 10.0

@@ -25,7 +25,8 @@ from graphvio.sources.sequencer import merge
 from graphvio.synchroniser import Synchroniser
 from graphvio.trajectory import Trajectory
 
-pytestmark = pytest.mark.xdist_group("unsynchronised")
+pytestmark = pytest.mark.heavy
+
 
 MS = 1_000_000
 DURATION_S = 3.0
