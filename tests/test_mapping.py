@@ -95,7 +95,7 @@ def test_no_closure_that_is_used_is_wrong(made: Made) -> None:
 
 def test_the_map_on_disk_is_whole(made: Made) -> None:
     header = json.loads((made.folder / "map.json").read_text())
-    assert (header["format"], header["version"]) == ("graphvio map", 1)
+    assert (header["format"], header["version"]) == ("graphvio map", 2)
     assert header["places"] == made.mapper.summary()["places"]
     assert {path.name for path in made.folder.parent.iterdir()} == {"room"}  # nothing unfinished is left
 
@@ -177,7 +177,7 @@ def test_what_is_no_map_is_refused(copied: Path, tmp_path: Path) -> None:
         Mapper(walk, CONFIG, tmp_path)
     header = json.loads((copied / "map.json").read_text())
     (copied / "map.json").write_text(json.dumps(header | {"version": 99}))
-    with pytest.raises(MapError, match="of version 99, this graphvio reads 1"):
+    with pytest.raises(MapError, match="of version 99, this graphvio reads 2"):
         Mapper(walk, CONFIG, copied)
     (copied / "map.json").write_text("{")
     with pytest.raises(MapError, match=r"map.json: is damaged"):

@@ -67,6 +67,7 @@ def estimate(number: int, epoch: int = 0, status: Status = Status.TRACKING) -> E
         epoch,
         velocity_nav=rng.normal(size=3),
         velocity_covariance=random_covariance(rng, 3, 0.1),
+        rates={"fused": np.array([0.1, 0.2, number]), "gyro": np.zeros(3)} if number else {},
     )
 
 
@@ -163,6 +164,10 @@ def test_poses_transforms_and_path_are_published(system: System) -> None:
         np.testing.assert_allclose(covariance[3:, :3], R @ each.covariance[:3, 3:] @ R.T, atol=1e-12)
         linear = told["twist"]["twist"]["linear"]
         np.testing.assert_allclose([linear["x"], linear["y"], linear["z"]], R.T @ each.velocity_nav)
+        angular = told["twist"]["twist"]["angular"]
+        expected = each.rates.get("fused", np.full(3, np.nan))
+        np.testing.assert_array_equal([angular["x"], angular["y"], angular["z"]], expected)
+        assert np.isnan(np.array(told["twist"]["covariance"]).reshape(6, 6)[3:]).all()
         (link,) = moved["transforms"]
         assert (link["header"]["frame_id"], link["child_frame_id"]) == ("odom", "imu_link")
         assert stamp_of(link["header"]) == each.stamp_ns

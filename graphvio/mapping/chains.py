@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import gtsam
 import numpy as np
@@ -13,7 +14,8 @@ from graphvio.backend.noise import gaussian
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 from graphvio.optimization.tie import Tie
 
-_LEAST_VARIANCE = 1e-12  # a micrometre, a microradian: keeps a covariance that says nothing is uncertain invertible
+EXACT: Final = 1e-12 * np.eye(6)
+"""A micrometre, a microradian: keeps a covariance that says nothing is uncertain invertible."""
 
 
 class Chains:
@@ -24,7 +26,6 @@ class Chains:
 
     def __init__(self) -> None:
         self.starts: list[int] = []
-        self.priors: list[Float] = []
         self.motions: list[Float] = []
         self.covariances: list[Float] = []
         self.poses: list[Float] = []
@@ -44,10 +45,9 @@ class Chains:
         """The fragment of a place."""
         return int(np.searchsorted(self.starts, place, side="right")) - 1
 
-    def begin(self, odom_T_body: Float, covariance: Float) -> None:
-        """Add a fragment with its first place (4, 4), in its odom frame, and that pose's covariance (6, 6)."""
+    def begin(self, odom_T_body: Float) -> None:
+        """Add a fragment with its first place (4, 4), in its odom frame."""
         self.starts.append(len(self))
-        self.priors.append(_regular(covariance))
         self._append(np.eye(4), np.zeros((6, 6)), odom_T_body, np.zeros((6, 6)))
 
     def add(self, previous_T_body: Float, covariance: Float) -> None:
@@ -79,17 +79,16 @@ class Chains:
             graph.add(self._factors[place])
 
     def prior(self, fragment: int) -> gtsam.NonlinearFactor:
-        """Where a fragment's odometry began, which is what its odom frame is."""
+        """Where a fragment begins: its frame is what makes this so, how uncertain odometry may be of gravity there."""
         start = self.starts[fragment]
-        return gtsam.PriorFactorPose3(x(start), gtsam.Pose3(self.poses[start]), gaussian(self.priors[fragment]))
+        return gtsam.PriorFactorPose3(x(start), gtsam.Pose3(self.poses[start]), gaussian(EXACT))
 
     @staticmethod
-    def of(starts: Sequence[int], priors: Float, firsts: Float, motions: Float, covariances: Float) -> Chains:
+    def of(starts: Sequence[int], firsts: Float, motions: Float, covariances: Float) -> Chains:
         """Chains again from what they were made of.
 
         Args:
             starts: first place of each of F fragments.
-            priors: (F, 6, 6).
             firsts: (F, 4, 4) poses of these.
             motions: (N, 4, 4) of all places; those of the first ones are not used.
             covariances: (N, 6, 6).
@@ -97,8 +96,7 @@ class Chains:
         made = Chains()
         for n, (motion, covariance) in enumerate(zip(motions, covariances, strict=True)):
             if n in starts:
-                k = list(starts).index(n)
-                made.begin(firsts[k], priors[k])
+                made.begin(firsts[list(starts).index(n)])
             else:
                 made.add(motion, covariance)
         return made
@@ -111,4 +109,4 @@ class Chains:
 
 
 def _regular(covariance: Float) -> Float:
-    return np.asarray(0.5 * (covariance + covariance.T) + _LEAST_VARIANCE * np.eye(6))
+    return np.asarray(0.5 * (covariance + covariance.T) + EXACT)

@@ -198,7 +198,7 @@ class Mapper:
             self._keyframe_ids.append(keyframe.id)
             # The graph comes last: what is saved after an interruption is what it holds.
             if new.previous_T_body is None or new.covariance is None:
-                self._graph.begin(keyframe.odom_T_body, keyframe.covariance)
+                self._graph.begin(keyframe.odom_T_body)
             else:
                 self._graph.add(new.previous_T_body, new.covariance)
         if number == 0:

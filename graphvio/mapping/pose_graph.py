@@ -17,7 +17,7 @@ from graphvio.arrays import Float
 from graphvio.backend.factors import x
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.geometry import se3_inverse
-from graphvio.mapping.chains import Chains
+from graphvio.mapping.chains import EXACT, Chains
 from graphvio.mapping.places import composed
 from graphvio.optimization.consistency import Joined, consistent, join_fragments
 from graphvio.optimization.loops.search import LoopClosure
@@ -85,12 +85,12 @@ class PoseGraph:
     def __len__(self) -> int:
         return len(self._poses)
 
-    def begin(self, odom_T_body: Float, covariance: Float) -> int:
-        """Add a place that begins a fragment, by its pose (4, 4) in odom and its covariance; returns its number."""
-        self.chains.begin(odom_T_body, covariance)
+    def begin(self, odom_T_body: Float) -> int:
+        """Add a place that begins a fragment, by its pose (4, 4) in odom; returns its number."""
+        self.chains.begin(odom_T_body)
         self._poses.append(odom_T_body)
         self._component.append(len(self._component))
-        self._bounds.append(covariance)
+        self._bounds.append(EXACT)
         return len(self) - 1
 
     def add(self, previous_T_body: Float, covariance: Float) -> int:
@@ -116,7 +116,7 @@ class PoseGraph:
         return self._poses[place]
 
     def covariance(self, place: int) -> Float:
-        """Covariance (6, 6) of that, tangent ``[rotation, translation]`` in body; of the frame's origin it is free."""
+        """Its covariance (6, 6) relative to the frame's first place, tangent ``[rotation, translation]`` in body."""
         return self._known(self._component_of(place)).pose(place)
 
     def may_see(self, one: int, other: int) -> bool:

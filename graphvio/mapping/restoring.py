@@ -27,7 +27,6 @@ def to_saved(graph: PoseGraph, recognition: Recognition, places: Sequence[Place]
         covariance=np.array([graph.covariance(k) for k in range(n)]).reshape(-1, 6, 6),
         starts=np.array(chains.starts, dtype=np.int64),
         component=np.array(graph.component, dtype=np.int64),
-        priors=np.array(chains.priors).reshape(-1, 6, 6),
         firsts=np.array([chains.poses[start] for start in chains.starts]).reshape(-1, 4, 4),
         motions=np.array(chains.motions).reshape(-1, 4, 4),
         motion_covariances=np.array(chains.covariances).reshape(-1, 6, 6),
@@ -44,7 +43,7 @@ def to_saved(graph: PoseGraph, recognition: Recognition, places: Sequence[Place]
 
 def restored(kept: SavedMap, config: Config) -> tuple[PoseGraph, Recognition, list[Place]]:
     """The graph as it was, what its places look like, and the places."""
-    chains = Chains.of(kept.starts.tolist(), kept.priors, kept.firsts, kept.motions, kept.motion_covariances)
+    chains = Chains.of(kept.starts.tolist(), kept.firsts, kept.motions, kept.motion_covariances)
     closures = [
         Judged(
             each,

@@ -26,7 +26,7 @@ from graphvio.optimization.loops.search import LoopClosure
 from graphvio.rig import Rig
 from graphvio.rig_files.same import difference, without_masks
 
-FORMAT, VERSION = "graphvio map", 1
+FORMAT, VERSION = "graphvio map", 2
 _HEADER, _RIG, _PLACES, _CLOSURES = "map.json", "rig.yaml", "map.npz", "closures.npz"
 _CHECKED = (_PLACES, _CLOSURES, DATABASE)
 
@@ -42,7 +42,6 @@ class SavedMap:
         covariance: (N, 6, 6) of these, tangent ``[rotation, translation]`` in body.
         starts: (F,) first place of each fragment.
         component: (F,) the fragment in whose frame each is; 0 is the map's.
-        priors: (F, 6, 6) of the first places.
         firsts: (F, 4, 4) of these in their odom frames.
         motions: (N, 4, 4) from the place before.
         motion_covariances: (N, 6, 6).
@@ -62,7 +61,6 @@ class SavedMap:
     covariance: Float
     starts: Int
     component: Int
-    priors: Float
     firsts: Float
     motions: Float
     motion_covariances: Float

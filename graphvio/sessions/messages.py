@@ -127,16 +127,20 @@ def transform(stamp_ns: int, parent: str, child: str, parent_T_child: Float) -> 
 
 
 def odometry(estimate: Estimate) -> Any:
-    """An estimate that has a pose; ROS orders covariances ``[translation, rotation]``, the pose's in the fixed axes."""
+    """An estimate that has a pose; ROS orders covariances ``[translation, rotation]``, the pose's in the fixed axes.
+
+    Rates are those of the newest interval, by all that is known, else by gyro, else by vision. What is not estimated,
+    as the covariance of rates, is NaN.
+    """
     assert estimate.nav_T_body is not None
     assert estimate.covariance is not None
     R = estimate.nav_T_body[:3, :3]
-    velocity, velocity_covariance = np.zeros(3), np.full((3, 3), np.nan)
+    velocity, rate, twist_covariance = np.full(3, np.nan), np.full(3, np.nan), np.full((6, 6), np.nan)
     if estimate.velocity_nav is not None and estimate.velocity_covariance is not None:
         velocity = R.T @ estimate.velocity_nav
-        velocity_covariance = R.T @ estimate.velocity_covariance @ R
-    twist_covariance = np.zeros((6, 6))
-    twist_covariance[:3, :3] = velocity_covariance
+        twist_covariance[:3, :3] = R.T @ estimate.velocity_covariance @ R
+    for kind in ("vision", "gyro", "fused"):
+        rate = estimate.rates.get(kind, rate)
     return make(
         ODOMETRY,
         header=header(estimate.stamp_ns, ODOM),
@@ -144,7 +148,7 @@ def odometry(estimate: Estimate) -> Any:
         pose=pose_with_covariance(estimate.nav_T_body, estimate.covariance),
         twist=make(
             "geometry_msgs/msg/TwistWithCovariance",
-            twist=make("geometry_msgs/msg/Twist", linear=_vector(velocity), angular=_vector(np.zeros(3))),
+            twist=make("geometry_msgs/msg/Twist", linear=_vector(velocity), angular=_vector(rate)),
             covariance=twist_covariance.reshape(-1),
         ),
     )
