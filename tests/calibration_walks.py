@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from recordings import half_size
+from recordings import half_size_rig
 
 from graphvio.arrays import Float
 from graphvio.geometry import se3_exp
 from graphvio.rig import Rig
-from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
+from graphvio.simulation import Simulator, build_scene, write_recording
 from graphvio.simulation.motion import Motion
 
 Course = Callable[[Float], Float]
@@ -44,12 +44,10 @@ def _course(
 
 def walk_simulator(duration_s: float, course: Course | None = None, trigger_offset_ms: float = 0.0) -> Simulator:
     """Of 320x240 images; without a course the rig is turned about all axes while it is carried around."""
-    rig = default_rig()
-    pairs = tuple(replace(pair, left=half_size(pair.left), right=half_size(pair.right)) for pair in rig.pairs)
     scene = build_scene("calibration", duration_s, 0.0)
     if course is not None:
         scene = replace(scene, motion=Motion(course, duration_s))
-    return Simulator(scene, replace(rig, pairs=pairs), 1, trigger_offset_ms=trigger_offset_ms)
+    return Simulator(scene, half_size_rig(), 1, trigger_offset_ms=trigger_offset_ms)
 
 
 def recorded(folder: Path, duration_s: float, course: Course | None = None, trigger_offset_ms: float = 0.0) -> Path:

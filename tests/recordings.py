@@ -10,6 +10,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.rig import Camera, Imu, Rig, StereoPair
+from graphvio.simulation import default_rig
 
 START_NS = 1_403_636_579_763_555_584
 FRAME_PERIOD_NS = 50_000_000
@@ -50,6 +51,13 @@ def half_size(camera: Camera) -> Camera:
     width, height = camera.size_px
     smaller = np.array([fx / 2, fy / 2, (cx - 0.5) / 2, (cy - 0.5) / 2])
     return replace(camera, intrinsics=smaller, size_px=(width // 2, height // 2))
+
+
+def half_size_rig() -> Rig:
+    """The simulator's rig with images of 320x240: rendering is most of what tests wait for."""
+    rig = default_rig()
+    pairs = tuple(replace(pair, left=half_size(pair.left), right=half_size(pair.right)) for pair in rig.pairs)
+    return replace(rig, pairs=pairs)
 
 
 def frame_stamps(frames: int) -> list[int]:

@@ -4,11 +4,12 @@ import json
 from pathlib import Path
 
 import pytest
+from recordings import half_size_rig
 
 from graphvio.config import Config
 from graphvio.pipeline import run
 from graphvio.results import ResultWriter
-from graphvio.simulation import simulate
+from graphvio.simulation import Simulator, build_scene, write_recording
 from graphvio.sources import open_source
 
 pytestmark = pytest.mark.heavy
@@ -18,10 +19,10 @@ DURATION_S = 30.0
 
 @pytest.fixture(scope="module")
 def corridor(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("simulated") / "corridor"
-    recording = simulate("corridor", out, duration_s=DURATION_S)
+    simulator = Simulator(build_scene("corridor", DURATION_S), half_size_rig(), 0)
+    recording = write_recording(simulator, tmp_path_factory.mktemp("simulated") / "corridor")
     assert {"door", "people", "blank"} <= {name for name, (_, end) in recording.events.items() if end < DURATION_S}
-    return out
+    return recording.path
 
 
 @pytest.mark.parametrize(("pairs", "most_drift_percent"), [([0, 1], 0.2), ([0], 1.0), ([1], 1.0)])

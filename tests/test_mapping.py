@@ -83,6 +83,8 @@ def test_corrections_are_as_good_as_they_say(made: Made) -> None:
     assert np.linalg.norm(error[3:]) < 0.005
     assert max(squares) < 40.0
     assert np.median(squares) < 12.0
+    # How gravity lies in the first odom frame is uncertain by 15 mrad, and no matter of the map, which has that frame.
+    assert all(np.sqrt(np.trace(covariance[:3, :3])) < 0.012 for _, _, covariance in made.front_end.corrections)
 
 
 def test_no_closure_that_is_used_is_wrong(made: Made) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import half_size_rig
 
 from graphvio import Config, Estimate, FrameSet, ImuSample, Odometry, Status, open_source
 from graphvio.arrays import Float
@@ -15,7 +16,7 @@ from graphvio.backend.window import Window, WindowError
 from graphvio.events import Event
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.rig import Rig
-from graphvio.simulation import simulate
+from graphvio.simulation import Simulator, build_scene, write_recording
 from graphvio.trajectory import Trajectory
 
 pytestmark = pytest.mark.heavy
@@ -28,9 +29,8 @@ MS = 1_000_000
 
 @pytest.fixture(scope="module")
 def walk_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("simulated") / "room"
-    simulate("room", out, duration_s=DURATION_S)
-    return out
+    simulator = Simulator(build_scene("room", DURATION_S), half_size_rig(), 0)
+    return write_recording(simulator, tmp_path_factory.mktemp("simulated") / "room").path
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +129,7 @@ def altered(
 
 
 def blackened(frameset: FrameSet) -> FrameSet:
-    black = np.zeros((480, 640), dtype=np.uint8)
+    black = np.zeros((240, 320), dtype=np.uint8)
     return replace(frameset, images=dict.fromkeys(frameset.images, (black, black)))
 
 

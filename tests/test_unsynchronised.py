@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from recordings import START_NS, frame_stamps, half_size, small_rig, write_euroc, write_rows
+from recordings import START_NS, frame_stamps, half_size_rig, small_rig, write_euroc, write_rows
 
 from graphvio import Estimate, FrameSet, ImuSample, Odometry, Status, open_source
 from graphvio.config import Config
@@ -19,7 +18,7 @@ from graphvio.errors import SourceError
 from graphvio.evaluation import evaluate
 from graphvio.events import Event
 from graphvio.rig import Rig
-from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
+from graphvio.simulation import Simulator, build_scene, write_recording
 from graphvio.sources.matching import TOLERANCE_NS, PairIndex, group_pairs, match_sides
 from graphvio.sources.sequencer import merge
 from graphvio.synchroniser import Synchroniser
@@ -37,10 +36,8 @@ def small_simulator(
     rate_hz: float | Sequence[float] = 20.0, trigger_offset_ms: float = 0.0, duration_s: float = DURATION_S
 ) -> Simulator:
     """A walk through the room with the paper's rig and images of 320x240."""
-    rig = default_rig()
-    pairs = tuple(replace(pair, left=half_size(pair.left), right=half_size(pair.right)) for pair in rig.pairs)
     scene = build_scene("room", duration_s, 0.5)
-    return Simulator(scene, replace(rig, pairs=pairs), 3, rate_hz, trigger_offset_ms=trigger_offset_ms)
+    return Simulator(scene, half_size_rig(), 3, rate_hz, trigger_offset_ms=trigger_offset_ms)
 
 
 # ------------------------------------------------------------------ the simulator

@@ -19,7 +19,7 @@ from graphvio.rig import Rig
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
 
 _LEAST_STEP_M = 0.05  # a motion is known no better than over this
-_FIRST_SIGMAS = np.repeat([1e-4, 1e-4], 3)
+_FIRST_SIGMAS = np.repeat([1.5e-2, 1e-3], 3)  # an odometry's at rest: gravity is as uncertain as the IMU's bias
 _PATIENCE_S = 0.001
 
 
