@@ -10,29 +10,34 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ros2_loopback import URI, free_domain
 
 from graphvio import Trajectory, open_source
 from graphvio.geometry import se3_inverse
 
-pytestmark = pytest.mark.heavy
-
 pytest.importorskip("pycolmap")
 pytest.importorskip("grpc")
+pytest.importorskip("cyclonedds")
+pytestmark = pytest.mark.heavy
 
 SOON_S = 200.0
 
 
 def slam(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", "from graphvio.cli import main; main()", "slam", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=SOON_S)
+    env = {**os.environ, "CYCLONEDDS_URI": URI}
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=SOON_S, env=env)
 
 
 @pytest.fixture(scope="module")
 def made(room_walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A map of the walk."""
+    """A map of the walk, made with all that can run beside."""
     out = tmp_path_factory.mktemp("slam") / "map"
-    done = slam(f"replay:{room_walk}?speed=0.5", "--out", out, "--save-rrd", out.parent / "shown.rrd")
+    beside = ("--save-rrd", out.parent / "shown.rrd", "--health-port", 0, "--ros2", free_domain())
+    done = slam(f"replay:{room_walk}?speed=0.5", "--out", out, *beside)
     assert done.returncode == 0, done.stderr
+    assert "health: http://127.0.0.1:" in done.stderr
+    assert "ROS 2: topics below /graphvio" in done.stderr
     return out
 
 

@@ -27,9 +27,8 @@ from graphvio.optimization.pipeline import optimize_sessions
 from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
 
-pytestmark = pytest.mark.heavy
-
 pycolmap: Any = pytest.importorskip("pycolmap", reason="loop closure needs the extra maps")
+pytestmark = pytest.mark.heavy
 CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 SECONDS = 7.0
 SETTINGS = "optimization: {loop_interval_s: 3.0, place_distance_m: 0.2, features: 500}\n"
