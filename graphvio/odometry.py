@@ -106,6 +106,17 @@ class Odometry:
         frameset = self._synchroniser.next_due(started=self._belief.has_started)
         return None if frameset is None else self._estimate(frameset)
 
+    @property
+    def held_ns(self) -> int | None:
+        """Stamp of the oldest frameset that is held until the IMU covers it, or None."""
+        return self._synchroniser.held_ns
+
+    def process_held(self) -> Estimate | None:
+        """The estimate of the oldest frameset that is held, or None while there is none: for real time, where it cannot
+        wait for the IMU any longer. Samples that come later are used for the motion from it on."""
+        frameset = self._synchroniser.next_held()
+        return None if frameset is None else self._estimate(frameset)
+
     def finish(self) -> list[Estimate]:
         """Estimates of the framesets still held when the input has ended; the window's poses are final then."""
         if self._finished:

@@ -105,6 +105,11 @@ class Synchroniser:
             return None
         return self._held.popleft()
 
+    @property
+    def held_ns(self) -> int | None:
+        """Stamp of the oldest held frameset, or None."""
+        return self._held[0].stamp_ns if self._held else None
+
     def next_held(self) -> FrameSet | None:
         """The oldest held frameset, due or not, or None."""
         return self._held.popleft() if self._held else None

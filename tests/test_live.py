@@ -89,6 +89,14 @@ def test_in_real_time_each_frameset_is_estimated_or_counted_and_no_sample_is_los
     assert stamps == sorted(stamps)
 
 
+def test_an_imu_that_falls_silent_is_not_awaited_beyond_the_limit(room_walk: Path) -> None:
+    estimates, told, figures = run_spec(f"simulator:room?recording={room_walk}&seed=3&legs=1&unplug=imu@3-4")
+    assert int(figures["imu_not_awaited"] or 0) >= 1
+    assert "imu_not_covering" in {incident.kind for incident in told}
+    assert {each.epoch for each in estimates} == {0}
+    assert estimates[-1].status == "tracking"
+
+
 def test_devices_that_come_back_go_on_in_the_same_epoch_if_the_imu_lives(room_walk: Path) -> None:
     simulator = f"simulator:room?recording={room_walk}&seed=3&speed=max&legs=1"
     estimates, told, figures = run_spec(f"{simulator}&unplug=front@2-3,back@2-3")

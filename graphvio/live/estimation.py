@@ -87,11 +87,13 @@ class Estimation:
     def estimate(self, stage: Stage) -> None:
         """Work on what comes, until its end."""
         while not self.inbox.is_finished:
-            taken = self.inbox.take(_ROUND_S)
-            if taken is None:
-                continue
-            with stage.working():
-                self._process(stage, *taken)
+            taken = self.inbox.take(self._patience_s())
+            if taken is not None:
+                with stage.working():
+                    self._process(stage, *taken)
+            elif self._patience_s() == 0.0:
+                with stage.working():
+                    self._process_held(stage)
         with stage.working():
             for estimate in self._odometry.finish():
                 self._deliver(stage, estimate)
@@ -113,6 +115,23 @@ class Estimation:
             begun_ns = host_ns()
             estimate = self._odometry.process_due()
         self._tell_incidents()
+
+    def _patience_s(self) -> float:
+        """How long there is nothing to do if nothing comes: what the odometry holds must not be late for the IMU."""
+        held_ns = self._odometry.held_ns
+        under_way = None if held_ns is None else self._under_way.get(held_ns)
+        if under_way is None or not self._is_limited(under_way.arrival_ns):
+            return _ROUND_S
+        waited_ms = 1e-6 * (host_ns() - under_way.arrival_ns)
+        return min(max(1e-3 * (self.load.patience_ms - waited_ms), 0.0), _ROUND_S)
+
+    def _process_held(self, stage: Stage) -> None:
+        """All that has come has been taken, and the oldest frameset cannot wait for what has not."""
+        begun_ns = host_ns()
+        estimate = self._odometry.process_held()
+        if estimate is not None:
+            self._meter.count("imu_not_awaited")
+            self._conclude(stage, estimate, begun_ns)
 
     def _conclude(self, stage: Stage, estimate: Estimate, begun_ns: int) -> None:
         """An estimate has been made since then."""

@@ -53,6 +53,11 @@ class LoadControl:
         return True
 
     @property
+    def patience_ms(self) -> float:
+        """How long after its arrival the work on a frameset can begin, to end in time."""
+        return max(self._limit_ms - self._likely_ms, 0.0)
+
+    @property
     def _likely_ms(self) -> float:
         """What the work on a frameset will hardly exceed."""
         return (self._work_ms or 0.0) + _DEVIATIONS * self._deviation_ms
