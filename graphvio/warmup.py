@@ -50,6 +50,7 @@ def warm_up(rig: Rig, config: Config) -> None:
         solve(RigArrays.of(rig), observations, np.eye(4), config.motion, rng)
     learn_from_nothing(joint_motion(RigArrays.of(rig), observations, np.eye(4), config.motion, rng))
     orientations(noise, np.full((1, 2), 20.0))
+    pair.left.project(np.ones((1, 3)))
     se3(np.eye(3), np.zeros(3))
     se3_exp(np.zeros(6))
     own_covariance(np.eye(6), np.eye(6))

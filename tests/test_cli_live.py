@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
@@ -144,7 +145,13 @@ def test_a_full_disk_ends_the_recording_and_not_the_run(recording: Path, tmp_pat
     )
     assert done.returncode == 3, done.stderr
     assert "Traceback" not in done.stderr
-    assert "recording stopped" in done.stderr.splitlines()[-1]
+    told = re.search(r"recording stopped .*; (\d+) framesets and (\d+) samples", done.stderr.splitlines()[-1])
+    assert told is not None, done.stderr
+    recorded = re.search(r"(\d+) framesets$", done.stdout.splitlines()[-1])
+    assert recorded is not None
+    assert int(recorded[1]) + int(told[1]) == 101
+    assert int(told[1]) > 5
+    assert int(told[2]) > 50
     assert "101 estimates of 101 framesets" in done.stdout
     assert framesets_in(out) > 5
 

@@ -15,6 +15,7 @@ from graphvio.arrays import Float, Int
 from graphvio.live.clock import ClockMap, ClockMaps
 from graphvio.live.drawn_clock import Conditions, Messages, clock_errors, draw_messages
 from graphvio.live.envelope import Envelope
+from graphvio.live.shared_clock import SharedClock
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -354,10 +355,61 @@ def test_a_clock_that_stood_still_is_mapped_anew() -> None:
     assert np.abs(errors_us(run, joined(before, shifted))[-1000:]).max() < 100.0
 
 
-def test_without_a_clock_stamps_are_kept() -> None:
-    maps = ClockMaps(lambda *_: None)
-    assert maps.map(None, 123, 456) == 123
-    assert not maps.drifts_ppm
+# ------------------------------------------------------------------ sensors that share a clock
+
+
+class Shared:
+    """Two sensors on one clock, and what is told of it."""
+
+    def __init__(self) -> None:
+        self.told: Counter[str] = Counter()
+        self.clock = SharedClock(lambda stamp_ns, kind, detail: self.told.update([kind]))
+
+    def feed(self, start_ms: float, count: int, camera_lag_ms: float = 0.0) -> tuple[list[float], list[float]]:
+        """Stamps in ms of an IMU (5 ms) and a camera (50 ms) whose images come later; as they are to be used."""
+        messages = [(5.0 * k, "imu", start_ms + 5.0 * k) for k in range(count)]
+        messages += [(50.0 * k + camera_lag_ms, "cam0", start_ms + 50.0 * k) for k in range(count // 10)]
+        used: dict[str, list[float]] = {"imu": [], "cam0": []}
+        for _, sensor, stamp_ms in sorted(messages):
+            mapped = self.clock.map(sensor, round(1e6 * stamp_ms))
+            if mapped is not None:
+                used[sensor].append(1e-6 * mapped)
+        return used["imu"], used["cam0"]
+
+
+def test_without_a_clock_of_their_own_stamps_are_kept() -> None:
+    run = Shared()
+    imu, cam0 = run.feed(1000.0, 200, camera_lag_ms=180.0)
+    np.testing.assert_allclose(imu, 1000.0 + 5.0 * np.arange(200))
+    np.testing.assert_allclose(cam0, 1000.0 + 50.0 * np.arange(20))
+    assert not run.told
+
+
+@pytest.mark.parametrize("back_ms", [400.0, 3000.0, 3600e3])
+@pytest.mark.parametrize("lag_ms", [0.0, 60.0])
+def test_a_clock_that_is_set_back_goes_on_after_a_gap_for_all_sensors_alike(back_ms: float, lag_ms: float) -> None:
+    run = Shared()
+    imu, cam0 = run.feed(10_000.0, 1000, lag_ms)
+    end_ms = imu[-1]
+    imu, cam0 = run.feed(15_000.0 - back_ms, 400, lag_ms)
+    assert run.told["clock_restarted"] == 1
+    assert imu[0] == pytest.approx(end_ms + 4000.0, abs=10.0)
+    np.testing.assert_allclose(np.diff(imu), 5.0)
+    late = [each for each in cam0 if each < end_ms + 3000.0]
+    assert len(late) <= 2  # as they are, late, and left out by what comes next
+    shift = imu[-1] - (15_000.0 - back_ms + 5.0 * 399)
+    expected = 15_000.0 - back_ms + 50.0 * np.arange(40) + shift
+    np.testing.assert_allclose(cam0[len(late) :], expected[len(late) - len(cam0) :])
+
+
+def test_wild_stamps_and_small_disorder_set_nothing_back() -> None:
+    run = Shared()
+    run.feed(0.0, 100)
+    for stamp_ms in (505.0, 60_000.0, 510.0, 480.0, 515.0, -60_000.0, 520.0, 525.0):
+        run.clock.map("imu", round(1e6 * stamp_ms))
+    imu, _ = run.feed(530.0, 100)
+    np.testing.assert_allclose(imu, 530.0 + 5.0 * np.arange(100))
+    assert run.told == {"stamp_implausible": 1}
 
 
 # ------------------------------------------------------------------ the line under the delays

@@ -435,10 +435,10 @@ def test_silent_sensors_are_told_and_no_reason_to_begin_anew() -> None:
     source = Scripted(small_rig(1), readings, is_realtime=True, interval_s=0.002)
     running = LiveOdometry(source, source.open(), Config(live=LiveConfig(stuck_s=0.3)))
     running.start()
-    until(lambda: "incident_sensors_silent" in running.status())
+    until(lambda: {"incident_cameras_silent", "incident_imu_silent"} <= running.status().keys())
     assert running.is_healthy
     may_go_on.set()
-    until(lambda: "incident_sensors_back" in running.status())
+    until(lambda: {"incident_cameras_back", "incident_imu_back"} <= running.status().keys())
     running.stop()
 
 
@@ -466,7 +466,7 @@ def test_metrics_are_what_prometheus_reads() -> None:
         "estimates", "skipped_late", "incident_device_lost", "status_tracking", "recorded_framesets"
     )}  # fmt: skip
     told = {each.labels["status"]: each.value for each in families["graphvio_status"].samples}
-    assert told == {"initialising": 0.0, "tracking": 1.0, "coasting": 0.0, "lost": 0.0}
+    assert told == {"initialising": 0.0, "tracking": 1.0, "coasting": 0.0, "lost": 0.0, "stale": 0.0}
     assert "graphvio_temperature_c" not in values
 
 

@@ -67,6 +67,7 @@ def test_a_spec_is_taken_apart() -> None:
         ("", "there is no live source ''"),
         ("simulator:room?speed", "option 'speed' has no value; write KEY=VALUE"),
         ("simulator:room?=3", "has no value"),
+        ("simulator:room?speed=1&speed=2", "option speed is given twice"),
         ("simulator:room?sped=2", "simulator has no option 'sped'.*speed"),
         ("simulator:rom", "there is no scene 'rom'; there are .*room"),
         ("simulator:room?speed=fast", "speed is 'fast'"),

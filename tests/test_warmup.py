@@ -9,6 +9,7 @@ from graphvio import FrameSet, ImuSample, Odometry
 from graphvio.config import Config
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.simulation import default_rig, make_simulator
+from graphvio.slam.keyframe import Keyframe
 from graphvio.warmup import warm_up
 
 _FRAMES = 6
@@ -47,7 +48,10 @@ def test_no_kernel_is_compiled_after_the_warm_up() -> None:
     events = sorted(both, key=lambda event: event.stamp_ns)
     for rig in (simulator.rig, simulator.rig.without_imu()):
         odometry = Odometry(rig)
+        keyframes: list[Keyframe] = []
+        odometry.on_keyframe(keyframes.append)
         for event in events if rig.imu is not None else framesets:
             odometry.process(event)
         odometry.finish()
+        assert keyframes
         assert compiled() - before == set()

@@ -137,10 +137,8 @@ class ClockMaps:
         self._report = report
         self._maps: dict[str, ClockMap] = {}
 
-    def map(self, clock: str | None, stamp_ns: int, arrival_ns: int) -> int | None:
-        """See `ClockMap.map`; without a clock, stamps are kept as they are."""
-        if clock is None:
-            return stamp_ns
+    def map(self, clock: str, stamp_ns: int, arrival_ns: int) -> int | None:
+        """See `ClockMap.map`."""
         if clock not in self._maps:
             self._maps[clock] = ClockMap(clock, self._report)
         return self._maps[clock].map(stamp_ns, arrival_ns)

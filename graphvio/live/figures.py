@@ -16,6 +16,10 @@ _STATM = Path("/proc/self/statm")
 _PAGE_BYTES = 4096
 _NO_NAME = re.compile(r"[^A-Za-z0-9]+")  # what names of figures, which become metrics, must not have
 
+_STALE_NS = 2_000_000_000
+STALE = "stale"
+"""The status where the newest estimate is older than two seconds."""
+
 Figures = dict[str, float | int | str | None]
 
 
@@ -38,8 +42,12 @@ def figures(meter: Meter, latest: Estimate | None, now_ns: int) -> Figures:
         "memory_mb": memory_mb(),
     }
     told |= dict(sorted(counts.items()))
-    if latest is not None:
+    newest_ns = meter.newest_ns("estimates")
+    if latest is not None and newest_ns is not None:
         told |= _of_estimate(latest)
+        told["estimate_age_s"] = 1e-9 * (now_ns - newest_ns)
+        if now_ns - newest_ns > _STALE_NS:
+            told["status"] = STALE
     return told
 
 

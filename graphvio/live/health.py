@@ -12,6 +12,7 @@ from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from graphvio.errors import MissingExtraError, ServiceError
 from graphvio.events import Status
+from graphvio.live.figures import STALE
 
 Figures = Mapping[str, float | int | str | None]
 
@@ -102,8 +103,8 @@ class _Collector:
                 kind = CounterMetricFamily if is_total else GaugeMetricFamily
                 yield kind(f"graphvio_{name}", f"{name} of the odometry", value=float(value))
         status = GaugeMetricFamily("graphvio_status", "1 for the newest estimate's status", labels=["status"])
-        for each in Status:
-            status.add_metric([str(each)], float(figures.get("status") == each))
+        for each in (*map(str, Status), STALE):
+            status.add_metric([each], float(figures.get("status") == each))
         yield status
         yield GaugeMetricFamily("graphvio_up", "1 while all stages live", value=float(figures.get("health") == "ok"))
 

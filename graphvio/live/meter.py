@@ -38,6 +38,12 @@ class Meter:
             while host_ns - stamps[0] > _RATE_S * 1e9:
                 stamps.popleft()
 
+    def newest_ns(self, what: str) -> int | None:
+        """When it came last, or None."""
+        with self._lock:
+            stamps = self._came.get(what)
+            return stamps[-1] if stamps else None
+
     def rate_hz(self, what: str, now_ns: int) -> float:
         """How often it came in the last two seconds."""
         with self._lock:

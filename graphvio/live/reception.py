@@ -12,6 +12,7 @@ from graphvio.live.meter import Meter
 from graphvio.live.ordering import SampleOrder
 from graphvio.live.pairing import FramesetAssembler
 from graphvio.live.pipe import Pipe
+from graphvio.live.shared_clock import SharedClock
 from graphvio.live.source import CameraFrame, ImuReading, LiveSource, Notice, host_ns
 from graphvio.live.stage import Stage
 from graphvio.rig import Imu, Rig
@@ -54,6 +55,7 @@ class Reception:
         self._report = report
         self._bring = bring
         self._clocks = ClockMaps(report)
+        self._shared = SharedClock(report)  # of the readings that name no clock
         self._order = SampleOrder(_MISSING_SAMPLE_MS, (rig.imu or Imu()).rate_hz)
         self._assembler = FramesetAssembler(rig, config.timing.simultaneous_ms, config.live.max_image_wait_ms, report)
 
@@ -92,7 +94,7 @@ class Reception:
             return
         if self._source.is_realtime and reading.arrival_ns < self.started_ns:
             return
-        stamp_ns = self._clocks.map(reading.clock, reading.stamp_ns, reading.arrival_ns)
+        stamp_ns = self._mapped(reading)
         if stamp_ns is None:
             return  # one wild stamp, or the first of a clock that begins anew: told by the clock
         if isinstance(reading, ImuReading):
@@ -107,6 +109,12 @@ class Reception:
             has_room = self.images.put((reading, stamp_ns), waits=not self._source.is_realtime)
         if not has_room:
             self._meter.count("images_not_decoded")
+
+    def _mapped(self, reading: ImuReading | CameraFrame) -> int | None:
+        """Its stamp on the clock of all sensors, or None if it cannot be believed."""
+        if reading.clock is None:
+            return self._shared.map("imu" if isinstance(reading, ImuReading) else reading.camera, reading.stamp_ns)
+        return self._clocks.map(reading.clock, reading.stamp_ns, reading.arrival_ns)
 
     def _next_image(self, stage: Stage) -> tuple[CameraFrame, int] | None:
         """The next image; None at the end. While none comes, framesets that have waited long enough go on."""

@@ -246,10 +246,16 @@ class LiveOdometry:
         self._ended.set()
         self._source.close()
 
-    def _silent_s(self) -> float:
-        """How long nothing has come from sensors that should deliver."""
-        is_awaited = self._source.is_realtime and self._stages[0].is_alive
-        return 1e-9 * (host_ns() - self._reception.last_ns) if is_awaited else 0.0
+    def _silent_s(self) -> Mapping[str, float]:
+        """How long nothing has come from each kind of sensor that should deliver."""
+        if not (self._source.is_realtime and self._stages[0].is_alive):
+            return {}
+        awaited = {"cameras": "images"} | ({} if self.rig.imu is None else {"imu": "imu_samples"})
+        began_ns, now_ns = self._reception.started_ns, host_ns()
+        return {
+            kind: 1e-9 * (now_ns - max(self._meter.newest_ns(what) or began_ns, began_ns))
+            for kind, what in awaited.items()
+        }
 
     def _raise_failure(self) -> None:
         if self._failures:

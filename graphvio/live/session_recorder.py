@@ -40,9 +40,11 @@ class SessionRecorder:
         self._writer = SessionWriter(path, rig, image_format)
         self._waiting: Pipe[Callable[[], None]] = Pipe(_WAITING)
         self._images = threading.Semaphore(_WAITING_IMAGES)
-        self._left_out = 0  # framesets
-        self._lost = 0  # samples, poses, messages
+        self._left_out = 0  # framesets for which the disk was too slow,
+        self._lost = 0  # and samples, poses, messages
         self._framesets = 0
+        self._failed_framesets = 0  # which could not be written
+        self._failed_messages = 0
         self.failure: Exception | None = None
         self._thread = threading.Thread(target=self._write, name="graphvio-record", daemon=True)
         self._thread.start()
@@ -71,8 +73,8 @@ class SessionRecorder:
         return {
             "recorded_framesets": self._framesets,
             "recorded_poses": self._writer.poses,
-            "framesets_not_recorded": self._left_out,
-            "messages_not_recorded": self._lost,
+            "framesets_not_recorded": self._left_out + self._failed_framesets,
+            "messages_not_recorded": self._lost + self._failed_messages,
             "recording_stopped": self._writer.stopped or (str(self.failure) if self.failure else ""),
             "disk_free_gb": self._free_gb(),
         }
@@ -83,7 +85,7 @@ class SessionRecorder:
         self._thread.join()
 
     def _put(self, write: Callable[[], None]) -> None:
-        self._lost += not self._waiting.put(write, self._waits)
+        self._lost += not self._waiting.put(lambda: self._write_message(write), self._waits)
 
     def _free_gb(self) -> float | None:
         try:
@@ -92,16 +94,23 @@ class SessionRecorder:
             return None
 
     def _write_frameset(self, frameset: FrameSet) -> None:
+        is_written = self._is_written(lambda: self._writer.add(frameset))
+        self._framesets += is_written
+        self._failed_framesets += not is_written
+        self._images.release()
+
+    def _write_message(self, write: Callable[[], None]) -> None:
+        self._failed_messages += not self._is_written(write)
+
+    def _is_written(self, write: Callable[[], None]) -> bool:
         try:
-            self._writer.add(frameset)
-            self._framesets += self._writer.stopped is None
-        finally:
-            self._images.release()
+            write()
+        except Exception as error:  # a message that cannot be written is no reason to stop the others
+            self.failure = error
+            return False
+        return self._writer.stopped is None
 
     def _write(self) -> None:
         with self._writer:
             while (write := self._waiting.take()) is not None:
-                try:
-                    write()
-                except Exception as error:  # a message that cannot be written is no reason to stop the others
-                    self.failure = error
+                write()

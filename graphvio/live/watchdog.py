@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from graphvio.live.stage import Stage
 
@@ -20,15 +20,17 @@ class Watchdog:
         stages: to look at.
         stuck_s: a piece of work that takes longer is stuck, and sensors from which nothing came for longer are silent.
         tell: is told when it begins, and when it is over.
-        silent_s: tells for how long nothing has come, 0 where that means nothing.
+        silent_s: tells for how long nothing has come of each kind of sensor that should deliver.
     """
 
-    def __init__(self, stages: Sequence[Stage], stuck_s: float, tell: Tell, silent_s: Callable[[], float]) -> None:
+    def __init__(
+        self, stages: Sequence[Stage], stuck_s: float, tell: Tell, silent_s: Callable[[], Mapping[str, float]]
+    ) -> None:
         self._stages = stages
         self._stuck_s = stuck_s
         self._tell = tell
         self._silent_s = silent_s
-        self._was_silent = False
+        self._silent: frozenset[str] = frozenset()
         self._stuck: frozenset[str] = frozenset()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="graphvio-watchdog", daemon=True)
@@ -65,8 +67,9 @@ class Watchdog:
             for name in sorted(self._stuck - stuck):
                 self._tell("stage_recovered", f"{name} goes on")
             self._stuck = stuck
-            is_silent = self._silent_s() > self._stuck_s
-            if is_silent != self._was_silent:
-                kind = "sensors_silent" if is_silent else "sensors_back"
-                self._tell(kind, f"nothing came for {self._stuck_s:g} s" if is_silent else "readings come again")
-            self._was_silent = is_silent
+            silent = frozenset(kind for kind, since_s in self._silent_s().items() if since_s > self._stuck_s)
+            for kind in sorted(silent - self._silent):
+                self._tell(f"{kind}_silent", f"nothing came for {self._stuck_s:g} s")
+            for kind in sorted(self._silent - silent):
+                self._tell(f"{kind}_back", "readings come again")
+            self._silent = silent

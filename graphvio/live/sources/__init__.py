@@ -47,6 +47,8 @@ class SourceSpec:
             key, equals, value = each.partition("=")
             if not equals or not key or not value:
                 raise SourceError(f"{text}: option {each!r} has no value; write KEY=VALUE")
+            if key in options:
+                raise SourceError(f"{text}: option {key} is given twice")
             options[key] = value
         return SourceSpec(kind, what, options)
 
