@@ -53,12 +53,13 @@ class Dashboard(Redrawn):
             self._console.print(line_of(figures), soft_wrap=True, highlight=False)
 
     def _tell(self, incident: Incident, now: float) -> None:
-        """Show a message; of those of one kind, one in a few seconds, and how many there were."""
-        last, passed_over = self._told.get(incident.kind, (-_PLAIN_S, 0))
+        """Show a message; of those of one kind, one in a few seconds, and how many there were. Each device counts."""
+        kind = incident.detail if incident.kind.startswith("device_") else incident.kind
+        last, passed_over = self._told.get(kind, (-_PLAIN_S, 0))
         if now - last < _PLAIN_S:
-            self._told[incident.kind] = last, passed_over + 1
+            self._told[kind] = last, passed_over + 1
             return
-        self._told[incident.kind] = now, 0
+        self._told[kind] = now, 0
         more = f" (and {passed_over} more before)" if passed_over else ""
         self._messages = [*self._messages, f"{incident.kind}: {incident.detail}{more}"][-_MESSAGES:]
         if not self._console.is_terminal:

@@ -1,7 +1,7 @@
 """``scripts/benchmark slam``: what the reference SLAM makes of the odometry, and how it finds its way in a saved map.
 
 The command ``graphvio slam`` itself is run on the simulated loop at the sensors' pace, and again from other places of
-the same walk with the map that it saved.
+the same walk, with its very images, with the map that it saved.
 """
 
 from __future__ import annotations
