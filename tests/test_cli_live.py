@@ -145,13 +145,9 @@ def test_a_full_disk_ends_the_recording_and_not_the_run(recording: Path, tmp_pat
     )
     assert done.returncode == 3, done.stderr
     assert "Traceback" not in done.stderr
-    told = re.search(r"recording stopped .*; (\d+) framesets and (\d+) samples", done.stderr.splitlines()[-1])
+    told = re.search(r"recording stopped .*: (\d+) framesets of 101$", done.stderr.splitlines()[-1])
     assert told is not None, done.stderr
-    recorded = re.search(r"(\d+) framesets$", done.stdout.splitlines()[-1])
-    assert recorded is not None
-    assert int(recorded[1]) + int(told[1]) == 101
-    assert int(told[1]) > 5
-    assert int(told[2]) > 50
+    assert int(told[1]) == framesets_in(out)
     assert "101 estimates of 101 framesets" in done.stdout
     assert framesets_in(out) > 5
 

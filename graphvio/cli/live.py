@@ -152,14 +152,28 @@ def _tell_recorded(path: Path, told: Mapping[str, float | int | str | None]) -> 
     """What is in the recording; exit code 3 where something is not."""
     size = f"{path.stat().st_size / 1e6:.1f} MB, " if path.exists() else ""
     typer.echo(f"{path}: {size}{told['recorded_framesets']} framesets")
-    if told["recording_stopped"] or told["framesets_not_recorded"] or told["messages_not_recorded"]:
+    if told["recording_stopped"]:
+        came = int(told["recorded_framesets"] or 0) + int(told["framesets_not_recorded"] or 0)
+        typer.echo(f"graphvio: {told['recording_stopped']}: {_readable(path)} framesets of {came}", err=True)
+        raise typer.Exit(EXIT_STOPPED)
+    if told["framesets_not_recorded"] or told["messages_not_recorded"]:
         typer.echo(
-            f"graphvio: {told['recording_stopped'] or 'the disk was too slow'}; "
-            f"{told['framesets_not_recorded']} framesets and {told['messages_not_recorded']} samples, poses and "
-            "messages were left out",
+            f"graphvio: the disk was too slow; {told['framesets_not_recorded']} framesets and "
+            f"{told['messages_not_recorded']} samples, poses and messages were left out",
             err=True,
         )
         raise typer.Exit(EXIT_STOPPED)
+
+
+def _readable(path: Path) -> int:
+    """How many framesets of a recording that was cut can be read: what was under way to the disk is lost, too."""
+    from graphvio.errors import GraphvioError
+    from graphvio.sources import open_source
+
+    try:
+        return open_source(path).frameset_count
+    except GraphvioError:
+        return 0
 
 
 def _viewer(stack: ExitStack, rig: Rig, view: bool, services: Services | None) -> Viewer | None:

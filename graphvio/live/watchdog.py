@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
 
 from graphvio.live.stage import Stage
 
+_log = logging.getLogger(__name__)
 _ROUND_S = 0.25
 
 Tell = Callable[[str, str], None]
@@ -61,15 +63,20 @@ class Watchdog:
 
     def _run(self) -> None:
         while not self._stop.wait(_ROUND_S):
-            stuck = self.stuck
-            for name in sorted(stuck - self._stuck):
-                self._tell("stage_stuck", f"{name} has worked on one thing for more than {self._stuck_s:g} s")
-            for name in sorted(self._stuck - stuck):
-                self._tell("stage_recovered", f"{name} goes on")
-            self._stuck = stuck
-            silent = frozenset(kind for kind, since_s in self._silent_s().items() if since_s > self._stuck_s)
-            for kind in sorted(silent - self._silent):
-                self._tell(f"{kind}_silent", f"nothing came for {self._stuck_s:g} s")
-            for kind in sorted(self._silent - silent):
-                self._tell(f"{kind}_back", "readings come again")
-            self._silent = silent
+            try:
+                self._look()
+            except Exception:  # of an output that is told: stages are watched on
+                _log.exception("an incident could not be told")
+
+    def _look(self) -> None:
+        stuck_before, self._stuck = self._stuck, self.stuck
+        for name in sorted(self._stuck - stuck_before):
+            self._tell("stage_stuck", f"{name} has worked on one thing for more than {self._stuck_s:g} s")
+        for name in sorted(stuck_before - self._stuck):
+            self._tell("stage_recovered", f"{name} goes on")
+        silent_before, silences_s = self._silent, self._silent_s()
+        self._silent = frozenset(kind for kind, since_s in silences_s.items() if since_s > self._stuck_s)
+        for kind in sorted(self._silent - silent_before):
+            self._tell(f"{kind}_silent", f"nothing came for {self._stuck_s:g} s")
+        for kind in sorted(silent_before - self._silent):
+            self._tell(f"{kind}_back", "readings come again")

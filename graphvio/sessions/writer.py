@@ -158,7 +158,7 @@ class SessionWriter:
 
     def _stop(self, error: OSError) -> None:
         rest = (
-            "what was written until a second before can be read"
+            "what was written until then can be read"
             if self._storage.is_readable_when_cut
             else "what was written until then cannot be read: remove it, make room and begin again"
         )
