@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import signal
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from graphvio.cli.run import EXIT_INTERRUPTED
 from graphvio.errors import ServiceError
 
 pytest.importorskip("grpc")
@@ -16,18 +20,28 @@ pytest.importorskip("grpc")
 from graphvio.slam.client import Client
 
 SOON_S = 120.0
+CODE = """
+import signal
+from graphvio.cli import main
+signal.signal(signal.SIGINT, signal.default_int_handler)
+main()
+"""
 
 
 def serve(*arguments: object) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", "from graphvio.cli import main; main()", "serve", *map(str, arguments)]
+    command = [sys.executable, "-c", CODE, "serve", *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def address_of(process: subprocess.Popen[str]) -> str:
     """What the command tells of its service."""
+    return told(process, "gRPC: ").removeprefix("gRPC: ")
+
+
+def told(process: subprocess.Popen[str], start: str) -> str:
+    """The next line that begins so."""
     assert process.stderr is not None
-    told = next(line for line in process.stderr if line.startswith("gRPC: "))
-    return told.removeprefix("gRPC: ").strip()
+    return next(line for line in process.stderr if line.startswith(start)).strip()
 
 
 def test_keyframes_go_out_and_a_correction_comes_in(room_walk: Path) -> None:
@@ -52,8 +66,42 @@ def test_keyframes_go_out_and_a_correction_comes_in(room_walk: Path) -> None:
     np.testing.assert_allclose(results[0].map_T_odom, map_T_odom, atol=1e-9)
 
 
+def test_a_slow_reader_gets_the_last_keyframe(room_walk: Path) -> None:
+    process = serve(f"replay:{room_walk}?speed=0.7", "--port", 0)
+    try:
+        with Client(address_of(process), patience_s=0.0) as client:
+            stream = client.keyframes(with_images=True)
+            ids = [next(stream).id]
+            assert "60 s at most" in told(process, "waiting for")
+            info = client.info()
+            ids += [keyframe.id for keyframe in stream]
+        assert process.wait(SOON_S) == 0
+    finally:
+        process.kill()
+    assert info.has_ended
+    assert ids == list(range(info.next_keyframe_id))
+
+
+def test_a_second_ctrl_c_does_not_wait_for_readers(room_walk: Path) -> None:
+    process = serve(f"replay:{room_walk}?speed=0.7", "--port", 0)
+    try:
+        with Client(address_of(process), patience_s=0.0) as client:
+            stream = client.keyframes(with_images=True)
+            next(stream)
+            while client.info().next_keyframe_id < 4:  # more than is on its way
+                time.sleep(0.05)
+            process.send_signal(signal.SIGINT)
+            told(process, "waiting for")
+            process.send_signal(signal.SIGINT)
+            assert process.wait(SOON_S) == EXIT_INTERRUPTED
+            with pytest.raises(ServiceError):  # the end is missing, and that is told
+                list(stream)
+    finally:
+        process.kill()
+
+
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "expected"),
     [
         (("--host", "0.0.0.0"), "TLS certificate"),
         (("--tls-cert", "cert.pem"), "without its key"),
@@ -62,13 +110,36 @@ def test_keyframes_go_out_and_a_correction_comes_in(room_walk: Path) -> None:
     ],
 )
 def test_what_cannot_be_is_one_line_and_no_sensor_is_started(
-    room_walk: Path, arguments: tuple[str, ...], told: str
+    room_walk: Path, arguments: tuple[str, ...], expected: str
 ) -> None:
     process = serve(f"replay:{room_walk}", *arguments)
     _, errors = process.communicate(timeout=SOON_S)
     assert process.returncode == 2
-    assert told in errors
+    assert expected in errors
     assert len(errors.strip().splitlines()) == 1
+
+
+def test_keys_and_the_port_are_tried_before_anything_is_recorded(room_walk: Path, tmp_path: Path) -> None:
+    def refusal(*arguments: object) -> str:
+        process = serve(f"replay:{room_walk}", *arguments, "--record", tmp_path / "walk.mcap")
+        _, errors = process.communicate(timeout=SOON_S)
+        assert process.returncode == 2
+        assert len(errors.strip().splitlines()) == 1
+        assert not (tmp_path / "walk.mcap").exists()
+        return errors
+
+    for name in ("server.pem", "server.key", "token"):
+        (tmp_path / name).write_text("short\n")
+        (tmp_path / name).chmod(0o600)
+    certificate, key, token = tmp_path / "server.pem", tmp_path / "server.key", tmp_path / "token"
+    assert "the TLS key cannot be read" in refusal(
+        "--port", 0, "--tls-cert", certificate, "--tls-key", tmp_path / "absent"
+    )
+    assert "are no TLS certificate and key" in refusal("--port", 0, "--tls-cert", certificate, "--tls-key", key)
+    assert "is no token" in refusal("--port", 0, "--token-file", token)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert f"127.0.0.1:{port}: cannot be listened on" in refusal("--port", port)
 
 
 def test_nobody_serves() -> None:

@@ -446,6 +446,55 @@ def test_what_is_left_of_an_odometry_that_has_ended_is_read_to_its_end(odometry:
         assert not stopper.is_alive()
 
 
+def test_what_waits_for_a_slow_reader_of_estimates_reaches_it_after_the_end(odometry: served.DrawnOdometry) -> None:
+    got: list[tuple[int, int]] = []
+    may_go_on = threading.Event()
+    published = 2_000
+    server = GrpcServer(odometry, ANY_PORT)
+    server.start()
+    with Client(server.address, patience_s=0.0) as client:
+
+        def read() -> None:
+            for update in client.estimates():
+                got.append((update.state.epoch, update.missed))
+                may_go_on.wait()
+
+        reader = in_thread(read)
+        until(lambda: listeners(odometry.estimates), "nobody listens")
+        for number in range(published):
+            odometry.estimates.publish(replace(served.estimate(1), epoch=number))
+        until(lambda: got, "nothing came")
+        odometry.end()
+        assert not server.drain(0.2)
+        stopper = in_thread(server.stop)
+        may_go_on.set()
+        reader.join(20.0)
+        stopper.join(20.0)
+        assert not stopper.is_alive()
+    assert got[-1][0] == published - 1
+    assert sum(missed for _, missed in got) + len(got) == published
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGSTOP")
+def test_a_reader_that_takes_nothing_does_not_hold_the_end(odometry: served.DrawnOdometry) -> None:
+    for number in range(200):
+        odometry.keyframe_log.add(served.keyframe(number))
+    server = GrpcServer(odometry, replace(ANY_PORT, keepalive_s=3600.0))
+    server.start()
+    process = reader_process(server, 0)
+    assert process.stdout is not None
+    process.stdout.readline()
+    os.kill(process.pid, signal.SIGSTOP)
+    try:
+        odometry.end()
+        stopper = in_thread(lambda: server.stop(grace_s=3600.0))
+        stopper.join(60.0)
+        assert not stopper.is_alive()
+    finally:
+        process.kill()
+        process.communicate()
+
+
 READER = """
 import sys
 from graphvio.slam.client import Client
@@ -508,10 +557,15 @@ def test_a_client_that_no_longer_answers_is_given_up(odometry: served.DrawnOdome
             process.communicate()
 
 
-def test_a_port_that_is_taken_and_a_second_start(server: GrpcServer, odometry: served.DrawnOdometry) -> None:
+def test_a_port_that_is_taken_and_a_second_start(
+    server: GrpcServer, odometry: served.DrawnOdometry, capfd: pytest.CaptureFixture[str]
+) -> None:
     port = int(server.address.rpartition(":")[2])
-    with pytest.raises(ServiceError, match=f"127.0.0.1:{port}: cannot be listened on"):
+    with pytest.raises(ServiceError, match=f"127.0.0.1:{port}: cannot be listened on .Address already in use"):
         GrpcServer(odometry, ServiceOptions(port=port)).start()
+    assert capfd.readouterr().err == ""  # gRPC has nothing to add
+    with pytest.raises(ServiceError, match=r"cannot be listened on .no host's name"):
+        GrpcServer(odometry, ServiceOptions("a..b", 0, Path("absent"), Path("absent"), Path("absent"))).start()
     with pytest.raises(ServiceError, match="is served already"):
         server.start()
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import typer
 
 if TYPE_CHECKING:
     from contextlib import ExitStack
@@ -13,6 +16,9 @@ if TYPE_CHECKING:
     from graphvio.config import Config
     from graphvio.live.running import LiveOdometry
     from graphvio.slam.service.options import ServiceOptions
+    from graphvio.slam.service.server import GrpcServer
+
+_SOON_S = 0.5  # readers that are done by then are not worth a word
 
 
 @dataclass(frozen=True)
@@ -62,12 +68,12 @@ class Services:
         """Find out what cannot be, before sensors are started.
 
         Raises:
-            ServiceError: if an address would be open to all, or files are missing.
+            ServiceError: if an address is taken or would be open to all, or files are missing or cannot be used.
             MissingExtraError: if a service's extra is not installed.
         """
-        from graphvio.slam.service.server import GrpcServer  # noqa: F401 - tells whether its library is there
+        from graphvio.slam.service.server import check
 
-        self._options()
+        check(self._options())
         if self.ros2_domain is not None:
             from graphvio.ros2.publisher import Publisher  # noqa: F401
 
@@ -80,7 +86,7 @@ class Services:
         """
         from graphvio.slam.service.server import GrpcServer
 
-        address = stack.enter_context(GrpcServer(running, self._options())).address
+        address = stack.enter_context(_until_read(GrpcServer(running, self._options()))).address
         lines = [f"gRPC: {address}" + (" (TLS)" if self.certificate else "")]
         if self.ros2_domain is None:
             return Started(address, lines)
@@ -95,3 +101,14 @@ class Services:
 
         port = DEFAULT_PORT if self.port is None else self.port
         return ServiceOptions(self.host, port, self.certificate, self.key, self.token_file)
+
+
+@contextmanager
+def _until_read(server: GrpcServer) -> Iterator[GrpcServer]:
+    """Serve, and at the end of the odometry wait for those who still read."""
+    from graphvio.slam.service.server import READ_S
+
+    with server:
+        yield server
+        if not server.drain(_SOON_S):
+            typer.echo(f"waiting for what gRPC's clients have not read yet, {READ_S:g} s at most", err=True)

@@ -53,9 +53,14 @@ class ServiceOptions:
             )
 
     @property
+    def bare_host(self) -> str:
+        """Where to listen; ``localhost`` is 127.0.0.1 only."""
+        return "127.0.0.1" if self.host == "localhost" else self.host
+
+    @property
     def address(self) -> str:
         """As gRPC takes it; IPv6 in brackets."""
-        host = "127.0.0.1" if self.host == "localhost" else self.host
+        host = self.bare_host
         return f"[{host}]:{self.port}" if ":" in host else f"{host}:{self.port}"
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
+import time
 import uuid
 from typing import Any, Self
 
 from graphvio.errors import ServiceError
 from graphvio.slam.interface import Served
 from graphvio.slam.service.libraries import grpc, stubs
+from graphvio.slam.service.listening import cannot_listen, check_address
 from graphvio.slam.service.malformed import MalformedInterceptor
 from graphvio.slam.service.options import ServiceOptions
 from graphvio.slam.service.pool import DaemonPool
@@ -23,6 +25,22 @@ _METADATA_BYTES = 16 * 2**10
 _HANDSHAKE_MS = 5_000
 _IDLE_MS = 300_000
 _LEAST_PING_MS = 4_000
+READ_S = 60.0  # for those who read what is left of an odometry that has ended
+_STALLED_S = 5.0  # a stream of which nothing is taken for so long is not read
+_CUT_S = 0.5  # for streams and calls to see that the server stops
+_LOOK_S = 0.05
+
+
+def check(options: ServiceOptions) -> None:
+    """Find out what would keep a server from starting, without starting one.
+
+    Raises:
+        ServiceError: if the address is taken or not this machine's, or token, certificate or key cannot be used.
+    """
+    check_address(options)
+    server_credentials(options)
+    if options.token_file is not None:
+        read_token(options.token_file)
 
 
 class GrpcServer:
@@ -50,8 +68,8 @@ class GrpcServer:
         self.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.stop()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.stop(READ_S if kind is None else _CUT_S)
 
     @property
     def address(self) -> str:
@@ -72,6 +90,7 @@ class GrpcServer:
         if self._server is not None:
             raise ServiceError(f"{self.address}: is served already; stop it first")
         options = self._options
+        check_address(options)
         credentials = server_credentials(options)
         interceptors = [] if options.token_file is None else [token_interceptor(read_token(options.token_file))]
         interceptors.append(MalformedInterceptor())
@@ -95,23 +114,35 @@ class GrpcServer:
         if not self._port:
             server.stop(None)
             pool.shutdown()
-            raise ServiceError(
-                f"{options.address}: cannot be listened on; choose a port that nobody uses, and an address of this "
-                "machine"
-            )
+            raise cannot_listen(options, "gRPC failed")
         server.start()
         self._server, self._pool = server, pool
 
-    def stop(self, grace_s: float = 2.0) -> None:
+    def drain(self, most_s: float = READ_S) -> bool:
+        """Let streams of an odometry that has ended be read to their end; whether all have been.
+
+        Args:
+            most_s: how long. It is given up before when nothing is taken of any stream for 5 s.
+        """
+        begun_s = time.monotonic()
+        while self.open_streams and (now_s := time.monotonic()) - begun_s < most_s:
+            if now_s - begun_s > _STALLED_S and not self._limit.is_read_since(now_s - _STALLED_S):
+                break
+            time.sleep(_LOOK_S)
+        return not self.open_streams
+
+    def stop(self, grace_s: float = READ_S) -> None:
         """Listen no more, and end all streams; a second time does nothing.
 
         Args:
-            grace_s: streams of an odometry that has ended may go on for so long, to be read to their end.
+            grace_s: streams of an odometry that has ended may go on for so long, see `drain`.
         """
         if self._server is None or self._pool is None:
             return
+        if self._served.keyframe_log.is_closed:
+            self.drain(grace_s)
         self._stopping.set()
-        self._server.stop(grace_s).wait()
+        self._server.stop(min(grace_s, _CUT_S)).wait()
         self._pool.shutdown()
         self._server = self._pool = None
 

@@ -11,13 +11,14 @@ from typing import Any, TypeVar
 import graphvio
 from graphvio.errors import GraphvioError, ServiceError
 from graphvio.events import Estimate, Prediction
-from graphvio.live.broadcast import Broadcast
+from graphvio.live.broadcast import Broadcast, Subscription
 from graphvio.slam.epochs import map_of_epoch, newest_epoch
 from graphvio.slam.interface import Served
+from graphvio.slam.keyframe_log import KeyframeLog
 from graphvio.slam.service import convert
 from graphvio.slam.service.arrays import checked_covariance, checked_pose, floats, packed
 from graphvio.slam.service.libraries import grpc, messages, stubs
-from graphvio.slam.service.streams import RUN_KEY, StreamLimit
+from graphvio.slam.service.streams import RUN_KEY, Stream, StreamLimit
 
 _LOOK_S = 0.25  # how soon a stream sees that its client is gone or the server stops
 _WAITING = {messages.RATE_FRAME: 2, messages.RATE_IMU: 16}
@@ -69,8 +70,8 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
             broadcast = self._served.predictions
         else:
             context.abort(grpc.StatusCode.INVALID_ARGUMENT, "rate: choose RATE_FRAME or RATE_IMU")
-        with self._stream(request, context):
-            for state, missed in self._listen(broadcast, _WAITING[request.rate], context):
+        with self._stream(request, context) as stream:
+            for state, missed in self._listen(broadcast, _WAITING[request.rate], stream, context):
                 yield self._update(state, missed)
 
     def StreamKeyframes(self, request: Any, context: Any) -> Iterator[Any]:
@@ -79,22 +80,22 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
             context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"from_id is {request.from_id}; the first keyframe is 0")
         log = self._served.keyframe_log
         next_id = request.from_id
-        with self._stream(request, context):
+        with self._stream(request, context) as stream:
             while context.is_active():
                 keyframe = log.read(next_id, _LOOK_S)
                 if keyframe is not None:
                     message = convert.keyframe_message(keyframe, request.with_images, request.with_descriptors)
                     yield messages.KeyframeUpdate(keyframe=message, gone=keyframe.id - next_id)
+                    stream.taken()  # one is asked for when the one before has gone out
                     next_id = keyframe.id + 1
                 elif log.is_closed and log.next_id <= next_id:
                     return
-                if not log.is_closed:  # else what is left of it may still be read
-                    self._abort_if_stopping(context)
+                self._abort_if_stopping(log, context)
 
     def StreamIncidents(self, request: Any, context: Any) -> Iterator[Any]:
         """What happens, from now on."""
-        with self._stream(request, context):
-            for incident, missed in self._listen(self._served.incidents, _INCIDENTS_WAITING, context):
+        with self._stream(request, context) as stream:
+            for incident, missed in self._listen(self._served.incidents, _INCIDENTS_WAITING, stream, context):
                 yield convert.incident_message(incident, missed)
 
     def Correct(self, request: Any, context: Any) -> Any:
@@ -120,7 +121,7 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
             update.prediction.CopyFrom(convert.prediction_message(state))
         return update
 
-    def _listen(self, broadcast: Broadcast[T], depth: int, context: Any) -> Iterator[tuple[T, int]]:
+    def _listen(self, broadcast: Broadcast[T], depth: int, stream: Stream, context: Any) -> Iterator[tuple[T, int]]:
         """Items as they come, each with the number of those left out before it."""
         subscription = broadcast.subscribe(depth)
         told = 0
@@ -131,28 +132,27 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
                 if item is not None:
                     missed = subscription.missed
                     yield item, missed - told
+                    stream.taken()
                     told = missed
                 elif was_closed:
                     return
-                if not was_closed:
-                    self._abort_if_stopping(context)
+                self._abort_if_stopping(subscription, context)
         finally:
             subscription.close()
 
     @contextmanager
-    def _stream(self, request: Any, context: Any) -> Iterator[None]:
+    def _stream(self, request: Any, context: Any) -> Iterator[Stream]:
         self._check_run(request, context)
-        client = context.peer()
         try:
-            self._limit.enter(client)
+            stream = self._limit.enter(context.peer())
         except ServiceError as error:
             context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, str(error))
         try:
             # Sent before there is a first message, which may be long in coming: the client knows that it is through.
             context.send_initial_metadata(((RUN_KEY, self._run_id),))
-            yield
+            yield stream
         finally:
-            self._limit.leave(client)
+            self._limit.leave(stream)
 
     def _check_run(self, request: Any, context: Any) -> None:
         if request.run_id not in ("", self._run_id):
@@ -161,8 +161,9 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
                 "another run of the odometry is served now, in which ids of keyframes mean something else; begin anew",
             )
 
-    def _abort_if_stopping(self, context: Any) -> None:
-        if self._stopping.is_set():
+    def _abort_if_stopping(self, read: KeyframeLog | Subscription[Any], context: Any) -> None:
+        """End a stream that would go on; what is left of an odometry that has ended may still be read."""
+        if self._stopping.is_set() and not read.is_closed:  # in this order: an odometry ends before its server stops
             context.abort(grpc.StatusCode.UNAVAILABLE, "the server stops")
 
 
