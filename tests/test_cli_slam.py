@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -132,7 +133,8 @@ def slam_of(process: subprocess.Popen[str]) -> int | None:
 
 def test_an_odometry_whose_slam_is_killed_goes_on_to_its_end(room_walk: Path, tmp_path: Path) -> None:
     out, temporary = tmp_path / "map", tmp_path / "temporary"
-    with running(_MAIN, temporary, f"replay:{room_walk}?speed=0.5", "--out", out) as process:
+    web = free_options()
+    with running(_MAIN, temporary, f"replay:{room_walk}?speed=0.5", "--out", out, "--web", web.port) as process:
         assert process.stderr is not None
         next(line for line in process.stderr if line.startswith("tracking"))
         killed = slam_of(process)
@@ -146,6 +148,8 @@ def test_an_odometry_whose_slam_is_killed_goes_on_to_its_end(room_walk: Path, tm
     assert {path.name for path in out.iterdir()} == {"odometry.txt", "online.txt"}
     assert len(Trajectory.read(out / "odometry.txt")) > 0.8 * open_source(room_walk).frameset_count
     assert not list(temporary.iterdir())
+    with socket.socket() as probe:  # the page has gone with it
+        assert probe.connect_ex(("127.0.0.1", web.port)) != 0
 
 
 def test_what_is_mapped_before_the_source_fails_is_saved(room_walk: Path, tmp_path: Path) -> None:

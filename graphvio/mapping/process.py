@@ -70,8 +70,10 @@ def run_mapping(task: MappingTask, ready: Event) -> str:
     """
     colmap()  # takes SIGTERM for itself when it is loaded
     for number in _SIGNALS:
-        signal.signal(number, signal.SIG_IGN)  # they are for the odometry, with which this ends
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)  # held back since the start, and not by what is started here
+        # They are for the odometry, with which this ends. What is started here, as the page for browsers, is ended by
+        # them: it would inherit that they are ignored or blocked, but not a handler.
+        signal.signal(number, lambda *_: None)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
     with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map, task.folder) as mapper:
         warm_up(client.rig, task.config)
         try:
