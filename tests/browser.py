@@ -1,17 +1,30 @@
-"""A headless Chromium, driven by its DevTools protocol over pipes."""
+"""A headless Chromium, driven by its DevTools protocol over pipes, and ports for what it looks at."""
 
 import base64
 import json
 import os
 import select
 import shutil
+import socket
 import subprocess
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
+from graphvio.viewer import WebOptions
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 _ANSWER_S = 60.0
+
+
+def free_options() -> WebOptions:
+    """Two ports next to each other that nobody listens on."""
+    while True:
+        with socket.socket() as one, socket.socket() as other, suppress(OSError):
+            one.bind(("127.0.0.1", 0))
+            other.bind(("127.0.0.1", one.getsockname()[1] + 1))
+            return WebOptions(one.getsockname()[1], memory_mb=64)
 
 
 class Browser:

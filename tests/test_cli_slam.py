@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import socket
 import subprocess
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import free_options
 from ros2_loopback import URI, free_domain
 
 from graphvio import Trajectory, open_source
@@ -33,9 +39,11 @@ def slam(*arguments: object) -> subprocess.CompletedProcess[str]:
 def made(room_walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of the walk, made with all that can run beside."""
     out = tmp_path_factory.mktemp("slam") / "map"
-    beside = ("--save-rrd", out.parent / "shown.rrd", "--health-port", 0, "--ros2", free_domain())
-    done = slam(f"replay:{room_walk}?speed=0.5", "--out", out, *beside)
+    web = free_options()
+    shown = ("--save-rrd", out.parent / "shown.rrd", "--web", web.port)
+    done = slam(f"replay:{room_walk}?speed=0.5", "--out", out, *shown, "--health-port", 0, "--ros2", free_domain())
     assert done.returncode == 0, done.stderr
+    assert f"browser: {web.url}" in done.stderr.splitlines()
     assert "health: http://127.0.0.1:" in done.stderr
     assert "ROS 2: topics below /graphvio" in done.stderr
     return out
@@ -70,12 +78,106 @@ def test_the_way_is_found_in_a_saved_map(made: Path, room_walk: Path, tmp_path: 
     assert np.linalg.norm(online.positions[0] - start) > 0.2
 
 
-def test_a_map_that_is_none_ends_it_at_once(room_walk: Path, tmp_path: Path) -> None:
-    done = slam(f"replay:{room_walk}", "--map", tmp_path / "nowhere")
+def test_a_map_that_is_none_is_told_before_a_source_is_opened(tmp_path: Path) -> None:
+    done = slam("replay:no-recording", "--map", tmp_path / "nowhere")
     assert done.returncode == 2
-    assert "nowhere" in done.stderr
-    assert "Traceback" not in done.stderr
-    assert done.stderr.rstrip().splitlines()[-1].startswith("graphvio: ")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"graphvio: {tmp_path / 'nowhere'}: is no map")
+
+
+_MAIN = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from graphvio.cli import main
+main()
+"""
+
+_FAILING = """
+import itertools
+from graphvio.errors import SourceError
+from graphvio.live.sources.replay import Replay
+whole = Replay.readings
+def readings(self):
+    yield from itertools.islice(whole(self), 900)
+    raise SourceError("the device is broken")
+if __name__ == "__main__":
+    Replay.readings = readings
+    from graphvio.cli import main
+    main()
+"""
+
+
+@contextmanager
+def running(code: str, temporary: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]:
+    """One that leads a group of processes, with a folder of its own for temporary files."""
+    temporary.mkdir()
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "slam", *map(str, arguments)],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "TMPDIR": str(temporary)},
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def slam_of(process: subprocess.Popen[str]) -> int | None:
+    """The process in which its SLAM runs."""
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return next((int(each) for each in children if "spawn_main" in Path(f"/proc/{each}/cmdline").read_text()), None)
+
+
+def test_an_odometry_whose_slam_is_killed_goes_on_to_its_end(room_walk: Path, tmp_path: Path) -> None:
+    out, temporary = tmp_path / "map", tmp_path / "temporary"
+    web = free_options()
+    with running(_MAIN, temporary, f"replay:{room_walk}?speed=0.5", "--out", out, "--web", web.port) as process:
+        assert process.stderr is not None
+        next(line for line in process.stderr if line.startswith("tracking"))
+        killed = slam_of(process)
+        assert killed is not None
+        os.kill(killed, signal.SIGKILL)
+        told = process.stderr.read()
+        assert process.wait(SOON_S) == 3, told
+    (line,) = [line for line in told.splitlines() if line.startswith("graphvio: ")]
+    assert "the SLAM failed (exit code -9)" in line
+    assert "the odometry goes on" in line
+    assert {path.name for path in out.iterdir()} == {"odometry.txt", "online.txt"}
+    assert len(Trajectory.read(out / "odometry.txt")) > 0.8 * open_source(room_walk).frameset_count
+    assert not list(temporary.iterdir())
+    with socket.socket() as probe:  # the page has gone with it
+        assert probe.connect_ex(("127.0.0.1", web.port)) != 0
+
+
+def test_what_is_mapped_before_the_source_fails_is_saved(room_walk: Path, tmp_path: Path) -> None:
+    out, temporary = tmp_path / "map", tmp_path / "temporary"
+    with running(_FAILING, temporary, f"replay:{room_walk}?speed=0.5", "--out", out) as process:
+        _, told = process.communicate(timeout=SOON_S)
+        assert process.returncode == 2, told
+    assert told.splitlines()[-1] == "graphvio: the device is broken"
+    assert "Traceback" not in told
+    assert json.loads((out / "map.json").read_text())["places"] > 0
+    assert len(Trajectory.read(out / "odometry.txt")) > 3
+    assert not list(temporary.iterdir())
+
+
+def test_ctrl_c_while_the_slam_starts_ends_both_without_a_word(room_walk: Path, tmp_path: Path) -> None:
+    out, temporary = tmp_path / "map", tmp_path / "temporary"
+    with running(_MAIN, temporary, f"replay:{room_walk}", "--out", out) as process:
+        end_s = time.monotonic() + SOON_S
+        while slam_of(process) is None:
+            assert process.poll() is None
+            assert time.monotonic() < end_s
+            time.sleep(0.01)
+        os.killpg(process.pid, signal.SIGINT)
+        _, told = process.communicate(timeout=SOON_S)
+        assert process.returncode == 130, told
+    assert not told
+    assert not out.exists()
+    assert not list(temporary.iterdir())
 
 
 def test_a_signal_to_both_processes_ends_it_with_the_map_saved(room_walk: Path, tmp_path: Path) -> None:

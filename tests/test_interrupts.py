@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -16,6 +17,7 @@ from typer.testing import CliRunner
 from graphvio import FrameSet, open_source
 from graphvio.cli import app, main
 from graphvio.cli.interrupts import HeldInterrupt, interruptible
+from graphvio.errors import MissingExtraError
 from graphvio.sessions.mcap_file import McapFile
 
 pytest.importorskip("mcap")
@@ -43,6 +45,26 @@ def interrupted_kernel(*_: Any, **__: Any) -> NoReturn:
         raise SystemError("<method 'next'> returned a result with an exception set")  # noqa: B904
 
 
+def interrupted_import(*_: Any, **__: Any) -> NoReturn:
+    """What pybind11 makes of Ctrl-C while a library is loaded."""
+    try:
+        raise KeyboardInterrupt
+    except KeyboardInterrupt as cause:
+        raise ImportError("initialization failed") from cause
+
+
+def interrupted_extra(*_: Any, **__: Any) -> NoReturn:
+    """An optional one."""
+    try:
+        interrupted_import()
+    except ImportError:
+        raise MissingExtraError("pycolmap", "maps", "a map") from None
+
+
+def missing(*_: Any, **__: Any) -> NoReturn:
+    raise MissingExtraError("pycolmap", "maps", "a map")
+
+
 def broken(*_: Any, **__: Any) -> NoReturn:
     raise SystemError("bad argument to internal function")
 
@@ -52,6 +74,14 @@ def test_an_interrupted_kernel_is_an_interrupt() -> None:
         interrupted_kernel()
     with pytest.raises(SystemError, match="bad argument"), interruptible():
         broken()
+
+
+@pytest.mark.parametrize("load", [interrupted_import, interrupted_extra])
+def test_an_interrupted_import_is_an_interrupt(load: Callable[[], NoReturn]) -> None:
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        load()
+    with pytest.raises(MissingExtraError), interruptible():
+        missing()
 
 
 def test_a_recording_that_is_interrupted_can_be_read(

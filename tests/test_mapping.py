@@ -196,6 +196,44 @@ def test_something_else_is_not_overwritten(tmp_path: Path) -> None:
     assert (tmp_path / "mine.txt").read_text() == "mine"
 
 
+def test_what_else_is_in_a_maps_folder_stays(tmp_path: Path) -> None:
+    mine = {"notes.txt": "mine", "online.txt": "an earlier path"}
+    (tmp_path / "link").symlink_to(tmp_path / "map")
+    with Mapper(front_end(0, 4, seed=0)[0], CONFIG) as mapper:
+        mapper.save(tmp_path / "map")
+        for name, text in mine.items():
+            (tmp_path / "map" / name).write_text(text)
+        (tmp_path / "map" / "photos").mkdir()
+        (tmp_path / "map" / "photos" / "door.jpg").write_bytes(b"door")
+        mapper.run()
+        mapper.save(tmp_path / "map")
+        mapper.save(tmp_path / "link")
+    assert json.loads((tmp_path / "map" / "map.json").read_text())["places"] == 1
+    assert {name: (tmp_path / "map" / name).read_text() for name in mine} == mine
+    assert (tmp_path / "map" / "photos" / "door.jpg").read_bytes() == b"door"
+    assert {path.name for path in tmp_path.iterdir()} == {"map", "link"}
+    assert (tmp_path / "link").is_symlink()
+
+
+def test_what_was_there_before_a_place_cannot_be_kept_is_saved(tmp_path: Path) -> None:
+    work = tmp_path / "work"
+    work.mkdir()
+
+    def obstruct(mapper: Mapper) -> None:
+        """No image can be written where its folder should be."""
+        if mapper.summary()["places"] == 3:
+            shutil.rmtree(work / "images")
+            (work / "images").touch()
+
+    with Mapper(front_end(0, 120, seed=1)[0], CONFIG, folder=work) as mapper:
+        with pytest.raises(MapError, match="a place cannot be kept"):
+            mapper.run(obstruct)
+        mapper.save(tmp_path / "map")
+    assert not work.exists()
+    with Mapper(front_end(0, 4, seed=0)[0], CONFIG, tmp_path / "map") as again:
+        assert again.summary()["places_of_map"] == 3
+
+
 def test_stop_ends_the_work_and_the_map_can_be_saved(tmp_path: Path) -> None:
     walk, _ = front_end(0, 240, seed=1)
     with Mapper(walk, CONFIG) as mapper:

@@ -8,13 +8,12 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from browser import CHROMIUM, Browser
+from browser import CHROMIUM, Browser, free_options
 from test_viewer import estimate, frameset, rows_of, some_rig
 
 from graphvio.arrays import AnyArray
@@ -27,14 +26,6 @@ from graphvio.viewer.web import WebHost
 pytest.importorskip("rerun")
 
 ROOT = Path(__file__).parents[1]
-
-
-def free_options() -> WebOptions:
-    while True:
-        with socket.socket() as one, socket.socket() as other, suppress(OSError):
-            one.bind(("127.0.0.1", 0))
-            other.bind(("127.0.0.1", one.getsockname()[1] + 1))
-            return WebOptions(one.getsockname()[1], memory_mb=64)
 
 
 def listening_hosts(port: int) -> set[str]:

@@ -8,16 +8,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Self
 
+from graphvio.errors import MissingExtraError
+
 
 @contextmanager
 def interruptible() -> Iterator[None]:
     """Has Ctrl-C end what is inside by `KeyboardInterrupt`, whatever it came in the middle of.
 
-    Compiled kernels that it meets end by a `SystemError` in whose chain of causes it is.
+    Compiled kernels that it meets end by a `SystemError` in whose chain of causes it is, compiled libraries that are
+    being loaded by an `ImportError`, which may have been taken for a library that is missing.
     """
     try:
         yield
-    except SystemError as error:
+    except (SystemError, ImportError, MissingExtraError) as error:
         if not _is_interrupt(error):
             raise
         raise KeyboardInterrupt from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -126,30 +126,39 @@ def run_live(
             health = HealthServer(running.status, port=health_port)
             stack.callback(health.close)
             typer.echo(f"health: http://{health.address}/healthz, metrics: http://{health.address}/metrics", err=True)
-        started = None if services is None else services.start(running, stack)
+        started = None if services is None else services.start(running, stack, lambda: signals.came)
         for line in () if started is None else started.lines:
             typer.echo(line, err=True)
         running.start()
         until = None if duration_s is None else monotonic() + duration_s
-        with Dashboard(opened.name, running.incidents.subscribe(64)) as dashboard:
-            while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):
-                dashboard.draw(running.status(), running.devices)
-                if started is not None:
-                    started.check()
-        if signals.came:
-            typer.echo("stopping: what has come is worked on and saved", err=True)
-        running.stop()
+        failure: Exception | None = None
+        try:
+            with Dashboard(opened.name, running.incidents.subscribe(64)) as dashboard:
+                while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):
+                    dashboard.draw(running.status(), running.devices)
+                    if started is not None:
+                        started.check()
+            if signals.came:
+                typer.echo("stopping: what has come is worked on and saved", err=True)
+            running.stop()
+        except Exception as error:  # what came until then is saved all the same
+            failure = error
+            with suppress(Exception):
+                running.stop()
         figures = running.status()
-        if started is not None:
-            started.finish()
+        is_whole = started is None or started.finish()
+        if failure is not None:
+            raise failure
     typer.echo(line_of(figures))
     typer.echo(summary_of(figures))
     if recorder is not None and record is not None:
-        _tell_recorded(record, recorder.status())
+        is_whole = _tell_recorded(record, recorder.status()) and is_whole
+    if not is_whole:
+        raise typer.Exit(EXIT_STOPPED)
 
 
-def _tell_recorded(path: Path, told: Mapping[str, float | int | str | None]) -> None:
-    """What is in the recording; exit code 3 where something is not."""
+def _tell_recorded(path: Path, told: Mapping[str, float | int | str | None]) -> bool:
+    """What is in the recording; whether that is all."""
     size = f"{path.stat().st_size / 1e6:.1f} MB, " if path.exists() else ""
     typer.echo(f"{path}: {size}{told['recorded_framesets']} framesets")
     if told["recording_stopped"]:
@@ -162,7 +171,8 @@ def _tell_recorded(path: Path, told: Mapping[str, float | int | str | None]) -> 
             f"{told['messages_not_recorded']} samples, poses and messages were left out",
             err=True,
         )
-        raise typer.Exit(EXIT_STOPPED)
+        return False
+    return True
 
 
 def _readable(path: Path) -> int:

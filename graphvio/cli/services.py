@@ -29,13 +29,13 @@ class Started:
         address: of gRPC.
         lines: for people, one for each.
         check: raises what has become of one that failed.
-        finish: waits for those that go on when the odometry has ended.
+        finish: waits for those that go on when the odometry has ended; whether they have done all they were to.
     """
 
     address: str
     lines: Sequence[str]
     check: Callable[[], None] = lambda: None
-    finish: Callable[[], None] = lambda: None
+    finish: Callable[[], bool] = lambda: True
 
 
 @dataclass(frozen=True)
@@ -77,10 +77,16 @@ class Services:
         if self.ros2_domain is not None:
             from graphvio.ros2.publisher import Publisher  # noqa: F401
 
-    def start(self, running: LiveOdometry, stack: ExitStack) -> Started:
+    def start(self, running: LiveOdometry, stack: ExitStack, is_stopped: Callable[[], bool] = lambda: False) -> Started:
         """Offer an odometry that is about to run, until the stack ends.
 
+        Args:
+            running: the odometry.
+            stack: ends what is started.
+            is_stopped: whether the run is to stop, asked while something is waited for.
+
         Raises:
+            KeyboardInterrupt: if it is to stop before all is there.
             ServiceError: if an address cannot be used, or would be open to all.
             MissingExtraError: if a service's extra is not installed.
         """

@@ -13,17 +13,10 @@ from graphvio.cli.live import run_live
 from graphvio.cli.services import Services, Started
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from contextlib import ExitStack
-    from multiprocessing.context import SpawnProcess
-    from multiprocessing.synchronize import Event
 
-    from graphvio.live.path_output import PathOutput
     from graphvio.live.running import LiveOdometry
-    from graphvio.mapping.process import MappingTask
-
-EXIT_FAILED = 2
-_LOOK_S = 0.1
-_PATIENCE_S = 300.0  # for a SLAM that is behind when the odometry ends
 
 
 def slam(
@@ -51,7 +44,7 @@ def slam(
     """Run the odometry with a small SLAM system behind it, in a process of its own, that corrects its place in the map.
 
     The SLAM recognises places, optimises a graph of them and sends corrections by gRPC, as any other would do. With
-    --map the rig finds its place in a saved map.
+    --map the rig finds its place in a saved map. When the SLAM fails, the odometry goes on; exit code 3 then.
 
     Examples:
 
@@ -60,8 +53,10 @@ def slam(
         graphvio slam realsense --map map --view
     """
     from graphvio.errors import MapError
-    from graphvio.mapping.saved_map import check_target
+    from graphvio.mapping.saved_map import check_map, check_target
 
+    if saved_map is not None:
+        check_map(saved_map)
     if out is not None:
         check_target(out)
         if out.exists() and any(out.iterdir()) and (saved_map is None or out.resolve() != saved_map.resolve()):
@@ -93,14 +88,14 @@ class _WithMapping(Services):
     map_web_port: int | None = None
     save_rrd: Path | None = None
 
-    def start(self, running: LiveOdometry, stack: ExitStack) -> Started:
+    def start(self, running: LiveOdometry, stack: ExitStack, is_stopped: Callable[[], bool] = lambda: False) -> Started:
         """Offer the odometry, and start the SLAM; see `Services.start`."""
-        from multiprocessing import get_context
-
+        from graphvio.cli.slam_process import SlamProcess
         from graphvio.live.path_output import PathOutput
         from graphvio.mapping.process import MappingTask
+        from graphvio.viewer import WebOptions
 
-        offered = super().start(running, stack)
+        offered = super().start(running, stack, is_stopped)
         task = MappingTask(
             offered.address,
             running.odometry.config,
@@ -113,59 +108,15 @@ class _WithMapping(Services):
         path = PathOutput(lambda: running.map_T_odom)
         if self.out is not None:
             running.add_output(path)
-        context = get_context("spawn")
-        ready = context.Event()
-        process = context.Process(target=_map, args=(task, ready), name="graphvio-slam")
-        process.start()
-        stack.callback(process.kill)
-        while not ready.wait(_LOOK_S):  # places that are seen before would be lost
-            _check(process)
+        beside = SlamProcess(task, path)
+        stack.callback(beside.close)
+        beside.wait_ready(is_stopped)
+        lines = list(offered.lines)
+        if self.map_web_port is not None:
+            lines.append(f"browser: {WebOptions(port=self.map_web_port).url}")
 
         def check() -> None:
             offered.check()
-            _check(process)
+            beside.check()
 
-        return replace(offered, check=check, finish=lambda: _finish(process, path, self.out))
-
-
-def _map(task: MappingTask, ready: Event) -> None:
-    """What the SLAM's process does."""
-    from graphvio.errors import GraphvioError
-    from graphvio.mapping.process import run_mapping
-
-    try:
-        typer.echo(run_mapping(task, ready), err=True)
-    except GraphvioError as error:
-        typer.echo(f"graphvio: mapping: {error}", err=True)
-        raise SystemExit(EXIT_FAILED) from None
-
-
-def _check(process: SpawnProcess) -> None:
-    """Notice a SLAM that failed.
-
-    Raises:
-        ServiceError: if it did.
-    """
-    from graphvio.errors import ServiceError
-
-    if process.exitcode:
-        raise ServiceError(f"the SLAM failed (exit code {process.exitcode}); what it said is above")
-
-
-def _finish(process: SpawnProcess, path: PathOutput, out: Path | None) -> None:
-    """Wait until the SLAM has worked on all keyframes and saved the map, and put the odometry's path beside it.
-
-    Raises:
-        ServiceError: if it failed.
-    """
-    from graphvio.errors import ServiceError
-
-    if process.is_alive():
-        typer.echo("waiting for the SLAM, which works on the last keyframes", err=True)
-    process.join(_PATIENCE_S)
-    if process.exitcode is None:
-        raise ServiceError(f"the SLAM is not done {_PATIENCE_S:g} s after the odometry; its map is not saved")
-    _check(process)
-    if out is not None:
-        path.write(out)
-        typer.echo(f"map: {out}; paths in it: odometry.txt, online.txt as it was known, trajectory.txt as it is now")
+        return replace(offered, lines=lines, check=check, finish=beside.finish)

@@ -45,17 +45,20 @@ class Mapper:
         front_end: its keyframes must carry images.
         config: its ``optimization`` says what places and closures are.
         map: folder of a saved map to begin with, or None.
+        folder: empty, to keep in what it needs; removed by `close`. None: one is made for temporary files.
 
     Raises:
         MapError: if the map cannot be used with the front-end's rig.
         MissingExtraError: if the extra ``maps`` is not installed.
     """
 
-    def __init__(self, front_end: FrontEnd, config: Config, map: Path | str | None = None) -> None:
+    def __init__(
+        self, front_end: FrontEnd, config: Config, map: Path | str | None = None, folder: Path | None = None
+    ) -> None:
         self._front_end = front_end
         self._rig = front_end.rig
         self._config = config
-        self._folder = Path(tempfile.mkdtemp(prefix="graphvio-map-"))
+        self._folder = Path(tempfile.mkdtemp(prefix="graphvio-map-")) if folder is None else folder
         try:
             self._begin(None if map is None else Path(map))
         except BaseException:
@@ -101,7 +104,7 @@ class Mapper:
             on_place: called after each place, in this thread.
 
         Raises:
-            GraphvioError: if the front-end fails, or a place cannot be kept.
+            GraphvioError: if the front-end fails, or a place cannot be kept. What there was before can be saved.
         """
         self._intake.start()
         while not self._is_stopped and (place := self._intake.next()) is not None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.errors import ServiceError
+from graphvio.errors import GraphvioError, MapError, ServiceError
 from graphvio.mapping.mapper import Mapper
 from graphvio.optimization.loops.database import colmap
 from graphvio.slam.client import Client
@@ -25,6 +25,7 @@ from graphvio.warmup import warm_up
 
 _MAP_COLOUR, _ODOM_COLOUR = (40, 190, 90), (150, 150, 150)
 _SHOWN_EVERY = 3  # places
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class MappingTask:
         view: open rerun's window.
         web_port: let a browser watch on this port, or None.
         save_rrd: write what the viewer shows, or None.
+        folder: empty, to work in; removed in the end. None: one is made.
     """
 
     address: str
@@ -48,10 +50,13 @@ class MappingTask:
     view: bool = False
     web_port: int | None = None
     save_rrd: Path | None = None
+    folder: Path | None = None
 
 
 def run_mapping(task: MappingTask, ready: Event) -> str:
     """Map until the odometry ends, and save the map; in a process of its own, whose signals it ignores from here on.
+
+    After a failure, what is there by then is saved.
 
     Args:
         task: what to do.
@@ -64,15 +69,22 @@ def run_mapping(task: MappingTask, ready: Event) -> str:
         GraphvioError: if the odometry cannot be reached, or the map not be used or written.
     """
     colmap()  # takes SIGTERM for itself when it is loaded
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # they are for the odometry, with which this ends
-    with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map) as mapper:
+    for number in _SIGNALS:
+        # They are for the odometry, with which this ends. What is started here, as the page for browsers, is ended by
+        # them: it would inherit that they are ignored or blocked, but not a handler.
+        signal.signal(number, lambda *_: None)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+    with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map, task.folder) as mapper:
         warm_up(client.rig, task.config)
-        ready.set()
-        _follow(client, mapper, task)
+        try:
+            _follow(client, mapper, task, ready)
+        except GraphvioError as error:
+            raise MapError(f"{error}{_rescued(mapper, task.out)}") from None
+        except Exception as error:
+            error.add_note(_rescued(mapper, task.out))
+            raise
         if task.out is not None:
-            mapper.save(task.out)
-            mapper.trajectory.write(task.out / "trajectory.txt")
+            _save(mapper, task.out)
         return told(mapper)
 
 
@@ -97,14 +109,32 @@ def told(mapper: Mapper) -> str:
     )
 
 
-def _follow(client: Client, mapper: Mapper, task: MappingTask) -> None:
+def _save(mapper: Mapper, out: Path) -> None:
+    mapper.save(out)
+    mapper.trajectory.write(out / "trajectory.txt")
+
+
+def _rescued(mapper: Mapper, out: Path | None) -> str:
+    """Save what there is after a failure; what became of it, to be put behind what is told of that."""
+    if out is None or not mapper.summary()["places"]:
+        return ""
+    try:
+        _save(mapper, out)
+    except GraphvioError as error:
+        return f" (and the map until then cannot be saved: {error})"
+    return f" (the map until then is in {out})"
+
+
+def _follow(client: Client, mapper: Mapper, task: MappingTask, ready: Event) -> None:
     if not (task.view or task.web_port is not None or task.save_rrd is not None):
+        ready.set()
         mapper.run()
         return
     web = None if task.web_port is None else WebOptions(port=task.web_port)
     with Viewer(client.rig, spawn=task.view, save=task.save_rrd, web=web) as viewer:
         odom = _OdomPath(client, viewer)
         odom.thread.start()
+        ready.set()
 
         def show(at: Mapper) -> None:
             if len(at.place_poses) % _SHOWN_EVERY == 0:

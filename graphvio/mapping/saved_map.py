@@ -29,6 +29,7 @@ from graphvio.rig_files.same import difference, without_masks
 FORMAT, VERSION = "graphvio map", 2
 _HEADER, _RIG, _PLACES, _CLOSURES = "map.json", "rig.yaml", "map.npz", "closures.npz"
 _CHECKED = (_PLACES, _CLOSURES, DATABASE)
+_OWN = (_HEADER, _RIG, *_CHECKED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +76,13 @@ class SavedMap:
 
 
 def save(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
-    """Write a map, whole or not at all; one that was there before is replaced.
+    """Write a map, whole or not at all; one that was there before is replaced, other files in the folder stay.
 
     Raises:
         MapError: if the folder holds something else, or cannot be written.
     """
     check_target(folder)
+    folder = folder.resolve()  # what is replaced is a folder, not a link to it
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         made = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
@@ -90,6 +92,7 @@ def save(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
                 old = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
                 folder.replace(old / folder.name)
                 made.replace(folder)
+                _move_others(old / folder.name, folder)
                 shutil.rmtree(old)
             else:
                 made.replace(folder)
@@ -97,6 +100,15 @@ def save(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
             shutil.rmtree(made, ignore_errors=True)
     except OSError as error:
         raise MapError(f"{folder}: cannot be written ({error}); choose another place, or make room") from None
+
+
+def check_map(folder: Path) -> None:
+    """Make sure that a folder holds a map that this version reads; of which rig, and whether it is whole, `load` finds.
+
+    Raises:
+        MapError: if it does not.
+    """
+    _header(folder)
 
 
 def load(folder: Path, rig: Rig) -> SavedMap:
@@ -169,6 +181,20 @@ def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
         "files": {name: _digest(folder / name) for name in _CHECKED},
     }
     (folder / _HEADER).write_text(json.dumps(header, indent=2) + "\n", encoding="utf-8")
+
+
+def _move_others(folder: Path, into: Path) -> None:
+    """Move all that is not a map's own.
+
+    Raises:
+        MapError: if that cannot be.
+    """
+    for path in folder.iterdir():
+        if path.name not in _OWN:
+            try:
+                path.replace(into / path.name)
+            except OSError as error:
+                raise MapError(f"{path}: cannot be moved to {into} ({error}); move it yourself") from None
 
 
 def _header(folder: Path) -> dict[str, dict[str, str]]:

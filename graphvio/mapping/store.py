@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import sqlite3
 import threading
 from collections.abc import Mapping
 from contextlib import closing
+from errno import ENOSPC
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +23,7 @@ from graphvio.rig import Rig
 
 DATABASE = "features.db"
 _IMAGES = "images"
+_ROOM_BYTES = 20_000_000  # must be free for a place: COLMAP aborts the process when its database finds no room
 
 
 class PlaceStore:
@@ -44,13 +48,18 @@ class PlaceStore:
         """Keep a place.
 
         Raises:
-            MapError: if it cannot be written.
+            MapError: if it cannot be written; images that were kept are gone then.
         """
         try:
+            if shutil.disk_usage(self._folder).free < _ROOM_BYTES:
+                raise OSError(ENOSPC, os.strerror(ENOSPC))
+            # The database comes last: unlike images, all that is in it is saved.
+            write_place(self._folder / _IMAGES, self._rig, session, frameset)
             with self._lock:
                 store_place(self._database, self._rig, session, frameset.stamp_ns, seen)
-            write_place(self._folder / _IMAGES, self._rig, session, frameset)
         except (OSError, RuntimeError) as error:
+            # Nothing more can be kept; without the images, a map on the same disk may have room.
+            shutil.rmtree(self._folder / _IMAGES, ignore_errors=True)
             raise MapError(f"{self._folder}: a place cannot be kept ({error}); is the disk full?") from None
 
     def view(self, session: str, stamp_ns: int) -> StoredView:
