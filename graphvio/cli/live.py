@@ -164,7 +164,7 @@ def _tell_recorded(path: Path, told: Mapping[str, float | int | str | None]) -> 
     if told["recording_stopped"]:
         came = int(told["recorded_framesets"] or 0) + int(told["framesets_not_recorded"] or 0)
         typer.echo(f"graphvio: {told['recording_stopped']}: {_readable(path)} framesets of {came}", err=True)
-        raise typer.Exit(EXIT_STOPPED)
+        return False
     if told["framesets_not_recorded"] or told["messages_not_recorded"]:
         typer.echo(
             f"graphvio: the disk was too slow; {told['framesets_not_recorded']} framesets and "

@@ -93,13 +93,11 @@ class SlamProcess:
         except GraphvioError as error:
             self._tell(str(error))
             return False
-        told = ", ".join(_PATHS)
+        paths = ", ".join(_PATHS)
         if is_done:
-            typer.echo(
-                f"map: {self._out}; paths in it: {', '.join(_PATHS)} as it was known, trajectory.txt as it is now"
-            )
+            typer.echo(f"map: {self._out}; paths in it: {paths} as it was known, trajectory.txt as it is now")
         else:
-            typer.echo(f"{self._out}: has the paths {told} in the map as it was known")
+            typer.echo(f"{self._out}: has the paths {paths} as it was known")
         return is_done
 
     def close(self) -> None:
