@@ -79,7 +79,7 @@ class Chains:
             graph.add(self._factors[place])
 
     def prior(self, fragment: int) -> gtsam.NonlinearFactor:
-        """Where a fragment begins: its frame is what makes this so, how uncertain odometry may be of gravity there."""
+        """Where a fragment begins, which makes its frame: certain, however little odometry knows of gravity there."""
         start = self.starts[fragment]
         return gtsam.PriorFactorPose3(x(start), gtsam.Pose3(self.poses[start]), gaussian(EXACT))
 
