@@ -29,7 +29,6 @@ from graphvio.warmup import warm_up
 
 _SCENE = "room"
 _PARTS = 10
-_MANY = 3  # of them are compared with as many
 _LOOK_S = 0.2
 _HEAD = ("framesets", "minutes", "framesets/s", "memory, MB", "error, mm", "epoch", "lost")
 _Figures = Mapping[str, float | int | str | None]
@@ -59,12 +58,13 @@ def main(args: argparse.Namespace) -> None:
     report.add(machine(), "", f"`--framesets {args.framesets}{given}`: {how}.")
     with tempfile.TemporaryDirectory() as made:
         target = Path(made) / "soak.mcap" if args.beside else None
-        rows, figures, memory, told_beside = _soak(folder, args.framesets, args.real_time, target)
+        rows, figures, growth_mb, told_beside = _soak(folder, args.framesets, args.real_time, target)
     report.table(_HEAD, rows)
     lost = _lost(figures)
     told = f"p50 {figures['latency_p50_ms']:.1f} ms (newest), p99 {figures['latency_p99_all_ms']:.1f} ms (all)"
     report.add(
-        f"{memory} Lost: {lost or 'nothing'}. "
+        f"Memory grew by {growth_mb:.1f} MB after {'three tenths' if args.beside else 'the first tenth'}. "
+        f"Lost: {lost or 'nothing'}. "
         + (f"Latency: {told}." if args.real_time else f"Work on a frameset: {_work_told(figures)}.")
     )
     if told_beside:
@@ -77,8 +77,8 @@ def main(args: argparse.Namespace) -> None:
 
 def _soak(
     folder: Path, framesets: int, is_real_time: bool, target: Path | None
-) -> tuple[list[list[str]], _Figures, str, str]:
-    """Rows by tenths, the figures at the end, what is told of memory, and of what ran beside: none without a target."""
+) -> tuple[list[list[str]], _Figures, float, str]:
+    """Rows by tenths, the figures at the end, by how much memory grew, and what ran beside: none without a target."""
     config = Config()
     if target is not None:
         config = replace(config, keyframes=replace(config.keyframes, images=True))
@@ -108,16 +108,7 @@ def _soak(
     rows.append(_row(figures, listener.error_mm, time.monotonic() - begun_s))
     memories.append(float(figures["memory_mb"] or np.nan))
     warm = 2 if beside is not None else 0  # keyframes are kept up to 256 MB, which takes a while to fill
-    return rows, figures, _memory_told(memories[warm:]), told_beside
-
-
-def _memory_told(memories: list[float]) -> str:
-    """Of a process's memory at the tenths after the warm-up: pages that the allocator holds come and go."""
-    first, last = float(np.median(memories[:_MANY])), float(np.median(memories[-_MANY:]))
-    return (
-        f"Memory after the warm-up: {last - first:+.0f} MB from the first {_MANY} tenths to the last {_MANY} (medians),"
-        f" between {min(memories):.0f} and {max(memories):.0f} MB."
-    )
+    return rows, figures, max(memories[warm:]) - memories[warm], told_beside
 
 
 def _row(figures: _Figures, error_mm: float, elapsed_s: float) -> list[str]:
