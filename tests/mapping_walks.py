@@ -11,7 +11,8 @@ import numpy as np
 from calibration_walks import walk_simulator
 
 from graphvio.arrays import Float
-from graphvio.config import Config, OptimizationConfig
+from graphvio.config import Config
+from graphvio.config_stages import OptimizationConfig
 from graphvio.errors import SourceError
 from graphvio.events import FrameSet
 from graphvio.geometry import se3_inverse

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from graphvio.arrays import AnyArray, Bool, Float
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty
-from graphvio.config import MotionConfig, SmootherConfig
+from graphvio.config_stages import MotionConfig, SmootherConfig
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.refinement import Refined

@@ -6,7 +6,7 @@ from synthetic import UP, filled_buffer, pose_at
 from graphvio.arrays import Float
 from graphvio.backend.inertial import GRAVITY_M_S2, ImuSpan
 from graphvio.backend.initialisation import initial_attitude, level
-from graphvio.config import InitialisationConfig
+from graphvio.config_stages import InitialisationConfig
 from graphvio.rig import Imu
 
 CONFIG = InitialisationConfig()

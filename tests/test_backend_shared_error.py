@@ -16,7 +16,7 @@ from graphvio.backend.factors import x
 from graphvio.backend.noise import gaussian
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
-from graphvio.config import SmootherConfig
+from graphvio.config_stages import SmootherConfig
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 from graphvio.rig import Imu

@@ -10,7 +10,7 @@ from graphvio.backend.factors import b, v, x
 from graphvio.backend.inertial import ImuBuffer
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
-from graphvio.config import SmootherConfig
+from graphvio.config_stages import SmootherConfig
 from graphvio.events import ImuSample
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_inverse, se3_log

@@ -15,7 +15,7 @@ from calibration_walks import recorded, walk_simulator
 
 from graphvio import Config, Odometry, open_source
 from graphvio.arrays import Float
-from graphvio.config import OptimizationConfig
+from graphvio.config_stages import OptimizationConfig
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.colmap_export import ColmapModel, export

@@ -4,7 +4,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from graphvio.config import Config, MotionConfig, SmootherConfig, profiles
+from graphvio.config import Config, profiles
+from graphvio.config_stages import MotionConfig, SmootherConfig
 from graphvio.errors import ConfigError
 
 

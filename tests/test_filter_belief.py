@@ -13,7 +13,7 @@ from synthetic import filled_buffer, measured_motion, pose_at, transform, two_pa
 from graphvio import Config, ConfigError, FrameSet, Odometry, Status, open_source
 from graphvio.arrays import Float
 from graphvio.backend.inertial import ImuSpan
-from graphvio.config import FilterConfig
+from graphvio.config_stages import FilterConfig
 from graphvio.events import Quality
 from graphvio.filter_belief import FilterBelief
 from graphvio.frontend.motion import RelativeMotion, VisualResult

@@ -8,7 +8,8 @@ import pytest
 from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import AnyArray, Float
-from graphvio.config import Config, MotionConfig
+from graphvio.config import Config
+from graphvio.config_stages import MotionConfig
 from graphvio.events import Quality
 from graphvio.frontend.agreement import Agreement, Side, _camps, _in_order, agree
 from graphvio.frontend.alignment import Misalignment

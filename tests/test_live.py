@@ -20,7 +20,8 @@ from recordings import noise_image, small_rig
 
 from graphvio import FrameSet, open_source
 from graphvio.arrays import Image
-from graphvio.config import Config, LiveConfig
+from graphvio.config import Config
+from graphvio.config_stages import LiveConfig
 from graphvio.errors import GraphvioError, RigError, ServiceError, SourceError
 from graphvio.events import Estimate, Event, ImuSample, Incident
 from graphvio.live import running as running_module

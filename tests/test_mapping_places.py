@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from graphvio.arrays import Float, Image
-from graphvio.config import OptimizationConfig
+from graphvio.config_stages import OptimizationConfig
 from graphvio.errors import MapError, SourceError
 from graphvio.events import Status
 from graphvio.geometry import se3_exp, se3_inverse, se3_log

@@ -13,7 +13,8 @@ import pytest
 from graphvio import ImuSample, Odometry, open_source
 from graphvio.arrays import Bool, Float
 from graphvio.backend.factors import x
-from graphvio.config import Config, SmootherConfig
+from graphvio.config import Config
+from graphvio.config_stages import SmootherConfig
 from graphvio.errors import OptimizationError
 from graphvio.evaluation import evaluate
 from graphvio.frontend.motion import RelativeMotion

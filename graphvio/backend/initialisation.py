@@ -8,7 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.inertial import GRAVITY_M_S2, ImuSpan
-from graphvio.config import InitialisationConfig
+from graphvio.config_stages import InitialisationConfig
 from graphvio.geometry import so3_exp
 
 _MIN_REST_S = 0.3

@@ -31,7 +31,7 @@ from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.reference_views import ReferenceViews
 from graphvio.backend.states import RigState, StartUncertainty, StateCovariance
 from graphvio.backend.window import SOLVER_ERRORS, Window
-from graphvio.config import SmootherConfig
+from graphvio.config_stages import SmootherConfig
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.rig import Imu

@@ -10,7 +10,7 @@ from graphvio.arrays import Float
 from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.initialisation import InitialAttitude, initial_attitude, level
 from graphvio.backend.states import RigState, StartUncertainty, as_origin, origin_covariance
-from graphvio.config import InitialisationConfig
+from graphvio.config_stages import InitialisationConfig
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.rig import Rig

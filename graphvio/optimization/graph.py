@@ -15,7 +15,7 @@ from graphvio.backend.noise import gaussian, isotropic
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.reference_views import ReferenceViews
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
-from graphvio.config import SmootherConfig
+from graphvio.config_stages import SmootherConfig
 from graphvio.optimization.extrinsics import own_motion, unknowns
 from graphvio.optimization.nodes import Nodes
 from graphvio.optimization.record import SessionRecord

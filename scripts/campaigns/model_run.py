@@ -15,7 +15,7 @@ from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
-from graphvio.config import SmootherConfig
+from graphvio.config_stages import SmootherConfig
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 
 _SETTLED_S = 2.0

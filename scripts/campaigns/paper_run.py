@@ -17,7 +17,7 @@ from graphvio.backend.ekf.state import FilterState
 from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
-from graphvio.config import FilterConfig, SmootherConfig
+from graphvio.config_stages import FilterConfig, SmootherConfig
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_exp, se3_log
 

@@ -22,7 +22,7 @@ from campaigns.imu_truth import Reconstruction, allan_deviation, force_errors, r
 from campaigns.measures import Squares, tilt_error
 from campaigns.real_run import Miss, RealRun, real_run
 from graphvio.arrays import Float
-from graphvio.config import SmootherConfig
+from graphvio.config_stages import SmootherConfig
 from graphvio.errors import GraphvioError
 from graphvio.rig import Imu
 

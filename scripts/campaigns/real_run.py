@@ -12,7 +12,7 @@ from campaigns.measures import tilt_error
 from graphvio.arrays import Float
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
-from graphvio.config import SmootherConfig
+from graphvio.config_stages import SmootherConfig
 from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.rig import Imu

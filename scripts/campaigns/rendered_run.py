@@ -10,7 +10,8 @@ from benchmarks.recordings import simulated
 
 from campaigns.measures import heading_aligned, tilt_error
 from campaigns.model_run import Square
-from graphvio.config import Config, MotionConfig, SmootherConfig
+from graphvio.config import Config
+from graphvio.config_stages import MotionConfig, SmootherConfig
 from graphvio.events import Estimate, Event, ImuSample
 from graphvio.geometry import se3_log
 from graphvio.odometry import Odometry
