@@ -85,7 +85,7 @@ def run_live(
     from graphvio.config import Config
     from graphvio.errors import SessionError
     from graphvio.live.health import HealthServer
-    from graphvio.live.output import Output
+    from graphvio.live.heap import share_heap
     from graphvio.live.running import LiveOdometry
     from graphvio.live.session_recorder import SessionRecorder
     from graphvio.live.sources import open_live_source
@@ -99,6 +99,7 @@ def run_live(
         raise typer.BadParameter("--png is how images are recorded; give --record FILE, too")
     if record is not None and record.suffix != ".mcap":
         raise SessionError(f"{record}: is recorded as MCAP, which is read by its name; name it .mcap")
+    share_heap()
     settings = Config.load(config)
     if services is not None:
         settings = services.settings(settings)
@@ -112,16 +113,11 @@ def run_live(
             used = opened.open()
             warm_up(used, settings)  # what sensors deliver meanwhile is not wanted
         signals = stack.enter_context(StopSignals())
-        outputs: list[Output] = []
-        if record is not None:
-            recorder = SessionRecorder(record, used, "png" if png else "raw", waits=not opened.is_realtime)
-            stack.callback(recorder.close)
-            outputs.append(recorder)
         viewer = _viewer(stack, used, view, services)
-        if viewer is not None:
-            outputs.append(ViewOutput(viewer))
-        running = LiveOdometry(opened, used, settings, outputs, wants_keyframes=services is not None)
+        running = LiveOdometry(opened, used, settings, wants_keyframes=services is not None)
         stack.callback(running.stop)
+        if viewer is not None:
+            running.add_output(ViewOutput(viewer))
         if health_port is not None:
             health = HealthServer(running.status, port=health_port)
             stack.callback(health.close)
@@ -129,6 +125,10 @@ def run_live(
         started = None if services is None else services.start(running, stack, lambda: signals.came)
         for line in () if started is None else started.lines:
             typer.echo(line, err=True)
+        if record is not None:  # last, so that no file is left behind by a port that is taken
+            recorder = SessionRecorder(record, used, "png" if png else "raw", waits=not opened.is_realtime)
+            stack.callback(recorder.close)
+            running.add_output(recorder)
         running.start()
         until = None if duration_s is None else monotonic() + duration_s
         failure: Exception | None = None

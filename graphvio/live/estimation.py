@@ -10,7 +10,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from graphvio.config import LiveConfig
+from graphvio.config_stages import LiveConfig
 from graphvio.events import Estimate, Event, FrameSet
 from graphvio.live.inbox import Inbox
 from graphvio.live.load import LoadControl
@@ -22,6 +22,7 @@ from graphvio.odometry import Odometry
 
 _WAITING_FRAMESETS = 8
 _WAITING_RESULTS = 64  # for output
+_READ_AHEAD = 2  # wait for either, where the source waits: more would only take memory
 _KEPT_FRAMESETS = 64  # until they are estimated
 _ROUND_S = 0.05
 _START_NS = 500_000_000
@@ -71,8 +72,8 @@ class Estimation:
         publish: Callable[[Estimate], None],
         tell_incidents: Callable[[], None],
     ) -> None:
-        self.inbox = Inbox(_WAITING_FRAMESETS, waits=not is_realtime)
-        self.results: Pipe[Result] = Pipe(_WAITING_RESULTS)
+        self.inbox = Inbox(_WAITING_FRAMESETS if is_realtime else _READ_AHEAD, waits=not is_realtime)
+        self.results: Pipe[Result] = Pipe(_WAITING_RESULTS if is_realtime else _READ_AHEAD)
         self.load = LoadControl(config.max_latency_ms)
         self.latest: Estimate | None = None
         self._odometry = odometry

@@ -19,6 +19,7 @@ from graphvio.rig import Imu, Rig
 from graphvio.synchroniser import Report
 
 _WAITING_IMAGES = 64  # for decoding
+_READ_AHEAD_IMAGES = 8  # likewise, of a source that waits
 _MISSING_SAMPLE_MS = 10.0  # so long one that others overtook is waited for
 _ROUND_S = 0.05
 
@@ -47,7 +48,8 @@ class Reception:
     def __init__(
         self, source: LiveSource, rig: Rig, config: Config, meter: Meter, report: Report, bring: Bring
     ) -> None:
-        self.images: Pipe[tuple[CameraFrame, int]] = Pipe(_WAITING_IMAGES)
+        most_images = _WAITING_IMAGES if source.is_realtime else _READ_AHEAD_IMAGES
+        self.images: Pipe[tuple[CameraFrame, int]] = Pipe(most_images)
         self.started_ns = self.last_ns = host_ns()
         self.temperature_c: float | None = None
         self._source = source

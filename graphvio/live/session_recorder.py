@@ -14,7 +14,8 @@ from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
 
 _WAITING = 20_000  # samples, poses and messages: a minute of them
-_WAITING_IMAGES = 120  # framesets
+_WAITING_IMAGES = 120  # framesets: a disk may pause for seconds
+_READ_AHEAD = 2  # framesets, where the source waits
 
 
 class SessionRecorder:
@@ -39,7 +40,7 @@ class SessionRecorder:
         self._waits = waits
         self._writer = SessionWriter(path, rig, image_format)
         self._waiting: Pipe[Callable[[], None]] = Pipe(_WAITING)
-        self._images = threading.Semaphore(_WAITING_IMAGES)
+        self._images = threading.Semaphore(_READ_AHEAD if waits else _WAITING_IMAGES)
         self._left_out = 0  # framesets for which the disk was too slow,
         self._lost = 0  # and samples, poses, messages
         self._framesets = 0

@@ -23,6 +23,7 @@ from campaigns.live_listener import Listener
 from campaigns.live_services import Beside
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
+from graphvio.live.heap import share_heap
 from graphvio.live.running import LiveOdometry
 from graphvio.live.sources.simulator import SimulatedRig
 from graphvio.warmup import warm_up
@@ -79,6 +80,7 @@ def _soak(
     folder: Path, framesets: int, is_real_time: bool, target: Path | None
 ) -> tuple[list[list[str]], _Figures, float, str]:
     """Rows by tenths, the figures at the end, by how much memory grew, and what ran beside: none without a target."""
+    share_heap()  # as the command line does
     config = Config()
     if target is not None:
         config = replace(config, keyframes=replace(config.keyframes, images=True))
