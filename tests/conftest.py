@@ -1,5 +1,7 @@
 """Fixtures that several test files share."""
 
+import fcntl
+import os
 from pathlib import Path
 
 import matplotlib
@@ -18,6 +20,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def room_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated recording: 5 s in the room, the first of them at rest, both pairs and the IMU."""
-    out = tmp_path_factory.mktemp("simulated") / "room"
-    simulate("room", out, duration_s=5.0, seed=3)
+    base = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        base = base.parent  # whichever process comes first renders it for all
+    out = base / "simulated" / "room"
+    out.parent.mkdir(exist_ok=True)
+    with (out.parent / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not out.exists():
+            simulate("room", out.with_name("unfinished"), duration_s=5.0, seed=3)
+            out.with_name("unfinished").rename(out)
     return out

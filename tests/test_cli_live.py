@@ -149,7 +149,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_run(recording: Path, tmp_pat
     assert told is not None, done.stderr
     assert int(told[1]) == framesets_in(out)
     assert "101 estimates of 101 framesets" in done.stdout
-    assert framesets_in(out) > 5
+    assert 0 < framesets_in(out) < 101
 
 
 def test_a_panel_is_drawn_in_a_terminal(recording: Path) -> None:
