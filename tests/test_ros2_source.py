@@ -243,7 +243,7 @@ def rig_of_other_names() -> Rig:
 
 def test_topics_that_are_not_published_are_named(domain: int, robot: Other) -> None:
     rig = small_rig()
-    absent = open_live_source(f"ros2:?domain={domain}&cam0=/front/image_raw&wait_s=2.5", rig)
+    absent = open_live_source(f"ros2:?domain={domain}&cam0=/front/image_raw&wait_s=1.5", rig)
     with pytest.raises(SourceError, match=r"nobody publishes /front/image_raw; topics on domain .* are .*/imu"):
         absent.open()
     of_another_type = open_live_source(f"ros2:?domain={domain}&cam0=/imu", rig)
@@ -252,10 +252,10 @@ def test_topics_that_are_not_published_are_named(domain: int, robot: Other) -> N
     reliable = open_live_source(f"ros2:?domain={domain}&reliable=1", rig)
     with pytest.raises(SourceError, match="best effort"):
         reliable.open()
-    nameless = open_live_source(f"ros2:?domain={domain}&wait_s=2.5", rig_of_other_names())
+    nameless = open_live_source(f"ros2:?domain={domain}&wait_s=1.5", rig_of_other_names())
     with pytest.raises(SourceError, match=r"images of north; say north=/TOPIC\. Topics with images: /pair0/left"):
         nameless.open()
-    no_pair = open_live_source(f"ros2:?domain={domain}&left=/pair0/left/image_raw&wait_s=2.5")
+    no_pair = open_live_source(f"ros2:?domain={domain}&left=/pair0/left/image_raw&wait_s=1.5")
     with pytest.raises(RigError, match="no rig is told"):
         no_pair.open()
 
