@@ -28,6 +28,7 @@ def room_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with (out.parent / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not out.exists():
-            simulate("room", out.with_name("unfinished"), duration_s=5.0, seed=3)
-            out.with_name("unfinished").rename(out)
+            unfinished = out.with_name(f"unfinished-{os.getpid()}")
+            simulate("room", unfinished, duration_s=5.0, seed=3)
+            unfinished.rename(out)
     return out

@@ -216,6 +216,14 @@ def test_what_cannot_be_opened_is_an_error_that_is_told(recording: Path, argumen
     assert told in str(done.exception)
 
 
+def test_a_recording_that_exists_is_told_before_a_source_is_opened(tmp_path: Path) -> None:
+    out = tmp_path / "walk.mcap"
+    out.touch()
+    done = live("replay:no-recording", "--record", out)
+    assert str(done.exception).startswith(f"{out}: exists")
+    assert not out.stat().st_size
+
+
 @pytest.mark.usefixtures("cold")
 def test_what_fails_in_a_thread_is_told_and_what_came_is_saved(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -248,13 +256,14 @@ def test_it_ends_after_the_time_that_was_asked_for(recording: Path) -> None:
 
 
 @pytest.mark.usefixtures("cold")
-def test_a_wrong_port_leaves_no_thread(recording: Path) -> None:
+def test_a_wrong_port_leaves_no_thread_and_no_recording(recording: Path, tmp_path: Path) -> None:
     from graphvio.live.health import HealthServer
 
-    taken = HealthServer(dict)
-    done = live(f"replay:{recording}", "--health-port", taken.address.split(":")[1])
+    taken, out = HealthServer(dict), tmp_path / "walk.mcap"
+    done = live(f"replay:{recording}", "--health-port", taken.address.split(":")[1], "--record", out)
     taken.close()
     assert "cannot be listened on" in str(done.exception)
+    assert not out.exists()
     assert not [t.name for t in threading.enumerate() if t.name in ("graphvio-capture", "graphvio-odometry")]
 
 

@@ -91,6 +91,7 @@ def run_live(
     from graphvio.live.sources import open_live_source
     from graphvio.live.view_output import ViewOutput
     from graphvio.rig import Rig
+    from graphvio.sessions.storage import exists_error
     from graphvio.warmup import warm_up
 
     if duration_s is not None and not duration_s > 0.0:
@@ -99,6 +100,10 @@ def run_live(
         raise typer.BadParameter("--png is how images are recorded; give --record FILE, too")
     if record is not None and record.suffix != ".mcap":
         raise SessionError(f"{record}: is recorded as MCAP, which is read by its name; name it .mcap")
+    if record is not None and record.exists():
+        raise exists_error(record)
+    if record is not None and not record.parent.is_dir():
+        raise SessionError(f"{record}: {record.parent} is no folder; make it first")
     share_heap()
     settings = Config.load(config)
     if services is not None:
@@ -113,6 +118,7 @@ def run_live(
             used = opened.open()
             warm_up(used, settings)  # what sensors deliver meanwhile is not wanted
         signals = stack.enter_context(StopSignals())
+        recording = stack.enter_context(ExitStack())  # ends after the run, so that it has all that was made
         viewer = _viewer(stack, used, view, services)
         running = LiveOdometry(opened, used, settings, wants_keyframes=services is not None)
         stack.callback(running.stop)
@@ -127,7 +133,7 @@ def run_live(
             typer.echo(line, err=True)
         if record is not None:  # last, so that no file is left behind by a port that is taken
             recorder = SessionRecorder(record, used, "png" if png else "raw", waits=not opened.is_realtime)
-            stack.callback(recorder.close)
+            recording.callback(recorder.close)
             running.add_output(recorder)
         running.start()
         until = None if duration_s is None else monotonic() + duration_s
@@ -191,9 +197,10 @@ def _viewer(stack: ExitStack, rig: Rig, view: bool, services: Services | None) -
     from graphvio.viewer import Viewer, WebOptions
 
     web = None if services is None or services.web_port is None else WebOptions(port=services.web_port)
+    viewer = stack.enter_context(Viewer(rig, spawn=view, web=web)) if view or web is not None else None
     if web is not None:
         typer.echo(f"browser: {web.url}", err=True)
-    return stack.enter_context(Viewer(rig, spawn=view, web=web)) if view or web is not None else None
+    return viewer
 
 
 def _list() -> None:

@@ -61,6 +61,8 @@ def slam(
         check_target(out)
         if out.exists() and any(out.iterdir()) and (saved_map is None or out.resolve() != saved_map.resolve()):
             raise MapError(f"{out}: holds a map already; name another folder, or go on with it by  --map {out}")
+    if save_rrd is not None and save_rrd.exists():
+        raise MapError(f"{save_rrd}: exists; name another file for --save-rrd")
     services = _WithMapping(
         port=0, ros2_domain=ros2, saved_map=saved_map, out=out, view=view, map_web_port=web, save_rrd=save_rrd
     )
