@@ -256,7 +256,7 @@ def test_a_decoder_that_fails_lets_go_of_a_capture_that_waits_for_room(is_realti
     most = 63 if is_realtime else 8  # of 64: in real time all may have come before the first one is taken
 
     def decode(i: int, image: Image) -> Image:
-        until(lambda: runs[0].status()["waiting_images"] >= most)
+        until(lambda: int(runs[0].status()["waiting_images"] or 0) >= most)
         raise ValueError("no image")
 
     source = Scripted(small_rig(1), lambda: small_readings(small_rig(1), 400, decode), is_realtime)
