@@ -7,7 +7,7 @@ from pathlib import Path
 
 from graphvio.arrays import Image
 from graphvio.errors import SourceError
-from graphvio.events import Event, ImuSample
+from graphvio.events import Event, FrameSet, ImuSample
 from graphvio.live.source import CameraFrame, DeviceHealth, DeviceInfo, ImuReading, Notice, Reading, host_ns
 from graphvio.live.sources import SourceSpec, check_options
 from graphvio.live.sources.pacing import Pace, speed_of
@@ -75,9 +75,11 @@ class Replay:
 
 
 def paced(events: Iterable[Event], rig: Rig, pace: Pace) -> Iterator[Reading]:
-    """Events as readings of one clock, each when it is due."""
+    """Events as readings of one clock, each when it is due; samples that precede the first frameset come at once."""
+    has_begun = False
     for event in events:
-        if not pace.wait_for(event.stamp_ns):
+        has_begun = has_begun or isinstance(event, FrameSet)
+        if has_begun and not pace.wait_for(event.stamp_ns):
             return
         now_ns = host_ns()
         if isinstance(event, ImuSample):
