@@ -128,6 +128,8 @@ import resource, signal, sys
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 import graphvio.warmup
 graphvio.warmup.warm_up = lambda *_: None
+from graphvio.sessions import mcap_storage
+mcap_storage._CHUNK_BYTES = 20_000  # what is on the disk must not depend on how fast this machine is
 from graphvio.cli import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, resource.RLIM_INFINITY))
 main()
@@ -149,7 +151,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_run(recording: Path, tmp_pat
     assert told is not None, done.stderr
     assert int(told[1]) == framesets_in(out)
     assert "101 estimates of 101 framesets" in done.stdout
-    assert 0 < framesets_in(out) < 101
+    assert 5 < framesets_in(out) < 101
 
 
 def test_a_panel_is_drawn_in_a_terminal(recording: Path) -> None:

@@ -150,10 +150,10 @@ def test_faults_of_a_recording_are_told(recording: Path, tmp_path: Path) -> None
 
 
 def test_a_replay_keeps_the_recordings_pace(recording: Path) -> None:
-    """Never faster, however busy the machine is: one second of images at ten times the pace."""
+    """Never faster, however busy the machine is: one second of images at five times the pace."""
     begun_s = time.monotonic()
-    readings = all_of(f"replay:{recording}?speed=10")
-    assert time.monotonic() - begun_s > 0.09
+    readings = all_of(f"replay:{recording}?speed=5")
+    assert time.monotonic() - begun_s > 0.18
     assert open_live_source(f"replay:{recording}?speed=10").is_realtime
     assert not open_live_source(f"replay:{recording}?speed=max").is_realtime
     frames, _ = images_and_samples(readings)

@@ -83,7 +83,6 @@ def run_live(
     from graphvio.cli.dashboard import Dashboard, line_of, summary_of
     from graphvio.cli.stopping import StopSignals, sigterm_as_interrupt
     from graphvio.config import Config
-    from graphvio.errors import SessionError
     from graphvio.live.health import HealthServer
     from graphvio.live.heap import share_heap
     from graphvio.live.running import LiveOdometry
@@ -91,19 +90,14 @@ def run_live(
     from graphvio.live.sources import open_live_source
     from graphvio.live.view_output import ViewOutput
     from graphvio.rig import Rig
-    from graphvio.sessions.storage import exists_error
     from graphvio.warmup import warm_up
 
     if duration_s is not None and not duration_s > 0.0:
         raise typer.BadParameter(f"--for is {duration_s:g}; give seconds")
     if png and record is None:
         raise typer.BadParameter("--png is how images are recorded; give --record FILE, too")
-    if record is not None and record.suffix != ".mcap":
-        raise SessionError(f"{record}: is recorded as MCAP, which is read by its name; name it .mcap")
-    if record is not None and record.exists():
-        raise exists_error(record)
-    if record is not None and not record.parent.is_dir():
-        raise SessionError(f"{record}: {record.parent} is no folder; make it first")
+    if record is not None:
+        _check_recording(record)
     share_heap()
     settings = Config.load(config)
     if services is not None:
@@ -161,6 +155,19 @@ def run_live(
         is_whole = _tell_recorded(record, recorder.status()) and is_whole
     if not is_whole:
         raise typer.Exit(EXIT_STOPPED)
+
+
+def _check_recording(path: Path) -> None:
+    """Find out what cannot be recorded to, before anything is started."""
+    from graphvio.errors import SessionError
+    from graphvio.sessions.storage import exists_error
+
+    if path.suffix != ".mcap":
+        raise SessionError(f"{path}: is recorded as MCAP, which is read by its name; name it .mcap")
+    if path.exists():
+        raise exists_error(path)
+    if not path.parent.is_dir():
+        raise SessionError(f"{path}: {path.parent} is no folder; make it first")
 
 
 def _tell_recorded(path: Path, told: Mapping[str, float | int | str | None]) -> bool:
