@@ -6,7 +6,7 @@ The names below are loaded when they are first used, so that ``import graphvio``
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-__version__ = "0.1.0"
+from graphvio.version import __version__
 
 if TYPE_CHECKING:
     from graphvio.calibration.calibrate import calibrate_pairs, calibrate_trajectories
@@ -15,14 +15,15 @@ if TYPE_CHECKING:
     from graphvio.errors import (
         CalibrationError,
         ConfigError,
-        EventError,
         GraphvioError,
+        MeasurementError,
         MissingExtraError,
         OptimizationError,
         RigError,
         SourceError,
     )
-    from graphvio.events import Estimate, FrameSet, ImuSample, Prediction, Status
+    from graphvio.measurements.estimate import Estimate, Prediction, Status
+    from graphvio.measurements.sensors import FrameSet, ImuSample
     from graphvio.odometry import Odometry
     from graphvio.optimization.optimize import Optimization
     from graphvio.optimization.pipeline import optimize_sessions
@@ -36,21 +37,21 @@ _HOME_OF = {
     "Camera": "rig",
     "Config": "config",
     "ConfigError": "errors",
-    "Estimate": "events",
-    "EventError": "errors",
-    "FrameSet": "events",
+    "Estimate": "measurements.estimate",
+    "MeasurementError": "errors",
+    "FrameSet": "measurements.sensors",
     "GraphvioError": "errors",
     "Imu": "rig",
-    "ImuSample": "events",
+    "ImuSample": "measurements.sensors",
     "MissingExtraError": "errors",
     "Odometry": "odometry",
     "Optimization": "optimization.optimize",
     "OptimizationError": "errors",
-    "Prediction": "events",
+    "Prediction": "measurements.estimate",
     "Rig": "rig",
     "RigError": "errors",
     "SourceError": "errors",
-    "Status": "events",
+    "Status": "measurements.estimate",
     "StereoPair": "rig",
     "Trajectory": "trajectory",
     "calibrate_pairs": "calibration.calibrate",
@@ -66,11 +67,11 @@ __all__ = [
     "Config",
     "ConfigError",
     "Estimate",
-    "EventError",
     "FrameSet",
     "GraphvioError",
     "Imu",
     "ImuSample",
+    "MeasurementError",
     "MissingExtraError",
     "Odometry",
     "Optimization",

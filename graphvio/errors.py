@@ -17,7 +17,7 @@ class ConfigError(GraphvioError):
     """A configuration file, profile or value is not valid."""
 
 
-class EventError(GraphvioError):
+class MeasurementError(GraphvioError):
     """An IMU sample or frameset that a program hands over is malformed."""
 
 

@@ -11,8 +11,7 @@ Reference: J. Sola, J. Deray, D. Atchuthan, *A micro Lie theory for state estima
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.copying import put
-from graphvio.kernels import kernel
+from graphvio.kernels import kernel, put
 
 _SMALL_ANGLE = 1e-5
 

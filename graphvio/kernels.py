@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
+import numpy as np
 from numba.core import event as numba_event
 
 P = ParamSpec("P")
@@ -124,3 +125,10 @@ class _Announcer(numba_event.Listener):  # type: ignore[misc]
 
 
 numba_event.register("numba:compile", _Announcer())
+
+
+@kernel
+def put(target: Any, values: Any) -> None:
+    """Assign ``target[:] = values`` of equal shapes, which numba itself takes seconds to compile at each use."""
+    for index in np.ndindex(values.shape):
+        target[index] = values[index]

@@ -11,7 +11,8 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.events import Estimate, Event, FrameSet, Status
+from graphvio.measurements.estimate import Estimate, Status
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.odometry import Odometry
 from graphvio.optimization.record import Recorder
 from graphvio.results import ResultWriter, Summary
@@ -19,7 +20,7 @@ from graphvio.sources import Source
 from graphvio.viewer import Viewer
 
 RESETS = ("gate_reset", "new_epoch", "window_rebuilt", "imu_came", "time_jump")
-"""Kinds of incidents after which the estimation started anew."""
+"""Kinds of events after which the estimation started anew."""
 
 _KEPT_FRAMESETS = 100  # held by the odometry for lack of IMU samples, at the most
 
@@ -57,7 +58,7 @@ def run(
     """Run the odometry over a source and write the results.
 
     Args:
-        source: of the events; its rig is used.
+        source: of the measurements; its rig is used.
         config: of the odometry.
         writer: of the results.
         viewer: shows or saves what happens, or None.
@@ -98,11 +99,11 @@ class _Run:
         self._start = perf_counter()
 
     def go(self) -> Summary:
-        """Feed every event, then what is still held; only the odometry's own time is taken for a frameset's."""
-        for event in self._source:
-            self._remember(event)
+        """Feed every measurement, then what is still held; only the odometry's own time is taken for a frameset's."""
+        for measurement in self._source:
+            self._remember(measurement)
             begin = perf_counter()
-            estimate = self._odometry.process(event)
+            estimate = self._odometry.process(measurement)
             if estimate is not None:
                 self._frameset_ms.append(1e3 * (perf_counter() - begin))
                 self._take(estimate)
@@ -113,8 +114,8 @@ class _Run:
             begin = perf_counter()
         wall_s = perf_counter() - self._start
         self._collect()
-        for incident in self._source.faults.incidents:
-            self._writer.add_incident(incident)
+        for event in self._source.faults.events:
+            self._writer.add_event(event)
         return self._writer.finish(
             wall_s=wall_s,
             frameset_ms=self._frameset_ms,
@@ -127,11 +128,11 @@ class _Run:
             truth=self._source.truth,
         )
 
-    def _remember(self, event: Event) -> None:
-        if isinstance(event, FrameSet):
+    def _remember(self, measurement: Measurement) -> None:
+        if isinstance(measurement, FrameSet):
             self._delivered += 1
             if self._viewer is not None:
-                self._waiting[event.stamp_ns] = event
+                self._waiting[measurement.stamp_ns] = measurement
                 if len(self._waiting) > _KEPT_FRAMESETS:
                     self._waiting.popitem(last=False)
 
@@ -161,11 +162,11 @@ class _Run:
         self._smoothed += final
         if self._recorder is not None:
             self._recorder.add_smoothed(final)
-        for incident in self._odometry.take_incidents():
-            self._resets += incident.kind in RESETS
-            self._writer.add_incident(incident)
+        for event in self._odometry.take_events():
+            self._resets += event.kind in RESETS
+            self._writer.add_event(event)
             if self._viewer is not None:
-                self._viewer.show_incident(incident)
+                self._viewer.show_event(event)
 
 
 def _distance(before: Estimate, now: Estimate) -> float:

@@ -12,13 +12,13 @@ from graphvio.backend.propagation import Propagator
 from graphvio.backend.states import RigState
 from graphvio.backend.time_offset import integrated_rates
 from graphvio.config import Config
-from graphvio.events import ImuSample
 from graphvio.frontend.alignment import learn_from_nothing
 from graphvio.frontend.observations import Observations, RigArrays, correspond
 from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import common_rows
 from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, so3_log
+from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Imu, Rig
 from graphvio.slam.descriptors import orientations
 
@@ -67,10 +67,10 @@ def _warm_up_imu(imu: Imu) -> None:
     buffer, up = ImuBuffer(1e3), np.array([0.0, 0.0, GRAVITY_M_S2])
     for stamp_ns in range(0, 40_000_000, 10_000_000):
         buffer.add(ImuSample(stamp_ns, np.zeros(3), up))
-    span = buffer.span(0, 25_000_000)
-    assert span is not None
-    integrated_rates(span.steps_s, span.angular_velocity)
-    preintegrate(span, preintegration_params(imu, 1.0), gtsam.imuBias.ConstantBias())
+    interval = buffer.interval(0, 25_000_000)
+    assert interval is not None
+    integrated_rates(interval.steps_s, interval.angular_velocity)
+    preintegrate(interval, preintegration_params(imu, 1.0), gtsam.imuBias.ConstantBias())
     for pose in (np.eye(4), np.asfortranarray(np.eye(4))):
         state = RigState(pose, np.zeros(3), np.zeros(3), np.zeros(3))
         for samples in (buffer.since(0), NO_SAMPLES):

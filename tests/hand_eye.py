@@ -10,8 +10,8 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.calibration.camera_motions import CameraMotions
 from graphvio.calibration.pose_pairs import PosePairs
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3, se3_exp, se3_inverse
+from graphvio.measurements.motion import RelativeMotion
 
 PERIOD_NS = 50_000_000
 FRAMES = 240

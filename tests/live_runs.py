@@ -11,13 +11,15 @@ from recordings import START_NS, noise_image
 
 from graphvio import Odometry, open_source
 from graphvio.arrays import Image
+from graphvio.broadcast import Subscription
 from graphvio.config import Config
-from graphvio.events import Estimate, Event, FrameSet, Incident
-from graphvio.live.broadcast import Subscription
 from graphvio.live.output import Output
 from graphvio.live.running import LiveOdometry
 from graphvio.live.source import CameraFrame, DeviceHealth, ImuReading, LiveSource, Reading, host_ns
 from graphvio.live.sources import open_live_source
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.rig import Rig
 
 SOON_S = 60.0  # until then an end is waited for; only a test that fails takes so long
@@ -66,13 +68,13 @@ class Scripted:
 class Watched(Output):
     """An output that does nothing but what a test overrides."""
 
-    def add_event(self, event: Event) -> None:
+    def add_measurement(self, measurement: Measurement) -> None:
         """Nothing."""
 
     def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
         """Nothing."""
 
-    def add_incident(self, incident: Incident) -> None:
+    def add_event(self, event: Event) -> None:
         """Nothing."""
 
     def status(self) -> Figures:
@@ -121,21 +123,21 @@ def all_of(subscription: Subscription[Estimate]) -> list[Estimate]:
 
 def run(
     source: LiveSource, config: Config | None = None, outputs: Sequence[Output] = ()
-) -> tuple[list[Estimate], list[Incident], Figures]:
-    """Run a source to its end: estimates, incidents and status."""
+) -> tuple[list[Estimate], list[Event], Figures]:
+    """Run a source to its end: estimates, events and status."""
     running = LiveOdometry(source, source.open(), config or Config(), outputs)
-    estimates, incidents = running.estimates.subscribe(100_000), running.incidents.subscribe(100_000)
+    estimates, events = running.estimates.subscribe(100_000), running.events.subscribe(100_000)
     running.start()
     assert running.wait(SOON_S)
     assert estimates.is_closed  # all can go home without anybody's stopping it
     running.stop()
     told = []
-    while (incident := incidents.get()) is not None:
-        told.append(incident)
+    while (event := events.get()) is not None:
+        told.append(event)
     return all_of(estimates), told, running.status()
 
 
-def run_spec(spec: str, outputs: Sequence[Output] = ()) -> tuple[list[Estimate], list[Incident], Figures]:
+def run_spec(spec: str, outputs: Sequence[Output] = ()) -> tuple[list[Estimate], list[Event], Figures]:
     """The same by what is written on the command line."""
     return run(open_live_source(spec), outputs=outputs)
 
@@ -144,7 +146,7 @@ def plain(recording: Path) -> list[Estimate]:
     """Estimates of the odometry over a recording."""
     source = open_source(recording)
     odometry = Odometry(source.rig)
-    estimates = [estimate for event in source if (estimate := odometry.process(event)) is not None]
+    estimates = [estimate for measurement in source if (estimate := odometry.process(measurement)) is not None]
     return [*estimates, *odometry.finish()]
 
 

@@ -12,12 +12,12 @@ from calibration_walks import walk_simulator
 
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.config_stages import OptimizationConfig
+from graphvio.config.stages import OptimizationConfig
 from graphvio.errors import SourceError
-from graphvio.events import FrameSet
 from graphvio.geometry import se3_inverse
 from graphvio.mapping.drawn_front_end import DrawnFrontEnd
 from graphvio.mapping.mapper import Mapper
+from graphvio.measurements.sensors import FrameSet
 from graphvio.simulation import Simulator
 from graphvio.slam.keyframe import CorrectionResult
 

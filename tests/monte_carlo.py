@@ -16,13 +16,13 @@ from scipy.stats import chi2
 from graphvio.arrays import AnyArray, Bool, Float
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty
-from graphvio.config_stages import MotionConfig, SmootherConfig
-from graphvio.frontend.motion import RelativeMotion
+from graphvio.config.stages import MotionConfig, SmootherConfig
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import joint_motion
 from graphvio.frontend.stereo import triangulate
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Rig, StereoPair
 from graphvio.simulation import build_scene
 from graphvio.simulation.default_rig import default_rig
@@ -151,8 +151,8 @@ def arrays_of_walks() -> RigArrays:
 
 def draw_poses(walk: Walk, frames: int, rng: np.random.Generator) -> Float:
     """Poses ``world_T_body`` (frames + 1, 4, 4) of successive framesets from a random time of the walk on."""
-    span = frames / RATE_HZ
-    start = rng.uniform(1.5, walk.motion.duration_s - span - 2.0)
+    interval = frames / RATE_HZ
+    start = rng.uniform(1.5, walk.motion.duration_s - interval - 2.0)
     return walk.motion.at(start + np.arange(frames + 1) / RATE_HZ).world_T_body
 
 

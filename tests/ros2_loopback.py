@@ -133,7 +133,7 @@ def robot(domain: int) -> None:
     import cv2
     from recordings import SIZE_PX, noise_image, small_rig
 
-    from graphvio.events import ImuSample
+    from graphvio.measurements.sensors import ImuSample
     from graphvio.sessions import messages
 
     rig = small_rig()

@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.events import Estimate, Incident, Prediction, Quality, Status
+from graphvio.broadcast import Broadcast
 from graphvio.geometry import se3, so3_exp
-from graphvio.live.broadcast import Broadcast
+from graphvio.measurements.estimate import Estimate, Prediction, Status
+from graphvio.measurements.events import Event
+from graphvio.measurements.motion import Quality
 from graphvio.rig import Camera, Imu, Rig, StereoPair
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
 from graphvio.slam.keyframe_log import KeyframeLog
@@ -105,7 +107,7 @@ class DrawnOdometry:
         self.rig = rig()
         self.estimates: Broadcast[Estimate] = Broadcast()
         self.predictions: Broadcast[Prediction] = Broadcast()
-        self.incidents: Broadcast[Incident] = Broadcast()
+        self.events: Broadcast[Event] = Broadcast()
         self.keyframe_log = KeyframeLog(most_bytes)
         self.map_T_odom: Float | None = None
         self.corrections: list[tuple[int, Float, Float]] = []
@@ -122,5 +124,5 @@ class DrawnOdometry:
         return self.figures
 
     def end(self) -> None:
-        for each in (self.estimates, self.predictions, self.incidents, self.keyframe_log):
+        for each in (self.estimates, self.predictions, self.events, self.keyframe_log):
             each.close()

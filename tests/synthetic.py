@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from graphvio.arrays import AnyArray, Float
 from graphvio.backend.inertial import GRAVITY_M_S2, ImuBuffer
-from graphvio.events import ImuSample
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.stereo import triangulate
+from graphvio.measurements.motion import RelativeMotion
+from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Camera, Imu, Rig, StereoPair
 
 # A first call may compile; and a test that fails does so every time.

@@ -3,8 +3,9 @@ import pytest
 from scipy.stats import chi2
 from synthetic import random_covariance, random_transform, transform
 
-from graphvio.backend.gating import Verdict, gate, relative_covariance
+from graphvio.backend.gating import gate, relative_covariance
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
+from graphvio.measurements.gate_result import GateResult
 
 
 def test_relative_covariance_against_monte_carlo() -> None:
@@ -55,21 +56,21 @@ def test_gross_errors_are_refused() -> None:
     covariance = np.diag(np.repeat([1e-3, 1e-2], 3) ** 2)
     truth = transform([0.01, 0.02, 0.0], [0.1, 0.0, 0.0])
     for error in ([0.1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0.2, 0], [0, 0, 3.1, 0, 0, 0], [0, 0, 0, 1e3, 0, 0]):
-        verdict = gate(truth @ se3_exp(np.array(error, dtype=float)), covariance, truth, covariance, 0.9999)
-        assert not verdict.accepted
-        assert verdict.statistic > verdict.threshold == pytest.approx(chi2.ppf(0.9999, 6))
+        gate_result = gate(truth @ se3_exp(np.array(error, dtype=float)), covariance, truth, covariance, 0.9999)
+        assert not gate_result.accepted
+        assert gate_result.statistic > gate_result.threshold == pytest.approx(chi2.ppf(0.9999, 6))
 
 
 def test_the_statistic_is_the_mahalanobis_distance() -> None:
     measured, predicted = transform([0, 0, 0], [0.3, 0, 0]), np.eye(4)
-    verdict = gate(measured, 0.04 * np.eye(6), predicted, 0.05 * np.eye(6), 0.95)
-    assert verdict.statistic == pytest.approx(0.3**2 / 0.09)
-    assert verdict.accepted
+    gate_result = gate(measured, 0.04 * np.eye(6), predicted, 0.05 * np.eye(6), 0.95)
+    assert gate_result.statistic == pytest.approx(0.3**2 / 0.09)
+    assert gate_result.accepted
 
 
 def test_an_outcome_near_the_threshold_is_not_clear() -> None:
     clear = [
-        Verdict(statistic < 20.0, statistic, 20.0, np.zeros(6), np.eye(6)).is_clear
+        GateResult(statistic < 20.0, statistic, 20.0, np.zeros(6), np.eye(6)).is_clear
         for statistic in (0.0, 9.0, 11.0, 20.0, 39.0, 41.0)
     ]
     assert clear == [True, True, False, False, False, True]

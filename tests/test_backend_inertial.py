@@ -5,9 +5,10 @@ from scipy.spatial.transform import Rotation
 from synthetic import UP, filled_buffer, pose_at, velocity_at
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import GRAVITY_M_S2, ImuBuffer, ImuSpan
+from graphvio.backend.inertial import GRAVITY_M_S2, ImuBuffer
 from graphvio.backend.preintegration import preintegrate, preintegration_params
-from graphvio.events import ImuSample
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Imu
 
 MS = 1_000_000
@@ -113,47 +114,47 @@ def test_coarse_readings_at_rest_are_not_stuck() -> None:
 
 
 @pytest.mark.parametrize(("start", "end"), [(0, 20), (3, 17), (10, 20), (11, 13), (0, 11), (19, 40)])
-def test_a_span_of_linear_signals_is_exact(start: int, end: int) -> None:
+def test_a_interval_of_linear_signals_is_exact(start: int, end: int) -> None:
     buffer = linear_buffer([0, 10 * MS, 15 * MS, 20 * MS, 40 * MS])
-    span = buffer.span(START_NS + start * MS, START_NS + end * MS)
-    assert span is not None
-    assert span.steps_s.sum() == pytest.approx((end - start) * 1e-3, abs=1e-12)
-    assert span.steps_s.min() > 0.0
+    interval = buffer.interval(START_NS + start * MS, START_NS + end * MS)
+    assert interval is not None
+    assert interval.steps_s.sum() == pytest.approx((end - start) * 1e-3, abs=1e-12)
+    assert interval.steps_s.min() > 0.0
     middle = START_NS + (start + end) * MS // 2
-    np.testing.assert_allclose(span.mean_rate, linear(middle)[0], atol=1e-9)
-    mean_force = span.steps_s @ span.linear_acceleration / span.steps_s.sum()
+    np.testing.assert_allclose(interval.mean_rate, linear(middle)[0], atol=1e-9)
+    mean_force = interval.steps_s @ interval.linear_acceleration / interval.steps_s.sum()
     np.testing.assert_allclose(mean_force, linear(middle)[1], atol=1e-8)
-    middles = np.cumsum(span.steps_s) - 0.5 * span.steps_s + start * 1e-3
+    middles = np.cumsum(interval.steps_s) - 0.5 * interval.steps_s + start * 1e-3
     expected = [linear(START_NS + round(t * 1e9))[0] for t in middles]
-    np.testing.assert_allclose(span.angular_velocity, expected, atol=1e-8)
+    np.testing.assert_allclose(interval.angular_velocity, expected, atol=1e-8)
 
 
-def test_spans_that_are_not_known() -> None:
+def test_intervals_that_are_not_known() -> None:
     buffer = linear_buffer([0, 10 * MS, 20 * MS, 75 * MS, 80 * MS])
-    assert buffer.span(START_NS - 1, START_NS + 10 * MS) is None
-    assert buffer.span(START_NS + 75 * MS, START_NS + 80 * MS + 1) is None
-    assert buffer.span(START_NS + 10 * MS, START_NS + 10 * MS) is None
-    assert buffer.span(START_NS + 10 * MS, START_NS + 5 * MS) is None
-    assert buffer.span(START_NS + 15 * MS, START_NS + 78 * MS) is None  # a gap of 55 ms
-    assert buffer.span(START_NS + 30 * MS, START_NS + 40 * MS) is None
-    assert buffer.span(START_NS, START_NS + 20 * MS) is not None
-    assert ImuBuffer(50.0).span(0, 1) is None
+    assert buffer.interval(START_NS - 1, START_NS + 10 * MS) is None
+    assert buffer.interval(START_NS + 75 * MS, START_NS + 80 * MS + 1) is None
+    assert buffer.interval(START_NS + 10 * MS, START_NS + 10 * MS) is None
+    assert buffer.interval(START_NS + 10 * MS, START_NS + 5 * MS) is None
+    assert buffer.interval(START_NS + 15 * MS, START_NS + 78 * MS) is None  # a gap of 55 ms
+    assert buffer.interval(START_NS + 30 * MS, START_NS + 40 * MS) is None
+    assert buffer.interval(START_NS, START_NS + 20 * MS) is not None
+    assert ImuBuffer(50.0).interval(0, 1) is None
 
 
-def test_a_stretch_ends_at_the_newest_sample_and_at_a_gap() -> None:
+def test_a_segment_ends_at_the_newest_sample_and_at_a_gap() -> None:
     buffer = linear_buffer([0, 10 * MS, 65 * MS, 70 * MS, 80 * MS, 90 * MS])
-    found = buffer.stretch(START_NS, START_NS + 85 * MS)
+    found = buffer.segment(START_NS, START_NS + 85 * MS)
     assert found is not None
-    span, start_ns = found
+    interval, start_ns = found
     assert start_ns == START_NS + 65 * MS
-    assert span.steps_s.sum() == pytest.approx(15e-3)
-    found = buffer.stretch(START_NS + 70 * MS, START_NS + 10**9)
+    assert interval.steps_s.sum() == pytest.approx(15e-3)
+    found = buffer.segment(START_NS + 70 * MS, START_NS + 10**9)
     assert found is not None
     assert found[1] == START_NS + 70 * MS
     assert found[0].steps_s.sum() == pytest.approx(20e-3)
-    assert buffer.stretch(START_NS + 81 * MS, START_NS + 95 * MS) is None  # one sample
-    assert buffer.stretch(START_NS - 10 * MS, START_NS - 1) is None
-    assert ImuBuffer(50.0).stretch(0, 10) is None
+    assert buffer.segment(START_NS + 81 * MS, START_NS + 95 * MS) is None  # one sample
+    assert buffer.segment(START_NS - 10 * MS, START_NS - 1) is None
+    assert ImuBuffer(50.0).segment(0, 10) is None
 
 
 def test_samples_without_framesets_do_not_fill_the_memory() -> None:
@@ -163,55 +164,57 @@ def test_samples_without_framesets_do_not_fill_the_memory() -> None:
     assert buffer.oldest_ns is not None
     assert buffer.newest_ns is not None
     assert buffer.newest_ns - buffer.oldest_ns < 180_000 * MS  # of 2000 s
-    assert buffer.span(buffer.newest_ns - 50_000 * MS, buffer.newest_ns) is not None
+    assert buffer.interval(buffer.newest_ns - 50_000 * MS, buffer.newest_ns) is not None
 
 
-def test_discarding_keeps_what_a_later_span_needs() -> None:
+def test_discarding_keeps_what_a_later_interval_needs() -> None:
     buffer = linear_buffer([i * 10 * MS for i in range(10)])
-    before = buffer.span(START_NS + 35 * MS, START_NS + 60 * MS)
+    before = buffer.interval(START_NS + 35 * MS, START_NS + 60 * MS)
     buffer.discard_before(START_NS + 35 * MS)
-    after = buffer.span(START_NS + 35 * MS, START_NS + 60 * MS)
+    after = buffer.interval(START_NS + 35 * MS, START_NS + 60 * MS)
     assert before is not None
     assert after is not None
     assert np.array_equal(before.angular_velocity, after.angular_velocity)
-    assert buffer.span(START_NS + 25 * MS, START_NS + 60 * MS) is None
+    assert buffer.interval(START_NS + 25 * MS, START_NS + 60 * MS) is None
 
 
 # ------------------------------------------------------------------ preintegration
 
 
-def predicted(span: ImuSpan, start: gtsam.NavState, bias: gtsam.imuBias.ConstantBias = NO_BIAS) -> gtsam.NavState:
-    return preintegrate(span, PARAMS, bias).predict(start, bias)
+def predicted(
+    interval: ImuInterval, start: gtsam.NavState, bias: gtsam.imuBias.ConstantBias = NO_BIAS
+) -> gtsam.NavState:
+    return preintegrate(interval, PARAMS, bias).predict(start, bias)
 
 
-def constant_span(rate: Float, force: Float, duration_s: float, rate_hz: float = 200.0) -> ImuSpan:
+def constant_interval(rate: Float, force: Float, duration_s: float, rate_hz: float = 200.0) -> ImuInterval:
     n = round(duration_s * rate_hz)
-    return ImuSpan(np.full(n, 1.0 / rate_hz), np.tile(rate, (n, 1)), np.tile(force, (n, 1)))
+    return ImuInterval(np.full(n, 1.0 / rate_hz), np.tile(rate, (n, 1)), np.tile(force, (n, 1)))
 
 
 def test_at_rest_it_stays_at_rest() -> None:
     pose = gtsam.Pose3(gtsam.Rot3.Ypr(0.3, -0.8, 1.2), np.array([1.0, 2.0, 3.0]))
     up_in_body = pose.rotation().matrix().T @ [0.0, 0.0, GRAVITY_M_S2]  # specific force points up
-    end = predicted(constant_span(np.zeros(3), up_in_body, 2.0), gtsam.NavState(pose, np.zeros(3)))
+    end = predicted(constant_interval(np.zeros(3), up_in_body, 2.0), gtsam.NavState(pose, np.zeros(3)))
     np.testing.assert_allclose(end.pose().matrix(), pose.matrix(), atol=1e-9)
     np.testing.assert_allclose(end.velocity(), 0.0, atol=1e-9)
 
 
 def test_free_fall_is_down() -> None:
-    end = predicted(constant_span(np.zeros(3), np.zeros(3), 1.0), gtsam.NavState())
+    end = predicted(constant_interval(np.zeros(3), np.zeros(3), 1.0), gtsam.NavState())
     np.testing.assert_allclose(end.velocity(), [0.0, 0.0, -GRAVITY_M_S2], atol=1e-9)
     np.testing.assert_allclose(end.position(), [0.0, 0.0, -0.5 * GRAVITY_M_S2], atol=1e-9)
 
 
 def test_bias_is_taken_away() -> None:
     gyro, accel = np.array([0.01, -0.02, 0.03]), np.array([0.1, 0.2, -0.3])
-    span = constant_span(gyro, accel + UP, 1.0)
-    end = predicted(span, gtsam.NavState(), gtsam.imuBias.ConstantBias(accel, gyro))
+    interval = constant_interval(gyro, accel + UP, 1.0)
+    end = predicted(interval, gtsam.NavState(), gtsam.imuBias.ConstantBias(accel, gyro))
     np.testing.assert_allclose(end.pose().matrix(), np.eye(4), atol=1e-9)
 
 
 def test_constant_acceleration_and_a_turn_about_it() -> None:
-    spin = constant_span(np.array([0.0, 0.0, 0.7]), np.array([0.0, 0.0, GRAVITY_M_S2 + 0.5]), 2.0)
+    spin = constant_interval(np.array([0.0, 0.0, 0.7]), np.array([0.0, 0.0, GRAVITY_M_S2 + 0.5]), 2.0)
     end = predicted(spin, gtsam.NavState(gtsam.Pose3(), np.array([1.0, 0.0, 0.0])))
     np.testing.assert_allclose(end.position(), [2.0, 0.0, 1.0], atol=1e-9)
     np.testing.assert_allclose(end.velocity(), [1.0, 0.0, 1.0], atol=1e-9)
@@ -230,7 +233,7 @@ def turning_errors(rate_hz: float) -> tuple[float, float]:
     """Errors of velocity and position after a second of rate and force that are constant in body."""
     rate, force = np.array([0.4, -0.6, 0.5]), np.array([1.0, 0.5, 9.0])
     velocity, position = turning_truth(rate, force, 1.0)
-    end = predicted(constant_span(rate, force, 1.0, rate_hz), gtsam.NavState())
+    end = predicted(constant_interval(rate, force, 1.0, rate_hz), gtsam.NavState())
     gravity = np.array([0.0, 0.0, -GRAVITY_M_S2])
     return (
         float(np.linalg.norm(end.velocity() - velocity - gravity)),
@@ -253,9 +256,9 @@ def test_a_turn_under_constant_force_is_exact() -> None:
 def test_a_walk_is_integrated_from_its_samples() -> None:
     imu, rng = Imu(), np.random.default_rng(0)
     buffer = filled_buffer(imu, 3.0, rng, np.zeros(3), np.zeros(3), noise_scale=0.0)
-    span = buffer.span(1_002_500_000, 2_997_500_000)  # between samples
-    assert span is not None
-    end = predicted(span, gtsam.NavState(gtsam.Pose3(pose_at(1.0025)), velocity_at(1.0025)))
+    interval = buffer.interval(1_002_500_000, 2_997_500_000)  # between samples
+    assert interval is not None
+    end = predicted(interval, gtsam.NavState(gtsam.Pose3(pose_at(1.0025)), velocity_at(1.0025)))
     np.testing.assert_allclose(end.position(), pose_at(2.9975)[:3, 3], atol=3e-4)
     np.testing.assert_allclose(end.velocity(), velocity_at(2.9975), atol=3e-4)
     np.testing.assert_allclose(end.attitude().matrix(), pose_at(2.9975)[:3, :3], atol=1e-4)
@@ -264,7 +267,7 @@ def test_a_walk_is_integrated_from_its_samples() -> None:
 def test_noise_densities_are_the_rigs_times_the_factor() -> None:
     imu = Imu()
     one, two = (
-        preintegrate(constant_span(np.zeros(3), np.zeros(3), 1.0), preintegration_params(imu, scale), NO_BIAS)
+        preintegrate(constant_interval(np.zeros(3), np.zeros(3), 1.0), preintegration_params(imu, scale), NO_BIAS)
         for scale in (1.0, 2.0)
     )
     covariance = np.asarray(one.preintMeasCov())

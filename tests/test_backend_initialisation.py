@@ -4,9 +4,10 @@ from scipy.spatial.transform import Rotation
 from synthetic import UP, filled_buffer, pose_at
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import GRAVITY_M_S2, ImuSpan
+from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.backend.initialisation import initial_attitude, level
-from graphvio.config_stages import InitialisationConfig
+from graphvio.config.stages import InitialisationConfig
+from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.rig import Imu
 
 CONFIG = InitialisationConfig()
@@ -14,13 +15,13 @@ IMU = Imu()
 FORWARD = np.array([1.0, 0.0, 0.0])
 
 
-def resting(nav_R_body: Float, gyro_bias: Float, seed: int, duration_s: float = 1.0, noise: float = 1.0) -> ImuSpan:
+def resting(nav_R_body: Float, gyro_bias: Float, seed: int, duration_s: float = 1.0, noise: float = 1.0) -> ImuInterval:
     n = round(duration_s * IMU.rate_hz)
     rng = np.random.default_rng(seed)
     root = noise * np.sqrt(IMU.rate_hz)
     rates = gyro_bias + IMU.gyro_noise_density * root * rng.standard_normal((n, 3))
     forces = nav_R_body.T @ UP + IMU.accel_noise_density * root * rng.standard_normal((n, 3))
-    return ImuSpan(np.full(n, 1.0 / IMU.rate_hz), rates, forces)
+    return ImuInterval(np.full(n, 1.0 / IMU.rate_hz), rates, forces)
 
 
 def tilt_between(nav_R_body: Float, truth: Float) -> float:
@@ -51,25 +52,25 @@ def test_at_rest(angles_deg: tuple[float, float]) -> None:
 
 
 def test_tilt_sigma_covers_an_accelerometer_bias() -> None:
-    span = resting(np.eye(3), np.zeros(3), 0)
-    biased = ImuSpan(span.steps_s, span.angular_velocity, span.linear_acceleration + 0.15 * FORWARD)
+    interval = resting(np.eye(3), np.zeros(3), 0)
+    biased = ImuInterval(interval.steps_s, interval.angular_velocity, interval.linear_acceleration + 0.15 * FORWARD)
     at = initial_attitude(biased, 1.0, CONFIG)
     assert tilt_between(at.nav_R_body, np.eye(3)) < 1.1 * at.tilt_sigma_rad
 
 
-def walking(start_s: float, end_s: float, at_s: float) -> tuple[ImuSpan, float]:
+def walking(start_s: float, end_s: float, at_s: float) -> tuple[ImuInterval, float]:
     rng = np.random.default_rng(1)
     buffer = filled_buffer(IMU, end_s + 0.1, rng, np.zeros(3), np.zeros(3))
-    span = buffer.span(round(start_s * 1e9), round(end_s * 1e9))
-    assert span is not None
-    return span, at_s - start_s
+    interval = buffer.interval(round(start_s * 1e9), round(end_s * 1e9))
+    assert interval is not None
+    return interval, at_s - start_s
 
 
 @pytest.mark.parametrize("start_s", [0.5, 1.0, 1.7, 2.6, 3.3])
 @pytest.mark.parametrize("place", [0.0, 0.5, 1.0])
 def test_in_motion(start_s: float, place: float) -> None:
-    span, offset_s = walking(start_s, start_s + 1.0, start_s + place)
-    at = initial_attitude(span, offset_s, CONFIG)
+    interval, offset_s = walking(start_s, start_s + 1.0, start_s + place)
+    at = initial_attitude(interval, offset_s, CONFIG)
     truth = pose_at(start_s + place)[:3, :3]
     assert not at.at_rest
     assert tilt_between(at.nav_R_body, truth) < 3.0 * at.tilt_sigma_rad
@@ -77,21 +78,21 @@ def test_in_motion(start_s: float, place: float) -> None:
     assert_heading_is_zero(at.nav_R_body)
 
 
-def test_a_turn_within_the_span_is_followed() -> None:
+def test_a_turn_within_the_interval_is_followed() -> None:
     """Turned by 90 degrees about x in a second, on the spot: the attitude asked for is that of the instant."""
     n, rate = 200, np.array([np.pi / 2.0, 0.0, 0.0])
     steps = np.full(n, 1.0 / n)
     turns = Rotation.from_rotvec(((np.arange(n) + 0.5) / n)[:, None] * rate)
     forces = turns.inv().apply(np.tile(UP, (n, 1)))
-    span = ImuSpan(steps, np.tile(rate, (n, 1)), forces)
+    interval = ImuInterval(steps, np.tile(rate, (n, 1)), forces)
     for at_s in (0.0, 0.5, 1.0):
-        at = initial_attitude(span, at_s, CONFIG)
+        at = initial_attitude(interval, at_s, CONFIG)
         truth = Rotation.from_rotvec(at_s * rate).as_matrix()
         assert not at.at_rest
         assert np.rad2deg(tilt_between(at.nav_R_body, truth)) < 0.6
 
 
-def test_shorter_spans_are_less_certain() -> None:
+def test_shorter_intervals_are_less_certain() -> None:
     long, short = (initial_attitude(*walking(1.0, end, end), CONFIG).tilt_sigma_rad for end in (2.0, 1.3))
     assert short > 1.5 * long
 
@@ -99,14 +100,14 @@ def test_shorter_spans_are_less_certain() -> None:
 def test_rest_is_not_believed_too_easily() -> None:
     shaken, turning, falling = (resting(np.eye(3), np.zeros(3), 0) for _ in range(3))
     shake = 0.3 * np.sin(np.arange(200))[:, None] * np.ones(3)
-    spans = [
-        ImuSpan(shaken.steps_s, shaken.angular_velocity, shaken.linear_acceleration + shake),
-        ImuSpan(turning.steps_s, turning.angular_velocity + 0.3, turning.linear_acceleration),
-        ImuSpan(falling.steps_s, falling.angular_velocity, falling.linear_acceleration + 0.08 * UP),
+    intervals = [
+        ImuInterval(shaken.steps_s, shaken.angular_velocity, shaken.linear_acceleration + shake),
+        ImuInterval(turning.steps_s, turning.angular_velocity + 0.3, turning.linear_acceleration),
+        ImuInterval(falling.steps_s, falling.angular_velocity, falling.linear_acceleration + 0.08 * UP),
         resting(np.eye(3), np.zeros(3), 0, duration_s=0.2),
     ]
-    for span in spans:
-        assert not initial_attitude(span, 0.1, CONFIG).at_rest
+    for interval in intervals:
+        assert not initial_attitude(interval, 0.1, CONFIG).at_rest
 
 
 @pytest.mark.parametrize("up", [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.9, 0.1, 0.2), (-0.95, 0.2, 0.1)])

@@ -16,9 +16,9 @@ from graphvio.backend.factors import x
 from graphvio.backend.noise import gaussian
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
-from graphvio.config_stages import SmootherConfig
-from graphvio.frontend.motion import RelativeMotion
+from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
+from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Imu
 
 IMU = Imu(accel_random_walk=1e-5, gyro_random_walk=1e-7)  # biases are drawn once
@@ -84,8 +84,8 @@ class Run:
             motion = motion_from(reference * PERIOD_NS, k * PERIOD_NS, shared_error, rng)
             if not self.split:
                 motion = replace(motion, shared_covariance=np.zeros((6, 6)))
-            span = buffer.span((k - 1) * PERIOD_NS, k * PERIOD_NS) if self.with_imu else None
-            self.smoother.extend(k * PERIOD_NS, span)
+            interval = buffer.interval((k - 1) * PERIOD_NS, k * PERIOD_NS) if self.with_imu else None
+            self.smoother.extend(k * PERIOD_NS, interval)
             if k > reference + 1:
                 self.statistics.append(self.smoother.test(motion).statistic)
             self.smoother.accept(motion)

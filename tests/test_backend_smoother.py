@@ -10,10 +10,10 @@ from graphvio.backend.factors import b, v, x
 from graphvio.backend.inertial import ImuBuffer
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
-from graphvio.config_stages import SmootherConfig
-from graphvio.events import ImuSample
-from graphvio.frontend.motion import RelativeMotion
+from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_inverse, se3_log
+from graphvio.measurements.motion import RelativeMotion
+from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Imu
 
 IMU = Imu()
@@ -52,8 +52,8 @@ class Run:
             self.step(PERIOD_NS, gated=False)  # nothing foresees the first motion
 
     def predict(self, stamp_ns: int, with_imu: bool = True) -> RigState:
-        span = self.imu.span(self.smoother.latest_ns, stamp_ns) if self.imu and with_imu else None
-        return self.smoother.extend(stamp_ns, span)
+        interval = self.imu.interval(self.smoother.latest_ns, stamp_ns) if self.imu and with_imu else None
+        return self.smoother.extend(stamp_ns, interval)
 
     def step(
         self, stamp_ns: int, reference_ns: int | None = None, keep: frozenset[int] = frozenset(), gated: bool = True

@@ -102,9 +102,9 @@ def test_a_bag_yields_what_was_recorded(kind: str, recording: Path, tmp_path: Pa
     original = open_source(recording)
     path = bag(kind, messages(recording, tmp_path), tmp_path)
     source = open_source(path, original.rig)
-    events, expected = list(source), list(original)
-    assert len(events) == len(expected)
-    for one, other in zip(events, expected, strict=True):
+    measurements, expected = list(source), list(original)
+    assert len(measurements) == len(expected)
+    for one, other in zip(measurements, expected, strict=True):
         same(one, other)
 
 
@@ -118,7 +118,7 @@ def test_a_bag_tells_its_own_rig(kind: str, recording: Path, tmp_path: Path) -> 
         np.testing.assert_allclose(one.intrinsics, other.intrinsics)
         np.testing.assert_allclose(one.distortion, other.distortion)
         np.testing.assert_allclose(one.body_T_cam, other.body_T_cam, atol=1e-9)
-    assert len([event for event in source if isinstance(event, FrameSet)]) == 6
+    assert len([measurement for measurement in source if isinstance(measurement, FrameSet)]) == 6
 
 
 def test_a_baseline_may_be_told_by_the_projection(recording: Path, tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_topics_of_any_name_may_be_mapped(recording: Path, tmp_path: Path) -> No
         open_source(path, odd)
     source = open_source(path, odd, topics={"cam0": "/a", "cam1": "/b", "imu": "/c"})
     assert source.rig.imu is not None
-    assert len([event for event in source if isinstance(event, FrameSet)]) == 6
+    assert len([measurement for measurement in source if isinstance(measurement, FrameSet)]) == 6
     with pytest.raises(SourceError, match="has no topic /d; it has /a, /b, /c"):
         open_source(path, odd, topics={"cam0": "/d"})
     with pytest.raises(SourceError, match="the rig has no cam7 to be mapped"):

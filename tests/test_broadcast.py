@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable
 
-from graphvio.live.broadcast import Broadcast, Subscription
+from graphvio.broadcast import Broadcast, Subscription
 
 SOON_S = 20.0  # until then a thread is waited for; only a test that fails takes so long
 

@@ -6,7 +6,7 @@ from hand_eye import FRAMES, PERIOD_NS, Walk, motions, straight, turning
 
 from graphvio.arrays import Float, Int
 from graphvio.calibration.imu_alignment import ImuAlignment, align
-from graphvio.calibration.spans import all_stretches
+from graphvio.calibration.intervals import all_segments
 from graphvio.errors import CalibrationError
 from graphvio.geometry import so3_exp, so3_log
 from graphvio.rig import Imu
@@ -41,10 +41,10 @@ def found(
         each.stamps_ns += 10**12
         each._reference = {a + 10**12: b + 10**12 for a, b in each._reference.items()}
         each._edge = {a + 10**12: edge for a, edge in each._edge.items()}
-    stretches = all_stretches(camera.stamps_ns.tolist(), [camera.between, other.between])
+    segments = all_segments(camera.stamps_ns.tolist(), [camera.between, other.between])
     imu = Imu(time_offset_s=rig_offset_s)
     stamps, rates = gyro(walk, offset_s, rng, imu.gyro_noise_density)
-    return align(stretches, 0, stamps, rates, imu, rig_R_left)
+    return align(segments, 0, stamps, rates, imu, rig_R_left)
 
 
 def test_rotation_offset_and_bias_are_found() -> None:
@@ -85,7 +85,7 @@ def test_without_turning_nothing_is_told() -> None:
 def test_gyro_and_camera_must_overlap() -> None:
     rng = np.random.default_rng(1)
     camera = motions(turning, np.eye(4), rng)
-    stretches = all_stretches(camera.stamps_ns.tolist(), [camera.between, camera.between])
+    segments = all_segments(camera.stamps_ns.tolist(), [camera.between, camera.between])
     stamps, rates = gyro(turning, 0.0, rng, 1e-4)
     with pytest.raises(CalibrationError, match="in common"):
-        align(stretches, 0, stamps + 10**13, rates, Imu(), BODY_R_LEFT)
+        align(segments, 0, stamps + 10**13, rates, Imu(), BODY_R_LEFT)

@@ -1,4 +1,4 @@
-"""Motions of one camera between any two instants, and the stretches of time that pose pairs are made of."""
+"""Motions of one camera between any two instants, and the segments of time that pose pairs are made of."""
 
 from functools import cache
 
@@ -11,9 +11,9 @@ from synthetic import pose_at, random_covariance, transform
 from graphvio.arrays import Float
 from graphvio.calibration.camera_motions import CameraMotions
 from graphvio.calibration.consistency import information
-from graphvio.calibration.spans import LENGTHS_S, all_stretches, most_telling, of_one_length, worth
-from graphvio.frontend.motion import RelativeMotion
+from graphvio.calibration.intervals import LENGTHS_S, all_segments, most_telling, of_one_length, worth
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
+from graphvio.measurements.motion import RelativeMotion
 
 BODY_T_LEFT = transform(np.array([0.3, -1.2, 0.5]), np.array([0.1, 0.2, -0.05]))
 FRAMES, KEYFRAMES = 16, 4
@@ -85,11 +85,11 @@ def test_no_instant_is_used_twice_and_the_choice_tells_more_than_any_length(gap_
     stamps, motions = steady(PERIOD_NS, gap_at)
     other = CameraMotions(stamps, [], BODY_T_LEFT)
     other._edge, other._reference = motions._edge, motions._reference
-    stretches = all_stretches(stamps, [motions.between, other.between])
-    first = stretches.chosen(of_one_length(stretches)).pairs
+    segments = all_segments(stamps, [motions.between, other.between])
+    first = segments.chosen(of_one_length(segments)).pairs
     covariance = np.asarray(np.linalg.inv(information(first, LEFT2_T_LEFT1)))
-    rows = most_telling(stretches, worth(stretches.pairs, LEFT2_T_LEFT1, covariance))
-    pairs = stretches.chosen(rows).pairs
+    rows = most_telling(segments, worth(segments.pairs, LEFT2_T_LEFT1, covariance))
+    pairs = segments.chosen(rows).pairs
     assert np.all(pairs.start_ns[1:] >= pairs.end_ns[:-1])
     assert np.all(pairs.end_ns - pairs.start_ns <= LENGTHS_S[-1] * 1e9)
     if gap_at is not None:
@@ -97,13 +97,13 @@ def test_no_instant_is_used_twice_and_the_choice_tells_more_than_any_length(gap_
         assert not across.any()
 
     def gained(chosen: list[int]) -> float:
-        told = information(stretches.chosen(chosen).pairs, LEFT2_T_LEFT1)
+        told = information(segments.chosen(chosen).pairs, LEFT2_T_LEFT1)
         return float(np.trace(covariance @ told))
 
     for length in (1, 2, 7, 20):
         of_length = [
             row
-            for row in range(len(stretches))
-            if stretches.last[row] - stretches.first[row] == length and stretches.first[row] % length == 0
+            for row in range(len(segments))
+            if segments.last[row] - segments.first[row] == length and segments.first[row] % length == 0
         ]
         assert gained(rows) >= gained(of_length)

@@ -8,20 +8,20 @@ from hand_eye import FRAMES, LEFT2_T_LEFT1, PERIOD_NS, Walk, motions, planar, st
 from monte_carlo import band
 
 from graphvio.arrays import Float
+from graphvio.calibration.intervals import Segments, all_segments
 from graphvio.calibration.pair_calibration import PairCalibration, calibrate_pair
-from graphvio.calibration.spans import Stretches, all_stretches
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 
 
-def stretches(walk: Walk, seed: int, moved: Float | None = None) -> Stretches:
+def segments(walk: Walk, seed: int, moved: Float | None = None) -> Segments:
     rng = np.random.default_rng(seed)
     one, other = motions(walk, np.eye(4), rng), motions(walk, se3_inverse(LEFT2_T_LEFT1), rng, moved)
-    return all_stretches(one.stamps_ns.tolist(), [one.between, other.between])
+    return all_segments(one.stamps_ns.tolist(), [one.between, other.between])
 
 
 def calibrated(walk: Walk, seed: int) -> PairCalibration:
-    return calibrate_pair(stretches(walk, seed))
+    return calibrate_pair(segments(walk, seed))
 
 
 def test_errors_are_within_what_is_told() -> None:
@@ -57,7 +57,7 @@ def test_checks_that_a_sound_recording_passes() -> None:
 
 @pytest.mark.parametrize("wrong_by", [0.02, -0.03])
 def test_a_wrong_baseline_is_found_and_put_right(wrong_by: float) -> None:
-    made = stretches(turning, 5)
+    made = segments(turning, 5)
     made.motions[:, 1, :3, 3] *= 1.0 + wrong_by
     found = calibrate_pair(made)
     assert found.scale.is_wrong
@@ -73,7 +73,7 @@ def test_a_wrong_baseline_is_found_and_put_right(wrong_by: float) -> None:
 
 def test_errors_that_last_make_the_covariance_larger() -> None:
     """One camera's scale wanders in time: what no single motion's covariance can tell."""
-    made = stretches(turning, 6)
+    made = segments(turning, 6)
     wandering = 1.0 + 0.06 * np.sin(made.start_ns * 1e-9)
     made.motions[:, 1, :3, 3] *= wandering[:, None]
     found = calibrate_pair(made, scale_mode="fixed")
@@ -102,7 +102,7 @@ def test_moving_without_turning_is_refused() -> None:
 def test_a_camera_that_was_knocked_is_told() -> None:
     """Half of the motions fit one place, half another."""
     moved = se3_inverse(se3_exp(np.array([0.0, 0.2, 0.1, 0.1, 0.0, 0.1])) @ LEFT2_T_LEFT1)
-    found = calibrate_pair(stretches(turning, 1, moved))
+    found = calibrate_pair(segments(turning, 1, moved))
     assert found.inlier.mean() < 0.9
     early = found.pairs.end_ns < FRAMES // 2 * PERIOD_NS
     assert min(found.inlier[early].mean(), found.inlier[~early].mean()) < 0.3
@@ -113,4 +113,4 @@ def test_without_common_instants_there_is_nothing_to_calibrate_from() -> None:
     rng = np.random.default_rng(2)
     one = motions(turning, np.eye(4), rng)
     with pytest.raises(CalibrationError, match="needs 3 pose pairs and has 0"):
-        calibrate_pair(all_stretches([], [one.between, one.between]))
+        calibrate_pair(all_segments([], [one.between, one.between]))

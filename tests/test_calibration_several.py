@@ -9,10 +9,10 @@ from monte_carlo import band
 from scipy.stats import chi2
 
 from graphvio.arrays import Float
+from graphvio.calibration.intervals import Segments, all_segments
 from graphvio.calibration.pair_calibration import SEEN_FROM, PairCalibration, calibrate_pair
 from graphvio.calibration.scale import ScaleMode
 from graphvio.calibration.several import Places, pairwise, place_all
-from graphvio.calibration.spans import Stretches, all_stretches
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 
@@ -21,13 +21,13 @@ TRUTH = np.array([np.eye(4), LEFT2_T_LEFT1, LEFT3_T_LEFT1])
 NAMES = ("front", "back", "side")
 
 
-def stretches(seed: int, walk: object = turning) -> Stretches:
+def segments(seed: int, walk: object = turning) -> Segments:
     rng = np.random.default_rng(seed)
     cameras = [motions(walk, se3_inverse(np.ascontiguousarray(place)), rng) for place in TRUTH]  # type: ignore[arg-type]
-    return all_stretches(cameras[0].stamps_ns.tolist(), [each.between for each in cameras])
+    return all_segments(cameras[0].stamps_ns.tolist(), [each.between for each in cameras])
 
 
-def placed(made: Stretches) -> Places:
+def placed(made: Segments) -> Places:
     def calibrate(one: int, other: int, mode: ScaleMode) -> PairCalibration:
         return calibrate_pair(made.of_both(one, other), scale_mode=mode)
 
@@ -46,7 +46,7 @@ def test_errors_of_all_are_within_what_is_told_and_no_larger_than_two_at_a_time(
     squares, ratios = [], []
     distances: list[float] = []
     for seed in range(runs):
-        places = placed(stretches(seed))
+        places = placed(segments(seed))
         off = error(places)
         squares.append(off @ np.linalg.solve(places.covariance, off))
         ratios.append(
@@ -64,7 +64,7 @@ def test_errors_of_all_are_within_what_is_told_and_no_larger_than_two_at_a_time(
 
 
 def test_places_close_every_loop_exactly() -> None:
-    places = placed(stretches(1))
+    places = placed(segments(1))
     around = np.eye(4)
     for i, j in ((0, 1), (1, 2), (2, 0)):
         around = places.left_T_left1[j] @ se3_inverse(places.left_T_left1[i]) @ around
@@ -72,7 +72,7 @@ def test_places_close_every_loop_exactly() -> None:
 
 
 def test_covariance_between_two_is_that_of_the_pose_between_them() -> None:
-    places = placed(stretches(2))
+    places = placed(segments(2))
     root = np.linalg.cholesky(places.covariance)
     rng = np.random.default_rng(0)
     between = LEFT3_T_LEFT1 @ se3_inverse(LEFT2_T_LEFT1)
@@ -86,7 +86,7 @@ def test_covariance_between_two_is_that_of_the_pose_between_them() -> None:
 
 
 def test_a_camera_that_is_blind_at_times_is_placed_all_the_same() -> None:
-    made = stretches(3)
+    made = segments(3)
     made.known[made.start_ns > np.median(made.start_ns), 2] = False
     made.motions[~made.known] = np.nan
     made.covariances[~made.known] = np.nan
@@ -98,7 +98,7 @@ def test_a_camera_that_is_blind_at_times_is_placed_all_the_same() -> None:
 
 
 def test_a_wrong_scale_of_one_camera_is_taken_out_of_all() -> None:
-    made = stretches(4)
+    made = segments(4)
     made.motions[:, 1, :3, 3] *= 1.02
     places = placed(made)
     assert any("back measures lengths 2." in sentence for sentence in places.warnings)
@@ -109,7 +109,7 @@ def test_a_wrong_scale_of_one_camera_is_taken_out_of_all() -> None:
 
 
 def test_planar_motion_leaves_the_heights_of_all_open() -> None:
-    places = placed(stretches(5, planar))
+    places = placed(segments(5, planar))
     for one, other in combinations(range(3), 2):
         assert not places.pairwise[one, other].observability.is_complete
     sigmas = np.sqrt(np.diag(places.covariance))
@@ -119,7 +119,7 @@ def test_planar_motion_leaves_the_heights_of_all_open() -> None:
 
 
 def test_a_camera_that_is_not_on_the_rig_is_named() -> None:
-    made = stretches(6)
+    made = segments(6)
     made.motions[:, 2] = made.motions[::-1, 2].copy()
     with pytest.raises(CalibrationError, match="front and side: "):
         placed(made)

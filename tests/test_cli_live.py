@@ -20,14 +20,14 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from graphvio import FrameSet, open_source
+from graphvio.broadcast import Broadcast
 from graphvio.cli import app
 from graphvio.cli.dashboard import Dashboard, line_of, summary_of
 from graphvio.cli.stopping import StopSignals
 from graphvio.errors import GraphvioError, RigError
-from graphvio.events import Incident
 from graphvio.live import sources
-from graphvio.live.broadcast import Broadcast
 from graphvio.live.source import DeviceHealth
+from graphvio.measurements.events import Event
 from graphvio.sessions.mcap_file import McapFile
 
 pytest.importorskip("mcap")
@@ -94,7 +94,7 @@ def recording_process(recording: Path, out: Path, *options: object) -> subproces
 
 
 def framesets_in(session: Path) -> int:
-    return sum(isinstance(event, FrameSet) for event in open_source(session))
+    return sum(isinstance(measurement, FrameSet) for measurement in open_source(session))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])
@@ -235,12 +235,12 @@ def test_what_fails_in_a_thread_is_told_and_what_came_is_saved(
     process = Odometry.process
     count = 0
 
-    def wrong(odometry: Odometry, event: Any) -> Any:
+    def wrong(odometry: Odometry, measurement: Any) -> Any:
         nonlocal count
-        count += isinstance(event, FrameSet)
+        count += isinstance(measurement, FrameSet)
         if count == 20:
             raise RigError("camera cam0: images are 32 x 24 px, the rig says 64 x 48; give the right rig")
-        return process(odometry, event)
+        return process(odometry, measurement)
 
     monkeypatch.setattr(Odometry, "process", wrong)
     out = tmp_path / "walk.mcap"
@@ -367,13 +367,13 @@ def test_why_a_recording_stopped_takes_the_place_of_its_size() -> None:
 
 
 def test_messages_of_one_kind_do_not_flood_the_terminal() -> None:
-    incidents: Broadcast[Incident] = Broadcast()
-    dashboard = Dashboard("walk", incidents.subscribe(64))
+    events: Broadcast[Event] = Broadcast()
+    dashboard = Dashboard("walk", events.subscribe(64))
     shown = Console(record=True, file=open(os.devnull, "w"), width=200)  # noqa: PTH123, SIM115
     dashboard._console = shown
     for i in range(20):
-        incidents.publish(Incident(i, "vision_gated", f"[{i}]"))
-    incidents.publish(Incident(20, "device_lost", "front was unplugged"))
+        events.publish(Event(i, "vision_gated", f"[{i}]"))
+    events.publish(Event(20, "device_lost", "front was unplugged"))
     dashboard.draw(FIGURES, [])
     lines = shown.export_text().splitlines()
     assert lines[:2] == ["vision_gated: [0]", "device_lost: front was unplugged"]
@@ -382,8 +382,8 @@ def test_messages_of_one_kind_do_not_flood_the_terminal() -> None:
 
 
 def test_the_panel_has_devices_and_messages() -> None:
-    dashboard = Dashboard("walk", Broadcast[Incident]().subscribe(1))
-    dashboard._tell(Incident(0, "stage_stuck", "output has worked on one thing"), 100.0)
+    dashboard = Dashboard("walk", Broadcast[Event]().subscribe(1))
+    dashboard._tell(Event(0, "stage_stuck", "output has worked on one thing"), 100.0)
     console = Console(record=True, file=open(os.devnull, "w"), width=150)  # noqa: PTH123, SIM115
     console.print(dashboard._panel(FIGURES, [DeviceHealth("front", False, "unplugged", {"dropped": 3})]))
     text = console.export_text()

@@ -15,7 +15,7 @@ from calibration_walks import recorded, walk_simulator
 
 from graphvio import Config, Odometry, open_source
 from graphvio.arrays import Float
-from graphvio.config_stages import OptimizationConfig
+from graphvio.config.stages import OptimizationConfig
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.colmap_export import ColmapModel, export
@@ -56,8 +56,8 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     config = replace(Config(), optimization=OptimizationConfig(features=500))
     recorder = Recorder(NAME)
     odometry = Odometry(source.rig, config, on_step=recorder.add)
-    for event in source:
-        odometry.process(event)
+    for measurement in source:
+        odometry.process(measurement)
     odometry.finish()
     record = recorder.record()
     places = [Place(0, int(row), int(record.stamps_ns[row])) for row in choose_places(record, 0.25, 10.0)]

@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from graphvio.config import Config, profiles
-from graphvio.config_stages import MotionConfig, SmootherConfig
+from graphvio.config.stages import MotionConfig, SmootherConfig
 from graphvio.errors import ConfigError
 
 

@@ -89,10 +89,10 @@ def out_of(kind: str, folder: Path) -> Path:
 
 
 def equal(one: Path, other: Path) -> None:
-    """The same events, rig and truth."""
+    """The same measurements, rig and truth."""
     sources = open_source(one), open_source(other)
-    for events in zip(*sources, strict=True):
-        same(*events)
+    for measurements in zip(*sources, strict=True):
+        same(*measurements)
     assert to_text(sources[0].rig, Path()) == to_text(sources[1].rig, Path())
     assert sources[0].truth is not None
     assert sources[1].truth is not None
@@ -148,12 +148,12 @@ def test_a_session_that_was_cut_is_converted_as_far_as_it_goes(recording: Path, 
     source, cut = open_source(recording), tmp_path / "cut.mcap"
     with SessionWriter(cut, source.rig) as writer:
         assert isinstance(writer._storage, McapStorage)
-        for event in source:
-            writer.add(event)
-            writer._storage._last_flush_s = -1.0  # so that each event has a chunk of its own
+        for measurement in source:
+            writer.add(measurement)
+            writer._storage._last_flush_s = -1.0  # so that each measurement has a chunk of its own
     cut.write_bytes(cut.read_bytes()[: cut.stat().st_size // 2])
     bag = converted(cut, tmp_path / "cut.bag")
-    assert 0 < len([event for event in open_source(bag) if isinstance(event, FrameSet)]) < FRAMES
+    assert 0 < len([measurement for measurement in open_source(bag) if isinstance(measurement, FrameSet)]) < FRAMES
     described = describe(bag)
     (log,) = (topic for topic in described.topics if topic.name == "/rosout")
     assert log.messages >= 1  # that it was cut, which has no time of its own
@@ -186,7 +186,7 @@ def test_cameras_of_other_names_are_renamed_for_the_layout(tmp_path: Path) -> No
 def trajectory(path: Path, to_s: float | None = None) -> list[str]:
     source = open_source(path, to_s=to_s)
     odometry = Odometry(source.rig)
-    found = [odometry.process(event) for event in source]
+    found = [odometry.process(measurement) for measurement in source]
     return [tum_line(e.stamp_ns, e.nav_T_body) for e in found if e is not None and e.nav_T_body is not None]
 
 

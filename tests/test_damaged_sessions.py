@@ -33,9 +33,9 @@ def session(recording: Path) -> Path:
     source = open_source(recording)
     with SessionWriter(path, source.rig) as writer:
         assert isinstance(writer._storage, McapStorage)
-        for number, event in enumerate(source):
+        for number, measurement in enumerate(source):
             writer._storage._last_flush_s = -1.0 if number % 20 == 0 else np.inf
-            writer.add(event)
+            writer.add(measurement)
     return path
 
 
@@ -64,15 +64,18 @@ def test_a_chunk_whose_bytes_changed_is_left_out_and_counted(session: Path, tmp_
     path = changed(session, tmp_path / "walk.mcap", chunk + 9 + length - 5)
     samples, images = places_of(session, "/imu", chunk), places_of(session, "/pair0/left/image_raw", chunk)
     source = open_source(path)
-    events, expected = list(source), [event for event in open_source(session) if event.stamp_ns not in samples]
+    measurements, expected = (
+        list(source),
+        [measurement for measurement in open_source(session) if measurement.stamp_ns not in samples],
+    )
     if not images:
         assert source.faults.counts["imu_garbage"] == len(samples) > 0
     else:
         assert source.faults.counts["image_undecodable"] == 2 * len(images)
         expected = [e for e in expected if not (isinstance(e, FrameSet) and e.stamp_ns in images)]
-    key = lambda event: (event.stamp_ns, isinstance(event, FrameSet))  # noqa: E731
-    assert len(events) == len(expected) > 100
-    for one, other in zip(sorted(events, key=key), sorted(expected, key=key), strict=True):
+    key = lambda measurement: (measurement.stamp_ns, isinstance(measurement, FrameSet))  # noqa: E731
+    assert len(measurements) == len(expected) > 100
+    for one, other in zip(sorted(measurements, key=key), sorted(expected, key=key), strict=True):
         same(one, other)
 
 
@@ -102,7 +105,7 @@ def test_a_stamp_of_the_index_that_is_not_the_messages_is_found(session: Path, t
     entry = place.logged_ns.to_bytes(8, "little") + place.offset.to_bytes(8, "little")
     path = changed(session, tmp_path / "walk.mcap", session.read_bytes().index(entry, place.chunk))
     source = open_source(path)
-    assert len([event for event in source if isinstance(event, FrameSet)]) == 7
+    assert len([measurement for measurement in source if isinstance(measurement, FrameSet)]) == 7
     assert source.faults.counts["image_undecodable"] == 1
 
 
@@ -139,8 +142,8 @@ def test_no_change_of_bytes_gives_more_than_a_refusal(session: Path, tmp_path: P
             del data[int(rng.integers(0, len(data))) :]
         path.write_bytes(data)
         try:
-            for event in open_source(path, rig if number % 3 == 0 else None):
-                assert isinstance(event, ImuSample | FrameSet)
+            for measurement in open_source(path, rig if number % 3 == 0 else None):
+                assert isinstance(measurement, ImuSample | FrameSet)
         except GraphvioError:
             refused += 1
     assert refused < 40

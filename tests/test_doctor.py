@@ -7,7 +7,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from graphvio import __version__
+from graphvio.version import __version__
 
 doctor: Any = importlib.import_module("graphvio.cli.doctor")
 

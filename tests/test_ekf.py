@@ -15,8 +15,8 @@ from graphvio.backend.ekf.filter import ExtendedKalmanFilter
 from graphvio.backend.ekf.measurements import GRAVITY, Measurement, VisualRates, accelerometer, gyro, stacked, vision
 from graphvio.backend.ekf.process import NOISES, jacobians, noise_sigmas, propagated
 from graphvio.backend.ekf.state import ATTITUDE, ERRORS, GYRO_BIAS, POSITION, RATE, VELOCITY, FilterState
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_exp, se3_inverse, so3_exp, so3_log
+from graphvio.measurements.motion import RelativeMotion
 
 DT = 0.05
 SEEDS = pytest.mark.parametrize("seed", range(5))

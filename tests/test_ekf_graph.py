@@ -17,9 +17,9 @@ from graphvio.backend.ekf.measurements import Measurement, VisualRates, accelero
 from graphvio.backend.ekf.process import noise_sigmas, propagated
 from graphvio.backend.ekf.state import FilterState
 from graphvio.backend.inertial import ImuBuffer
-from graphvio.events import ImuSample
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_exp, se3_inverse
+from graphvio.measurements.motion import RelativeMotion
+from graphvio.measurements.sensors import ImuSample
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.tables import read_imu_csv
 from graphvio.trajectory import Trajectory
@@ -133,9 +133,9 @@ def real(rng: np.random.Generator, count: int) -> tuple[Iterator[Step], FilterSt
             noise = np.sqrt(np.diag(covariance)) * rng.standard_normal(6) + 0.1 * (rng.random() < 1 / 30)
             moved = se3_inverse(poses.nav_T_body[k - 1]) @ poses.nav_T_body[k] @ se3_exp(noise)
             motion = RelativeMotion(int(stamps[k - 1]), int(stamps[k]), moved, covariance, np.zeros((6, 6)), 100)
-            span = buffer.span(int(stamps[k - 1]), int(stamps[k]))
-            assert span is not None
-            yield Step(VisualRates.of(motion), span.mean_rate, span.mean_force)
+            interval = buffer.interval(int(stamps[k - 1]), int(stamps[k]))
+            assert interval is not None
+            yield Step(VisualRates.of(motion), interval.mean_rate, interval.mean_force)
 
     first = poses.nav_T_body[0]
     return steps(), FilterState(first[:3, 3].copy(), first[:3, :3].copy(), np.zeros(3), np.zeros(3), np.zeros(3))

@@ -12,12 +12,11 @@ from synthetic import filled_buffer, measured_motion, pose_at, transform, two_pa
 
 from graphvio import Config, ConfigError, FrameSet, Odometry, Status, open_source
 from graphvio.arrays import Float
-from graphvio.backend.inertial import ImuSpan
-from graphvio.config_stages import FilterConfig
-from graphvio.events import Quality
-from graphvio.filter_belief import FilterBelief
-from graphvio.frontend.motion import RelativeMotion, VisualResult
+from graphvio.backend.ekf.estimator import FilterEstimator
+from graphvio.config.stages import FilterConfig
 from graphvio.geometry import se3_inverse
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.rig import Imu
 from graphvio.trajectory import Trajectory
 
@@ -41,36 +40,37 @@ class Walk:
         self.rng = np.random.default_rng(self.seed)
         rig = two_pair_rig(IMU if self.with_imu else None)
         config = replace(Config.from_yaml(PAPER), filter=self.config)
-        self.belief = FilterBelief(rig, config, lambda _, kind, detail: self.told.append(kind), lambda: None)
+        self.estimator = FilterEstimator(rig, config, lambda _, kind, detail: self.told.append(kind), lambda: None)
         self.imu = filled_buffer(IMU, 20.0, self.rng, GYRO_BIAS, np.zeros(3))
-        span = self.imu.stretch(0, 1_000_000_000) if self.with_imu else None
+        interval = self.imu.segment(0, 1_000_000_000) if self.with_imu else None
         self.now_ns = 1_000_000_000
-        self.belief.start(self.now_ns, None if span is None else (span[0], 1.0))
-        self.belief.update(self.now_ns, True, frozenset())
+        self.estimator.start(self.now_ns, None if interval is None else (interval[0], 1.0))
+        self.estimator.update(self.now_ns, True, frozenset())
 
-    def span(self, start_ns: int, end_ns: int) -> ImuSpan | None:
-        return self.imu.span(start_ns, end_ns) if self.with_imu else None
+    def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
+        return self.imu.interval(start_ns, end_ns) if self.with_imu else None
 
     def step(self, blind: bool = False, off: Float | None = None) -> bool:
         """One frameset; whether vision was used."""
         before, self.now_ns = self.now_ns, self.now_ns + PERIOD_NS
-        self.belief.predict(self.now_ns, self.span(before, self.now_ns))
+        self.estimator.predict(self.now_ns, self.interval(before, self.now_ns))
         motion: RelativeMotion | None = None
         if not blind:
             motion = measured_motion(before, self.now_ns, self.rng)
             if off is not None:
                 motion = replace(motion, reference_T_current=motion.reference_T_current @ off)
         used = (
-            self.belief.use(VisualResult(motion, Quality.GOOD if motion else Quality.FAILED, "", {}), False) is not None
+            self.estimator.use(VisualResult(motion, Quality.GOOD if motion else Quality.FAILED, "", {}), False)
+            is not None
         )
-        self.statuses.append(self.belief.update(self.now_ns, used, frozenset()))
+        self.statuses.append(self.estimator.update(self.now_ns, used, frozenset()))
         return used
 
     def steps(self, seconds: float, blind: bool = False, off: Float | None = None) -> list[bool]:
         return [self.step(blind, off) for _ in range(round(seconds * 1e9 / PERIOD_NS))]
 
     def sigma_m(self) -> float:
-        return float(np.sqrt(np.linalg.eigvalsh(self.belief.covariance.pose[3:, 3:])[-1]))
+        return float(np.sqrt(np.linalg.eigvalsh(self.estimator.covariance.pose[3:, 3:])[-1]))
 
 
 def moved(poses: Sequence[tuple[int, Float]]) -> tuple[Float, Float]:
@@ -84,15 +84,15 @@ def moved(poses: Sequence[tuple[int, Float]]) -> tuple[Float, Float]:
 def test_it_follows_a_walk(with_imu: bool, bias: str) -> None:
     walk = Walk(FilterConfig(bias=bias), with_imu)  # type: ignore[arg-type]
     walk.steps(1.0)
-    walk.belief.take_final()
+    walk.estimator.take_final()
     assert all(walk.steps(5.0))
     assert set(walk.statuses[20:]) == {Status.TRACKING}
-    found, truth = moved(walk.belief.take_final())
+    found, truth = moved(walk.estimator.take_final())
     assert np.linalg.norm(found[:3, 3] - truth[:3, 3]) < 0.15  # 100 motions of 3 mm and 1 mrad
     if with_imu and bias == "estimated":
-        np.testing.assert_allclose(walk.belief.state().gyro_bias, GYRO_BIAS, atol=4e-3)
+        np.testing.assert_allclose(walk.estimator.state().gyro_bias, GYRO_BIAS, atol=4e-3)
     else:
-        assert bias == "estimated" or not walk.belief.state().gyro_bias.any()
+        assert bias == "estimated" or not walk.estimator.state().gyro_bias.any()
 
 
 def test_the_first_approach_uses_the_gyro_only_where_it_differs_from_vision() -> None:
@@ -101,9 +101,9 @@ def test_the_first_approach_uses_the_gyro_only_where_it_differs_from_vision() ->
     for threshold in (0.2, 1e-6):
         walk = Walk(FilterConfig(bias="none", gyro_threshold_rad_s=threshold, gyro_sigma_rad_s=0.005))
         walk.steps(1.0)
-        walk.belief.take_final()
+        walk.estimator.take_final()
         walk.steps(8.0)
-        found, truth = moved(walk.belief.take_final())
+        found, truth = moved(walk.estimator.take_final())
         errors.append(np.arccos(np.clip(0.5 * (np.trace(found[:3, :3].T @ truth[:3, :3]) - 1.0), -1.0, 1.0)))
     assert errors[0] < 0.5 * errors[1]
 
@@ -132,15 +132,15 @@ def test_blind_the_gyro_holds_the_attitude_and_the_position_is_lost_in_the_end()
     walk.steps(0.5, blind=True)
     assert set(walk.statuses[-10:]) == {Status.COASTING}
     assert np.sqrt(walk.sigma_m() ** 2 - before**2) > 0.2  # of the blind half second alone
-    pose = walk.belief.state().nav_T_body
-    found, truth = moved([(3_000_000_000, walk.belief.take_final()[40][1]), (walk.now_ns, pose)])
+    pose = walk.estimator.state().nav_T_body
+    found, truth = moved([(3_000_000_000, walk.estimator.take_final()[40][1]), (walk.now_ns, pose)])
     assert np.arccos(np.clip(0.5 * (np.trace(found[:3, :3].T @ truth[:3, :3]) - 1.0), -1.0, 1.0)) < 0.03
     walk.steps(4.0, blind=True)
     assert walk.statuses[-1:] == [Status.LOST]
     assert walk.told.count("lost") == 1
     walk.steps(0.5)
     assert walk.statuses[-1:] == [Status.TRACKING]
-    assert (walk.told[-1], walk.belief.epoch) == ("new_epoch", 1)
+    assert (walk.told[-1], walk.estimator.epoch) == ("new_epoch", 1)
 
 
 def test_a_gate_that_shuts_for_long_opens_again() -> None:
@@ -156,9 +156,9 @@ def test_resets_change_nothing_that_is_told() -> None:
     never, often = (Walk(FilterConfig(reset_s=reset_s)) for reset_s in (100.0, 0.5))
     for walk in (never, often):
         walk.steps(6.0)
-    assert never.belief._forgotten.max() == 0.0 < often.belief._forgotten.max()
-    np.testing.assert_allclose(often.belief.state().nav_T_body, never.belief.state().nav_T_body, atol=1e-6)
-    np.testing.assert_allclose(often.belief.covariance.pose, never.belief.covariance.pose, rtol=0.05, atol=1e-6)
+    assert never.estimator._forgotten.max() == 0.0 < often.estimator._forgotten.max()
+    np.testing.assert_allclose(often.estimator.state().nav_T_body, never.estimator.state().nav_T_body, atol=1e-6)
+    np.testing.assert_allclose(often.estimator.covariance.pose, never.estimator.covariance.pose, rtol=0.05, atol=1e-6)
 
 
 def test_a_long_gap_opens_an_epoch() -> None:
@@ -167,7 +167,7 @@ def test_a_long_gap_opens_an_epoch() -> None:
     walk.now_ns += 5_000_000_000
     before = walk.sigma_m()
     walk.step()
-    assert (walk.told[-1], walk.belief.epoch) == ("time_jump", 1)
+    assert (walk.told[-1], walk.estimator.epoch) == ("time_jump", 1)
     assert walk.sigma_m() > before + 0.9
 
 
@@ -177,20 +177,20 @@ def test_a_refused_translation_does_not_leave_the_gyro_out() -> None:
     for off in (np.zeros(3), np.array([1.0, 0.0, 0.0])):
         walk = Walk(FilterConfig(bias="none", gyro_threshold_rad_s=10.0))
         walk.steps(1.0)
-        before = walk.belief._running.covariance[9:12, 9:12].trace()
+        before = walk.estimator._running.covariance[9:12, 9:12].trace()
         walk.step(off=transform(np.zeros(3), off))
-        rates.append(walk.belief._running.covariance[9:12, 9:12].trace() / before)
+        rates.append(walk.estimator._running.covariance[9:12, 9:12].trace() / before)
     assert rates[1] < 2.0  # the gyro measured the rate in vision's place
 
 
 def test_a_second_start_forgets_what_the_first_one_left() -> None:
     walk = Walk(FilterConfig(reset_s=0.5))
     walk.steps(5.0)
-    assert walk.belief._forgotten.any()
-    walk.belief.start(walk.now_ns, None)
-    walk.belief.update(walk.now_ns, True, frozenset())
-    assert not walk.belief._forgotten.any()
-    assert walk.belief.latest_rate() is None
+    assert walk.estimator._forgotten.any()
+    walk.estimator.start(walk.now_ns, None)
+    walk.estimator.update(walk.now_ns, True, frozenset())
+    assert not walk.estimator._forgotten.any()
+    assert walk.estimator.latest_rate() is None
 
 
 def test_it_needs_motions_over_one_step() -> None:
@@ -202,9 +202,11 @@ def test_it_needs_motions_over_one_step() -> None:
 def test_the_odometry_runs_with_it(room_walk: Path, bias: str) -> None:
     source = open_source(room_walk)
     odometry = Odometry(source.rig, Config.from_yaml(f"{PAPER}filter: {{bias: {bias}}}\n"))
-    events = list(source)
-    estimates = [e for event in events if (e := odometry.process(event)) is not None] + odometry.finish()
-    assert len(estimates) == sum(isinstance(event, FrameSet) for event in events)
+    measurements = list(source)
+    estimates = [
+        e for measurement in measurements if (e := odometry.process(measurement)) is not None
+    ] + odometry.finish()
+    assert len(estimates) == sum(isinstance(measurement, FrameSet) for measurement in measurements)
     assert all(e.nav_T_body is not None for e in estimates)
     assert all(e.covariance is not None and np.linalg.eigvalsh(e.covariance)[0] > 0 for e in estimates)
     smoothed = odometry.take_smoothed()

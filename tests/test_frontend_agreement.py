@@ -9,11 +9,9 @@ from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import AnyArray, Float
 from graphvio.config import Config
-from graphvio.config_stages import MotionConfig
-from graphvio.events import Quality
+from graphvio.config.stages import MotionConfig
 from graphvio.frontend.agreement import Agreement, Side, _camps, _in_order, agree
 from graphvio.frontend.alignment import Misalignment
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.frontend.observations import Correspondences, Observations, RigArrays
 from graphvio.frontend.quality import StereoShare, doubted, graded, stereo_share
 from graphvio.frontend.refinement import Refined
@@ -21,6 +19,7 @@ from graphvio.frontend.selection import joint_motion
 from graphvio.frontend.tracks import PairFrame
 from graphvio.frontend.visual import VisualFrontend, _report
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from graphvio.measurements.motion import Quality, RelativeMotion
 
 RIG = two_pair_rig()
 ARRAYS = RigArrays.of(RIG)

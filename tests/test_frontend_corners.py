@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from graphvio.arrays import Bool, Float, Image
-from graphvio.config_stages import CornerConfig
+from graphvio.config.stages import CornerConfig
 from graphvio.frontend.corners import find_corners, occupied_cells, thinned
 
 SETTINGS = CornerConfig()

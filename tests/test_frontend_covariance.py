@@ -18,7 +18,7 @@ from monte_carlo import (
 )
 
 from graphvio.arrays import Bool, Float
-from graphvio.config_stages import MotionConfig
+from graphvio.config.stages import MotionConfig
 from graphvio.frontend.observations import Observations
 from graphvio.frontend.refinement import refine
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log

@@ -3,8 +3,8 @@
 import numpy as np
 
 from graphvio.arrays import Image
-from graphvio.events import FrameSet
 from graphvio.frontend.frozen import FrozenImages
+from graphvio.measurements.sensors import FrameSet
 
 RNG = np.random.default_rng(0)
 
@@ -20,10 +20,10 @@ def frameset(stamp_ns: int, **images: tuple[Image, Image]) -> FrameSet:
 def test_new_images_are_no_matter() -> None:
     frozen = FrozenImages()
     for k in range(3):
-        verdict = frozen.look(frameset(k, p0=(image(), image()), p1=(image(), image())))
-        assert verdict.pairs == frozenset()
-        assert verdict.all_since_ns is None
-        assert verdict.reason == ""
+        gate_result = frozen.look(frameset(k, p0=(image(), image()), p1=(image(), image())))
+        assert gate_result.pairs == frozenset()
+        assert gate_result.all_since_ns is None
+        assert gate_result.reason == ""
 
 
 def test_a_stuck_pair_is_named_while_another_lives() -> None:
@@ -32,9 +32,9 @@ def test_a_stuck_pair_is_named_while_another_lives() -> None:
     frozen.look(frameset(0, p0=(image(), image()), p1=stuck))
     for k in range(1, 4):
         copies = (stuck[0].copy(), stuck[1].copy())
-        verdict = frozen.look(frameset(k, p0=(image(), image()), p1=copies))
-        assert verdict.pairs == {1}
-        assert "[1]" in verdict.reason
+        gate_result = frozen.look(frameset(k, p0=(image(), image()), p1=copies))
+        assert gate_result.pairs == {1}
+        assert "[1]" in gate_result.reason
     assert frozen.look(frameset(4, p0=(image(), image()), p1=(image(), image()))).pairs == frozenset()
 
 
@@ -50,6 +50,6 @@ def test_when_all_repeat_no_camera_is_accused() -> None:
     first, second = (image(), image()), (image(), image())
     frozen.look(frameset(10, p0=first, p1=second))
     for k in (11, 12):
-        verdict = frozen.look(frameset(k, p0=first, p1=second))
-        assert verdict.pairs == frozenset()
-        assert verdict.all_since_ns == 10
+        gate_result = frozen.look(frameset(k, p0=first, p1=second))
+        assert gate_result.pairs == frozenset()
+        assert gate_result.all_since_ns == 10

@@ -6,8 +6,8 @@ from synthetic import two_pair_rig
 
 from graphvio.arrays import AnyArray
 from graphvio.errors import RigError
-from graphvio.events import FrameSet
 from graphvio.frontend.images import checked
+from graphvio.measurements.sensors import FrameSet
 
 RIG = two_pair_rig()
 IMAGE = np.zeros((480, 640), dtype=np.uint8)

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import AnyArray, Float, Int
-from graphvio.config_stages import MotionConfig
+from graphvio.config.stages import MotionConfig
 from graphvio.frontend.cost import left_motions, robust_cost
 from graphvio.frontend.noise import noise_by_pair
 from graphvio.frontend.observations import Observations, RigArrays

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from graphvio.arrays import Float
-from graphvio.config_stages import MotionConfig
+from graphvio.config.stages import MotionConfig
 from graphvio.frontend.observations import Correspondences, correspond
 from graphvio.frontend.references import References
 from graphvio.frontend.refinement import Refined

@@ -13,14 +13,14 @@ PLACES = np.random.default_rng(0).uniform(0.0, 400.0, (60, 2))
 
 
 def told(shifts_px: Float, noise_px: float = 0.05, explained: int = 60) -> list[bool]:
-    """Verdicts on frames whose points have moved by so much (K,) along x."""
-    standstill, rng, verdicts = Standstill(), np.random.default_rng(1), []
+    """GateResults on frames whose points have moved by so much (K,) along x."""
+    standstill, rng, gate_results = Standstill(), np.random.default_rng(1), []
     for k, shift in enumerate(shifts_px):
         pixels = PLACES + [shift, 0.0] + noise_px * rng.standard_normal((60, 2))
         pixels[explained:] += 40.0 * k  # somebody walks by, whom the rig's motion does not explain
         frame = replace(PairFrame.empty(k * PERIOD_NS), ids=np.arange(60), pixels=pixels)
-        verdicts.append(standstill.look({0: frame}, {0: np.arange(explained)}))
-    return verdicts
+        gate_results.append(standstill.look({0: frame}, {0: np.arange(explained)}))
+    return gate_results
 
 
 def test_rest_is_told_after_a_quarter_of_a_second() -> None:
@@ -33,10 +33,10 @@ def test_slow_motion_is_no_rest_however_little_it_is_in_a_frame() -> None:
 
 
 def test_rest_ends_at_once_and_begins_anew() -> None:
-    verdicts = told(np.concatenate([np.zeros(10), np.arange(1.0, 6.0), np.full(10, 5.0)]))
-    assert verdicts[5:10] == [True] * 5
-    assert not any(verdicts[10:19])
-    assert all(verdicts[20:])
+    gate_results = told(np.concatenate([np.zeros(10), np.arange(1.0, 6.0), np.full(10, 5.0)]))
+    assert gate_results[5:10] == [True] * 5
+    assert not any(gate_results[10:19])
+    assert all(gate_results[20:])
 
 
 def test_few_points_tell_nothing() -> None:

@@ -5,7 +5,7 @@ from synthetic import transform
 
 from graphvio.arrays import Bool, Float, Image
 from graphvio.cameras import RADIAL_TANGENTIAL, project_points, unproject_pixels
-from graphvio.config_stages import StereoConfig
+from graphvio.config.stages import StereoConfig
 from graphvio.frontend.lucas_kanade import build_pyramid
 from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
 

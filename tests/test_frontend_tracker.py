@@ -11,8 +11,8 @@ from waves import picture, waves
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.config import Config
-from graphvio.config_stages import CornerConfig
-from graphvio.frontend.grain import noise_sigma
+from graphvio.config.stages import CornerConfig
+from graphvio.frontend.image_noise import noise_sigma
 from graphvio.frontend.lucas_kanade import build_pyramid
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.tracker import PairTracker

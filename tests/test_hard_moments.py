@@ -14,10 +14,11 @@ from calibration_walks import misplacement, with_wrong_place
 from graphvio import Config, Estimate, FrameSet, Odometry, Status, open_source
 from graphvio.arrays import Float, Image
 from graphvio.evaluation.measures import umeyama_se3
-from graphvio.events import Event, Incident, Quality
 from graphvio.frontend.matching import StereoMatcher, StereoMatches
-from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.geometry import se3_inverse, se3_log
+from graphvio.measurements.events import Event
+from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
+from graphvio.measurements.sensors import Measurement
 from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
 
@@ -31,7 +32,7 @@ class Walk:
     def __init__(
         self,
         recording: Path,
-        events: list[Event],
+        measurements: list[Measurement],
         change: Change,
         *,
         rig: Rig | None = None,
@@ -48,14 +49,14 @@ class Walk:
             return self.results[-1]
 
         frontend.process = listened  # type: ignore[method-assign,assignment]
-        start_ns = next(event.stamp_ns for event in events if isinstance(event, FrameSet))
+        start_ns = next(measurement.stamp_ns for measurement in measurements if isinstance(measurement, FrameSet))
         self.estimates: list[Estimate] = []
-        for event in events:
-            if isinstance(event, FrameSet):
-                estimate = self.odometry.process(change((event.stamp_ns - start_ns) * 1e-9, event))
+        for measurement in measurements:
+            if isinstance(measurement, FrameSet):
+                estimate = self.odometry.process(change((measurement.stamp_ns - start_ns) * 1e-9, measurement))
                 self.estimates += [estimate] if estimate is not None else []
         self.estimates += self.odometry.finish()
-        self.incidents: list[Incident] = self.odometry.take_incidents()
+        self.events: list[Event] = self.odometry.take_events()
 
     def pose(self, stamp_ns: int) -> Float:
         """True ``world_T_body`` at a frameset."""
@@ -109,11 +110,11 @@ class Walk:
         return float(np.sqrt(np.mean(np.square(errors))))
 
     def kinds(self) -> set[str]:
-        return {incident.kind for incident in self.incidents}
+        return {event.kind for event in self.events}
 
 
 @pytest.fixture(scope="module")
-def events(room_walk: Path) -> list[Event]:
+def measurements(room_walk: Path) -> list[Measurement]:
     return list(open_source(room_walk))
 
 
@@ -152,8 +153,8 @@ def noise_like(image: Image, level: float, seed: int) -> Image:
     return np.asarray(np.random.default_rng(seed).normal(level, 2.0, image.shape).clip(0, 255), dtype=np.uint8)
 
 
-def test_the_walk_as_it_is(room_walk: Path, events: list[Event]) -> None:
-    walk = Walk(room_walk, events, as_it_is)
+def test_the_walk_as_it_is(room_walk: Path, measurements: list[Measurement]) -> None:
+    walk = Walk(room_walk, measurements, as_it_is)
     assert walk.end_error_m < 0.004
     assert walk.worst < 45.0
     assert walk.kinds() <= {"vision_weak"}
@@ -166,21 +167,21 @@ def test_the_walk_as_it_is(room_walk: Path, events: list[Event]) -> None:
     assert np.mean(resting[6:19]) > 0.9  # the first second, of which a quarter goes by before it can be told
     assert not any(resting[:5])
     assert not any(resting[40:])  # and then it has begun to walk
-    again = Walk(room_walk, events, as_it_is)
+    again = Walk(room_walk, measurements, as_it_is)
     for one, other in zip(walk.estimates, again.estimates, strict=True):
         assert np.array_equal(one.nav_T_body, other.nav_T_body)  # type: ignore[arg-type]
         assert np.array_equal(one.covariance, other.covariance)  # type: ignore[arg-type]
 
 
-def test_an_error_of_p12_is_told_and_corrected(room_walk: Path, events: list[Event]) -> None:
+def test_an_error_of_p12_is_told_and_corrected(room_walk: Path, measurements: list[Measurement]) -> None:
     """1 degree and 3 cm: over each second the two pairs stay better than the better one of them.
 
     The ATE of so short a walk, half a millimetre, is partly luck: it stays below a multiple of the better pair's.
     """
     rig = open_source(room_walk).rig.without_imu()
     error = misplacement(1.0, 0.03)
-    walk = Walk(room_walk, events, as_it_is, rig=with_wrong_place(rig, 1.0, 0.03))
-    told = [incident for incident in walk.incidents if incident.kind == "extrinsics_off"]
+    walk = Walk(room_walk, measurements, as_it_is, rig=with_wrong_place(rig, 1.0, 0.03))
+    told = [event for event in walk.events if event.kind == "extrinsics_off"]
     assert len(told) == 1
     assert "pair back" in told[0].detail
     found = walk.odometry._frontend.misaligned[1].tangent
@@ -189,8 +190,8 @@ def test_an_error_of_p12_is_told_and_corrected(room_walk: Path, events: list[Eve
     def only(pair: int) -> Change:
         return lambda _, frameset: replace(frameset, images={0: frameset.images[pair]})
 
-    alone = [Walk(room_walk, events, only(pair), rig=rig.with_pairs([pair])) for pair in (0, 1)]
-    exact = Walk(room_walk, events, as_it_is)
+    alone = [Walk(room_walk, measurements, only(pair), rig=rig.with_pairs([pair])) for pair in (0, 1)]
+    exact = Walk(room_walk, measurements, as_it_is)
     assert exact.error_over_1s_m < 0.6 * min(single.error_over_1s_m for single in alone)
     assert exact.ate_m < 1.05 * min(single.ate_m for single in alone)
     assert walk.error_over_1s_m < 1.05 * min(single.error_over_1s_m for single in alone)
@@ -200,7 +201,7 @@ def test_an_error_of_p12_is_told_and_corrected(room_walk: Path, events: list[Eve
 
 
 def test_all_that_stereo_matching_threw_out_is_reported(
-    room_walk: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
+    room_walk: Path, measurements: list[Measurement], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also of the search for new corners, when the reference changes."""
     thrown_out: Counter[str] = Counter()
@@ -212,7 +213,7 @@ def test_all_that_stereo_matching_threw_out_is_reported(
         return matches
 
     monkeypatch.setattr(StereoMatcher, "match", counted)
-    walk = Walk(room_walk, events, as_it_is)
+    walk = Walk(room_walk, measurements, as_it_is)
     reported: Counter[str] = Counter()
     for estimate in walk.estimates:
         for report in estimate.pairs.values():
@@ -222,26 +223,26 @@ def test_all_that_stereo_matching_threw_out_is_reported(
 
 
 @pytest.mark.parametrize("pair", [0, 1])
-def test_a_blinded_pair_breaks_nothing(room_walk: Path, events: list[Event], pair: int) -> None:
+def test_a_blinded_pair_breaks_nothing(room_walk: Path, measurements: list[Measurement], pair: int) -> None:
     """For 2 s, which is what the walk has room for; the benchmark of faults blinds pairs for 5 s."""
     numbers = iter(range(1000))
-    walk = Walk(room_walk, events, altered(pair, lambda image: noise_like(image, 3.0, next(numbers))))
+    walk = Walk(room_walk, measurements, altered(pair, lambda image: noise_like(image, 3.0, next(numbers))))
     assert all(estimate.status is Status.TRACKING for estimate in walk.estimates[1:])
     assert walk.end_error_m < 0.012
     assert walk.worst < 45.0
 
 
 @pytest.mark.parametrize("pair", [0, 1])
-def test_a_frozen_pair_is_left_out(room_walk: Path, events: list[Event], pair: int) -> None:
-    walk = Walk(room_walk, events, frozen((pair,), 4.0))
+def test_a_frozen_pair_is_left_out(room_walk: Path, measurements: list[Measurement], pair: int) -> None:
+    walk = Walk(room_walk, measurements, frozen((pair,), 4.0))
     assert walk.end_error_m < 0.02
     assert walk.worst < 45.0
     left_out = [result for result in walk.results if pair not in result.pairs]
     assert len(left_out) == 39  # the first of forty is new
 
 
-def test_all_frozen_is_never_sure(room_walk: Path, events: list[Event]) -> None:
-    walk = Walk(room_walk, events, frozen((0, 1), 2.5))
+def test_all_frozen_is_never_sure(room_walk: Path, measurements: list[Measurement]) -> None:
+    walk = Walk(room_walk, measurements, frozen((0, 1), 2.5))
     during = [result for result in walk.results if "repeats" in result.reason]
     assert len(during) == 9
     assert all(result.quality is Quality.WEAK for result in during)
@@ -250,10 +251,10 @@ def test_all_frozen_is_never_sure(room_walk: Path, events: list[Event]) -> None:
 
 @pytest.mark.parametrize("reference", ["keyframe", "previous"])
 def test_what_is_measured_after_a_freeze_is_measured_from_before_it(
-    room_walk: Path, events: list[Event], reference: Literal["keyframe", "previous"]
+    room_walk: Path, measurements: list[Measurement], reference: Literal["keyframe", "previous"]
 ) -> None:
     config = replace(Config(), motion=replace(Config().motion, reference=reference))
-    walk = Walk(room_walk, events, frozen((0, 1), 2.3), config=config)
+    walk = Walk(room_walk, measurements, frozen((0, 1), 2.3), config=config)
     assert walk.worst < 60.0  # one in 10,000,000; from frame to frame the covariances have longer tails
     frozen_ns = {e.stamp_ns for e in walk.estimates if "repeats" in e.vision_reason}
     assert len(frozen_ns) == 5
@@ -262,7 +263,7 @@ def test_what_is_measured_after_a_freeze_is_measured_from_before_it(
 
 
 @pytest.mark.parametrize("pair", [0, 1])
-def test_a_pair_that_comes_back_interrupts_nothing(room_walk: Path, events: list[Event], pair: int) -> None:
+def test_a_pair_that_comes_back_interrupts_nothing(room_walk: Path, measurements: list[Measurement], pair: int) -> None:
     """Be it the first or the second: what stayed in view counts, not what the pair saw before it went."""
 
     def without(seconds: float, frameset: FrameSet) -> FrameSet:
@@ -270,7 +271,7 @@ def test_a_pair_that_comes_back_interrupts_nothing(room_walk: Path, events: list
             return frameset
         return replace(frameset, images={j: both for j, both in frameset.images.items() if j != pair})
 
-    walk = Walk(room_walk, events, without)
+    walk = Walk(room_walk, measurements, without)
     assert all(result.motion is not None for result in walk.results[1:])
     assert {len(result.pairs) for result in walk.results} == {1, 2}
     assert all(result.pairs[pair].inliers > 40 for result in walk.results[-10:])
@@ -278,31 +279,31 @@ def test_a_pair_that_comes_back_interrupts_nothing(room_walk: Path, events: list
     assert walk.end_error_m < 0.006
 
 
-def test_left_and_right_swapped(room_walk: Path, events: list[Event]) -> None:
+def test_left_and_right_swapped(room_walk: Path, measurements: list[Measurement]) -> None:
     def swap(seconds: float, frameset: FrameSet) -> FrameSet:
         if not 2.0 <= seconds < 4.0:
             return frameset
         left, right = frameset.images[0]
         return replace(frameset, images={**frameset.images, 0: (right, left)})
 
-    walk = Walk(room_walk, events, swap)
+    walk = Walk(room_walk, measurements, swap)
     assert walk.end_error_m < 0.012
     assert all(estimate.status is Status.TRACKING for estimate in walk.estimates[1:])
 
 
-def test_exposure_that_jumps(room_walk: Path, events: list[Event]) -> None:
+def test_exposure_that_jumps(room_walk: Path, measurements: list[Measurement]) -> None:
     numbers = iter(range(1000))
 
     def dim(image: Image) -> Image:
         gain = (1.0, 0.6)[(next(numbers) // 2) % 2]
         return np.asarray((gain * image).clip(0, 255), dtype=np.uint8)
 
-    walk = Walk(room_walk, events, altered(0, dim))
+    walk = Walk(room_walk, measurements, altered(0, dim))
     assert walk.end_error_m < 0.012
     assert all(estimate.status is Status.TRACKING for estimate in walk.estimates[1:])
 
 
-def test_a_poster_that_is_carried_across_one_view(room_walk: Path, events: list[Event]) -> None:
+def test_a_poster_that_is_carried_across_one_view(room_walk: Path, measurements: list[Measurement]) -> None:
     """A textured plane, 1 m away, fills the first pair's view and moves: its motion is not the rig's."""
     noise = np.random.default_rng(5).integers(0, 256, (480, 2000), dtype=np.uint8)
     poster = np.asarray(cv2.equalizeHist(cv2.GaussianBlur(noise, (0, 0), 3)), dtype=np.uint8)
@@ -316,6 +317,6 @@ def test_a_poster_that_is_carried_across_one_view(room_walk: Path, events: list[
         left, right = (np.ascontiguousarray(poster[:, at + shift : at + shift + 640]) for shift in (0, disparity))
         return replace(frameset, images={**frameset.images, 0: (left, right)})
 
-    walk = Walk(room_walk, events, carry)
+    walk = Walk(room_walk, measurements, carry)
     assert walk.worst < 45.0
     assert walk.end_error_m < 0.02

@@ -91,8 +91,8 @@ def test_a_recording_that_is_interrupted_can_be_read(
 
     start_ns = open_source(recording).start_ns
 
-    def interrupted(odometry: Odometry, event: Any) -> None:
-        if isinstance(event, FrameSet) and event.stamp_ns > start_ns:
+    def interrupted(odometry: Odometry, measurement: Any) -> None:
+        if isinstance(measurement, FrameSet) and measurement.stamp_ns > start_ns:
             interrupted_kernel()
 
     monkeypatch.setattr(Odometry, "process", interrupted)
@@ -104,7 +104,7 @@ def test_a_recording_that_is_interrupted_can_be_read(
         == f"graphvio: interrupted; what was recorded until then is in {out}, which can be read"
     )
     assert McapFile(out).is_whole
-    assert len([event for event in open_source(out) if isinstance(event, FrameSet)]) == 2
+    assert len([measurement for measurement in open_source(out) if isinstance(measurement, FrameSet)]) == 2
 
 
 @pytest.mark.parametrize(
@@ -151,8 +151,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 import graphvio.warmup
 from graphvio.cli import main
 from graphvio.odometry import Odometry
-def process(self, event):
-    print(event.stamp_ns, flush=True)
+def process(self, measurement):
+    print(measurement.stamp_ns, flush=True)
     time.sleep(0.02)
 graphvio.warmup.warm_up = lambda *_: None
 Odometry.process = process

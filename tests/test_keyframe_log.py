@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from graphvio.events import Status
+from graphvio.measurements.estimate import Status
 from graphvio.slam.keyframe import Keyframe, Landmarks
 from graphvio.slam.keyframe_log import KeyframeLog
 

@@ -15,10 +15,11 @@ from graphvio import Config, ConfigError, Estimate, FrameSet, Odometry, Predicti
 from graphvio.arrays import AnyArray, Float, Image
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.window import WindowError
-from graphvio.events import Event
 from graphvio.frontend.stereo import triangulate
 from graphvio.frontend.tracks import PairFrame, common_rows
 from graphvio.geometry import se3, se3_inverse, se3_log
+from graphvio.measurements.sensors import Measurement
+from graphvio.measurements.step import Step
 from graphvio.rig import Rig
 from graphvio.simulation.simulator import make_simulator
 from graphvio.slam.descriptors import describer
@@ -26,7 +27,6 @@ from graphvio.slam.keyframe import Keyframe
 from graphvio.slam.keyframes import Keyframes
 from graphvio.slam.landmarks import landmarks_of
 from graphvio.slam.map_frame import MapFrame
-from graphvio.step import Step
 from graphvio.trajectory import Trajectory
 
 SOON_S = 30.0  # until then a thread is waited for; only a test that fails takes so long
@@ -44,7 +44,7 @@ class Run:
 
 
 @pytest.fixture(scope="module")
-def events(room_walk: Path) -> list[Event]:
+def measurements(room_walk: Path) -> list[Measurement]:
     return list(open_source(room_walk))
 
 
@@ -59,21 +59,21 @@ def truth(room_walk: Path) -> Trajectory:
 
 
 @pytest.fixture(scope="module")
-def run(rig: Rig, events: list[Event]) -> Run:
+def run(rig: Rig, measurements: list[Measurement]) -> Run:
     """The whole recording, with images."""
-    return run_of(rig, events, "keyframes: {images: true}")
+    return run_of(rig, measurements, "keyframes: {images: true}")
 
 
-def run_of(rig: Rig, events: Sequence[Event], config: str = "{}") -> Run:
+def run_of(rig: Rig, measurements: Sequence[Measurement], config: str = "{}") -> Run:
     steps: list[Step] = []
     keyframes: list[Keyframe] = []
     odometry = Odometry(rig, Config.from_yaml(config), on_step=steps.append)
     odometry.on_keyframe(keyframes.append)
-    return Run(odometry, feed(odometry, events), keyframes, steps)
+    return Run(odometry, feed(odometry, measurements), keyframes, steps)
 
 
-def feed(odometry: Odometry, events: Sequence[Event]) -> list[Estimate]:
-    estimates = [estimate for event in events if (estimate := odometry.process(event)) is not None]
+def feed(odometry: Odometry, measurements: Sequence[Measurement]) -> list[Estimate]:
+    estimates = [estimate for measurement in measurements if (estimate := odometry.process(measurement)) is not None]
     return estimates + odometry.finish()
 
 
@@ -87,10 +87,10 @@ def squared_error(measured: Float, true: Float, covariance: Float) -> float:
     return float(error @ np.linalg.solve(covariance, error))
 
 
-def until(events: list[Event], framesets: int) -> list[Event]:
-    """Events up to a number of framesets."""
-    ends = [i for i, event in enumerate(events) if isinstance(event, FrameSet)]
-    return events[: ends[framesets - 1] + 1]
+def until(measurements: list[Measurement], framesets: int) -> list[Measurement]:
+    """Measurements up to a number of framesets."""
+    ends = [i for i, measurement in enumerate(measurements) if isinstance(measurement, FrameSet)]
+    return measurements[: ends[framesets - 1] + 1]
 
 
 # ------------------------------------------------------------------ when they come, and their poses
@@ -111,17 +111,17 @@ def test_each_reference_is_a_keyframe_and_ids_count(run: Run) -> None:
 
 @pytest.mark.parametrize("kind", ["imu", "vision", "filter", "in_turns"])
 def test_motions_between_keyframes_are_within_their_covariance(
-    kind: str, run: Run, rig: Rig, events: list[Event], truth: Trajectory
+    kind: str, run: Run, rig: Rig, measurements: list[Measurement], truth: Trajectory
 ) -> None:
     if kind == "vision":
-        run = run_of(rig.without_imu(), [e for e in events if isinstance(e, FrameSet)])
+        run = run_of(rig.without_imu(), [e for e in measurements if isinstance(e, FrameSet)])
         assert run.keyframes[0].stamp_ns == run.estimates[0].stamp_ns  # though it is initialising
     elif kind == "filter":
         config = "{motion: {reference: previous}, fusion: {estimator: filter}}"
-        run = run_of(rig, until(events, 60), config)
+        run = run_of(rig, until(measurements, 60), config)
         assert len(run.keyframes) == len(run.estimates)
     elif kind == "in_turns":
-        run = run_of(rig, in_turns(events))
+        run = run_of(rig, in_turns(measurements))
         assert {len(np.unique(k.landmarks.pair)) for k in run.keyframes} == {1}
     squares = []
     for before, now in zip(run.keyframes[:-1], run.keyframes[1:], strict=True):
@@ -135,13 +135,13 @@ def test_motions_between_keyframes_are_within_their_covariance(
     assert max(squares) < 30.0
 
 
-def in_turns(events: list[Event]) -> list[Event]:
+def in_turns(measurements: list[Measurement]) -> list[Measurement]:
     """Front and back images alternate, each at its own time."""
-    made, count = list[Event](), 0
-    for event in events:
-        if isinstance(event, FrameSet):
-            event, count = replace(event, images={count % 2: event.images[count % 2]}), count + 1
-        made.append(event)
+    made, count = list[Measurement](), 0
+    for measurement in measurements:
+        if isinstance(measurement, FrameSet):
+            measurement, count = replace(measurement, images={count % 2: measurement.images[count % 2]}), count + 1
+        made.append(measurement)
     return made
 
 
@@ -188,7 +188,7 @@ def test_where_nothing_is_known_of_the_way_all_of_the_poses_covariance_is_told(r
 
 
 def test_where_the_window_is_rebuilt_a_keyframe_begins(
-    rig: Rig, events: list[Event], monkeypatch: pytest.MonkeyPatch
+    rig: Rig, measurements: list[Measurement], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is measured from there on is measured from there, and steps say so, too."""
 
@@ -199,25 +199,25 @@ def test_where_the_window_is_rebuilt_a_keyframe_begins(
     steps, keyframes = list[Step](), list[Keyframe]()
     odometry = Odometry(rig, on_step=steps.append)
     odometry.on_keyframe(keyframes.append)
-    begun = until(events, 30)
-    for event in begun:
-        odometry.process(event)
+    begun = until(measurements, 30)
+    for measurement in begun:
+        odometry.process(measurement)
     count = len(steps)
     with monkeypatch.context() as patch:
         patch.setattr(Smoother, "settle", fail)
-        for event in events[len(begun) : len(until(events, 35))]:
-            odometry.process(event)
+        for measurement in measurements[len(begun) : len(until(measurements, 35))]:
+            odometry.process(measurement)
     odometry.finish()
-    assert "window_rebuilt" in {i.kind for i in odometry.take_incidents()}
+    assert "window_rebuilt" in {i.kind for i in odometry.take_events()}
     rebuilt = steps[count].estimate
     assert steps[count].references == {rebuilt.stamp_ns}
     assert [k.stamp_ns for k in keyframes] == [steps[0].estimate.stamp_ns, rebuilt.stamp_ns]
     np.testing.assert_array_equal(keyframes[1].relative_covariance, rebuilt.covariance)
 
 
-def test_a_start_in_motion_has_no_keyframe_until_it_is_known(rig: Rig, events: list[Event]) -> None:
-    began = next(e.stamp_ns for e in events if isinstance(e, FrameSet)) + 2_000_000_000
-    run = run_of(rig, [e for e in events if e.stamp_ns > began])
+def test_a_start_in_motion_has_no_keyframe_until_it_is_known(rig: Rig, measurements: list[Measurement]) -> None:
+    began = next(e.stamp_ns for e in measurements if isinstance(e, FrameSet)) + 2_000_000_000
+    run = run_of(rig, [e for e in measurements if e.stamp_ns > began])
     statuses = [e.status for e in run.estimates]
     assert statuses[0] is Status.INITIALISING
     assert statuses[-1] is Status.TRACKING
@@ -227,20 +227,20 @@ def test_a_start_in_motion_has_no_keyframe_until_it_is_known(rig: Rig, events: l
     assert (run.keyframes[0].id, run.keyframes[0].previous_id) == (0, None)
 
 
-def test_a_break_of_the_epoch_breaks_the_chain_and_ends_the_map(rig: Rig, events: list[Event]) -> None:
-    begun, rest = until(events, 50), events[len(until(events, 50)) :]
+def test_a_break_of_the_epoch_breaks_the_chain_and_ends_the_map(rig: Rig, measurements: list[Measurement]) -> None:
+    begun, rest = until(measurements, 50), measurements[len(until(measurements, 50)) :]
     odometry, keyframes, before = Odometry(rig), list[Keyframe](), list[Estimate]()
     odometry.on_keyframe(keyframes.append)
-    for event in begun:
-        estimate = odometry.process(event)
+    for measurement in begun:
+        estimate = odometry.process(measurement)
         before += [] if estimate is None else [estimate]
     old = keyframes[-1].id
     assert odometry.map_T_body(before[-1].stamp_ns) is None
     assert odometry.correct(old, transform([0, 0, 1.0], [5.0, 0, 0]), TIGHT).accepted
     assert odometry.map_T_body(before[-1].stamp_ns) is not None
     estimates = []
-    for event in until(rest, 15):
-        estimate = odometry.process(replace(event, stamp_ns=event.stamp_ns + 10**13))
+    for measurement in until(rest, 15):
+        estimate = odometry.process(replace(measurement, stamp_ns=measurement.stamp_ns + 10**13))
         if estimate is not None:
             estimates.append(estimate)
             assert odometry.map_T_body(estimate.stamp_ns) is None or estimate.epoch == 0
@@ -248,20 +248,20 @@ def test_a_break_of_the_epoch_breaks_the_chain_and_ends_the_map(rig: Rig, events
     first = next(k for k in keyframes if k.epoch == 1)
     assert (first.previous_id, first.previous_T_body, first.relative_covariance) == (None, None, None)
     assert [k.id for k in keyframes] == list(range(len(keyframes)))
-    odometry.take_incidents()
+    odometry.take_events()
     result = odometry.correct(old, np.eye(4), TIGHT)
     assert (result.accepted, result.map_T_odom) == (False, None)
-    incident = odometry.take_incidents()[-1]
-    assert (incident.kind, incident.stamp_ns) == ("correction_refused", estimates[-1].stamp_ns)
-    assert "not of the newest epoch" in incident.detail
+    event = odometry.take_events()[-1]
+    assert (event.kind, event.stamp_ns) == ("correction_refused", estimates[-1].stamp_ns)
+    assert "not of the newest epoch" in event.detail
     assert odometry.correct(keyframes[-1].id, np.eye(4), TIGHT).accepted
     assert odometry.map_T_body(estimates[-1].stamp_ns) is not None
     odometry.finish()
 
 
-def test_what_is_lost_has_no_keyframe(rig: Rig, events: list[Event]) -> None:
+def test_what_is_lost_has_no_keyframe(rig: Rig, measurements: list[Measurement]) -> None:
     black = np.zeros((480, 640), dtype=np.uint8)
-    framesets = [e for e in events if isinstance(e, FrameSet)][30:70]
+    framesets = [e for e in measurements if isinstance(e, FrameSet)][30:70]
     for k in range(10, 30):
         framesets[k] = replace(framesets[k], images=dict.fromkeys((0, 1), (black, black)))
     run = run_of(rig.without_imu(), framesets, "smoother: {lost_position_sigma_m: 0.2}")
@@ -412,15 +412,15 @@ def test_corners_at_the_edge_have_descriptors_too() -> None:
     assert describer("none") is None
 
 
-def test_images_come_only_where_they_are_asked_for(run: Run, rig: Rig, events: list[Event]) -> None:
-    of = {e.stamp_ns: e.images for e in events if isinstance(e, FrameSet)}
+def test_images_come_only_where_they_are_asked_for(run: Run, rig: Rig, measurements: list[Measurement]) -> None:
+    of = {e.stamp_ns: e.images for e in measurements if isinstance(e, FrameSet)}
     for keyframe in run.keyframes:
         assert set(keyframe.images) == {0, 1}
         for j, images in keyframe.images.items():
             for copied, image in zip(images, of[keyframe.stamp_ns][j], strict=True):
                 np.testing.assert_array_equal(copied, image)
                 assert not np.shares_memory(copied, image)
-    plain = run_of(rig, until(events, 20), "keyframes: {descriptors: none}").keyframes
+    plain = run_of(rig, until(measurements, 20), "keyframes: {descriptors: none}").keyframes
     assert plain
     assert not plain[0].images
     assert plain[0].landmarks.descriptors.shape == (len(plain[0].landmarks), 0)
@@ -429,12 +429,12 @@ def test_images_come_only_where_they_are_asked_for(run: Run, rig: Rig, events: l
 # ------------------------------------------------------------------ threads, and what does not change
 
 
-def test_neither_listeners_nor_corrections_change_an_estimate(rig: Rig, events: list[Event]) -> None:
+def test_neither_listeners_nor_corrections_change_an_estimate(rig: Rig, measurements: list[Measurement]) -> None:
     """With others that read, correct and ask in threads of their own all the while."""
-    events = until(events, 60)
+    measurements = until(measurements, 60)
     config = "motion: {keyframe_overlap: 0.9}\n"  # has many keyframes
     alone = Odometry(rig, Config.from_yaml(config))
-    expected = feed(alone, events)
+    expected = feed(alone, measurements)
     assert alone._keyframes.log.next_id == 0  # nobody asked
 
     odometry = Odometry(rig, Config.from_yaml(config + "keyframes: {descriptors: sift, images: true}"))
@@ -470,8 +470,8 @@ def test_neither_listeners_nor_corrections_change_an_estimate(rig: Rig, events: 
 
     newest, estimates = [0], list[Estimate]()
     threads = [guarded(correct_all), guarded(ask)]
-    for event in events:
-        estimate = odometry.process(event)
+    for measurement in measurements:
+        estimate = odometry.process(measurement)
         if estimate is not None:
             estimates.append(estimate)
             newest[0] = estimate.stamp_ns
@@ -484,7 +484,7 @@ def test_neither_listeners_nor_corrections_change_an_estimate(rig: Rig, events: 
     assert [k.id for k in read] == [k.id for k in called] == list(range(len(called)))
     assert moved.count(True) > 3
     assert moved.count(False) > 3
-    assert {i.kind for i in odometry.take_incidents()} >= {"correction_refused"}
+    assert {i.kind for i in odometry.take_events()} >= {"correction_refused"}
     assert len(estimates) == len(expected)
     for one, other in zip(estimates, expected, strict=True):
         np.testing.assert_array_equal(one.nav_T_body, other.nav_T_body)
@@ -494,15 +494,15 @@ def test_neither_listeners_nor_corrections_change_an_estimate(rig: Rig, events: 
         np.testing.assert_array_equal(pose, other_pose)
 
 
-def test_the_map_jumps_and_odom_does_not(rig: Rig, events: list[Event]) -> None:
+def test_the_map_jumps_and_odom_does_not(rig: Rig, measurements: list[Measurement]) -> None:
     predictions = list[Prediction]()
     config = Config.from_yaml("motion: {keyframe_overlap: 0.9}")
     odometry = Odometry(rig, config, on_prediction=predictions.append)
     keyframes, in_map = list[Keyframe](), list[Float]()
     odometry.on_keyframe(keyframes.append)
-    for event in until(events, 70):
+    for measurement in until(measurements, 70):
         count = len(keyframes)
-        estimate = odometry.process(event)
+        estimate = odometry.process(measurement)
         if len(keyframes) > count:
             newest = keyframes[-1]
             side = transform([0, 0, 0], [8.0 if newest.stamp_ns - keyframes[0].stamp_ns > 1.5e9 else 0.0, 0, 0])
@@ -515,21 +515,21 @@ def test_the_map_jumps_and_odom_does_not(rig: Rig, events: list[Event]) -> None:
             np.testing.assert_array_equal(found, odometry.map_T_odom @ prediction.nav_T_body)
             in_map.append(found[:3, 3])
     odometry.finish()
-    assert "map_moved" in {i.kind for i in odometry.take_incidents()}
+    assert "map_moved" in {i.kind for i in odometry.take_events()}
     assert np.linalg.norm(np.diff(in_map, axis=0), axis=1).max() > 7.0
     steps = np.diff([p.nav_T_body[:3, 3] for p in predictions], axis=0)
     assert np.linalg.norm(steps, axis=1).max() < 0.02  # 1 cm a sample at twice the walking speed, and small corrections
 
 
-def test_an_iterator_may_come_late_and_ends_at_the_end(rig: Rig, events: list[Event]) -> None:
+def test_an_iterator_may_come_late_and_ends_at_the_end(rig: Rig, measurements: list[Measurement]) -> None:
     odometry, keyframes = Odometry(rig), list[Keyframe]()
-    events = until(events, 50)
-    for event in events[: len(events) // 2]:
-        odometry.process(event)
+    measurements = until(measurements, 50)
+    for measurement in measurements[: len(measurements) // 2]:
+        odometry.process(measurement)
     early = odometry.keyframes()
     odometry.on_keyframe(keyframes.append)
-    for event in events[len(events) // 2 :]:
-        odometry.process(event)
+    for measurement in measurements[len(measurements) // 2 :]:
+        odometry.process(measurement)
     odometry.finish()
     assert keyframes
     assert [k.id for k in early] == list(range(len(keyframes)))
@@ -537,10 +537,10 @@ def test_an_iterator_may_come_late_and_ends_at_the_end(rig: Rig, events: list[Ev
     assert [k.id for k in odometry.keyframes(1)] == list(range(1, len(keyframes)))
 
 
-def test_corners_can_be_made_fewer_and_many_again(rig: Rig, events: list[Event]) -> None:
+def test_corners_can_be_made_fewer_and_many_again(rig: Rig, measurements: list[Measurement]) -> None:
     odometry, counts, shares = Odometry(rig), list[int](), {20: 0.25, 45: 1.0}
-    for event in until(events, 70):
-        estimate = odometry.process(event)
+    for measurement in until(measurements, 70):
+        estimate = odometry.process(measurement)
         if estimate is not None:
             counts.append(sum(len(report.pixels) for report in estimate.pairs.values()))
             if len(counts) in shares:

@@ -21,9 +21,8 @@ from recordings import noise_image, small_rig
 from graphvio import FrameSet, open_source
 from graphvio.arrays import Image
 from graphvio.config import Config
-from graphvio.config_stages import LiveConfig
+from graphvio.config.stages import LiveConfig
 from graphvio.errors import GraphvioError, RigError, ServiceError, SourceError
-from graphvio.events import Estimate, Event, ImuSample, Incident
 from graphvio.live import running as running_module
 from graphvio.live import session_recorder
 from graphvio.live.health import HealthServer
@@ -31,6 +30,9 @@ from graphvio.live.running import LiveOdometry
 from graphvio.live.session_recorder import SessionRecorder
 from graphvio.live.source import Notice, Reading
 from graphvio.live.stage import Stage
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import ImuSample, Measurement
 from graphvio.sessions.mcap_file import McapFile
 
 
@@ -75,7 +77,7 @@ def test_a_replay_is_the_plain_odometry_bit_for_bit_and_so_is_what_it_recorded(r
 def test_in_real_time_each_frameset_is_estimated_or_counted_and_no_sample_is_lost(room_walk: Path, speed: str) -> None:
     """At forty times its speed there is no time for all of it on any machine."""
     source = open_source(room_walk)
-    samples = sum(isinstance(event, ImuSample) for event in source)
+    samples = sum(isinstance(measurement, ImuSample) for measurement in source)
     estimates, _, figures = run_spec(f"replay:{room_walk}?speed={speed}")
     skipped = int(figures["skipped_late"] or 0) + int(figures["skipped_no_room"] or 0)
     assert figures["estimates"] == len(estimates) > 5
@@ -93,7 +95,7 @@ def test_in_real_time_each_frameset_is_estimated_or_counted_and_no_sample_is_los
 def test_an_imu_that_falls_silent_is_not_awaited_beyond_the_limit(room_walk: Path) -> None:
     estimates, told, figures = run_spec(f"simulator:room?recording={room_walk}&seed=3&legs=1&unplug=imu@3-4")
     assert int(figures["imu_not_awaited"] or 0) >= 1
-    assert "imu_not_covering" in {incident.kind for incident in told}
+    assert "imu_not_covering" in {event.kind for event in told}
     assert {each.epoch for each in estimates} == {0}
     assert estimates[-1].status == "tracking"
 
@@ -104,7 +106,7 @@ def test_devices_that_come_back_go_on_in_the_same_epoch_if_the_imu_lives(room_wa
     assert {each.epoch for each in estimates} == {0}
     assert estimates[-1].status == "tracking"
     assert figures["framesets"] == 80
-    kinds = [incident.kind for incident in told]
+    kinds = [event.kind for event in told]
     assert kinds.count("device_lost") == kinds.count("device_back") == 2
 
 
@@ -122,7 +124,7 @@ def test_after_everything_was_gone_for_too_long_a_new_epoch_begins(room_walk: Pa
         f"simulator:room?recording={room_walk}&seed=3&speed=max&legs=1&unplug=front{gone},back{gone},imu{gone}"
     )
     assert sorted({each.epoch for each in estimates}) == [0, 1]
-    assert "time_jump" in {incident.kind for incident in told}
+    assert "time_jump" in {event.kind for event in told}
 
 
 def test_clocks_that_drift_and_readings_that_come_late(room_walk: Path) -> None:
@@ -195,7 +197,7 @@ class Failing(Watched):
         if self._results == 3:
             raise GraphvioError("the window was closed")
 
-    def add_incident(self, incident: Incident) -> None:
+    def add_event(self, event: Event) -> None:
         if self._results >= 3:
             raise GraphvioError("nothing can be shown")
 
@@ -229,7 +231,7 @@ def test_a_stage_that_fails_ends_the_run_and_holds_up_nobody(
     outputs = [Failing()] if outputs else []
     source = Scripted(small_rig(1), make, is_realtime, interval_s=0.0005 if is_realtime else 0.0)
     running = LiveOdometry(source, source.open(), Config(), outputs)
-    incidents, estimates = running.incidents.subscribe(1000), running.estimates.subscribe(1)
+    events, estimates = running.events.subscribe(1000), running.estimates.subscribe(1)
     running.start()
     with pytest.raises(error, match=told):
         running.wait(SOON_S)
@@ -239,13 +241,13 @@ def test_a_stage_that_fails_ends_the_run_and_holds_up_nobody(
         with pytest.raises(error, match=told):
             running.stop()
     assert threads_of_a_run() == []
-    assert incidents.is_closed
+    assert events.is_closed
     assert estimates.is_closed
     assert running.keyframe_log.is_closed
     kinds, failed = [], []
-    while (incident := incidents.get()) is not None:
-        kinds.append(incident.kind)
-        failed += [incident.detail] if incident.kind == "stage_failed" else []
+    while (event := events.get()) is not None:
+        kinds.append(event.kind)
+        failed += [event.detail] if event.kind == "stage_failed" else []
     assert failed[0].startswith(f"{stage}: ")  # an output that fails at everything takes others along
     assert "stage_stuck" not in kinds
 
@@ -267,7 +269,7 @@ def test_a_decoder_that_fails_lets_go_of_a_capture_that_waits_for_room(is_realti
     with pytest.raises(ValueError, match="no image"):
         runs[0].stop()
     assert threads_of_a_run() == []
-    assert "incident_stage_stuck" not in runs[0].status()
+    assert "event_stage_stuck" not in runs[0].status()
 
 
 def test_what_came_before_a_failure_is_put_out() -> None:
@@ -299,7 +301,7 @@ def test_a_damaged_image_is_told_and_the_run_goes_on() -> None:
 
     estimates, told, figures = run(Scripted(small_rig(1), lambda: small_readings(small_rig(1), 20, decode)))
     assert len(estimates) == 19
-    assert figures["incident_image_damaged"] == 2
+    assert figures["event_image_damaged"] == 2
     assert [i.detail for i in told if i.kind == "image_damaged"] == ["half a JPEG"] * 2
 
 
@@ -332,14 +334,14 @@ def test_an_output_that_never_goes_on_is_left_behind(is_realtime: bool, monkeypa
     stalling = Stalling()
     source = Scripted(small_rig(1), lambda: small_readings(small_rig(1), 2000), is_realtime, 0.001 * is_realtime)
     running = LiveOdometry(source, source.open(), Config(), [stalling])
-    incidents = running.incidents.subscribe(1000)
+    events = running.events.subscribe(1000)
     running.start()
     assert stalling.is_held.wait(SOON_S)
     running.stop()
-    assert incidents.is_closed
+    assert events.is_closed
     told = []
-    while (incident := incidents.get()) is not None:
-        told.append(incident)
+    while (event := events.get()) is not None:
+        told.append(event)
     assert "output does not end; left behind" in [each.detail for each in told if each.kind == "stage_stuck"]
     stalling.may_go_on.set()  # and is gone when it does go on, see `no_thread_is_left`
 
@@ -359,7 +361,7 @@ def test_a_source_that_does_not_close_is_left_behind(monkeypatch: pytest.MonkeyP
     running.start()
     assert is_hanging.wait(SOON_S)
     running.stop()
-    assert running.status()["incident_stage_stuck"] == 1
+    assert running.status()["event_stage_stuck"] == 1
     goes_on.set()
     figures = running.status()
     assert int(figures["estimates"] or 0) + int(figures["skipped_no_room"] or 0) == figures["framesets"] == 10
@@ -406,23 +408,23 @@ def test_a_stalled_output_is_stuck_until_it_goes_on() -> None:
     config = Config(live=LiveConfig(stuck_s=0.3))
     source = Scripted(small_rig(1), lambda: small_readings(small_rig(1), 100_000), is_realtime=True, interval_s=0.005)
     running = LiveOdometry(source, source.open(), config, [stalling])
-    incidents = running.incidents.subscribe(1000)
+    events = running.events.subscribe(1000)
     health = HealthServer(running.status)
     running.start()
     assert stalling.is_held.wait(SOON_S)
     until(lambda: asked(health.address, "/healthz")[0] == 503)
     status, text = asked(health.address, "/healthz")
-    until(lambda: "incident_stage_stuck" in running.status())
+    until(lambda: "event_stage_stuck" in running.status())
     if status == 503:
         assert "output" in json.loads(text)["stuck"]
     stalling.may_go_on.set()
     until(lambda: asked(health.address, "/healthz")[0] == 200)
-    until(lambda: "incident_stage_recovered" in running.status())
+    until(lambda: "event_stage_recovered" in running.status())
     running.stop()
     health.close()
     told = []
-    while (incident := incidents.get()) is not None:
-        told.append((incident.kind, incident.detail.split()[0]))
+    while (event := events.get()) is not None:
+        told.append((event.kind, event.detail.split()[0]))
     assert told.index(("stage_stuck", "output")) < told.index(("stage_recovered", "output"))
 
 
@@ -437,15 +439,15 @@ def test_silent_sensors_are_told_and_no_reason_to_begin_anew() -> None:
     source = Scripted(small_rig(1), readings, is_realtime=True, interval_s=0.002)
     running = LiveOdometry(source, source.open(), Config(live=LiveConfig(stuck_s=0.3)))
     running.start()
-    until(lambda: {"incident_cameras_silent", "incident_imu_silent"} <= running.status().keys())
+    until(lambda: {"event_cameras_silent", "event_imu_silent"} <= running.status().keys())
     assert running.is_healthy
     may_go_on.set()
-    until(lambda: {"incident_cameras_back", "incident_imu_back"} <= running.status().keys())
+    until(lambda: {"event_cameras_back", "event_imu_back"} <= running.status().keys())
     running.stop()
 
 
 FIGURES: Figures = {
-    "health": "ok", "status": "tracking", "stuck": "", "estimates": 12, "skipped_late": 3, "incident_device_lost": 2,
+    "health": "ok", "status": "tracking", "stuck": "", "estimates": 12, "skipped_late": 3, "event_device_lost": 2,
     "status_tracking": 10, "recorded_framesets": 7, "latency_p99_ms": 41.5, "temperature_c": None, "epoch": 1,
 }  # fmt: skip
 
@@ -465,7 +467,7 @@ def test_metrics_are_what_prometheus_reads() -> None:
     assert values["graphvio_latency_p99_ms"] == 41.5
     counters = {name for name, family in families.items() if family.type == "counter"}
     assert counters == {f"graphvio_{name}" for name in (
-        "estimates", "skipped_late", "incident_device_lost", "status_tracking", "recorded_framesets"
+        "estimates", "skipped_late", "event_device_lost", "status_tracking", "recorded_framesets"
     )}  # fmt: skip
     told = {each.labels["status"]: each.value for each in families["graphvio_status"].samples}
     assert told == {"initialising": 0.0, "tracking": 1.0, "coasting": 0.0, "lost": 0.0, "stale": 0.0}
@@ -538,15 +540,15 @@ class SlowDisk:
         self.is_held = threading.Event()
         write = recorder._writer.add
 
-        def add(event: Event) -> None:
+        def add(measurement: Measurement) -> None:
             self.is_held.set()
             assert self.may_go_on.wait(SOON_S)
-            write(event)
+            write(measurement)
 
         recorder._writer.add = add  # type: ignore[method-assign]
 
 
-def events(framesets: int) -> Iterator[Event]:
+def measurements(framesets: int) -> Iterator[Measurement]:
     rig = small_rig(1)
     image = noise_image(0)
     for i in range(framesets):
@@ -559,8 +561,8 @@ def test_a_slow_disk_costs_framesets_of_the_recording_and_holds_up_nobody(tmp_pa
     pytest.importorskip("mcap")
     recorder = SessionRecorder(tmp_path / "slow.mcap", small_rig(1))
     disk = SlowDisk(recorder)
-    for event in events(200):
-        recorder.add_event(event)
+    for measurement in measurements(200):
+        recorder.add_measurement(measurement)
     assert disk.is_held.wait(SOON_S)
     assert recorder.status()["framesets_not_recorded"] == 80
     disk.may_go_on.set()
@@ -568,8 +570,8 @@ def test_a_slow_disk_costs_framesets_of_the_recording_and_holds_up_nobody(tmp_pa
     told = recorder.status()
     assert (told["recorded_framesets"], told["messages_not_recorded"], told["recording_stopped"]) == (120, 0, "")
     recorded = list(open_source(tmp_path / "slow.mcap"))
-    assert sum(isinstance(event, ImuSample) for event in recorded) == 200
-    assert sum(isinstance(event, FrameSet) for event in recorded) == 120
+    assert sum(isinstance(measurement, ImuSample) for measurement in recorded) == 200
+    assert sum(isinstance(measurement, FrameSet) for measurement in recorded) == 120
 
 
 def test_a_disk_that_stands_still_for_long_costs_samples_too_and_they_are_counted(
@@ -579,10 +581,10 @@ def test_a_disk_that_stands_still_for_long_costs_samples_too_and_they_are_counte
     monkeypatch.setattr(session_recorder, "_WAITING", 50)
     recorder = SessionRecorder(tmp_path / "still.mcap", small_rig(1))
     disk = SlowDisk(recorder)
-    recorder.add_event(ImuSample(0, np.zeros(3), np.zeros(3)))
+    recorder.add_measurement(ImuSample(0, np.zeros(3), np.zeros(3)))
     assert disk.is_held.wait(SOON_S)
     for i in range(1, 101):
-        recorder.add_event(ImuSample(i, np.zeros(3), np.zeros(3)))
+        recorder.add_measurement(ImuSample(i, np.zeros(3), np.zeros(3)))
     assert recorder.status()["messages_not_recorded"] == 50
     disk.may_go_on.set()
     recorder.close()
@@ -592,8 +594,8 @@ def test_a_recorder_that_waits_records_all(tmp_path: Path, monkeypatch: pytest.M
     pytest.importorskip("mcap")
     monkeypatch.setattr(session_recorder, "_WAITING", 5)
     recorder = SessionRecorder(tmp_path / "all.mcap", small_rig(1), waits=True)
-    for event in events(200):
-        recorder.add_event(event)
+    for measurement in measurements(200):
+        recorder.add_measurement(measurement)
     recorder.close()
     told = recorder.status()
     assert (told["recorded_framesets"], told["framesets_not_recorded"], told["messages_not_recorded"]) == (200, 0, 0)
@@ -602,9 +604,9 @@ def test_a_recorder_that_waits_records_all(tmp_path: Path, monkeypatch: pytest.M
 def test_a_message_that_cannot_be_written_stops_no_other(tmp_path: Path) -> None:
     pytest.importorskip("mcap")
     recorder = SessionRecorder(tmp_path / "odd.mcap", small_rig(1))
-    recorder.add_event(ImuSample(-1, np.zeros(3), np.zeros(3)))
-    for event in events(3):
-        recorder.add_event(event)
+    recorder.add_measurement(ImuSample(-1, np.zeros(3), np.zeros(3)))
+    for measurement in measurements(3):
+        recorder.add_measurement(measurement)
     recorder.close()
     assert recorder.status()["recorded_framesets"] == 3
     assert "-1" in str(recorder.status()["recording_stopped"])

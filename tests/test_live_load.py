@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graphvio.events import FrameSet, ImuSample
 from graphvio.live import inbox as inbox_module
 from graphvio.live.inbox import Inbox
 from graphvio.live.load import LoadControl
 from graphvio.live.meter import Meter
 from graphvio.live.ordering import SampleOrder
 from graphvio.live.pipe import Pipe
+from graphvio.measurements.sensors import FrameSet, ImuSample
 
 SOON_S = 20.0  # until then a thread is waited for; only a test that fails takes so long
 PERIOD_NS = 50_000_000
@@ -201,14 +201,14 @@ def test_samples_that_nobody_takes_are_counted_at_last(monkeypatch: pytest.Monke
     assert (taken(inbox), inbox.dropped_samples) == ([0, 1, 2, 3, 4], 4)
 
 
-@pytest.mark.parametrize("event", [frameset(1), sample(1)], ids=["frameset", "sample"])
+@pytest.mark.parametrize("measurement", [frameset(1), sample(1)], ids=["frameset", "sample"])
 def test_whoever_waits_for_room_goes_on_when_nothing_is_taken_any_more(
-    event: FrameSet | ImuSample, monkeypatch: pytest.MonkeyPatch
+    measurement: FrameSet | ImuSample, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(inbox_module, "_MOST_SAMPLES", 1)
     inbox = Inbox(1, waits=True)
     inbox.put(frameset(0))
-    thread, _ = in_thread(lambda: inbox.put(event))
+    thread, _ = in_thread(lambda: inbox.put(measurement))
     inbox.abandon()
     thread.join(SOON_S)
     assert not thread.is_alive()

@@ -14,7 +14,6 @@ from recordings import write_euroc
 
 from graphvio import FrameSet, open_source
 from graphvio.errors import SourceError
-from graphvio.events import Event, ImuSample
 from graphvio.geometry import so3_exp
 from graphvio.live.source import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.live.sources import SourceSpec, open_live_source
@@ -22,6 +21,7 @@ from graphvio.live.sources.pacing import Pace, speed_of
 from graphvio.live.sources.replay import paced
 from graphvio.live.sources.simulated_faults import DeviceFaults, Outage, devices_of, with_faults
 from graphvio.live.sources.simulator import _leg
+from graphvio.measurements.sensors import ImuSample, Measurement
 from graphvio.simulation import simulate
 from graphvio.simulation.simulator import make_simulator
 
@@ -205,11 +205,11 @@ def test_there_and_back_is_the_same_way(room_walk: Path) -> None:
     track = make_simulator("room", seed=3).imu_track
     there, back = ([*_leg(source, track, leg)] for leg in (0, 1))
 
-    def samples(events: list[Event]) -> list[ImuSample]:
-        return [e for e in events if isinstance(e, ImuSample)]
+    def samples(measurements: list[Measurement]) -> list[ImuSample]:
+        return [e for e in measurements if isinstance(e, ImuSample)]
 
-    def framesets(events: list[Event]) -> list[FrameSet]:
-        return [e for e in events if isinstance(e, FrameSet)]
+    def framesets(measurements: list[Measurement]) -> list[FrameSet]:
+        return [e for e in measurements if isinstance(e, FrameSet)]
 
     stamps = [e.stamp_ns for e in (*samples(there), *samples(back))]
     assert np.ptp(np.diff(stamps)) <= 1
@@ -293,13 +293,13 @@ def test_each_device_has_a_clock_of_its_own(recording: Path) -> None:
     assert devices_of(source.rig) == ("pair0", "pair1", "imu")
     readings = list(faulty(recording, DeviceFaults(drift_ppm=100.0)))
     frames, samples = images_and_samples(readings)
-    spans = {}
+    intervals = {}
     for device in ("pair0", "pair1", "imu"):
         of_device: list[CameraFrame | ImuReading] = [*frames, *samples]
         stamps = [r.stamp_ns for r in of_device if r.clock == device]
-        spans[device] = (stamps[-1] - stamps[0]) / 1e9
-    assert spans["pair0"] == pytest.approx(0.95 * (1 + 1e-4), abs=1e-8)
-    assert spans["pair1"] == pytest.approx(0.95 * (1 - 1e-4), abs=1e-8)
+        intervals[device] = (stamps[-1] - stamps[0]) / 1e9
+    assert intervals["pair0"] == pytest.approx(0.95 * (1 + 1e-4), abs=1e-8)
+    assert intervals["pair1"] == pytest.approx(0.95 * (1 - 1e-4), abs=1e-8)
     assert {f.clock for f in frames if f.camera in ("cam2", "cam3")} == {"pair1"}
 
 

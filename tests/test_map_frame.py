@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scipy.stats import chi2, kstest
 from synthetic import random_covariance, random_transform, transform
 
-from graphvio import EventError
+from graphvio import MeasurementError
 from graphvio.arrays import Float
-from graphvio.events import Status
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from graphvio.measurements.estimate import Status
 from graphvio.slam import map_frame
 from graphvio.slam.keyframe import Keyframe, Landmarks
 from graphvio.slam.map_frame import MapFrame
@@ -390,6 +390,6 @@ def test_drift_since_a_keyframe_that_is_forgotten_is_known(monkeypatch: pytest.M
 )
 def test_what_is_no_pose_or_covariance_is_refused(pose: Float, covariance: Float, message: str) -> None:
     frame = frame_with(chain(np.random.default_rng(17), 2).keyframes)
-    with pytest.raises(EventError, match=message):
+    with pytest.raises(MeasurementError, match=message):
         frame.correct(0, pose, covariance)
     assert frame.map_T_odom is None

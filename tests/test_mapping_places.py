@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from graphvio.arrays import Float, Image
-from graphvio.config_stages import OptimizationConfig
+from graphvio.config.stages import OptimizationConfig
 from graphvio.errors import MapError, SourceError
-from graphvio.events import Status
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.mapping.intake import Intake
 from graphvio.mapping.keyframe_poses import spread_keyframes
 from graphvio.mapping.places import PlaceChooser, motion_between
+from graphvio.measurements.estimate import Status
 from graphvio.rig import Rig
 from graphvio.simulation import default_rig
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks

@@ -13,9 +13,9 @@ from dawdling import Dawdling
 from graphvio import (
     Config,
     Estimate,
-    EventError,
     FrameSet,
     ImuSample,
+    MeasurementError,
     Odometry,
     Prediction,
     RigError,
@@ -25,12 +25,13 @@ from graphvio import (
 from graphvio.arrays import Image
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.window import Window, WindowError
-from graphvio.events import Event, Quality
+from graphvio.measurements.motion import Quality
+from graphvio.measurements.sensors import Measurement
 from graphvio.trajectory import Trajectory
 
 
 @pytest.fixture(scope="module")
-def events(room_walk: Path) -> list[Event]:
+def measurements(room_walk: Path) -> list[Measurement]:
     return list(open_source(room_walk, to_s=2.5))
 
 
@@ -46,22 +47,22 @@ def odometry(room_walk: Path) -> Iterator[Odometry]:
     made.finish()
 
 
-def framesets(events: list[Event]) -> list[FrameSet]:
-    return [event for event in events if isinstance(event, FrameSet)]
+def framesets(measurements: list[Measurement]) -> list[FrameSet]:
+    return [measurement for measurement in measurements if isinstance(measurement, FrameSet)]
 
 
-def feed(odometry: Odometry, events: list[Event]) -> list[Estimate]:
-    estimates = [estimate for event in events if (estimate := odometry.process(event)) is not None]
+def feed(odometry: Odometry, measurements: list[Measurement]) -> list[Estimate]:
+    estimates = [estimate for measurement in measurements if (estimate := odometry.process(measurement)) is not None]
     return estimates + odometry.finish()
 
 
 def kinds(odometry: Odometry) -> list[str]:
-    return [incident.kind for incident in odometry.take_incidents()]
+    return [event.kind for event in odometry.take_events()]
 
 
-def test_every_frameset_has_one_estimate_in_order(odometry: Odometry, events: list[Event]) -> None:
-    estimates = feed(odometry, events)
-    assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(events)]
+def test_every_frameset_has_one_estimate_in_order(odometry: Odometry, measurements: list[Measurement]) -> None:
+    estimates = feed(odometry, measurements)
+    assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(measurements)]
     assert kinds(odometry) == []
     for estimate in estimates:
         assert estimate.status is Status.TRACKING
@@ -72,7 +73,7 @@ def test_every_frameset_has_one_estimate_in_order(odometry: Odometry, events: li
     np.testing.assert_allclose(estimates[0].nav_T_body[:3, 3], 0, atol=1e-3)  # type: ignore[index]
 
 
-def test_the_threads_timing_changes_nothing(room_walk: Path, events: list[Event]) -> None:
+def test_the_threads_timing_changes_nothing(room_walk: Path, measurements: list[Measurement]) -> None:
     rig, runs = open_source(room_walk).rig, []
     for seed in range(3):
         odometry = Odometry(rig)
@@ -80,7 +81,7 @@ def test_the_threads_timing_changes_nothing(room_walk: Path, events: list[Event]
         if seed:
             frontend._workers.shutdown()
             frontend._workers = Dawdling(len(rig.pairs), seed)
-        runs.append(feed(odometry, events))
+        runs.append(feed(odometry, measurements))
         assert not seed or len(frontend._workers.delays_ms) > 50  # type: ignore[attr-defined]
     for again in runs[1:]:
         for one, other in zip(runs[0], again, strict=True):
@@ -92,29 +93,33 @@ def test_the_threads_timing_changes_nothing(room_walk: Path, events: list[Event]
                 np.testing.assert_array_equal(report.is_inlier, other.pairs[j].is_inlier)
 
 
-def test_smoothed_poses_cover_every_frameset_once(odometry: Odometry, events: list[Event]) -> None:
-    feed(odometry, events)
+def test_smoothed_poses_cover_every_frameset_once(odometry: Odometry, measurements: list[Measurement]) -> None:
+    feed(odometry, measurements)
     smoothed = sorted(stamp for stamp, _ in odometry.take_smoothed())
-    assert smoothed == [f.stamp_ns for f in framesets(events)]
+    assert smoothed == [f.stamp_ns for f in framesets(measurements)]
     assert odometry.take_smoothed() == []
 
 
-def test_nav_is_upright_and_scale_is_metric(odometry: Odometry, events: list[Event], truth: Trajectory) -> None:
-    estimate = feed(odometry, events)[-1]
+def test_nav_is_upright_and_scale_is_metric(
+    odometry: Odometry, measurements: list[Measurement], truth: Trajectory
+) -> None:
+    estimate = feed(odometry, measurements)[-1]
     assert estimate.nav_T_body is not None
-    true, _ = truth.at(np.array([framesets(events)[0].stamp_ns, estimate.stamp_ns]), 0.1)
+    true, _ = truth.at(np.array([framesets(measurements)[0].stamp_ns, estimate.stamp_ns]), 0.1)
     up_error = np.arccos(min(1.0, estimate.nav_T_body[2, :3] @ true.rotations[1][2]))
     assert np.rad2deg(up_error) < 0.5
     walked = np.linalg.norm(true.positions[1] - true.positions[0])
     assert np.linalg.norm(estimate.nav_T_body[:3, 3]) == pytest.approx(walked, abs=0.01)
 
 
-def test_a_frameset_is_held_until_its_imu_samples_have_come(odometry: Odometry, events: list[Event]) -> None:
-    feed_until = next(i for i, e in enumerate(events) if isinstance(e, FrameSet) and i > 300)
-    late = [e for e in events[feed_until - 8 : feed_until] if isinstance(e, ImuSample)]
-    for event in events[: feed_until - 8]:
-        odometry.process(event)
-    frameset = events[feed_until]
+def test_a_frameset_is_held_until_its_imu_samples_have_come(
+    odometry: Odometry, measurements: list[Measurement]
+) -> None:
+    feed_until = next(i for i, e in enumerate(measurements) if isinstance(e, FrameSet) and i > 300)
+    late = [e for e in measurements[feed_until - 8 : feed_until] if isinstance(e, ImuSample)]
+    for measurement in measurements[: feed_until - 8]:
+        odometry.process(measurement)
+    frameset = measurements[feed_until]
     assert odometry.process(frameset) is None
     results = [odometry.process(sample) for sample in late]
     assert results[:-1] == [None] * (len(late) - 1)
@@ -122,11 +127,11 @@ def test_a_frameset_is_held_until_its_imu_samples_have_come(odometry: Odometry, 
     assert results[-1].stamp_ns == frameset.stamp_ns
 
 
-def test_framesets_are_not_held_for_ever(odometry: Odometry, events: list[Event]) -> None:
+def test_framesets_are_not_held_for_ever(odometry: Odometry, measurements: list[Measurement]) -> None:
     cut = 400
-    begun = [odometry.process(event) for event in events[:cut]]
+    begun = [odometry.process(measurement) for measurement in measurements[:cut]]
     assert any(begun)
-    rest = framesets(events[cut:])
+    rest = framesets(measurements[cut:])
     estimates = [e for f in rest if (e := odometry.process(f)) is not None]
     wait_ns = Config().timing.max_imu_wait_ms * 1e6
     assert len(estimates) >= len(rest) - wait_ns // 50_000_000 - 1
@@ -134,10 +139,12 @@ def test_framesets_are_not_held_for_ever(odometry: Odometry, events: list[Event]
     assert "imu_not_covering" in kinds(odometry)
 
 
-def test_framesets_before_the_imu_have_no_pose_and_start_nothing(odometry: Odometry, events: list[Event]) -> None:
-    first = framesets(events)[0].stamp_ns
-    estimates = feed(odometry, [kept for e in events if (kept := _without_early_imu(e, first)) is not None])
-    assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(events)]
+def test_framesets_before_the_imu_have_no_pose_and_start_nothing(
+    odometry: Odometry, measurements: list[Measurement]
+) -> None:
+    first = framesets(measurements)[0].stamp_ns
+    estimates = feed(odometry, [kept for e in measurements if (kept := _without_early_imu(e, first)) is not None])
+    assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(measurements)]
     assert all(e.status is Status.INITIALISING and e.nav_T_body is None for e in estimates[:20])
     assert (estimates[0].vision, estimates[0].vision_reason) == (Quality.FAILED, "first images")
     assert all(e.vision is not Quality.FAILED for e in estimates[1:20])
@@ -145,20 +152,24 @@ def test_framesets_before_the_imu_have_no_pose_and_start_nothing(odometry: Odome
     assert kinds(odometry) == []
 
 
-def test_an_imu_that_comes_after_a_start_without_opens_an_epoch(room_walk: Path, events: list[Event]) -> None:
+def test_an_imu_that_comes_after_a_start_without_opens_an_epoch(
+    room_walk: Path, measurements: list[Measurement]
+) -> None:
     rig = open_source(room_walk).rig
     config = Config.from_yaml("timing: {max_imu_start_wait_s: 0.5}")
-    first = framesets(events)[0].stamp_ns
+    first = framesets(measurements)[0].stamp_ns
     late = Odometry(rig, config)
-    estimates = feed(late, [kept for e in events if (kept := _without_early_imu(e, first)) is not None])
+    estimates = feed(late, [kept for e in measurements if (kept := _without_early_imu(e, first)) is not None])
     assert [e.nav_T_body is None for e in estimates] == [True] * 10 + [False] * (len(estimates) - 10)
     assert [estimates[0].epoch, estimates[-1].epoch] == [0, 1]
     assert kinds(late)[0] == "started_without_imu"
     assert estimates[-1].gyro_bias is not None
 
 
-def _without_early_imu(event: Event, first_ns: int) -> Event | None:
-    return None if isinstance(event, ImuSample) and event.stamp_ns < first_ns + 1_000_000_000 else event
+def _without_early_imu(measurement: Measurement, first_ns: int) -> Measurement | None:
+    return (
+        None if isinstance(measurement, ImuSample) and measurement.stamp_ns < first_ns + 1_000_000_000 else measurement
+    )
 
 
 @pytest.mark.parametrize(
@@ -170,42 +181,48 @@ def test_images_that_are_not_the_rigs_are_refused(room_walk: Path, wrong: Image)
         odometry.process(FrameSet(1, {0: (wrong, wrong)}))
 
 
-def test_time_never_goes_back(odometry: Odometry, events: list[Event]) -> None:
-    estimates = [e for event in events[:600] if (e := odometry.process(event)) is not None]
-    old = framesets(events)[5]
+def test_time_never_goes_back(odometry: Odometry, measurements: list[Measurement]) -> None:
+    estimates = [e for measurement in measurements[:600] if (e := odometry.process(measurement)) is not None]
+    old = framesets(measurements)[5]
     assert odometry.process(old) is None
-    assert odometry.process(framesets(events[:600])[-1]) is None
+    assert odometry.process(framesets(measurements[:600])[-1]) is None
     assert kinds(odometry) == ["frameset_backward_stamp", "frameset_duplicate_stamp"]
     stamps = [e.stamp_ns for e in estimates]
     assert stamps == sorted(set(stamps))
 
 
-def test_unusable_samples_are_left_out_and_told(odometry: Odometry, events: list[Event]) -> None:
-    for event in events[:300]:
-        odometry.process(event)
-    last = next(e for e in reversed(events[:300]) if isinstance(e, ImuSample))
+def test_unusable_samples_are_left_out_and_told(odometry: Odometry, measurements: list[Measurement]) -> None:
+    for measurement in measurements[:300]:
+        odometry.process(measurement)
+    last = next(e for e in reversed(measurements[:300]) if isinstance(e, ImuSample))
     nan = ImuSample(last.stamp_ns + 1_000_000, np.array([np.nan, 0, 0]), np.zeros(3))
     for bad in (last, replace(last, stamp_ns=last.stamp_ns - 7), nan):
         odometry.process(bad)
     assert kinds(odometry) == ["imu_duplicate_stamp", "imu_backward_stamp", "imu_not_finite"]
 
 
-def test_a_clock_jump_breaks_no_run(odometry: Odometry, events: list[Event]) -> None:
+def test_a_clock_jump_breaks_no_run(odometry: Odometry, measurements: list[Measurement]) -> None:
     jump_ns = 10_000_000_000_000
-    cut = len(events) // 2
-    later = [replace(event, stamp_ns=event.stamp_ns + jump_ns) for event in events[cut:]]
-    estimates = feed(odometry, events[:cut] + later)
-    assert len(estimates) == len(framesets(events))
+    cut = len(measurements) // 2
+    later = [replace(measurement, stamp_ns=measurement.stamp_ns + jump_ns) for measurement in measurements[cut:]]
+    estimates = feed(odometry, measurements[:cut] + later)
+    assert len(estimates) == len(framesets(measurements))
     assert estimates[-1].nav_T_body is not None
     assert estimates[-1].epoch == 1
 
 
-def test_a_pair_that_drops_out_is_not_missed(odometry: Odometry, events: list[Event], truth: Trajectory) -> None:
-    def without_back(event: Event) -> Event:
-        return replace(event, images={0: event.images[0]}) if isinstance(event, FrameSet) else event
+def test_a_pair_that_drops_out_is_not_missed(
+    odometry: Odometry, measurements: list[Measurement], truth: Trajectory
+) -> None:
+    def without_back(measurement: Measurement) -> Measurement:
+        return (
+            replace(measurement, images={0: measurement.images[0]})
+            if isinstance(measurement, FrameSet)
+            else measurement
+        )
 
-    third = len(events) // 3
-    broken = [*events[:third], *map(without_back, events[third : 2 * third]), *events[2 * third :]]
+    third = len(measurements) // 3
+    broken = [*measurements[:third], *map(without_back, measurements[third : 2 * third]), *measurements[2 * third :]]
     estimates = feed(odometry, broken)
     assert all(e.status is Status.TRACKING for e in estimates)
     assert estimates[-1].nav_T_body is not None
@@ -214,16 +231,18 @@ def test_a_pair_that_drops_out_is_not_missed(odometry: Odometry, events: list[Ev
     assert np.linalg.norm(estimates[-1].nav_T_body[:3, 3]) == pytest.approx(walked, abs=0.015)
 
 
-def test_pairs_that_are_not_triggered_together(odometry: Odometry, events: list[Event], truth: Trajectory) -> None:
+def test_pairs_that_are_not_triggered_together(
+    odometry: Odometry, measurements: list[Measurement], truth: Trajectory
+) -> None:
     """Front and back images alternate, each at its own time."""
-    alternating: list[Event] = []
+    alternating: list[Measurement] = []
     count = 0
-    for event in events:
-        if isinstance(event, FrameSet):
-            alternating.append(replace(event, images={count % 2: event.images[count % 2]}))
+    for measurement in measurements:
+        if isinstance(measurement, FrameSet):
+            alternating.append(replace(measurement, images={count % 2: measurement.images[count % 2]}))
             count += 1
         else:
-            alternating.append(event)
+            alternating.append(measurement)
     estimates = feed(odometry, alternating)
     assert len(estimates) == count
     assert all(e.status is Status.TRACKING for e in estimates[2:])
@@ -233,15 +252,17 @@ def test_pairs_that_are_not_triggered_together(odometry: Odometry, events: list[
     assert np.linalg.norm(estimates[-1].nav_T_body[:3, 3]) == pytest.approx(walked, abs=0.03)
 
 
-def test_a_blackout_coasts_on_the_imu_with_growing_covariance(odometry: Odometry, events: list[Event]) -> None:
-    def darkened(event: Event) -> Event:
+def test_a_blackout_coasts_on_the_imu_with_growing_covariance(
+    odometry: Odometry, measurements: list[Measurement]
+) -> None:
+    def darkened(measurement: Measurement) -> Measurement:
         black = np.zeros((480, 640), dtype=np.uint8)
-        begin, end = framesets(events)[30].stamp_ns, framesets(events)[44].stamp_ns
-        if not isinstance(event, FrameSet) or not begin <= event.stamp_ns <= end:
-            return event
-        return replace(event, images={0: (black, black), 1: (black, black)})
+        begin, end = framesets(measurements)[30].stamp_ns, framesets(measurements)[44].stamp_ns
+        if not isinstance(measurement, FrameSet) or not begin <= measurement.stamp_ns <= end:
+            return measurement
+        return replace(measurement, images={0: (black, black), 1: (black, black)})
 
-    estimates = feed(odometry, list(map(darkened, events)))
+    estimates = feed(odometry, list(map(darkened, measurements)))
     assert [e.status for e in estimates[30:45]] == [Status.COASTING] * 15
     sigmas = [np.trace(e.covariance[3:, 3:]) for e in estimates[29:45] if e.covariance is not None]
     assert (np.diff(sigmas) > 0).all()
@@ -250,11 +271,11 @@ def test_a_blackout_coasts_on_the_imu_with_growing_covariance(odometry: Odometry
     assert np.linalg.norm(steps, axis=1).max() < 0.12  # walking speed: at most 6 cm a frameset, and no jump
 
 
-def test_poses_are_told_at_the_imus_rate(room_walk: Path, events: list[Event], truth: Trajectory) -> None:
+def test_poses_are_told_at_the_imus_rate(room_walk: Path, measurements: list[Measurement], truth: Trajectory) -> None:
     told: list[Prediction] = []
     odometry = Odometry(open_source(room_walk).rig, on_prediction=told.append)
-    assert odometry.predict(events[0].stamp_ns) is None  # there is no pose yet
-    estimates = feed(odometry, events)
+    assert odometry.predict(measurements[0].stamp_ns) is None  # there is no pose yet
+    estimates = feed(odometry, measurements)
     rate_hz = len(told) / (1e-9 * (told[-1].stamp_ns - told[0].stamp_ns))
     assert rate_hz == pytest.approx(200.0, rel=0.01)
     assert (np.diff([each.stamp_ns for each in told]) > 0).all()
@@ -271,8 +292,8 @@ def test_poses_are_told_at_the_imus_rate(room_walk: Path, events: list[Event], t
     assert odometry.predict(newest.stamp_ns - 1) is None
 
 
-def test_nothing_is_predicted_while_lost(room_walk: Path, events: list[Event]) -> None:
-    without_imu = [event for event in events if isinstance(event, FrameSet)]
+def test_nothing_is_predicted_while_lost(room_walk: Path, measurements: list[Measurement]) -> None:
+    without_imu = [measurement for measurement in measurements if isinstance(measurement, FrameSet)]
     black = np.zeros((480, 640), dtype=np.uint8)
     dark = [replace(each, images=dict.fromkeys(each.images, (black, black))) for each in without_imu[10:]]
     config = Config.from_yaml("smoother: {lost_position_sigma_m: 0.2}")
@@ -292,19 +313,19 @@ def test_importing_the_package_and_its_command_line_loads_nothing_heavy() -> Non
     assert not {"numba", "gtsam", "cv2", "rerun", "matplotlib", "numpy"} & set(loaded)
 
 
-def test_numpys_integers_are_stamps_and_floats_are_not(odometry: Odometry, events: list[Event]) -> None:
-    for event in events[:400]:
+def test_numpys_integers_are_stamps_and_floats_are_not(odometry: Odometry, measurements: list[Measurement]) -> None:
+    for measurement in measurements[:400]:
         for kind in (np.int64, np.uint64):
-            estimate = odometry.process(replace(event, stamp_ns=kind(event.stamp_ns)))  # type: ignore[arg-type]
+            estimate = odometry.process(replace(measurement, stamp_ns=kind(measurement.stamp_ns)))  # type: ignore[arg-type]
             assert estimate is None or type(estimate.stamp_ns) is int
-    with pytest.raises(EventError, match="whole nanoseconds"):
-        odometry.process(replace(events[400], stamp_ns=events[400].stamp_ns * 1e-9))  # type: ignore[arg-type]
+    with pytest.raises(MeasurementError, match="whole nanoseconds"):
+        odometry.process(replace(measurements[400], stamp_ns=measurements[400].stamp_ns * 1e-9))  # type: ignore[arg-type]
 
 
-def test_malformed_events_are_refused(odometry: Odometry) -> None:
-    with pytest.raises(EventError, match="three components"):
+def test_malformed_measurements_are_refused(odometry: Odometry) -> None:
+    with pytest.raises(MeasurementError, match="three components"):
         odometry.process(ImuSample(1, np.zeros(2), np.zeros(3)))
-    with pytest.raises(EventError, match=r"\(left, right\)"):
+    with pytest.raises(MeasurementError, match=r"\(left, right\)"):
         odometry.process(FrameSet(1, {0: (np.zeros((480, 640), np.uint8),)}))  # type: ignore[dict-item]
     image = np.zeros((480, 640), dtype=np.uint8)
     odometry.process(FrameSet(0, {0: np.stack([image, image])}))  # type: ignore[dict-item]
@@ -313,43 +334,43 @@ def test_malformed_events_are_refused(odometry: Odometry) -> None:
         ({0: None}, "not two images"),
         ({0: (image, [[1, 2], [3, 4]])}, "something else than arrays"),
     ):
-        with pytest.raises(EventError, match=told):
+        with pytest.raises(MeasurementError, match=told):
             odometry.process(FrameSet(0, images))  # type: ignore[arg-type]
-    with pytest.raises(EventError, match="all be numbers"):
+    with pytest.raises(MeasurementError, match="all be numbers"):
         odometry.process(ImuSample(0, "fast", np.zeros(3)))  # type: ignore[arg-type]
-    with pytest.raises(EventError, match="not NoneType"):
+    with pytest.raises(MeasurementError, match="not NoneType"):
         odometry.process(None)  # type: ignore[arg-type]
 
 
-def test_finishing_twice_adds_nothing_and_ends_it(odometry: Odometry, events: list[Event]) -> None:
-    feed(odometry, events[:300])
+def test_finishing_twice_adds_nothing_and_ends_it(odometry: Odometry, measurements: list[Measurement]) -> None:
+    feed(odometry, measurements[:300])
     assert len(odometry.take_smoothed()) > 0
     assert odometry.finish() == []
     assert odometry.take_smoothed() == []
-    with pytest.raises(EventError, match="finished"):
-        odometry.process(events[300])
+    with pytest.raises(MeasurementError, match="finished"):
+        odometry.process(measurements[300])
 
 
-def test_one_stamp_far_ahead_stops_nothing(odometry: Odometry, events: list[Event]) -> None:
+def test_one_stamp_far_ahead_stops_nothing(odometry: Odometry, measurements: list[Measurement]) -> None:
     ahead_ns = 10_000_000_000
-    spoilt: list[Event] = []
-    for i, event in enumerate(events):
-        spoilt.append(event)
+    spoilt: list[Measurement] = []
+    for i, measurement in enumerate(measurements):
+        spoilt.append(measurement)
         if i in (200, 500):
-            sample = next(e for e in events if isinstance(e, ImuSample))
-            spoilt.append(replace(sample, stamp_ns=event.stamp_ns + ahead_ns))
-            spoilt.append(replace(framesets(events)[0], stamp_ns=event.stamp_ns + ahead_ns))
+            sample = next(e for e in measurements if isinstance(e, ImuSample))
+            spoilt.append(replace(sample, stamp_ns=measurement.stamp_ns + ahead_ns))
+            spoilt.append(replace(framesets(measurements)[0], stamp_ns=measurement.stamp_ns + ahead_ns))
     estimates = feed(odometry, spoilt)
-    assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(events)]
+    assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(measurements)]
     assert all(e.status is Status.TRACKING for e in estimates)
     assert sorted(set(kinds(odometry))) == ["frameset_future_stamp", "imu_future_stamp"]
 
 
 def test_a_rig_whose_imu_never_speaks_goes_on_without_it_and_without_delay(
-    odometry: Odometry, events: list[Event]
+    odometry: Odometry, measurements: list[Measurement]
 ) -> None:
-    estimates = [odometry.process(frameset) for frameset in framesets(events)]
-    assert [e.stamp_ns for e in estimates if e is not None] == [f.stamp_ns for f in framesets(events)]
+    estimates = [odometry.process(frameset) for frameset in framesets(measurements)]
+    assert [e.stamp_ns for e in estimates if e is not None] == [f.stamp_ns for f in framesets(measurements)]
     assert estimates[-1] is not None
     assert estimates[-1].status is Status.TRACKING
     assert kinds(odometry) == ["started_without_imu"]
@@ -359,11 +380,11 @@ def test_a_rig_whose_imu_never_speaks_goes_on_without_it_and_without_delay(
 def test_a_wild_imu_sample_leaves_an_error_that_the_covariance_admits(
     odometry: Odometry, room_walk: Path, truth: Trajectory, glitch: str
 ) -> None:
-    events = list(open_source(room_walk, to_s=4.0))
-    at = next(i for i in range(len(events) // 2, len(events)) if isinstance(events[i], ImuSample))
-    value = getattr(events[at], glitch) + np.array([0.0, 100.0 if glitch == "linear_acceleration" else 8.0, 0.0])
-    events[at] = replace(events[at], **{glitch: value})
-    estimates = feed(odometry, events)
+    measurements = list(open_source(room_walk, to_s=4.0))
+    at = next(i for i in range(len(measurements) // 2, len(measurements)) if isinstance(measurements[i], ImuSample))
+    value = getattr(measurements[at], glitch) + np.array([0.0, 100.0 if glitch == "linear_acceleration" else 8.0, 0.0])
+    measurements[at] = replace(measurements[at], **{glitch: value})
+    estimates = feed(odometry, measurements)
     assert "gate_reset" in kinds(odometry)
     first, last = estimates[0], estimates[-1]
     assert last.status is Status.TRACKING
@@ -385,7 +406,7 @@ def test_a_wild_imu_sample_leaves_an_error_that_the_covariance_admits(
 )  # fmt: skip
 def test_a_window_that_fails_is_rebuilt(
     odometry: Odometry,
-    events: list[Event],
+    measurements: list[Measurement],
     monkeypatch: pytest.MonkeyPatch,
     owner: type,
     method: str,
@@ -395,22 +416,24 @@ def test_a_window_that_fails_is_rebuilt(
         patch.undo()  # fails once, or the window could not be rebuilt either
         raise kind("made to fail")
 
-    half = len(events) - 150
-    estimates = [e for event in events[:half] if (e := odometry.process(event)) is not None]
+    half = len(measurements) - 150
+    estimates = [e for measurement in measurements[:half] if (e := odometry.process(measurement)) is not None]
     before = len(estimates)
     with monkeypatch.context() as patch:
         patch.setattr(owner, method, fail)
         while "window_rebuilt" not in kinds(odometry):
             assert len(estimates) - before < 3, "every one of these is called for each third frameset"
-            estimates += [e for event in events[half : half + 1] if (e := odometry.process(event)) is not None]
+            estimates += [
+                e for measurement in measurements[half : half + 1] if (e := odometry.process(measurement)) is not None
+            ]
             half += 1
     rebuilt, known = estimates[-1], estimates[-2]
     assert rebuilt.covariance is not None
     assert known.covariance is not None
     assert rebuilt.covariance.trace() > known.covariance.trace()
     assert rebuilt.velocity_covariance is not None
-    estimates += [e for event in events[half:] if (e := odometry.process(event)) is not None]
-    assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(events)]
+    estimates += [e for measurement in measurements[half:] if (e := odometry.process(measurement)) is not None]
+    assert [e.stamp_ns for e in estimates] == [f.stamp_ns for f in framesets(measurements)]
     assert estimates[-1].status is Status.TRACKING
     steps = np.diff([e.nav_T_body[:3, 3] for e in estimates if e.nav_T_body is not None], axis=0)
     assert np.linalg.norm(steps, axis=1).max() < 0.12

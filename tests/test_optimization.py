@@ -14,11 +14,11 @@ from graphvio import ImuSample, Odometry, open_source
 from graphvio.arrays import Bool, Float
 from graphvio.backend.factors import x
 from graphvio.config import Config
-from graphvio.config_stages import SmootherConfig
+from graphvio.config.stages import SmootherConfig
 from graphvio.errors import OptimizationError
 from graphvio.evaluation import evaluate
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
+from graphvio.measurements.motion import RelativeMotion
 from graphvio.optimization.drawn_session import DrawnSession, closure_between, draw_session
 from graphvio.optimization.exchange import write_g2o
 from graphvio.optimization.extrinsics import c, d, own_motion
@@ -272,16 +272,16 @@ def test_an_imu_that_is_found_wrong_does_not_bend_the_trajectory(room_walk: Path
     recorder = Recorder("walk")
     odometry = Odometry(source.rig, CONFIG, on_step=recorder.add)
     kinds = []
-    for event in source:
-        if isinstance(event, ImuSample) and event.stamp_ns - source.start_ns > 2_500_000_000:
-            event = replace(
-                event,
-                angular_velocity=event.angular_velocity + np.array([0.05, 0.0, 0.05]),
-                linear_acceleration=event.linear_acceleration + np.array([0.5, 0.0, 0.0]),
+    for measurement in source:
+        if isinstance(measurement, ImuSample) and measurement.stamp_ns - source.start_ns > 2_500_000_000:
+            measurement = replace(
+                measurement,
+                angular_velocity=measurement.angular_velocity + np.array([0.05, 0.0, 0.05]),
+                linear_acceleration=measurement.linear_acceleration + np.array([0.5, 0.0, 0.0]),
             )
-        odometry.process(event)
+        odometry.process(measurement)
         recorder.add_smoothed(odometry.take_smoothed())
-        kinds += [incident.kind for incident in odometry.take_incidents()]
+        kinds += [event.kind for event in odometry.take_events()]
     odometry.finish()
     recorder.add_smoothed(odometry.take_smoothed())
     assert "gate_reset" in kinds

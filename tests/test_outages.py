@@ -13,8 +13,8 @@ from recordings import half_size_rig
 from graphvio import Config, Estimate, FrameSet, ImuSample, Odometry, Status, open_source
 from graphvio.arrays import Float
 from graphvio.backend.window import Window, WindowError
-from graphvio.events import Event
 from graphvio.geometry import se3_inverse, se3_log
+from graphvio.measurements.sensors import Measurement
 from graphvio.rig import Rig
 from graphvio.simulation import Simulator, build_scene, write_recording
 from graphvio.trajectory import Trajectory
@@ -34,7 +34,7 @@ def walk_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def events(walk_folder: Path) -> list[Event]:
+def measurements(walk_folder: Path) -> list[Measurement]:
     return list(open_source(walk_folder))
 
 
@@ -45,7 +45,7 @@ class Outcome:
     Attributes:
         estimates: of all framesets that were given.
         given: number of framesets.
-        kinds: of incidents.
+        kinds: of events.
         truth: (4, 4) by stamp.
         start_ns: of the recording.
     """
@@ -92,37 +92,39 @@ class Outcome:
         return float(np.linalg.norm(se3_log(np.ascontiguousarray(np.linalg.inv(true) @ motion))[3:]))
 
 
-def outcome(folder: Path, events: list[Event], config: Config | None = None, rig: Rig | None = None) -> Outcome:
+def outcome(
+    folder: Path, measurements: list[Measurement], config: Config | None = None, rig: Rig | None = None
+) -> Outcome:
     source = open_source(folder)
     odometry = Odometry(source.rig if rig is None else rig, config)
-    estimates = [estimate for event in events if (estimate := odometry.process(event)) is not None]
+    estimates = [estimate for measurement in measurements if (estimate := odometry.process(measurement)) is not None]
     estimates += odometry.finish()
     stamps = [e.stamp_ns for e in estimates]
     assert stamps == sorted(set(stamps))  # time never goes back
     assert source.truth is not None
     truth = Trajectory.read(source.truth)
     poses = dict(zip(truth.stamps_ns.tolist(), truth.nav_T_body, strict=True))
-    given = sum(isinstance(event, FrameSet) for event in events)
-    return Outcome(estimates, given, [i.kind for i in odometry.take_incidents()], poses, source.start_ns)
+    given = sum(isinstance(measurement, FrameSet) for measurement in measurements)
+    return Outcome(estimates, given, [i.kind for i in odometry.take_events()], poses, source.start_ns)
 
 
 def altered(
-    events: list[Event],
+    measurements: list[Measurement],
     start_s: float,
     end_s: float,
     frameset: Callable[[FrameSet], FrameSet | None] | None = None,
     sample: Callable[[ImuSample], ImuSample | None] | None = None,
-) -> list[Event]:
-    """The events, those between two times as given functions make them; None leaves one out."""
-    start_ns = next(e.stamp_ns for e in events if isinstance(e, FrameSet))
-    made: list[Event] = []
-    for event in events:
-        inside = start_s - 1e-3 <= (event.stamp_ns - start_ns) * 1e-9 < end_s - 1e-3
-        changed: Event | None = event
-        if inside and isinstance(event, FrameSet) and frameset is not None:
-            changed = frameset(event)
-        elif inside and isinstance(event, ImuSample) and sample is not None:
-            changed = sample(event)
+) -> list[Measurement]:
+    """The measurements, those between two times as given functions make them; None leaves one out."""
+    start_ns = next(e.stamp_ns for e in measurements if isinstance(e, FrameSet))
+    made: list[Measurement] = []
+    for measurement in measurements:
+        inside = start_s - 1e-3 <= (measurement.stamp_ns - start_ns) * 1e-9 < end_s - 1e-3
+        changed: Measurement | None = measurement
+        if inside and isinstance(measurement, FrameSet) and frameset is not None:
+            changed = frameset(measurement)
+        elif inside and isinstance(measurement, ImuSample) and sample is not None:
+            changed = sample(measurement)
         if changed is not None:
             made.append(changed)
     return made
@@ -138,10 +140,10 @@ def blackened(frameset: FrameSet) -> FrameSet:
 
 @pytest.mark.parametrize(("dark_s", "most_jump_m"), [(0.3, 0.01), (1.0, 0.03), (3.0, 0.3), (5.0, 0.8)])
 def test_a_blackout_is_coasted_through(
-    walk_folder: Path, events: list[Event], dark_s: float, most_jump_m: float
+    walk_folder: Path, measurements: list[Measurement], dark_s: float, most_jump_m: float
 ) -> None:
     end_s = START_S + dark_s
-    done = outcome(walk_folder, altered(events, START_S, end_s, blackened))
+    done = outcome(walk_folder, altered(measurements, START_S, end_s, blackened))
     assert done.completion == 1.0
     dark = done.between(START_S, end_s)
     assert len(dark) == round(dark_s / PERIOD_S)
@@ -157,10 +159,10 @@ def test_a_blackout_is_coasted_through(
     assert not {"lost", "new_epoch", "gate_reset", "window_rebuilt"} & set(done.kinds)
 
 
-def test_beyond_what_is_useful_a_new_epoch_begins(walk_folder: Path, events: list[Event]) -> None:
+def test_beyond_what_is_useful_a_new_epoch_begins(walk_folder: Path, measurements: list[Measurement]) -> None:
     """Lost is told, nothing is claimed meanwhile, and the next epoch has a number and the best guess with its doubt."""
     config = Config.from_yaml("smoother: {lost_position_sigma_m: 0.05}")
-    done = outcome(walk_folder, altered(events, START_S, START_S + 3.0, blackened), config)
+    done = outcome(walk_folder, altered(measurements, START_S, START_S + 3.0, blackened), config)
     lost = [e for e in done.estimates if e.status is Status.LOST]
     assert lost
     assert all(e.nav_T_body is None and e.covariance is None and e.velocity_nav is None for e in lost)
@@ -175,11 +177,11 @@ def test_beyond_what_is_useful_a_new_epoch_begins(walk_folder: Path, events: lis
 
 
 def test_a_window_that_fails_while_lost_glues_nothing(
-    walk_folder: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
+    walk_folder: Path, measurements: list[Measurement], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the dark and at the first images after it: lost stays lost, and what follows is another epoch."""
     config = Config.from_yaml("smoother: {lost_position_sigma_m: 0.05}")
-    optimise, start_ns = Window.optimise, next(e.stamp_ns for e in events if isinstance(e, FrameSet))
+    optimise, start_ns = Window.optimise, next(e.stamp_ns for e in measurements if isinstance(e, FrameSet))
 
     def fails_now_and_then(window: Window, followed: Sequence[int] = ()) -> None:
         if failing:
@@ -190,13 +192,13 @@ def test_a_window_that_fails_while_lost_glues_nothing(
     failing: list[int] = []
     monkeypatch.setattr(Window, "optimise", fails_now_and_then)
     odometry, estimates = Odometry(open_source(walk_folder).rig, config), []
-    for event in altered(events, START_S, START_S + 3.0, blackened):
-        if isinstance(event, FrameSet) and (event.stamp_ns - start_ns) // MS in (5500, 6000, 6050):
+    for measurement in altered(measurements, START_S, START_S + 3.0, blackened):
+        if isinstance(measurement, FrameSet) and (measurement.stamp_ns - start_ns) // MS in (5500, 6000, 6050):
             failing.append(0)
-        estimates.append(odometry.process(event))
+        estimates.append(odometry.process(measurement))
     estimates += odometry.finish()
     told = [e for e in estimates if e is not None]
-    assert [i.kind for i in odometry.take_incidents()].count("window_rebuilt") == 3
+    assert [i.kind for i in odometry.take_events()].count("window_rebuilt") == 3
     lost = [k for k, e in enumerate(told) if e.status is Status.LOST]
     assert lost == list(range(lost[0], lost[-1] + 1))
     assert all(told[k].nav_T_body is None for k in lost)
@@ -213,8 +215,10 @@ def left_out(_: ImuSample) -> None:
 
 
 @pytest.mark.parametrize("gap_s", [0.2, 2.0])
-def test_a_gap_of_the_imu_is_bridged_by_vision(walk_folder: Path, events: list[Event], gap_s: float) -> None:
-    done = outcome(walk_folder, altered(events, START_S, START_S + gap_s, sample=left_out))
+def test_a_gap_of_the_imu_is_bridged_by_vision(
+    walk_folder: Path, measurements: list[Measurement], gap_s: float
+) -> None:
+    done = outcome(walk_folder, altered(measurements, START_S, START_S + gap_s, sample=left_out))
     assert done.completion == 1.0
     assert {e.status for e in done.between(1.0, 10.0)} == {Status.TRACKING}
     assert done.largest_jump_m() < 0.01
@@ -222,15 +226,15 @@ def test_a_gap_of_the_imu_is_bridged_by_vision(walk_folder: Path, events: list[E
     assert "imu_not_covering" in done.kinds
 
 
-def test_duplicates_and_backward_stamps_change_nothing(walk_folder: Path, events: list[Event]) -> None:
-    muddled: list[Event] = []
-    for event in events:
-        muddled.append(event)
-        if isinstance(event, ImuSample):
-            muddled += [event, replace(event, stamp_ns=event.stamp_ns - 20 * MS)]
+def test_duplicates_and_backward_stamps_change_nothing(walk_folder: Path, measurements: list[Measurement]) -> None:
+    muddled: list[Measurement] = []
+    for measurement in measurements:
+        muddled.append(measurement)
+        if isinstance(measurement, ImuSample):
+            muddled += [measurement, replace(measurement, stamp_ns=measurement.stamp_ns - 20 * MS)]
         else:
-            muddled += [event, replace(event, stamp_ns=event.stamp_ns - 200 * MS)]
-    clean, done = outcome(walk_folder, events), outcome(walk_folder, muddled)
+            muddled += [measurement, replace(measurement, stamp_ns=measurement.stamp_ns - 200 * MS)]
+    clean, done = outcome(walk_folder, measurements), outcome(walk_folder, muddled)
     assert len(done.estimates) == clean.given
     for one, other in zip(clean.estimates, done.estimates, strict=True):
         np.testing.assert_array_equal(one.nav_T_body, other.nav_T_body)
@@ -239,14 +243,14 @@ def test_duplicates_and_backward_stamps_change_nothing(walk_folder: Path, events
     )
 
 
-def test_nan_costs_only_its_samples(walk_folder: Path, events: list[Event]) -> None:
+def test_nan_costs_only_its_samples(walk_folder: Path, measurements: list[Measurement]) -> None:
     numbers = iter(range(100_000))
 
     def spoiled(sample: ImuSample) -> ImuSample:
         bad = np.array([np.nan, 0.0, 0.0])
         return replace(sample, linear_acceleration=bad) if next(numbers) % 4 == 0 else sample
 
-    done = outcome(walk_folder, altered(events, START_S, 6.0, sample=spoiled))
+    done = outcome(walk_folder, altered(measurements, START_S, 6.0, sample=spoiled))
     assert done.completion == 1.0
     assert {e.status for e in done.between(1.0, 10.0)} == {Status.TRACKING}
     assert done.error_m(2.0, 9.0) < 0.03
@@ -260,23 +264,23 @@ def stuck(sample: ImuSample, axis: int) -> ImuSample:
 
 
 @pytest.mark.parametrize("axis", [0, 2])
-def test_an_axis_that_sticks_is_left_to_vision(walk_folder: Path, events: list[Event], axis: int) -> None:
-    assert_left_to_vision(walk_folder, altered(events, START_S, START_S + 2.0, sample=lambda s: stuck(s, axis)))
+def test_an_axis_that_sticks_is_left_to_vision(walk_folder: Path, measurements: list[Measurement], axis: int) -> None:
+    assert_left_to_vision(walk_folder, altered(measurements, START_S, START_S + 2.0, sample=lambda s: stuck(s, axis)))
 
 
-def test_an_imu_that_repeats_itself_is_left_to_vision(walk_folder: Path, events: list[Event]) -> None:
+def test_an_imu_that_repeats_itself_is_left_to_vision(walk_folder: Path, measurements: list[Measurement]) -> None:
     seen: list[ImuSample] = []
 
     def frozen(sample: ImuSample) -> ImuSample:
         seen.append(sample)
         return replace(seen[0], stamp_ns=sample.stamp_ns)
 
-    assert_left_to_vision(walk_folder, altered(events, START_S, START_S + 2.0, sample=frozen))
+    assert_left_to_vision(walk_folder, altered(measurements, START_S, START_S + 2.0, sample=frozen))
 
 
-def assert_left_to_vision(folder: Path, events: list[Event]) -> None:
+def assert_left_to_vision(folder: Path, measurements: list[Measurement]) -> None:
     """Of an IMU that is stuck for 400 samples: they are left out, and nothing else happens."""
-    done = outcome(folder, events)
+    done = outcome(folder, measurements)
     assert done.completion == 1.0
     assert done.kinds.count("imu_stuck") > 380
     assert {e.status for e in done.between(1.0, 10.0)} == {Status.TRACKING}
@@ -284,10 +288,10 @@ def assert_left_to_vision(folder: Path, events: list[Event]) -> None:
     assert done.error_m(2.0, 9.0) < 0.03
 
 
-def test_an_axis_that_sticks_in_the_dark_is_not_believed(walk_folder: Path, events: list[Event]) -> None:
+def test_an_axis_that_sticks_in_the_dark_is_not_believed(walk_folder: Path, measurements: list[Measurement]) -> None:
     """Nothing but the last velocity is left to go on by, and the doubt is that of it."""
     end_s = START_S + 0.5
-    done = outcome(walk_folder, altered(events, START_S, end_s, blackened, lambda s: stuck(s, 2)))
+    done = outcome(walk_folder, altered(measurements, START_S, end_s, blackened, lambda s: stuck(s, 2)))
     assert done.completion == 1.0
     dark = done.between(START_S, end_s)
     assert {e.status for e in dark} == {Status.COASTING}
@@ -299,13 +303,13 @@ def test_an_axis_that_sticks_in_the_dark_is_not_believed(walk_folder: Path, even
     assert not {"gate_reset", "lost"} & set(done.kinds)
 
 
-def test_a_gyro_at_the_end_of_its_range(walk_folder: Path, events: list[Event]) -> None:
+def test_a_gyro_at_the_end_of_its_range(walk_folder: Path, measurements: list[Measurement]) -> None:
     """Cut off at less than the walk's turns: vision is not refused for long, and the path stays right."""
 
     def cut(sample: ImuSample) -> ImuSample:
         return replace(sample, angular_velocity=np.clip(sample.angular_velocity, -0.15, 0.15))
 
-    done = outcome(walk_folder, altered(events, START_S, 6.0, sample=cut))
+    done = outcome(walk_folder, altered(measurements, START_S, 6.0, sample=cut))
     assert done.completion == 1.0
     assert sum(e.status is not Status.TRACKING for e in done.between(1.0, 10.0)) < 10
     assert done.error_m(2.0, 9.0) < 0.03
@@ -313,10 +317,10 @@ def test_a_gyro_at_the_end_of_its_range(walk_folder: Path, events: list[Event]) 
 
 
 @pytest.mark.parametrize("jump_s", [7.0, 10_000.0])
-def test_a_jump_of_the_clock_opens_an_epoch(walk_folder: Path, events: list[Event], jump_s: float) -> None:
+def test_a_jump_of_the_clock_opens_an_epoch(walk_folder: Path, measurements: list[Measurement], jump_s: float) -> None:
     jump_ns = round(jump_s * 1e9)
     jumped = altered(
-        events, START_S, 1e9,
+        measurements, START_S, 1e9,
         lambda frameset: replace(frameset, stamp_ns=frameset.stamp_ns + jump_ns),
         lambda sample: replace(sample, stamp_ns=sample.stamp_ns + jump_ns),
     )  # fmt: skip
@@ -334,9 +338,11 @@ def test_a_jump_of_the_clock_opens_an_epoch(walk_folder: Path, events: list[Even
 
 
 @pytest.mark.parametrize("offset_ms", [-10, 25])
-def test_an_unknown_time_offset_is_found(walk_folder: Path, events: list[Event], offset_ms: int) -> None:
+def test_an_unknown_time_offset_is_found(walk_folder: Path, measurements: list[Measurement], offset_ms: int) -> None:
     """Of an IMU that stamps late or early. The first second is at rest, and tells nothing."""
-    shifted = [replace(e, stamp_ns=e.stamp_ns + offset_ms * MS) if isinstance(e, ImuSample) else e for e in events]
+    shifted = [
+        replace(e, stamp_ns=e.stamp_ns + offset_ms * MS) if isinstance(e, ImuSample) else e for e in measurements
+    ]
     shifted.sort(key=lambda e: (e.stamp_ns, isinstance(e, FrameSet)))
     config = Config.from_yaml("fusion: {estimate_time_offset: true}")
     ignored, found = outcome(walk_folder, shifted), outcome(walk_folder, shifted, config)
@@ -354,14 +360,16 @@ def test_an_unknown_time_offset_is_found(walk_folder: Path, events: list[Event],
 
 @pytest.mark.parametrize("offset_ms", [-10, 25])
 def test_the_rigs_time_offset_is_taken_from_the_imus_stamps(
-    walk_folder: Path, events: list[Event], offset_ms: int
+    walk_folder: Path, measurements: list[Measurement], offset_ms: int
 ) -> None:
     """The same poses come of an IMU that stamps late, where the rig says so."""
-    shifted = [replace(e, stamp_ns=e.stamp_ns + offset_ms * MS) if isinstance(e, ImuSample) else e for e in events]
+    shifted = [
+        replace(e, stamp_ns=e.stamp_ns + offset_ms * MS) if isinstance(e, ImuSample) else e for e in measurements
+    ]
     rig = open_source(walk_folder).rig
     assert rig.imu is not None
     late = replace(rig, imu=replace(rig.imu, time_offset_s=1e-3 * offset_ms))
-    clean, done = outcome(walk_folder, events), outcome(walk_folder, shifted, rig=late)
+    clean, done = outcome(walk_folder, measurements), outcome(walk_folder, shifted, rig=late)
     assert len(done.estimates) == clean.given
     for one, other in zip(clean.estimates, done.estimates, strict=True):
         assert one.nav_T_body is not None
@@ -369,8 +377,8 @@ def test_the_rigs_time_offset_is_taken_from_the_imus_stamps(
         np.testing.assert_allclose(one.nav_T_body, other.nav_T_body, atol=1e-9)
 
 
-def test_a_time_offset_that_the_rig_has_is_confirmed(walk_folder: Path, events: list[Event]) -> None:
-    done = outcome(walk_folder, events, Config.from_yaml("fusion: {estimate_time_offset: true}"))
+def test_a_time_offset_that_the_rig_has_is_confirmed(walk_folder: Path, measurements: list[Measurement]) -> None:
+    done = outcome(walk_folder, measurements, Config.from_yaml("fusion: {estimate_time_offset: true}"))
     assert "time_offset_off" not in done.kinds
     last = done.estimates[-1]
     assert last.time_offset_s is not None
@@ -381,10 +389,10 @@ def test_a_time_offset_that_the_rig_has_is_confirmed(walk_folder: Path, events: 
 # ------------------------------------------------------------------ vision's data
 
 
-def test_vision_that_comes_late_is_used_at_its_time(walk_folder: Path, events: list[Event]) -> None:
+def test_vision_that_comes_late_is_used_at_its_time(walk_folder: Path, measurements: list[Measurement]) -> None:
     """Framesets that arrive 200 ms after the IMU of their instant give the same poses as those in time."""
-    late = sorted(events, key=lambda e: e.stamp_ns + (200 * MS if isinstance(e, FrameSet) else 0))
-    clean, done = outcome(walk_folder, events), outcome(walk_folder, late)
+    late = sorted(measurements, key=lambda e: e.stamp_ns + (200 * MS if isinstance(e, FrameSet) else 0))
+    clean, done = outcome(walk_folder, measurements), outcome(walk_folder, late)
     assert len(done.estimates) == clean.given
     for one, other in zip(clean.estimates, done.estimates, strict=True):
         assert one.nav_T_body is not None
@@ -392,9 +400,9 @@ def test_vision_that_comes_late_is_used_at_its_time(walk_folder: Path, events: l
         np.testing.assert_allclose(one.nav_T_body, other.nav_T_body, atol=1e-9)
 
 
-def test_half_of_the_framesets_are_enough(walk_folder: Path, events: list[Event]) -> None:
+def test_half_of_the_framesets_are_enough(walk_folder: Path, measurements: list[Measurement]) -> None:
     rng = np.random.default_rng(0)
-    done = outcome(walk_folder, altered(events, 0.5, 1e9, lambda f: f if rng.random() < 0.5 else None))
+    done = outcome(walk_folder, altered(measurements, 0.5, 1e9, lambda f: f if rng.random() < 0.5 else None))
     assert done.completion == 1.0
     assert {e.status for e in done.between(1.0, 10.0)} == {Status.TRACKING}
     assert done.error_m(2.0, 9.0) < 0.03
@@ -403,33 +411,35 @@ def test_half_of_the_framesets_are_enough(walk_folder: Path, events: list[Event]
 # ------------------------------------------------------------------ standing still
 
 
-def test_images_alone_do_not_make_a_standstill(walk_folder: Path, events: list[Event]) -> None:
+def test_images_alone_do_not_make_a_standstill(walk_folder: Path, measurements: list[Measurement]) -> None:
     """In a lift, or before a screen that moves with it, the images rest, and the IMU says that the rig does not."""
     source = open_source(walk_folder)
     start_ns, rng = source.start_ns, np.random.default_rng(0)
-    still = [e for e in events if isinstance(e, FrameSet) and e.stamp_ns < start_ns + 900 * MS]
+    still = [e for e in measurements if isinstance(e, FrameSet) and e.stamp_ns < start_ns + 900 * MS]
     for shaking, at_rest in ((0.0, True), (1.0, False)):
         odometry = Odometry(source.rig)
         estimates = []
-        for event in events:
-            if event.stamp_ns > still[-1].stamp_ns + 10 * MS:
+        for measurement in measurements:
+            if measurement.stamp_ns > still[-1].stamp_ns + 10 * MS:
                 break
-            if isinstance(event, ImuSample):
-                moving = shaking * rng.standard_normal(3) if event.stamp_ns > start_ns + 300 * MS else np.zeros(3)
-                event = replace(event, linear_acceleration=event.linear_acceleration + moving)
-            estimates.append(odometry.process(event))
+            if isinstance(measurement, ImuSample):
+                moving = shaking * rng.standard_normal(3) if measurement.stamp_ns > start_ns + 300 * MS else np.zeros(3)
+                measurement = replace(measurement, linear_acceleration=measurement.linear_acceleration + moving)
+            estimates.append(odometry.process(measurement))
         estimates += odometry.finish()
         last = [e for e in estimates if e is not None][-1]
         assert last.at_rest is at_rest
         assert ("rest" in last.innovations) is at_rest
 
 
-def test_ten_minutes_of_standing_drift_less_than_a_centimetre(walk_folder: Path, events: list[Event]) -> None:
+def test_ten_minutes_of_standing_drift_less_than_a_centimetre(
+    walk_folder: Path, measurements: list[Measurement]
+) -> None:
     """Images of the first second, which is at rest, in random order, two a second; an IMU that is drawn."""
     source = open_source(walk_folder)
     imu, rng, start_ns = source.rig.imu, np.random.default_rng(0), source.start_ns
     assert imu is not None
-    still = [e for e in events if isinstance(e, FrameSet) and e.stamp_ns < start_ns + 900 * MS]
+    still = [e for e in measurements if isinstance(e, FrameSet) and e.stamp_ns < start_ns + 900 * MS]
     noise = [np.sqrt(imu.rate_hz) * density for density in (imu.gyro_noise_density, imu.accel_noise_density)]
     gyro_bias, force = np.array([3e-3, -2e-3, 1e-3]), np.array([0.03, 0.02, 9.81])
     odometry, estimates, last = Odometry(source.rig), [], 0
@@ -451,4 +461,4 @@ def test_ten_minutes_of_standing_drift_less_than_a_centimetre(walk_folder: Path,
     assert newest.gyro_bias is not None
     assert newest.gyro_bias_covariance is not None
     np.testing.assert_allclose(newest.gyro_bias, gyro_bias, atol=3e-4)
-    assert not [i.kind for i in odometry.take_incidents() if i.kind != "vision_weak"]
+    assert not [i.kind for i in odometry.take_events() if i.kind != "vision_weak"]

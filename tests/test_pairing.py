@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from recordings import small_rig
 
 from graphvio.arrays import Image
-from graphvio.events import FrameSet
 from graphvio.live.clock import ClockMaps
 from graphvio.live.pairing import FramesetAssembler
+from graphvio.measurements.sensors import FrameSet
 from graphvio.sources.matching import group_pairs, match_sides
 
 MS = 1_000_000

@@ -8,9 +8,9 @@ import pytest
 
 from graphvio.errors import GraphvioError
 from graphvio.evaluation import evaluate
-from graphvio.events import Status
 from graphvio.geometry import se3, so3_exp
-from graphvio.plotting import draw_evaluation, draw_run
+from graphvio.measurements.estimate import Status
+from graphvio.results.plotting import draw_evaluation, draw_run
 from graphvio.trajectory import Trajectory
 
 COASTING_BGR, LOST_BGR, EPOCH_BGR, TRUTH_BGR = (28, 142, 242), (40, 39, 214), (173, 68, 142), (85, 85, 85)
@@ -60,7 +60,7 @@ def test_truth_is_drawn_when_known(tmp_path: Path) -> None:
     assert pixels_of(tmp_path / "with.png", TRUTH_BGR) > 300 + 2 * pixels_of(tmp_path / "without.png", TRUTH_BGR)
     image = cv2.imread(str(tmp_path / "with.png"))
     assert image is not None
-    assert max(image.shape) < 2500  # truth was brought into nav: the picture does not span 90 m
+    assert max(image.shape) < 2500  # truth was brought into nav: the picture does not interval 90 m
 
 
 @pytest.mark.parametrize(("width_m", "depth_m"), [(200.0, 0.1), (0.1, 200.0), (0.0, 0.0), (1e-3, 1e-3)])
@@ -73,7 +73,7 @@ def test_any_extent_can_be_drawn(tmp_path: Path, width_m: float, depth_m: float)
 
 
 def test_one_metre_is_as_long_in_every_direction(tmp_path: Path) -> None:
-    from graphvio.plotting import _maps
+    from graphvio.results.plotting import _maps
 
     _, plan, side = _maps(walk(30.0, 2.0).positions, None, series=False)
     for axes in (plan, side):
@@ -98,5 +98,5 @@ def test_places_and_formats_that_do_not_work(tmp_path: Path) -> None:
 
 
 def test_pyplot_is_left_alone() -> None:
-    code = "import graphvio.plotting, sys; assert 'matplotlib.pyplot' not in sys.modules"
+    code = "import graphvio.results.plotting, sys; assert 'matplotlib.pyplot' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -132,13 +132,13 @@ def test_without_samples_velocity_and_rate_in_body_go_on() -> None:
 def test_the_buffer_tells_the_imu_from_an_instant_on() -> None:
     buffer = filled_buffer(IMU, 0.1, np.random.default_rng(1), GYRO_BIAS, ACCEL_BIAS)
     stamps, values = buffer.since(52 * MS)
-    span = buffer.span(52 * MS, 100 * MS)
-    assert span is not None
+    interval = buffer.interval(52 * MS, 100 * MS)
+    assert interval is not None
     assert stamps[0] == 52 * MS
     assert stamps[-1] == 100 * MS
     means = 0.5 * (values[1:] + values[:-1])
-    np.testing.assert_allclose(means, np.hstack([span.angular_velocity, span.linear_acceleration]), atol=1e-12)
-    np.testing.assert_allclose(np.diff(stamps) * 1e-9, span.steps_s, atol=1e-15)
+    np.testing.assert_allclose(means, np.hstack([interval.angular_velocity, interval.linear_acceleration]), atol=1e-12)
+    np.testing.assert_allclose(np.diff(stamps) * 1e-9, interval.steps_s, atol=1e-15)
     assert len(buffer.since(50 * MS)[0]) == 11
     assert len(buffer.since(100 * MS)[0]) == 1
     for beyond in (-1, 101 * MS):

@@ -9,13 +9,14 @@ import pytest
 from recordings import REAL_DATA
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import ImuBuffer, ImuSpan
+from graphvio.backend.inertial import ImuBuffer
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
-from graphvio.config_stages import SmootherConfig
-from graphvio.events import ImuSample
-from graphvio.frontend.motion import RelativeMotion
+from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_exp, se3_inverse
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import RelativeMotion
+from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Imu
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.tables import read_imu_csv
@@ -34,13 +35,13 @@ class Beginning:
 
     Attributes:
         stamps_ns: N of them.
-        spans: N - 1, the IMU from each stamp to the next.
+        intervals: N - 1, the IMU from each stamp to the next.
         world_T_body: (N, 4, 4) as the file has it.
         gyro_bias: (N, 3) rad/s, the same.
     """
 
     stamps_ns: list[int]
-    spans: list[ImuSpan]
+    intervals: list[ImuInterval]
     world_T_body: Float
     gyro_bias: Float
 
@@ -59,8 +60,8 @@ class Beginning:
         for stamp_ns, values in zip(table.stamps_ns.tolist(), table.values, strict=True):
             if not buffer.covers(int(stamps[-1])):
                 assert buffer.add(ImuSample(stamp_ns, values[:3] + more_bias, values[3:])) == ""
-        spans = [buffer.span(*each) for each in zip(stamps[:-1].tolist(), stamps[1:].tolist(), strict=True)]
-        whole = [span for span in spans if span is not None]
+        intervals = [buffer.interval(*each) for each in zip(stamps[:-1].tolist(), stamps[1:].tolist(), strict=True)]
+        whole = [interval for interval in intervals if interval is not None]
         assert len(whole) == STEPS
         return Beginning(stamps.tolist(), whole, poses.nav_T_body, gyro_bias + more_bias)
 
@@ -92,7 +93,7 @@ def test_the_gyros_bias_is_found(more_bias: Float) -> None:
     rng, flight = np.random.default_rng(0), Beginning.read(more_bias)
     smoother, refused, errors = flight.started(rng), 0, []
     for k in range(1, STEPS + 1):
-        smoother.extend(flight.stamps_ns[k], flight.spans[k - 1])
+        smoother.extend(flight.stamps_ns[k], flight.intervals[k - 1])
         motion = flight.motion(k, rng)
         if smoother.test(motion).accepted:
             smoother.accept(motion)

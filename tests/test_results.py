@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graphvio import __version__
 from graphvio.errors import GraphvioError
-from graphvio.events import Estimate, Incident, PairReport, Status
 from graphvio.geometry import se3, so3_exp
+from graphvio.measurements.estimate import Estimate, Status
+from graphvio.measurements.events import Event
+from graphvio.measurements.motion import PairReport
 from graphvio.results import PairMedians, ResultWriter, Summary
 from graphvio.rig import Camera, Imu, Rig, StereoPair
 from graphvio.trajectory import Trajectory
+from graphvio.version import __version__
 
 START_NS = 1_403_636_579_763_555_584
 STEP_NS = 50_000_000
@@ -85,8 +87,8 @@ def write_all(folder: Path, truth: Trajectory | None = None) -> Summary:
     with ResultWriter(folder, some_rig(), "profile: balanced\n") as writer:
         for estimate in estimates():
             writer.add(estimate)
-        writer.add_incident(Incident(START_NS, "vision_gated", "front: 3 of 40 points, «far off»"))
-        writer.add_incident(Incident(START_NS + 1, "reset", "lost"))
+        writer.add_event(Event(START_NS, "vision_gated", "front: 3 of 40 points, «far off»"))
+        writer.add_event(Event(START_NS + 1, "reset", "lost"))
         return finish(writer, truth)
 
 
@@ -199,7 +201,7 @@ def test_summary(folder: Path) -> None:
     assert summary["stage_ms"]["track"] == {"median": 29.5, "p95": 56.05, "p99": 58.41}
     assert summary["frameset_ms"]["median"] == 2.0
     assert summary["input_faults"] == {"imu_gap": 2}
-    assert summary["incidents"] == {"vision_gated": 1, "reset": 1}
+    assert summary["events"] == {"vision_gated": 1, "reset": 1}
     assert summary["status"] == {"tracking": 45, "coasting": 10, "lost": 5}
     assert [epoch["poses"] for epoch in summary["epochs"]] == [30, 25]
     assert summary["graphvio_version"] == __version__

@@ -83,8 +83,8 @@ def test_raw_images_are_read_once_where_packed_ones_are_there_too(kind: str, rec
     source = open_source(path)
     (pair,) = source.rig.pairs
     assert (pair.name, pair.left.name, pair.right.name) == ("pair0", "/pair0/left/image_raw", "/pair0/right/image_raw")
-    framesets = [event for event in source if isinstance(event, FrameSet)]
-    expected = [event for event in open_source(recording) if isinstance(event, FrameSet)]
+    framesets = [measurement for measurement in source if isinstance(measurement, FrameSet)]
+    expected = [measurement for measurement in open_source(recording) if isinstance(measurement, FrameSet)]
     for one, other in zip(framesets, expected, strict=True):
         same(one, other)
     assert [each.first for each in describe(path).synchronisation] == ["pair0 left"]
@@ -104,7 +104,7 @@ def test_of_several_imus_the_first_is_taken_and_it_is_said(
     source = open_source(path)
     assert source.faults.counts["imu_several"] == 1
     assert "has samples on /a/imu, /imu; the first is taken, or what --topics imu=TOPIC says" in caplog.text
-    assert all(event.angular_velocity[0] == 1.0 for event in source if isinstance(event, ImuSample))
+    assert all(measurement.angular_velocity[0] == 1.0 for measurement in source if isinstance(measurement, ImuSample))
     chosen = open_source(path, topics={"imu": "/imu"})
     assert "imu_several" not in chosen.faults.counts
-    assert all(event.angular_velocity[0] != 1.0 for event in chosen if isinstance(event, ImuSample))
+    assert all(measurement.angular_velocity[0] != 1.0 for measurement in chosen if isinstance(measurement, ImuSample))

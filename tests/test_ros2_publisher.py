@@ -19,10 +19,11 @@ from ros2_loopback import PERIOD_NS, START_NS, URI, Other, free_domain, until
 from synthetic import random_covariance, transform
 
 from graphvio.arrays import Float
+from graphvio.broadcast import Broadcast
 from graphvio.errors import ServiceError
-from graphvio.events import Estimate, Incident, Prediction, Status
 from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_exp
-from graphvio.live.broadcast import Broadcast
+from graphvio.measurements.estimate import Estimate, Prediction, Status
+from graphvio.measurements.events import Event
 from graphvio.ros2.path import ThinnedPath
 from graphvio.ros2.publisher import Publisher
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
@@ -41,7 +42,7 @@ class Running:
         self.rig = replace(rig, pairs=(first, rig.pairs[1]))
         self.estimates: Broadcast[Estimate] = Broadcast()
         self.predictions: Broadcast[Prediction] = Broadcast()
-        self.incidents: Broadcast[Incident] = Broadcast()
+        self.events: Broadcast[Event] = Broadcast()
         self.keyframe_log = KeyframeLog()
         self.map_T_odom: Float | None = None
         self.corrections: list[tuple[int, Float, Float]] = []

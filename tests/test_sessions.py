@@ -19,8 +19,11 @@ from typer.testing import CliRunner
 from graphvio import FrameSet, ImuSample, open_source
 from graphvio.cli import app
 from graphvio.errors import SessionError, SourceError
-from graphvio.events import Estimate, Event, Incident, Status
 from graphvio.geometry import se3, so3_exp
+from graphvio.image_decoding import ImageError
+from graphvio.measurements.estimate import Estimate, Status
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import Measurement
 from graphvio.sessions import cdr
 from graphvio.sessions.description import describe
 from graphvio.sessions.mcap_file import McapFile
@@ -29,7 +32,6 @@ from graphvio.sessions.messages import IMAGE, header, odometry
 from graphvio.sessions.pixels import grey
 from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
-from graphvio.sources.images import ImageError
 
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
@@ -43,14 +45,14 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def written(recording: Path, path: Path, image_format: ImageFormat = "raw") -> Path:
     source = open_source(recording)
     with SessionWriter(path, source.rig, image_format) as writer:
-        for event in source:
-            writer.add(event)
-        writer.add_incident(Incident(source.end_ns, "imu_gap", "no samples for 80 ms"))
+        for measurement in source:
+            writer.add(measurement)
+        writer.add_event(Event(source.end_ns, "imu_gap", "no samples for 80 ms"))
     assert writer.stopped is None
     return path
 
 
-def same(one: Event, other: Event) -> None:
+def same(one: Measurement, other: Measurement) -> None:
     assert type(one) is type(other)
     assert one.stamp_ns == other.stamp_ns
     if isinstance(one, ImuSample) and isinstance(other, ImuSample):
@@ -69,9 +71,9 @@ def test_a_session_yields_what_was_recorded_to_the_bit(
 ) -> None:
     session = open_source(written(recording, tmp_path / "walk.mcap", image_format))
     original = open_source(recording)
-    events, expected = list(session), list(original)
-    assert len(events) == len(expected)
-    for one, other in zip(events, expected, strict=True):
+    measurements, expected = list(session), list(original)
+    assert len(measurements) == len(expected)
+    for one, other in zip(measurements, expected, strict=True):
         same(one, other)
     assert session.rig.pairs[1].left.name == original.rig.pairs[1].left.name
     np.testing.assert_array_equal(session.rig.left2_T_left1(), original.rig.left2_T_left1())
@@ -105,21 +107,23 @@ def test_a_file_that_was_cut_is_read_as_far_as_it_goes(recording: Path, tmp_path
     path = tmp_path / "walk.mcap"
     with SessionWriter(path, source.rig) as writer:
         assert isinstance(writer._storage, McapStorage)
-        for event in source:
-            writer.add(event)
-            writer._storage._last_flush_s = -1.0  # so that each event has a chunk of its own
+        for measurement in source:
+            writer.add(measurement)
+            writer._storage._last_flush_s = -1.0  # so that each measurement has a chunk of its own
     whole = path.read_bytes()
     path.write_bytes(whole[: int(share * len(whole))])
     cut = open_source(path)
-    events = list(cut)
+    measurements = list(cut)
     assert cut.faults.counts.get("session_cut") == 1
-    for one, other in zip((e for e in events if isinstance(e, FrameSet)), source_framesets(recording), strict=False):
+    for one, other in zip(
+        (e for e in measurements if isinstance(e, FrameSet)), source_framesets(recording), strict=False
+    ):
         same(one, other)
-    assert 0 < len(events) < len(list(source))
+    assert 0 < len(measurements) < len(list(source))
 
 
 def source_framesets(recording: Path) -> list[FrameSet]:
-    return [event for event in open_source(recording) if isinstance(event, FrameSet)]
+    return [measurement for measurement in open_source(recording) if isinstance(measurement, FrameSet)]
 
 
 _RECORDER = """
@@ -198,7 +202,9 @@ print(writer.stopped)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert "recording stopped (File too large)" in done.stdout
-    framesets = [event for event in open_source(tmp_path / "full.mcap") if isinstance(event, FrameSet)]
+    framesets = [
+        measurement for measurement in open_source(tmp_path / "full.mcap") if isinstance(measurement, FrameSet)
+    ]
     assert 10 < len(framesets) < 60
 
 
@@ -229,7 +235,7 @@ def test_the_command_converts_a_piece(recording: Path, tmp_path: Path) -> None:
 
 
 def test_recording_keeps_what_the_odometry_made_of_it(recording: Path, tmp_path: Path) -> None:
-    """Images of noise give no pose, which is an incident."""
+    """Images of noise give no pose, which is an event."""
     out = tmp_path / "recorded.mcap"
     done = CliRunner().invoke(app, ["record", str(recording), "--out", str(out)])
     assert done.exit_code == 0, done.output

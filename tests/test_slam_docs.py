@@ -74,6 +74,6 @@ def test_the_calls_of_the_page_are_those_of_the_proto() -> None:
     proto = (ROOT / "graphvio/slam/service/graphvio.proto").read_text()
     assert re.findall(r"^\| `(\w+)` \| [^|]+ \|$", PAGE, re.MULTILINE)[-6:] == [
         call
-        for call in ("GetInfo", "GetStatus", "StreamEstimates", "StreamKeyframes", "StreamIncidents", "Correct")
+        for call in ("GetInfo", "GetStatus", "StreamEstimates", "StreamKeyframes", "StreamEvents", "Correct")
         if f"rpc {call}(" in proto
     ]

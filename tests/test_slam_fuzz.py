@@ -23,7 +23,7 @@ from graphvio.slam.service.libraries import messages
 from graphvio.slam.service.options import ServiceOptions
 from graphvio.slam.service.server import GrpcServer
 
-METHODS = ("GetInfo", "GetStatus", "StreamEstimates", "StreamKeyframes", "StreamIncidents", "Correct")
+METHODS = ("GetInfo", "GetStatus", "StreamEstimates", "StreamKeyframes", "StreamEvents", "Correct")
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 MB = 2**20
 

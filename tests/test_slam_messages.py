@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from graphvio.errors import ServiceError
-from graphvio.events import Estimate, Status
+from graphvio.measurements.estimate import Estimate, Status
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
 
 pytest.importorskip("grpc")

@@ -129,7 +129,7 @@ def test_a_wrong_or_missing_token_is_refused_for_every_call(
         with pytest.raises(ServiceError, match="the token is missing or wrong; give the one in the server's token"):
             Client(at_home(secure), files.ca, token)
     credentials = grpc.ssl_channel_credentials(files.ca.read_bytes())
-    methods = ("GetInfo", "GetStatus", "StreamEstimates", "StreamKeyframes", "StreamIncidents", "Correct", "Nonsense")
+    methods = ("GetInfo", "GetStatus", "StreamEstimates", "StreamKeyframes", "StreamEvents", "Correct", "Nonsense")
     both = ("authorization", f"Bearer {TOKEN}"), ("authorization", "Bearer wrong")
     with grpc.secure_channel(at_home(secure), credentials) as channel:
         for method in methods:

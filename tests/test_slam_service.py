@@ -19,9 +19,9 @@ import pytest
 import served
 from test_slam_messages import assert_same
 
+from graphvio.broadcast import Broadcast
 from graphvio.errors import ServiceError
-from graphvio.events import Incident
-from graphvio.live.broadcast import Broadcast
+from graphvio.measurements.events import Event
 from graphvio.slam.interface import FrontEnd
 from graphvio.slam.keyframe import Keyframe
 
@@ -159,15 +159,15 @@ def test_estimates_and_predictions_come_whole_with_the_correction_in_force(
     assert (without.state.epoch, without.map_T_odom) == (3, None)
 
 
-def test_incidents_and_figures(odometry: served.DrawnOdometry, client: Client) -> None:
-    incident = Incident(served.START_NS, "vision_gated", "χ² = 31")
-    got: list[Incident] = []
-    reader = in_thread(lambda: got.extend(client.incidents()))
-    until(lambda: listeners(odometry.incidents), "nobody listens")
-    odometry.incidents.publish(incident)
+def test_events_and_figures(odometry: served.DrawnOdometry, client: Client) -> None:
+    event = Event(served.START_NS, "vision_gated", "χ² = 31")
+    got: list[Event] = []
+    reader = in_thread(lambda: got.extend(client.events()))
+    until(lambda: listeners(odometry.events), "nobody listens")
+    odometry.events.publish(event)
     odometry.end()
     reader.join(10.0)
-    assert got == [incident]
+    assert got == [event]
     odometry.figures = {"rate_hz": 19.9, "framesets": 7, "status": "tracking", "battery": None}
     assert client.status() == dict(sorted(odometry.figures.items()))
 

@@ -38,11 +38,11 @@ S = 10**9
 
 
 def framesets(source: Source) -> list[FrameSet]:
-    return [event for event in source if isinstance(event, FrameSet)]
+    return [measurement for measurement in source if isinstance(measurement, FrameSet)]
 
 
 def samples(source: Source) -> list[ImuSample]:
-    return [event for event in source if isinstance(event, ImuSample)]
+    return [measurement for measurement in source if isinstance(measurement, ImuSample)]
 
 
 @pytest.fixture
@@ -60,15 +60,15 @@ def test_euroc_whole(walk: Path, inner: bool) -> None:
     assert (source.name, source.frameset_count) == ("walk", 10)
     assert (source.start_ns, source.end_ns) == (START_NS, START_NS + 9 * FRAME_PERIOD_NS)
     assert source.truth is None
-    events = list(source)
-    sets = [event for event in events if isinstance(event, FrameSet)]
+    measurements = list(source)
+    sets = [measurement for measurement in measurements if isinstance(measurement, FrameSet)]
     assert [s.stamp_ns for s in sets] == frame_stamps(10)
     for i, frameset in enumerate(sets):
         assert sorted(frameset.images) == [0, 1]
         for pair, images in frameset.images.items():
             for side, image in enumerate(images):
                 np.testing.assert_array_equal(image, noise_image(100 * (2 * pair + side) + i))
-    imu = [event for event in events if isinstance(event, ImuSample)]
+    imu = [measurement for measurement in measurements if isinstance(measurement, ImuSample)]
     assert [s.stamp_ns for s in imu] == list(range(START_NS - S, source.end_ns + 10**8 + 1, IMU_PERIOD_NS))
     np.testing.assert_array_equal(imu[3].angular_velocity, [0.01, -0.02, 0.03])
     np.testing.assert_array_equal(imu[3].linear_acceleration, [0.1, 0.2, 9.81])
@@ -79,11 +79,11 @@ def test_euroc_whole(walk: Path, inner: bool) -> None:
 
 def test_the_sample_that_covers_a_frameset_comes_first(walk: Path) -> None:
     latest = 0
-    for event in open_source(walk):
-        if isinstance(event, FrameSet):
-            assert event.stamp_ns <= latest < event.stamp_ns + IMU_PERIOD_NS
+    for measurement in open_source(walk):
+        if isinstance(measurement, FrameSet):
+            assert measurement.stamp_ns <= latest < measurement.stamp_ns + IMU_PERIOD_NS
         else:
-            latest = event.stamp_ns
+            latest = measurement.stamp_ns
 
 
 def test_rig_decides_what_is_read(walk: Path) -> None:
@@ -397,13 +397,13 @@ def test_fault(walk: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
     damage(walk)
     with caplog.at_level(logging.WARNING, logger="graphvio"):
         source = open_source(walk)
-        events = list(source)
+        measurements = list(source)
     assert source.faults.counts == {kind: count for kind, count in counts.items() if count}
-    assert sum(isinstance(event, FrameSet) for event in events) == frames
-    assert sum(isinstance(event, ImuSample) for event in events) == imu
-    assert [incident.kind for incident in source.faults.incidents] == list(source.faults.counts)
+    assert sum(isinstance(measurement, FrameSet) for measurement in measurements) == frames
+    assert sum(isinstance(measurement, ImuSample) for measurement in measurements) == imu
+    assert [event.kind for event in source.faults.events] == list(source.faults.counts)
     assert len(caplog.records) == len(source.faults.counts)
-    stamps = [event.stamp_ns for event in events if isinstance(event, FrameSet)]
+    stamps = [measurement.stamp_ns for measurement in measurements if isinstance(measurement, FrameSet)]
     assert stamps == sorted(set(stamps))
     assert set(stamps) <= set(frame_stamps(10))
 
@@ -417,10 +417,10 @@ def test_iterating_again_yields_and_counts_the_same(walk: Path, caplog: pytest.L
     image_file(walk, 2, 4).unlink()
     csv_edit("imu0", drop(slice(220, 250)))(walk)
     source = open_source(walk)
-    first = [event.stamp_ns for event in source]
+    first = [measurement.stamp_ns for measurement in source]
     counts = dict(source.faults.counts)
     assert counts == {"imu_gap": 1, "image_missing": 1}
-    assert [event.stamp_ns for event in source] == first
+    assert [measurement.stamp_ns for measurement in source] == first
     assert source.faults.counts == counts
     assert len(source.decode_ms) == 10
     assert len(caplog.records) == 2
@@ -431,7 +431,7 @@ def test_places_of_faults(walk: Path) -> None:
     image_file(walk, 1, 3).unlink()
     source = open_source(walk)
     list(source)
-    gap, image = source.faults.incidents
+    gap, image = source.faults.events
     assert gap.stamp_ns == IMU_T0 + 219 * IMU_PERIOD_NS
     assert gap.detail == f"no samples for 155 ms after {gap.stamp_ns}"
     assert image.stamp_ns == START_NS + 3 * FRAME_PERIOD_NS
@@ -440,7 +440,11 @@ def test_places_of_faults(walk: Path) -> None:
 
 def test_frameset_in_an_imu_gap_does_not_wait(walk: Path) -> None:
     csv_edit("imu0", drop(slice(221, 271)))(walk)  # 250 ms from 100 ms after the first frameset
-    order = [type(event).__name__[0] for event in open_source(walk) if event.stamp_ns > START_NS + 90_000_000]
+    order = [
+        type(measurement).__name__[0]
+        for measurement in open_source(walk)
+        if measurement.stamp_ns > START_NS + 90_000_000
+    ]
     assert "".join(order).startswith("IF" + "FFF")
 
 
@@ -493,11 +497,11 @@ def test_time_offset_moves_the_frames(tmp_path: Path) -> None:
     small_rig(1).save(rig_file)
     rig_file.write_text(rig_file.read_text().replace("time_offset_s: 0.0", "time_offset_s: 0.02"))
     latest = 0
-    for event in open_source(tmp_path):
-        if isinstance(event, FrameSet):
-            assert latest == event.stamp_ns + 20_000_000
+    for measurement in open_source(tmp_path):
+        if isinstance(measurement, FrameSet):
+            assert latest == measurement.stamp_ns + 20_000_000
         else:
-            latest = event.stamp_ns
+            latest = measurement.stamp_ns
 
 
 @pytest.mark.parametrize("kind", ["16 bit", "colour", "colour with alpha"])
@@ -563,32 +567,32 @@ def ended(seconds: float = 5.0) -> bool:
     return readers() == 0
 
 
-def first_frameset(events: Iterator[object]) -> None:
-    while not isinstance(next(events), FrameSet):
+def first_frameset(measurements: Iterator[object]) -> None:
+    while not isinstance(next(measurements), FrameSet):
         pass
 
 
 @pytest.mark.parametrize("how", ["exhausted", "closed", "collected", "broken out of", "raised"])
 def test_threads_end(walk: Path, how: str) -> None:
     source = open_source(walk)
-    events = iter(source)
-    first_frameset(events)
+    measurements = iter(source)
+    first_frameset(measurements)
     assert readers() > 0
     if how == "exhausted":
-        list(events)
+        list(measurements)
     elif how == "closed":
-        events.close()  # type: ignore[attr-defined]
+        measurements.close()  # type: ignore[attr-defined]
     elif how == "collected":
-        del events
+        del measurements
         gc.collect()
     elif how == "broken out of":
-        del events
-        for event in source:
-            if isinstance(event, FrameSet):
+        del measurements
+        for measurement in source:
+            if isinstance(measurement, FrameSet):
                 break
-        del event
+        del measurement
     else:
-        del events
+        del measurements
         image_file(walk, 0, 0).write_bytes(cv2.imencode(".png", noise_image(0, (32, 32)))[1].tobytes())
         with pytest.raises(RigError):
             list(open_source(walk))
@@ -638,17 +642,17 @@ def test_errors_in_threads_surface() -> None:
 def test_real_euroc_clip() -> None:
     root = REAL_DATA / "euroc_mh01_clip"
     source = open_source(root)
-    events = list(source)
-    sets = [event for event in events if isinstance(event, FrameSet)]
+    measurements = list(source)
+    sets = [measurement for measurement in measurements if isinstance(measurement, FrameSet)]
     assert source.frameset_count == len(sets) == 340
     rows = read_rows(root / "mav0" / "cam0" / "data.csv")[1:]
     assert [s.stamp_ns for s in sets] == [int(row.split(",")[0]) for row in rows if row]
     assert all(image.shape == (480, 752) for s in sets for image in s.images[0])
     imu_rows = [row for row in read_rows(root / "mav0" / "imu0" / "data.csv")[1:] if row]
-    imu = [event for event in events if isinstance(event, ImuSample)]
+    imu = [measurement for measurement in measurements if isinstance(measurement, ImuSample)]
     assert [s.stamp_ns for s in imu] == [int(row.split(",")[0]) for row in imu_rows]
     assert source.faults.counts == {"frame_gap": 1}
-    (gap,) = source.faults.incidents
+    (gap,) = source.faults.events
     assert (gap.stamp_ns, gap.detail) == (
         1403636592863555584,
         "pair0 has no images for 100 ms after 1403636592863555584",

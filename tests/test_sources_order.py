@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recordings import noise_image, small_rig, write_image
 
-from graphvio.events import FrameSet, ImuSample
+from graphvio.image_decoding import damage_of
+from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.rig import Rig
 from graphvio.sources.faults import FaultLog
-from graphvio.sources.images import damage_of
 from graphvio.sources.matching import TOLERANCE_NS, group_pairs, match_sides
 from graphvio.sources.recording import ImageFiles, Index, Recording
 from graphvio.sources.sequencer import COVER_NS, merge
@@ -32,15 +32,15 @@ def imu_at(stamps: list[int]) -> list[ImuSample]:
 
 @given(imu=increasing, frames=increasing, offset_ns=st.integers(-300 * MS, 300 * MS))
 def test_merge(imu: list[int], frames: list[int], offset_ns: int) -> None:
-    events = list(merge(imu_at(imu), [FrameSet(stamp, {}) for stamp in frames], offset_ns))
-    assert [e.stamp_ns for e in events if isinstance(e, ImuSample)] == imu  # nothing lost, nothing moved
-    assert [e.stamp_ns for e in events if isinstance(e, FrameSet)] == frames
+    measurements = list(merge(imu_at(imu), [FrameSet(stamp, {}) for stamp in frames], offset_ns))
+    assert [e.stamp_ns for e in measurements if isinstance(e, ImuSample)] == imu  # nothing lost, nothing moved
+    assert [e.stamp_ns for e in measurements if isinstance(e, FrameSet)] == frames
     seen: list[int] = []
-    for event in events:
-        if isinstance(event, ImuSample):
-            seen.append(event.stamp_ns)
+    for measurement in measurements:
+        if isinstance(measurement, ImuSample):
+            seen.append(measurement.stamp_ns)
             continue
-        instant = event.stamp_ns + offset_ns
+        instant = measurement.stamp_ns + offset_ns
         covering = next((stamp for stamp in imu if stamp >= instant), None)
         if covering is not None and covering <= instant + COVER_NS:
             assert covering in seen
@@ -56,8 +56,8 @@ def test_merge_reads_no_further_than_it_must() -> None:
             taken.append(sample.stamp_ns)
             yield sample
 
-    for event in merge(samples(), [FrameSet(15, {})]):
-        if isinstance(event, FrameSet):
+    for measurement in merge(samples(), [FrameSet(15, {})]):
+        if isinstance(measurement, FrameSet):
             break
     assert taken == [0, 10, 20, 30]  # the one that covers, and the one that is next
 
@@ -169,7 +169,7 @@ def test_memory_does_not_grow_with_length(tmp_path: Path) -> None:
     index = Index("long", {"cam0": track, "cam1": track}, imu)
     source = Recording(index, _resized(rig, size_px), FaultLog("long"))
     tracemalloc.start()
-    count = sum(isinstance(event, FrameSet) for event in source)
+    count = sum(isinstance(measurement, FrameSet) for measurement in source)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert count == frames

@@ -7,15 +7,16 @@ import pytest
 
 from graphvio.arrays import Float
 from graphvio.backend.inertial import GRAVITY_M_S2
+from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.backend.states import StartUncertainty, origin_covariance
 from graphvio.config import Config
-from graphvio.events import ImuSample, Quality, Status
-from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.geometry import se3, se3_exp, so3_exp, so3_log
+from graphvio.measurements.estimate import Status
+from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
+from graphvio.measurements.sensors import ImuSample
+from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Imu
 from graphvio.simulation.default_rig import default_rig
-from graphvio.smoother_belief import SmootherBelief
-from graphvio.synchroniser import Synchroniser
 
 STEP_S = 0.05
 UP = np.array([0.0, 0.0, GRAVITY_M_S2])
@@ -69,7 +70,7 @@ class Outcome:
     speed_sigma_m_s: list[float] = field(default_factory=list)
     step_m: list[float] = field(default_factory=list)
     status: list[Status] = field(default_factory=list)
-    incidents: list[tuple[float, str, str]] = field(default_factory=list)
+    events: list[tuple[float, str, str]] = field(default_factory=list)
 
     @property
     def initialised_s(self) -> float:
@@ -91,10 +92,10 @@ def run(
     swing, synchroniser, out = Swing(rng, accel_m_s2, hertz), Synchroniser(rig, config, lambda *_: None), Outcome()
     for k in range(-round(rig.imu.rate_hz), round((duration_s + 0.1) * rig.imu.rate_hz)):
         synchroniser.add_sample(swing.sample(k / rig.imu.rate_hz, rig.imu))
-    belief = SmootherBelief(
+    estimator = SmootherEstimator(
         rig,
         config,
-        lambda ns, kind, detail: out.incidents.append(((ns - BASE_NS) * 1e-9, kind, detail)),
+        lambda ns, kind, detail: out.events.append(((ns - BASE_NS) * 1e-9, kind, detail)),
         lambda: None,
     )
     before_ns, before, true_before = BASE_NS, np.eye(4), swing.pose(0.0)
@@ -103,19 +104,19 @@ def run(
         stamp_ns, true = BASE_NS + round(t * 1e9), swing.pose(t)
         used = n == 0
         if n == 0:
-            belief.start(stamp_ns, synchroniser.initial_span(stamp_ns))
+            estimator.start(stamp_ns, synchroniser.initial_interval(stamp_ns))
             if bias_error is not None:
-                state = replace(belief.state(), gyro_bias=swing.gyro_bias + bias_error)
+                state = replace(estimator.state(), gyro_bias=swing.gyro_bias + bias_error)
                 known = StartUncertainty(origin_covariance(state.nav_T_body[:3, :3], 0.25), 0.3, 0.001)
-                belief._running.start(stamp_ns, state, known)
+                estimator._running.start(stamp_ns, state, known)
         else:
-            belief.predict(stamp_ns, synchroniser.span(before_ns, stamp_ns))
+            estimator.predict(stamp_ns, synchroniser.interval(before_ns, stamp_ns))
             if sigmas is not None:
                 measured = np.linalg.inv(true_before) @ true @ se3_exp(sigmas * rng.standard_normal(6))
                 motion = RelativeMotion(before_ns, stamp_ns, measured, np.diag(sigmas**2), np.zeros((6, 6)), 200)
-                used = belief.use(VisualResult(motion, Quality.GOOD, "", {}), at_rest=False) is not None
-        out.status.append(belief.update(stamp_ns, used, frozenset()))
-        state, told = belief.state(), belief.covariance
+                used = estimator.use(VisualResult(motion, Quality.GOOD, "", {}), at_rest=False) is not None
+        out.status.append(estimator.update(stamp_ns, used, frozenset()))
+        state, told = estimator.state(), estimator.covariance
         rotation = state.nav_T_body[:3, :3]
         out.tilt_deg.append(float(np.rad2deg(np.arccos(min(rotation[2] @ true[2, :3], 1.0)))))
         about_nav = (rotation @ told.pose[:3, :3] @ rotation.T)[:2, :2]
@@ -142,7 +143,7 @@ def test_it_is_known_within_two_seconds_and_rightly(accel_m_s2: float, hertz: fl
         assert np.all(np.array(out.speed_m_s[k:]) < 4.5 * np.array(out.speed_sigma_m_s[k:]))
         assert out.step_m[k] < 0.05  # the switch is no jump: 3 deg of half a metre are 2.6 cm
         assert set(out.status[k:]) == {Status.TRACKING}
-        assert not out.incidents
+        assert not out.events
     assert np.median([out.tilt_deg[-1] for out in outcomes]) < 0.6
     if accel_m_s2 > 1.0:  # where it began far off
         assert max(out.tilt_deg[0] for out in outcomes) > 10.0
@@ -157,7 +158,7 @@ def test_what_is_lacking_is_told_once() -> None:
     """Of points that are all far away, vision tells the rotation alone."""
     out = run(0, 1.0, 0.5, sigmas=np.repeat([1e-3, 5.0], 3))
     assert set(out.status) <= {Status.INITIALISING, Status.COASTING}
-    ((told_s, _, detail),) = [incident for incident in out.incidents if incident[1] == "not_initialised"]
+    ((told_s, _, detail),) = [event for event in out.events if event[1] == "not_initialised"]
     assert told_s == pytest.approx(2.05, abs=0.01)
     assert "velocity" in detail
 
@@ -166,7 +167,7 @@ def test_what_is_wrong_and_taken_for_known_is_given_up() -> None:
     """A bias of 10 deg/s too much, to a mrad/s: vision is refused, and would be in each epoch that takes it over."""
     for seed in range(4):
         out = run(seed, 1.0, 0.5, duration_s=8.0, bias_error=np.array([-0.1, 0.1, 0.1]))
-        kinds = [kind for _, kind, _ in out.incidents]
+        kinds = [kind for _, kind, _ in out.events]
         assert [kinds.count(kind) for kind in ("lost", "new_epoch")] == [1, 1]
         assert set(out.status[-40:]) == {Status.TRACKING}
         assert out.tilt_deg[-1] < 3.0

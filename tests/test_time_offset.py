@@ -7,9 +7,9 @@ from scipy.stats import chi2
 from synthetic import filled_buffer, measured_motion, stamps_ns, transform
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.time_offset import TimeOffsetFilter, integrated_rates
-from graphvio.frontend.motion import RelativeMotion
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Imu
 
 IMU = Imu()
@@ -27,7 +27,7 @@ class Run:
         buffer = filled_buffer(IMU, DURATION_S + 2.0 * LATE_S, rng, self.gyro_bias, np.zeros(3))
         late_ns = round(LATE_S * 1e9)
         self.filter = TimeOffsetFilter(
-            IMU, 1.0, lambda start_ns, end_ns: buffer.span(start_ns + late_ns, end_ns + late_ns)
+            IMU, 1.0, lambda start_ns, end_ns: buffer.interval(start_ns + late_ns, end_ns + late_ns)
         )
         shift_ns = round((LATE_S + error_s) * 1e9)
         reference_ns = 0
@@ -66,9 +66,9 @@ def test_at_a_constant_rate_it_is_not_known() -> None:
     """Then all instants look alike; the bias is known all the same."""
     rate, bias = np.array([0.2, -0.3, 0.5]), np.array([0.01, 0.02, -0.01])
 
-    def imu_between(start_ns: int, end_ns: int) -> ImuSpan:
+    def imu_between(start_ns: int, end_ns: int) -> ImuInterval:
         steps = round((end_ns - start_ns) * 1e-9 * IMU.rate_hz)
-        return ImuSpan(np.full(steps, 1.0 / IMU.rate_hz), np.tile(rate + bias, (steps, 1)), np.zeros((steps, 3)))
+        return ImuInterval(np.full(steps, 1.0 / IMU.rate_hz), np.tile(rate + bias, (steps, 1)), np.zeros((steps, 3)))
 
     turning = TimeOffsetFilter(IMU, 1.0, imu_between)
     first_ns, *later_ns = stamps_ns(DURATION_S)

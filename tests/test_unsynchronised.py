@@ -16,12 +16,12 @@ from graphvio import Estimate, FrameSet, ImuSample, Odometry, Status, open_sourc
 from graphvio.config import Config
 from graphvio.errors import SourceError
 from graphvio.evaluation import evaluate
-from graphvio.events import Event
+from graphvio.measurements.sensors import Measurement
+from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 from graphvio.simulation import Simulator, build_scene, write_recording
 from graphvio.sources.matching import TOLERANCE_NS, PairIndex, group_pairs, match_sides
 from graphvio.sources.sequencer import merge
-from graphvio.synchroniser import Synchroniser
 from graphvio.trajectory import Trajectory
 
 pytestmark = pytest.mark.heavy
@@ -88,14 +88,14 @@ def test_stamps_are_kept_and_nothing_is_lost(
     source = open_source(tmp_path / "walk")
     latest_imu, stamps = 0, []
     seen: dict[int, list[int]] = {0: [], 1: []}
-    for event in source:
-        if isinstance(event, ImuSample):
-            latest_imu = event.stamp_ns
+    for measurement in source:
+        if isinstance(measurement, ImuSample):
+            latest_imu = measurement.stamp_ns
             continue
-        stamps.append(event.stamp_ns)
-        assert latest_imu >= min(event.stamp_ns, int(simulator.imu_track.stamps_ns[-1]))
-        for pair in event.images:
-            seen[pair].append(event.stamp_ns)
+        stamps.append(measurement.stamp_ns)
+        assert latest_imu >= min(measurement.stamp_ns, int(simulator.imu_track.stamps_ns[-1]))
+        for pair in measurement.images:
+            seen[pair].append(measurement.stamp_ns)
     assert source.frameset_count == len(stamps) == count
     assert (np.diff(stamps) > 0).all()
     assert sum(stamp in seen[0] for stamp in seen[1]) == shared
@@ -141,11 +141,11 @@ def test_sides_further_apart_than_the_tolerance_are_no_pair(tmp_path: Path) -> N
     shifted = [f"{s + 3 * MS},{s}.png" for s in frame_stamps(10)]
     write_rows(tmp_path / "mav0/cam3/data.csv", shifted)
     source = open_source(tmp_path)
-    assert all(list(event.images) == [0] for event in source if isinstance(event, FrameSet))
+    assert all(list(measurement.images) == [0] for measurement in source if isinstance(measurement, FrameSet))
     assert source.faults.counts["unpaired_image"] == 19  # the last right image comes after the last frameset
-    assert "cam3 has none within 2 ms" in next(i.detail for i in source.faults.incidents if i.kind == "unpaired_image")
+    assert "cam3 has none within 2 ms" in next(i.detail for i in source.faults.events if i.kind == "unpaired_image")
     wider = open_source(tmp_path, tolerance_ms=3.0)
-    assert [list(event.images) for event in wider if isinstance(event, FrameSet)] == [[0, 1]] * 10
+    assert [list(measurement.images) for measurement in wider if isinstance(measurement, FrameSet)] == [[0, 1]] * 10
     assert wider.faults.counts == {}
 
 
@@ -173,7 +173,7 @@ def test_only_what_is_missing_is_a_fault(tmp_path: Path) -> None:
     source = open_source(tmp_path)
     assert source.frameset_count == 16
     assert source.faults.counts == {"frameset_incomplete": 3}
-    assert source.faults.incidents[0].stamp_ns == START_NS + 7 * 50 * MS
+    assert source.faults.events[0].stamp_ns == START_NS + 7 * 50 * MS
 
 
 # ------------------------------------------------------------------ live framesets
@@ -227,10 +227,10 @@ def walk(rates: float | tuple[float, ...], offset_ms: float) -> tuple[Rig, list[
     return simulator.rig, framesets, samples, Trajectory(simulator.stamps_ns, simulator.world_T_body)
 
 
-def feed(rig: Rig, events: Iterable[Event]) -> Iterator[Estimate]:
+def feed(rig: Rig, measurements: Iterable[Measurement]) -> Iterator[Estimate]:
     odometry = Odometry(rig, CONFIG)
-    for event in events:
-        estimate = odometry.process(event)
+    for measurement in measurements:
+        estimate = odometry.process(measurement)
         if estimate is not None:
             yield estimate
     yield from odometry.finish()

@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 
 from graphvio.errors import GraphvioError, MissingExtraError
-from graphvio.events import Estimate, FrameSet, Incident, PairReport, Status
 from graphvio.geometry import se3, so3_exp
+from graphvio.measurements.estimate import Estimate, Status
+from graphvio.measurements.events import Event
+from graphvio.measurements.motion import PairReport
+from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Camera, Imu, Rig, StereoPair
 from graphvio.trajectory import Trajectory
 from graphvio.viewer import Viewer
@@ -82,7 +85,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Viewer(some_rig(), save=file) as viewer:
         for k in range(250):
             viewer.show(frameset(k), estimate(k))
-        viewer.show_incident(Incident(START_NS, "vision_gated", "front"))
+        viewer.show_event(Event(START_NS, "vision_gated", "front"))
         viewer.show_path("smoothed", Trajectory(np.arange(3), np.array([np.eye(4)] * 3)))
     return file
 
@@ -117,7 +120,7 @@ def test_no_pose_is_dropped_though_images_are(recording: Path) -> None:
     assert entities["/world/rig/uncertainty"] == 245
     assert entities["/timing/track"] == 250
     assert 1 <= entities["/world/rig/cam0/image"] < 250
-    assert entities["/events"] == 4  # tracking, lost, tracking, and the incident
+    assert entities["/events"] == 4  # tracking, lost, tracking, and the event
 
 
 def test_residuals_of_each_pair_are_curves_without_those_that_are_not_known(tmp_path: Path) -> None:
@@ -238,7 +241,7 @@ def test_results_can_be_shown_again_from_their_files(tmp_path: Path) -> None:
     with ResultWriter(folder, some_rig(), "") as writer:
         for each in shown:
             writer.add(each)
-        writer.add_incident(Incident(START_NS, "vision_gated", "front"))
+        writer.add_event(Event(START_NS, "vision_gated", "front"))
         smoothed = [(e.stamp_ns, e.nav_T_body) for e in shown if e.nav_T_body is not None]
         writer.finish(
             wall_s=1.0,

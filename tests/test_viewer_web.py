@@ -18,7 +18,7 @@ from test_viewer import estimate, frameset, rows_of, some_rig
 
 from graphvio.arrays import AnyArray
 from graphvio.errors import GraphvioError
-from graphvio.events import Status
+from graphvio.measurements.estimate import Status
 from graphvio.viewer import Viewer, WebOptions
 from graphvio.viewer.layout import STATUS_COLOURS
 from graphvio.viewer.web import WebHost

@@ -45,13 +45,13 @@ def test_no_kernel_is_compiled_after_the_warm_up() -> None:
     assert result.motion is not None
     assert compiled() - before == set()
     both: list[FrameSet | ImuSample] = [*samples, *framesets]
-    events = sorted(both, key=lambda event: event.stamp_ns)
+    measurements = sorted(both, key=lambda measurement: measurement.stamp_ns)
     for rig in (simulator.rig, simulator.rig.without_imu()):
         odometry = Odometry(rig)
         keyframes: list[Keyframe] = []
         odometry.on_keyframe(keyframes.append)
-        for event in events if rig.imu is not None else framesets:
-            odometry.process(event)
+        for measurement in measurements if rig.imu is not None else framesets:
+            odometry.process(measurement)
         odometry.finish()
         assert keyframes
         assert compiled() - before == set()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -10,33 +9,9 @@ from scipy.stats import chi2
 
 from graphvio.arrays import Float
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
+from graphvio.measurements.gate_result import GateResult
 
 _SURELY = 5.0  # standard deviations
-_UNCLEAR = (0.5, 2.0)  # statistic over threshold
-
-
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """Outcome of a gate.
-
-    Attributes:
-        accepted: whether the measurement may be used.
-        statistic: squared Mahalanobis distance of the innovation.
-        threshold: the largest that is accepted.
-        innovation: (M,) what was measured, less what was expected.
-        covariance: (M, M) of it.
-    """
-
-    accepted: bool
-    statistic: float
-    threshold: float
-    innovation: Float
-    covariance: Float
-
-    @property
-    def is_clear(self) -> bool:
-        """Whether the outcome is not a matter of a small difference."""
-        return not _UNCLEAR[0] < self.statistic / self.threshold < _UNCLEAR[1]
 
 
 def relative_covariance(a_T_b: Float, joint: Float) -> Float:
@@ -51,17 +26,17 @@ def gate(
     predicted: Float,
     predicted_covariance: Float,
     probability: float,
-) -> Verdict:
+) -> GateResult:
     """Test a motion (4, 4) against a predicted one; covariances (6, 6) in the frame that it ends in."""
     innovation = se3_log(se3_inverse(predicted) @ measured)
     return judged(innovation, measured_covariance + predicted_covariance, probability)
 
 
-def judged(innovation: Float, covariance: Float, probability: float) -> Verdict:
+def judged(innovation: Float, covariance: Float, probability: float) -> GateResult:
     """Test an innovation (M,) with a covariance (M, M)."""
     statistic = float(innovation @ np.linalg.solve(covariance, innovation))
     threshold = chi_square_quantile(probability, len(innovation))
-    return Verdict(statistic <= threshold, statistic, threshold, innovation, covariance)
+    return GateResult(statistic <= threshold, statistic, threshold, innovation, covariance)
 
 
 def excess(value: Float, covariance: Float, most: float) -> float | None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.copying import put
-from graphvio.events import ImuSample
-from graphvio.kernels import kernel
+from graphvio.kernels import kernel, put
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.sensors import ImuSample
 
 GRAVITY_M_S2 = 9.81
 _MAX_RATE = 100.0  # rad/s and m/s^2: beyond what any inertial sensor for this use can read
@@ -28,31 +27,6 @@ _UNLIKELY = np.log(1e-9)  # chance that a living axis repeats its value so often
 _MOVING = np.repeat([0.2, 1.0], 3)  # rad/s and m/s^2, by so much
 _KEPT_NS = 60_000_000_000  # framesets do not come later than this after their samples
 _ROOM = 1024  # samples that the buffer has room for at first
-
-
-@dataclass(frozen=True, eq=False)
-class ImuSpan:
-    """The IMU between two instants, as steps of constant rate and acceleration.
-
-    Attributes:
-        steps_s: (N,) durations.
-        angular_velocity: (N, 3) rad/s, body.
-        linear_acceleration: (N, 3) m/s^2 specific force, body.
-    """
-
-    steps_s: Float
-    angular_velocity: Float
-    linear_acceleration: Float
-
-    @property
-    def mean_rate(self) -> Float:
-        """Mean angular rate (3,) rad/s, bias included."""
-        return np.asarray(self.steps_s @ self.angular_velocity / self.steps_s.sum())
-
-    @property
-    def mean_force(self) -> Float:
-        """Mean specific force (3,) m/s^2, bias included."""
-        return np.asarray(self.steps_s @ self.linear_acceleration / self.steps_s.sum())
 
 
 class ImuBuffer:
@@ -98,7 +72,7 @@ class ImuBuffer:
         """Whether a sample at or after an instant has come."""
         return self._end > self._first and bool(self._stamps[self._end - 1] >= stamp_ns)
 
-    def span(self, start_ns: int, end_ns: int) -> ImuSpan | None:
+    def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
         """The IMU between two instants, interpolated at both ends, or None where a gap makes it unknown."""
         first = self._find(start_ns, "right") - 1
         last = self._find(end_ns, "left")
@@ -108,19 +82,19 @@ class ImuBuffer:
         if np.diff(stamps).max() > self._max_gap_ns:
             return None
         steps_s, means = _steps(stamps - start_ns, self._values[first : last + 1], end_ns - start_ns)
-        return ImuSpan(steps_s, means[:, :3], means[:, 3:])
+        return ImuInterval(steps_s, means[:, :3], means[:, 3:])
 
-    def stretch(self, start_ns: int, end_ns: int) -> tuple[ImuSpan, int] | None:
+    def segment(self, start_ns: int, end_ns: int) -> tuple[ImuInterval, int] | None:
         """The longest gapless piece of the IMU that ends at the newest sample within two instants.
 
         Returns:
-            The span and the stamp at which it starts, or None where there are not two samples.
+            The interval and the stamp at which it starts, or None where there are not two samples.
         """
         stamps = self._stamps[self._find(start_ns, "left") : self._find(end_ns, "right")]
         gaps = np.flatnonzero(np.diff(stamps) > self._max_gap_ns)
         stamps = stamps[gaps[-1] + 1 :] if len(gaps) else stamps
-        span = self.span(int(stamps[0]), int(stamps[-1])) if len(stamps) > 1 else None
-        return None if span is None else (span, int(stamps[0]))
+        interval = self.interval(int(stamps[0]), int(stamps[-1])) if len(stamps) > 1 else None
+        return None if interval is None else (interval, int(stamps[0]))
 
     def since(self, stamp_ns: int) -> tuple[Int, Float]:
         """The IMU at an instant and its samples after it.
@@ -140,7 +114,7 @@ class ImuBuffer:
         return stamps, np.vstack([at, self._values[end : self._end]])
 
     def discard_before(self, stamp_ns: int) -> None:
-        """Forget samples that no later span can need."""
+        """Forget samples that no later interval can need."""
         self._first = max(self._find(stamp_ns, "right") - 1, self._first)
 
     def _find(self, stamp_ns: int, side: Literal["left", "right"]) -> int:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import GRAVITY_M_S2, ImuSpan
-from graphvio.config_stages import InitialisationConfig
+from graphvio.backend.inertial import GRAVITY_M_S2
+from graphvio.config.stages import InitialisationConfig
 from graphvio.geometry import so3_exp
+from graphvio.measurements.imu_interval import ImuInterval
 
 _MIN_REST_S = 0.3
 _SPEED_CHANGE_SIGMA_M_S = 1.5  # a start may be anywhere in a take-off or a braking
@@ -37,26 +38,28 @@ class InitialAttitude:
     at_rest: bool
 
 
-def initial_attitude(span: ImuSpan, at_s: float, config: InitialisationConfig) -> InitialAttitude:
-    """Attitude at an instant of a span of the IMU, ``at_s`` seconds after the span's start.
+def initial_attitude(interval: ImuInterval, at_s: float, config: InitialisationConfig) -> InitialAttitude:
+    """Attitude at an instant of an interval of the IMU, ``at_s`` seconds after the interval's start.
 
     At rest the mean specific force is gravity and the mean rate is the gyro's bias. In motion, the specific force,
     turned by the gyro into the instant's frame, still averages to gravity but for the change of speed, whose
     share falls with the duration; the bias is then left to the smoother.
     """
-    duration = float(span.steps_s.sum())
-    mean_force = span.linear_acceleration.mean(axis=0)
-    at_rest = duration >= _MIN_REST_S and is_at_rest(span, config)
+    duration = float(interval.steps_s.sum())
+    mean_force = interval.linear_acceleration.mean(axis=0)
+    at_rest = duration >= _MIN_REST_S and is_at_rest(interval, config)
     tilt_sigma = _ACCEL_BIAS_SIGMA_M_S2 / GRAVITY_M_S2
     if at_rest:
-        samples = len(span.steps_s)
-        bias_sigma = max(3.0 * _spread(span.angular_velocity) / np.sqrt(samples), 1e-4)
-        return InitialAttitude(level(mean_force), tilt_sigma, span.mean_rate, float(bias_sigma), True)
+        samples = len(interval.steps_s)
+        bias_sigma = max(3.0 * _spread(interval.angular_velocity) / np.sqrt(samples), 1e-4)
+        return InitialAttitude(level(mean_force), tilt_sigma, interval.mean_rate, float(bias_sigma), True)
     force = np.zeros(3)
     start_R_body = np.eye(3)
     start_R_at = np.eye(3)
     elapsed = 0.0
-    for step, rate, specific in zip(span.steps_s, span.angular_velocity, span.linear_acceleration, strict=True):
+    for step, rate, specific in zip(
+        interval.steps_s, interval.angular_velocity, interval.linear_acceleration, strict=True
+    ):
         force += step * (start_R_body @ specific)
         start_R_body = start_R_body @ so3_exp(step * rate)
         elapsed += step
@@ -69,13 +72,13 @@ def initial_attitude(span: ImuSpan, at_s: float, config: InitialisationConfig) -
     )
 
 
-def is_at_rest(span: ImuSpan, config: InitialisationConfig) -> bool:
-    """Whether a span of the IMU shows nothing but gravity and noise; a short one may by chance."""
+def is_at_rest(interval: ImuInterval, config: InitialisationConfig) -> bool:
+    """Whether an interval of the IMU shows nothing but gravity and noise; a short one may by chance."""
     return bool(
-        _spread(span.angular_velocity) < config.static_gyro_rad_s
-        and _spread(span.linear_acceleration) < config.static_accel_m_s2
-        and abs(float(np.linalg.norm(span.linear_acceleration.mean(axis=0))) - GRAVITY_M_S2) < 0.5
-        and float(np.linalg.norm(span.mean_rate)) < 0.2  # beyond any gyro's bias
+        _spread(interval.angular_velocity) < config.static_gyro_rad_s
+        and _spread(interval.linear_acceleration) < config.static_accel_m_s2
+        and abs(float(np.linalg.norm(interval.linear_acceleration.mean(axis=0))) - GRAVITY_M_S2) < 0.5
+        and float(np.linalg.norm(interval.mean_rate)) < 0.2  # beyond any gyro's bias
     )
 
 

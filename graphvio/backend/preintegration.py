@@ -10,9 +10,10 @@ import gtsam
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import GRAVITY_M_S2, ImuSpan
+from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.geometry import so3_exp
 from graphvio.kernels import kernel
+from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.rig import Imu
 
 _INTEGRATION_SIGMA = 3e-5  # m/s^2-like noise that stands for the error of integrating piecewise constant rates
@@ -30,16 +31,16 @@ def preintegration_params(imu: Imu, noise_scale: float) -> gtsam.PreintegrationC
 
 
 def preintegrate(
-    span: ImuSpan, params: gtsam.PreintegrationCombinedParams, bias: gtsam.imuBias.ConstantBias
+    interval: ImuInterval, params: gtsam.PreintegrationCombinedParams, bias: gtsam.imuBias.ConstantBias
 ) -> gtsam.PreintegratedCombinedMeasurements:
-    """Preintegrate a span, linearised at a bias.
+    """Preintegrate an interval, linearised at a bias.
 
     A step's mean force belongs to its middle, and gtsam takes it to be in the frame at the step's start: it is turned
     there by half of the step's rotation.
     """
     measurements = gtsam.PreintegratedCombinedMeasurements(params, bias)
-    forces = _at_start(span.steps_s, span.angular_velocity, span.linear_acceleration, bias.vector())
-    for force, rate, step in zip(forces, span.angular_velocity, span.steps_s.tolist(), strict=True):
+    forces = _at_start(interval.steps_s, interval.angular_velocity, interval.linear_acceleration, bias.vector())
+    for force, rate, step in zip(forces, interval.angular_velocity, interval.steps_s.tolist(), strict=True):
         if step > 0.0:
             measurements.integrateMeasurement(force, rate, step)
     return measurements

@@ -13,10 +13,9 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.backend.states import RigState
-from graphvio.copying import put
-from graphvio.events import Prediction
 from graphvio.geometry import se3_compose, se3_exp, so3_exp
-from graphvio.kernels import kernel
+from graphvio.kernels import kernel, put
+from graphvio.measurements.estimate import Prediction
 
 _LONGEST_BLIND_NS = 5_000_000_000  # without a frameset
 

@@ -10,8 +10,8 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.backend.factors import r, x
 from graphvio.backend.noise import gaussian, own_covariance
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_adjoint, se3_inverse
+from graphvio.measurements.motion import RelativeMotion
 
 
 class Holder(Protocol):

@@ -24,16 +24,17 @@ from graphvio.backend.factors import (
     v,
     x,
 )
-from graphvio.backend.gating import Verdict, excess, gate, judged, relative_covariance
-from graphvio.backend.inertial import ImuSpan
+from graphvio.backend.gating import excess, gate, judged, relative_covariance
 from graphvio.backend.noise import gaussian, robust
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.reference_views import ReferenceViews
 from graphvio.backend.states import RigState, StartUncertainty, StateCovariance
 from graphvio.backend.window import SOLVER_ERRORS, Window
-from graphvio.config_stages import SmootherConfig
-from graphvio.frontend.motion import RelativeMotion
+from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from graphvio.measurements.gate_result import GateResult
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Imu
 
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
@@ -84,19 +85,19 @@ class Smoother:
         for factor in first_state(k, state, uncertainty, self.has_imu):
             self._window.add(factor)
 
-    def extend(self, stamp_ns: int, span: ImuSpan | None) -> RigState:
-        """Predict the next state and append it; without a span of the IMU, by constant velocity."""
+    def extend(self, stamp_ns: int, interval: ImuInterval | None) -> RigState:
+        """Predict the next state and append it; without an interval of the IMU, by constant velocity."""
         i = self._index_of[self.latest_ns]
         dt = (stamp_ns - self.latest_ns) * 1e-9
         before = self.state()
-        if span is None or self._params is None:
+        if interval is None or self._params is None:
             motion = se3_exp(self._previous_motion * dt)
             state = RigState(before.nav_T_body @ motion, before.velocity_nav, before.gyro_bias, before.accel_bias)
             j = self._append(stamp_ns, state)
             self._link_by_constant_velocity(i, j, motion, dt)
             return state
         bias = gtsam.imuBias.ConstantBias(before.accel_bias, before.gyro_bias)
-        measurements = preintegrate(span, self._params, bias)
+        measurements = preintegrate(interval, self._params, bias)
         predicted = measurements.predict(gtsam.NavState(gtsam.Pose3(before.nav_T_body), before.velocity_nav), bias)
         state = RigState(
             predicted.pose().matrix(), np.asarray(predicted.velocity()), before.gyro_bias, before.accel_bias
@@ -158,7 +159,7 @@ class Smoother:
         relative = se3_inverse(self.pose(stamp_ns)) @ self.pose(self.latest_ns)
         return relative_covariance(relative, self._window.joint_covariance([x(i), x(j)]))
 
-    def test(self, motion: RelativeMotion) -> Verdict:
+    def test(self, motion: RelativeMotion) -> GateResult:
         """Chi-square test of a motion that ends in the newest state, against the window's prediction."""
         newest = x(self._index_of[motion.stamp_ns])
         reference, covariance = self._views.seen(self._index_of[motion.reference_stamp_ns], motion)
@@ -172,7 +173,7 @@ class Smoother:
             self._config.gate_probability,
         )
 
-    def test_rest(self) -> Verdict:
+    def test_rest(self) -> GateResult:
         """Chi-square test of a velocity of zero."""
         k = self._index_of[self.latest_ns]
         covariance = self._window.joint_covariance([v(k)]) + rest_noise().covariance()
@@ -299,7 +300,7 @@ class Smoother:
                 self._window.add(factor)
 
     def _followed(self, keep: frozenset[int]) -> list[int]:
-        """Variables that the next motion and the next span of the IMU will be tied to, or that are asked for."""
+        """Variables that the next motion and the next interval of the IMU will be tied to, or that are asked for."""
         stamps = sorted(keep & self._index_of.keys() - {self.latest_ns})
         keys = [key for stamp in stamps for key in self._views.keys(self._index_of[stamp])]
         newest = self._index_of[self.latest_ns]

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.initialisation import InitialAttitude, initial_attitude, level
 from graphvio.backend.states import RigState, StartUncertainty, as_origin, origin_covariance
-from graphvio.config_stages import InitialisationConfig
-from graphvio.frontend.motion import RelativeMotion
+from graphvio.config.stages import InitialisationConfig
 from graphvio.geometry import se3, se3_inverse, se3_log
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Rig
 
 _UNKNOWN_SPEED_SIGMA = 30.0  # without an IMU the first motion is believed whatever it is, on foot or on the road
@@ -47,7 +47,7 @@ class Start:
 
 
 def first_start(
-    stamp_ns: int, position: Float, found: tuple[ImuSpan, float] | None, rig: Rig, config: InitialisationConfig
+    stamp_ns: int, position: Float, found: tuple[ImuInterval, float] | None, rig: Rig, config: InitialisationConfig
 ) -> Start:
     """A start at a position (3,) in nav, with the attitude that the IMU tells.
 

@@ -13,12 +13,11 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.gating import judged
-from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.noise import own_covariance
-from graphvio.copying import put
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import so3_exp, so3_log
-from graphvio.kernels import kernel
+from graphvio.kernels import kernel, put
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Imu
 
 _START_SIGMA_S = 0.01
@@ -57,7 +56,7 @@ class TimeOffsetFilter:
         imu_between: the IMU between two framesets' stamps by the offset in use, or None where it is not known.
     """
 
-    def __init__(self, imu: Imu, noise_scale: float, imu_between: Callable[[int, int], ImuSpan | None]) -> None:
+    def __init__(self, imu: Imu, noise_scale: float, imu_between: Callable[[int, int], ImuInterval | None]) -> None:
         self._gyro_variance = (noise_scale * imu.gyro_noise_density) ** 2
         self._walk_variance = np.array([_WALK_S**2, *3 * [(noise_scale * imu.gyro_random_walk) ** 2]])
         self._imu_between = imu_between
@@ -86,9 +85,9 @@ class TimeOffsetFilter:
         self._walk(motion.stamp_ns)
         for error_s in (float(self._mean[0]), 0.0):  # where it is believed to be, if the samples there have come
             shift_ns = round(error_s * 1e9)
-            span = self._imu_between(start_ns + shift_ns, motion.stamp_ns + shift_ns)
-            if span is not None:
-                self._measure(*_rotation_between(start, motion), span, error_s)
+            interval = self._imu_between(start_ns + shift_ns, motion.stamp_ns + shift_ns)
+            if interval is not None:
+                self._measure(*_rotation_between(start, motion), interval, error_s)
                 return
 
     def corrected(self) -> float:
@@ -103,16 +102,16 @@ class TimeOffsetFilter:
             self._covariance += np.diag(seconds * self._walk_variance)
         self._newest_ns = stamp_ns
 
-    def _measure(self, start_R_end: Float, covariance: Float, span: ImuSpan, error_s: float) -> None:
+    def _measure(self, start_R_end: Float, covariance: Float, interval: ImuInterval, error_s: float) -> None:
         """A rotation (3, 3) by vision, its covariance (3, 3) in the frame at its end, the IMU for some error."""
-        by_gyro, by_bias = integrated_rates(span.steps_s, span.angular_velocity - self._mean[1:])
+        by_gyro, by_bias = integrated_rates(interval.steps_s, interval.angular_velocity - self._mean[1:])
         residual = so3_log(np.ascontiguousarray(by_gyro.T @ start_R_end))
-        rates = span.angular_velocity[[0, -1]] - self._mean[1:]
+        rates = interval.angular_velocity[[0, -1]] - self._mean[1:]
         by_offset = rates[1] - by_gyro.T @ rates[0]
         jacobian = np.hstack([by_offset[:, None], by_bias])
         # The rates are not those of the true instants: they change with the angular acceleration.
         change = _ANGULAR_ACCEL_RAD_S2 * self._covariance[0, 0]
-        covariance = covariance + (span.steps_s.sum() * self._gyro_variance + change**2) * np.eye(3)
+        covariance = covariance + (interval.steps_s.sum() * self._gyro_variance + change**2) * np.eye(3)
         innovation = residual - by_offset * (self._mean[0] - error_s)
         spread = covariance + jacobian @ self._covariance @ jacobian.T
         if not judged(innovation, spread, _GATE_PROBABILITY).accepted:

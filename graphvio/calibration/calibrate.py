@@ -12,16 +12,16 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.calibration.camera_motions import CameraMotions
 from graphvio.calibration.imu_alignment import ImuAlignment, align
+from graphvio.calibration.intervals import Segments, all_segments
 from graphvio.calibration.pair_calibration import PairCalibration, calibrate_pair
 from graphvio.calibration.result import Calibration, Clock, rig_warnings
 from graphvio.calibration.scale import ScaleMode
 from graphvio.calibration.separate_motions import SeparateMotions
 from graphvio.calibration.several import pairwise, place_all
-from graphvio.calibration.spans import Stretches, all_stretches
 from graphvio.calibration.trajectory_motions import TwoTrajectories, aligned, of_all
 from graphvio.config import Config
 from graphvio.errors import CalibrationError
-from graphvio.events import FrameSet, ImuSample
+from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.rig import Rig
 from graphvio.sources import Source, open_source
 from graphvio.trajectory import Trajectory
@@ -66,12 +66,12 @@ def calibrate_pairs(
     gyro: list[Float] = []
     number = 0
     try:
-        for event in opened:
-            if isinstance(event, ImuSample):
-                stamps_ns.append(event.stamp_ns)
-                gyro.append(event.angular_velocity)
-            elif isinstance(event, FrameSet):
-                separate.add(event)
+        for measurement in opened:
+            if isinstance(measurement, ImuSample):
+                stamps_ns.append(measurement.stamp_ns)
+                gyro.append(measurement.angular_velocity)
+            elif isinstance(measurement, FrameSet):
+                separate.add(measurement)
                 number += 1
                 if on_frameset is not None and on_frameset(number, separate):
                     break
@@ -84,14 +84,14 @@ def calibrate_pairs(
                 f"{name} told no motion at all in {number} framesets: does it see texture, are its left and right "
                 "images in this order and not another pair's, and is its own calibration right?"
             )
-    stretches = stretches_of_motions(motions)
+    segments = segments_of_motions(motions)
 
     def calibrate(one: int, other: int, mode: ScaleMode) -> PairCalibration:
-        return calibrate_pair(stretches.of_both(one, other), seed, scale_mode=mode)
+        return calibrate_pair(segments.of_both(one, other), seed, scale_mode=mode)
 
     found, missing = pairwise(names, calibrate, scale_mode)
-    places = place_all(found, names, stretches)
-    imu, unchecked = _imu(rig, stretches, np.array(stamps_ns, dtype=np.int64), np.array(gyro).reshape(-1, 3))
+    places = place_all(found, names, segments)
+    imu, unchecked = _imu(rig, segments, np.array(stamps_ns, dtype=np.int64), np.array(gyro).reshape(-1, 3))
     made = Calibration(names, places, rig, imu)
     return replace(made, warnings=(*places.warnings, *missing, *rig_warnings(made), *unchecked))
 
@@ -132,7 +132,7 @@ def calibrate_trajectories(
         if (one, other) not in two:
             two[one, other] = aligned(trajectories[one], trajectories[other], same_clock, seed)
         both = two[one, other]
-        return calibrate_pair(both.stretches, seed, further=both.further, scale_mode=mode, seen_from=_EXACT)
+        return calibrate_pair(both.segments, seed, further=both.further, scale_mode=mode, seen_from=_EXACT)
 
     found, missing = pairwise(names, calibrate, scale_mode)
     places = place_all(found, names, of_all(trajectories, {each: two[each] for each in found}), _EXACT)
@@ -146,19 +146,19 @@ def calibrate_trajectories(
     return Calibration(tuple(names), places, clocks=clocks, warnings=(*places.warnings, *missing, *drifts))
 
 
-def stretches_of_motions(motions: Sequence[CameraMotions]) -> Stretches:
-    """Stretches between the first camera's instants, of all cameras."""
-    return all_stretches(motions[0].stamps_ns.tolist(), [each.between for each in motions])
+def segments_of_motions(motions: Sequence[CameraMotions]) -> Segments:
+    """Segments between the first camera's instants, of all cameras."""
+    return all_segments(motions[0].stamps_ns.tolist(), [each.between for each in motions])
 
 
-def _imu(rig: Rig, stretches: Stretches, stamps_ns: Int, gyro: Float) -> tuple[dict[int, ImuAlignment], list[str]]:
+def _imu(rig: Rig, segments: Segments, stamps_ns: Int, gyro: Float) -> tuple[dict[int, ImuAlignment], list[str]]:
     """All left cameras against the IMU, and why some could not be compared."""
     if rig.imu is None or not len(stamps_ns):
         return {}, []
     found, missing = {}, []
     for j, pair in enumerate(rig.pairs):
         try:
-            found[j] = align(stretches, j, stamps_ns, gyro, rig.imu, pair.left.body_T_cam[:3, :3])
+            found[j] = align(segments, j, stamps_ns, gyro, rig.imu, pair.left.body_T_cam[:3, :3])
         except CalibrationError as error:
             missing.append(f"{pair.name}: {error}")
     return found, missing

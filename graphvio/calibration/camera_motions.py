@@ -9,8 +9,8 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.backend.noise import own_covariance
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from graphvio.measurements.motion import RelativeMotion
 
 _LONGEST_NS = 150_000_000  # from one instant to the next, over which a motion is interpolated
 _INTERPOLATION_SIGMA = 5e-5  # radians and metres, over 50 ms; a cubic's error grows with the fourth power

@@ -13,9 +13,8 @@ from scipy.stats import chi2
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.calibration.pose_pairs import PosePairs
-from graphvio.copying import put
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log, se3_right_jacobian_inverse
-from graphvio.kernels import kernel
+from graphvio.kernels import kernel, put
 
 _PROBABILITY = 0.999  # of an honest pose pair, to be within what is no outlier
 LIMIT = float(chi2.ppf(_PROBABILITY, 6))

@@ -18,7 +18,7 @@ ENOUGH_DEG, ENOUGH_M, ENOUGH_MOTIONS = 0.05, 2e-3, 40
 """One standard deviation in the direction that is known least with which a recording is long enough, and how many
 motions, each of a third of a second, there must be: from fewer, errors that last cannot be told from others."""
 
-_STRETCH_NS = 350_000_000
+_SEGMENT_NS = 350_000_000
 _BEGINNING = "turn the rig about two axes, one after the other, by 30 degrees and more, while you walk"
 
 
@@ -80,12 +80,12 @@ class Guide:
         return max(advice, key=lambda each: (bool(each.missing), each.translation_sigma_m, each.rotation_sigma_deg))
 
     def _take(self, motions: Sequence[CameraMotions]) -> None:
-        """Stretches of some tenths of a second, one after the other, as they come in."""
+        """Segments of some tenths of a second, one after the other, as they come in."""
         stamps = motions[0].stamps_ns
         if self._until_ns is None and len(stamps):
             self._until_ns = int(stamps[0])
         while self._until_ns is not None:
-            index = int(np.searchsorted(stamps, self._until_ns + _STRETCH_NS))
+            index = int(np.searchsorted(stamps, self._until_ns + _SEGMENT_NS))
             if index >= len(stamps):
                 return
             start_ns, end_ns = self._until_ns, int(stamps[index])

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from graphvio.arrays import Float, Int
 from graphvio.calibration import paper_method
-from graphvio.calibration.spans import Stretches, of_one_length
+from graphvio.calibration.intervals import Segments, of_one_length
 from graphvio.errors import CalibrationError
 from graphvio.geometry import skew, so3_exp, so3_log
 from graphvio.kernels import kernel
@@ -46,7 +46,7 @@ class ImuAlignment:
         time_offset_sigma_s: of it.
         rig_time_offset_s: what the rig says of it.
         gyro_bias: (3,) rad/s.
-        stretches: number of motions that agree.
+        segments: number of motions that agree.
     """
 
     body_R_left: Float
@@ -56,7 +56,7 @@ class ImuAlignment:
     time_offset_sigma_s: float
     rig_time_offset_s: float
     gyro_bias: Float
-    stretches: int
+    segments: int
 
     @property
     def is_turned(self) -> bool:
@@ -85,11 +85,11 @@ class ImuAlignment:
         return told
 
 
-def align(stretches: Stretches, camera: int, stamps_ns: Int, gyro: Float, imu: Imu, body_R_left: Float) -> ImuAlignment:
+def align(segments: Segments, camera: int, stamps_ns: Int, gyro: Float, imu: Imu, body_R_left: Float) -> ImuAlignment:
     """Find rotation and time offset of one camera.
 
     Args:
-        stretches: of all cameras.
+        segments: of all cameras.
         camera: which of them.
         stamps_ns: (S,) of the gyro, increasing.
         gyro: (S, 3) rad/s in body.
@@ -99,7 +99,7 @@ def align(stretches: Stretches, camera: int, stamps_ns: Int, gyro: Float, imu: I
     Raises:
         CalibrationError: if gyro and vision do not overlap in time, or the rig hardly turned.
     """
-    of_camera = stretches.chosen(stretches.known[:, camera])
+    of_camera = segments.chosen(segments.known[:, camera])
     chosen = of_camera.chosen(of_one_length(of_camera))
     turned = _Turned(chosen, camera, stamps_ns, gyro, imu)
     if len(turned.turns) < _FEWEST:
@@ -123,7 +123,7 @@ def align(stretches: Stretches, camera: int, stamps_ns: Int, gyro: Float, imu: I
         time_offset_sigma_s=float(np.hypot(np.sqrt(covariance[6, 6]), _FLOOR_S)),
         rig_time_offset_s=imu.time_offset_s,
         gyro_bias=found.bias,
-        stretches=found.agreeing,
+        segments=found.agreeing,
     )
 
 
@@ -140,17 +140,17 @@ class _Found:
 class _Turned:
     """Rotations of a camera, and of body as the gyro has them over the same time."""
 
-    def __init__(self, stretches: Stretches, camera: int, stamps_ns: Int, gyro: Float, imu: Imu) -> None:
+    def __init__(self, segments: Segments, camera: int, stamps_ns: Int, gyro: Float, imu: Imu) -> None:
         self._origin_ns = int(stamps_ns[0])
         self._times_s = (stamps_ns - self._origin_ns) / _NS_PER_S
         self._gyro = np.ascontiguousarray(gyro)
         self._gyro_variance = imu.gyro_noise_density**2
         margin_s = abs(imu.time_offset_s) + _WIDEST_S
-        start, end = ((each - self._origin_ns) / _NS_PER_S for each in (stretches.start_ns, stretches.end_ns))
+        start, end = ((each - self._origin_ns) / _NS_PER_S for each in (segments.start_ns, segments.end_ns))
         inside = (start > margin_s) & (end < self._times_s[-1] - margin_s)
         self._start_s, self._end_s = start[inside], end[inside]
-        self.turns = np.ascontiguousarray(stretches.motions[inside, camera, :3, :3])
-        self._covariances = stretches.covariances[inside, camera, :3, :3]
+        self.turns = np.ascontiguousarray(segments.motions[inside, camera, :3, :3])
+        self._covariances = segments.covariances[inside, camera, :3, :3]
 
     @property
     def is_about_two_axes(self) -> bool:

@@ -1,6 +1,6 @@
 """All pairs at once: one graph, whose relative poses close every loop.
 
-For each stretch of time the first camera's true motion is an unknown, of which every camera's own motion is a
+For each segment of time the first camera's true motion is an unknown, of which every camera's own motion is a
 measurement through that camera's place on the rig. With two cameras this is the graph of `calibration.graph`; with
 more, no motion's noise is counted twice, as it would be by an average of results for two at a time.
 """
@@ -18,8 +18,8 @@ from graphvio.arrays import Bool, Float
 from graphvio.backend.noise import gaussian
 from graphvio.calibration.consistency import LIMIT, error_covariance, error_of
 from graphvio.calibration.graph import holding
+from graphvio.calibration.intervals import Segments
 from graphvio.calibration.pose_pairs import FEWEST
-from graphvio.calibration.spans import Stretches
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_right_jacobian_inverse
 from graphvio.kernels import kernel
@@ -47,11 +47,11 @@ class JointSolution:
         return np.asarray(self.left_T_left1[other] @ se3_inverse(np.ascontiguousarray(self.left_T_left1[one])))
 
 
-def solve(stretches: Stretches, start: Float, held: Sequence[Float]) -> JointSolution:
+def solve(segments: Segments, start: Float, held: Sequence[Float]) -> JointSolution:
     """The most likely places of all cameras.
 
     Args:
-        stretches: N that do not overlap, of J cameras.
+        segments: N that do not overlap, of J cameras.
         start: ``left_T_left1`` (J, 4, 4).
         held: for each camera but the first, directions (K, 6) in which the start is kept.
 
@@ -59,9 +59,9 @@ def solve(stretches: Stretches, start: Float, held: Sequence[Float]) -> JointSol
         CalibrationError: if a camera agrees with the others in fewer than three motions.
     """
     left_T_left1 = np.array(start)
-    cameras = range(1, stretches.cameras)
+    cameras = range(1, segments.cameras)
     for _ in range(_ROUNDS):
-        used = _agreeing(stretches, left_T_left1)
+        used = _agreeing(segments, left_T_left1)
         if used[:, 1:].sum(axis=0).min() < FEWEST:
             worst = int(np.argmin(used[:, 1:].sum(axis=0))) + 1
             raise CalibrationError(f"camera {worst} agrees with the others in fewer than {FEWEST} motions")
@@ -73,9 +73,9 @@ def solve(stretches: Stretches, start: Float, held: Sequence[Float]) -> JointSol
         for k in np.flatnonzero(used.sum(axis=1) > 1).tolist():
             j = int(np.argmax(used[k]))  # the first that is used
             there = left_T_left1[j]
-            values.insert(_motion(k), gtsam.Pose3(se3_inverse(there) @ stretches.motions[k, j] @ there))
+            values.insert(_motion(k), gtsam.Pose3(se3_inverse(there) @ segments.motions[k, j] @ there))
             for j in np.flatnonzero(used[k]).tolist():
-                graph.push_back(_factor(k, j, stretches.motions[k, j], stretches.covariances[k, j]))
+                graph.push_back(_factor(k, j, segments.motions[k, j], segments.covariances[k, j]))
         values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
         for j in cameras:
             left_T_left1[j] = values.atPose3(_place(j)).matrix()
@@ -88,15 +88,15 @@ def _place(camera: int) -> int:
     return int(gtsam.symbol("X", camera))
 
 
-def _motion(stretch: int) -> int:
-    return int(gtsam.symbol("M", stretch))
+def _motion(segment: int) -> int:
+    return int(gtsam.symbol("M", segment))
 
 
-def _factor(stretch: int, camera: int, measured: Float, covariance: Float) -> gtsam.NonlinearFactor:
+def _factor(segment: int, camera: int, measured: Float, covariance: Float) -> gtsam.NonlinearFactor:
     """A camera's motion as a measurement of the first one's, which alone is known for the first itself."""
     noise, measured = gaussian(covariance), np.ascontiguousarray(measured)
     if camera == 0:
-        return gtsam.PriorFactorPose3(_motion(stretch), gtsam.Pose3(measured), noise)
+        return gtsam.PriorFactorPose3(_motion(segment), gtsam.Pose3(measured), noise)
 
     def error(_: Any, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
         place, motion = (np.ascontiguousarray(values.atPose3(key).matrix()) for key in keys)
@@ -106,23 +106,23 @@ def _factor(stretch: int, camera: int, measured: Float, covariance: Float) -> gt
             jacobians[1] = np.asfortranarray(se3_right_jacobian_inverse(off) @ se3_adjoint(place))
         return off
 
-    keys = [_place(camera), _motion(stretch)]
+    keys = [_place(camera), _motion(segment)]
     return gtsam.CustomFactor(noise, keys, error)
 
 
-def _agreeing(stretches: Stretches, left_T_left1: Float) -> Bool:
-    """(N, J) motions that agree with at least half of the others over the same stretch."""
-    agree = _agreements(stretches.motions, stretches.covariances, stretches.known, left_T_left1, LIMIT)
-    others = stretches.known.sum(axis=1, keepdims=True) - 1
-    return np.asarray(stretches.known & (agree > 0) & (agree >= _AGREEING * others))
+def _agreeing(segments: Segments, left_T_left1: Float) -> Bool:
+    """(N, J) motions that agree with at least half of the others over the same segment."""
+    agree = _agreements(segments.motions, segments.covariances, segments.known, left_T_left1, LIMIT)
+    others = segments.known.sum(axis=1, keepdims=True) - 1
+    return np.asarray(segments.known & (agree > 0) & (agree >= _AGREEING * others))
 
 
 @kernel
 def _agreements(motions: Float, covariances: Float, known: Bool, left_T_left1: Float, limit: float) -> Float:
     """(N, J) with how many others each motion agrees."""
-    stretches, cameras = known.shape
-    agree = np.zeros((stretches, cameras))
-    for k in range(stretches):
+    segments, cameras = known.shape
+    agree = np.zeros((segments, cameras))
+    for k in range(segments):
         for i in range(cameras):
             for j in range(i + 1, cameras):
                 if not (known[k, i] and known[k, j]):

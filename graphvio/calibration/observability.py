@@ -139,7 +139,7 @@ def _missing(undetermined: Float, axes: Float, turning_rad: Float) -> list[str]:
 
 
 def _directions(parts: Float) -> Float:
-    """An orthonormal basis (K, 3) of what vectors (N, 3) span, but for what is small."""
+    """An orthonormal basis (K, 3) of what vectors (N, 3) interval, but for what is small."""
     _, sizes, rows = np.linalg.svd(parts)
     return np.asarray(rows[: int(np.sum(sizes > 0.3))])
 

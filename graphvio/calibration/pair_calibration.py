@@ -13,10 +13,10 @@ from graphvio.calibration.comparison import Comparison, compare
 from graphvio.calibration.consistency import LIMIT, Further, squared_distances, whitened
 from graphvio.calibration.dispersion import dispersion
 from graphvio.calibration.graph import GraphSolution
+from graphvio.calibration.intervals import Segments, most_telling, of_one_length, worth
 from graphvio.calibration.observability import Observability
 from graphvio.calibration.pose_pairs import PosePairs
 from graphvio.calibration.scale import ScaleCheck, ScaleMode
-from graphvio.calibration.spans import Stretches, most_telling, of_one_length, worth
 from graphvio.calibration.validation import Grown, Halves, alignment_lengths, growth, halves, resampled
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 
@@ -155,7 +155,7 @@ class PairCalibration:
 
 
 def calibrate_pair(
-    stretches: Stretches,
+    segments: Segments,
     seed: int = 0,
     *,
     further: Further | None = None,
@@ -165,9 +165,9 @@ def calibrate_pair(
     """Calibrate two pairs.
 
     Args:
-        stretches: of two cameras, all that may be chosen from.
+        segments: of two cameras, all that may be chosen from.
         seed: of the random triples, and of the bootstrap.
-        further: unknowns besides, with derivatives for all stretches.
+        further: unknowns besides, with derivatives for all segments.
         scale_mode: whether the second camera's lengths may be wrong by a factor, an unknown then: ``fixed``,
             ``estimate``, or ``auto`` where they are beyond doubt.
         seen_from: covariance (6, 6) of where each camera is, as its images have it.
@@ -176,12 +176,12 @@ def calibrate_pair(
         CalibrationError: if there are fewer than three pose pairs, the rig hardly turned, or no relative pose explains
             the motions; the message says what to do.
     """
-    rows = np.array(of_one_length(stretches), dtype=np.int64)
-    first = stretches.pairs.chosen(rows)
+    rows = np.array(of_one_length(segments), dtype=np.int64)
+    first = segments.pairs.chosen(rows)
     begun = graph.solve(first, paper_method.calibrate(first, seed).left2_T_left1, _of(further, rows))
-    worths = worth(stretches.pairs, begun.left2_T_left1, begun.covariance)
-    rows = np.array(most_telling(stretches, worths), dtype=np.int64)
-    pairs, further = stretches.pairs.chosen(rows), _of(further, rows)
+    worths = worth(segments.pairs, begun.left2_T_left1, begun.covariance)
+    rows = np.array(most_telling(segments, worths), dtype=np.int64)
+    pairs, further = segments.pairs.chosen(rows), _of(further, rows)
     checked = _scale(pairs, begun.left2_T_left1, further)
     estimate_scale = scale_mode == "estimate" or (scale_mode == "auto" and checked.is_wrong)
     if estimate_scale:
@@ -191,7 +191,7 @@ def calibrate_pair(
     found = graph.solve(pairs, paper.left2_T_left1, with_scale)
     factor = _dispersion(pairs, found, with_scale)
     floor = allowance(found.left2_T_left1, seen_from)
-    frames = stretches.pairs.chosen(stretches.last - stretches.first == 1)
+    frames = segments.pairs.chosen(segments.last - segments.first == 1)
     return PairCalibration(
         solution=found,
         pairs=pairs,

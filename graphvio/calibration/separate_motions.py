@@ -6,10 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 from graphvio.calibration.camera_motions import CameraMotions
 from graphvio.config import Config
-from graphvio.events import FrameSet, Quality
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.frontend.steady_motion import SteadyMotion
 from graphvio.frontend.visual import VisualFrontend
+from graphvio.measurements.motion import Quality, RelativeMotion
+from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
 
 

@@ -11,9 +11,9 @@ from scipy.stats import chi2
 
 from graphvio.arrays import Float
 from graphvio.calibration import joint
+from graphvio.calibration.intervals import Segments, most_telling, worth
 from graphvio.calibration.pair_calibration import SEEN_FROM, PairCalibration, size_in_words
 from graphvio.calibration.scale import ScaleMode
-from graphvio.calibration.spans import Stretches, most_telling, worth
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 
@@ -106,7 +106,7 @@ def pairwise(
 def place_all(
     found: Mapping[tuple[int, int], PairCalibration],
     names: Sequence[str],
-    stretches: Stretches,
+    segments: Segments,
     seen_from: Float = SEEN_FROM,
 ) -> Places:
     """Places that fit all motions at once.
@@ -114,7 +114,7 @@ def place_all(
     Args:
         found: results for two at a time, among them those of the first camera and each other one.
         names: (J) of the cameras.
-        stretches: all that may be chosen from, of J cameras.
+        segments: all that may be chosen from, of J cameras.
         seen_from: covariance (6, 6) of where each camera is, as its images have it.
 
     Raises:
@@ -131,8 +131,8 @@ def place_all(
     start = np.array([np.eye(4), *(found[0, j].left2_T_left1 for j in range(1, count))])
     if count == 2:
         return Places(start, found[0, 1].covariance, found, (), {}, tuple(warnings))
-    stretches = _rescaled(stretches, found)
-    chosen = stretches.chosen(most_telling(stretches, _worths(stretches, found, count)))
+    segments = _rescaled(segments, found)
+    chosen = segments.chosen(most_telling(segments, _worths(segments, found, count)))
     held = [found[0, j].observability.undetermined for j in range(1, count)]
     solution = joint.solve(chosen, start, held)
     covariance = max(each.dispersion for each in found.values()) * solution.covariance
@@ -152,22 +152,22 @@ def place_all(
     return Places(solution.left_T_left1, covariance, found, loops, distances, tuple(warnings))
 
 
-def _rescaled(stretches: Stretches, found: Mapping[tuple[int, int], PairCalibration]) -> Stretches:
-    """Stretches on which all cameras measure lengths as the first does, where that was an unknown."""
-    motions = stretches.motions.copy()
-    for j in range(1, stretches.cameras):
+def _rescaled(segments: Segments, found: Mapping[tuple[int, int], PairCalibration]) -> Segments:
+    """Segments on which all cameras measure lengths as the first does, where that was an unknown."""
+    motions = segments.motions.copy()
+    for j in range(1, segments.cameras):
         if found[0, j].scale_estimated:
             motions[:, j, :3, 3] *= np.exp(-found[0, j].scale.log_ratio)
-    return replace(stretches, motions=motions)
+    return replace(segments, motions=motions)
 
 
-def _worths(stretches: Stretches, found: Mapping[tuple[int, int], PairCalibration], count: int) -> Float:
-    """What stretches (N,) tell of all places, to first order."""
-    worths = np.zeros(len(stretches))
+def _worths(segments: Segments, found: Mapping[tuple[int, int], PairCalibration], count: int) -> Float:
+    """What segments (N,) tell of all places, to first order."""
+    worths = np.zeros(len(segments))
     for j in range(1, count):
-        both = stretches.known[:, 0] & stretches.known[:, j]
+        both = segments.known[:, 0] & segments.known[:, j]
         each = found[0, j]
-        worths[both] += worth(stretches.of_both(0, j).pairs, each.left2_T_left1, each.covariance)
+        worths[both] += worth(segments.of_both(0, j).pairs, each.left2_T_left1, each.covariance)
     return worths
 
 

@@ -1,7 +1,7 @@
 """Motions of two cameras from trajectories that others' software made, on clocks of their own.
 
 Such trajectories carry no covariance: the noise of their motions is what the residuals of a first solution show, for
-each length of stretch by itself.
+each length of segment by itself.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from graphvio.calibration import graph, paper_method
 from graphvio.calibration.clocks import find_offset
 from graphvio.calibration.consistency import LIMIT, Further, errors_of, whitened
 from graphvio.calibration.dispersion import dispersion
+from graphvio.calibration.intervals import LENGTHS_S, Segments, ends_of, of_one_length
 from graphvio.calibration.pose_pairs import inverses
-from graphvio.calibration.spans import LENGTHS_S, Stretches, ends_of, of_one_length
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_adjoint, se3_inverse
 from graphvio.trajectory import Trajectory
@@ -79,8 +79,8 @@ def first_relation(one: Trajectory, other: Trajectory, same_clock: bool) -> Cloc
     return ClockRelation(offset_ns, 0.0, (begin + end) // 2)
 
 
-def stretches_of(trajectories: Sequence[Trajectory], clocks: Sequence[ClockRelation]) -> Stretches:
-    """Stretches of J trajectories, with covariances that are all the same.
+def segments_of(trajectories: Sequence[Trajectory], clocks: Sequence[ClockRelation]) -> Segments:
+    """Segments of J trajectories, with covariances that are all the same.
 
     Args:
         trajectories: of the cameras.
@@ -95,20 +95,20 @@ def stretches_of(trajectories: Sequence[Trajectory], clocks: Sequence[ClockRelat
     known = np.stack([there[first] & there[last] for _, there in sampled], axis=1)
     rows = known[:, 0] & (known.sum(axis=1) > 1)
     covariances = np.broadcast_to(np.diag(0.5 * _FIRST_SIGMAS**2), (*known.shape, 6, 6)).copy()
-    return Stretches(stamps[first], stamps[last], first, last, motions, covariances, known).chosen(rows)
+    return Segments(stamps[first], stamps[last], first, last, motions, covariances, known).chosen(rows)
 
 
 @dataclass(frozen=True, eq=False)
 class TwoTrajectories:
-    """Stretches of two trajectories, ready for calibration.
+    """Segments of two trajectories, ready for calibration.
 
     Attributes:
-        stretches: with covariances that the residuals show.
+        segments: with covariances that the residuals show.
         clock: as refined with the relative pose.
         further: its offset, seconds, and drift as unknowns, around this relation.
     """
 
-    stretches: Stretches
+    segments: Segments
     clock: ClockRelation
     further: Further | None
 
@@ -126,90 +126,90 @@ def aligned(one: Trajectory, other: Trajectory, same_clock: bool = False, seed: 
         CalibrationError: if no offset makes them turn alike, or no relative pose explains their motions.
     """
     clock = first_relation(one, other, same_clock)
-    stretches = stretches_of([one, other], [clock])
-    rows = np.array(of_one_length(stretches), dtype=np.int64)
-    pose = paper_method.calibrate(stretches.pairs.chosen(rows), seed).left2_T_left1
+    segments = segments_of([one, other], [clock])
+    rows = np.array(of_one_length(segments), dtype=np.int64)
+    pose = paper_method.calibrate(segments.pairs.chosen(rows), seed).left2_T_left1
     for _ in range(_ROUNDS):
-        stretches = _with_noise(stretches, pose)
-        further = None if same_clock else _clock_unknowns(one, other, clock, stretches, pose)
-        found = graph.solve(stretches.pairs.chosen(rows), pose, None if further is None else further.chosen(rows))
+        segments = _with_noise(segments, pose)
+        further = None if same_clock else _clock_unknowns(one, other, clock, segments, pose)
+        found = graph.solve(segments.pairs.chosen(rows), pose, None if further is None else further.chosen(rows))
         pose = found.left2_T_left1
         if further is not None:
             clock = clock.later(*found.further.tolist())
-            stretches = stretches_of([one, other], [clock])
-            rows = np.array(of_one_length(stretches), dtype=np.int64)
-    stretches = _long_enough(_with_noise(stretches, pose))
-    further = None if same_clock else _clock_unknowns(one, other, clock, stretches, pose)
-    return TwoTrajectories(stretches, clock, further)
+            segments = segments_of([one, other], [clock])
+            rows = np.array(of_one_length(segments), dtype=np.int64)
+    segments = _long_enough(_with_noise(segments, pose))
+    further = None if same_clock else _clock_unknowns(one, other, clock, segments, pose)
+    return TwoTrajectories(segments, clock, further)
 
 
-def of_all(trajectories: Sequence[Trajectory], two: Mapping[tuple[int, int], TwoTrajectories]) -> Stretches:
-    """Stretches of J trajectories, by the clock of the first and with each one's noise as the mean of what it has in
+def of_all(trajectories: Sequence[Trajectory], two: Mapping[tuple[int, int], TwoTrajectories]) -> Segments:
+    """Segments of J trajectories, by the clock of the first and with each one's noise as the mean of what it has in
     results for two at a time.
 
     Args:
         trajectories: of the cameras.
         two: (first, second) -> what was aligned; with all (0, j).
     """
-    stretches = stretches_of(trajectories, [two[0, j].clock for j in range(1, len(trajectories))])
-    length = _length_classes(stretches)
+    segments = segments_of(trajectories, [two[0, j].clock for j in range(1, len(trajectories))])
+    length = _length_classes(segments)
     noise: dict[tuple[int, int], list[Float]] = {}  # camera, length -> covariances
     for cameras, aligned_two in two.items():
-        of_two = aligned_two.stretches
+        of_two = aligned_two.segments
         classes, rows = np.unique(_length_classes(of_two), return_index=True)
         for each, row in zip(classes.tolist(), rows.tolist(), strict=True):
             for column, camera in enumerate(cameras):
                 noise.setdefault((camera, each), []).append(of_two.covariances[row, column])
     for (camera, each), told in noise.items():
-        stretches.covariances[length == each, camera] = np.mean(told, axis=0)
+        segments.covariances[length == each, camera] = np.mean(told, axis=0)
     sound = [each for each in np.unique(length).tolist() if all((j, each) in noise for j in range(len(trajectories)))]
-    return stretches.chosen(np.isin(length, sound))
+    return segments.chosen(np.isin(length, sound))
 
 
-def _long_enough(stretches: Stretches) -> Stretches:
+def _long_enough(segments: Segments) -> Segments:
     """Without lengths over which the rig turns too little against the noise.
 
     Noise in a motion's own rotation looks like turning that has no effect, and so makes the offset between the cameras
     smaller than it is, by the share of the turning's mean square that is noise.
     """
-    length = _length_classes(stretches)
+    length = _length_classes(segments)
     shares = {}
     for each in np.unique(length).tolist():
-        pairs = stretches.chosen(length == each).pairs
+        pairs = segments.chosen(length == each).pairs
         turning = np.linalg.eigvalsh(pairs.rotations_rad.T @ pairs.rotations_rad / len(pairs))
         noise = np.trace(pairs.covariance_2[:, :3, :3], axis1=1, axis2=2).mean() / 3.0
         shares[each] = noise / max(float(turning[1]), 1e-12)
     most = max(_MOST_NOISE_SHARE, min(shares.values()))
-    return stretches.chosen(np.isin(length, [each for each, share in shares.items() if share <= most]))
+    return segments.chosen(np.isin(length, [each for each, share in shares.items() if share <= most]))
 
 
-def _with_noise(stretches: Stretches, left2_T_left1: Float) -> Stretches:
-    """Stretches of two cameras, of which each has half of what the residuals of stretches of that length show."""
-    pairs = stretches.pairs
+def _with_noise(segments: Segments, left2_T_left1: Float) -> Segments:
+    """Segments of two cameras, of which each has half of what the residuals of segments of that length show."""
+    pairs = segments.pairs
     residuals = errors_of(left2_T_left1, pairs.motion_1, pairs.motion_2)
     adjoint = se3_adjoint(se3_inverse(left2_T_left1))
-    covariances = stretches.covariances.copy()
-    length = _length_classes(stretches)
+    covariances = segments.covariances.copy()
+    length = _length_classes(segments)
     for each in np.unique(length):
         of_length = length == each
         half = 0.5 * _robust_covariance(residuals[of_length])
         covariances[of_length] = np.stack([adjoint @ half @ adjoint.T, half])
-        covariances[of_length] *= _scatter(replace(stretches, covariances=covariances).chosen(of_length), left2_T_left1)
-    return replace(stretches, covariances=covariances)
+        covariances[of_length] *= _scatter(replace(segments, covariances=covariances).chosen(of_length), left2_T_left1)
+    return replace(segments, covariances=covariances)
 
 
-def _scatter(stretches: Stretches, left2_T_left1: Float) -> float:
-    """Factor on the noise of stretches of one length, as errors of an odometry last: what ten short stretches tell is
+def _scatter(segments: Segments, left2_T_left1: Float) -> float:
+    """Factor on the noise of segments of one length, as errors of an odometry last: what ten short segments tell is
     much less than ten times what one of them does."""
-    pairs = stretches.chosen(of_one_length(stretches)).pairs
+    pairs = segments.chosen(of_one_length(segments)).pairs
     errors, jacobians = whitened(pairs, left2_T_left1)
     within = np.sum(errors**2, axis=1) <= LIMIT
     return dispersion(pairs.chosen(within), errors[within], jacobians[within], np.eye(6), chance=0.5)
 
 
-def _length_classes(stretches: Stretches) -> Int:
-    """Which of `LENGTHS_S` each stretch (N,) is nearest to."""
-    lengths_s = (stretches.end_ns - stretches.start_ns) / _NS_PER_S
+def _length_classes(segments: Segments) -> Int:
+    """Which of `LENGTHS_S` each segment (N,) is nearest to."""
+    lengths_s = (segments.end_ns - segments.start_ns) / _NS_PER_S
     return np.asarray(np.argmin(np.abs(lengths_s[:, None] - np.array(LENGTHS_S)), axis=1))
 
 
@@ -222,28 +222,28 @@ def _robust_covariance(residuals: Float) -> Float:
 
 
 def _clock_unknowns(
-    one: Trajectory, other: Trajectory, clock: ClockRelation, stretches: Stretches, left2_T_left1: Float
+    one: Trajectory, other: Trajectory, clock: ClockRelation, segments: Segments, left2_T_left1: Float
 ) -> Further:
     """Offset and drift as unknowns, with derivatives by differences."""
     back, ahead = (
-        _errors(one, other, clock.later(sign * _STEP_NS / _NS_PER_S, 0.0), stretches, left2_T_left1)
+        _errors(one, other, clock.later(sign * _STEP_NS / _NS_PER_S, 0.0), segments, left2_T_left1)
         for sign in (-1.0, 1.0)
     )
     by_offset = (ahead - back) * (0.5 * _NS_PER_S / _STEP_NS)
     by_offset[~np.isfinite(by_offset).all(axis=1)] = 0.0  # at the very ends
-    since_s = (0.5 * (stretches.start_ns + stretches.end_ns) - clock.at_ns) / _NS_PER_S
+    since_s = (0.5 * (segments.start_ns + segments.end_ns) - clock.at_ns) / _NS_PER_S
     return Further(np.stack([by_offset, since_s[:, None] * by_offset], axis=2), np.array([OFFSET_SIGMA_S, DRIFT_SIGMA]))
 
 
 def _errors(
-    one: Trajectory, other: Trajectory, clock: ClockRelation, stretches: Stretches, left2_T_left1: Float
+    one: Trajectory, other: Trajectory, clock: ClockRelation, segments: Segments, left2_T_left1: Float
 ) -> Float:
-    """Errors (N, 6) of the same stretches under another relation of the clocks; NaN where one ends."""
+    """Errors (N, 6) of the same segments under another relation of the clocks; NaN where one ends."""
     stamps = _thinned(one.stamps_ns)
     poses, known = _at(other, clock.of(stamps))
-    motion_2 = inverses(poses)[stretches.first] @ poses[stretches.last]
-    errors = errors_of(left2_T_left1, stretches.pairs.motion_1, motion_2)
-    errors[~(known[stretches.first] & known[stretches.last])] = np.nan
+    motion_2 = inverses(poses)[segments.first] @ poses[segments.last]
+    errors = errors_of(left2_T_left1, segments.pairs.motion_1, motion_2)
+    errors[~(known[segments.first] & known[segments.last])] = np.nan
     return errors
 
 

@@ -61,7 +61,7 @@ def compare(
         if each.evaluation is None:
             typer.echo(f"graphvio: {each.name}: {each.why_not}", err=True)
     if plot is not None:
-        from graphvio.plotting import draw_comparison
+        from graphvio.results.plotting import draw_comparison
 
         draw_comparison(plot, {each.name: each.evaluation for each in compared if each.evaluation is not None})
     above = [each.name for each in compared if max_ate is not None and each.ate_m > max_ate]

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 from rich.text import Text
 
+from graphvio.broadcast import Subscription
 from graphvio.cli.redrawn import Redrawn
-from graphvio.events import Incident
-from graphvio.live.broadcast import Subscription
+from graphvio.measurements.events import Event
 
 if TYPE_CHECKING:
     from graphvio.live.source import DeviceHealth
@@ -28,21 +28,21 @@ class Dashboard(Redrawn):
 
     Args:
         title: of the run.
-        incidents: to be shown as they come.
+        events: to be shown as they come.
     """
 
-    def __init__(self, title: str, incidents: Subscription[Incident]) -> None:
+    def __init__(self, title: str, events: Subscription[Event]) -> None:
         super().__init__()
         self._title = title
-        self._incidents = incidents
+        self._events = events
         self._messages: list[str] = []
         self._told: dict[str, tuple[float, int]] = {}  # kind -> when it was told last, and how often it came since
 
     def draw(self, figures: Figures, devices: Sequence[DeviceHealth]) -> None:
         """Show the newest, if it is time to."""
         now = time.monotonic()
-        while (incident := self._incidents.get(0.0)) is not None:
-            self._tell(incident, now)
+        while (event := self._events.get(0.0)) is not None:
+            self._tell(event, now)
         if now < self._next_s:
             return
         if self._console.is_terminal:
@@ -52,16 +52,16 @@ class Dashboard(Redrawn):
             self._next_s = now + _PLAIN_S
             self._console.print(line_of(figures), soft_wrap=True, highlight=False)
 
-    def _tell(self, incident: Incident, now: float) -> None:
+    def _tell(self, event: Event, now: float) -> None:
         """Show a message; of those of one kind, one in a few seconds, and how many there were. Each device counts."""
-        kind = incident.detail if incident.kind.startswith("device_") else incident.kind
+        kind = event.detail if event.kind.startswith("device_") else event.kind
         last, passed_over = self._told.get(kind, (-_PLAIN_S, 0))
         if now - last < _PLAIN_S:
             self._told[kind] = last, passed_over + 1
             return
         self._told[kind] = now, 0
         more = f" (and {passed_over} more before)" if passed_over else ""
-        self._messages = [*self._messages, f"{incident.kind}: {incident.detail}{more}"][-_MESSAGES:]
+        self._messages = [*self._messages, f"{event.kind}: {event.detail}{more}"][-_MESSAGES:]
         if not self._console.is_terminal:
             self._console.print(self._messages[-1], soft_wrap=True, highlight=False, markup=False)
 

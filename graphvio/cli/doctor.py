@@ -69,8 +69,8 @@ def _table(findings: dict[str, Any]) -> Any:
 
 def examine() -> dict[str, Any]:
     """All findings, as JSON can hold them."""
-    from graphvio import __version__
     from graphvio.kernels import any_compiled_before, cache_root
+    from graphvio.version import __version__
 
     folder = cache_root()
     kernels = [file.stat().st_size for file in folder.rglob("*.nbc")]

@@ -53,7 +53,7 @@ def evaluate(
         except OSError as error:
             raise GraphvioError(f"{json_file}: cannot be written ({error.strerror}); choose another place") from None
     if plot is not None:
-        from graphvio.plotting import draw_evaluation
+        from graphvio.results.plotting import draw_evaluation
 
         draw_evaluation(plot, figures, trajectory.stem)
 

@@ -133,7 +133,7 @@ def run_live(
         until = None if duration_s is None else monotonic() + duration_s
         failure: Exception | None = None
         try:
-            with Dashboard(opened.name, running.incidents.subscribe(64)) as dashboard:
+            with Dashboard(opened.name, running.events.subscribe(64)) as dashboard:
                 while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):
                     dashboard.draw(running.status(), running.devices)
                     if started is not None:

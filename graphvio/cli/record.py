@@ -11,7 +11,7 @@ import typer
 from graphvio.cli import options
 
 if TYPE_CHECKING:
-    from graphvio.events import Event
+    from graphvio.measurements.sensors import Measurement
     from graphvio.odometry import Odometry
     from graphvio.sessions.formats import RecordingWriter
     from graphvio.sessions.writer import SessionWriter
@@ -33,7 +33,7 @@ def record(
     to_s: options.ToS = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Run the odometry and record images, IMU, rig, poses and incidents as a session (MCAP, ROS 2 messages).
+    """Run the odometry and record images, IMU, rig, poses and events as a session (MCAP, ROS 2 messages).
 
     When the disk is full recording stops, the odometry goes on, and the exit code is 3. After Ctrl-C, which ends with
     130, what was recorded until then can be read.
@@ -129,13 +129,12 @@ def _truth(opened: Source, is_whole: bool) -> Trajectory | None:
 
 
 def _write(opened: Source, truth: Trajectory | None, writer: RecordingWriter, odometry: Odometry | None) -> None:
-    """Record all events, the truth, and what an odometry makes of them; without one there is no reason to go on when
-    the disk is full."""
+    """Record measurements, truth and an odometry's results; without an odometry, stop when the disk is full."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from graphvio.cli.interrupts import HeldInterrupt, interruptible
-    from graphvio.events import FrameSet
+    from graphvio.measurements.sensors import FrameSet
     from graphvio.sessions.writer import SessionWriter
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -143,14 +142,14 @@ def _write(opened: Source, truth: Trajectory | None, writer: RecordingWriter, od
     progress = Progress(*columns, console=Console(stderr=True), transient=True)
     with interruptible(), HeldInterrupt() as held, writer, progress as bar:
         task = bar.add_task("framesets", total=opened.frameset_count)
-        for event in opened:
+        for measurement in opened:
             held.check()
-            while poses and poses[0][0] <= event.stamp_ns:
+            while poses and poses[0][0] <= measurement.stamp_ns:
                 writer.add_true_pose(*poses.popleft())
-            writer.add(event)
-            bar.advance(task, isinstance(event, FrameSet))
+            writer.add(measurement)
+            bar.advance(task, isinstance(measurement, FrameSet))
             if odometry is not None and isinstance(writer, SessionWriter):
-                _advance(odometry, event, writer)
+                _advance(odometry, measurement, writer)
             elif writer.stopped is not None:
                 break
         for stamp_ns, pose in poses:
@@ -158,17 +157,17 @@ def _write(opened: Source, truth: Trajectory | None, writer: RecordingWriter, od
         if odometry is not None and isinstance(writer, SessionWriter):
             for estimate in odometry.finish():
                 writer.add_estimate(estimate)
-        incidents = odometry.take_incidents() if odometry is not None else []
-        for incident in (*incidents, *opened.faults.incidents):
-            writer.add_incident(incident)
+        events = odometry.take_events() if odometry is not None else []
+        for event in (*events, *opened.faults.events):
+            writer.add_event(event)
 
 
-def _advance(odometry: Odometry, event: Event, writer: SessionWriter) -> None:
-    estimate = odometry.process(event)
+def _advance(odometry: Odometry, measurement: Measurement, writer: SessionWriter) -> None:
+    estimate = odometry.process(measurement)
     if estimate is not None:
         writer.add_estimate(estimate)
-    for incident in odometry.take_incidents():
-        writer.add_incident(incident)
+    for event in odometry.take_events():
+        writer.add_event(event)
 
 
 def _exit_if_stopped(writer: RecordingWriter) -> None:

@@ -185,7 +185,7 @@ def _loop_closure(aligned: Trajectory, truth: Trajectory, path_m: float) -> Loop
 
 
 def _why_not_associated(estimate: Trajectory, truth: Trajectory, associated: int, max_gap_s: float) -> str:
-    def span(trajectory: Trajectory) -> str:
+    def interval(trajectory: Trajectory) -> str:
         if not len(trajectory):
             return "no pose"
         first, last = trajectory.stamps_ns[0] / _NS_PER_S, trajectory.stamps_ns[-1] / _NS_PER_S
@@ -194,7 +194,7 @@ def _why_not_associated(estimate: Trajectory, truth: Trajectory, associated: int
     if len(estimate) < _MIN_POSES:
         return f"the estimate has {len(estimate)} poses; at least {_MIN_POSES} are needed for an alignment"
     return (
-        f"only {associated} of {len(estimate)} estimates ({span(estimate)}) have a true pose ({span(truth)}, "
+        f"only {associated} of {len(estimate)} estimates ({interval(estimate)}) have a true pose ({interval(truth)}, "
         f"at most {max_gap_s:g} s apart); at least {_MIN_POSES} are needed: check that both files are of one "
         "recording and use one clock"
     )

@@ -16,7 +16,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from graphvio import __version__
 from graphvio.config import Config
 from graphvio.errors import FleetError, TrajectoryError
 from graphvio.evaluation import evaluate
@@ -33,6 +32,7 @@ from graphvio.rig import Rig
 from graphvio.rig_files.native import to_text
 from graphvio.sources import Source, open_source
 from graphvio.trajectory import Trajectory
+from graphvio.version import __version__
 
 ODOMETRY, LOOPS, GRAPH = "odometry", "loops", "graph"
 

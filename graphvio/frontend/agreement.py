@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from graphvio.arrays import Bool
-from graphvio.config_stages import MotionConfig
+from graphvio.config.stages import MotionConfig
 from graphvio.frontend.alignment import Misalignment, combined, placed
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.ransac import search

@@ -3,8 +3,7 @@
 import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
-from graphvio.copying import put
-from graphvio.kernels import fast_kernel, kernel
+from graphvio.kernels import fast_kernel, kernel, put
 
 _HARRIS_K = 0.04
 _RADIUS = 3  # of the 7x7 window over which gradients are summed

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphvio.arrays import Image
-from graphvio.events import FrameSet
+from graphvio.measurements.sensors import FrameSet
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Image
 from graphvio.errors import RigError
-from graphvio.events import FrameSet
+from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Camera, Rig
 
 

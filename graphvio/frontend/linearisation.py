@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.copying import put
 from graphvio.frontend.blocks import LEFT_U, LEFT_V, POINTS, RIGHT_U, RIGHT_V, SEEN, Blocks, W, X, Y
 from graphvio.frontend.cost import WORST, elements
 from graphvio.frontend.observations import RigArrays
@@ -29,7 +28,7 @@ from graphvio.frontend.point_errors import (
     whiten_transposed,
     whitener_of,
 )
-from graphvio.kernels import vector_kernel
+from graphvio.kernels import put, vector_kernel
 
 _EXPANSIONS = 2
 _FARTHEST = 16.0  # squared whitened error up to which a point may follow its residual; outliers would gain leverage

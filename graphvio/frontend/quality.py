@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Bool
-from graphvio.events import Quality
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.frontend.tracks import PairFrame
 from graphvio.geometry import se3_inverse, se3_log
+from graphvio.measurements.motion import Quality, RelativeMotion
 
 _RIVAL_SHARE = 0.1  # of the best-supported side's points: from there on another side may be the right one
 _FEW_POINTS = 25  # fewer may agree by chance

@@ -3,7 +3,7 @@
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.config_stages import MotionConfig
+from graphvio.config.stages import MotionConfig
 from graphvio.frontend.cost import WORST, left_motions, score_all, squared_error_px
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.resection import resect

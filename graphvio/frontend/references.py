@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from graphvio.arrays import Int
-from graphvio.config_stages import MotionConfig
+from graphvio.config.stages import MotionConfig
 from graphvio.frontend.observations import Correspondences
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.tracks import PairFrame, common_rows

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.config_stages import MotionConfig
+from graphvio.config.stages import MotionConfig
 from graphvio.frontend.blocks import POINTS, Blocks, in_blocks, lane_by_lane, point_by_point
 from graphvio.frontend.cost import left_motions
 from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise, unexpanded

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.config_stages import MotionConfig
+from graphvio.config.stages import MotionConfig
 from graphvio.frontend.cost import robust_cost
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.ransac import search

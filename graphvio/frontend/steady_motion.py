@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_inverse
+from graphvio.measurements.motion import RelativeMotion
 
 
 class SteadyMotion:

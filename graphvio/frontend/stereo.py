@@ -11,8 +11,7 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.cameras import distort, fold_radius
-from graphvio.copying import put
-from graphvio.kernels import fast_kernel, kernel
+from graphvio.kernels import fast_kernel, kernel, put
 
 _HALF_PATCH = 5
 _HALF_COARSE_PATCH = 4

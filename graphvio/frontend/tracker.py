@@ -10,7 +10,7 @@ from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
 from graphvio.frontend.anchor import Anchor
 from graphvio.frontend.corners import find_corners, occupied_cells, thinned
-from graphvio.frontend.grain import noise_sigma
+from graphvio.frontend.image_noise import noise_sigma
 from graphvio.frontend.images import allowed_pixels
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
 from graphvio.frontend.matching import StereoMatcher

@@ -11,12 +11,10 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float
 from graphvio.config import Config
-from graphvio.events import FrameSet, PairReport, Quality
 from graphvio.frontend.agreement import Agreement, Side, agree, is_supported
 from graphvio.frontend.alignment import Misalignment, PairAlignment
 from graphvio.frontend.frozen import FrozenImages
 from graphvio.frontend.images import checked
-from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.frontend.observations import Correspondences, RigArrays, correspond
 from graphvio.frontend.quality import doubted, graded, stereo_share
 from graphvio.frontend.references import References
@@ -27,6 +25,8 @@ from graphvio.frontend.stopwatch import Stopwatch
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import PairFrame
 from graphvio.geometry import se3_adjoint, se3_inverse, so3_log
+from graphvio.measurements.motion import PairReport, Quality, RelativeMotion, VisualResult
+from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
 
 MotionPredictor = Callable[[int], Float | None]

@@ -7,7 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from graphvio.live.envelope import Envelope, Line
-from graphvio.synchroniser import Report
+from graphvio.measurements.events import Report
 
 JUMP_NS = 500_000_000
 """Off by more than this, a stamp is of a clock that was set or began anew."""

@@ -10,14 +10,15 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from graphvio.config_stages import LiveConfig
-from graphvio.events import Estimate, Event, FrameSet
+from graphvio.config.stages import LiveConfig
 from graphvio.live.inbox import Inbox
 from graphvio.live.load import LoadControl
 from graphvio.live.meter import Meter
 from graphvio.live.pipe import Pipe
 from graphvio.live.source import host_ns
 from graphvio.live.stage import Stage
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.odometry import Odometry
 
 _WAITING_FRAMESETS = 8
@@ -54,7 +55,7 @@ class Estimation:
         is_realtime: whether there is one, and framesets for which there is no room go; else whoever brings them waits.
         meter: counts what is given up and how long the rest took.
         publish: is handed each estimate, in this thread.
-        tell_incidents: passes on what the odometry has to tell.
+        tell_events: passes on what the odometry has to tell.
 
     Attributes:
         inbox: what waits for the odometry.
@@ -70,7 +71,7 @@ class Estimation:
         is_realtime: bool,
         meter: Meter,
         publish: Callable[[Estimate], None],
-        tell_incidents: Callable[[], None],
+        tell_events: Callable[[], None],
     ) -> None:
         self.inbox = Inbox(_WAITING_FRAMESETS if is_realtime else _READ_AHEAD, waits=not is_realtime)
         self.results: Pipe[Result] = Pipe(_WAITING_RESULTS if is_realtime else _READ_AHEAD)
@@ -80,7 +81,7 @@ class Estimation:
         self._is_realtime = is_realtime
         self._meter = meter
         self._publish = publish
-        self._tell_incidents = tell_incidents
+        self._tell_events = tell_events
         self._corner_share = 1.0
         self._under_way: OrderedDict[int, _UnderWay] = OrderedDict()
         self._first_pose_ns: int | None = None  # when it was made
@@ -99,23 +100,23 @@ class Estimation:
             for estimate in self._odometry.finish():
                 self._deliver(stage, estimate)
 
-    def _process(self, stage: Stage, event: Event, arrival_ns: int) -> None:
+    def _process(self, stage: Stage, measurement: Measurement, arrival_ns: int) -> None:
         begun_ns = host_ns()
-        if isinstance(event, FrameSet):
+        if isinstance(measurement, FrameSet):
             waited_ms = 1e-6 * (begun_ns - arrival_ns)
             if self._is_limited(arrival_ns) and self.load.must_skip(waited_ms, is_newest=not self.inbox.framesets):
                 self._meter.count("skipped_late")
                 return
-            self._under_way[event.stamp_ns] = _UnderWay(event, arrival_ns, waited_ms)
+            self._under_way[measurement.stamp_ns] = _UnderWay(measurement, arrival_ns, waited_ms)
             if len(self._under_way) > _KEPT_FRAMESETS:
                 self._under_way.popitem(last=False)
-        estimate = self._odometry.process(event)
+        estimate = self._odometry.process(measurement)
         while estimate is not None:
             self._conclude(stage, estimate, begun_ns)
             stage.get_on()
             begun_ns = host_ns()
             estimate = self._odometry.process_due()
-        self._tell_incidents()
+        self._tell_events()
 
     def _patience_s(self) -> float:
         """How long there is nothing to do if nothing comes: what the odometry holds must not be late for the IMU."""
@@ -136,7 +137,7 @@ class Estimation:
 
     def _conclude(self, stage: Stage, estimate: Estimate, begun_ns: int) -> None:
         """An estimate has been made since then."""
-        self._tell_incidents()
+        self._tell_events()
         under_way = self._under_way.get(estimate.stamp_ns)
         if under_way is not None and self._is_limited(under_way.arrival_ns):
             self.load.note(estimate.stamp_ns, under_way.waited_ms, 1e-6 * (host_ns() - begun_ns))

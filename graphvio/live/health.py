@@ -11,15 +11,15 @@ from typing import Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from graphvio.errors import MissingExtraError, ServiceError
-from graphvio.events import Status
 from graphvio.live.figures import STALE
+from graphvio.measurements.estimate import Status
 
 Figures = Mapping[str, float | int | str | None]
 
 _TOTALS = ("images", "imu_samples", "framesets", "estimates", "imu_lost")
 _TOTAL_PREFIXES = (
     "skipped",
-    "incident",
+    "event",
     "status_",
     "recorded",
     "framesets_not",

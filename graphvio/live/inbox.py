@@ -5,14 +5,14 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-from graphvio.events import Event, FrameSet
 from graphvio.live.source import host_ns
+from graphvio.measurements.sensors import FrameSet, Measurement
 
 _MOST_SAMPLES = 50_000  # minutes: when so many wait, whoever takes them is dead
 
 
 class Inbox:
-    """Between the threads that bring events and the one that takes them.
+    """Between the threads that bring measurements and the one that takes them.
 
     Args:
         most_framesets: that may wait.
@@ -28,15 +28,15 @@ class Inbox:
         self._most = most_framesets
         self._waits = waits
         self._changed = threading.Condition()
-        self._waiting: deque[tuple[Event, int]] = deque()
+        self._waiting: deque[tuple[Measurement, int]] = deque()
         self._framesets = 0
         self._is_closed = False
         self.dropped_framesets = 0
         self.dropped_samples = 0
 
-    def put(self, event: Event, arrival_ns: int | None = None) -> None:
-        """Bring an event that came just now, or then; once it is closed nothing is taken in."""
-        is_frameset = isinstance(event, FrameSet)
+    def put(self, measurement: Measurement, arrival_ns: int | None = None) -> None:
+        """Bring a measurement that came just now, or then; once it is closed nothing is taken in."""
+        is_frameset = isinstance(measurement, FrameSet)
         with self._changed:
             if self._waits:
                 self._changed.wait_for(lambda: self._has_room(is_frameset) or self._is_closed)
@@ -49,20 +49,20 @@ class Inbox:
             elif not self._has_room(is_frameset):
                 self.dropped_samples += 1
                 return
-            self._waiting.append((event, host_ns() if arrival_ns is None else arrival_ns))
+            self._waiting.append((measurement, host_ns() if arrival_ns is None else arrival_ns))
             self._changed.notify_all()
 
-    def take(self, timeout_s: float) -> tuple[Event, int] | None:
-        """The oldest event and when it came, or None when there is none by the end of the time."""
+    def take(self, timeout_s: float) -> tuple[Measurement, int] | None:
+        """The oldest measurement and when it came, or None when there is none by the end of the time."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._is_closed, timeout_s)
             if not self._waiting:
                 return None
-            event, arrival_ns = self._waiting.popleft()
-            self._framesets -= isinstance(event, FrameSet)
+            measurement, arrival_ns = self._waiting.popleft()
+            self._framesets -= isinstance(measurement, FrameSet)
             if self._waits:
                 self._changed.notify_all()
-            return event, arrival_ns
+            return measurement, arrival_ns
 
     def close(self) -> None:
         """Nothing more will come; what waits can still be taken."""
@@ -95,7 +95,7 @@ class Inbox:
         return self._framesets < self._most if is_frameset else len(self._waiting) < _MOST_SAMPLES
 
     def _drop_oldest_frameset(self) -> None:
-        at = next(i for i, (event, _) in enumerate(self._waiting) if isinstance(event, FrameSet))
+        at = next(i for i, (measurement, _) in enumerate(self._waiting) if isinstance(measurement, FrameSet))
         del self._waiting[at]
         self._framesets -= 1
         self.dropped_framesets += 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from heapq import heappop, heappush
 
-from graphvio.events import ImuSample
+from graphvio.measurements.sensors import ImuSample
 
 _MISSING_PERIODS = 1.5  # between samples: something is missing, or late
 _PERIODS = 50  # whose mean is the usual one, once

@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol
 
-from graphvio.events import Estimate, Event, FrameSet, Incident
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import FrameSet, Measurement
 
 
 class Output(Protocol):
-    """Handed events by the threads that bring them, which it must not hold up; and results by a thread of its own."""
+    """Consumer of measurements and results: it must not block the threads that hand measurements over."""
 
-    def add_event(self, event: Event) -> None:
+    def add_measurement(self, measurement: Measurement) -> None:
         """A sample or frameset came; from several threads."""
 
     def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
         """An estimate was made, of images that are given if they are still known."""
 
-    def add_incident(self, incident: Incident) -> None:
+    def add_event(self, event: Event) -> None:
         """Something happened; from several threads."""
 
     def status(self) -> Mapping[str, float | int | str | None]:

@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 
 from graphvio.arrays import Image
-from graphvio.events import FrameSet
+from graphvio.measurements.events import Report
+from graphvio.measurements.sensors import FrameSet
+from graphvio.odometry.synchroniser import JumpGuard
 from graphvio.rig import Rig
-from graphvio.synchroniser import JumpGuard, Report
 
 _SILENT_NS = 1_000_000_000  # a pair one of whose cameras has not delivered for so long is not waited for
 _MOST_WAITING = 32  # images of a camera, or matched ones of a pair: what a wait may hold at any sensible rate

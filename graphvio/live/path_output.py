@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.events import Estimate, Event, FrameSet, Incident
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.trajectory import Trajectory
 
 
@@ -24,8 +26,8 @@ class PathOutput:
         self._odom: list[tuple[int, Float]] = []
         self._map: list[tuple[int, Float]] = []
 
-    def add_event(self, event: Event) -> None:
-        """Events leave no trace."""
+    def add_measurement(self, measurement: Measurement) -> None:
+        """Measurements leave no trace."""
 
     def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
         """See `Output`."""
@@ -36,8 +38,8 @@ class PathOutput:
         if map_T_odom is not None:
             self._map.append((estimate.stamp_ns, map_T_odom @ estimate.nav_T_body))
 
-    def add_incident(self, incident: Incident) -> None:
-        """Incidents leave no trace."""
+    def add_event(self, event: Event) -> None:
+        """Events leave no trace."""
 
     def status(self) -> Mapping[str, float | int | str | None]:
         """How many poses there are."""

@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 from graphvio.config import Config
 from graphvio.errors import SourceError
-from graphvio.events import Event, ImuSample
 from graphvio.live.clock import ClockMaps
 from graphvio.live.meter import Meter
 from graphvio.live.ordering import SampleOrder
@@ -15,16 +14,17 @@ from graphvio.live.pipe import Pipe
 from graphvio.live.shared_clock import SharedClock
 from graphvio.live.source import CameraFrame, ImuReading, LiveSource, Notice, host_ns
 from graphvio.live.stage import Stage
+from graphvio.measurements.events import Report
+from graphvio.measurements.sensors import ImuSample, Measurement
 from graphvio.rig import Imu, Rig
-from graphvio.synchroniser import Report
 
 _WAITING_IMAGES = 64  # for decoding
 _READ_AHEAD_IMAGES = 8  # likewise, of a source that waits
 _MISSING_SAMPLE_MS = 10.0  # so long one that others overtook is waited for
 _ROUND_S = 0.05
 
-Bring = Callable[[Stage, Event, int], None]
-"""Takes the stage that brings it, an event, and when it came."""
+Bring = Callable[[Stage, Measurement, int], None]
+"""Takes the stage that brings it, a measurement, and when it came."""
 
 
 class Reception:

@@ -8,9 +8,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 from graphvio.arrays import Float
+from graphvio.broadcast import Broadcast
 from graphvio.config import Config
-from graphvio.events import Estimate, FrameSet, ImuSample, Incident, Prediction
-from graphvio.live.broadcast import Broadcast
 from graphvio.live.estimation import Estimation
 from graphvio.live.figures import device_figures, figures
 from graphvio.live.meter import Meter
@@ -19,6 +18,9 @@ from graphvio.live.reception import Reception
 from graphvio.live.source import DeviceHealth, LiveSource, host_ns
 from graphvio.live.stage import Stage
 from graphvio.live.watchdog import Watchdog
+from graphvio.measurements.estimate import Estimate, Prediction
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig
 from graphvio.slam.keyframe import CorrectionResult
@@ -42,7 +44,7 @@ class LiveOdometry:
         rig: of the source.
         estimates: as they are made.
         predictions: at each sample of the IMU.
-        incidents: as they happen.
+        events: as they happen.
         keyframe_log: the newest keyframes.
     """
 
@@ -57,7 +59,7 @@ class LiveOdometry:
         self.rig = rig
         self.estimates: Broadcast[Estimate] = Broadcast()
         self.predictions: Broadcast[Prediction] = Broadcast()
-        self.incidents: Broadcast[Incident] = Broadcast()
+        self.events: Broadcast[Event] = Broadcast()
         self.keyframe_log = KeyframeLog()
         self._source = source
         self._config = config
@@ -73,7 +75,7 @@ class LiveOdometry:
             source.is_realtime,
             self._meter,
             self.estimates.publish,
-            self._tell_incidents,
+            self._tell_events,
         )
         self._failures: list[BaseException] = []
         self._ended = threading.Event()
@@ -195,18 +197,18 @@ class LiveOdometry:
         self._reception.images.abandon()
         self._estimation.inbox.close()
 
-    def _bring(self, stage: Stage, event: ImuSample | FrameSet, arrival_ns: int) -> None:
-        if isinstance(event, FrameSet):
+    def _bring(self, stage: Stage, measurement: ImuSample | FrameSet, arrival_ns: int) -> None:
+        if isinstance(measurement, FrameSet):
             self._meter.came("framesets", arrival_ns)
         for output in self._outputs:
-            output.add_event(event)
+            output.add_measurement(measurement)
         with stage.waiting():
-            self._estimation.inbox.put(event, arrival_ns)
+            self._estimation.inbox.put(measurement, arrival_ns)
 
     def _end_odometry(self) -> None:
         self._estimation.inbox.abandon()
         try:
-            self._tell_incidents()
+            self._tell_events()
         finally:
             self._estimation.results.close()
 
@@ -225,18 +227,18 @@ class LiveOdometry:
     # ------------------------------------------------------------------ what is told
 
     def _report(self, stamp_ns: int, kind: str, detail: str) -> None:
-        incident = Incident(stamp_ns, kind, detail)
-        self._meter.count(f"incident_{kind}")
-        self.incidents.publish(incident)
+        event = Event(stamp_ns, kind, detail)
+        self._meter.count(f"event_{kind}")
+        self.events.publish(event)
         for output in self._outputs:
-            output.add_incident(incident)
+            output.add_event(event)
 
     def _tell_now(self, kind: str, detail: str) -> None:
         self._report(host_ns(), kind, detail)
 
-    def _tell_incidents(self) -> None:
-        for incident in self._odometry.take_incidents():
-            self._report(incident.stamp_ns, incident.kind, incident.detail)
+    def _tell_events(self) -> None:
+        for event in self._odometry.take_events():
+            self._report(event.stamp_ns, event.kind, event.detail)
 
     def _fail(self, stage: Stage, error: BaseException) -> None:
         """A stage is dead: the source ends, by which all others come to their end."""
@@ -263,5 +265,5 @@ class LiveOdometry:
 
     def _close_listeners(self) -> None:
         self.keyframe_log.close()
-        for broadcast in (self.estimates, self.predictions, self.incidents):
+        for broadcast in (self.estimates, self.predictions, self.events):
             broadcast.close()

@@ -7,8 +7,10 @@ import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from graphvio.events import Estimate, Event, FrameSet, Incident
 from graphvio.live.pipe import Pipe
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.rig import Rig
 from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
@@ -50,24 +52,24 @@ class SessionRecorder:
         self._thread = threading.Thread(target=self._write, name="graphvio-record", daemon=True)
         self._thread.start()
 
-    def add_event(self, event: Event) -> None:
+    def add_measurement(self, measurement: Measurement) -> None:
         """See `Output`."""
-        if isinstance(event, FrameSet):
+        if isinstance(measurement, FrameSet):
             if not self._images.acquire(blocking=self._waits):
                 self._left_out += 1
-            elif not self._waiting.put(lambda: self._write_frameset(event), self._waits):
+            elif not self._waiting.put(lambda: self._write_frameset(measurement), self._waits):
                 self._images.release()
                 self._left_out += 1
         else:
-            self._put(lambda: self._writer.add(event))
+            self._put(lambda: self._writer.add(measurement))
 
     def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
         """See `Output`."""
         self._put(lambda: self._writer.add_estimate(estimate))
 
-    def add_incident(self, incident: Incident) -> None:
+    def add_event(self, event: Event) -> None:
         """See `Output`."""
-        self._put(lambda: self._writer.add_incident(incident))
+        self._put(lambda: self._writer.add_event(event))
 
     def status(self) -> Mapping[str, float | int | str | None]:
         """See `Output`."""

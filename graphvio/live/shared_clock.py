@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from graphvio.backend.starts import MAX_UNBRIDGED_S
-from graphvio.synchroniser import Report
+from graphvio.measurements.events import Report
 
 BACK_NS = 250_000_000
 """Further behind the stamps before it of the same sensor, a stamp is of a clock that was set back."""

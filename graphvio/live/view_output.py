@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from graphvio.events import Estimate, Event, FrameSet, Incident
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.viewer import Viewer
 
 
@@ -18,16 +20,16 @@ class ViewOutput:
     def __init__(self, viewer: Viewer) -> None:
         self._viewer = viewer
 
-    def add_event(self, event: Event) -> None:
-        """Events are shown with what is made of them."""
+    def add_measurement(self, measurement: Measurement) -> None:
+        """Measurements are shown with what is made of them."""
 
     def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
         """See `Output`."""
         self._viewer.show(frameset, estimate)
 
-    def add_incident(self, incident: Incident) -> None:
+    def add_event(self, event: Event) -> None:
         """See `Output`."""
-        self._viewer.show_incident(incident)
+        self._viewer.show_event(event)
 
     def status(self) -> Mapping[str, float | int | str | None]:
         """See `Output`."""

@@ -12,7 +12,7 @@ _log = logging.getLogger(__name__)
 _ROUND_S = 0.25
 
 Tell = Callable[[str, str], None]
-"""Takes kind and detail of an incident."""
+"""Takes kind and detail of an event."""
 
 
 class Watchdog:
@@ -66,7 +66,7 @@ class Watchdog:
             try:
                 self._look()
             except Exception:  # of an output that is told: stages are watched on
-                _log.exception("an incident could not be told")
+                _log.exception("an event could not be told")
 
     def _look(self) -> None:
         stuck_before, self._stuck = self._stuck, self.stuck

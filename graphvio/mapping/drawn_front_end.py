@@ -12,9 +12,10 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.gating import chi_square_quantile
-from graphvio.events import FrameSet, Status
 from graphvio.geometry import se3_exp, se3_inverse
 from graphvio.mapping.places import composed
+from graphvio.measurements.estimate import Status
+from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
 

@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from graphvio.config_stages import OptimizationConfig
+from graphvio.config.stages import OptimizationConfig
 from graphvio.errors import MapError
 from graphvio.mapping.places import Anchored, NewPlace, PlaceChooser
 from graphvio.slam.interface import FrontEnd

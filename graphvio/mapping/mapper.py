@@ -14,7 +14,6 @@ import numpy as np
 from graphvio.arrays import AnyArray, Float
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
-from graphvio.events import FrameSet
 from graphvio.mapping import saved_map
 from graphvio.mapping.intake import Intake
 from graphvio.mapping.keyframe_poses import spread_keyframes
@@ -24,6 +23,7 @@ from graphvio.mapping.recognition import Recognition
 from graphvio.mapping.restoring import restored, to_saved
 from graphvio.mapping.stages import StageTimes
 from graphvio.mapping.store import PlaceStore
+from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.features import PlaceObserver
 from graphvio.optimization.loops.search import LoopClosure, Place, closure_of
 from graphvio.optimization.loops.verification import FreshView, crossings, verified

@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from graphvio import __version__
 from graphvio.arrays import AnyArray, Bool, Float, Int
 from graphvio.errors import GraphvioError, MapError
 from graphvio.mapping.store import DATABASE, PlaceStore, copy_database
@@ -25,6 +24,7 @@ from graphvio.optimization.loops import saved
 from graphvio.optimization.loops.search import LoopClosure
 from graphvio.rig import Rig
 from graphvio.rig_files.same import difference, without_masks
+from graphvio.version import __version__
 
 FORMAT, VERSION = "graphvio map", 2
 _HEADER, _RIG, _PLACES, _CLOSURES = "map.json", "rig.yaml", "map.npz", "closures.npz"

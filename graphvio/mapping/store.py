@@ -14,7 +14,7 @@ from pathlib import Path
 
 from graphvio.arrays import AnyArray
 from graphvio.errors import MapError
-from graphvio.events import FrameSet
+from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.features import PairFeatures, store_place
 from graphvio.optimization.loops.place_images import read_place, write_place

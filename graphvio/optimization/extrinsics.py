@@ -17,8 +17,8 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.backend.factors import x
 from graphvio.backend.noise import gaussian, isotropic
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_adjoint, se3_compose, se3_exp, se3_inverse, se3_log
+from graphvio.measurements.motion import RelativeMotion
 from graphvio.optimization.marginals import Marginals
 from graphvio.rig import Rig
 

@@ -15,7 +15,7 @@ from graphvio.backend.noise import gaussian, isotropic
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.reference_views import ReferenceViews
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
-from graphvio.config_stages import SmootherConfig
+from graphvio.config.stages import SmootherConfig
 from graphvio.optimization.extrinsics import own_motion, unknowns
 from graphvio.optimization.nodes import Nodes
 from graphvio.optimization.record import SessionRecord
@@ -142,12 +142,12 @@ class SessionGraph:
                 continue
             before, row, k = int(nodes.rows[n - 1]), int(nodes.rows[n]), first + n
             dt = float(record.stamps_ns[row] - record.stamps_ns[before]) * 1e-9
-            span = nodes.span(n) if params is not None else None
-            if span is not None:
+            interval = nodes.interval(n) if params is not None else None
+            if interval is not None:
                 self._kind = "imu"
                 bias = gtsam.imuBias.ConstantBias(record.accel_bias[row], record.gyro_bias[row])
                 assert params is not None
-                measurements = preintegrate(span, params, bias)
+                measurements = preintegrate(interval, params, bias)
                 self.add(gtsam.CombinedImuFactor(x(k - 1), v(k - 1), x(k), v(k), b(k - 1), b(k), measurements))
             else:
                 self._kind = "walk"

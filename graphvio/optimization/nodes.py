@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.backend.inertial import ImuSpan
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
+from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.optimization.record import SessionRecord
 
 
@@ -56,14 +56,14 @@ class Nodes:
         rate = around[:, :3].mean(axis=0) - record.gyro_bias[row]
         return np.concatenate([rate, record.smoothed[row, :3, :3].T @ record.velocity_nav[row]])
 
-    def span(self, n: int) -> ImuSpan | None:
+    def interval(self, n: int) -> ImuInterval | None:
         """The IMU from state ``n - 1`` to ``n``; None where it does not cover that."""
         inertial, first, last = self.record.inertial, self.rows[n - 1] + 1, self.rows[n] + 1
         if not inertial.covers[first:last].all() or not self.record.with_imu[[first - 1, last - 1]].all():
             return None
         steps = slice(int(inertial.begins[first]), int(inertial.begins[last]))
         values = inertial.values[steps]
-        return ImuSpan(inertial.steps_s[steps], values[:, :3], values[:, 3:])
+        return ImuInterval(inertial.steps_s[steps], values[:, :3], values[:, 3:])
 
 
 def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from graphvio import __version__
 from graphvio.config import Config
 from graphvio.errors import TrajectoryError
 from graphvio.optimization.colmap_export import export
@@ -28,6 +27,7 @@ from graphvio.rig import Rig
 from graphvio.rig_files.native import to_text
 from graphvio.sources import Source
 from graphvio.trajectory import Trajectory
+from graphvio.version import __version__
 
 DATABASE = "database.db"
 

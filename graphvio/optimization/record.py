@@ -13,9 +13,9 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.errors import OptimizationError
-from graphvio.events import Status
-from graphvio.frontend.motion import RelativeMotion
-from graphvio.step import Step
+from graphvio.measurements.estimate import Status
+from graphvio.measurements.motion import RelativeMotion
+from graphvio.measurements.step import Step
 
 
 class Inertial(NamedTuple):
@@ -183,13 +183,13 @@ class Recorder:
         if motion is not None and step.used:
             self._motions.append(motion)
             self._own += sorted(step.own.items())
-        spans = self._since
+        intervals = self._since
         self._steps.append(
             _Row(
                 step.estimate,
-                np.concatenate([np.zeros(0), *(each[0] for each in spans)]),
-                np.concatenate([np.zeros((0, 6)), *(each[1] for each in spans)]),
-                self._is_covered and step.span is not None,
+                np.concatenate([np.zeros(0), *(each[0] for each in intervals)]),
+                np.concatenate([np.zeros((0, 6)), *(each[1] for each in intervals)]),
+                self._is_covered and step.interval is not None,
                 step.started,
             )
         )
@@ -238,11 +238,11 @@ class Recorder:
         )
 
     def _collect_inertial(self, step: Step) -> None:
-        if step.span is None:
+        if step.interval is None:
             self._is_covered = False
             return
-        span = step.span
-        self._since.append((span.steps_s, np.hstack([span.angular_velocity, span.linear_acceleration])))
+        interval = step.interval
+        self._since.append((interval.steps_s, np.hstack([interval.angular_velocity, interval.linear_acceleration])))
 
 
 @dataclass(eq=False)

@@ -64,7 +64,7 @@ class Summary:
         frameset_ms: time per frameset of all stages, without decoding images.
         input_faults: kind -> count.
         resets: times the estimation was started anew.
-        incidents: kind -> count, of everything in ``events.jsonl``.
+        events: kind -> count, of everything in ``events.jsonl``.
         warnings: what a person should mend before the next run, such as a rig file that the motions refute.
         status: status -> number of estimates.
         pair_medians: name of each of the rig's pairs -> its medians.
@@ -90,7 +90,7 @@ class Summary:
     frameset_ms: Percentiles | None
     input_faults: Mapping[str, int]
     resets: int
-    incidents: Mapping[str, int]
+    events: Mapping[str, int]
     warnings: Sequence[str]
     status: Mapping[str, int]
     pair_medians: Mapping[str, PairMedians]
@@ -118,12 +118,12 @@ def path_length(trajectory: Trajectory, epochs: Int) -> float:
     return float(sum(travelled(part)[-1] for part in parts))
 
 
-def epoch_spans(trajectory: Trajectory, epochs: Int) -> list[dict[str, int]]:
+def epoch_intervals(trajectory: Trajectory, epochs: Int) -> list[dict[str, int]]:
     """Number, first and last stamp (nanoseconds) and number of poses of each epoch (N,)."""
-    spans = []
+    intervals = []
     for epoch in np.unique(epochs):
         stamps = trajectory.stamps_ns[epochs == epoch]
-        spans.append(
+        intervals.append(
             {
                 "epoch": int(epoch),
                 "first_stamp_ns": int(stamps[0]),
@@ -131,4 +131,4 @@ def epoch_spans(trajectory: Trajectory, epochs: Int) -> list[dict[str, int]]:
                 "poses": len(stamps),
             }
         )
-    return spans
+    return intervals

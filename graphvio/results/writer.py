@@ -22,15 +22,17 @@ from typing import IO
 
 import numpy as np
 
-from graphvio import __version__
 from graphvio.arrays import Float
 from graphvio.errors import GraphvioError, TrajectoryError
 from graphvio.evaluation import Evaluation, evaluate
-from graphvio.events import Estimate, Incident, PairReport
-from graphvio.plotting import draw_run
-from graphvio.results.summary import PairMedians, Percentiles, Summary, epoch_spans, path_length
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.events import Event
+from graphvio.measurements.motion import PairReport
+from graphvio.results.plotting import draw_run
+from graphvio.results.summary import PairMedians, Percentiles, Summary, epoch_intervals, path_length
 from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory, tum_line
+from graphvio.version import __version__
 
 _TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
 _COVARIANCE_HEADER = ",".join(["stamp_ns", *(f"{a}_{b}" for a, b in combinations_with_replacement(_TANGENT, 2))])
@@ -86,7 +88,7 @@ class ResultWriter:
         }
         self._pair_rejected: dict[str, Counter[str]] = {name: Counter() for name in self._pair_names}
         self._status: Counter[str] = Counter()
-        self._incidents: Counter[str] = Counter()
+        self._events: Counter[str] = Counter()
         self._stamps, self._epochs, self._lost = array("q"), array("q"), array("q")
         self._poses = array("d")
         self._pose_status: list[str] = []
@@ -162,14 +164,14 @@ class ResultWriter:
         self._pose_status.append(str(estimate.status))
         self._poses.extend(np.asarray(estimate.nav_T_body, dtype=np.float64).ravel())
 
-    def add_incident(self, incident: Incident) -> None:
+    def add_event(self, event: Event) -> None:
         """Append one line to ``events.jsonl``.
 
         Raises:
             GraphvioError: if the disk is full or the folder gone.
         """
-        self._incidents[incident.kind] += 1
-        self._write("events.jsonl", json.dumps(asdict(incident), ensure_ascii=False))
+        self._events[event.kind] += 1
+        self._write("events.jsonl", json.dumps(asdict(event), ensure_ascii=False))
 
     def finish(
         self,
@@ -219,12 +221,12 @@ class ResultWriter:
             frameset_ms=Percentiles.of(frameset_ms),
             input_faults=dict(input_faults),
             resets=resets,
-            incidents=dict(self._incidents),
+            events=dict(self._events),
             warnings=list(warnings),
             status=dict(self._status),
             pair_medians={name: PairMedians.of(figures) for name, figures in self._pair_figures.items()},
             pair_rejected={name: dict(sorted(counts.items())) for name, counts in self._pair_rejected.items()},
-            epochs=epoch_spans(trajectory, epochs),
+            epochs=epoch_intervals(trajectory, epochs),
             time_offset_s=self._time_offset[0],
             time_offset_sigma_s=self._time_offset[1],
             graphvio_version=__version__,

@@ -9,13 +9,13 @@ import cv2
 
 from graphvio.arrays import Image
 from graphvio.errors import SessionError, SourceError
+from graphvio.image_decoding import ImageError
 from graphvio.live.source import CameraFrame, DeviceHealth, ImuReading, Notice, Reading, host_ns
 from graphvio.ros2.node import Node, Reader
 from graphvio.ros2.qos import Profile
 from graphvio.sessions import cdr
 from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, imu_sample
 from graphvio.sessions.pixels import grey
-from graphvio.sources.images import ImageError
 
 _IMAGES: Final = 10  # that are kept while nobody takes them: half a second
 _SAMPLES: Final = 500

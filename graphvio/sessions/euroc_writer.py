@@ -11,25 +11,25 @@ from typing import TYPE_CHECKING, Self, TextIO
 
 import numpy as np
 
-from graphvio import euroc_layout
 from graphvio.arrays import Float
 from graphvio.errors import RigError
-from graphvio.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
-from graphvio.events import Event, FrameSet
 from graphvio.geometry import quat_wxyz_from_rotation
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.rig import Rig
 from graphvio.rig_files.native import FILE_NAME
+from graphvio.sessions import euroc_layout
+from graphvio.sessions.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
 from graphvio.sessions.storage import exists_error, not_writable_error
 
 if TYPE_CHECKING:
-    from graphvio.events import Incident
+    from graphvio.measurements.events import Event
 
 _log = logging.getLogger(__name__)
 _COMMENT = "converted by graphvio"
 
 
 class EurocWriter:
-    """Writes sensors' events as a folder; values of the IMU and poses read back to the last digit.
+    """Writes sensors' measurements as a folder; values of the IMU and poses read back to the last digit.
 
     Images bear the stamps of their framesets. When the disk is full writing stops, as with `SessionWriter`.
 
@@ -67,11 +67,11 @@ class EurocWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def add(self, event: Event) -> None:
+    def add(self, measurement: Measurement) -> None:
         """Write an IMU sample or a frameset."""
         try:
             if self.stopped is None:
-                self._add(event)
+                self._add(measurement)
         except OSError as error:
             self._stop(error)
 
@@ -84,8 +84,8 @@ class EurocWriter:
         except OSError as error:
             self._stop(error)
 
-    def add_incident(self, incident: Incident) -> None:
-        """The layout has no place for incidents."""
+    def add_event(self, event: Event) -> None:
+        """The layout has no place for events."""
 
     def close(self) -> None:
         """Finish the folder; a second time does nothing."""
@@ -120,17 +120,17 @@ class EurocWriter:
             self._add_table(folder, euroc_layout.POSE_HEADER)
         self._tables[folder].write(row + "\n")
 
-    def _add(self, event: Event) -> None:
-        if not isinstance(event, FrameSet):
-            values = [*event.angular_velocity, *event.linear_acceleration]
-            self._add_row(IMU_FOLDER, euroc_layout.exact_row(event.stamp_ns, values))
+    def _add(self, measurement: Measurement) -> None:
+        if not isinstance(measurement, FrameSet):
+            values = [*measurement.angular_velocity, *measurement.linear_acceleration]
+            self._add_row(IMU_FOLDER, euroc_layout.exact_row(measurement.stamp_ns, values))
             return
-        for number, images in sorted(event.images.items()):
+        for number, images in sorted(measurement.images.items()):
             pair = self.rig.pairs[number]
             for camera, image in zip((pair.left, pair.right), images, strict=True):
-                euroc_layout.write_image(self._mav0 / camera.name / "data" / f"{event.stamp_ns}.png", image)
-                self._add_row(camera.name, euroc_layout.frame_row(event.stamp_ns))
-                self._stamps[camera.name].append(event.stamp_ns)
+                euroc_layout.write_image(self._mav0 / camera.name / "data" / f"{measurement.stamp_ns}.png", image)
+                self._add_row(camera.name, euroc_layout.frame_row(measurement.stamp_ns))
+                self._stamps[camera.name].append(measurement.stamp_ns)
 
     def _write_sensors(self) -> None:
         for camera in self.rig.cameras:

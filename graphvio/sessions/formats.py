@@ -8,7 +8,8 @@ from typing import Protocol, Self
 
 from graphvio.arrays import Float
 from graphvio.errors import SessionError
-from graphvio.events import Event, Incident
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import Measurement
 from graphvio.rig import Rig
 from graphvio.sessions.bag_storage import Ros1Storage, Ros2Storage
 from graphvio.sessions.euroc_writer import EurocWriter
@@ -42,14 +43,14 @@ class RecordingWriter(Protocol):
     def __exit__(self, *_: object) -> None:
         """Finish what is written."""
 
-    def add(self, event: Event) -> None:
+    def add(self, measurement: Measurement) -> None:
         """Write an IMU sample or a frameset."""
 
     def add_true_pose(self, stamp_ns: int, world_T_body: Float) -> None:
         """Write a pose (4, 4) of the true trajectory."""
 
-    def add_incident(self, incident: Incident) -> None:
-        """Write an incident, where the format has a place for it."""
+    def add_event(self, event: Event) -> None:
+        """Write an event, where the format has a place for it."""
 
 
 def format_of(path: Path, asked: str | None) -> str:

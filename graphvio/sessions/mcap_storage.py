@@ -8,10 +8,10 @@ import time
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from graphvio import __version__
 from graphvio.errors import MissingExtraError
 from graphvio.sessions import cdr
 from graphvio.sessions.storage import exists_error, not_writable_error
+from graphvio.version import __version__
 
 LIBRARY = "graphvio"
 

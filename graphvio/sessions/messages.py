@@ -8,8 +8,10 @@ import numpy as np
 
 from graphvio.arrays import Float, Image
 from graphvio.errors import SessionError
-from graphvio.events import Estimate, ImuSample, Incident
 from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Camera, Rig
 from graphvio.sessions.cdr import make
 
@@ -192,14 +194,14 @@ def text(content: str) -> Any:
     return make(TEXT, data=content)
 
 
-def log(incident: Incident) -> Any:
-    """An incident as a line of ``/rosout``."""
+def log(event: Event) -> Any:
+    """An event as a line of ``/rosout``."""
     return make(
         LOG,
-        stamp=_time(incident.stamp_ns),
+        stamp=_time(event.stamp_ns),
         level=_WARN,
-        name=incident.kind,
-        msg=incident.detail,
+        name=event.kind,
+        msg=event.detail,
         file="",
         function="",
         line=0,

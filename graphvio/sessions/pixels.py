@@ -33,7 +33,7 @@ def grey(message: Any, where: str) -> Image:
     Raises:
         ImageError: if it is damaged, or its encoding is not known.
     """
-    from graphvio.sources.images import ImageError, decode_grey  # whose package imports this module
+    from graphvio.image_decoding import ImageError, decode_grey
 
     if hasattr(message, "format"):
         return decode_grey(bytes(message.data), where)

@@ -1,4 +1,4 @@
-"""Records a session: sensors' events, and what the odometry made of them, as messages."""
+"""Records a session: sensors' measurements, and what the odometry made of them, as messages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from graphvio.arrays import Float, Image
-from graphvio.events import Estimate, Event, FrameSet, Incident
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.rig import Rig
 from graphvio.rig_files.native import to_text
 from graphvio.sessions import messages
@@ -33,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 
 class SessionWriter:
-    """Writes sensors' events, and what the odometry made of them.
+    """Writes sensors' measurements, and what the odometry made of them.
 
     When the disk is full or the file cannot be written any more, recording stops, which is logged and told by
     `stopped`; the caller goes on.
@@ -81,14 +83,14 @@ class SessionWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def add(self, event: Event) -> None:
+    def add(self, measurement: Measurement) -> None:
         """Record an IMU sample or a frameset."""
-        self._first_ns = event.stamp_ns if self._first_ns is None else self._first_ns
-        self._last_ns = max(self._last_ns, event.stamp_ns)
-        if isinstance(event, FrameSet):
-            self._guarded(lambda: self._add_frameset(event))
+        self._first_ns = measurement.stamp_ns if self._first_ns is None else self._first_ns
+        self._last_ns = max(self._last_ns, measurement.stamp_ns)
+        if isinstance(measurement, FrameSet):
+            self._guarded(lambda: self._add_frameset(measurement))
         else:
-            self._guarded(lambda: self._add(IMU_TOPIC, event.stamp_ns, messages.imu(event)))
+            self._guarded(lambda: self._add(IMU_TOPIC, measurement.stamp_ns, messages.imu(measurement)))
 
     def add_estimate(self, estimate: Estimate) -> None:
         """Record an estimate, if it has a pose."""
@@ -100,12 +102,12 @@ class SessionWriter:
         """Record a pose (4, 4) of the true trajectory."""
         self._guarded(lambda: self._add(TRUTH_TOPIC, stamp_ns, messages.true_pose(stamp_ns, world_T_body)))
 
-    def add_incident(self, incident: Incident) -> None:
-        """Record an incident; one without a time of the recording, at the recording's nearest end."""
+    def add_event(self, event: Event) -> None:
+        """Record an event; one without a time of the recording, at the recording's nearest end."""
         if self._first_ns is not None:
-            stamp_ns = min(max(incident.stamp_ns, self._first_ns), self._last_ns)
-            incident = Incident(stamp_ns, incident.kind, incident.detail)
-        self._guarded(lambda: self._add(LOG_TOPIC, incident.stamp_ns, messages.log(incident)))
+            stamp_ns = min(max(event.stamp_ns, self._first_ns), self._last_ns)
+            event = Event(stamp_ns, event.kind, event.detail)
+        self._guarded(lambda: self._add(LOG_TOPIC, event.stamp_ns, messages.log(event)))
 
     def close(self) -> None:
         """Finish the file; a second time does nothing."""

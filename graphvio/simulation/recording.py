@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from graphvio import euroc_layout
 from graphvio.arrays import Float, Image
 from graphvio.errors import SourceError
-from graphvio.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
 from graphvio.geometry import quat_wxyz_from_rotation
+from graphvio.sessions import euroc_layout
+from graphvio.sessions.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
 from graphvio.simulation.simulator import Simulator, make_simulator
 
 Progress = Callable[[int, int], None]

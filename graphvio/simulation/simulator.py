@@ -9,7 +9,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Image, Int
 from graphvio.errors import SourceError
-from graphvio.events import FrameSet
+from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Imu, Rig
 from graphvio.simulation.atlas import Atlas
 from graphvio.simulation.default_rig import default_rig

@@ -10,7 +10,8 @@ from typing import Any, Generic, Literal, Self, TypeVar, overload
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.events import Estimate, Incident, Prediction
+from graphvio.measurements.estimate import Estimate, Prediction
+from graphvio.measurements.events import Event
 from graphvio.rig import Rig
 from graphvio.slam.keyframe import CorrectionResult, Keyframe
 from graphvio.slam.service import convert
@@ -166,11 +167,11 @@ class Client:
         """
         return self._estimates() if rate == "frame" else self._predictions()
 
-    def incidents(self) -> Iterator[Incident]:
+    def events(self) -> Iterator[Event]:
         """What a person would want to know of, from now on, until the odometry has ended."""
-        request = messages.StreamIncidentsRequest(run_id=self._run_id)
-        for update in self._connection.follow(self._connection.stub.StreamIncidents, lambda: request):
-            yield Incident(update.stamp_ns, update.kind, update.detail)
+        request = messages.StreamEventsRequest(run_id=self._run_id)
+        for update in self._connection.follow(self._connection.stub.StreamEvents, lambda: request):
+            yield Event(update.stamp_ns, update.kind, update.detail)
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
         """Say where a keyframe is in the map.

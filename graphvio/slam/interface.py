@@ -6,8 +6,9 @@ from collections.abc import Iterator, Mapping
 from typing import Protocol
 
 from graphvio.arrays import Float
-from graphvio.events import Estimate, Incident, Prediction
-from graphvio.live.broadcast import Broadcast
+from graphvio.broadcast import Broadcast
+from graphvio.measurements.estimate import Estimate, Prediction
+from graphvio.measurements.events import Event
 from graphvio.rig import Rig
 from graphvio.slam.keyframe import CorrectionResult, Keyframe
 from graphvio.slam.keyframe_log import KeyframeLog
@@ -44,14 +45,14 @@ class Served(Protocol):
         rig: cameras and IMU.
         estimates: of the framesets, as they are made.
         predictions: at each sample of the IMU.
-        incidents: as they happen.
+        events: as they happen.
         keyframe_log: the newest keyframes; closed when the odometry has ended.
     """
 
     rig: Rig
     estimates: Broadcast[Estimate]
     predictions: Broadcast[Prediction]
-    incidents: Broadcast[Incident]
+    events: Broadcast[Event]
     keyframe_log: KeyframeLog
 
     @property

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Image, Int
-from graphvio.events import Status
+from graphvio.measurements.estimate import Status
 
 
 @dataclass(frozen=True, slots=True, eq=False)

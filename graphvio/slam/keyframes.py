@@ -8,9 +8,9 @@ import numpy as np
 
 from graphvio.arrays import Float, Image
 from graphvio.config import Config
-from graphvio.events import Estimate, Status
 from graphvio.frontend.tracks import PairFrame
 from graphvio.geometry import se3_inverse
+from graphvio.measurements.estimate import Estimate, Status
 from graphvio.rig import Rig
 from graphvio.slam.descriptors import describer
 from graphvio.slam.keyframe import CorrectionResult, Keyframe

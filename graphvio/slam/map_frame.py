@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from graphvio.arrays import Float
-from graphvio.errors import EventError
+from graphvio.errors import MeasurementError
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.slam.keyframe import CorrectionResult, Keyframe
 
@@ -70,18 +70,20 @@ class MapFrame:
         self._accepted: list[_Correction] = []  # in the order of keyframes
         self._refused: list[_Correction] = []  # since the last one that was accepted, the newest of each keyframe
         self._agreement = _FIRST_AGREEMENT
-        self._belief: _Correction | None = None  # what all that were accepted say together, at the last one's keyframe
+        self._estimator: _Correction | None = (
+            None  # what all that were accepted say together, at the last one's keyframe
+        )
 
     @property
     def map_T_odom(self) -> Float | None:
         """(4, 4), or None before the epoch's first correction."""
-        belief = self._belief
-        return None if belief is None else belief.map_T_odom.copy()
+        estimator = self._estimator
+        return None if estimator is None else estimator.map_T_odom.copy()
 
     def of_epoch(self, epoch: int) -> Float | None:
         """The same (4, 4) for an epoch's odom frame; None if it is known of none or of another one."""
-        belief = self._belief  # read once: with its epoch, since the next one may begin at any time
-        return None if belief is None or belief.epoch != epoch else belief.map_T_odom.copy()
+        estimator = self._estimator  # read once: with its epoch, since the next one may begin at any time
+        return None if estimator is None or estimator.epoch != epoch else estimator.map_T_odom.copy()
 
     def begin(self, epoch: int) -> None:
         """An epoch runs; a new one ends what was known of the old one."""
@@ -89,7 +91,7 @@ class MapFrame:
             with self._lock:
                 self._epoch = epoch
                 self._passed, self._accepted, self._refused = {}, [], []
-                self._agreement, self._belief = _FIRST_AGREEMENT, None
+                self._agreement, self._estimator = _FIRST_AGREEMENT, None
 
     def add(self, keyframe: Keyframe) -> None:
         """The next keyframe."""
@@ -115,7 +117,7 @@ class MapFrame:
             covariance: (6, 6), tangent ``[rotation, translation]`` in body.
 
         Raises:
-            EventError: if the pose is not rigid, or the covariance is none.
+            MeasurementError: if the pose is not rigid, or the covariance is none.
         """
         map_T_body, covariance = _checked(map_T_body, covariance)
         with self._lock:
@@ -131,7 +133,7 @@ class MapFrame:
                 to_odom @ covariance @ to_odom.T,
                 passed.drift,
             )
-            if self._belief is None:
+            if self._estimator is None:
                 return self._accept(offered, None)
             statistic = _distance(self._expected_at(offered), offered)
             if statistic <= self._threshold:
@@ -141,7 +143,7 @@ class MapFrame:
             newest = self._refused[-self._agreement :]
             if len(newest) == self._agreement and self._agree(newest):
                 self._agreement *= 2
-                self._accepted, self._belief = newest[:-1], None
+                self._accepted, self._estimator = newest[:-1], None
                 return self._accept(
                     offered, statistic, f"{len(newest)} refused corrections in a row agree: the map moves"
                 )
@@ -153,13 +155,13 @@ class MapFrame:
 
     def _accept(self, offered: _Correction, statistic: float | None, reason: str = "") -> CorrectionResult:
         others = [each for each in self._accepted if each.is_many or each.keyframe_id != offered.keyframe_id]
-        belief, count = self._belief, len(self._accepted)
+        estimator, count = self._estimator, len(self._accepted)
         self._accepted = sorted([*others, offered], key=lambda each: each.keyframe_id)
         self._refused = []
-        if belief is None or belief.keyframe_id > offered.keyframe_id or len(self._accepted) != count + 1:
-            self._belief = _fused(self._accepted)
+        if estimator is None or estimator.keyframe_id > offered.keyframe_id or len(self._accepted) != count + 1:
+            self._estimator = _fused(self._accepted)
         else:
-            self._belief = _fused([belief, offered])
+            self._estimator = _fused([estimator, offered])
         if len(self._accepted) > _MOST_CORRECTIONS:  # the older half becomes one
             half = self._accepted[: _MOST_CORRECTIONS // 2]
             self._accepted = [replace(_fused(half), is_many=True), *self._accepted[len(half) :]]
@@ -170,9 +172,9 @@ class MapFrame:
 
     def _expected_at(self, offered: _Correction) -> _Correction:
         """What all that were accepted say at the keyframe of one more: those before it and those after it."""
-        assert self._belief is not None
-        if self._belief.keyframe_id <= offered.keyframe_id:
-            return _carried(self._belief, offered)
+        assert self._estimator is not None
+        if self._estimator.keyframe_id <= offered.keyframe_id:
+            return _carried(self._estimator, offered)
         before = [each for each in self._accepted if each.keyframe_id <= offered.keyframe_id]
         after = [each for each in self._accepted if each.keyframe_id > offered.keyframe_id]
         return _fused([_carried(_fused(side), offered) for side in (before, after[::-1]) if side])
@@ -184,23 +186,23 @@ class MapFrame:
 
 def _fused(corrections: Sequence[_Correction]) -> _Correction:
     """What corrections say together at the last one's keyframe; their keyframes go forward, or all back."""
-    belief = corrections[0]
+    estimator = corrections[0]
     for offered in corrections[1:]:
-        prior = belief.covariance + _drift(belief, offered)
+        prior = estimator.covariance + _drift(estimator, offered)
         gain = np.linalg.solve(prior + offered.covariance, prior).T
-        step = gain @ _difference(belief, offered)
+        step = gain @ _difference(estimator, offered)
         rest = np.eye(6) - gain
-        belief = replace(
+        estimator = replace(
             offered,
-            map_T_odom=belief.map_T_odom @ se3_exp(step),
+            map_T_odom=estimator.map_T_odom @ se3_exp(step),
             covariance=rest @ prior @ rest.T + gain @ offered.covariance @ gain.T,
         )
-    return belief
+    return estimator
 
 
-def _carried(belief: _Correction, to: _Correction) -> _Correction:
-    """A belief at another's keyframe."""
-    return replace(to, map_T_odom=belief.map_T_odom, covariance=belief.covariance + _drift(belief, to))
+def _carried(estimator: _Correction, to: _Correction) -> _Correction:
+    """A estimator at another's keyframe."""
+    return replace(to, map_T_odom=estimator.map_T_odom, covariance=estimator.covariance + _drift(estimator, to))
 
 
 def _distance(one: _Correction, other: _Correction) -> float:
@@ -237,15 +239,21 @@ def _checked(map_T_body: Float, covariance: Float) -> tuple[Float, Float]:
     try:
         pose, spread = (np.array(each, dtype=np.float64) for each in (map_T_body, covariance))
     except (TypeError, ValueError):
-        raise EventError("map_T_body or covariance is no array of numbers; give (4, 4) and (6, 6)") from None
+        raise MeasurementError("map_T_body or covariance is no array of numbers; give (4, 4) and (6, 6)") from None
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise EventError(f"map_T_body has shape {pose.shape}, or holds NaN; give a rigid transform (4, 4)")
+        raise MeasurementError(f"map_T_body has shape {pose.shape}, or holds NaN; give a rigid transform (4, 4)")
     rotation = pose[:3, :3]
     off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(pose[3] - [0, 0, 0, 1]).max())
     if off > _RIGID or np.linalg.det(rotation) < 0.0:
-        raise EventError(f"map_T_body is no rigid transform: off by {off:.2g}; give rotation and translation (4, 4)")
+        raise MeasurementError(
+            f"map_T_body is no rigid transform: off by {off:.2g}; give rotation and translation (4, 4)"
+        )
     if spread.shape != (6, 6) or not np.isfinite(spread).all():
-        raise EventError(f"covariance has shape {spread.shape}, or holds NaN; give (6, 6) [rotation, translation]")
+        raise MeasurementError(
+            f"covariance has shape {spread.shape}, or holds NaN; give (6, 6) [rotation, translation]"
+        )
     if not np.allclose(spread, spread.T, rtol=1e-6, atol=1e-12) or np.linalg.eigvalsh(spread)[0] <= 0.0:
-        raise EventError("covariance is not symmetric and positive definite; say how well each direction is known")
+        raise MeasurementError(
+            "covariance is not symmetric and positive definite; say how well each direction is known"
+        )
     return pose, 0.5 * (spread + spread.T)

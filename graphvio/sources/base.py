@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from graphvio.arrays import Int
-from graphvio.events import Event, FrameSet
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.rig import Rig
 from graphvio.sources.faults import FaultLog
 
@@ -21,7 +21,7 @@ class Source(Protocol):
 
     @property
     def rig(self) -> Rig:
-        """The rig that the events refer to; its IMU is None where the recording has none."""
+        """The rig that the measurements refer to; its IMU is None where the recording has none."""
 
     @property
     def faults(self) -> FaultLog:
@@ -58,7 +58,7 @@ class Source(Protocol):
             SourceError: if there is none of this stamp.
         """
 
-    def __iter__(self) -> Iterator[Event]:
+    def __iter__(self) -> Iterator[Measurement]:
         """IMU samples and framesets: the sample that covers a frameset's instant comes before it.
 
         Raises:

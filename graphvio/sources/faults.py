@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 
-from graphvio.events import Incident
+from graphvio.measurements.events import Event
 
 _log = logging.getLogger(__name__)
 
@@ -15,14 +15,14 @@ class FaultLog:
 
     Attributes:
         counts: kind -> how often it was met.
-        incidents: the first fault of each kind, in the order in which the kinds were met.
+        events: the first fault of each kind, in the order in which the kinds were met.
     """
 
     def __init__(self, name: str) -> None:
         """An empty log; ``name`` of the recording begins each logged line."""
         self.name = name
         self.counts: dict[str, int] = {}
-        self.incidents: list[Incident] = []
+        self.events: list[Event] = []
         self._told: set[str] = set()
 
     def add(self, kind: str, stamp_ns: int, detail: str, times: int = 1) -> None:
@@ -33,18 +33,18 @@ class FaultLog:
         self.counts[kind] = self.counts.get(kind, 0) + times
         if not first:
             return
-        self.incidents.append(Incident(stamp_ns, kind, detail))
+        self.events.append(Event(stamp_ns, kind, detail))
         if kind not in self._told:  # a second pass over the recording tells nothing new
             self._told.add(kind)
             _log.warning("%s: %s: %s (further ones are only counted)", self.name, kind, detail)
 
-    def mark(self) -> tuple[Counter[str], list[Incident]]:
+    def mark(self) -> tuple[Counter[str], list[Event]]:
         """What is known now, to return to with `rewind`."""
-        return Counter(self.counts), list(self.incidents)
+        return Counter(self.counts), list(self.events)
 
-    def rewind(self, marked: tuple[Counter[str], list[Incident]]) -> None:
+    def rewind(self, marked: tuple[Counter[str], list[Event]]) -> None:
         """Forget what was counted since `mark`."""
-        self.counts, self.incidents = dict(marked[0]), list(marked[1])
+        self.counts, self.events = dict(marked[0]), list(marked[1])
 
     def __str__(self) -> str:
         return ", ".join(f"{kind} {count}" for kind, count in sorted(self.counts.items())) or "none"

@@ -18,10 +18,10 @@ import numpy as np
 
 from graphvio.arrays import Bool, Image, Int
 from graphvio.errors import RigError, SourceError
-from graphvio.events import Event, FrameSet, ImuSample
+from graphvio.image_decoding import ImageError, read_grey
+from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.rig import Camera, Rig
 from graphvio.sources.faults import FaultLog
-from graphvio.sources.images import ImageError, read_grey
 from graphvio.sources.matching import TOLERANCE_NS, FramesetIndex, PairIndex, group_pairs, match_sides
 from graphvio.sources.read_ahead import read_ahead
 from graphvio.sources.sequencer import merge
@@ -147,7 +147,7 @@ class Recording:
         self.rig = rig if self._imu is not None else rig.without_imu()
         self._opened = faults.mark()
 
-    def __iter__(self) -> Iterator[Event]:
+    def __iter__(self) -> Iterator[Measurement]:
         """IMU samples and framesets: the sample that covers a frameset's instant comes before it.
 
         Raises:
@@ -200,7 +200,7 @@ class Recording:
         if is_empty:
             raise SourceError(
                 f"{self.name}: none of its {self.frameset_count} framesets could be read ({self.faults}); "
-                f"{self.faults.incidents[0].detail}"
+                f"{self.faults.events[0].detail}"
             )
 
     def _decode(self, at: int) -> _Decoded:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from graphvio.events import Event, FrameSet, ImuSample
+from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 
 COVER_NS = 50_000_000
 """A sample further past a frameset than this does not cover it: the IMU has a gap there."""
 
 
-def merge(imu: Iterable[ImuSample], framesets: Iterable[FrameSet], time_offset_ns: int = 0) -> Iterator[Event]:
+def merge(imu: Iterable[ImuSample], framesets: Iterable[FrameSet], time_offset_ns: int = 0) -> Iterator[Measurement]:
     """All samples and framesets in time order, where each frameset follows the sample that covers it.
 
     The covering sample is the first at or after the frameset's instant on the IMU's clock. In a gap of the

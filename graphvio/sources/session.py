@@ -10,6 +10,7 @@ import numpy as np
 
 from graphvio.arrays import Image, Int
 from graphvio.errors import SessionError, SourceError
+from graphvio.image_decoding import ImageError
 from graphvio.rig import Camera, Rig
 from graphvio.rig_files.native import parse
 from graphvio.sessions import cdr
@@ -23,7 +24,6 @@ from graphvio.sessions.stamps import header_stamps
 from graphvio.sessions.topics import RIG_ATTACHMENT, RIG_TOPIC, image_topic, of_type, preference
 from graphvio.sessions.truth import truth_topic
 from graphvio.sources.faults import FaultLog
-from graphvio.sources.images import ImageError
 from graphvio.sources.recording import Index
 from graphvio.sources.tables import ImuTable, clean_stamps
 

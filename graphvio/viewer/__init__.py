@@ -17,7 +17,9 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from graphvio.errors import GraphvioError, MissingExtraError
-from graphvio.events import Estimate, FrameSet, Incident
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
 from graphvio.viewer.web import WebOptions
 
@@ -92,9 +94,9 @@ class Viewer:
                 self._frameset = (frameset, estimate)
             self._changed.notify()
 
-    def show_incident(self, incident: Incident) -> None:
+    def show_event(self, event: Event) -> None:
         """Hand over a message; returns at once."""
-        self._add_extra(lambda recording: recording.add_incident(incident))
+        self._add_extra(lambda recording: recording.add_event(event))
 
     def show_path(self, name: str, path: Trajectory, colour: tuple[int, int, int] = (150, 150, 150)) -> None:
         """Hand over a whole other path in nav, such as the smoothed one or truth; returns at once."""

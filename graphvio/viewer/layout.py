@@ -6,7 +6,7 @@ from typing import Any
 
 import rerun.blueprint as rrb
 
-from graphvio.events import Status
+from graphvio.measurements.estimate import Status
 from graphvio.rig import Rig
 
 TIMELINE = "time"

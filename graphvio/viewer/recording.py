@@ -32,8 +32,10 @@ import numpy as np
 import rerun as rr
 
 from graphvio.arrays import Float
-from graphvio.events import Estimate, FrameSet, Incident, Status
 from graphvio.geometry import quat_wxyz_from_rotation
+from graphvio.measurements.estimate import Estimate, Status
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
 from graphvio.viewer.layout import AXES, RATE_COLOURS, STATUS_COLOURS, TIMELINE, blueprint
@@ -126,10 +128,10 @@ class Recording:
                 self._log_text(str(estimate.status), "status", STATUS_COLOURS[estimate.status])
                 self._status = estimate.status
 
-    def add_incident(self, incident: Incident) -> None:
+    def add_event(self, event: Event) -> None:
         """A message at the time of its data."""
-        self._at(incident.stamp_ns)
-        self._log_text(incident.detail, incident.kind, (200, 200, 200))
+        self._at(event.stamp_ns)
+        self._log_text(event.detail, event.kind, (200, 200, 200))
 
     def add_images(self, frameset: FrameSet, estimate: Estimate) -> None:
         """Left images with the corners tracked in them, green where the motion explains them."""

@@ -11,7 +11,8 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.errors import GraphvioError
-from graphvio.events import Estimate, Incident, Status
+from graphvio.measurements.estimate import Estimate, Status
+from graphvio.measurements.events import Event
 from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
 from graphvio.viewer import Viewer
@@ -34,13 +35,13 @@ def replay(folder: Path, *, spawn: bool = False, save: Path | None = None) -> No
     if not (folder / "trajectory.txt").is_file():
         raise GraphvioError(f"{folder}: holds no trajectory.txt; give a folder that  graphvio run  has written")
     rig = Rig.load(folder / "rig.yaml")
-    estimates, incidents = list(read_estimates(folder)), list(_read_incidents(folder / "events.jsonl"))
+    estimates, events = list(read_estimates(folder)), list(_read_events(folder / "events.jsonl"))
     smoothed = folder / "trajectory_smoothed.txt"
     with Viewer(rig, spawn=spawn, save=save) as viewer:
         for estimate in estimates:
             viewer.show(None, estimate)
-        for incident in incidents:
-            viewer.show_incident(incident)
+        for event in events:
+            viewer.show_event(event)
         if smoothed.is_file() and smoothed.stat().st_size:
             viewer.show_path("smoothed", Trajectory.read(smoothed), _SMOOTHED_COLOUR)
 
@@ -81,12 +82,12 @@ def _read_rows(path: Path, columns: int) -> Iterator[tuple[int, Float]]:
             raise GraphvioError(f"{path}, line {number}: is damaged ({error}); remove the line") from None
 
 
-def _read_incidents(path: Path) -> Iterator[Incident]:
+def _read_events(path: Path) -> Iterator[Event]:
     if not path.is_file():
         return
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
         try:
-            yield Incident(**json.loads(line))
+            yield Event(**json.loads(line))
         except (ValueError, TypeError) as error:
             raise GraphvioError(f"{path}, line {number}: is damaged ({error}); remove the line") from None
 

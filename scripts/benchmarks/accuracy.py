@@ -136,11 +136,11 @@ def _together_table(report: Report, bench: Bench, cases: list[tuple[str, bool]])
             all_m = everyone.epoch_ate_m
             which, single = bench.better_single(name, profile, imu)
             single_m = single.epoch_ate_m
-            verdict = "met" if all_m <= AIM * single_m and np.isfinite(all_m) else "missed"
+            gate_result = "met" if all_m <= AIM * single_m and np.isfinite(all_m) else "missed"
             errors = [_cm(all_m), _cm(single_m), which, _ratio(all_m, single_m)]
             errors.append(_ratio(everyone.ate_m, bench.least_ate_m(name, profile, imu)))
             seen = [f"{run.by_vision_percent:.0f}" for run in (everyone, single)]
-            rows.append([name, profile, _yes_or_no(imu), *errors, *seen, verdict])
+            rows.append([name, profile, _yes_or_no(imu), *errors, *seen, gate_result])
     if not rows:
         return
     report.add(
@@ -219,7 +219,7 @@ def _blind_table(report: Report, bench: Bench, duration_s: float | None) -> None
     rig = bench.rig(_BLIND_SCENE)
     if len(rig.pairs) < 2:
         return
-    begin_s, end_s = _blind_span(duration_s)
+    begin_s, end_s = _blind_interval(duration_s)
     start_ns = open_source(bench.recordings[_BLIND_SCENE]).start_ns
     from_ns, to_ns = (start_ns + round(1e9 * s) for s in (begin_s, end_s))
     together = bench.choices(_BLIND_SCENE)[0]
@@ -237,7 +237,7 @@ def _blind_table(report: Report, bench: Bench, duration_s: float | None) -> None
     report.table(["blind", "IMU", *HEAD], rows)
 
 
-def _blind_span(duration_s: float | None) -> tuple[float, float]:
+def _blind_interval(duration_s: float | None) -> tuple[float, float]:
     """From when to when a pair is blind, seconds; a short walk is blind for a share of its length."""
     if duration_s is None:
         return _BLIND_FROM_S, _BLIND_FROM_S + _BLIND_S

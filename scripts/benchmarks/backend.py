@@ -22,9 +22,9 @@ from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, machine, tell
 from graphvio.arrays import Float
 from graphvio.backend.factors import r, x
+from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
-from graphvio.smoother_belief import SmootherBelief
 
 AIM_MS, AIM_P99_MS, AIM_PREDICTION_US = 1.5, 5.0, 50.0
 LAGS_S = (0.5, 0.75, 1.0, 2.0, 4.0)
@@ -110,7 +110,7 @@ class _Timing(NamedTuple):
 
 def _timed(stream: Stream, lag_s: float) -> _Timing:
     log, config = FactorLog(), Config()
-    belief = SmootherBelief(
+    estimator = SmootherEstimator(
         stream.rig, replace(config, smoother=replace(config.smoother, lag_s=lag_s)), lambda *_: None, lambda: None
     )
     theirs = _Incremental(lag_s)
@@ -118,14 +118,14 @@ def _timed(stream: Stream, lag_s: float) -> _Timing:
     for calls in stream.framesets:
         start = perf_counter()
         for name, arguments in calls:
-            getattr(belief, name)(*arguments)
+            getattr(estimator, name)(*arguments)
         ours_s = perf_counter() - start
         stamp_ns, _, keep = calls[-1].arguments
-        index_of = belief._running._index_of
+        index_of = estimator._running._index_of
         references = [index_of[ns] for ns in keep if ns in index_of]
         spent_s, covariance_s, position = theirs.step(stamp_ns, index_of[stamp_ns], references, log.take())
-        apart_m = np.linalg.norm(position - belief.state().nav_T_body[:3, 3])
-        is_whole = belief._running._advanced == 0
+        apart_m = np.linalg.norm(position - estimator.state().nav_T_body[:3, 3])
+        is_whole = estimator._running._advanced == 0
         rows.append([1e3 * ours_s, 1e3 * spent_s, 1e3 * (spent_s + covariance_s), apart_m, is_whole])
     return _Timing(*np.array(rows[_WARM_UP:]).T)
 

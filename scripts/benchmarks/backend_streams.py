@@ -14,7 +14,7 @@ import gtsam
 
 from graphvio.backend import smoother
 from graphvio.backend.window import Window
-from graphvio.events import Event, FrameSet, ImuSample
+from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig
 from graphvio.sources import open_source
@@ -23,7 +23,7 @@ _STEPS = ("start", "predict", "use", "update")
 
 
 class Call(NamedTuple):
-    """A step of the back-end, see `graphvio.belief.Belief`, and what it was given."""
+    """A step of the back-end, see `graphvio.backend.estimator.StateEstimator`, and what it was given."""
 
     name: str
     arguments: tuple[Any, ...]
@@ -49,28 +49,30 @@ def note_stream(folder: Path, most: int) -> Stream:
     source = open_source(folder)
     odometry = Odometry(source.rig)
     framesets: list[list[Call]] = [[]]
-    belief: Any = odometry._belief
+    estimator: Any = odometry._estimator
     for name in _STEPS:
-        _note(belief, name, framesets)
+        _note(estimator, name, framesets)
     prediction_us = []
-    for event in list(takewhile(_before(most), source)):  # decoded before, so that no time is of the threads for that
-        odometry.process(event)
-        if isinstance(event, ImuSample):
+    for measurement in list(
+        takewhile(_before(most), source)
+    ):  # decoded before, so that no time is of the threads for that
+        odometry.process(measurement)
+        if isinstance(measurement, ImuSample):
             start = perf_counter()
-            if odometry.predict(event.stamp_ns) is not None:
+            if odometry.predict(measurement.stamp_ns) is not None:
                 prediction_us.append(1e6 * (perf_counter() - start))
     odometry.finish()
     return Stream(source.rig, [calls for calls in framesets if calls][:most], prediction_us)
 
 
-def _before(most: int) -> Callable[[Event], bool]:
-    """Whether an event is one of the first framesets, or comes before the next one."""
+def _before(most: int) -> Callable[[Measurement], bool]:
+    """Whether a measurement is one of the first framesets, or comes before the next one."""
     framesets = count()
-    return lambda event: not isinstance(event, FrameSet) or next(framesets) < most
+    return lambda measurement: not isinstance(measurement, FrameSet) or next(framesets) < most
 
 
-def _note(belief: Any, name: str, framesets: list[list[Call]]) -> None:
-    step = getattr(belief, name)
+def _note(estimator: Any, name: str, framesets: list[list[Call]]) -> None:
+    step = getattr(estimator, name)
 
     def noted(*arguments: Any) -> Any:
         kept = (replace(arguments[0], pairs={}), *arguments[1:]) if name == "use" else arguments
@@ -79,7 +81,7 @@ def _note(belief: Any, name: str, framesets: list[list[Call]]) -> None:
             framesets.append([])
         return step(*arguments)
 
-    setattr(belief, name, noted)
+    setattr(estimator, name, noted)
 
 
 class Added(NamedTuple):

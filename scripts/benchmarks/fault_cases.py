@@ -1,4 +1,4 @@
-"""The cases of the campaign of faults, and the events that each of them feeds to the odometry."""
+"""The cases of the campaign of faults, and the measurements that each of them feeds to the odometry."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from benchmarks import fault_planes as planes
 from benchmarks.fault_images import Fault, Images, Moment
 from benchmarks.fault_scenes import CORRIDOR_S
 from graphvio.arrays import Float
-from graphvio.events import Event, FrameSet
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.simulation import build_scene
 from graphvio.sources import Source
 
-Spans = tuple[tuple[float, float], ...]
+Intervals = tuple[tuple[float, float], ...]
 """(start, end) in seconds since the first frameset, in order."""
 
 WALKS = ("room", "calibration", "stairs")
@@ -37,7 +37,7 @@ class Case:
 
     Attributes:
         name: as the table and ``--cases`` know it.
-        fault: alters images for spans of time; None where the scene itself is hard.
+        fault: alters images for intervals of time; None where the scene itself is hard.
         scene: where; None for the walk of the seed.
         title: for the table.
     """
@@ -47,22 +47,22 @@ class Case:
     fault: Fault | None = None
     scene: str | None = None
 
-    def spans(self, seed: int, duration_s: float) -> Spans:
+    def intervals(self, seed: int, duration_s: float) -> Intervals:
         """When the case is hard: at once for scenes, again and again for faults, for 0.3 to 2.2 s each time."""
         if self.name == "clean":
             return ()
         if self.scene == "corridor":
-            events = build_scene("corridor", CORRIDOR_S).events.values()
-            return tuple(sorted((a, b) for a, b in events if a < duration_s))
+            measurements = build_scene("corridor", CORRIDOR_S).events.values()
+            return tuple(sorted((a, b) for a, b in measurements if a < duration_s))
         if self.fault is None:
             return ((0.0, duration_s),)
         draw = np.random.default_rng(self.seed(seed))
-        spans, start = [], _FIRST_S
+        intervals, start = [], _FIRST_S
         while start < duration_s:
             end = start + draw.uniform(*_LASTS_S)
-            spans.append((start, min(end, duration_s)))
+            intervals.append((start, min(end, duration_s)))
             start = end + draw.uniform(*_PAUSE_S)
-        return tuple(spans)
+        return tuple(intervals)
 
     def seed(self, seed: int) -> tuple[int, int]:
         """Of all that is drawn for this case."""
@@ -104,10 +104,10 @@ CASES = (
 )
 
 
-def hard_events(
+def hard_measurements(
     case: Case, seed: int, source: Source, truth: dict[int, Float], duration_s: float
-) -> Iterator[tuple[Event, bool]]:
-    """The events of a recording with a case's faults in them, and whether each falls into a fault's span.
+) -> Iterator[tuple[Measurement, bool]]:
+    """The measurements of a recording with a case's faults in them, and whether each falls into a fault's interval.
 
     Args:
         case: what is wrong.
@@ -116,27 +116,27 @@ def hard_events(
         truth: stamp -> ``world_T_body`` (4, 4), at the framesets' stamps.
         duration_s: of the recording.
     """
-    spans = case.spans(seed, duration_s)
+    intervals = case.intervals(seed, duration_s)
     before: deque[Images] = deque(maxlen=_KEPT)
     stamps: list[int] = []
-    began = (-1, 0)  # the span that lasts, and the index of its first frameset
-    for event in source:
-        since_s = (event.stamp_ns - source.start_ns) * 1e-9
-        inside = next((k for k, (start, end) in enumerate(spans) if start <= since_s < end), None)
-        if not isinstance(event, FrameSet):
-            yield event, inside is not None
+    began = (-1, 0)  # the interval that lasts, and the index of its first frameset
+    for measurement in source:
+        since_s = (measurement.stamp_ns - source.start_ns) * 1e-9
+        inside = next((k for k, (start, end) in enumerate(intervals) if start <= since_s < end), None)
+        if not isinstance(measurement, FrameSet):
+            yield measurement, inside is not None
             continue
-        stamps.append(event.stamp_ns)
-        images = event.images
+        stamps.append(measurement.stamp_ns)
+        images = measurement.images
         if inside is not None and case.fault is not None:
             if began[0] != inside:
                 began = inside, len(stamps) - 1
             images = case.fault(
-                _moment(event, list(before), source, truth, stamps, began[1], (*case.seed(seed), inside))
+                _moment(measurement, list(before), source, truth, stamps, began[1], (*case.seed(seed), inside))
             )
-        before.append(event.images)
+        before.append(measurement.images)
         if images:
-            yield FrameSet(event.stamp_ns, images), inside is not None
+            yield FrameSet(measurement.stamp_ns, images), inside is not None
 
 
 def _moment(

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from benchmarks.motions import BREAK_STATISTIC, motion_error, overhear
 from graphvio.arrays import Float
 from graphvio.config import Config
-from graphvio.events import Event, FrameSet, Quality
-from graphvio.frontend.motion import RelativeMotion, VisualResult
+from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig
 
@@ -28,7 +28,7 @@ class Judged:
         nees: squared Mahalanobis distance from the truth, 6 degrees of freedom.
         error_m: of the translation.
         error_deg: of the rotation.
-        span_s: from its reference to its end.
+        interval_s: from its reference to its end.
         inliers: of each pair.
         points: of each pair, that were offered to the estimation.
     """
@@ -39,7 +39,7 @@ class Judged:
     nees: float
     error_m: float
     error_deg: float
-    span_s: float
+    interval_s: float
     inliers: dict[int, int]
     points: dict[int, int]
 
@@ -60,9 +60,9 @@ class Outcome:
 
     Attributes:
         framesets: that the front-end was given.
-        during: those of them in a fault's span.
+        during: those of them in a fault's interval.
         failures: reason -> number of framesets without a motion.
-        incidents: kind -> number.
+        events: kind -> number.
         motions: all that were returned.
         used: those that went into the estimate; where pairs contradict each other, one side's.
     """
@@ -70,7 +70,7 @@ class Outcome:
     framesets: int = 0
     during: int = 0
     failures: Counter[str] = field(default_factory=Counter)
-    incidents: Counter[str] = field(default_factory=Counter)
+    events: Counter[str] = field(default_factory=Counter)
     motions: list[Judged] = field(default_factory=list)
     used: list[Judged] = field(default_factory=list)
 
@@ -79,7 +79,7 @@ class Outcome:
         self.framesets += other.framesets
         self.during += other.during
         self.failures.update(other.failures)
-        self.incidents.update(other.incidents)
+        self.events.update(other.events)
         self.motions += other.motions
         self.used += other.used
 
@@ -99,20 +99,20 @@ class Run:
         self._overheard = overhear(self._odometry)
         self._during: dict[int, bool] = {}
 
-    def feed(self, event: Event, during: bool) -> None:
-        """Give it an event, and whether a fault lasts."""
-        if isinstance(event, FrameSet):
-            self._during[event.stamp_ns] = during
+    def feed(self, measurement: Measurement, during: bool) -> None:
+        """Give it a measurement, and whether a fault lasts."""
+        if isinstance(measurement, FrameSet):
+            self._during[measurement.stamp_ns] = during
         elif not self._with_imu:
             return
-        self._odometry.process(event)
+        self._odometry.process(measurement)
 
     def finish(self, truth: dict[int, Float], start_ns: int) -> Outcome:
         """End the run and judge it by the truth, stamp -> ``world_T_body`` (4, 4)."""
         self._odometry.finish()
         results, used = self._overheard
         outcome = Outcome(len(results), sum(self._during.values()))
-        outcome.incidents.update(incident.kind for incident in self._odometry.take_incidents())
+        outcome.events.update(event.kind for event in self._odometry.take_events())
         for stamp_ns, result in results.items():
             if result.motion is None:
                 outcome.failures[re.sub(r"\d+", "N", result.reason) or "no reason given"] += 1
@@ -133,7 +133,7 @@ class Run:
             nees=error.statistic,
             error_m=error.error_m,
             error_deg=error.error_deg,
-            span_s=motion.duration_s,
+            interval_s=motion.duration_s,
             inliers={pair: report.inliers for pair, report in sorted(result.pairs.items())},
             points={pair: report.points for pair, report in sorted(result.pairs.items())},
         )

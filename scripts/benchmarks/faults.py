@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.command_line import add_command
-from benchmarks.fault_cases import CASES, WALKS, Case, hard_events
+from benchmarks.fault_cases import CASES, WALKS, Case, hard_measurements
 from benchmarks.fault_judging import MATERIAL_DEG, MATERIAL_M, Judged, Outcome, Run
 from benchmarks.fault_scenes import CORRIDOR_S, recording
 from benchmarks.motions import BREAK_STATISTIC
@@ -25,7 +25,7 @@ from benchmarks.recordings import add_data_option
 from benchmarks.report import Report, machine, tell
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
-from graphvio.events import Quality
+from graphvio.measurements.motion import Quality
 from graphvio.sources import open_source
 from graphvio.trajectory import Trajectory
 from graphvio.warmup import warm_up
@@ -38,7 +38,7 @@ _HEAD = (
     "NEES median", "NEES mean", "> 5 sigma", "material", "used", "used, > 5 sigma", "used, material",
 )  # fmt: skip
 _COLUMNS = (
-    "case", "imu", "second", "in_fault", "quality", "used", "nees", "error_m", "error_deg", "span_s", "inliers",
+    "case", "imu", "second", "in_fault", "quality", "used", "nees", "error_m", "error_deg", "interval_s", "inliers",
     "points",
 )  # fmt: skip
 
@@ -110,9 +110,9 @@ def run_case(task: Task) -> dict[bool, Outcome]:
     truth = dict(zip(trajectory.stamps_ns.tolist(), trajectory.nav_T_body, strict=True))
     warm_up(source.rig, task.config)
     runs = {with_imu: Run(source.rig, task.config, with_imu=with_imu) for with_imu in _MODES}
-    for event, during in hard_events(case, task.seed, source, truth, duration_s):
+    for measurement, during in hard_measurements(case, task.seed, source, truth, duration_s):
         for run in runs.values():
-            run.feed(event, during)
+            run.feed(measurement, during)
     return {with_imu: run.finish(truth, source.start_ns) for with_imu, run in runs.items()}
 
 
@@ -188,7 +188,7 @@ def _write(report: Report, outcomes: Mapping[str, Mapping[bool, Outcome]]) -> No
         rows.append(_row("**all**", total))
         report.table(_HEAD, rows)
         report.add(*_shares(total))
-        report.add(_verdict(total))
+        report.add(_gate_result(total))
 
 
 def _row(title: str, outcome: Outcome) -> list[str]:
@@ -238,18 +238,18 @@ def _shares(total: Outcome) -> list[str]:
                 f"- {name}: {len(motions)}; beyond 5 sigma {wrong} ({100 * wrong / len(motions):.2f} %), "
                 f"material {material} ({100 * material / len(motions):.2f} %)"
             )
-    kinds = ", ".join(f"{kind} {count}" for kind, count in sorted(total.incidents.items()))
-    return [*lines, f"- incidents: {kinds or 'none'}"]
+    kinds = ", ".join(f"{kind} {count}" for kind, count in sorted(total.events.items()))
+    return [*lines, f"- events: {kinds or 'none'}"]
 
 
-def _verdict(total: Outcome) -> str:
+def _gate_result(total: Outcome) -> str:
     used = total.used
     aim = f"Aim: less than {100 * AIM_SHARE:g} % of the used motions beyond 5 sigma"
     if not used:
         return f"{aim}: cannot be told, none was used."
     wrong = sum(m.wrong for m in used)
-    verdict = "met" if wrong < AIM_SHARE * len(used) else "missed"
-    return f"{aim}: **{verdict}**, {wrong} of {len(used)} ({100 * wrong / len(used):.3f} %)."
+    gate_result = "met" if wrong < AIM_SHARE * len(used) else "missed"
+    return f"{aim}: **{gate_result}**, {wrong} of {len(used)} ({100 * wrong / len(used):.3f} %)."
 
 
 def _list_motions(path: Path, outcomes: Mapping[str, Mapping[bool, Outcome]]) -> None:
@@ -266,6 +266,6 @@ def _list_motions(path: Path, outcomes: Mapping[str, Mapping[bool, Outcome]]) ->
 
 def _motion_row(case: str, with_imu: bool, m: Judged, used: bool) -> list[str]:
     flags = (int(m.during), m.quality, int(used))
-    figures = (f"{m.nees:.1f}", f"{m.error_m:.4f}", f"{m.error_deg:.3f}", f"{m.span_s:.2f}")
+    figures = (f"{m.nees:.1f}", f"{m.error_m:.4f}", f"{m.error_deg:.3f}", f"{m.interval_s:.2f}")
     pairs = ("+".join(map(str, counts.values())) for counts in (m.inliers, m.points))
     return [case, f"{int(with_imu)}", f"{m.since_s:.2f}", *map(str, flags), *figures, *pairs]

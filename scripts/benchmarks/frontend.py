@@ -175,7 +175,7 @@ def _aims(report: Report, rig: Rig, ratios: Sequence[float], odometry: Timings, 
     """What is aimed at beside what came out; the aims are for two pairs of one size."""
     has_aims = len(rig.pairs) == 2 and all(pair.left.size_px == AIM_SIZE_PX for pair in rig.pairs)
 
-    def verdict(value: float, aim: float, unit: str = "") -> str:
+    def gate_result(value: float, aim: float, unit: str = "") -> str:
         return f"{aim:g}{unit}: {'met' if value <= aim else 'missed'}" if has_aims else "-"
 
     ratio, odometry_ms = float(np.median(ratios)), odometry.median_ms
@@ -185,15 +185,15 @@ def _aims(report: Report, rig: Rig, ratios: Sequence[float], odometry: Timings, 
     report.table(
         ["medians", "value", "aim"],
         [
-            [f"front-end / reference, median of the rounds' ({each})", f"{ratio:.2f}", verdict(ratio, AIM)],
+            [f"front-end / reference, median of the rounds' ({each})", f"{ratio:.2f}", gate_result(ratio, AIM)],
             ["odometry / reference", f"{odometry_ms / reference_ms:.2f}", "-"],
-            ["odometry, a frameset", f"{odometry_ms:.1f} ms", verdict(odometry_ms, AIM_MS, " ms")],
+            ["odometry, a frameset", f"{odometry_ms:.1f} ms", gate_result(odometry_ms, AIM_MS, " ms")],
             [
                 f"back-end in it ({' and '.join(BACKEND_STAGES)})",
                 f"{median_ms:.2f} ms",
-                verdict(median_ms, BACKEND_AIM_MS, " ms"),
+                gate_result(median_ms, BACKEND_AIM_MS, " ms"),
             ],
-            ["the same, 99th percentile", f"{p99_ms:.2f} ms", verdict(p99_ms, BACKEND_AIM_P99_MS, " ms")],
+            ["the same, 99th percentile", f"{p99_ms:.2f} ms", gate_result(p99_ms, BACKEND_AIM_P99_MS, " ms")],
         ],
     )
 

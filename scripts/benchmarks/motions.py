@@ -8,10 +8,11 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from graphvio.arrays import Float
-from graphvio.events import Estimate, FrameSet, Status
-from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.frontend.visual import MotionPredictor
 from graphvio.geometry import se3_inverse, se3_log
+from graphvio.measurements.estimate import Estimate, Status
+from graphvio.measurements.motion import RelativeMotion, VisualResult
+from graphvio.measurements.sensors import FrameSet
 from graphvio.odometry import Odometry
 
 BREAK_SIGMA = 5.0
@@ -66,7 +67,7 @@ def overhear(odometry: Odometry) -> Overheard:
     An estimate does not carry the motion that vision measured, only the pose that came of it, in which IMU and earlier
     motions hide an error; so the front-end's answers are overheard on their way to the odometry.
     """
-    process, use = odometry._frontend.process, odometry._belief.use
+    process, use = odometry._frontend.process, odometry._estimator.use
     overheard = Overheard({}, {})
 
     def processed(frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
@@ -80,7 +81,7 @@ def overhear(odometry: Odometry) -> Overheard:
         return motion
 
     odometry._frontend.process = processed  # type: ignore[method-assign]
-    odometry._belief.use = used  # type: ignore[method-assign]
+    odometry._estimator.use = used  # type: ignore[method-assign]
     return overheard
 
 

@@ -18,7 +18,7 @@ import graphvio
 from benchmarks.report import tell
 from graphvio.arrays import Image
 from graphvio.errors import GraphvioError
-from graphvio.events import Event, FrameSet
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.rig import Camera, Rig, StereoPair
 from graphvio.simulation import SCENE_NAMES, simulate
 from graphvio.sources import open_source
@@ -107,11 +107,11 @@ class Footage:
 
     Attributes:
         rig: to which the pair indices refer.
-        steps: for each frameset, the events since the one before; the frameset is the last of them.
+        steps: for each frameset, the measurements since the one before; the frameset is the last of them.
     """
 
     rig: Rig
-    steps: list[list[Event]]
+    steps: list[list[Measurement]]
 
     @staticmethod
     def load(folder: Path, count: int, rig: Rig | None = None) -> Footage:
@@ -126,11 +126,11 @@ class Footage:
             GraphvioError: if it cannot be read.
         """
         source = open_source(folder, rig)
-        steps: list[list[Event]] = []
-        waiting: list[Event] = []
-        for event in source:
-            waiting.append(event)
-            if isinstance(event, FrameSet):
+        steps: list[list[Measurement]] = []
+        waiting: list[Measurement] = []
+        for measurement in source:
+            waiting.append(measurement)
+            if isinstance(measurement, FrameSet):
                 steps.append(waiting)
                 waiting = []
                 if len(steps) == count:
@@ -140,7 +140,7 @@ class Footage:
     @property
     def framesets(self) -> list[FrameSet]:
         """All framesets, in order."""
-        return [event for step in self.steps for event in step if isinstance(event, FrameSet)]
+        return [measurement for step in self.steps for measurement in step if isinstance(measurement, FrameSet)]
 
     def first(self, count: int) -> Footage:
         """Only the first framesets."""
@@ -166,7 +166,7 @@ class Footage:
         pairs = tuple(
             replace(pair, left=_resized(pair.left, scale), right=_resized(pair.right, scale)) for pair in self.rig.pairs
         )
-        steps: list[list[Event]] = []
+        steps: list[list[Measurement]] = []
         for frameset in self.framesets:
             images = {
                 j: (_resampled(left, pairs[j].left.size_px), _resampled(right, pairs[j].right.size_px))
@@ -176,13 +176,13 @@ class Footage:
         return Footage(Rig(pairs, name=self.rig.name), steps)
 
 
-def blocks(events: Iterator[Event], framesets: int) -> Iterator[list[Event]]:
-    """Events in lists that hold so many framesets each: reading ahead is done before a list is worked on."""
-    block: list[Event] = []
+def blocks(measurements: Iterator[Measurement], framesets: int) -> Iterator[list[Measurement]]:
+    """Measurements in lists that hold so many framesets each: reading ahead is done before a list is worked on."""
+    block: list[Measurement] = []
     held = 0
-    for event in events:
-        block.append(event)
-        held += isinstance(event, FrameSet)
+    for measurement in measurements:
+        block.append(measurement)
+        held += isinstance(measurement, FrameSet)
         if held == framesets:
             yield block
             block, held = [], 0

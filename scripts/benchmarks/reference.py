@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Image
-from graphvio.events import FrameSet
+from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Camera, Rig, StereoPair
 
 _QUALITY = 0.01

@@ -16,9 +16,10 @@ from graphvio.arrays import Bool, Float, Int
 from graphvio.config import Config
 from graphvio.errors import GraphvioError, TrajectoryError
 from graphvio.evaluation import MAX_GAP_S, Evaluation, evaluate
-from graphvio.events import Estimate, Event, FrameSet
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3, so3_exp
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.motion import RelativeMotion
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig, StereoPair
 from graphvio.sources import open_source
@@ -136,8 +137,8 @@ def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, n
     overheard = overhear(odometry)
     estimates: list[Estimate] = []
     for block in blocks(iter(source), _BLOCK):
-        for event in _altered(block, alter):
-            estimate = odometry.process(event)
+        for measurement in _altered(block, alter):
+            estimate = odometry.process(measurement)
             if estimate is not None:
                 estimates.append(estimate)
     estimates += odometry.finish()
@@ -145,10 +146,10 @@ def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, n
     return _judge(estimates, overheard, truth, noise)
 
 
-def _altered(block: list[Event], alter: Alter | None) -> list[Event]:
+def _altered(block: list[Measurement], alter: Alter | None) -> list[Measurement]:
     if alter is None:
         return block
-    return [alter(event) if isinstance(event, FrameSet) else event for event in block]
+    return [alter(measurement) if isinstance(measurement, FrameSet) else measurement for measurement in block]
 
 
 def _judge(estimates: list[Estimate], overheard: Overheard, truth: Trajectory, noise: TruthNoise) -> Outcome:

@@ -146,8 +146,8 @@ class OdometryContender:
     def step(self, index: int) -> dict[str, float]:
         """Time one frameset and the samples before it."""
         stage_ms: dict[str, float] = {}
-        for event in self._steps[index]:
-            estimate = self._odometry.process(event)
+        for measurement in self._steps[index]:
+            estimate = self._odometry.process(measurement)
             if estimate is not None:
                 stage_ms = dict(estimate.stage_ms)
         return stage_ms

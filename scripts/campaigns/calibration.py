@@ -21,7 +21,7 @@ from scipy.stats import chi2
 
 from campaigns.calibration_draws import PAIRS, Run, one_run
 from graphvio.arrays import Float
-from graphvio.calibration.calibrate import calibrate_pairs, stretches_of_motions
+from graphvio.calibration.calibrate import calibrate_pairs, segments_of_motions
 from graphvio.calibration.pair_calibration import PairCalibration, calibrate_pair
 from graphvio.calibration.result import Calibration
 from graphvio.calibration.separate_motions import SeparateMotions
@@ -123,7 +123,7 @@ def _growth(recording: Path) -> tuple[Calibration, list[list[str]]]:
 
     def follow(number: int, separate: SeparateMotions) -> bool:
         if number in _FRAMESETS:
-            rows.append(_growth_row(number, calibrate_pair(stretches_of_motions(separate.motions())), truth))
+            rows.append(_growth_row(number, calibrate_pair(segments_of_motions(separate.motions())), truth))
             tell(" | ".join(rows[-1]))
         return False
 

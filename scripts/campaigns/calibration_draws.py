@@ -15,7 +15,7 @@ from graphvio.simulation import build_scene
 from graphvio.simulation.default_rig import default_rig
 
 PAIRS = 300
-SPAN_S = 0.35
+INTERVAL_S = 0.35
 _RANDOM_TURN, _RANDOM_STEP_M = 0.15, 0.1  # of outliers
 
 
@@ -56,8 +56,8 @@ def one_run(seed: int, rotation_rad: float, translation_m: float, outlier_share:
     """
     rng = np.random.default_rng(seed)
     rig = default_rig()
-    motion = build_scene("calibration", (PAIRS + 1) * SPAN_S, 0.0).motion
-    poses = motion.at(np.arange(PAIRS + 1, dtype=np.float64) * SPAN_S).world_T_body
+    motion = build_scene("calibration", (PAIRS + 1) * INTERVAL_S, 0.0).motion
+    poses = motion.at(np.arange(PAIRS + 1, dtype=np.float64) * INTERVAL_S).world_T_body
     sigmas = np.repeat([rotation_rad, translation_m], 3)
     cameras = []
     for pair in rig.pairs:
@@ -69,7 +69,7 @@ def one_run(seed: int, rotation_rad: float, translation_m: float, outlier_share:
     for k in np.flatnonzero(outlier):
         cameras[1][k] = se3_exp(random * rng.standard_normal(6))
     covariance = np.tile(np.diag(sigmas**2), (PAIRS, 1, 1))
-    stamps = (np.arange(PAIRS + 1) * SPAN_S * 1e9).astype(np.int64)
+    stamps = (np.arange(PAIRS + 1) * INTERVAL_S * 1e9).astype(np.int64)
     pairs = PosePairs(stamps[:-1], stamps[1:], cameras[0], covariance, cameras[1], covariance)
     paper = paper_method.calibrate(pairs, seed)
     found = graph.solve(pairs, paper.left2_T_left1)

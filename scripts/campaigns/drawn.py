@@ -11,9 +11,9 @@ from benchmarks.recordings import simulated
 
 from graphvio.arrays import Float
 from graphvio.backend.noise import own_covariance
-from graphvio.events import FrameSet
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse
+from graphvio.measurements.motion import RelativeMotion
+from graphvio.measurements.sensors import FrameSet
 from graphvio.odometry import Odometry
 from graphvio.sources import open_source
 
@@ -38,9 +38,9 @@ def templates_of(data: Path, scene: str) -> dict[int, Template]:
     source = open_source(simulated(data, scene))
     odometry = Odometry(source.rig.without_imu())
     overheard = overhear(odometry)
-    for event in source:
-        if isinstance(event, FrameSet):
-            odometry.process(event)
+    for measurement in source:
+        if isinstance(measurement, FrameSet):
+            odometry.process(measurement)
     odometry.finish()
     number = {stamp_ns: k for k, stamp_ns in enumerate(sorted(overheard.results))}
     motions = {stamp_ns: result.motion for stamp_ns, result in overheard.results.items()}

@@ -18,22 +18,22 @@ from campaigns.measures import heading_aligned, tilt_error
 from campaigns.walks import FRAMES_HZ
 from graphvio.arrays import Float
 from graphvio.backend.inertial import ImuBuffer
+from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
-from graphvio.events import ImuSample, Quality
-from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.geometry import se3_exp, se3_inverse
+from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
+from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Imu
 from graphvio.simulation.default_rig import default_rig
 from graphvio.simulation.imu import measure
 from graphvio.simulation.walking import Walk
-from graphvio.smoother_belief import SmootherBelief
 
 _PARTS = 6
 _CORNERS_M = np.array([[2.6, 2.1, 1.45], [-2.6, 2.1, 1.45], [-2.6, -2.1, 1.45], [2.6, -2.1, 1.45]])
 _SPEED_M_S = 1.05
 _SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of vision: rad and metres from frame to frame
-_HEAD = ("minutes", "median ms", "99th percentile", "memory, MB", "variables", "incidents", "position, m, sigma",
+_HEAD = ("minutes", "median ms", "99th percentile", "memory, MB", "variables", "events", "position, m, sigma",
          "tilt, deg", "sigma", "gyro bias, mrad/s", "sigma")  # fmt: skip
 
 
@@ -72,8 +72,8 @@ def _parts(duration_s: float) -> list[list[str]]:
     framesets = round(duration_s * FRAMES_HZ)
     stamps = [round(k * 1e9 / FRAMES_HZ) for k in range(framesets + 1)]
     states = motion.at(np.array(stamps) * 1e-9)
-    incidents: list[int] = []
-    belief = SmootherBelief(rig, Config(), lambda ns, *_: incidents.append(ns), lambda: None)
+    events: list[int] = []
+    estimator = SmootherEstimator(rig, Config(), lambda ns, *_: events.append(ns), lambda: None)
     buffer, added = ImuBuffer(50.0), 0
     spent_ms: list[float] = []
     rows = []
@@ -85,14 +85,14 @@ def _parts(duration_s: float) -> list[list[str]]:
         visual = VisualResult(_motion(states.world_T_body, stamps, k, rng) if k else None, Quality.GOOD, "", {})
         start = perf_counter()
         if k == 0:
-            found = buffer.stretch(0, stamps[0] + 500_000_000)
+            found = buffer.segment(0, stamps[0] + 500_000_000)
             assert found is not None
-            belief.start(stamp_ns, (found[0], 0.0))
+            estimator.start(stamp_ns, (found[0], 0.0))
         else:
-            belief.predict(stamp_ns, buffer.span(stamps[k - 1], stamp_ns))
-        used = belief.use(visual, at_rest=False) is not None
-        belief.update(stamp_ns, used or k == 0, frozenset())
-        belief.take_final()
+            estimator.predict(stamp_ns, buffer.interval(stamps[k - 1], stamp_ns))
+        used = estimator.use(visual, at_rest=False) is not None
+        estimator.update(stamp_ns, used or k == 0, frozenset())
+        estimator.take_final()
         spent_ms.append(1e3 * (perf_counter() - start))
         buffer.discard_before(stamp_ns)
         if k and k % (framesets // _PARTS) == 0:
@@ -102,9 +102,9 @@ def _parts(duration_s: float) -> list[list[str]]:
                     f"{np.median(spent_ms):.2f}",
                     f"{np.percentile(spent_ms, 99):.2f}",
                     f"{_memory_mb():.0f}",
-                    str(belief._running._window.values.size()),
-                    str(len(incidents)),
-                    *_errors(belief, states.world_T_body[k], track.gyro_bias[round(k * imu.rate_hz / FRAMES_HZ)]),
+                    str(estimator._running._window.values.size()),
+                    str(len(events)),
+                    *_errors(estimator, states.world_T_body[k], track.gyro_bias[round(k * imu.rate_hz / FRAMES_HZ)]),
                 ]
             )
             tell(" | ".join(rows[-1]))
@@ -118,9 +118,9 @@ def _motion(world_T_body: Float, stamps: list[int], k: int, rng: np.random.Gener
     return RelativeMotion(stamps[k - 1], stamps[k], measured, np.diag(_SIGMAS**2), np.zeros((6, 6)), 300)
 
 
-def _errors(belief: SmootherBelief, world_T_body: Float, gyro_bias: Float) -> list[str]:
+def _errors(estimator: SmootherEstimator, world_T_body: Float, gyro_bias: Float) -> list[str]:
     """Sigma of the position; error and sigma of the tilt; of the gyro's bias."""
-    state, known = belief.state(), belief.covariance
+    state, known = estimator.state(), estimator.covariance
     assert known.gyro_bias is not None
     true = heading_aligned(state.nav_T_body, world_T_body) @ world_T_body
     tilt, tilt_covariance = tilt_error(state.nav_T_body, true, known.pose)

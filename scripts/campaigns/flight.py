@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.backend.inertial import ImuBuffer, ImuSpan
+from graphvio.backend.inertial import ImuBuffer
 from graphvio.errors import GraphvioError
-from graphvio.events import ImuSample
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.sensors import ImuSample
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.tables import ImuTable, read_imu_csv
 from graphvio.trajectory import Trajectory
@@ -45,12 +46,12 @@ class Flight:
 
     Attributes:
         stamps_ns: N of them.
-        spans: N - 1, the IMU from each stamp to the next.
+        intervals: N - 1, the IMU from each stamp to the next.
         told: by the file; the velocities are those of its positions.
     """
 
     stamps_ns: list[int]
-    spans: list[ImuSpan]
+    intervals: list[ImuInterval]
     told: Truth
 
     @staticmethod
@@ -75,7 +76,7 @@ class Flight:
         biases = np.stack([np.interp(at, seconds, column) for column in columns.T], axis=1)
         velocity = np.gradient(poses.positions, 1e-9 * STEP_NS, axis=0)
         told = Truth(poses.nav_T_body, velocity, biases[:, :3], biases[:, 3:])
-        return Flight(stamps.tolist(), list(_spans(table, stamps, folder)), told)
+        return Flight(stamps.tolist(), list(_intervals(table, stamps, folder)), told)
 
 
 def _bias_columns(path: Path, rows: int) -> Float:
@@ -89,15 +90,15 @@ def _bias_columns(path: Path, rows: int) -> Float:
     return columns
 
 
-def _spans(table: ImuTable, stamps_ns: Int, folder: Path) -> Iterator[ImuSpan]:
+def _intervals(table: ImuTable, stamps_ns: Int, folder: Path) -> Iterator[ImuInterval]:
     """The IMU between stamps (N,), as the odometry's own buffer gives it."""
     buffer, added = ImuBuffer(1e3 * _MAX_GAP_S), 0
     for start_ns, end_ns in zip(stamps_ns[:-1].tolist(), stamps_ns[1:].tolist(), strict=True):
         while not buffer.covers(end_ns):
             buffer.add(ImuSample(int(table.stamps_ns[added]), table.values[added, :3], table.values[added, 3:]))
             added += 1
-        span = buffer.span(start_ns, end_ns)
-        if span is None:
+        interval = buffer.interval(start_ns, end_ns)
+        if interval is None:
             raise GraphvioError(f"{folder}: its IMU has a gap of more than {_MAX_GAP_S:g} s; choose another recording")
-        yield span
+        yield interval
         buffer.discard_before(end_ns)

@@ -86,10 +86,10 @@ def turns(told: Truth, found: Truth) -> Float:
 def force_errors(flight: Flight, truth: Truth, imu: Imu) -> Float:
     """Mean specific force (N - 1, 3) m/s^2 of each step as measured, less that of a truth; body, bias included."""
     step_s, up = 1e-9 * STEP_NS, np.array([0.0, 0.0, GRAVITY_M_S2])
-    params, errors = preintegration_params(imu, 1.0), np.empty((len(flight.spans), 3))
-    for k, (span, bias) in enumerate(zip(flight.spans, _biases(truth)[:-1], strict=True)):
+    params, errors = preintegration_params(imu, 1.0), np.empty((len(flight.intervals), 3))
+    for k, (interval, bias) in enumerate(zip(flight.intervals, _biases(truth)[:-1], strict=True)):
         gained = truth.velocity_world[k + 1] - truth.velocity_world[k] + step_s * up
-        measured = preintegrate(span, params, bias).deltaVij()
+        measured = preintegrate(interval, params, bias).deltaVij()
         errors[k] = truth.accel_bias[k] + (measured - truth.world_T_body[k, :3, :3].T @ gained) / step_s
     return errors
 
@@ -103,12 +103,12 @@ def with_drawn_forces(flight: Flight, errors: Float, density: float, seed: int) 
         density: of the noise, m/s^2/sqrt(Hz).
         seed: of the noise.
     """
-    rng, spans = np.random.default_rng([seed, 13]), []
-    for span, off in zip(flight.spans, errors - errors.mean(axis=0), strict=True):
-        steps_s = np.maximum(span.steps_s, 1e-9)[:, None]
-        noise = density / np.sqrt(steps_s) * rng.standard_normal(span.linear_acceleration.shape)
-        spans.append(replace(span, linear_acceleration=span.linear_acceleration - off + noise))
-    return replace(flight, spans=spans)
+    rng, intervals = np.random.default_rng([seed, 13]), []
+    for interval, off in zip(flight.intervals, errors - errors.mean(axis=0), strict=True):
+        steps_s = np.maximum(interval.steps_s, 1e-9)[:, None]
+        noise = density / np.sqrt(steps_s) * rng.standard_normal(interval.linear_acceleration.shape)
+        intervals.append(replace(interval, linear_acceleration=interval.linear_acceleration - off + noise))
+    return replace(flight, intervals=intervals)
 
 
 def allan_deviation(values: Float, steps: int) -> Float:
@@ -122,8 +122,8 @@ def _graph(flight: Flight, around: Truth, params: gtsam.PreintegrationCombinedPa
     graph, noise = gtsam.NonlinearFactorGraph(), isotropic(3, _POSITION_SIGMA_M)
     for k, world_T_body in enumerate(flight.told.world_T_body):
         graph.add(gtsam.GPSFactorArmCalib(x(k), _LEVER_ARM, world_T_body[:3, 3], noise))
-    for k, (span, bias) in enumerate(zip(flight.spans, _biases(around)[:-1], strict=True)):
-        measured = preintegrate(span, params, bias)
+    for k, (interval, bias) in enumerate(zip(flight.intervals, _biases(around)[:-1], strict=True)):
+        measured = preintegrate(interval, params, bias)
         graph.add(gtsam.CombinedImuFactor(x(k), v(k), x(k + 1), v(k + 1), b(k), b(k + 1), measured))
     graph.add(gtsam.PriorFactorConstantBias(b(0), gtsam.imuBias.ConstantBias(), isotropic(6, _BIAS_SIGMA)))
     graph.add(gtsam.PriorFactorVector(_LEVER_ARM, np.zeros(3), isotropic(3, _LEVER_ARM_SIGMA_M)))

@@ -19,7 +19,7 @@ from benchmarks.report import Report, machine, tell
 from campaigns.paper_run import PaperRun, Track
 from campaigns.walks import FRAMES_HZ
 from graphvio.arrays import Float
-from graphvio.config_stages import SmootherConfig
+from graphvio.config.stages import SmootherConfig
 from graphvio.errors import GraphvioError
 
 LAGS = ((1, 1), (1, 3), (5, 1), (5, 3), (20, 1), (20, 3))

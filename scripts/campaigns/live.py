@@ -23,10 +23,12 @@ from benchmarks.report import Report, machine, tell
 from campaigns.live_listener import Listener
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
-from graphvio.events import Estimate, Event, FrameSet, ImuSample, Incident
 from graphvio.live.output import Output
 from graphvio.live.running import LiveOdometry
 from graphvio.live.sources import open_live_source
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.sources import open_source
 from graphvio.warmup import warm_up
 
@@ -107,7 +109,7 @@ def _run(case: _Case, folder: Path, seconds: float) -> list[str]:
     running.stop()
     listener.thread.join()
     figures = running.status()
-    told = {name.removeprefix("incident_"): value for name, value in figures.items() if name.startswith("incident_")}
+    told = {name.removeprefix("event_"): value for name, value in figures.items() if name.startswith("event_")}
     return [
         str(figures["framesets"]),
         str(int(figures["skipped_late"] or 0) + int(figures["skipped_no_room"] or 0)),
@@ -126,7 +128,7 @@ class _Stall(Output):
         self._seconds = seconds
         self._results = 0
 
-    def add_event(self, event: Event) -> None:
+    def add_measurement(self, measurement: Measurement) -> None:
         """Nothing."""
 
     def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
@@ -135,7 +137,7 @@ class _Stall(Output):
         if self._seconds and self._results == 100:
             time.sleep(self._seconds)
 
-    def add_incident(self, incident: Incident) -> None:
+    def add_event(self, event: Event) -> None:
         """Nothing."""
 
     def status(self) -> Mapping[str, float | int | str | None]:
@@ -163,6 +165,6 @@ def _killed(folder: Path, after_s: float) -> float:
         elapsed_s = time.monotonic() - begun_s
         process.wait()
         session = open_source(out)
-        framesets = [event for event in session if not isinstance(event, ImuSample)]
+        framesets = [measurement for measurement in session if not isinstance(measurement, ImuSample)]
         recorded_s = 1e-9 * (framesets[-1].stamp_ns - framesets[0].stamp_ns)
         return max(0.0, elapsed_s - recorded_s)

@@ -11,12 +11,12 @@ import numpy as np
 from campaigns.drawn import DrawnVision, Template
 from campaigns.measures import tilt_error
 from campaigns.walks import FRAMES_HZ, Walk, buffer_of
-from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
-from graphvio.config_stages import SmootherConfig
+from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
+from graphvio.measurements.imu_interval import ImuInterval
 
 _SETTLED_S = 2.0
 _TILT_SIGMA, _SPEED_SIGMA, _GYRO_BIAS_SIGMA, _ACCEL_BIAS_SIGMA = 0.02, 0.2, 0.01, 0.2  # the last is the smoother's
@@ -59,17 +59,17 @@ class _ModelRun:
         self._start()
         anchors = {1: 0, 10: 0}  # seconds -> frameset from which the motion is measured
         for k in range(1, len(self._stamps)):
-            span = self._buffer.span(self._stamps[k - 1], self._stamps[k])
-            assert span is not None
-            smoother.extend(self._stamps[k], span)
+            interval = self._buffer.interval(self._stamps[k - 1], self._stamps[k])
+            assert interval is not None
+            smoother.extend(self._stamps[k], interval)
             if k > _SETTLED_S * FRAMES_HZ:
-                yield "imu", k / FRAMES_HZ, self._imu_square(span, k), 15
+                yield "imu", k / FRAMES_HZ, self._imu_square(interval, k), 15
             motion = self._vision.at(k)
             if motion is not None and smoother.knows(motion.reference_stamp_ns):
-                verdict = smoother.test(motion)
+                gate_result = smoother.test(motion)
                 if k > _SETTLED_S * FRAMES_HZ:
-                    yield "vision", k / FRAMES_HZ, verdict.statistic, 6
-                if verdict.accepted:
+                    yield "vision", k / FRAMES_HZ, gate_result.statistic, 6
+                if gate_result.accepted:
                     smoother.accept(motion)
             kept = {self._stamps[number] for number in anchors.values()}
             following = self._vision.reference(k + 1)
@@ -106,14 +106,14 @@ class _ModelRun:
         ):
             yield name, time_s, float(error @ np.linalg.solve(covariance, error)), len(error)
 
-    def _imu_square(self, span: ImuSpan, k: int) -> float:
+    def _imu_square(self, interval: ImuInterval, k: int) -> float:
         """How far the IMU from one frameset to the next, with the walk of its biases, is from the truth."""
         biases = []
         for number in (k - 1, k):
             sample = round(number / FRAMES_HZ * self._imu_rate_hz)
             biases.append(gtsam.imuBias.ConstantBias(self._track.accel_bias[sample], self._track.gyro_bias[sample]))
         states = [(gtsam.Pose3(self._truth[number]), self._velocities[number]) for number in (k - 1, k)]
-        factor = gtsam.CombinedImuFactor(0, 1, 2, 3, 4, 5, preintegrate(span, self._params, biases[0]))
+        factor = gtsam.CombinedImuFactor(0, 1, 2, 3, 4, 5, preintegrate(interval, self._params, biases[0]))
         values = gtsam.Values()
         for at, (pose, velocity) in enumerate(states):
             values.insert(2 * at, pose)

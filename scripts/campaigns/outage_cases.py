@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from graphvio.events import Event, FrameSet, ImuSample
+from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 
 BEGIN_S = 3.0
 """Of what goes wrong, after the recording's first frameset."""
@@ -18,8 +18,8 @@ _END_OF_VISION_S = 8.0
 _FOR_EVER_S = math.inf
 _MS = 1_000_000
 
-Change = Callable[[Event], list[Event]]
-"""What is delivered in place of an event; nothing where it stays away."""
+Change = Callable[[Measurement], list[Measurement]]
+"""What is delivered in place of a measurement; nothing where it stays away."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Case:
     Attributes:
         name: for people.
         promise: what is to happen, for people.
-        make: a fresh change, which is applied to the events from ``begin_s`` on and before ``end_s``.
+        make: a fresh change, which is applied to the measurements from ``begin_s`` on and before ``end_s``.
         begin_s: seconds after the first frameset; minus infinity for all that comes before it, too.
         end_s: on the same scale; infinite where it never ends.
         late_s: framesets are delivered so much later than the IMU's samples of their instant.
@@ -58,33 +58,33 @@ class Case:
 
 
 class Delivery:
-    """The events of a recording as a case delivers them, one by one.
+    """The measurements of a recording as a case delivers them, one by one.
 
     Attributes:
         framesets: how many of the recording's were delivered so far, each counted once.
     """
 
-    def __init__(self, case: Case, events: Iterable[Event], start_ns: int) -> None:
+    def __init__(self, case: Case, measurements: Iterable[Measurement], start_ns: int) -> None:
         self.framesets = 0
-        self._case, self._events, self._start_ns = case, events, start_ns
+        self._case, self._measurements, self._start_ns = case, measurements, start_ns
 
-    def __iter__(self) -> Iterator[Event]:
+    def __iter__(self) -> Iterator[Measurement]:
         late_ns, held = round(self._case.late_s * 1e9), deque[FrameSet]()
-        for event in self._changed():
-            while held and held[0].stamp_ns + late_ns < event.stamp_ns:
+        for measurement in self._changed():
+            while held and held[0].stamp_ns + late_ns < measurement.stamp_ns:
                 yield held.popleft()
-            if late_ns and isinstance(event, FrameSet):
-                held.append(event)
+            if late_ns and isinstance(measurement, FrameSet):
+                held.append(measurement)
             else:
-                yield event
+                yield measurement
         yield from held
 
-    def _changed(self) -> Iterator[Event]:
+    def _changed(self) -> Iterator[Measurement]:
         case, change = self._case, self._case.make()
-        for event in self._events:
-            time_s = (event.stamp_ns - self._start_ns) * 1e-9
-            delivered = change(event) if case.begin_s - 1e-3 <= time_s < case.end_s - 1e-3 else [event]
-            self.framesets += isinstance(event, FrameSet) and bool(delivered)
+        for measurement in self._measurements:
+            time_s = (measurement.stamp_ns - self._start_ns) * 1e-9
+            delivered = change(measurement) if case.begin_s - 1e-3 <= time_s < case.end_s - 1e-3 else [measurement]
+            self.framesets += isinstance(measurement, FrameSet) and bool(delivered)
             yield from delivered
 
 
@@ -92,19 +92,19 @@ class Delivery:
 
 
 def _unchanged() -> Change:
-    return lambda event: [event]
+    return lambda measurement: [measurement]
 
 
 def _of_framesets(change: Callable[[FrameSet], FrameSet | None]) -> Change:
-    return lambda event: _present(change(event)) if isinstance(event, FrameSet) else [event]
+    return lambda measurement: _present(change(measurement)) if isinstance(measurement, FrameSet) else [measurement]
 
 
 def _of_samples(change: Callable[[ImuSample], ImuSample | None]) -> Change:
-    return lambda event: _present(change(event)) if isinstance(event, ImuSample) else [event]
+    return lambda measurement: _present(change(measurement)) if isinstance(measurement, ImuSample) else [measurement]
 
 
-def _present(event: Event | None) -> list[Event]:
-    return [] if event is None else [event]
+def _present(measurement: Measurement | None) -> list[Measurement]:
+    return [] if measurement is None else [measurement]
 
 
 def _black(*pairs: int) -> Callable[[], Change]:
@@ -143,7 +143,7 @@ def _repeated() -> Change:
 
 def _stuck_and_black() -> Change:
     stick, blacken = _stuck(2)(), _black()()
-    return lambda event: blacken(event) if isinstance(event, FrameSet) else stick(event)
+    return lambda measurement: blacken(measurement) if isinstance(measurement, FrameSet) else stick(measurement)
 
 
 def _cut_off() -> Change:
@@ -157,11 +157,11 @@ def _not_a_number() -> Change:
 
 
 def _muddled() -> Change:
-    """Every event twice, and once with a stamp that lies back."""
+    """Every measurement twice, and once with a stamp that lies back."""
 
-    def three(event: Event) -> list[Event]:
-        back_ms = 20 if isinstance(event, ImuSample) else 200
-        return [event, event, replace(event, stamp_ns=event.stamp_ns - back_ms * _MS)]
+    def three(measurement: Measurement) -> list[Measurement]:
+        back_ms = 20 if isinstance(measurement, ImuSample) else 200
+        return [measurement, measurement, replace(measurement, stamp_ns=measurement.stamp_ns - back_ms * _MS)]
 
     return three
 
@@ -173,7 +173,7 @@ def _half() -> Change:
 
 def _jumped(jump_s: float) -> Callable[[], Change]:
     jump_ns = round(jump_s * 1e9)
-    return lambda: lambda event: [replace(event, stamp_ns=event.stamp_ns + jump_ns)]
+    return lambda: lambda measurement: [replace(measurement, stamp_ns=measurement.stamp_ns + jump_ns)]
 
 
 # ------------------------------------------------------------------ cases

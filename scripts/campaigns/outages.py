@@ -23,8 +23,9 @@ from scipy.stats import chi2
 from campaigns.outage_cases import BEGIN_S, CASES, Case, Delivery
 from graphvio.arrays import Float
 from graphvio.errors import GraphvioError
-from graphvio.events import Estimate, Incident, Status
 from graphvio.geometry import se3_inverse, se3_log
+from graphvio.measurements.estimate import Estimate, Status
+from graphvio.measurements.events import Event
 from graphvio.odometry import Odometry
 from graphvio.sources import open_source
 from graphvio.trajectory import Trajectory
@@ -36,7 +37,7 @@ _MOST_SIGMA = 3.0
 _MOST_STATISTIC = float(chi2.isf(chi2.sf(_MOST_SIGMA**2, 1), 6))  # as improbable of a pose, which has six numbers
 _BY_VISION = (Status.TRACKING, Status.INITIALISING)
 _HEAD = ("case", "poses, %", "while it lasts", "largest jump, mm", "at return", "recovery, s", "error, cm",
-         "epochs", "incidents")  # fmt: skip
+         "epochs", "events")  # fmt: skip
 _EXPLANATION = (
     f"What goes wrong begins after {BEGIN_S:g} s of the {_SCENE} where nothing else is said. Poses: of the delivered "
     "framesets, those whose estimate has one. Largest jump: the most by which a step from one frameset to the next, "
@@ -100,14 +101,14 @@ def outcome_of(case: Case, folder: Path) -> Outcome:
     assert source.truth is not None
     truth = Trajectory.read(source.truth)
     odometry, delivery = Odometry(source.rig), Delivery(case, source, source.start_ns)
-    estimates = [estimate for event in delivery if (estimate := odometry.process(event)) is not None]
+    estimates = [estimate for measurement in delivery if (estimate := odometry.process(measurement)) is not None]
     estimates += odometry.finish()
     stamps = [case.true_ns(estimate.stamp_ns, source.start_ns) for estimate in estimates]
     times_s = (np.array(stamps, dtype=np.int64) - source.start_ns) * 1e-9
     at = np.searchsorted(truth.stamps_ns, stamps)
     assert np.array_equal(truth.stamps_ns[at], stamps)
-    incidents = odometry.take_incidents()
-    return Outcome(case, estimates, np.asarray(times_s), truth.nav_T_body[at], delivery.framesets, incidents)
+    events = odometry.take_events()
+    return Outcome(case, estimates, np.asarray(times_s), truth.nav_T_body[at], delivery.framesets, events)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +121,7 @@ class Outcome:
         times_s: (N,) of the images, seconds of the recording after its first frameset.
         world_T_body: (N, 4, 4) true poses.
         given: number of the framesets that were delivered.
-        incidents: all.
+        events: all.
     """
 
     case: Case
@@ -128,7 +129,7 @@ class Outcome:
     times_s: Float
     world_T_body: Float
     given: int
-    incidents: list[Incident]
+    events: list[Event]
 
     def cells(self) -> list[str]:
         """Of the table, after the case's name."""
@@ -136,7 +137,7 @@ class Outcome:
         distances = self.return_distances()
         lasts = (self.times_s >= self.case.begin_s - 1e-3) & (self.times_s < self.case.over_s - 1e-3)
         statuses = Counter(str(e.status) for e, during in zip(estimates, lasts, strict=True) if during)
-        kinds = Counter(incident.kind for incident in self.incidents)
+        kinds = Counter(event.kind for event in self.events)
         return [
             f"{100 * sum(e.nav_T_body is not None for e in estimates) / self.given:.1f}",
             _counts(statuses),

@@ -14,12 +14,12 @@ from graphvio.backend.ekf.graph import PaperGraph
 from graphvio.backend.ekf.measurements import Measurement, VisualRates, accelerometer, gyro, stacked, vision
 from graphvio.backend.ekf.process import noise_sigmas
 from graphvio.backend.ekf.state import FilterState
-from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
-from graphvio.config_stages import FilterConfig, SmootherConfig
-from graphvio.frontend.motion import RelativeMotion
+from graphvio.config.stages import FilterConfig, SmootherConfig
 from graphvio.geometry import se3_exp, se3_log
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import RelativeMotion
 
 _SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of vision: rad and metres from frame to frame
 _BLIND_EVERY_S, _BLIND_S = 5.0, 1.0
@@ -52,13 +52,13 @@ class PaperRun:
         self._imu, self._stamps = walk.imu, walk.stamps_ns
         self._truth, self._rates = walk.world_T_body, walk.angular_velocity
         self._velocities = np.einsum("nji,nj->ni", self._truth[:, :3, :3], walk.velocity_world)
-        self._spans: list[ImuSpan] = []
+        self._intervals: list[ImuInterval] = []
         self._motions: list[RelativeMotion | None] = []
         for k in range(1, len(self._stamps)):
             start_ns, end_ns = self._stamps[k - 1], self._stamps[k]
-            span = buffer.span(start_ns, end_ns)
-            assert span is not None
-            self._spans.append(span)
+            interval = buffer.interval(start_ns, end_ns)
+            assert interval is not None
+            self._intervals.append(interval)
             true = np.linalg.inv(self._truth[k - 1]) @ self._truth[k]
             measured = true @ se3_exp(_SIGMAS * rng.standard_normal(6))
             sees = (k / FRAMES_HZ) % _BLIND_EVERY_S < _BLIND_EVERY_S - _BLIND_S
@@ -98,7 +98,7 @@ class PaperRun:
         smoother.start(0, RigState(pose, pose[:3, :3] @ first.velocity_body, np.zeros(3), np.zeros(3)), known)
         newest, leaving = [], []
         for k in range(1, len(self._stamps)):
-            smoother.extend(self._stamps[k], self._spans[k - 1])
+            smoother.extend(self._stamps[k], self._intervals[k - 1])
             motion = self._motions[k - 1]
             if motion is not None:
                 smoother.accept(motion)
@@ -124,10 +124,10 @@ class PaperRun:
         )
 
     def _expectations(self, k: int) -> list[Callable[[FilterState], Measurement]]:
-        config, span, motion = FilterConfig(), self._spans[k - 1], self._motions[k - 1]
+        config, interval, motion = FilterConfig(), self._intervals[k - 1], self._motions[k - 1]
         made: list[Callable[[FilterState], Measurement]] = [
-            lambda state: gyro(state, span.mean_rate, config.gyro_sigma_rad_s),
-            lambda state: accelerometer(state, span.mean_force, config.gravity_sigma_m_s2),
+            lambda state: gyro(state, interval.mean_rate, config.gyro_sigma_rad_s),
+            lambda state: accelerometer(state, interval.mean_force, config.gravity_sigma_m_s2),
         ]
         if motion is not None:
             rates = VisualRates.of(motion)

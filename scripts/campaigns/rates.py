@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from graphvio.arrays import Float, Image
 from graphvio.errors import GraphvioError
-from graphvio.events import FrameSet
+from graphvio.measurements.sensors import FrameSet
 from graphvio.odometry import Odometry
 from graphvio.simulation import build_scene
 from graphvio.sources import open_source
@@ -52,11 +52,11 @@ def main(args: argparse.Namespace) -> None:
     odometry = Odometry(source.rig)
     rates: dict[str, list[tuple[float, Float]]] = defaultdict(list)
     images: list[tuple[float, list[Image]]] = []
-    for event in source:
-        time_s = (event.stamp_ns - source.start_ns) * 1e-9
-        if isinstance(event, FrameSet) and time_s >= begin_s:
-            images.append((time_s, [event.images[j][0] for j in sorted(event.images)]))
-        estimate = odometry.process(event)
+    for measurement in source:
+        time_s = (measurement.stamp_ns - source.start_ns) * 1e-9
+        if isinstance(measurement, FrameSet) and time_s >= begin_s:
+            images.append((time_s, [measurement.images[j][0] for j in sorted(measurement.images)]))
+        estimate = odometry.process(measurement)
         if estimate is None:
             continue
         time_s = (estimate.stamp_ns - source.start_ns) * 1e-9

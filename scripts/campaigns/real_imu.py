@@ -22,7 +22,7 @@ from campaigns.imu_truth import Reconstruction, allan_deviation, force_errors, r
 from campaigns.measures import Squares, tilt_error
 from campaigns.real_run import Miss, RealRun, real_run
 from graphvio.arrays import Float
-from graphvio.config_stages import SmootherConfig
+from graphvio.config.stages import SmootherConfig
 from graphvio.errors import GraphvioError
 from graphvio.rig import Imu
 
@@ -56,7 +56,7 @@ def main(args: argparse.Namespace) -> None:
         raise GraphvioError("--seeds wants 2 or more")
     flight, imu, config = Flight.read(args.recording), Imu(), SmootherConfig()
     report = Report()
-    report.add(machine(), "", f"`--seeds {args.seeds}`, {len(flight.spans) / FRAMES_HZ:.0f} s of flight.")
+    report.add(machine(), "", f"`--seeds {args.seeds}`, {len(flight.intervals) / FRAMES_HZ:.0f} s of flight.")
     found = reconstruct(flight, imu, config.imu_noise_scale)
     _write_truth(report, flight, found, reconstruct(flight, imu, config.imu_noise_scale, rounds=1))
     truth, errors = found.truth, force_errors(flight, found.truth, imu)
@@ -183,8 +183,8 @@ def _write_biases(report: Report, told: Truth, found: Truth, runs: list[RealRun]
         gyro = np.array([run.gyro_biases[:, axis] for run in runs])
         beyond |= (np.abs(gyro - told.gyro_bias[:, axis]) > _GYRO_BIAS_AIM).any(axis=0)
         by_file, by_fit = (_apart(gyro[:, first:], each.gyro_bias[first:, axis]) for each in (told, found))
-        verdicts = ["met" if value <= _GYRO_BIAS_AIM else "missed" for value in by_file]
-        table.append([f"gyro {letter}, mrad/s", *_pair(by_file), *verdicts, *_pair(by_fit)])
+        gate_results = ["met" if value <= _GYRO_BIAS_AIM else "missed" for value in by_file]
+        table.append([f"gyro {letter}, mrad/s", *_pair(by_file), *gate_results, *_pair(by_fit)])
     for axis, letter in enumerate(_AXES):
         accel = np.array([run.accel_biases[first:, axis] for run in runs])
         by_file, by_fit = (_apart(accel, each.accel_bias[first:, axis]) for each in (told, found))

@@ -12,15 +12,15 @@ from campaigns.measures import tilt_error
 from graphvio.arrays import Float
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
-from graphvio.config_stages import SmootherConfig
-from graphvio.frontend.motion import RelativeMotion
+from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
+from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Imu
 
 _SETTLED_S = 2.0
 _SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of vision: rad and metres from frame to frame
 _TILT_SIGMA, _SPEED_SIGMA, _GYRO_BIAS_SIGMA = 0.05, 0.2, 0.1
-_SPANS_S = (1, 10)
+_INTERVALS_S = (1, 10)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,15 +63,15 @@ def real_run(seed: int, flight: Flight, truth: Truth, config: SmootherConfig, im
     smoother = _started(flight, truth, config, imu, rng)
     misses: list[Miss] = []
     states, refused = [smoother.state()], 0
-    anchors = dict.fromkeys(_SPANS_S, 0)  # seconds -> number of the state from which the motion is measured
+    anchors = dict.fromkeys(_INTERVALS_S, 0)  # seconds -> number of the state from which the motion is measured
     for k in range(1, len(flight.stamps_ns)):
-        smoother.extend(flight.stamps_ns[k], flight.spans[k - 1])
+        smoother.extend(flight.stamps_ns[k], flight.intervals[k - 1])
         motion = _drawn(flight, truth, k, rng)
-        verdict = smoother.test(motion)
+        gate_result = smoother.test(motion)
         settled = k >= _SETTLED_S * FRAMES_HZ
         if settled:
-            misses.append(Miss("vision", k, verdict.innovation, verdict.covariance))
-        if verdict.accepted:
+            misses.append(Miss("vision", k, gate_result.innovation, gate_result.covariance))
+        if gate_result.accepted:
             smoother.accept(motion)
         else:
             refused += 1

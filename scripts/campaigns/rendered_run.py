@@ -10,15 +10,16 @@ from benchmarks.recordings import simulated
 
 from campaigns.measures import heading_aligned, tilt_error
 from campaigns.model_run import Square
+from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
-from graphvio.config_stages import MotionConfig, SmootherConfig
-from graphvio.events import Estimate, Event, ImuSample
+from graphvio.config.stages import MotionConfig, SmootherConfig
 from graphvio.geometry import se3_log
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.sensors import ImuSample, Measurement
 from graphvio.odometry import Odometry
 from graphvio.simulation import build_scene
 from graphvio.simulation.imu import ImuTrack, measure
 from graphvio.simulation.motion import MotionStates
-from graphvio.smoother_belief import SmootherBelief
 from graphvio.sources import open_source
 
 CALIBRATION_ERROR_SHARE = 2e-4
@@ -36,7 +37,7 @@ def rendered_run(seed: int, scene: str, data: Path, duration_s: float) -> list[S
     stamps = np.array([e.stamp_ns for e in source if isinstance(e, ImuSample)], dtype=np.int64)
     times = np.clip((stamps - source.start_ns) * 1e-9, 0.0, motion.duration_s)
     track = measure(motion, source.rig.imu, times, stamps, 1000 + seed)
-    events = [_redrawn(event, track) for event in source]
+    measurements = [_redrawn(measurement, track) for measurement in source]
     squares: list[Square] = []
     for seconds, share in ((1, CALIBRATION_ERROR_SHARE), (10, CALIBRATION_ERROR_SHARE), (10, 0.0)):
         config = Config(
@@ -47,26 +48,26 @@ def rendered_run(seed: int, scene: str, data: Path, duration_s: float) -> list[S
         without = "" if share else WITHOUT_SHARE
         squares += [
             (name + without, time_s, square, dimensions)
-            for name, time_s, square, dimensions in run.squares(events, seconds)
+            for name, time_s, square, dimensions in run.squares(measurements, seconds)
         ]
     return squares
 
 
-def _redrawn(event: Event, track: ImuTrack) -> Event:
-    if not isinstance(event, ImuSample):
-        return event
-    i = int(np.searchsorted(track.stamps_ns, event.stamp_ns))
-    return ImuSample(event.stamp_ns, track.angular_velocity[i], track.linear_acceleration[i])
+def _redrawn(measurement: Measurement, track: ImuTrack) -> Measurement:
+    if not isinstance(measurement, ImuSample):
+        return measurement
+    i = int(np.searchsorted(track.stamps_ns, measurement.stamp_ns))
+    return ImuSample(measurement.stamp_ns, track.angular_velocity[i], track.linear_acceleration[i])
 
 
 class _Run:
     def __init__(self, start_ns: int, odometry: Odometry, track: ImuTrack, states: MotionStates) -> None:
         self._start_ns, self._odometry, self._track, self._states = start_ns, odometry, track, states
 
-    def squares(self, events: list[Event], seconds: int) -> Iterator[Square]:
+    def squares(self, measurements: list[Measurement], seconds: int) -> Iterator[Square]:
         """Those of the motion over so many seconds; with one second, those of the states, too."""
-        for event in events:
-            estimate = self._odometry.process(event)
+        for measurement in measurements:
+            estimate = self._odometry.process(measurement)
             if estimate is None:
                 continue
             time_s = (estimate.stamp_ns - self._start_ns) * 1e-9
@@ -100,16 +101,16 @@ class _Run:
             yield name, time_s, float(error @ np.linalg.solve(covariance, error)), len(error)
 
     def _motion_square(self, estimate: Estimate, time_s: float, seconds: int) -> Iterator[Square]:
-        belief = self._odometry._belief
-        assert isinstance(belief, SmootherBelief)
+        estimator = self._odometry._estimator
+        assert isinstance(estimator, SmootherEstimator)
         then_ns = estimate.stamp_ns - seconds * 1_000_000_000
-        belief._running.solve()  # that state was not kept
-        now_T_then = belief.motion_since(then_ns)
+        estimator._running.solve()  # that state was not kept
+        now_T_then = estimator.motion_since(then_ns)
         if now_T_then is None:
             return
         start, end = (self._states.world_T_body[self._sample(ns)] for ns in (then_ns, estimate.stamp_ns))
         error = se3_log(np.ascontiguousarray(now_T_then @ np.linalg.inv(start) @ end))
-        covariance = belief._running.covariance_since(then_ns)
+        covariance = estimator._running.covariance_since(then_ns)
         yield f"pose over {seconds} s", time_s, float(error @ np.linalg.solve(covariance, error)), 6
 
     def _sample(self, stamp_ns: int) -> int:

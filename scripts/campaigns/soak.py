@@ -127,7 +127,7 @@ def _row(figures: _Figures, error_mm: float, elapsed_s: float) -> list[str]:
 
 
 def _lost(figures: _Figures) -> dict[str, int]:
-    kinds = ("skipped", "images_not", "imu_lost", "results_not", "incident_")
+    kinds = ("skipped", "images_not", "imu_lost", "results_not", "event_")
     return {name: int(value) for name, value in figures.items() if name.startswith(kinds) and value}
 
 

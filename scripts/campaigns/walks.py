@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphvio.backend.inertial import ImuBuffer
-from graphvio.events import ImuSample
+from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Imu
 from graphvio.simulation import build_scene
 from graphvio.simulation.imu import ImuTrack, measure

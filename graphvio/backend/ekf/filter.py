@@ -10,7 +10,8 @@ from graphvio.arrays import Float
 from graphvio.backend.ekf.measurements import Measurement
 from graphvio.backend.ekf.process import jacobians, propagated
 from graphvio.backend.ekf.state import ERRORS, POSITION, FilterState
-from graphvio.backend.gating import Verdict, judged
+from graphvio.backend.gating import judged
+from graphvio.measurements.gate_result import GateResult
 
 
 @dataclass
@@ -32,7 +33,7 @@ class ExtendedKalmanFilter:
         self.covariance = by_error @ self.covariance @ by_error.T + noise @ noise.T
         self.state = propagated(self.state, dt)
 
-    def test(self, measurement: Measurement, probability: float) -> Verdict:
+    def test(self, measurement: Measurement, probability: float) -> GateResult:
         """Chi-square test of an innovation."""
         return judged(measurement.innovation, self._spread(measurement), probability)
 

@@ -28,7 +28,7 @@ def alignment_errors(each: PairCalibration) -> Figure:
     axes.hist(shown, bins=bins, stacked=True, color=[BLUE, RED], label=["fits", "outlier"])
     mean = float(errors[inlier].mean())
     axes.axvline(mean, color="black", linewidth=1.2, linestyle=(0, (4, 2)), label=f"mean {mean:.2f} mm")
-    over = "from frame to frame" if by_frame else "of all stretches of time used"
+    over = "from frame to frame" if by_frame else "of all segments of time used"
     axes.set(xlabel="alignment error, mm", ylabel="motions", xlim=(0.0, highest))
     axes.set_title(f"{inlier.sum()} of {len(inlier)} motions {over} fit", fontsize=10, loc="left")
     axes.legend(frameon=False, fontsize=9)

@@ -37,7 +37,7 @@ def page(found: Calibration, pictures: Mapping[tuple[int, int], Mapping[str, byt
     """
     parts = [
         f"<h1>Where the cameras are: {escape(source)}</h1>",
-        _verdict(found),
+        _gate_result(found),
         "<h2>Result</h2>",
         _places(found),
     ]
@@ -58,7 +58,7 @@ def page(found: Calibration, pictures: Mapping[tuple[int, int], Mapping[str, byt
     return html_page(f"{source}: calibration", parts)
 
 
-def _verdict(found: Calibration) -> str:
+def _gate_result(found: Calibration) -> str:
     if not found.is_complete:
         return (
             '<p class="doubt"><b>Part of the answer only.</b> The rig did not move in a way that tells everything; '
@@ -95,8 +95,8 @@ def _present(found: Calibration, j: int) -> str:
     present = found.present(j)
     if present is None:
         return ""
-    verdict = "agrees" if not present.is_off else "is off"
-    return f"{verdict}: {size_in_words(present.tangent)} away{present.doubt}"
+    gate_result = "agrees" if not present.is_off else "is off"
+    return f"{gate_result}: {size_in_words(present.tangent)} away{present.doubt}"
 
 
 def _details(each: PairCalibration) -> str:

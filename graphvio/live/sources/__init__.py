@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Protocol, cast
 
-from graphvio.config_values import nearest
+from graphvio.config.values import nearest
 from graphvio.errors import SourceError
 from graphvio.live.source import DeviceInfo, LiveSource
 from graphvio.rig import Rig

@@ -1,4 +1,4 @@
-"""Recorded events at the pace at which they were recorded, or a multiple."""
+"""Recorded measurements at the pace at which they were recorded, or a multiple."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LATE_NS = 1_000_000_000
 
 
 class Pace:
-    """Waits until an event is due.
+    """Waits until a measurement is due.
 
     Args:
         speed: of the recording's time; None does not wait.

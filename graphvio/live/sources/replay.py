@@ -7,11 +7,11 @@ from pathlib import Path
 
 from graphvio.arrays import Image
 from graphvio.errors import SourceError
-from graphvio.events import Event, FrameSet, ImuSample
 from graphvio.live.source import CameraFrame, DeviceHealth, DeviceInfo, ImuReading, Notice, Reading, host_ns
 from graphvio.live.sources import SourceSpec, check_options
 from graphvio.live.sources.pacing import Pace, speed_of
 from graphvio.live.spec_options import number_of
+from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.rig import Rig
 from graphvio.sources import Source
 from graphvio.sources import open_source as open_recording
@@ -62,8 +62,8 @@ class Replay:
     def readings(self) -> Iterator[Reading]:
         """Samples and images, each when it is due."""
         yield from paced(self._recording, self._recording.rig, self._pace)
-        for incident in self._recording.faults.incidents:
-            yield Notice(incident.kind, incident.detail, host_ns())
+        for event in self._recording.faults.events:
+            yield Notice(event.kind, event.detail, host_ns())
 
     def health(self) -> Sequence[DeviceHealth]:
         """What was wrong with the recording until now."""
@@ -74,20 +74,22 @@ class Replay:
         self._pace.stop()
 
 
-def paced(events: Iterable[Event], rig: Rig, pace: Pace) -> Iterator[Reading]:
-    """Events as readings of one clock, each when it is due; samples that precede the first frameset come at once."""
+def paced(measurements: Iterable[Measurement], rig: Rig, pace: Pace) -> Iterator[Reading]:
+    """Measurements as readings of one clock, each when it is due; samples before the first frameset come at once."""
     has_begun = False
-    for event in events:
-        has_begun = has_begun or isinstance(event, FrameSet)
-        if has_begun and not pace.wait_for(event.stamp_ns):
+    for measurement in measurements:
+        has_begun = has_begun or isinstance(measurement, FrameSet)
+        if has_begun and not pace.wait_for(measurement.stamp_ns):
             return
         now_ns = host_ns()
-        if isinstance(event, ImuSample):
-            yield ImuReading(event.stamp_ns, event.angular_velocity, event.linear_acceleration, now_ns)
+        if isinstance(measurement, ImuSample):
+            yield ImuReading(
+                measurement.stamp_ns, measurement.angular_velocity, measurement.linear_acceleration, now_ns
+            )
             continue
-        for j, images in sorted(event.images.items()):
+        for j, images in sorted(measurement.images.items()):
             for camera, image in zip((rig.pairs[j].left, rig.pairs[j].right), images, strict=True):
-                yield CameraFrame(camera.name, event.stamp_ns, _Decoded(image), now_ns)
+                yield CameraFrame(camera.name, measurement.stamp_ns, _Decoded(image), now_ns)
 
 
 class _Decoded:

@@ -55,8 +55,8 @@ class DeviceFaults:
             jitter = float(options.get("jitter_ms", "0"))
             outages = []
             for text in filter(None, options.get("unplug", "").split(",")):
-                device, _, span = text.partition("@")
-                begin, _, end = span.partition("-")
+                device, _, interval = text.partition("@")
+                begin, _, end = interval.partition("-")
                 outages.append(Outage(device, float(begin), float(end)))
         except ValueError:
             raise SourceError(

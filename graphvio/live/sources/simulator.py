@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from graphvio.errors import SourceError
-from graphvio.events import Event, FrameSet, ImuSample
 from graphvio.kernels import cache_root
 from graphvio.live.source import DeviceHealth, DeviceInfo, Reading
 from graphvio.live.sources import SourceSpec, check_options
@@ -28,6 +27,7 @@ from graphvio.live.sources.replay import paced
 from graphvio.live.sources.simulated_faults import OPTIONS as FAULT_OPTIONS
 from graphvio.live.sources.simulated_faults import DeviceFaults, devices_of, with_faults
 from graphvio.live.spec_options import number_of, whole_number_of
+from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.rig import Rig
 from graphvio.simulation import SCENE_NAMES
 from graphvio.sources import Source
@@ -134,8 +134,8 @@ class SimulatedRig:
     def readings(self) -> Iterator[Reading]:
         """Samples and images, each when it is due."""
         assert self._opened is not None, "it was opened"
-        with closing(self._events(self._opened)) as events:
-            readings = paced(events, self._opened.rig, self._pace)
+        with closing(self._measurements(self._opened)) as measurements:
+            readings = paced(measurements, self._opened.rig, self._pace)
             yield from with_faults(readings, self._opened.rig, self._faults, self._opened.start_ns, self._seed)
 
     def health(self) -> Sequence[DeviceHealth]:
@@ -146,13 +146,13 @@ class SimulatedRig:
         """Walk no further."""
         self._pace.stop()
 
-    def _events(self, recording: Source) -> Generator[Event, None, None]:
+    def _measurements(self, recording: Source) -> Generator[Measurement, None, None]:
         leg = 0
         while self._legs is None or leg < self._legs:
-            for event in _leg(recording, self._track, leg):
-                if self._duration_s is not None and event.stamp_ns - recording.start_ns > self._duration_s * 1e9:
+            for measurement in _leg(recording, self._track, leg):
+                if self._duration_s is not None and measurement.stamp_ns - recording.start_ns > self._duration_s * 1e9:
                     return
-                yield event
+                yield measurement
             leg += 1
 
     def _inertial(self, recording: Source) -> ImuTrack | None:
@@ -198,7 +198,7 @@ class SimulatedRig:
         return folder
 
 
-def _leg(recording: Source, track: ImuTrack | None, leg: int) -> Iterator[Event]:
+def _leg(recording: Source, track: ImuTrack | None, leg: int) -> Iterator[Measurement]:
     """One walk through, there if the leg is even, back if it is odd; what stands at the turn is not given twice."""
     start_ns, end_ns = recording.start_ns, recording.end_ns
     shift_ns, is_back = leg * (end_ns - start_ns), bool(leg % 2)

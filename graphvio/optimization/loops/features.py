@@ -12,7 +12,7 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Image, Int
 from graphvio.config import Config
-from graphvio.events import FrameSet
+from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.database import CENTRE_PX, FeatureDatabase, colmap, image_name
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.rig import Rig

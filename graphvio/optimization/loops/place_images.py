@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from graphvio.arrays import Image
-from graphvio.events import FrameSet
+from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.database import image_name
 from graphvio.rig import Rig
 

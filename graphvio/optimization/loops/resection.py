@@ -14,7 +14,6 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.config import Config
-from graphvio.events import FrameSet
 from graphvio.frontend.agreement import is_supported
 from graphvio.frontend.anchor import Anchor
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT
@@ -23,6 +22,7 @@ from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import joint_motion
 from graphvio.frontend.tracks import PairFrame
+from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.rig import Rig
 

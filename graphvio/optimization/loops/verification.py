@@ -10,9 +10,9 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Int
 from graphvio.config import Config
-from graphvio.events import FrameSet
 from graphvio.frontend.stereo import triangulate
 from graphvio.frontend.tracks import PairFrame
+from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.features import PairFeatures
 from graphvio.optimization.loops.matching import alike, estimated_geometry

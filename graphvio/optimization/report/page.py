@@ -16,6 +16,7 @@ from graphvio.optimization.report.words import (
     angle,
     cost,
     doubts,
+    gate_result,
     length,
     medians,
     noise,
@@ -23,7 +24,6 @@ from graphvio.optimization.report.words import (
     pairs_in_words,
     parts_in_words,
     plain,
-    verdict,
 )
 from graphvio.reporting.page import bullets, html_page, picture, table
 
@@ -36,7 +36,7 @@ _MEANINGS = {
     "motion": "motion of the rig, from images",
     "view": "the error that a keyframe's motions share",
     "rest": "the rig stands still",
-    "walk": "a stretch without IMU or images: steady motion",
+    "walk": "a segment without IMU or images: steady motion",
     "start": "what is known of a first state",
     "calibration": "what the rig file says of places and offset",
     "loop": "loop closures that are used",
@@ -178,7 +178,7 @@ def _calibration(each: SessionCalibration, with_name: bool) -> str:
     rows = []
     for pair in each.pairs:
         if pair.is_held:
-            rows.append((pair_name(pair), "", "", verdict(pair)))
+            rows.append((pair_name(pair), "", "", gate_result(pair)))
         else:
             rows.append(
                 (
@@ -186,13 +186,13 @@ def _calibration(each: SessionCalibration, with_name: bool) -> str:
                     f"{pair.angle_deg:.3f} degrees, sigma {pair.angle_sigma_deg:.3f}: {pair.angle_sigmas:.1f} sigmas",
                     f"{1e3 * pair.distance_m:.2f} mm, sigma {1e3 * pair.distance_sigma_m:.2f}: "
                     f"{pair.distance_sigmas:.1f} sigmas",
-                    verdict(pair),
+                    gate_result(pair),
                 )
             )
     if each.offset is not None:
         offset = each.offset
         told = f"{1e3 * offset.offset_s:+.2f} ms, sigma {1e3 * offset.sigma_s:.2f}: {offset.sigmas:.1f} sigmas"
-        rows.append(("time offset of the IMU", "", told, verdict(offset)))
+        rows.append(("time offset of the IMU", "", told, gate_result(offset)))
     name = f"{each.session}: " if with_name else ""
     all_in_all = (
         "<b>the rig file is borne out</b>: all of it is within three standard deviations of what is found."

@@ -113,12 +113,12 @@ def doubts(found: Optimization, numbers: Numbers) -> list[str]:
 
 def calibration_in_words(each: SessionCalibration) -> list[str]:
     """What is found of a session's rig file: a line for each pair, and one for the time offset."""
-    made = [f"{_pair_in_words(pair)}: {verdict(pair)}" for pair in each.pairs]
+    made = [f"{_pair_in_words(pair)}: {gate_result(pair)}" for pair in each.pairs]
     if each.offset is not None:
         found = each.offset
         made.append(
             f"time offset {1e3 * found.offset_s:+.2f} ms (sigma {1e3 * found.sigma_s:.2f} ms: {found.sigmas:.1f} "
-            f"sigmas): {verdict(found)}"
+            f"sigmas): {gate_result(found)}"
         )
     return made
 
@@ -128,7 +128,7 @@ def pair_name(pair: PairCorrection) -> str:
     return f"pair {pair.pair} ({pair.name})" if pair.name else f"pair {pair.pair}"
 
 
-def verdict(found: PairCorrection | OffsetCorrection) -> str:
+def gate_result(found: PairCorrection | OffsetCorrection) -> str:
     """Whether the rig file's value may stay."""
     if isinstance(found, PairCorrection) and found.is_held:
         return "held where the rig file has it"

@@ -1,4 +1,4 @@
-"""Corridors of an office building: a door, a crowd, a blank-walled bend and a stretch where the lamps fail.
+"""Corridors of an office building: a door, a crowd, a blank-walled bend and a segment where the lamps fail.
 
 The walk goes along +x through a door (leg A), a lobby full of people, and into a bend (leg B, to the left and
 right again) where walls, floor and ceiling are blank; then along +x where the lamps fail (leg C), and at last
@@ -28,7 +28,7 @@ _LOBBY_X = (11.0, 20.0)
 _LOBBY_HALF_M = 3.5
 _BEND_X = 28.0  # middle of leg B, which runs from y = 0 to _C_Y
 _C_Y = 3.0
-_BLANK_M = 2.6  # blank stretch before and after leg B
+_BLANK_M = 2.6  # blank segment before and after leg B
 _D_X = 50.0  # middle of leg D
 _END_Y = 27.0
 _PATH = [(_START_X, 0.0), (_BEND_X, 0.0), (_BEND_X, _C_Y), (_D_X, _C_Y), (_D_X, _END_Y - 2.0)]

@@ -77,7 +77,7 @@ def _walls(world: World) -> None:
 def _wall(
     world: World, start: tuple[float, float], end: tuple[float, float], textures: tuple[str, ...], first: int
 ) -> None:
-    """A wall in equal stretches, each with a door in its middle, a board to its right and a picture to its left."""
+    """A wall in equal segments, each with a door in its middle, a board to its right and a picture to its left."""
     a, b = np.array(start), np.array(end)
     along = (b - a) / np.linalg.norm(b - a)
     half = 0.5 * float(np.linalg.norm(b - a)) / len(textures)

@@ -12,7 +12,9 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Image
 from graphvio.errors import ServiceError
-from graphvio.events import Estimate, Incident, Prediction, Quality, Status
+from graphvio.measurements.estimate import Estimate, Prediction, Status
+from graphvio.measurements.events import Event
+from graphvio.measurements.motion import Quality
 from graphvio.rig import Camera, Rig, StereoPair, as_written
 from graphvio.rig_files import native
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
@@ -117,11 +119,9 @@ def prediction_of(message: Any) -> Prediction:
     )
 
 
-def incident_message(incident: Incident, missed: int) -> Any:
-    """``IncidentUpdate`` of the proto."""
-    return messages.IncidentUpdate(
-        stamp_ns=incident.stamp_ns, kind=incident.kind, detail=incident.detail, missed=missed
-    )
+def event_message(event: Event, missed: int) -> Any:
+    """``EventUpdate`` of the proto."""
+    return messages.EventUpdate(stamp_ns=event.stamp_ns, kind=event.kind, detail=event.detail, missed=missed)
 
 
 def keyframe_message(keyframe: Keyframe, with_images: bool, with_descriptors: bool) -> Any:

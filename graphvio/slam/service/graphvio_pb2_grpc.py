@@ -54,10 +54,10 @@ class FrontEndStub:
                 request_serializer=graphvio_dot_slam_dot_service_dot_graphvio__pb2.StreamKeyframesRequest.SerializeToString,
                 response_deserializer=graphvio_dot_slam_dot_service_dot_graphvio__pb2.KeyframeUpdate.FromString,
                 _registered_method=True)
-        self.StreamIncidents = channel.unary_stream(
-                '/graphvio.v1.FrontEnd/StreamIncidents',
-                request_serializer=graphvio_dot_slam_dot_service_dot_graphvio__pb2.StreamIncidentsRequest.SerializeToString,
-                response_deserializer=graphvio_dot_slam_dot_service_dot_graphvio__pb2.IncidentUpdate.FromString,
+        self.StreamEvents = channel.unary_stream(
+                '/graphvio.v1.FrontEnd/StreamEvents',
+                request_serializer=graphvio_dot_slam_dot_service_dot_graphvio__pb2.StreamEventsRequest.SerializeToString,
+                response_deserializer=graphvio_dot_slam_dot_service_dot_graphvio__pb2.EventUpdate.FromString,
                 _registered_method=True)
         self.Correct = channel.unary_unary(
                 '/graphvio.v1.FrontEnd/Correct',
@@ -101,7 +101,7 @@ class FrontEndServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
-    def StreamIncidents(self, request, context):
+    def StreamEvents(self, request, context):
         """What a person would want to know of, from now on: gates, resets, faults.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
@@ -139,10 +139,10 @@ def add_FrontEndServicer_to_server(servicer, server):
                     request_deserializer=graphvio_dot_slam_dot_service_dot_graphvio__pb2.StreamKeyframesRequest.FromString,
                     response_serializer=graphvio_dot_slam_dot_service_dot_graphvio__pb2.KeyframeUpdate.SerializeToString,
             ),
-            'StreamIncidents': grpc.unary_stream_rpc_method_handler(
-                    servicer.StreamIncidents,
-                    request_deserializer=graphvio_dot_slam_dot_service_dot_graphvio__pb2.StreamIncidentsRequest.FromString,
-                    response_serializer=graphvio_dot_slam_dot_service_dot_graphvio__pb2.IncidentUpdate.SerializeToString,
+            'StreamEvents': grpc.unary_stream_rpc_method_handler(
+                    servicer.StreamEvents,
+                    request_deserializer=graphvio_dot_slam_dot_service_dot_graphvio__pb2.StreamEventsRequest.FromString,
+                    response_serializer=graphvio_dot_slam_dot_service_dot_graphvio__pb2.EventUpdate.SerializeToString,
             ),
             'Correct': grpc.unary_unary_rpc_method_handler(
                     servicer.Correct,
@@ -269,7 +269,7 @@ class FrontEnd:
             _registered_method=True)
 
     @staticmethod
-    def StreamIncidents(request,
+    def StreamEvents(request,
             target,
             options=(),
             channel_credentials=None,
@@ -282,9 +282,9 @@ class FrontEnd:
         return grpc.experimental.unary_stream(
             request,
             target,
-            '/graphvio.v1.FrontEnd/StreamIncidents',
-            graphvio_dot_slam_dot_service_dot_graphvio__pb2.StreamIncidentsRequest.SerializeToString,
-            graphvio_dot_slam_dot_service_dot_graphvio__pb2.IncidentUpdate.FromString,
+            '/graphvio.v1.FrontEnd/StreamEvents',
+            graphvio_dot_slam_dot_service_dot_graphvio__pb2.StreamEventsRequest.SerializeToString,
+            graphvio_dot_slam_dot_service_dot_graphvio__pb2.EventUpdate.FromString,
             options,
             channel_credentials,
             insecure,

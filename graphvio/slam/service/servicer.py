@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import graphvio
+from graphvio.broadcast import Broadcast, Subscription
 from graphvio.errors import GraphvioError, ServiceError
-from graphvio.events import Estimate, Prediction
-from graphvio.live.broadcast import Broadcast, Subscription
+from graphvio.measurements.estimate import Estimate, Prediction
 from graphvio.slam.epochs import map_of_epoch, newest_epoch
 from graphvio.slam.interface import Served
 from graphvio.slam.keyframe_log import KeyframeLog
@@ -22,7 +22,7 @@ from graphvio.slam.service.streams import RUN_KEY, Stream, StreamLimit
 
 _LOOK_S = 0.25  # how soon a stream sees that its client is gone or the server stops
 _WAITING = {messages.RATE_FRAME: 2, messages.RATE_IMU: 16}
-_INCIDENTS_WAITING = 256
+_EVENTS_WAITING = 256
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
 
@@ -92,11 +92,11 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
                     return
                 self._abort_if_stopping(log, context)
 
-    def StreamIncidents(self, request: Any, context: Any) -> Iterator[Any]:
+    def StreamEvents(self, request: Any, context: Any) -> Iterator[Any]:
         """What happens, from now on."""
         with self._stream(request, context) as stream:
-            for incident, missed in self._listen(self._served.incidents, _INCIDENTS_WAITING, stream, context):
-                yield convert.incident_message(incident, missed)
+            for event, missed in self._listen(self._served.events, _EVENTS_WAITING, stream, context):
+                yield convert.event_message(event, missed)
 
     def Correct(self, request: Any, context: Any) -> Any:
         """A correction: checked for its form here, judged by the odometry."""

@@ -8,8 +8,7 @@ from contextlib import suppress
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.gating import Verdict
-from graphvio.backend.inertial import ImuSpan
+from graphvio.backend.estimator import StateEstimator
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.starts import (
     MAX_UNBRIDGED_S,
@@ -23,19 +22,20 @@ from graphvio.backend.starts import (
 )
 from graphvio.backend.states import RigState
 from graphvio.backend.window import SOLVER_ERRORS
-from graphvio.belief import Belief
 from graphvio.config import Config
-from graphvio.events import Quality, Status
-from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.geometry import se3_inverse, se3_log
+from graphvio.measurements.estimate import Status
+from graphvio.measurements.events import Report
+from graphvio.measurements.gate_result import GateResult
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.rig import Rig
-from graphvio.synchroniser import Report
 
 _TRUSTED_AFTER = 20  # motions; what a start that ends sooner has found is not taken for known
 
 
-class SmootherBelief(Belief):
-    """The rig's state by the fixed-lag smoother; for arguments and attributes see `Belief`."""
+class SmootherEstimator(StateEstimator):
+    """The rig's state by the fixed-lag smoother; for arguments and attributes see `StateEstimator`."""
 
     def __init__(self, rig: Rig, config: Config, report: Report, rekey: Callable[[], None]) -> None:
         super().__init__(rig, config, report, rekey)
@@ -52,36 +52,36 @@ class SmootherBelief(Belief):
 
     @property
     def has_started(self) -> bool:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         return self._smoother is not None
 
     @property
     def has_imu(self) -> bool:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         return self._smoother is not None and self._smoother.has_imu
 
     @property
     def latest_ns(self) -> int:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         return self._running.latest_ns
 
     def state(self) -> RigState:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         return self._running.state()
 
     def latest_rate(self) -> Float | None:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         return self._running.latest_rate()
 
     def motion_since(self, then_ns: int) -> Float | None:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         smoother = self._smoother
         if smoother is None or not smoother.knows(then_ns):
             return None
         return se3_inverse(smoother.pose(smoother.latest_ns)) @ smoother.pose(then_ns)
 
     def covariance_since(self, then_ns: int) -> Float | None:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         smoother = self._smoother
         if smoother is None or not smoother.knows(then_ns):
             return None
@@ -91,35 +91,35 @@ class SmootherBelief(Belief):
             return None
 
     def end(self) -> None:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         if self._smoother is not None:
             self._final += self._smoother.all_poses()
 
     # ------------------------------------------------------------------ one frameset
 
-    def start(self, stamp_ns: int, found: tuple[ImuSpan, float] | None) -> None:
-        """See `Belief`."""
+    def start(self, stamp_ns: int, found: tuple[ImuInterval, float] | None) -> None:
+        """See `StateEstimator`."""
         position = self._position_to_start_at(stamp_ns, found)
         if self._smoother is not None:
             self._final += self._smoother.all_poses()
         self._smoother = Smoother(self._config.smoother, self._rig.imu if found else None)
         self._begin(first_start(stamp_ns, position, found, self._rig, self._config.initialisation))
 
-    def predict(self, stamp_ns: int, span: ImuSpan | None) -> None:
-        """See `Belief`."""
-        self.verdicts = {}
-        if span is None and stamp_ns - self.latest_ns > MAX_UNBRIDGED_S * 1e9:
+    def predict(self, stamp_ns: int, interval: ImuInterval | None) -> None:
+        """See `StateEstimator`."""
+        self.gate_results = {}
+        if interval is None and stamp_ns - self.latest_ns > MAX_UNBRIDGED_S * 1e9:
             self._jump(stamp_ns)
             return
-        self._imu_failed |= self.has_imu and span is None and bool(self._refused)
+        self._imu_failed |= self.has_imu and interval is None and bool(self._refused)
         before = self.state()
         try:
-            self._running.extend(stamp_ns, span)
+            self._running.extend(stamp_ns, interval)
         except SOLVER_ERRORS as error:
             self._rebuild(stamp_ns, before, error)
 
     def use(self, visual: VisualResult, at_rest: bool) -> RelativeMotion | None:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         try:
             motion = self._use_motion(visual)
             if at_rest and self.has_imu:
@@ -131,12 +131,12 @@ class SmootherBelief(Belief):
 
     def _use_rest(self) -> None:
         """Standing still: a velocity of zero, unless the prediction is sure of another."""
-        verdict = self._running.test_rest()
-        self.verdicts["rest"] = verdict
-        if verdict.accepted:
+        gate_result = self._running.test_rest()
+        self.gate_results["rest"] = gate_result
+        if gate_result.accepted:
             self._running.accept_rest()
         else:
-            self._report(self.latest_ns, "rest_gated", _beyond(verdict))
+            self._report(self.latest_ns, "rest_gated", _beyond(gate_result))
 
     def _use_motion(self, visual: VisualResult) -> RelativeMotion | None:
         """Gate a measured motion and insert it."""
@@ -150,10 +150,10 @@ class SmootherBelief(Belief):
             # It is not from a state that was known.
             self._recover(motion)
             return motion
-        motion, verdict = self._judge(visual)
-        self.verdicts["vision"] = verdict
+        motion, gate_result = self._judge(visual)
+        self.gate_results["vision"] = gate_result
         excess = smoother.excess_acceleration(motion)
-        if verdict.accepted and excess is None:
+        if gate_result.accepted and excess is None:
             if self._imu_failed and motion.reference_stamp_ns in self._refused:
                 # It agrees with the prediction only because both start from a state that vision was not heard on.
                 self._refused[motion.stamp_ns] = self._refused[motion.reference_stamp_ns] @ motion.reference_T_current
@@ -163,7 +163,7 @@ class SmootherBelief(Belief):
             self._accepted += 1
             self._forget_troubles()
             return motion
-        why = _beyond(verdict) if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
+        why = _beyond(gate_result) if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
         self._report(motion.stamp_ns, "vision_gated", f"{why}, {motion.inliers} inliers")
         if visual.quality is not Quality.GOOD:
             return None  # vision that contradicts itself cannot put the prediction in the wrong
@@ -176,7 +176,7 @@ class SmootherBelief(Belief):
         return None
 
     def update(self, stamp_ns: int, used: bool, keep: frozenset[int]) -> Status:
-        """Optimise and marginalise; a window without a solution is rebuilt around the prediction. See `Belief`."""
+        """Optimise and marginalise; a window without a solution is rebuilt around the prediction."""
         smoother = self._running
         if used:
             self._tracked_ns = stamp_ns
@@ -202,13 +202,13 @@ class SmootherBelief(Belief):
         assert self._smoother is not None, "it has started"
         return self._smoother
 
-    def _judge(self, visual: VisualResult) -> tuple[RelativeMotion, Verdict]:
+    def _judge(self, visual: VisualResult) -> tuple[RelativeMotion, GateResult]:
         """The motion and its test; where pairs contradict each other, the side that the prediction clearly prefers."""
         assert visual.motion is not None
-        verdicts = [(self._running.test(motion), motion) for motion in visual.alternatives]
-        verdicts.sort(key=lambda judged: judged[0].statistic)
-        if verdicts:
-            (likely, motion), (unlikely, _) = verdicts[:2]
+        gate_results = [(self._running.test(motion), motion) for motion in visual.alternatives]
+        gate_results.sort(key=lambda judged: judged[0].statistic)
+        if gate_results:
+            (likely, motion), (unlikely, _) = gate_results[:2]
             if likely.accepted and not unlikely.accepted and likely.is_clear and unlikely.is_clear:
                 return motion, likely
         return visual.motion, self._running.test(visual.motion)
@@ -287,5 +287,5 @@ class SmootherBelief(Belief):
         self._lost = False
 
 
-def _beyond(verdict: Verdict) -> str:
-    return f"innovation {verdict.statistic:.1f} beyond chi-square {verdict.threshold:.1f}"
+def _beyond(gate_result: GateResult) -> str:
+    return f"innovation {gate_result.statistic:.1f} beyond chi-square {gate_result.threshold:.1f}"

@@ -1,7 +1,7 @@
-"""Which stretches of time make pose pairs: those that together tell most, none of them twice.
+"""Which segments of time make pose pairs: those that together tell most, none of them twice.
 
 A motion over one frame is small and noisy; over a second it is larger, but so is its error. Every instant belongs to at
-most one stretch, so that no noise is counted twice.
+most one segment, so that no noise is counted twice.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from graphvio.calibration.consistency import whitened
 from graphvio.calibration.pose_pairs import PosePairs
 
 LENGTHS_S = (0.0, 0.1, 0.2, 0.35, 0.6, 1.0)
-"""Lengths of the stretches that are tried; 0 is one frame."""
+"""Lengths of the segments that are tried; 0 is one frame."""
 
 _FIRST_S = 0.35
 _NS_PER_S = 1e9
 
 
 @dataclass(frozen=True, eq=False)
-class Stretches:
-    """Motions of J cameras over N stretches of time, which may overlap.
+class Segments:
+    """Motions of J cameras over N segments of time, which may overlap.
 
     Attributes:
         start_ns: (N,) int64.
@@ -52,10 +52,10 @@ class Stretches:
         """J."""
         return int(self.known.shape[1])
 
-    def chosen(self, rows: Bool | Int | Sequence[int]) -> Stretches:
+    def chosen(self, rows: Bool | Int | Sequence[int]) -> Segments:
         """Some of them."""
         which = np.asarray(rows, dtype=None if isinstance(rows, np.ndarray) else np.int64)
-        return Stretches(
+        return Segments(
             self.start_ns[which],
             self.end_ns[which],
             self.first[which],
@@ -65,11 +65,11 @@ class Stretches:
             self.known[which],
         )
 
-    def of_both(self, one: int, other: int) -> Stretches:
+    def of_both(self, one: int, other: int) -> Segments:
         """Those over which two cameras tell their motions, and these two only, in this order."""
         both = self.chosen(self.known[:, one] & self.known[:, other])
         columns = [one, other]
-        return Stretches(
+        return Segments(
             both.start_ns,
             both.end_ns,
             both.first,
@@ -90,8 +90,8 @@ Between = Callable[[int, int], "tuple[Float, Float] | None"]
 """Motion (4, 4) and covariance (6, 6) from one stamp to another, or None."""
 
 
-def all_stretches(stamps_ns: Sequence[int], betweens: Sequence[Between]) -> Stretches:
-    """Stretches of several lengths from every instant on, over which the first camera and another one tell.
+def all_segments(stamps_ns: Sequence[int], betweens: Sequence[Between]) -> Segments:
+    """Segments of several lengths from every instant on, over which the first camera and another one tell.
 
     Args:
         stamps_ns: T instants in order.
@@ -107,7 +107,7 @@ def all_stretches(stamps_ns: Sequence[int], betweens: Sequence[Between]) -> Stre
     nothing = np.full((4, 4), np.nan), np.full((6, 6), np.nan)
     count, cameras = len(told), len(betweens)
     first, last = np.array(places, dtype=np.int64).reshape(-1, 2).T
-    return Stretches(
+    return Segments(
         stamps[first],
         stamps[last],
         first,
@@ -119,7 +119,7 @@ def all_stretches(stamps_ns: Sequence[int], betweens: Sequence[Between]) -> Stre
 
 
 def ends_of(stamps_ns: Int) -> tuple[Int, Int]:
-    """Between which of T instants stretches of all lengths lie, from every instant on: first (N,) and last (N,)."""
+    """Between which of T instants segments of all lengths lie, from every instant on: first (N,) and last (N,)."""
     count = len(stamps_ns)
     lengths_ns = np.round(np.array(LENGTHS_S) * _NS_PER_S).astype(np.int64)
     ends = np.searchsorted(stamps_ns, stamps_ns[:, None] + lengths_ns, "right") - 1
@@ -131,11 +131,11 @@ def ends_of(stamps_ns: Int) -> tuple[Int, Int]:
     return first[within], ends[within]
 
 
-def of_one_length(stretches: Stretches) -> list[int]:
-    """Stretches of some tenths of a second, one after the other: to begin with, as nothing is known."""
-    duration = (stretches.end_ns - stretches.start_ns) / _NS_PER_S
+def of_one_length(segments: Segments) -> list[int]:
+    """Segments of some tenths of a second, one after the other: to begin with, as nothing is known."""
+    duration = (segments.end_ns - segments.start_ns) / _NS_PER_S
     nearest: dict[int, int] = {}
-    for row, i in enumerate(stretches.first.tolist()):
+    for row, i in enumerate(segments.first.tolist()):
         if i not in nearest or abs(duration[row] - _FIRST_S) < abs(duration[nearest[i]] - _FIRST_S):
             nearest[i] = row
     chosen: list[int] = []
@@ -143,7 +143,7 @@ def of_one_length(stretches: Stretches) -> list[int]:
     for i in sorted(nearest):
         if i >= free:
             chosen.append(nearest[i])
-            free = int(stretches.last[nearest[i]])
+            free = int(segments.last[nearest[i]])
     return chosen
 
 
@@ -160,19 +160,19 @@ def worth(pairs: PosePairs, left2_T_left1: Float, covariance: Float) -> Float:
     return np.asarray(np.einsum("nki,ij,nkj->n", jacobians, covariance, jacobians))
 
 
-def most_telling(stretches: Stretches, worths: Float) -> list[int]:
-    """Stretches that do not overlap and together are worth most, by dynamic programming over the instants.
+def most_telling(segments: Segments, worths: Float) -> list[int]:
+    """Segments that do not overlap and together are worth most, by dynamic programming over the instants.
 
     Args:
-        stretches: N to choose from.
+        segments: N to choose from.
         worths: (N,) of each.
     """
     ending: dict[int, list[int]] = {}
-    for row, j in enumerate(stretches.last.tolist()):
+    for row, j in enumerate(segments.last.tolist()):
         ending.setdefault(j, []).append(row)
-    first = stretches.first.tolist()
-    count = int(stretches.last.max(initial=0)) + 1
-    best = np.zeros(count)  # worth of all stretches that end by then
+    first = segments.first.tolist()
+    count = int(segments.last.max(initial=0)) + 1
+    best = np.zeros(count)  # worth of all segments that end by then
     by: list[int | None] = [None] * count
     for j in range(1, count):
         best[j] = best[j - 1]

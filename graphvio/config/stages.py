@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from graphvio.config_values import Stage
+from graphvio.config.values import Stage
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from graphvio.events import Quality
 from graphvio.frontend.alignment import Misalignment, misplaced
-from graphvio.frontend.motion import VisualResult
+from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.rig import Rig
 
 

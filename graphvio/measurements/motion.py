@@ -4,11 +4,51 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 
-from graphvio.arrays import Float
-from graphvio.events import PairReport, Quality
+from graphvio.arrays import Float, Int
+
+
+class Quality(StrEnum):
+    """How far a measured motion can be trusted."""
+
+    GOOD = "good"
+    """Its covariance says all there is to say."""
+    WEAK = "weak"
+    """Pairs contradict each other, points are few, or a direction is hardly constrained; its covariance says so."""
+    FAILED = "failed"
+    """There is no motion."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairReport:
+    """What one stereo pair contributed to a frameset.
+
+    Attributes:
+        points: points offered to the estimation.
+        inliers: points that the chosen motion explains.
+        pixels: (N, 2) left-image pixels of the tracked corners, for display.
+        is_inlier: (N,) whether each of them is explained.
+        ages: (N,) number of earlier frames that saw each of them.
+        rejected: test of tracking or stereo matching -> how many corners it threw out.
+        rms_px: rms reprojection error of these under the chosen motion, per direction and without the share of the
+            points' own uncertainty; None where there are none.
+        own_inliers: points that the pair's own motion explains, or None where there is but one pair or too few points.
+        own_rms_px: their rms error under it, or None; much less than ``rms_px`` tells of a transfer between pairs that
+            is wrong.
+    """
+
+    points: int
+    inliers: int
+    pixels: Float
+    is_inlier: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    ages: Int | None = None
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    rms_px: float | None = None
+    own_inliers: int | None = None
+    own_rms_px: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

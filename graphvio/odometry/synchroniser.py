@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Generic, Protocol, TypeVar
 
 from graphvio.arrays import Float, Int
-from graphvio.backend.inertial import ImuBuffer, ImuSpan
+from graphvio.backend.inertial import ImuBuffer
 from graphvio.config import Config
-from graphvio.events import FrameSet, ImuSample
+from graphvio.measurements.events import Report
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.rig import Rig
 
 _LEAST_INTERVAL_NS = 1_000_000  # between framesets: less is of one instant, and no motion can be told from it
@@ -27,8 +28,6 @@ class HasStamp(Protocol):
 
 
 Stamped = TypeVar("Stamped", bound=HasStamp)
-Report = Callable[[int, str, str], None]
-"""Takes stamp, kind and detail of an incident."""
 
 
 class Synchroniser:
@@ -114,16 +113,16 @@ class Synchroniser:
         """The oldest held frameset, due or not, or None."""
         return self._held.popleft() if self._held else None
 
-    def span(self, start_ns: int, end_ns: int) -> ImuSpan | None:
+    def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
         """The IMU between two framesets' stamps, or None where it does not cover them."""
-        return self._imu.span(start_ns + self._offset_ns, end_ns + self._offset_ns)
+        return self._imu.interval(start_ns + self._offset_ns, end_ns + self._offset_ns)
 
     def samples_since(self, stamp_ns: int) -> tuple[Int, Float]:
         """The IMU from a frameset's stamp on, stamps on the framesets' clock; see `ImuBuffer.since`."""
         stamps, values = self._imu.since(stamp_ns + self._offset_ns)
         return stamps - self._offset_ns, values
 
-    def initial_span(self, stamp_ns: int) -> tuple[ImuSpan, float] | None:
+    def initial_interval(self, stamp_ns: int) -> tuple[ImuInterval, float] | None:
         """The IMU around a frameset, and the frameset's place in it in seconds, once it is long enough."""
         at_ns = stamp_ns + self._offset_ns
         window_ns, least_ns = (
@@ -132,7 +131,7 @@ class Synchroniser:
         if not self._has_imu or not self._imu.covers(at_ns):
             return None
         for end_ns in (at_ns, at_ns + least_ns):
-            found = self._imu.stretch(at_ns - window_ns, end_ns)
+            found = self._imu.segment(at_ns - window_ns, end_ns)
             if found is not None and found[0].steps_s.sum() >= 0.95e-9 * least_ns:
                 return found[0], (at_ns - found[1]) * 1e-9
         return None
@@ -164,7 +163,7 @@ class Synchroniser:
         if not started:
             if self.precedes_imu(frameset.stamp_ns):
                 return True
-            enough = self.initial_span(frameset.stamp_ns) is not None
+            enough = self.initial_interval(frameset.stamp_ns) is not None
             return enough or waited_ns > 2.0 * self._initialisation.min_window_s * 1e9
         at_ns, newest_ns = frameset.stamp_ns + self._offset_ns, self._imu.newest_ns
         if newest_ns is None or newest_ns >= at_ns:
@@ -183,19 +182,19 @@ class JumpGuard(Generic[Stamped]):
         self._newest_ns: int | None = None
         self._suspect: Stamped | None = None
 
-    def confirm(self, event: Stamped) -> list[Stamped]:
-        """The events that may be taken now, in order; far ahead is more than 5 s."""
+    def confirm(self, measurement: Stamped) -> list[Stamped]:
+        """The measurements that may be taken now, in order; far ahead is more than 5 s."""
         suspect, self._suspect = self._suspect, None
         if suspect is not None:
-            if 0 < event.stamp_ns - suspect.stamp_ns < _SUSPICIOUS_JUMP_NS:
-                self._newest_ns = event.stamp_ns
-                return [suspect, event]
+            if 0 < measurement.stamp_ns - suspect.stamp_ns < _SUSPICIOUS_JUMP_NS:
+                self._newest_ns = measurement.stamp_ns
+                return [suspect, measurement]
             self._leave_out(suspect)
-        if self._newest_ns is not None and event.stamp_ns - self._newest_ns > _SUSPICIOUS_JUMP_NS:
-            self._suspect = event
+        if self._newest_ns is not None and measurement.stamp_ns - self._newest_ns > _SUSPICIOUS_JUMP_NS:
+            self._suspect = measurement
             return []
-        self._newest_ns = max(event.stamp_ns, self._newest_ns or event.stamp_ns)
-        return [event]
+        self._newest_ns = max(measurement.stamp_ns, self._newest_ns or measurement.stamp_ns)
+        return [measurement]
 
     def end(self) -> None:
         """Nothing more will come, so what was not confirmed is left out."""

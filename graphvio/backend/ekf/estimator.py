@@ -12,16 +12,16 @@ from graphvio.backend.ekf.filter import ExtendedKalmanFilter
 from graphvio.backend.ekf.measurements import Measurement, VisualRates, accelerometer, gyro, stacked, vision
 from graphvio.backend.ekf.process import noise_sigmas
 from graphvio.backend.ekf.state import ATTITUDE, ERRORS, GYRO_BIAS, POSITION, RATE, VELOCITY, FilterState
-from graphvio.backend.inertial import ImuSpan
+from graphvio.backend.estimator import StateEstimator
 from graphvio.backend.starts import AFTER_JUMP, MAX_UNBRIDGED_S, first_start
 from graphvio.backend.states import RigState, StateCovariance
-from graphvio.belief import Belief
 from graphvio.config import Config
-from graphvio.events import Status
-from graphvio.frontend.motion import RelativeMotion, VisualResult
 from graphvio.geometry import se3_adjoint, se3_inverse, skew
+from graphvio.measurements.estimate import Status
+from graphvio.measurements.events import Report
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import RelativeMotion, VisualResult
 from graphvio.rig import Rig
-from graphvio.synchroniser import Report
 
 _ANCHOR_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
 _LEAST_GROWTH = 1e-4  # of a pose's covariance from frameset to frameset, as a share of it
@@ -29,8 +29,8 @@ _UNKNOWN_RATE_SIGMA_RAD_S = 3.0
 _FORGOTTEN_SPEED_SIGMA_M_S = 30.0  # on foot or on the road
 
 
-class FilterBelief(Belief):
-    """The rig's state by the filter; for arguments and attributes see `Belief`."""
+class FilterEstimator(StateEstimator):
+    """The rig's state by the filter; for arguments and attributes see `StateEstimator`."""
 
     def __init__(self, rig: Rig, config: Config, report: Report, rekey: Callable[[], None]) -> None:
         super().__init__(rig, config, report, rekey)
@@ -39,7 +39,7 @@ class FilterBelief(Belief):
         self._latest_ns = self._reset_ns = 0
         self._before_ns: int | None = None  # stamp at which the newest step began
         self._refused_ns: int | None = None  # since when vision is refused
-        self._span: ImuSpan | None = None
+        self._interval: ImuInterval | None = None
         self._forgotten = np.zeros((3, 3))  # position covariance, nav, that resets took out of the filter
         self._before_outage = np.zeros((3, 3))  # position covariance, nav, when vision was last used
         self._poses: dict[int, Float] = {}  # nav_T_body at stamps that motions are measured from
@@ -49,17 +49,17 @@ class FilterBelief(Belief):
 
     @property
     def has_started(self) -> bool:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         return self._filter is not None
 
     @property
     def has_imu(self) -> bool:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         return self._has_imu
 
     @property
     def latest_ns(self) -> int:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         return self._latest_ns
 
     def state(self) -> RigState:
@@ -68,11 +68,11 @@ class FilterBelief(Belief):
         return RigState(state.nav_T_body, state.nav_R_body @ state.velocity_body, state.gyro_bias, np.zeros(3))
 
     def latest_rate(self) -> Float | None:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         return None if self._before_ns is None else self._running.state.rate_body
 
     def motion_since(self, then_ns: int) -> Float | None:
-        """See `Belief`."""
+        """See `StateEstimator`."""
         if self._filter is None or then_ns not in self._poses:
             return None
         return se3_inverse(self._filter.state.nav_T_body) @ self._poses[then_ns]
@@ -90,12 +90,12 @@ class FilterBelief(Belief):
         return np.asarray((directions * np.maximum(sizes, _LEAST_GROWTH)) @ directions.T * np.outer(sigmas, sigmas))
 
     def end(self) -> None:
-        """See `Belief`: a filter never corrects a pose later."""
+        """See `StateEstimator`: a filter never corrects a pose later."""
 
     # ------------------------------------------------------------------ one frameset
 
-    def start(self, stamp_ns: int, found: tuple[ImuSpan, float] | None) -> None:
-        """See `Belief`."""
+    def start(self, stamp_ns: int, found: tuple[ImuInterval, float] | None) -> None:
+        """See `StateEstimator`."""
         position = self._position_to_start_at(stamp_ns, found)
         start = first_start(stamp_ns, position, found, self._rig, self._config.initialisation)
         pose, uncertainty = start.state.nav_T_body, start.uncertainty
@@ -113,22 +113,22 @@ class FilterBelief(Belief):
         self._has_imu = found is not None
         self._latest_ns = self._tracked_ns = self._reset_ns = stamp_ns
         self._note_start(start)
-        self._lost, self._span = False, None
+        self._lost, self._interval = False, None
         self._before_ns = self._refused_ns = None
         self._forgotten = np.zeros((3, 3))
         self._poses.clear()
 
-    def predict(self, stamp_ns: int, span: ImuSpan | None) -> None:
+    def predict(self, stamp_ns: int, interval: ImuInterval | None) -> None:
         """Go on to a frameset's instant by constant velocity; the IMU since the last one is measured there."""
-        self.verdicts = {}
+        self.gate_results = {}
         config, dt = self._config.filter, (stamp_ns - self._latest_ns) * 1e-9
-        if span is None and dt > MAX_UNBRIDGED_S:
+        if interval is None and dt > MAX_UNBRIDGED_S:
             self._jump(stamp_ns, dt)
             dt = 0.0
         walk = config.gyro_bias_walk_rad_s if config.bias == "estimated" else 0.0
         sigmas = noise_sigmas(dt, config.accel_sigma_m_s2, config.angular_accel_sigma_rad_s2, walk)
         self._running.predict(dt, sigmas)
-        self._span, self._before_ns, self._latest_ns = span, self._latest_ns, stamp_ns
+        self._interval, self._before_ns, self._latest_ns = interval, self._latest_ns, stamp_ns
 
     def use(self, visual: VisualResult, at_rest: bool) -> RelativeMotion | None:
         """Test each measurement against the prediction, and update with those that pass; rest is none of them."""
@@ -210,15 +210,15 @@ class FilterBelief(Belief):
 
     def _inertial(self, rates: VisualRates | None) -> list[Measurement]:
         """The gyro and the accelerometer over the newest step, as far as they are to be used."""
-        span, config, state = self._span, self._config.filter, self._running.state
-        if span is None:
+        interval, config, state = self._interval, self._config.filter, self._running.state
+        if interval is None:
             return []
-        measured = [accelerometer(state, span.mean_force, config.gravity_sigma_m_s2)]
+        measured = [accelerometer(state, interval.mean_force, config.gravity_sigma_m_s2)]
         if config.bias == "estimated" or rates is None:
-            return [gyro(state, span.mean_rate, config.gyro_sigma_rad_s), *measured]
+            return [gyro(state, interval.mean_rate, config.gyro_sigma_rad_s), *measured]
         # The first approach: where gyro and vision agree, the gyro's bias must not spoil what vision says.
-        if np.abs(span.mean_rate - rates.values[3:]).max() > config.gyro_threshold_rad_s:
-            measured.append(gyro(state, span.mean_rate, config.gyro_sigma_rad_s))
+        if np.abs(interval.mean_rate - rates.values[3:]).max() > config.gyro_threshold_rad_s:
+            measured.append(gyro(state, interval.mean_rate, config.gyro_sigma_rad_s))
         return measured
 
     def _passes_as_vision(self, motion: RelativeMotion, rates: VisualRates) -> bool:
@@ -233,15 +233,15 @@ class FilterBelief(Belief):
         return self._passes(vision(state, rates))
 
     def _passes(self, measurement: Measurement) -> bool:
-        verdict = self._running.test(measurement, self._config.filter.gate_probability)
-        self.verdicts[measurement.name] = verdict
-        if not verdict.accepted:
+        gate_result = self._running.test(measurement, self._config.filter.gate_probability)
+        self.gate_results[measurement.name] = gate_result
+        if not gate_result.accepted:
             self._report(
                 self._latest_ns,
                 f"{measurement.name}_gated",
-                f"innovation {verdict.statistic:.1f} beyond chi-square {verdict.threshold:.1f}",
+                f"innovation {gate_result.statistic:.1f} beyond chi-square {gate_result.threshold:.1f}",
             )
-        return verdict.accepted
+        return gate_result.accepted
 
     def _jump(self, stamp_ns: int, gap_s: float) -> None:
         """After a gap that nothing bridges: a new epoch at the last pose, as uncertain as after any such gap."""

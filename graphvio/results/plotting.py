@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from graphvio.arrays import Bool, Float
 from graphvio.errors import GraphvioError
 from graphvio.evaluation import Evaluation
-from graphvio.events import Status
 from graphvio.geometry import se3_inverse
+from graphvio.measurements.estimate import Status
 from graphvio.trajectory import Trajectory, travelled
 
 _DPI = 130
@@ -50,7 +50,7 @@ def draw_run(
     Args:
         path: picture to write; its ending chooses the format.
         trajectory: N poses of body in nav.
-        status: N values of `graphvio.events.Status`, or nothing.
+        status: N values of `graphvio.measurements.sensors.Status`, or nothing.
         epochs: N epoch numbers, or nothing; a new epoch is marked and the line is interrupted.
         lost_ns: stamps of framesets without a pose.
         truth: poses of body in any frame; drawn only together with ``evaluation``, which aligns it.
@@ -171,7 +171,7 @@ def _status_masks(status: Sequence[str], breaks: Any) -> dict[Status, Bool]:
 
 
 def _mark_lost(axes: Any, trajectory: Trajectory, lost_ns: Sequence[int], z: int) -> None:
-    """A red cross at the last pose before each stretch without poses."""
+    """A red cross at the last pose before each segment without poses."""
     if not len(lost_ns) or not len(trajectory):
         return
     before = np.unique(np.searchsorted(trajectory.stamps_ns, np.asarray(lost_ns)) - 1)
@@ -211,12 +211,12 @@ def _maps(first: Float, second: Float | None, series: bool) -> tuple[Figure, Any
     """Figure with plan above side view: same x, same scale, boxes that fit the data without waste."""
     points = first if second is None else np.concatenate([first, second])
     low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (-np.ones(3), np.ones(3))
-    centre, span = 0.5 * (low + high), 1.12 * (high - low)
-    span[0] = max(span[0], 0.6 * span[1], 0.5)
-    span[1] = max(span[1], 0.35 * span[0])
-    span[2] = max(1.3 * span[2], 0.16 * span[0])
-    inch_per_m = min(_MAP_WIDTH_IN / span[0], _MAP_HEIGHT_IN / (span[1] + span[2]))
-    width, plan_height, side_height = inch_per_m * span
+    centre, interval = 0.5 * (low + high), 1.12 * (high - low)
+    interval[0] = max(interval[0], 0.6 * interval[1], 0.5)
+    interval[1] = max(interval[1], 0.35 * interval[0])
+    interval[2] = max(1.3 * interval[2], 0.16 * interval[0])
+    inch_per_m = min(_MAP_WIDTH_IN / interval[0], _MAP_HEIGHT_IN / (interval[1] + interval[2]))
+    width, plan_height, side_height = inch_per_m * interval
     right = _SERIES_GAP_IN + _SERIES_WIDTH_IN if series else 0.0
     side_room = max(side_height, _MIN_SERIES_HEIGHT_IN - plan_height - _GAP_IN) if series else side_height
     total_width = max(_MARGIN_LEFT_IN + width + right + _MARGIN_RIGHT_IN, 6.5)
@@ -232,8 +232,8 @@ def _maps(first: Float, second: Float | None, series: bool) -> tuple[Figure, Any
     plan = place(_MARGIN_BOTTOM_IN + side_room + _GAP_IN, plan_height)
     for axes, z, label in ((plan, 1, "y, m"), (side, 2, "z, m")):
         axes.set_aspect("equal", adjustable="box")
-        axes.set_xlim(centre[0] - span[0] / 2, centre[0] + span[0] / 2)
-        axes.set_ylim(centre[z] - span[z] / 2, centre[z] + span[z] / 2)
+        axes.set_xlim(centre[0] - interval[0] / 2, centre[0] + interval[0] / 2)
+        axes.set_ylim(centre[z] - interval[z] / 2, centre[z] + interval[z] / 2)
         axes.set_ylabel(label)
         axes.grid(**_GRID)
         axes.set_axisbelow(True)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import ImuSpan
-from graphvio.frontend.motion import RelativeMotion
 from graphvio.geometry import se3_inverse, so3_log
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import RelativeMotion
 
 
 class AngularRates:
@@ -15,19 +15,19 @@ class AngularRates:
         self._before: RelativeMotion | None = None
 
     def update(
-        self, motion: RelativeMotion | None, span: ImuSpan | None, gyro_bias: Float, fused: Float | None
+        self, motion: RelativeMotion | None, interval: ImuInterval | None, gyro_bias: Float, fused: Float | None
     ) -> dict[str, Float]:
         """Rates (3,) rad/s in body by ``gyro``, ``vision`` and ``fused``, as far as known.
 
         Args:
             motion: measured motion that ends in the newest frameset, or None.
-            span: the IMU since the frameset before, or None.
+            interval: the IMU since the frameset before, or None.
             gyro_bias: (3,) rad/s.
             fused: (3,) rad/s by the smoother, or None.
         """
         rates: dict[str, Float] = {}
-        if span is not None:
-            rates["gyro"] = span.mean_rate - gyro_bias
+        if interval is not None:
+            rates["gyro"] = interval.mean_rate - gyro_bias
         before, self._before = self._before, motion
         if motion is not None:
             earlier_T_now, since_ns = motion.reference_T_current, motion.reference_stamp_ns

@@ -9,42 +9,35 @@ from time import perf_counter
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import NO_SAMPLES, ImuSpan
+from graphvio.backend.ekf.estimator import FilterEstimator
+from graphvio.backend.estimator import StateEstimator
+from graphvio.backend.inertial import NO_SAMPLES
 from graphvio.backend.initialisation import is_at_rest
 from graphvio.backend.propagation import Propagator
-from graphvio.belief import Belief
+from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
-from graphvio.errors import ConfigError, EventError
-from graphvio.events import (
-    Estimate,
-    Event,
-    FrameSet,
-    ImuSample,
-    Incident,
-    Prediction,
-    Quality,
-    Status,
-    checked_event,
-)
-from graphvio.filter_belief import FilterBelief
-from graphvio.frontend.motion import VisualResult
+from graphvio.errors import ConfigError, MeasurementError
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import se3_inverse
-from graphvio.offset_correction import OffsetCorrection
-from graphvio.rates import AngularRates
+from graphvio.measurements.estimate import Estimate, Prediction, Status
+from graphvio.measurements.events import Event
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import Quality, VisualResult
+from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement, checked_measurement
+from graphvio.measurements.step import Step
+from graphvio.odometry.angular_rates import AngularRates
+from graphvio.odometry.synchroniser import Synchroniser
+from graphvio.odometry.time_offset_correction import OffsetCorrection
+from graphvio.odometry.vision_events import VisionReports
 from graphvio.rig import Rig
 from graphvio.slam.keyframe import CorrectionResult, Keyframe
 from graphvio.slam.keyframes import Keyframes
-from graphvio.smoother_belief import SmootherBelief
-from graphvio.step import Step
-from graphvio.synchroniser import Synchroniser
-from graphvio.vision_reports import VisionReports
 
 
 class Odometry:
     """Visual-inertial odometry of a rig of stereo pairs.
 
-    Feed it events in time order with `process`. It holds a frameset until the IMU samples that cover it have come.
+    Feed measurements in time order with `process`. It holds a frameset until the IMU samples that cover it have come.
     With more than one pair, OpenCV's own threads are switched off in this process: pairs run side by side instead.
 
     Args:
@@ -65,8 +58,8 @@ class Odometry:
         self.config = config or Config()
         self._frontend = VisualFrontend(rig, self.config)
         self._synchroniser = Synchroniser(rig, self.config, self._report)
-        kind = FilterBelief if self.config.fusion.estimator == "filter" else SmootherBelief
-        self._belief: Belief = kind(rig, self.config, self._report, lambda: self._frontend.rekey())
+        kind = FilterEstimator if self.config.fusion.estimator == "filter" else SmootherEstimator
+        self._estimator: StateEstimator = kind(rig, self.config, self._report, lambda: self._frontend.rekey())
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._on_prediction = on_prediction
         self._on_step = on_step
@@ -74,36 +67,36 @@ class Odometry:
         self._keyframes = Keyframes(rig, self.config)
         self._vision_reports = VisionReports(rig, self._report)
         self._rates = AngularRates()
-        self._incidents: deque[Incident] = deque()  # appended to by any thread that corrects
+        self._events: deque[Event] = deque()  # appended to by any thread that corrects
         self._first_ns: int | None = None
         self._newest_ns = 0  # stamp of the newest frameset that was worked on
         self._finished = False
 
-    def process(self, event: Event) -> Estimate | None:
-        """Take one event.
+    def process(self, measurement: Measurement) -> Estimate | None:
+        """Take one measurement.
 
         Returns:
             The estimate of the oldest frameset that is due, or None while there is none. At most one frameset is
-            worked on in a call; what is still held comes with later events or with `finish`.
+            worked on in a call; what is still held comes with later measurements or with `finish`.
 
         Raises:
-            EventError: if the event is malformed, or the odometry has been finished.
+            MeasurementError: if the measurement is malformed, or the odometry has been finished.
             RigError: if an image is not what the rig says.
         """
         if self._finished:
-            raise EventError("the odometry has been finished; make a new one for more events")
-        event = checked_event(event)
-        if isinstance(event, ImuSample):
-            for sample in self._synchroniser.add_sample(event):
+            raise MeasurementError("the odometry has been finished; make a new one for more measurements")
+        measurement = checked_measurement(measurement)
+        if isinstance(measurement, ImuSample):
+            for sample in self._synchroniser.add_sample(measurement):
                 self._go_on(sample)
         else:
-            self._synchroniser.add_frameset(event)
+            self._synchroniser.add_frameset(measurement)
         return self.process_due()
 
     def process_due(self) -> Estimate | None:
         """The estimate of the oldest frameset that is held though it is due, or None while there is none: after
-        `process`, where several became due at once and later events are not to be waited for."""
-        frameset = self._synchroniser.next_due(started=self._belief.has_started)
+        `process`, where several became due at once and later measurements are not to be waited for."""
+        frameset = self._synchroniser.next_due(started=self._estimator.has_started)
         return None if frameset is None else self._estimate(frameset)
 
     @property
@@ -124,7 +117,7 @@ class Odometry:
         estimates = []
         while (frameset := self._synchroniser.next_held()) is not None:
             estimates.append(self._estimate(frameset))
-        self._belief.end()
+        self._estimator.end()
         self._frontend.close()
         self._keyframes.log.close()
         self._finished = True
@@ -143,13 +136,13 @@ class Odometry:
         """
         return self._propagator.predict(stamp_ns)
 
-    def take_incidents(self) -> list[Incident]:
+    def take_events(self) -> list[Event]:
         """What happened since the last call that a person would want to know of."""
-        return [self._incidents.popleft() for _ in range(len(self._incidents))]
+        return [self._events.popleft() for _ in range(len(self._events))]
 
     def take_smoothed(self) -> list[tuple[int, Float]]:
         """Stamps and poses ``nav_T_body`` that became final since the last call; not always in time order."""
-        return self._belief.take_final()
+        return self._estimator.take_final()
 
     def limit_corners(self, share: float) -> None:
         """Follow only a share, above 0 and up to 1, of the corners that the configuration asks for, from now on: for
@@ -189,7 +182,7 @@ class Odometry:
             in a row agree with each other.
 
         Raises:
-            EventError: if the pose is not rigid, or the covariance is none.
+            MeasurementError: if the pose is not rigid, or the covariance is none.
         """
         result = self._keyframes.map_frame.correct(keyframe_id, map_T_body, covariance)
         if result.reason:
@@ -215,25 +208,25 @@ class Odometry:
         start = perf_counter()
         stamp_ns = self._newest_ns = frameset.stamp_ns
         if self._must_wait_for_imu(stamp_ns):
-            return self._without_pose(stamp_ns, self._frontend.process(frameset, self._belief.motion_since))
-        starting, span, starts = self._must_start(stamp_ns), None, self._belief.starts
+            return self._without_pose(stamp_ns, self._frontend.process(frameset, self._estimator.motion_since))
+        starting, interval, starts = self._must_start(stamp_ns), None, self._estimator.starts
         if starting:
-            self._belief.start(stamp_ns, self._synchroniser.initial_span(stamp_ns))
+            self._estimator.start(stamp_ns, self._synchroniser.initial_interval(stamp_ns))
         else:
-            span = self._span(self._belief.latest_ns, stamp_ns)
-            self._belief.predict(stamp_ns, span)
+            interval = self._interval(self._estimator.latest_ns, stamp_ns)
+            self._estimator.predict(stamp_ns, interval)
         predicted = perf_counter()
-        visual = self._frontend.process(frameset, self._belief.motion_since)
+        visual = self._frontend.process(frameset, self._estimator.motion_since)
         measured = perf_counter()
         if not starting:
             self._vision_reports.update(stamp_ns, visual, self._frontend.misaligned)
-        at_rest = visual.at_rest and self._imu_is_at_rest(span)
-        motion = self._belief.use(visual, at_rest)
+        at_rest = visual.at_rest and self._imu_is_at_rest(interval)
+        motion = self._estimator.use(visual, at_rest)
         used = motion is not None or starting
         before_ns = self._keyframes.previous_ns
         kept = self._frontend.reference_stamps_ns | (set() if before_ns is None else {before_ns})
-        status = self._belief.update(stamp_ns, used, kept)
-        self._keyframes.map_frame.begin(self._belief.epoch)
+        status = self._estimator.update(stamp_ns, used, kept)
+        self._keyframes.map_frame.begin(self._estimator.epoch)
         references = self._frontend.reference_stamps_ns  # others than before where the window was rebuilt
         self._synchroniser.forget_before(stamp_ns)
         self._predict_from(stamp_ns, status)
@@ -243,7 +236,7 @@ class Odometry:
             **visual.stage_ms,
             "update": 1e3 * (perf_counter() - measured),
         }
-        estimate = self._assemble(stamp_ns, status, visual, span, at_rest, stage_ms)
+        estimate = self._assemble(stamp_ns, status, visual, interval, at_rest, stage_ms)
         if self._on_step is not None:
             refused = None if visual.quality is not Quality.GOOD else visual.motion
             self._on_step(
@@ -251,8 +244,8 @@ class Odometry:
                     estimate,
                     refused if motion is None else motion,
                     used=motion is not None,
-                    span=span,
-                    started=self._belief.starts != starts,
+                    interval=interval,
+                    started=self._estimator.starts != starts,
                     own={} if motion is None else visual.own,
                     references=references,
                 )
@@ -265,7 +258,10 @@ class Odometry:
         """A frameset from which later motions are measured, with the motion since the one before."""
         motion = None
         if before_ns is not None:
-            now_T_before, covariance = self._belief.motion_since(before_ns), self._belief.covariance_since(before_ns)
+            now_T_before, covariance = (
+                self._estimator.motion_since(before_ns),
+                self._estimator.covariance_since(before_ns),
+            )
             if now_T_before is not None and covariance is not None:
                 motion = se3_inverse(now_T_before), covariance
         self._keyframes.add(
@@ -276,15 +272,15 @@ class Odometry:
             motion,
         )
 
-    def _imu_is_at_rest(self, span: ImuSpan | None) -> bool:
+    def _imu_is_at_rest(self, interval: ImuInterval | None) -> bool:
         """What the IMU says of a standstill; it does not object where there is none, but where its samples lack."""
-        if span is None:
-            return not self._belief.has_imu
-        return is_at_rest(span, self.config.initialisation)
+        if interval is None:
+            return not self._estimator.has_imu
+        return is_at_rest(interval, self.config.initialisation)
 
     def _must_wait_for_imu(self, stamp_ns: int) -> bool:
         """Before the IMU's first sample there is nothing to start from, unless it has been awaited for long."""
-        if self._belief.has_started:
+        if self._estimator.has_started:
             return False
         if self._first_ns is None:
             self._first_ns = stamp_ns
@@ -293,19 +289,19 @@ class Odometry:
 
     def _must_start(self, stamp_ns: int) -> bool:
         """True at the first frameset, and where an IMU comes after a start without."""
-        if self._belief.has_imu:
+        if self._estimator.has_imu:
             return False
-        return not self._belief.has_started or self._synchroniser.initial_span(stamp_ns) is not None
+        return not self._estimator.has_started or self._synchroniser.initial_interval(stamp_ns) is not None
 
     def _predict_from(self, stamp_ns: int, status: Status) -> None:
         """Predictions go on from a new estimate."""
         if status is Status.LOST:
             self._propagator.forget()
             return
-        belief, rate = self._belief, self._belief.latest_rate()
-        samples = self._synchroniser.samples_since(stamp_ns) if belief.has_imu else NO_SAMPLES
+        estimator, rate = self._estimator, self._estimator.latest_rate()
+        samples = self._synchroniser.samples_since(stamp_ns) if estimator.has_imu else NO_SAMPLES
         self._propagator.restart(
-            stamp_ns, belief.state(), belief.epoch, np.zeros(3) if rate is None else rate, *samples
+            stamp_ns, estimator.state(), estimator.epoch, np.zeros(3) if rate is None else rate, *samples
         )
 
     def _go_on(self, sample: ImuSample) -> None:
@@ -315,14 +311,14 @@ class Odometry:
         if prediction is not None and self._on_prediction is not None:
             self._on_prediction(prediction)
 
-    def _span(self, start_ns: int, end_ns: int) -> ImuSpan | None:
+    def _interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
         """The IMU between two framesets, or None where it does not cover them."""
-        if not self._belief.has_imu:
+        if not self._estimator.has_imu:
             return None
-        span = self._synchroniser.span(start_ns, end_ns)
-        if span is None:
+        interval = self._synchroniser.interval(start_ns, end_ns)
+        if interval is None:
             self._report(end_ns, "imu_not_covering", "no IMU for this interval: constant velocity instead")
-        return span
+        return interval
 
     # ------------------------------------------------------------------ what is told
 
@@ -343,29 +339,29 @@ class Odometry:
         stamp_ns: int,
         status: Status,
         visual: VisualResult,
-        span: ImuSpan | None,
+        interval: ImuInterval | None,
         at_rest: bool,
         stage_ms: dict[str, float],
     ) -> Estimate:
-        belief = self._belief
-        state, known = belief.state(), belief.covariance
+        estimator = self._estimator
+        state, known = estimator.state(), estimator.covariance
         honest = status is not Status.LOST
         return Estimate(
             stamp_ns=stamp_ns,
             status=status,
             nav_T_body=state.nav_T_body if honest else None,
             covariance=known.pose if honest else None,
-            epoch=belief.epoch,
+            epoch=estimator.epoch,
             velocity_nav=state.velocity_nav if honest else None,
-            gyro_bias=state.gyro_bias if belief.has_imu else None,
-            accel_bias=state.accel_bias if belief.has_imu else None,
+            gyro_bias=state.gyro_bias if estimator.has_imu else None,
+            accel_bias=state.accel_bias if estimator.has_imu else None,
             velocity_covariance=known.velocity if honest else None,
             gyro_bias_covariance=known.gyro_bias,
             accel_bias_covariance=known.accel_bias,
             time_offset_s=self._time_offset.offset_s,
             time_offset_sigma_s=self._time_offset.sigma_s,
-            innovations=belief.verdicts,
-            rates=self._rates.update(visual.motion, span, state.gyro_bias, belief.latest_rate()),
+            innovations=estimator.gate_results,
+            rates=self._rates.update(visual.motion, interval, state.gyro_bias, estimator.latest_rate()),
             vision=visual.quality,
             vision_reason=visual.reason,
             vision_sigmas=None if visual.motion is None else visual.motion.weakest_sigmas,
@@ -380,4 +376,4 @@ class Odometry:
         return self._vision_reports.rig_warnings
 
     def _report(self, stamp_ns: int, kind: str, detail: str) -> None:
-        self._incidents.append(Incident(stamp_ns, kind, detail))
+        self._events.append(Event(stamp_ns, kind, detail))

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from graphvio.backend.time_offset import TimeOffsetFilter
 from graphvio.config import Config
-from graphvio.events import Quality
-from graphvio.frontend.motion import VisualResult
+from graphvio.measurements.events import Report
+from graphvio.measurements.motion import Quality, VisualResult
+from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
-from graphvio.synchroniser import Report, Synchroniser
 
 _NOTABLE_OFFSET_S = 1e-3
 _SURELY = 5.0  # standard deviations
@@ -31,7 +31,7 @@ class OffsetCorrection:
         self._is_told = False
         if rig.imu is not None and config.fusion.estimate_time_offset:
             self._nominal_s = rig.imu.time_offset_s
-            self._filter = TimeOffsetFilter(rig.imu, config.smoother.imu_noise_scale, synchroniser.span)
+            self._filter = TimeOffsetFilter(rig.imu, config.smoother.imu_noise_scale, synchroniser.interval)
 
     @property
     def offset_s(self) -> float | None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from graphvio.backend.inertial import ImuSpan
-from graphvio.events import Estimate
-from graphvio.frontend.motion import RelativeMotion
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import RelativeMotion
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,7 +18,7 @@ class Step:
         estimate: as emitted.
         motion: by which vision constrains the state; where the gate refused, what it refused; or None.
         used: whether the motion was let in.
-        span: the IMU since the step before, or None.
+        interval: the IMU since the step before, or None.
         started: whether the estimation began here, be it anew: what is known of the time before then does not count.
         references: stamps of the framesets that later motions are measured from.
         own: pair index -> what it alone says of the motion, at the end of a keyframe whose motion is used.
@@ -27,7 +27,7 @@ class Step:
     estimate: Estimate
     motion: RelativeMotion | None
     used: bool
-    span: ImuSpan | None
+    interval: ImuInterval | None
     started: bool
     references: frozenset[int]
     own: Mapping[int, RelativeMotion]

@@ -9,7 +9,7 @@ import hashlib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from graphvio.config_stages import (
+from graphvio.config.stages import (
     CornerConfig,
     FilterConfig,
     FusionConfig,
@@ -23,7 +23,7 @@ from graphvio.config_stages import (
     TimingConfig,
     TrackingConfig,
 )
-from graphvio.config_values import build, nearest
+from graphvio.config.values import build, nearest
 from graphvio.errors import ConfigError
 
 
@@ -112,7 +112,7 @@ class Config:
 
 def profiles() -> dict[str, Path]:
     """Name -> file of the configurations that come with graphvio."""
-    here = Path(__file__).parent
+    here = Path(__file__).parent.parent
     for folder in (here / "configs", here.parent / "configs"):  # as installed, as checked out
         if folder.is_dir():
             return {path.stem: path for path in sorted(folder.glob("*.yaml"))}

@@ -8,20 +8,20 @@ from collections.abc import Callable
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.gating import Verdict
-from graphvio.backend.inertial import ImuSpan
 from graphvio.backend.starts import Start
 from graphvio.backend.states import RigState, StateCovariance
 from graphvio.config import Config
-from graphvio.events import Status
-from graphvio.frontend.motion import RelativeMotion, VisualResult
+from graphvio.measurements.estimate import Status
+from graphvio.measurements.events import Report
+from graphvio.measurements.gate_result import GateResult
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import RelativeMotion, VisualResult
 from graphvio.rig import Rig
-from graphvio.synchroniser import Report
 
 _INITIALISED_WITHIN_S = 2.0  # else it is told why not
 
 
-class Belief(ABC):
+class StateEstimator(ABC):
     """The rig's state, from `start` on: for each frameset `predict`, `use` and `update`, in this order.
 
     Args:
@@ -33,14 +33,14 @@ class Belief(ABC):
     Attributes:
         epoch: counts declared breaks.
         covariance: of the newest state.
-        verdicts: of the tests since the last prediction, by what was measured, see `graphvio.events.Estimate`.
+        gate_results: of the tests since the last prediction, see `graphvio.measurements.estimate.Estimate`.
         starts: counts how often it began, be it anew.
     """
 
     def __init__(self, rig: Rig, config: Config, report: Report, rekey: Callable[[], None]) -> None:
         self.epoch = 0
         self.covariance = StateCovariance(np.zeros((6, 6)))
-        self.verdicts: dict[str, Verdict] = {}
+        self.gate_results: dict[str, GateResult] = {}
         self.starts = 0
         self._rig = rig
         self._config = config
@@ -99,7 +99,7 @@ class Belief(ABC):
     # ------------------------------------------------------------------ one frameset
 
     @abstractmethod
-    def start(self, stamp_ns: int, found: tuple[ImuSpan, float] | None) -> None:
+    def start(self, stamp_ns: int, found: tuple[ImuInterval, float] | None) -> None:
         """Begin at a frameset, where the rig is thought to be, with what the IMU says of its attitude.
 
         Args:
@@ -108,8 +108,8 @@ class Belief(ABC):
         """
 
     @abstractmethod
-    def predict(self, stamp_ns: int, span: ImuSpan | None) -> None:
-        """Go on to a frameset's instant by the IMU, or without a span of it by constant velocity."""
+    def predict(self, stamp_ns: int, interval: ImuInterval | None) -> None:
+        """Go on to a frameset's instant by the IMU, or without an interval of it by constant velocity."""
 
     @abstractmethod
     def use(self, visual: VisualResult, at_rest: bool) -> RelativeMotion | None:
@@ -133,7 +133,7 @@ class Belief(ABC):
             keep: stamps of states that later motions will be measured from.
         """
 
-    def _position_to_start_at(self, stamp_ns: int, found: tuple[ImuSpan, float] | None) -> Float:
+    def _position_to_start_at(self, stamp_ns: int, found: tuple[ImuInterval, float] | None) -> Float:
         """Where a start begins, (3,) in nav: at the newest position if there is one, which ends an epoch."""
         if self.has_started:
             self.epoch += 1

@@ -1,0 +1,100 @@
+"""The state of the rig as the odometry estimates it, and as it is predicted from there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from graphvio.arrays import Float
+from graphvio.measurements.gate_result import GateResult
+from graphvio.measurements.motion import PairReport, Quality
+
+
+class Status(StrEnum):
+    """What an estimate rests on."""
+
+    INITIALISING = "initialising"
+    """Vision moves the pose; gravity, velocity or biases are not yet known well."""
+    TRACKING = "tracking"
+    """Vision constrains this frameset."""
+    COASTING = "coasting"
+    """Vision failed or was rejected; the pose is predicted and its covariance grows."""
+    LOST = "lost"
+    """There is no honest pose; the next one starts a new epoch."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The state of the rig at a frameset's time, as known when that frameset arrived (causal).
+
+    Attributes:
+        stamp_ns: the frameset's stamp.
+        status: what the pose rests on.
+        nav_T_body: (4, 4) pose, or None when there is nothing honest to say.
+        covariance: (6, 6) of the pose, tangent ``[rotation, translation]`` in frame body, or None with the pose.
+        epoch: counts declared breaks; poses of different epochs do not share a nav frame.
+        velocity_nav: (3,) m/s in nav, or None when not estimated.
+        gyro_bias: (3,) rad/s, or None without an IMU.
+        accel_bias: (3,) m/s^2, or None without an IMU.
+        velocity_covariance: (3, 3) of ``velocity_nav``, in nav, or None where it is not estimated.
+        gyro_bias_covariance: (3, 3), or None where the bias is not estimated.
+        accel_bias_covariance: (3, 3), or None where the bias is not estimated.
+        time_offset_s: how much later than the framesets' the IMU's stamp of an instant is, as estimated, or None where
+            that is not estimated.
+        time_offset_sigma_s: its standard deviation, or None.
+        innovations: what was measured against what was expected, with the test's outcome: ``vision``, and ``rest``
+            where the rig stood still; with the paper's filter ``vision``, ``gyro`` and ``accelerometer``.
+        rates: angular rate of body (3,) rad/s by ``gyro``, ``vision`` and ``fused``, as far as known.
+        vision: how far the motion that vision measured can be trusted.
+        vision_reason: why that is not ``good``, or empty.
+        vision_sigmas: how well the geometry conditions that motion: its standard deviations in the directions that are
+            known least, of the rotation (radians) and the translation (metres); None without a motion.
+        at_rest: images, and the IMU if there is one, show no motion.
+        pairs: pair index -> what it contributed.
+        stage_ms: processing time by stage, milliseconds: ``predict``; ``track``, with all pairs side by side; its parts
+            ``pyramid``, ``register``, ``flow`` and ``stereo``, each of the pair that took longest; then ``motion``,
+            ``judge``, ``renew`` (next to nothing unless the reference changes) and ``update``. A stage that was not
+            reached is absent.
+    """
+
+    stamp_ns: int
+    status: Status
+    nav_T_body: Float | None
+    covariance: Float | None
+    epoch: int = 0
+    velocity_nav: Float | None = None
+    gyro_bias: Float | None = None
+    accel_bias: Float | None = None
+    velocity_covariance: Float | None = None
+    gyro_bias_covariance: Float | None = None
+    accel_bias_covariance: Float | None = None
+    time_offset_s: float | None = None
+    time_offset_sigma_s: float | None = None
+    innovations: Mapping[str, GateResult] = field(default_factory=dict)
+    rates: Mapping[str, Float] = field(default_factory=dict)
+    vision: Quality = Quality.FAILED
+    vision_reason: str = ""
+    vision_sigmas: tuple[float, float] | None = None
+    at_rest: bool = False
+    pairs: Mapping[int, PairReport] = field(default_factory=dict)
+    stage_ms: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """The rig between framesets, or beyond the newest one, from the newest estimate and the IMU since then.
+
+    Attributes:
+        stamp_ns: on the framesets' clock.
+        nav_T_body: (4, 4) pose.
+        velocity_nav: (3,) m/s in nav.
+        angular_velocity: (3,) rad/s in body, without the gyro's bias.
+        epoch: of the estimate that it goes on from.
+    """
+
+    stamp_ns: int
+    nav_T_body: Float
+    velocity_nav: Float
+    angular_velocity: Float
+    epoch: int

@@ -1,0 +1,94 @@
+"""Measurements of the sensors: IMU samples and framesets.
+
+Stamps are int64 nanoseconds. A sample's time is the IMU's; a frameset's is the cameras', and the two differ by the
+rig's ``time_offset_s``.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.arrays import Float, Image
+from graphvio.errors import MeasurementError
+
+_LARGEST_STAMP = 2**62  # differences of two stamps are int64, too
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSample:
+    """One reading of the IMU.
+
+    Attributes:
+        stamp_ns: IMU clock, nanoseconds.
+        angular_velocity: (3,) rad/s, frame body.
+        linear_acceleration: (3,) m/s^2, frame body: specific force, so at rest it points up with 9.81.
+    """
+
+    stamp_ns: int
+    angular_velocity: Float
+    linear_acceleration: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSet:
+    """Images of one instant from any subset of the rig's pairs.
+
+    Attributes:
+        stamp_ns: camera clock, nanoseconds.
+        images: pair index -> (left, right), each (height, width) uint8. A pair that delivered nothing is absent. They
+            are kept until the pair's next ones have come, and not copied: a driver that fills the same buffer again
+            has to hand over copies.
+    """
+
+    stamp_ns: int
+    images: Mapping[int, tuple[Image, Image]]
+
+
+Measurement = ImuSample | FrameSet
+
+
+def checked_measurement(measurement: Measurement) -> Measurement:
+    """The measurement with its stamp as an int and its vectors as float64 arrays.
+
+    Raises:
+        MeasurementError: if its type, stamp, vectors or pairs are not valid.
+    """
+    if not isinstance(measurement, ImuSample | FrameSet):
+        raise MeasurementError(f"a measurement is an ImuSample or a FrameSet, not {type(measurement).__name__}")
+    try:
+        stamp_ns = operator.index(measurement.stamp_ns)
+    except TypeError:
+        raise MeasurementError(f"stamp_ns is {measurement.stamp_ns!r}; give whole nanoseconds as an int") from None
+    if abs(stamp_ns) > _LARGEST_STAMP:
+        raise MeasurementError(
+            f"stamp_ns is {stamp_ns}, which is no time in nanoseconds; give at most {_LARGEST_STAMP}"
+        )
+    if isinstance(measurement, ImuSample):
+        try:
+            vectors = [
+                np.asarray(v, dtype=np.float64) for v in (measurement.angular_velocity, measurement.linear_acceleration)
+            ]
+        except (TypeError, ValueError):
+            vectors = []
+        if not vectors or any(vector.shape != (3,) for vector in vectors):
+            raise MeasurementError(
+                f"IMU sample at {stamp_ns}: both vectors must have three components, and all be numbers"
+            )
+        return ImuSample(stamp_ns, *vectors)
+    pairs: object = measurement.images  # what callers without a type checker give
+    if not isinstance(pairs, Mapping):
+        raise MeasurementError(
+            f"frameset at {stamp_ns}: images is a {type(pairs).__name__}; map pairs to (left, right)"
+        )
+    for pair, images in pairs.items():
+        if not isinstance(images, Sequence | np.ndarray) or len(images) != 2:
+            raise MeasurementError(f"frameset at {stamp_ns}: pair {pair} has not two images; give (left, right)")
+        if not all(isinstance(image, np.ndarray) for image in images):
+            raise MeasurementError(
+                f"frameset at {stamp_ns}: pair {pair} has something else than arrays; give two images"
+            )
+    return FrameSet(stamp_ns, measurement.images)
