@@ -1,19 +1,180 @@
-"""What happens during a run that a person would want to know of."""
+"""Events of a run that a person would want to know of, and their kinds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import StrEnum
+
+
+class EventKind(StrEnum):
+    """Kinds of events; the sentence after each says what happened and what is done about it."""
+
+    # ---------------------------------------------------------------- input of the odometry
+    IMU_NOT_FINITE = "imu_not_finite"
+    """An IMU sample has a NaN or infinite component; it is left out."""
+    IMU_OUT_OF_RANGE = "imu_out_of_range"
+    """An IMU sample is beyond what any inertial sensor measures; it is left out."""
+    IMU_DUPLICATE_STAMP = "imu_duplicate_stamp"
+    """An IMU sample has the stamp of the one before; it is left out."""
+    IMU_BACKWARD_STAMP = "imu_backward_stamp"
+    """An IMU sample is older than the one before; it is left out."""
+    IMU_FUTURE_STAMP = "imu_future_stamp"
+    """The stamp of an IMU sample is far ahead of its neighbours'; it is left out."""
+    IMU_STUCK = "imu_stuck"
+    """An axis of the IMU repeats its value beyond what noise allows; samples are left out until it changes again."""
+    FRAMESET_DUPLICATE_STAMP = "frameset_duplicate_stamp"
+    """A frameset comes less than 1 ms after the one before; it is left out."""
+    FRAMESET_BACKWARD_STAMP = "frameset_backward_stamp"
+    """A frameset is older than the one before; it is left out."""
+    FRAMESET_FUTURE_STAMP = "frameset_future_stamp"
+    """The stamp of a frameset is far ahead of its neighbours'; it is left out."""
+    UNKNOWN_PAIR = "unknown_pair"
+    """A frameset has images of a pair that is not in the rig; they are left out."""
+    IMU_NOT_COVERING = "imu_not_covering"
+    """No IMU samples cover the interval between two framesets; constant velocity is assumed."""
+    STARTED_WITHOUT_IMU = "started_without_imu"
+    """No IMU samples came while the odometry waited for them; it starts on vision alone."""
+    IMU_CAME = "imu_came"
+    """IMU samples came after a start without them; a new epoch starts with roll and pitch from gravity."""
+
+    # ---------------------------------------------------------------- vision
+    VISION_FAILED = "vision_failed"
+    """The front-end has no motion: too few points, or none that enough of them agree on."""
+    VISION_WEAK = "vision_weak"
+    """A motion is uncertain beyond what its residuals show; its covariance is enlarged."""
+    CAMERA_FROZEN = "camera_frozen"
+    """A camera repeats its image while others do not; its pair is left out until the image changes."""
+    EXTRINSICS_OFF = "extrinsics_off"
+    """The pairs' motions contradict the rig's transform between them; it is corrected for this run."""
+
+    # ---------------------------------------------------------------- state estimation
+    VISION_GATED = "vision_gated"
+    """A measured motion failed the innovation test; it is left out."""
+    GYRO_GATED = "gyro_gated"
+    """The mean angular rate failed the paper's filter's innovation test; it is left out."""
+    ACCELEROMETER_GATED = "accelerometer_gated"
+    """The mean specific force failed the paper's filter's innovation test; it is left out."""
+    ZERO_VELOCITY_GATED = "zero_velocity_gated"
+    """Images and IMU show a standstill, but the state is sure of a motion; the zero-velocity update is left out."""
+    MOTION_OVER_SEVERAL_STEPS = "motion_over_several_steps"
+    """A motion does not start at the previous frameset, so that the paper's filter cannot use it; it is left out."""
+    GATE_RESET = "gate_reset"
+    """Vision was gated for too long; the state is reinitialised from vision."""
+    LOST = "lost"
+    """The position is too uncertain to be reported."""
+    NEW_EPOCH = "new_epoch"
+    """Vision is back after the estimate was lost; a new epoch starts at the predicted pose."""
+    TIME_JUMP = "time_jump"
+    """Neither images nor IMU bridge a gap of time; a new epoch starts at the last pose."""
+    WINDOW_REBUILT = "window_rebuilt"
+    """The smoother's equations have no unique solution; its window is rebuilt at the last state."""
+    NOT_INITIALISED = "not_initialised"
+    """Some seconds after a start in motion, attitude or velocity are still uncertain; go on moving."""
+    TIME_OFFSET_OFF = "time_offset_off"
+    """Rotations of vision and gyro contradict the rig's time offset; it is corrected for this run."""
+
+    # ---------------------------------------------------------------- SLAM
+    CORRECTION_REFUSED = "correction_refused"
+    """A SLAM system's correction of a keyframe failed the innovation test, or is of another epoch; it is left out."""
+    MAP_MOVED = "map_moved"
+    """Several corrections that had been refused agree with each other; the map frame follows them."""
+
+    # ---------------------------------------------------------------- recordings
+    SESSION_CUT = "session_cut"
+    """The recording of a session was not finished; what there is is read."""
+    SESSION_DAMAGED = "session_damaged"
+    """Parts of a session cannot be read; what is left is read."""
+    IMU_GARBAGE = "imu_garbage"
+    """A row or message of the IMU is not valid; it is dropped."""
+    FRAME_GARBAGE = "frame_garbage"
+    """A row or message of a camera is not valid; it is dropped."""
+    IMU_DUPLICATE = "imu_duplicate"
+    """An IMU row has the stamp of an earlier one; it is dropped."""
+    FRAME_DUPLICATE = "frame_duplicate"
+    """A camera's row has the stamp of an earlier one; it is dropped."""
+    IMU_BACKWARD = "imu_backward"
+    """An IMU row is out of order; it is dropped."""
+    FRAME_BACKWARD = "frame_backward"
+    """A camera's row is out of order; it is dropped."""
+    IMU_OUTLIER = "imu_outlier"
+    """The stamp of an IMU row lies an hour or more from all others; it is dropped."""
+    FRAME_OUTLIER = "frame_outlier"
+    """The stamp of a camera's row lies an hour or more from all others; it is dropped."""
+    IMU_GAP = "imu_gap"
+    """There is no IMU sample for more than five periods; framesets in the gap do not wait for any."""
+    FRAME_GAP = "frame_gap"
+    """A pair has no images for more than 1.5 periods."""
+    IMU_STARTS_LATE = "imu_starts_late"
+    """The IMU does not cover the first frameset."""
+    IMU_STOPS_EARLY = "imu_stops_early"
+    """The IMU does not cover the last frameset."""
+    IMU_SEVERAL = "imu_several"
+    """Several topics have IMU samples; the first by name is used, unless ``--topics imu=TOPIC`` names another."""
+    IMU_MISSING = "imu_missing"
+    """The rig has an IMU, but the recording has no samples of it; vision alone is used."""
+    UNPAIRED_IMAGE = "unpaired_image"
+    """A left image has no right one within the tolerance, or the other way round; it is dropped."""
+    FRAMESET_INCOMPLETE = "frameset_incomplete"
+    """A pair has no images at a time when another pair has; the others are used."""
+    FRAMESET_EMPTY = "frameset_empty"
+    """No pair has two usable images; the frameset is dropped."""
+    IMAGE_MISSING = "image_missing"
+    """The file of an image does not exist; its pair is left out of the frameset."""
+    IMAGE_UNDECODABLE = "image_undecodable"
+    """An image is empty, cut or damaged; its pair is left out of the frameset."""
+    IMAGE_WRONG_SIZE = "image_wrong_size"
+    """An image is not of the rig's size; its pair is left out of the frameset."""
+    CSV_MISSING = "csv_missing"
+    """A camera has no ``data.csv``; stamps are read from the names of its images."""
+
+    # ---------------------------------------------------------------- live
+    DEVICE_LOST = "device_lost"
+    """A device was unplugged or fell silent."""
+    DEVICE_BACK = "device_back"
+    """A device delivers again."""
+    CAMERAS_SILENT = "cameras_silent"
+    """No image has come for ``live.stuck_s``."""
+    CAMERAS_BACK = "cameras_back"
+    """Images come again."""
+    IMU_SILENT = "imu_silent"
+    """No IMU sample has come for ``live.stuck_s``."""
+    IMU_BACK = "imu_back"
+    """IMU samples come again."""
+    STAGE_STUCK = "stage_stuck"
+    """A stage works on one item for longer than ``live.stuck_s``, or did not end."""
+    STAGE_RECOVERED = "stage_recovered"
+    """A stage that was stuck goes on."""
+    STAGE_FAILED = "stage_failed"
+    """An error ended a stage, and with it the run."""
+    IMAGE_DAMAGED = "image_damaged"
+    """An image could not be decoded; it is left out."""
+    CLOCK_RESTARTED = "clock_restarted"
+    """A clock was set to another time; its mapping to the host's clock starts again."""
+    CLOCK_STEPPED = "clock_stepped"
+    """A clock went forward by less than 0.5 s; the mapping follows by 1 ms a second."""
+    STAMP_IMPLAUSIBLE = "stamp_implausible"
+    """A stamp is more than 0.5 s off its device's clock; it is left out until three in a row agree."""
+    IMAGE_WITHOUT_PARTNER = "image_without_partner"
+    """An image has no partner from the other camera of its pair; it is left out."""
+    LATE_IMAGE = "late_image"
+    """An image is of an instant whose frameset was handed on already; it is left out."""
+    DUPLICATE_IMAGE = "duplicate_image"
+    """An image has the stamp of an earlier one of its camera; it is left out."""
+    IMAGE_FUTURE_STAMP = "image_future_stamp"
+    """The stamp of an image is more than 5 s ahead; it is left out."""
+    UNKNOWN_CAMERA = "unknown_camera"
+    """An image is of a camera that is not in the rig; it is left out."""
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that a person would want to know of: a gate, a reset, a fault of the input.
+    """Something that a person would want to know of: a gated measurement, a reset, a fault of the input.
 
     Attributes:
-        stamp_ns: when, on the clock of the data concerned.
-        kind: short name that can be counted, such as ``vision_gated`` or ``imu_gap``.
-        detail: one line for people, with the figures.
+        stamp_ns: When, on the clock of the data concerned.
+        kind: What happened. Drivers of devices may have kinds of their own.
+        detail: One line for people, with the figures.
     """
 
     stamp_ns: int
