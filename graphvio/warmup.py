@@ -34,7 +34,7 @@ def warm_up(rig: Rig, config: Config) -> None:
     noise = rng.integers(0, 256, size=(height, width), dtype=np.uint8)
     for stamp_ns in range(2):
         frame = tracker.observe(stamp_ns, noise, noise, np.eye(4), np.eye(4))
-        tracker.anchor()
+        tracker.keep_keyframe_patches()
     correspond({0: frame}, {0: frame})
     common_rows(frame.ids, frame.ids)
     points = np.column_stack([rng.uniform(-0.3, 0.3, (_POINTS, 2)), rng.uniform(0.1, 1.0, _POINTS)])

@@ -52,7 +52,7 @@ def test_a_keyframe_whose_near_points_have_gone_is_spent(near_left: int, expecte
     """Far points stay for long, and are most of them; what they tell of translation is nothing."""
     depths = np.concatenate([np.full(100, FAR), np.full(30, NEAR)])
     reference = frame(0, depths)
-    assert reference.tells_translation(0.3).sum() == 30
+    assert reference.constrains_translation(0.3).sum() == 30
     assert spent(reference, reference.keep(np.arange(130) < 100 + near_left)) == expected
 
 

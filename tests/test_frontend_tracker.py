@@ -78,9 +78,9 @@ def followed(
         since_last = pose @ np.linalg.inv(poses[k - 1]) if k else None
         since_first = pose @ np.linalg.inv(poses[0]) if k and anchored else None
         frame = tracker.observe(k, *views(pose, k), since_last, since_first)
-        frames.append(tracker.renew() if k in renewed else frame)
+        frames.append(tracker.replenish() if k in renewed else frame)
         if k == 0:
-            tracker.anchor()
+            tracker.keep_keyframe_patches()
     return frames
 
 
@@ -139,7 +139,7 @@ def test_new_corners_come_on_demand_or_when_few_tracks_are_left() -> None:
     tracker = PairTracker(rectified(), Config())
     first, second = followed(poses[:2], anchored=True, tracker=tracker)
     assert np.isin(second.ids, first.ids).all()
-    renewed = tracker.renew()
+    renewed = tracker.replenish()
     new = ~np.isin(renewed.ids, second.ids)
     assert new.any()
     np.testing.assert_array_equal(renewed.ids[~new], second.ids)
@@ -160,7 +160,7 @@ def test_a_frame_stays_as_it_was_when_the_next_one_comes() -> None:
     for predicted in (None, poses[1] @ np.linalg.inv(poses[0])):
         tracker = PairTracker(rectified(), Config())
         first = tracker.observe(0, *views(poses[0]), None, None)
-        tracker.anchor()
+        tracker.keep_keyframe_patches()
         held: dict[str, AnyArray] = {name: v.copy() for name, v in vars(first).items() if isinstance(v, np.ndarray)}
         second = tracker.observe(1, *views(poses[1], 1), predicted, predicted)
         _, then, now = np.intersect1d(first.ids, second.ids, return_indices=True)
@@ -195,7 +195,7 @@ def test_only_a_prediction_keeps_tracks_through_a_fast_turn() -> None:
     for predicted in (None, turned @ transform([0.01, -0.01, 0.01], [0.01, 0.0, 0.02])):  # not quite right
         tracker = PairTracker(rectified(), Config())
         first = tracker.observe(0, *views(np.eye(4)), None, None)
-        tracker.anchor()
+        tracker.keep_keyframe_patches()
         second = tracker.observe(1, *views(turned, 1), predicted, predicted)
         _, then, now = np.intersect1d(first.ids, second.ids, return_indices=True)
         true = seen(on_wall(first.pixels, np.eye(4)), turned)
@@ -283,7 +283,7 @@ def test_weak_corners_are_admitted_in_low_light_but_no_noise(noise: float) -> No
     frame = PairTracker(rectified(), Config()).observe(0, dark, dark, None, None)
     plain = PairTracker(rectified(), Config(corners=CornerConfig(scarce_share=0.0)))
     plain.observe(0, dark, dark, None, None)
-    assert len(plain.renew().ids) < 6  # strong ones alone
+    assert len(plain.replenish().ids) < 6  # strong ones alone
     assert np.sum(frame.pixels[:, 0] < 165) > 12
     assert np.sum(frame.pixels[:, 0] > 170) <= 1
 
@@ -304,7 +304,7 @@ def test_a_rich_image_gets_no_weak_corners() -> None:
     for share in (0.0, CornerConfig().scarce_share):
         tracker = PairTracker(rectified(), Config(corners=CornerConfig(scarce_share=share)))
         frame = tracker.observe(0, *views(np.eye(4)), None, None)
-        frames.append(frame if len(frame.ids) else tracker.renew())
+        frames.append(frame if len(frame.ids) else tracker.replenish())
     np.testing.assert_array_equal(frames[0].pixels, frames[1].pixels)
 
 

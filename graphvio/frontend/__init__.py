@@ -3,9 +3,9 @@
 It follows sections 2 and 3 of the paper.
 
 *One pair.* `corners` finds corners, above the noise that `grain` measures. `prediction` tells where a motion puts them
-and how it deforms their patches; `anchor` holds a keyframe's patches against later images. `lucas_kanade` registers or
-follows, by the alignment of `patches`. `matching` finds corners in the right image: `stereo` searches and triangulates,
-`slanted` aligns. `tracker` joins these, and `tracks` is what it returns.
+and how it deforms their patches; `keyframe_patches` holds a keyframe's patches against later images. `lucas_kanade`
+registers or follows, by the alignment of `patches`. `matching` finds corners in the right image: `stereo` searches and
+triangulates, `slanted` aligns. `tracker` joins these, and `tracks` is what it returns.
 
 *All pairs.* `observations` puts the tracks of a reference and the present side by side. 3-point hypotheses
 (`resection`) of every pair are scored on every pair (`cost`, `ransac`); the winner is refined and given its covariance

@@ -6,7 +6,7 @@ from graphvio.arrays import Image
 from graphvio.kernels import kernel
 
 _STEP = 6  # pixels and rows from one place that is looked at to the next
-_LARGEST = 2047
+_MAX_RESPONSE = 2047
 _SHARE = 0.5
 _DEVIATIONS = 6.0 * 0.6745  # the operator's gain on the noise's deviation, times a normal deviate's median
 
@@ -20,7 +20,7 @@ def noise_sigma(image: Image) -> float:
     black or saturated show no noise and do not count.
     """
     height, width = image.shape
-    histogram = np.zeros(_LARGEST + 1, dtype=np.int64)
+    histogram = np.zeros(_MAX_RESPONSE + 1, dtype=np.int64)
     count = 0
     for y in range(1, height - 1, _STEP):
         for x in range(1, width - 1, _STEP):
@@ -30,11 +30,11 @@ def noise_sigma(image: Image) -> float:
             corners = int(image[y - 1, x - 1]) + int(image[y - 1, x + 1])
             corners += int(image[y + 1, x - 1]) + int(image[y + 1, x + 1])
             edges = int(image[y - 1, x]) + int(image[y + 1, x]) + int(image[y, x - 1]) + int(image[y, x + 1])
-            histogram[min(abs(corners - 2 * edges + 4 * middle), _LARGEST)] += 1
+            histogram[min(abs(corners - 2 * edges + 4 * middle), _MAX_RESPONSE)] += 1
             count += 1
     rounding = float(1.0 / np.sqrt(12.0))
     below = 0
-    for value in range(_LARGEST + 1):
+    for value in range(_MAX_RESPONSE + 1):
         if below + histogram[value] > _SHARE * count:
             within = (_SHARE * count - below) / histogram[value]
             return float(max((value - 0.5 + within) / _DEVIATIONS, rounding))

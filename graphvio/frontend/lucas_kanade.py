@@ -30,7 +30,7 @@ from graphvio.kernels import fast_kernel
 MIN_GRADIENT = 1.0
 """Rms grey levels per pixel along a patch's weaker direction; below, it is not localised."""
 
-_MOST_SIGMA_PX = 0.2
+_MAX_SIGMA_PX = 0.2
 """Of a place along the weaker direction; sharp images have less than half of it."""
 
 Pyramid = tuple[Image, ...]
@@ -94,7 +94,7 @@ def _forth_and_back(
     moved = guess.copy()
     found = np.zeros(n, dtype=np.bool_)
     bordered, patch, seen, gx, gy = room(half + 1), room(half), room(half), room(half), room(half)
-    inside, most2 = lattice(half).inside, _MOST_SIGMA_PX**2
+    inside, most2 = lattice(half).inside, _MAX_SIGMA_PX**2
     for i in range(n):
         for level in range(levels - 1, -1, -1):
             scale = 1.0 / (1 << level)
@@ -148,7 +148,7 @@ def register(
     found, localised = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     bordered, patch, seen, gx, gy = room(half + 1), room(half), room(half), room(half), room(half)
     inside, inside_border, scratch = lattice(half).inside, lattice(half + 1).inside, scratch_room(half + 1)
-    most2 = _MOST_SIGMA_PX**2
+    most2 = _MAX_SIGMA_PX**2
     least2 = (min_gradient * (2 * half + 1)) ** 2
     for i in range(n):
         x, y, warp = pixels[i, 0], pixels[i, 1], warps[i]

@@ -15,9 +15,9 @@ _PRIOR_RESIDUALS = 3.0  # the noise model counts for so many, which helps where 
 _COUNTED_AT_NOISY_POINTS = 1.04  # normal matrices at noisy points promise that much more than there is, by Monte Carlo
 _CUTOFF = 25.0  # squared error over the noise variance: one right point in 20,000 lies beyond (4 degrees of freedom)
 _MEDIAN_CHI2_OF_2, _MEDIAN_CHI2_OF_4 = 1.386, 3.357
-_LEAST_VARIANCE = 0.05
+_MIN_VARIANCE = 0.05
 _POINTS_OF_EQUAL_NOISE = 10.0  # a pair's noise is thought to be that of the others by so many points
-_MOST_UNLIKE = 4.0  # variance over that of all; more is no noise, but another motion
+_MAX_RATIO = 4.0  # variance over that of all; more is no noise, but another motion
 
 
 class Influence(NamedTuple):
@@ -68,7 +68,7 @@ def noise_variance(errors2: Float, has_right: Bool, largest2: float) -> float:
     if not near.any():
         return 1.0
     medians = np.where(has_right[near], _MEDIAN_CHI2_OF_4, _MEDIAN_CHI2_OF_2)
-    return max(float(np.median(errors2[near] / medians)), _LEAST_VARIANCE)
+    return max(float(np.median(errors2[near] / medians)), _MIN_VARIANCE)
 
 
 @kernel
@@ -82,7 +82,7 @@ def noise_by_pair(errors2: Float, has_right: Bool, pair: Int, pairs: int, larges
         if 0 < fitting < np.sum(errors2 < largest2):
             own = noise_variance(errors2[of_pair], has_right[of_pair], largest2) / usual
             ratio = (fitting * own + _POINTS_OF_EQUAL_NOISE) / (fitting + _POINTS_OF_EQUAL_NOISE)
-            ratios[j] = min(max(ratio, 1.0 / _MOST_UNLIKE), _MOST_UNLIKE)
+            ratios[j] = min(max(ratio, 1.0 / _MAX_RATIO), _MAX_RATIO)
     return ratios
 
 

@@ -97,12 +97,12 @@ class Correspondences:
     Attributes:
         observations: of all pairs.
         rows: pair -> (M,) rows of the current `PairFrame` that take part, in order.
-        offered: pair -> number of points that its reference had, of the pairs that take part.
+        candidates: pair -> number of points that its reference had, of the pairs that take part.
     """
 
     observations: Observations
     rows: Mapping[int, Int]
-    offered: Mapping[int, int]
+    candidates: Mapping[int, int]
 
     def identities(self, frames: Mapping[int, PairFrame], inlier: Bool) -> dict[int, Int]:
         """Pair -> identities, increasing, of those of its current tracks that are inliers among all points (N,)."""
@@ -112,19 +112,19 @@ class Correspondences:
 def correspond(reference: Mapping[int, PairFrame], current: Mapping[int, PairFrame]) -> Correspondences:
     """Join the tracks of two instants by their identities; points without depth at the reference stay out."""
     rows: dict[int, Int] = {}
-    offered: dict[int, int] = {}
+    candidates: dict[int, int] = {}
     parts: list[Observations] = []
     for pair in sorted(reference.keys() & current.keys()):
         then, now = reference[pair], current[pair]
-        offered[pair] = int(np.count_nonzero(then.has_depth))
+        candidates[pair] = int(np.count_nonzero(then.has_depth))
         joined, rows[pair] = _join(
             pair, then.ids, then.has_depth, then.points, then.covariances,
             now.ids, now.has_depth, now.left, now.right,
         )  # fmt: skip
         parts.append(joined)
     if not parts:
-        return Correspondences(_NOTHING, rows, offered)
-    return Correspondences(Observations(*(np.concatenate(c) for c in zip(*parts, strict=True))), rows, offered)
+        return Correspondences(_NOTHING, rows, candidates)
+    return Correspondences(Observations(*(np.concatenate(c) for c in zip(*parts, strict=True))), rows, candidates)
 
 
 @kernel

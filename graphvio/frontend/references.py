@@ -79,7 +79,7 @@ class References:
             return True  # a pair that came back takes part again from the next frameset on
         pair, overlap = correspondences.observations.pair, self._config.keyframe_overlap
         explained = {int(j) for j in np.flatnonzero(np.bincount(pair[refined.inlier]))}
-        support, offered = int(refined.inlier.sum()), sum(correspondences.offered[j] for j in explained)
+        support, offered = int(refined.inlier.sum()), sum(correspondences.candidates[j] for j in explained)
         if support < overlap * offered or support < _FEWEST_POINTS:
             return True
         seen = correspondences.identities(frames, refined.inlier)
@@ -97,7 +97,7 @@ class References:
         view for long, but tell no translation."""
         offered = still = 0
         for j, ids in seen.items():
-            near = self._frames[j].tells_translation(self._config.pixel_sigma_px)
+            near = self._frames[j].constrains_translation(self._config.pixel_sigma_px)
             offered += int(near.sum())
             still += int(near[common_rows(self._frames[j].ids, ids)[0]].sum())
         return still / offered if offered else 1.0

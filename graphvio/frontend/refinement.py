@@ -19,7 +19,7 @@ from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.geometry import se3_compose, se3_exp
 from graphvio.kernels import kernel
 
-_MOST_ROUNDS = 3
+_MAX_ROUNDS = 3
 _ROUNDS_TO_FIND_INLIERS = 5
 _ROUNDS_WITH_ALL = 2
 _GROSS = 4.0  # over the cutoff of inliers: what one pair's noise may be, over that of all
@@ -27,8 +27,8 @@ _STEPS_PER_ROUND = 6
 _CONVERGED = 1e-6  # radians and metres
 _NEAR = 1e-4  # enough to tell inliers
 _WEAK_DIRECTION_SIGMA = 10.0
-_LEAST_SHARE_OF_A_PAIR = 0.25
-_LEAST_POINTS_OF_A_PAIR = 5
+_MIN_SHARE_OF_A_PAIR = 0.25
+_MIN_POINTS_OF_A_PAIR = 5
 _SHARED_BOUNDS = (0.02, 0.9)
 
 
@@ -110,7 +110,7 @@ def _refined(
         inlier &= _is_of_an_explained_pair(observations.pair, inlier)
     active = lane_by_lane(blocks, inlier.astype(np.float64))
     pose, hessian, errors2 = _levenberg_marquardt(
-        pose, rig, blocks, at, active, sigmas_px, scale, _MOST_ROUNDS, _CONVERGED
+        pose, rig, blocks, at, active, sigmas_px, scale, _MAX_ROUNDS, _CONVERGED
     )
     used = influence(errors2[inlier], has_right[inlier], scale)
     # Backward propagation of the reprojection covariance. The small prior keeps unconstrained directions finite.
@@ -136,7 +136,7 @@ def _scale(errors2: Float, has_right: Bool, widest: float, largest2: float) -> f
 def _is_of_an_explained_pair(pair: Int, inlier: Bool) -> Bool:
     """Which points (N,) belong to a pair of which more than a few fit, as some always do by chance; all, if no pair."""
     fitting = np.bincount(pair, weights=inlier.astype(np.float64))
-    explained = fitting >= np.maximum(_LEAST_SHARE_OF_A_PAIR * np.bincount(pair), _LEAST_POINTS_OF_A_PAIR)
+    explained = fitting >= np.maximum(_MIN_SHARE_OF_A_PAIR * np.bincount(pair), _MIN_POINTS_OF_A_PAIR)
     those: Bool = explained[pair] | (not explained.any())
     return those
 

@@ -15,7 +15,7 @@ from graphvio.kernels import fast_kernel, kernel, put
 
 _HALF_PATCH = 5
 _HALF_COARSE_PATCH = 4
-_MOST_STEPS = 400
+_MAX_STEPS = 400
 _FINE_STEPS = 2  # of the half-sized image, to either side
 _AMBIGUOUS = 0.97
 _GAUSS_NEWTON_STEPS = 4
@@ -60,7 +60,7 @@ def epipolar_search(
     depths = np.zeros(n)
     found = np.zeros(n, dtype=np.bool_)
     coarse, fine = _square(_HALF_COARSE_PATCH), _square(_HALF_PATCH)
-    scores = np.empty(_MOST_STEPS + 1)
+    scores = np.empty(_MAX_STEPS + 1)
     camera = (right_T_left, model, intrinsics, distortion, fold_radius(model, distortion))
     for i in range(n):
         x, y, w0, w1 = pixels[i, 0], pixels[i, 1], inverse_depths[i, 0], inverse_depths[i, 1]
@@ -104,7 +104,7 @@ def _scan(
     u1, v1, ok1 = _on_curve(ray, w1, camera)
     if not (ok0 and ok1):
         return 0, 0
-    steps = min(max(int(scale * np.hypot(u1 - u0, v1 - v0)) + 1, 2), _MOST_STEPS)
+    steps = min(max(int(scale * np.hypot(u1 - u0, v1 - v0)) + 1, 2), _MAX_STEPS)
     best = 0
     for k in range(steps + 1):
         scores[k] = -1.0

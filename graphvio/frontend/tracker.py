@@ -8,10 +8,10 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
-from graphvio.frontend.anchor import Anchor
 from graphvio.frontend.corners import find_corners, occupied_cells, thinned
 from graphvio.frontend.image_noise import noise_sigma
 from graphvio.frontend.images import allowed_pixels
+from graphvio.frontend.keyframe_patches import KeyframePatches
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.prediction import predict_pixels
@@ -37,7 +37,7 @@ class PairTracker:
         self._last = PairFrame.empty()
         self._left: Pyramid = ()
         self._right: Pyramid = ()
-        self._anchor = Anchor(pair, config.tracking.window_px)
+        self._patches = KeyframePatches(pair, config.tracking.window_px)
         self._noise_sigma = 0.0
 
     def observe(
@@ -46,7 +46,7 @@ class PairTracker:
         left: Image,
         right: Image,
         left_T_left_prev: Float | None,
-        left_T_left_anchor: Float | None,
+        left_T_left_keyframe: Float | None,
     ) -> PairFrame:
         """Follow the tracks, match them left to right and triangulate; where few are left, add new ones.
 
@@ -55,7 +55,7 @@ class PairTracker:
             left: (height, width), contiguous, of the size that the rig says.
             right: likewise.
             left_T_left_prev: (4, 4) predicted motion of points since the images before, or None if unknown.
-            left_T_left_anchor: (4, 4) the same since the anchor, or None.
+            left_T_left_keyframe: (4, 4) the same since the anchor, or None.
         """
         watch = Stopwatch()
         before, levels = self._left, max(self._config.tracking.levels, 2)
@@ -63,7 +63,7 @@ class PairTracker:
         self._noise_sigma = noise_sigma(left)
         watch.lap("pyramid")
         last, guess, inverse_depths = self._predict(left_T_left_prev)
-        pixels, found = self._follow(before, last, guess, left_T_left_prev, left_T_left_anchor, watch)
+        pixels, found = self._follow(before, last, guess, left_T_left_prev, left_T_left_keyframe, watch)
         rejected: dict[str, int] = {}
         stays = self._still_wanted(pixels, found, rejected)
         last = last.keep(stays)
@@ -79,9 +79,9 @@ class PairTracker:
         )
         watch.lap("stereo")
         self._last = replace(self._last, stage_ms=watch.stage_ms)
-        return self.renew() if self._share_of_cells(self._last) < self._config.corners.scarce_share else self._last
+        return self.replenish() if self._share_of_cells(self._last) < self._config.corners.scarce_share else self._last
 
-    def renew(self) -> PairFrame:
+    def replenish(self) -> PairFrame:
         """Add new corners to the newest frame, where no track gives geometry."""
         watch = Stopwatch()
         pixels = self._new_corners(self._last)
@@ -98,10 +98,10 @@ class PairTracker:
         """From now on have only a share of the image's cells, and so of the corners."""
         self._cell_px = round(self._config.corners.cell_px(self._pair.left.size_px[0]) / np.sqrt(share))
 
-    def anchor(self) -> None:
+    def keep_keyframe_patches(self) -> None:
         """Hold the tracks against the newest frame's own patches from here on."""
         if self._left:
-            self._anchor.place(self._last, self._left[0])
+            self._patches.take(self._last, self._left[0])
 
     def drop(self, ids: Int) -> None:
         """Forget tracks, so that fresh corners may take their place."""
@@ -129,7 +129,7 @@ class PairTracker:
         last: PairFrame,
         guess: Float,
         left_T_left_prev: Float | None,
-        left_T_left_anchor: Float | None,
+        left_T_left_keyframe: Float | None,
         watch: Stopwatch,
     ) -> tuple[Float, Bool]:
         """Where the tracks are now (N, 2), and which of them were found (N,).
@@ -138,8 +138,8 @@ class PairTracker:
         before.
         """
         pixels, found = guess.copy(), np.zeros(len(guess), dtype=bool)
-        if left_T_left_anchor is not None and left_T_left_prev is not None:
-            pixels, found = self._anchor.find(last.ids, guess, self._left[0], left_T_left_anchor, self._min_gradient)
+        if left_T_left_keyframe is not None and left_T_left_prev is not None:
+            pixels, found = self._patches.find(last.ids, guess, self._left[0], left_T_left_keyframe, self._min_gradient)
         watch.lap("register")
         rest, settings = np.flatnonzero(~found), self._config.tracking
         if len(rest):
@@ -155,10 +155,10 @@ class PairTracker:
                 first_levels=None if left_T_left_prev is None else _LEVELS_AFTER_PREDICTION,
             )
         watch.lap("flow")
-        if left_T_left_anchor is not None:
+        if left_T_left_keyframe is not None:
             rest = rest[found[rest]]
-            pixels[rest], _ = self._anchor.find(
-                last.ids[rest], pixels[rest], self._left[0], left_T_left_anchor, self._min_gradient
+            pixels[rest], _ = self._patches.find(
+                last.ids[rest], pixels[rest], self._left[0], left_T_left_keyframe, self._min_gradient
             )
         watch.lap("register")
         return pixels, found
@@ -211,7 +211,7 @@ class PairTracker:
     def _new_corners(self, frame: PairFrame) -> Float:
         """Corners (M, 2) where no track of a frame gives geometry, weak ones too where there are few."""
         settings, image = self._config.corners, self._left[0]
-        tracked, settled = frame.pixels, frame.tells_translation(self._config.motion.pixel_sigma_px)
+        tracked, settled = frame.pixels, frame.constrains_translation(self._config.motion.pixel_sigma_px)
         cell_px, border_px = self._cell_px, settings.border_px
         new = find_corners(image, self._allowed, tracked, settled, cell_px, border_px, settings.min_response)
         admitted = settings.noise_factor * self._noise_sigma

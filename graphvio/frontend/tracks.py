@@ -48,7 +48,7 @@ class PairFrame:
     rejected: Mapping[str, int] = field(default_factory=dict)
     stage_ms: Mapping[str, float] = field(default_factory=dict)
 
-    def tells_translation(self, sigma_px: float) -> Bool:
+    def constrains_translation(self, sigma_px: float) -> Bool:
         """Which tracks (N,) are near enough for their motion to tell more than rotation, with pixels so noisy."""
         sigma_w = sigma_px * np.sqrt(self.covariances[:, 2, 2])
         return np.asarray(self.has_depth & (self.points[:, 2] > _NEAR_SIGMAS * sigma_w))

@@ -200,12 +200,12 @@ class VisualFrontend:
         """
         if self._all_frozen:
             return dict(frames)
-        renewed = self._side_by_side(lambda j: self._trackers[j].renew(), frames)
+        renewed = self._side_by_side(lambda j: self._trackers[j].replenish(), frames)
         self._latest.update(renewed)
         self._references.replace(renewed)
         if self._config.motion.reference == "keyframe":
             for j in renewed:
-                self._trackers[j].anchor()
+                self._trackers[j].keep_keyframe_patches()
         return renewed
 
     def _estimate(

@@ -15,7 +15,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Int
 from graphvio.config import Config
 from graphvio.frontend.agreement import is_supported
-from graphvio.frontend.anchor import Anchor
+from graphvio.frontend.keyframe_patches import KeyframePatches
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT
 from graphvio.frontend.observations import Observations, RigArrays, correspond
 from graphvio.frontend.prediction import predict_pixels
@@ -101,13 +101,13 @@ def register_again(
     if not pairs:
         return found
     rig = RigArrays.of(Rig(tuple(observer.pair for observer in observers)))
-    anchors = {j: Anchor(observers[j].pair, config.tracking.window_px) for j in pairs}
+    patches = {j: KeyframePatches(observers[j].pair, config.tracking.window_px) for j in pairs}
     known = {j: observers[j].observe(then.stamp_ns, then.images[j], reference[j].pixels) for j in pairs}
     for j in pairs:
-        anchors[j].place(known[j], then.images[j][0])
+        patches[j].take(known[j], then.images[j][0])
     best = found
     for _ in range(_ROUNDS):
-        seen = {j: _registered(observers[j], anchors[j], known[j], now, j, best.cur_T_ref) for j in pairs}
+        seen = {j: _registered(observers[j], patches[j], known[j], now, j, best.cur_T_ref) for j in pairs}
         correspondences = correspond(known, seen)
         observations = correspondences.observations
         if len(observations.pair) < _LEAST_REGISTERED:
@@ -120,7 +120,7 @@ def register_again(
 
 
 def _registered(
-    observer: PairObserver, anchor: Anchor, known: PairFrame, now: FrameSet, j: int, cur_T_ref: Float
+    observer: PairObserver, patches: KeyframePatches, known: PairFrame, now: FrameSet, j: int, cur_T_ref: Float
 ) -> PairFrame:
     """The reference's patches in pair j's images of the other place."""
     camera, images = observer.pair.left, now.images[j]
@@ -130,7 +130,7 @@ def _registered(
         known.left, depth, left_T_left, camera.model_number, camera.intrinsics, camera.distortion
     )
     rows = np.flatnonzero(valid & known.has_depth & camera.contains(guess, 8.0))
-    pixels, at = anchor.find(known.ids[rows], guess[rows], images[0], left_T_left, MIN_GRADIENT)
+    pixels, at = patches.find(known.ids[rows], guess[rows], images[0], left_T_left, MIN_GRADIENT)
     rows, pixels, expected = rows[at], pixels[at], inverse_depths[rows][at]
     frame = observer.observe(now.stamp_ns, images, pixels, expected)
     return replace(frame, ids=known.ids[rows])

@@ -8,7 +8,7 @@ from synthetic import transform
 from waves import picture, waves
 
 from graphvio.arrays import Float, Image
-from graphvio.frontend.anchor import Anchor
+from graphvio.frontend.keyframe_patches import KeyframePatches
 from graphvio.frontend.tracks import PairFrame
 from graphvio.rig import Camera, StereoPair
 
@@ -17,8 +17,8 @@ CENTRE = np.array([0.5 * WIDTH, 0.5 * HEIGHT])
 WALL = np.array([0.55, 0.15, 0.6])  # inverse depth of a ray [x, y, 1] is its product with this: a wall seen askew
 ALONG_WALL = np.linalg.svd(WALL[None])[2][1:]  # (2, 3) two directions in it
 X, Y = np.meshgrid(np.arange(float(WIDTH)), np.arange(float(HEIGHT)))
-MOTION = transform([0.01, 0.02, -0.03], [0.1, 0.02, -0.3])  # left_T_left_anchor
-WINDOW_PX, LEAST_GRADIENT = 15, 1.0
+MOTION = transform([0.01, 0.02, -0.03], [0.1, 0.02, -0.3])  # left_T_left_keyframe
+WINDOW_PX, MIN_GRADIENT = 15, 1.0
 
 
 def pair() -> StereoPair:
@@ -60,23 +60,23 @@ def tracks() -> PairFrame:
     )
 
 
-def seen_after(frame: PairFrame, left_T_left_anchor: Float) -> Float:
+def seen_after(frame: PairFrame, left_T_left_keyframe: Float) -> Float:
     rays = np.column_stack([frame.left, np.ones(len(frame.ids))])
-    points = rays / (rays @ WALL)[:, None] @ left_T_left_anchor[:3, :3].T + left_T_left_anchor[:3, 3]
+    points = rays / (rays @ WALL)[:, None] @ left_T_left_keyframe[:3, :3].T + left_T_left_keyframe[:3, 3]
     return np.asarray(FOCAL * points[:, :2] / points[:, 2:] + CENTRE)
 
 
-def placed(frame: PairFrame) -> Anchor:
-    anchor = Anchor(pair(), WINDOW_PX)
-    anchor.place(frame, view(np.eye(4)))
-    return anchor
+def placed(frame: PairFrame) -> KeyframePatches:
+    patches = KeyframePatches(pair(), WINDOW_PX)
+    patches.take(frame, view(np.eye(4)))
+    return patches
 
 
 def errors_px(frame: PairFrame, slopes: Float) -> tuple[Float, float]:
     """Errors of the patches that were found in a later view, and how many were."""
     truth = seen_after(frame, MOTION)
     guess = truth + np.random.default_rng(1).uniform(-0.5, 0.5, truth.shape)
-    pixels, found = placed(replace(frame, slopes=slopes)).find(frame.ids, guess, view(MOTION), MOTION, LEAST_GRADIENT)
+    pixels, found = placed(replace(frame, slopes=slopes)).find(frame.ids, guess, view(MOTION), MOTION, MIN_GRADIENT)
     np.testing.assert_array_equal(pixels[~found], guess[~found])
     return np.linalg.norm(pixels - truth, axis=1)[found], float(found.mean())
 
@@ -98,7 +98,7 @@ def test_what_the_anchor_does_not_know_is_not_found() -> None:
     guess = np.full((len(ids), 2), 100.0)
     own = np.isin(ids, frame.ids)
     guess[own] = frame.pixels
-    pixels, found = placed(frame).find(ids, guess, view(np.eye(4)), np.eye(4), LEAST_GRADIENT)
+    pixels, found = placed(frame).find(ids, guess, view(np.eye(4)), np.eye(4), MIN_GRADIENT)
     assert not found[~own].any()
     assert not found[own][~frame.has_depth].any()
     assert found[own][frame.has_depth].mean() > 0.95
@@ -107,16 +107,16 @@ def test_what_the_anchor_does_not_know_is_not_found() -> None:
 
 @pytest.mark.parametrize("frame", [None, PairFrame.empty()], ids=["never placed", "no tracks"])
 def test_an_anchor_without_tracks_finds_nothing(frame: PairFrame | None) -> None:
-    anchor = Anchor(pair(), WINDOW_PX) if frame is None else placed(frame)
+    patches = KeyframePatches(pair(), WINDOW_PX) if frame is None else placed(frame)
     guess = np.array([[100.0, 80.0]])
-    pixels, found = anchor.find(np.array([0]), guess, view(np.eye(4)), np.eye(4), LEAST_GRADIENT)
+    pixels, found = patches.find(np.array([0]), guess, view(np.eye(4)), np.eye(4), MIN_GRADIENT)
     np.testing.assert_array_equal(pixels, guess)
     assert not found.any()
 
 
 def test_no_tracks_are_asked_for() -> None:
     none = np.zeros((0, 2))
-    pixels, found = placed(tracks()).find(np.zeros(0, dtype=np.int64), none, view(np.eye(4)), np.eye(4), LEAST_GRADIENT)
+    pixels, found = placed(tracks()).find(np.zeros(0, dtype=np.int64), none, view(np.eye(4)), np.eye(4), MIN_GRADIENT)
     assert pixels.shape == (0, 2)
     assert found.shape == (0,)
 
@@ -124,5 +124,5 @@ def test_no_tracks_are_asked_for() -> None:
 def test_a_prediction_that_turns_the_wall_away_finds_nothing() -> None:
     frame = tracks()
     away = transform([0.0, 0.0, 0.0], [0.0, 0.0, -50.0])
-    _, found = placed(frame).find(frame.ids, frame.pixels, view(np.eye(4)), away, LEAST_GRADIENT)
+    _, found = placed(frame).find(frame.ids, frame.pixels, view(np.eye(4)), away, MIN_GRADIENT)
     assert not found.any()

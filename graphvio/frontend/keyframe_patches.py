@@ -15,7 +15,7 @@ _MAX_REGISTRATION_PX = 2.0
 _SAME_PATCH = 0.8  # correlation of the patches
 
 
-class Anchor:
+class KeyframePatches:
     """One frame's patches, which later images are held against.
 
     Following a point from frame to frame adds up the errors of each step. The anchor's patch, deformed as a predicted
@@ -36,7 +36,7 @@ class Anchor:
         self._rays: Float = np.zeros((5, 0, 2))  # of what is around each of the tracks
         self._inverse_depths: Float = np.zeros((5, 0))
 
-    def place(self, frame: PairFrame, image: Image) -> None:
+    def take(self, frame: PairFrame, image: Image) -> None:
         """Take the patches of a frame's tracks, from its left image (height, width)."""
         self._frame, self._image = frame, packed(image)
         pixels = around(frame.pixels, self._step_px)
@@ -54,7 +54,7 @@ class Anchor:
         )
 
     def find(
-        self, ids: Int, guess: Float, image: Image, left_T_left_anchor: Float, min_gradient: float
+        self, ids: Int, guess: Float, image: Image, left_T_left_keyframe: Float, min_gradient: float
     ) -> tuple[Float, Bool]:
         """Where the patches of tracks are in another image.
 
@@ -62,7 +62,7 @@ class Anchor:
             ids: (N,) the tracks.
             guess: (N, 2) pixels, nearly right.
             image: (height, width), left.
-            left_T_left_anchor: (4, 4) predicted motion of points since the anchor.
+            left_T_left_keyframe: (4, 4) predicted motion of points since the anchor.
             min_gradient: least rms gradient of a patch along its weaker direction, grey levels per pixel.
 
         Returns:
@@ -78,7 +78,7 @@ class Anchor:
             self._rays[:, rows],
             self._inverse_depths[:, rows],
             self._step_px,
-            left_T_left_anchor,
+            left_T_left_keyframe,
             camera.model_number,
             camera.intrinsics,
             camera.distortion,
