@@ -1,1 +1,1 @@
-"""What reports have in common: a page of HTML with everything in it, its pictures, and files that are whole."""
+"""Parts that all reports share: HTML templates, figures, and files that are whole or absent."""
