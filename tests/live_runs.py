@@ -15,10 +15,11 @@ from graphvio.broadcast import Subscription
 from graphvio.config import Config
 from graphvio.live.output import Output
 from graphvio.live.running import LiveOdometry
-from graphvio.live.source import CameraFrame, DeviceHealth, ImuReading, LiveSource, Reading, host_ns
+from graphvio.live.source import LiveSource
 from graphvio.live.sources import open_live_source
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
+from graphvio.measurements.readings import CameraFrame, DeviceHealth, ImuReading, Reading, host_ns
 from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.rig import Rig
 

@@ -26,8 +26,8 @@ from graphvio.cli.dashboard import Dashboard, line_of, summary_of
 from graphvio.cli.stopping import StopSignals
 from graphvio.errors import GraphvioError, RigError
 from graphvio.live import sources
-from graphvio.live.source import DeviceHealth
 from graphvio.measurements.events import Event
+from graphvio.measurements.readings import DeviceHealth
 from graphvio.sessions.mcap_file import McapFile
 
 pytest.importorskip("mcap")

@@ -28,10 +28,10 @@ from graphvio.live import session_recorder
 from graphvio.live.health import HealthServer
 from graphvio.live.running import LiveOdometry
 from graphvio.live.session_recorder import SessionRecorder
-from graphvio.live.source import Notice, Reading
 from graphvio.live.stage import Stage
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
+from graphvio.measurements.readings import Notice, Reading
 from graphvio.measurements.sensors import ImuSample, Measurement
 from graphvio.sessions.mcap_file import McapFile
 

@@ -16,9 +16,9 @@ from graphvio.live.device_clock import MicrosecondCounter, host_ns_of_monotonic,
 from graphvio.live.devices import DeviceLostError, DeviceSource, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
 from graphvio.live.mailbox import Mailbox
-from graphvio.live.source import ImuReading, Notice, Reading, host_ns
 from graphvio.live.sources import SourceSpec
 from graphvio.live.spec_options import choice_of, names_of, number_of, size_of
+from graphvio.measurements.readings import ImuReading, Notice, Reading, host_ns
 from graphvio.rig import Rig
 
 QUICK = (0.01, 0.02)

@@ -21,7 +21,7 @@ from graphvio.live.devices import Device, DeviceSource
 from graphvio.live.imu_readers.iio_imu import IioImu
 from graphvio.live.imu_readers.iio_scan import ScanElement, ScanFormat, mount_matrix
 from graphvio.live.imu_readers.serial_imu import ImuLines, SerialImu
-from graphvio.live.source import ImuReading, Notice, Reading, host_ns
+from graphvio.measurements.readings import ImuReading, Notice, Reading, host_ns
 
 BAUD = 115_200
 

@@ -21,10 +21,10 @@ from graphvio.errors import MissingExtraError, RigError, SourceError
 from graphvio.geometry import se3, se3_inverse, so3_exp
 from graphvio.live.devices import DeviceSource
 from graphvio.live.lens_fit import fit_rational
-from graphvio.live.source import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.live.sources import SourceSpec, kind_of
 from graphvio.live.sources.oak import list_devices, open_source
 from graphvio.live.sources.oak_device import StreamSettings
+from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.rig import Rig
 
 dai = pytest.importorskip("depthai")

@@ -17,9 +17,9 @@ from graphvio.arrays import Float, Image
 from graphvio.errors import MissingExtraError, RigError, SourceError
 from graphvio.geometry import se3, se3_inverse, so3_exp
 from graphvio.live.devices import DeviceSource
-from graphvio.live.source import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.live.sources import SourceSpec, kind_of
 from graphvio.live.sources.realsense import list_devices, open_source
+from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.rig import Rig, StereoPair
 
 rs = pytest.importorskip("pyrealsense2")

@@ -15,12 +15,12 @@ from recordings import write_euroc
 from graphvio import FrameSet, open_source
 from graphvio.errors import SourceError
 from graphvio.geometry import so3_exp
-from graphvio.live.source import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.live.sources import SourceSpec, open_live_source
 from graphvio.live.sources.pacing import Pace, speed_of
 from graphvio.live.sources.replay import paced
 from graphvio.live.sources.simulated_faults import DeviceFaults, Outage, devices_of, with_faults
 from graphvio.live.sources.simulator import _leg
+from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.measurements.sensors import ImuSample, Measurement
 from graphvio.simulation import simulate
 from graphvio.simulation.simulator import make_simulator

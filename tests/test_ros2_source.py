@@ -17,9 +17,10 @@ from recordings import SIZE_PX, noise_image, small_rig
 from ros2_loopback import PERIOD_NS, START_NS, URI, Other, free_domain, until
 
 from graphvio.errors import MissingExtraError, RigError, SourceError
-from graphvio.live.source import CameraFrame, ImuReading, LiveSource, Notice, Reading
+from graphvio.live.source import LiveSource
 from graphvio.live.sources import open_live_source
 from graphvio.live.sources.ros2 import list_devices
+from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading
 from graphvio.rig import Rig
 
 FRAMESETS = 5

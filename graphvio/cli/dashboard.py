@@ -14,7 +14,7 @@ from graphvio.cli.redrawn import Redrawn
 from graphvio.measurements.events import Event
 
 if TYPE_CHECKING:
-    from graphvio.live.source import DeviceHealth
+    from graphvio.measurements.readings import DeviceHealth
 
 Figures = Mapping[str, float | int | str | None]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 
-from graphvio.live.source import host_ns
+from graphvio.measurements.readings import host_ns
 
 _MONOTONIC_TO_HOST_NS = host_ns() - time.monotonic_ns()
 

@@ -12,7 +12,7 @@ from typing import Protocol
 from graphvio.errors import SourceError
 from graphvio.live.counts import Counts
 from graphvio.live.mailbox import Mailbox
-from graphvio.live.source import DeviceHealth, Notice, Reading, host_ns
+from graphvio.measurements.readings import DeviceHealth, Notice, Reading, host_ns
 from graphvio.rig import Rig
 
 HandOver = Callable[[Reading], None]

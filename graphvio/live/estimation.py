@@ -15,9 +15,9 @@ from graphvio.live.inbox import Inbox
 from graphvio.live.load import LoadControl
 from graphvio.live.meter import Meter
 from graphvio.live.pipe import Pipe
-from graphvio.live.source import host_ns
 from graphvio.live.stage import Stage
 from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.readings import host_ns
 from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.odometry import Odometry
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from graphvio.live.meter import Meter
-from graphvio.live.source import DeviceHealth
 from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.readings import DeviceHealth
 
 _STATM = Path("/proc/self/statm")
 _PAGE_BYTES = 4096

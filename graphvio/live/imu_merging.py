@@ -11,7 +11,7 @@ from operator import itemgetter
 
 from graphvio.arrays import Float
 from graphvio.live.counts import Counts
-from graphvio.live.source import ImuReading
+from graphvio.measurements.readings import ImuReading
 
 _LONGEST_GAP_NS = 100_000_000
 _MOST_WAITING = 256

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-from graphvio.live.source import host_ns
+from graphvio.measurements.readings import host_ns
 from graphvio.measurements.sensors import FrameSet, Measurement
 
 _MOST_SAMPLES = 50_000  # minutes: when so many wait, whoever takes them is dead

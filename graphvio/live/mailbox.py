@@ -6,7 +6,7 @@ import threading
 from collections import deque
 
 from graphvio.live.counts import Counts
-from graphvio.live.source import Notice, Reading
+from graphvio.measurements.readings import Notice, Reading
 
 _LONGEST_NS = 2_000_000_000
 

@@ -12,9 +12,10 @@ from graphvio.live.ordering import SampleOrder
 from graphvio.live.pairing import FramesetAssembler
 from graphvio.live.pipe import Pipe
 from graphvio.live.shared_clock import SharedClock
-from graphvio.live.source import CameraFrame, ImuReading, LiveSource, Notice, host_ns
+from graphvio.live.source import LiveSource
 from graphvio.live.stage import Stage
 from graphvio.measurements.events import Report
+from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, host_ns
 from graphvio.measurements.sensors import ImuSample, Measurement
 from graphvio.rig import Imu, Rig
 

@@ -15,11 +15,12 @@ from graphvio.live.figures import device_figures, figures
 from graphvio.live.meter import Meter
 from graphvio.live.output import Output
 from graphvio.live.reception import Reception
-from graphvio.live.source import DeviceHealth, LiveSource, host_ns
+from graphvio.live.source import LiveSource
 from graphvio.live.stage import Stage
 from graphvio.live.watchdog import Watchdog
 from graphvio.measurements.estimate import Estimate, Prediction
 from graphvio.measurements.events import Event
+from graphvio.measurements.readings import DeviceHealth, host_ns
 from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig

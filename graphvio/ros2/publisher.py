@@ -9,8 +9,8 @@ from types import TracebackType
 from typing import Any, Final
 
 from graphvio.errors import GraphvioError, ServiceError
-from graphvio.live.source import host_ns
 from graphvio.measurements.estimate import Estimate, Status
+from graphvio.measurements.readings import host_ns
 from graphvio.ros2 import messages
 from graphvio.ros2.corrections import Corrections
 from graphvio.ros2.messages import CORRECTION, DIAGNOSTICS, MAP, PATH, POINTS, Level

@@ -10,7 +10,7 @@ import cv2
 from graphvio.arrays import Image
 from graphvio.errors import SessionError, SourceError
 from graphvio.image_decoding import ImageError
-from graphvio.live.source import CameraFrame, DeviceHealth, ImuReading, Notice, Reading, host_ns
+from graphvio.measurements.readings import CameraFrame, DeviceHealth, ImuReading, Notice, Reading, host_ns
 from graphvio.ros2.node import Node, Reader
 from graphvio.ros2.qos import Profile
 from graphvio.sessions import cdr

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.live.source import ImuReading, Reading
+from graphvio.measurements.readings import ImuReading, Reading
 from graphvio.ros2.sensor_topic import SensorTopic
 from graphvio.sessions.rig_of_topics import path_between
 

@@ -18,7 +18,7 @@ from graphvio.live.device_clock import host_ns_of_monotonic, realtime_to_host_ns
 from graphvio.live.devices import DeviceLostError, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
 from graphvio.live.imu_readers.iio_scan import ScanElement, ScanFormat, mount_matrix
-from graphvio.live.source import ImuReading, host_ns
+from graphvio.measurements.readings import ImuReading, host_ns
 
 _SYSFS = Path("/sys/bus/iio/devices")
 _DEV = Path("/dev")

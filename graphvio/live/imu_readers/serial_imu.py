@@ -22,7 +22,7 @@ from graphvio.errors import MissingExtraError, SourceError
 from graphvio.live.counts import Counts
 from graphvio.live.device_clock import MicrosecondCounter
 from graphvio.live.devices import DeviceLostError, HandOver
-from graphvio.live.source import ImuReading, Notice, host_ns
+from graphvio.measurements.readings import ImuReading, Notice, host_ns
 
 _POLL_S = 0.05
 _SILENCE_NS = 3_000_000_000

@@ -17,8 +17,8 @@ from graphvio.live.counts import Counts
 from graphvio.live.devices import DeviceLostError, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
 from graphvio.live.lens_fit import FittedLens
-from graphvio.live.source import CameraFrame, ImuReading, host_ns
 from graphvio.live.sources.oak_calibration import factory_rig, fitted_lens
+from graphvio.measurements.readings import CameraFrame, ImuReading, host_ns
 from graphvio.rig import Rig
 
 _POLL_S = 0.1

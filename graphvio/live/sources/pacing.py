@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 
-from graphvio.live.source import host_ns
 from graphvio.live.sources import SourceSpec
 from graphvio.live.spec_options import number_of
+from graphvio.measurements.readings import host_ns
 
 _LATE_NS = 1_000_000_000
 

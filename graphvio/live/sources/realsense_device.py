@@ -16,8 +16,8 @@ from graphvio.live.counts import Counts
 from graphvio.live.device_clock import MicrosecondCounter, host_ns_of_realtime
 from graphvio.live.devices import DeviceLostError, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
-from graphvio.live.source import CameraFrame, ImuReading, host_ns
 from graphvio.live.sources.realsense_calibration import factory_rig
+from graphvio.measurements.readings import CameraFrame, ImuReading, host_ns
 from graphvio.rig import Rig
 
 SYNC_MODES = {"none": 0, "master": 1, "slave": 2}

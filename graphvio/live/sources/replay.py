@@ -7,10 +7,11 @@ from pathlib import Path
 
 from graphvio.arrays import Image
 from graphvio.errors import SourceError
-from graphvio.live.source import CameraFrame, DeviceHealth, DeviceInfo, ImuReading, Notice, Reading, host_ns
+from graphvio.live.source import DeviceInfo
 from graphvio.live.sources import SourceSpec, check_options
 from graphvio.live.sources.pacing import Pace, speed_of
 from graphvio.live.spec_options import number_of
+from graphvio.measurements.readings import CameraFrame, DeviceHealth, ImuReading, Notice, Reading, host_ns
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.rig import Rig
 from graphvio.sources import Source

@@ -9,8 +9,9 @@ from typing import Final
 
 from graphvio.arrays import Float
 from graphvio.errors import SourceError
-from graphvio.live.source import DeviceHealth, DeviceInfo, ImuReading, LiveSource, Reading
+from graphvio.live.source import DeviceInfo, LiveSource
 from graphvio.live.sources import SourceSpec, check_options
+from graphvio.measurements.readings import DeviceHealth, ImuReading, Reading
 from graphvio.rig import Rig
 from graphvio.ros2.node import Node, Publication, domain_of
 from graphvio.ros2.rig import listen_for_rig, listen_for_transforms

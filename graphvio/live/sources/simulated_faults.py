@@ -11,7 +11,7 @@ from itertools import count
 import numpy as np
 
 from graphvio.errors import SourceError
-from graphvio.live.source import CameraFrame, ImuReading, Notice, Reading, host_ns
+from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.rig import Rig
 
 IMU = "imu"

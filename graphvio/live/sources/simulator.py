@@ -20,13 +20,14 @@ import numpy as np
 
 from graphvio.errors import SourceError
 from graphvio.kernels import cache_root
-from graphvio.live.source import DeviceHealth, DeviceInfo, Reading
+from graphvio.live.source import DeviceInfo
 from graphvio.live.sources import SourceSpec, check_options
 from graphvio.live.sources.pacing import Pace, speed_of
 from graphvio.live.sources.replay import paced
 from graphvio.live.sources.simulated_faults import OPTIONS as FAULT_OPTIONS
 from graphvio.live.sources.simulated_faults import DeviceFaults, devices_of, with_faults
 from graphvio.live.spec_options import number_of, whole_number_of
+from graphvio.measurements.readings import DeviceHealth, Reading
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.rig import Rig
 from graphvio.simulation import SCENE_NAMES

@@ -12,7 +12,7 @@ from graphvio.live.counts import Counts
 from graphvio.live.devices import Device, DeviceLostError, DeviceSource, HandOver
 from graphvio.live.imu_readers.iio_imu import IioImu
 from graphvio.live.imu_readers.serial_imu import SerialImu
-from graphvio.live.source import CameraFrame, DeviceInfo, LiveSource, host_ns
+from graphvio.live.source import DeviceInfo, LiveSource
 from graphvio.live.sources import SourceSpec, check_options
 from graphvio.live.sources.v4l2_capture import (
     FORMATS,
@@ -24,6 +24,7 @@ from graphvio.live.sources.v4l2_capture import (
     stamp_of,
 )
 from graphvio.live.spec_options import choice_of, names_of, number_of, size_of
+from graphvio.measurements.readings import CameraFrame, host_ns
 from graphvio.rig import Camera, Rig
 
 OPTIONS = ("layout", "size", "fps", "format", "exposure_us", "gain", "imu", "imu_baud", "imu_rate_hz")
