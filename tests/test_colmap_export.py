@@ -19,11 +19,12 @@ from graphvio.config.stages import OptimizationConfig
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.colmap_export import ColmapModel, export
+from graphvio.optimization.loops.closures import LoopClosure, Place
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.features import extract_places
 from graphvio.optimization.loops.matching import alike
 from graphvio.optimization.loops.places import choose_places
-from graphvio.optimization.loops.search import LoopClosure, Place, SessionInput
+from graphvio.optimization.loops.search import SessionInput
 from graphvio.optimization.optimize import JudgedLoop, Optimization, optimize
 from graphvio.optimization.record import Recorder
 

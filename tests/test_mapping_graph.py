@@ -11,9 +11,8 @@ from graphvio.arrays import Float
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.mapping.chains import Chains
 from graphvio.mapping.pose_graph import PoseGraph
-from graphvio.optimization.loops.search import LoopClosure, Place
-from graphvio.optimization.marginals import Marginals
-from graphvio.optimization.tie import Tie
+from graphvio.optimization.loops.closures import LoopClosure, Place
+from graphvio.optimization.solver import Edge, Marginals
 
 STEP_SIGMAS = np.repeat([1e-3, 4e-3], 3)
 LOOP_SIGMAS = np.repeat([1e-3, 3e-3], 3)
@@ -65,8 +64,8 @@ def test_chains_know_motions_as_the_solved_graph_does() -> None:
         expected_motion, expected = known.motion(first, second)
         np.testing.assert_allclose(motion, expected_motion, atol=1e-9)
         np.testing.assert_allclose(covariance, expected, rtol=1e-4, atol=1e-10)
-    tie = Tie(2, 25, se3_inverse(truth[2]) @ truth[25], np.diag(LOOP_SIGMAS**2))
-    assert graph.chains.distance(tie) == pytest.approx(known.distance(tie), rel=1e-4)
+    edge = Edge(2, 25, se3_inverse(truth[2]) @ truth[25], np.diag(LOOP_SIGMAS**2))
+    assert graph.chains.distance(edge) == pytest.approx(known.distance(edge), rel=1e-4)
 
 
 def test_a_covariance_that_says_nothing_is_uncertain_can_be_used() -> None:
@@ -143,7 +142,7 @@ def test_a_fragment_is_joined_by_three_places_that_agree() -> None:
     assert graph.is_in_map(59)
     assert graph.component == [0, 0]
     assert worst_m(graph, truth) < 0.15
-    used = {(each.tie.first, each.tie.second): each.is_used for each in graph.closures}
+    used = {(each.edge.first, each.edge.second): each.is_used for each in graph.closures}
     assert not used[3, 44]
     assert used[5, 45]
     error = se3_log(se3_inverse(graph.pose(50)) @ truth[50])

@@ -1,4 +1,4 @@
-"""Sessions as one graph, on sessions drawn by chance whose truth and noise are known."""
+"""Graph optimisation of synthetic sessions, whose truth and noise are known."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from synthetic_session import SyntheticSession, closure_between, make_session
 
 from graphvio import ImuSample, Odometry, open_source
 from graphvio.arrays import Bool, Float
@@ -19,15 +20,13 @@ from graphvio.errors import OptimizationError
 from graphvio.evaluation import evaluate
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.measurements.motion import RelativeMotion
-from graphvio.optimization.drawn_session import DrawnSession, closure_between, draw_session
 from graphvio.optimization.exchange import write_g2o
 from graphvio.optimization.extrinsics import c, d, own_motion
-from graphvio.optimization.loops import saved
-from graphvio.optimization.loops.search import LoopClosure
-from graphvio.optimization.marginals import Marginals
+from graphvio.optimization.loops.closures import LoopClosure, closures_to_bytes, load_closures
 from graphvio.optimization.nodes import choose_nodes, spread
 from graphvio.optimization.optimize import Optimization, optimize
 from graphvio.optimization.record import Motions, Recorder, SessionRecord
+from graphvio.optimization.solver import Marginals
 from graphvio.rig import Imu
 from graphvio.simulation import default_rig
 from graphvio.trajectory import Trajectory
@@ -37,20 +36,20 @@ CONFIG = Config()
 
 
 @pytest.fixture(scope="module")
-def walk() -> DrawnSession:
+def walk() -> SyntheticSession:
     """Two and a half laps with 40 closures, of which the last 12 are false."""
-    return draw_session(225.0, 1, IMU, 40, 0.3)
+    return make_session(225.0, 1, IMU, 40, 0.3)
 
 
-def ate_m(poses: Float, drawn: DrawnSession) -> float:
-    return evaluate(Trajectory(drawn.record.stamps_ns, poses), drawn.truth).ate_position_m.rmse
+def ate_m(poses: Float, session: SyntheticSession) -> float:
+    return evaluate(Trajectory(session.record.stamps_ns, poses), session.truth).ate_position_m.rmse
 
 
-def optimized(drawn: DrawnSession, closures: list[LoopClosure]) -> Optimization:
-    return optimize([drawn.record], [IMU], closures, CONFIG)
+def optimized(session: SyntheticSession, closures: list[LoopClosure]) -> Optimization:
+    return optimize([session.record], [IMU], closures, CONFIG)
 
 
-def test_false_closures_do_not_bend_the_trajectory(walk: DrawnSession) -> None:
+def test_false_closures_do_not_bend_the_trajectory(walk: SyntheticSession) -> None:
     """With 30 % false closures the result is within a tenth of that of the right ones alone."""
     right = walk.closures[: -walk.false]
     clean, mixed, alone = optimized(walk, right), optimized(walk, walk.closures), optimized(walk, [])
@@ -63,7 +62,7 @@ def test_false_closures_do_not_bend_the_trajectory(walk: DrawnSession) -> None:
     assert 0.1 < mixed.after["loop"].per_dimension < 1.2  # of the IMU's noise three times as much is expected
 
 
-def test_false_closures_that_agree_with_each_other_are_refused(walk: DrawnSession) -> None:
+def test_false_closures_that_agree_with_each_other_are_refused(walk: SyntheticSession) -> None:
     """As many wrong ones as right ones, all off by the same two metres, as where a pattern repeats."""
     right = walk.closures[: -walk.false]
     shift = np.eye(4)
@@ -78,11 +77,11 @@ def test_what_is_told_of_the_uncertainty_is_true() -> None:
     config = replace(CONFIG, smoother=replace(SmootherConfig(), imu_noise_scale=1.0))
     squares = []
     for seed in range(40):
-        drawn = draw_session(12.0, seed, IMU, 0)
-        found = optimize([drawn.record], [IMU], [], config)
+        session = make_session(12.0, seed, IMU, 0)
+        found = optimize([session.record], [IMU], [], config)
         last = len(found.sessions[0].nodes.rows) - 1
         relative, covariance = Marginals(found.graph, found.values).motion(0, last)
-        true = se3_inverse(drawn.truth.nav_T_body[0]) @ drawn.truth.nav_T_body[-1]
+        true = se3_inverse(session.truth.nav_T_body[0]) @ session.truth.nav_T_body[-1]
         error = se3_log(se3_inverse(relative) @ true)
         squares.append(error @ np.linalg.solve(covariance, error))
     assert 4.95 < np.mean(squares) < 7.1
@@ -90,7 +89,7 @@ def test_what_is_told_of_the_uncertainty_is_true() -> None:
 
 def test_sessions_of_one_place_come_into_one_frame() -> None:
     """Two walks, each in a frame of its own, are one after a few closures between them; one closure is not believed."""
-    one, other = draw_session(100.0, 1, IMU, 10), draw_session(100.0, 2, IMU, 10, session=1)
+    one, other = make_session(100.0, 1, IMU, 10), make_session(100.0, 2, IMU, 10, session=1)
     turned = se3_exp(np.array([0.0, 0.0, 2.0, 5.0, -3.0, 0.4]))
     elsewhere = replace(
         other.record,
@@ -113,15 +112,15 @@ def test_sessions_of_one_place_come_into_one_frame() -> None:
 
 def test_things_that_two_buildings_have_alike_do_not_join_them() -> None:
     """Ten closures that agree, each on few points, as on one poster, are not believed; with a hundred each they are."""
-    one, other = draw_session(40.0, 1, IMU, 0), draw_session(40.0, 2, IMU, 0, session=1)
+    one, other = make_session(40.0, 1, IMU, 0), make_session(40.0, 2, IMU, 0, session=1)
     between = [closure_between(one, other, row, 5) for row in range(100, 300, 20)]
     few = [replace(each, inliers=60) for each in between]
     assert optimize([one.record, other.record], [IMU, IMU], few, CONFIG).frames == [0, 1]
     assert optimize([one.record, other.record], [IMU, IMU], between, CONFIG).frames == [0, 0]
 
 
-def test_closures_of_other_sessions_are_refused(walk: DrawnSession) -> None:
-    other = draw_session(40.0, 2, IMU, 0)
+def test_closures_of_other_sessions_are_refused(walk: SyntheticSession) -> None:
+    other = make_session(40.0, 2, IMU, 0)
     with pytest.raises(OptimizationError, match="are of other sessions"):
         optimize([other.record], [IMU], walk.closures, CONFIG)
 
@@ -131,9 +130,9 @@ def chosen(motions: Motions, which: Bool) -> Motions:
     return Motions(**columns)
 
 
-def broken(drawn: DrawnSession, row: int) -> SessionRecord:
+def broken(session: SyntheticSession, row: int) -> SessionRecord:
     """The same walk with a new epoch from a row on, whose first pose is a wrong guess."""
-    record, moved = drawn.record, se3_exp(np.array([0.0, 0.0, 0.5, 3.0, 1.0, 0.0]))
+    record, moved = session.record, se3_exp(np.array([0.0, 0.0, 0.5, 3.0, 1.0, 0.0]))
     kept = (record.motions.reference >= row) | (record.motions.row < row)
     poses = record.smoothed.copy()
     poses[row:] = moved @ poses[row:]
@@ -145,7 +144,7 @@ def broken(drawn: DrawnSession, row: int) -> SessionRecord:
     return replace(record, online=poses, smoothed=poses, velocity_nav=velocity, epoch=epoch, motions=motions)
 
 
-def test_a_break_is_bridged_by_closures_and_stays_declared_without(walk: DrawnSession) -> None:
+def test_a_break_is_bridged_by_closures_and_stays_declared_without(walk: SyntheticSession) -> None:
     record = broken(walk, 3000)
     found = optimize([record], [IMU], walk.closures, CONFIG)
     assert found.frames == [0, 0]
@@ -155,14 +154,14 @@ def test_a_break_is_bridged_by_closures_and_stays_declared_without(walk: DrawnSe
     assert np.array_equal(alone.sessions[0].frame, record.epoch)
 
 
-def test_without_an_imu_motions_alone_are_solved(walk: DrawnSession) -> None:
+def test_without_an_imu_motions_alone_are_solved(walk: SyntheticSession) -> None:
     record = replace(walk.record, with_imu=np.zeros(len(walk.record.stamps_ns), dtype=bool))
     found = optimize([record], [None], walk.closures, CONFIG)
     assert "imu" not in found.after
     assert ate_m(found.sessions[0].nav_T_body, walk) < 0.3 * ate_m(record.online, walk)
 
 
-def test_a_part_without_any_measurement_is_held_by_constant_velocity(walk: DrawnSession) -> None:
+def test_a_part_without_any_measurement_is_held_by_constant_velocity(walk: SyntheticSession) -> None:
     """Neither motions nor IMU for half a second: the graph still has one solution."""
     record = walk.record
     blind = (record.motions.row > 1000) & (record.motions.reference < 1010)
@@ -175,7 +174,7 @@ def test_a_part_without_any_measurement_is_held_by_constant_velocity(walk: Drawn
     assert "walk" in found.after
 
 
-def test_poses_between_states_keep_the_smoothed_motion(walk: DrawnSession) -> None:
+def test_poses_between_states_keep_the_smoothed_motion(walk: SyntheticSession) -> None:
     nodes = choose_nodes(walk.record, 1.0)
     exact = spread(nodes, walk.record.smoothed[nodes.rows])
     np.testing.assert_allclose(exact, walk.record.smoothed, atol=1e-9)
@@ -190,8 +189,8 @@ def test_the_calibration_is_found_with_the_trajectory() -> None:
         se3_exp(np.array([0.005, -0.006, 0.004, 0.002, -0.001, 0.002])),
         se3_exp(np.array([-0.02, 0.03, 0.01, 0.03, 0.02, -0.02])),
     ]
-    drawn = draw_session(100.0, 4, IMU, 5, corrections=true, offset_s=0.006)
-    found = optimize([drawn.record], [IMU], drawn.closures, CONFIG, calibrates=True)
+    session = make_session(100.0, 4, IMU, 5, corrections=true, offset_s=0.006)
+    found = optimize([session.record], [IMU], session.closures, CONFIG, calibrates=True)
     (correction,) = found.corrections
     assert correction is not None
     for pair, expected in enumerate(true):
@@ -228,13 +227,13 @@ def test_derivatives_of_a_single_pairs_motion() -> None:
     np.testing.assert_allclose(found, np.array(columns).T, atol=1e-6)
 
 
-def test_records_and_closures_are_kept_to_the_bit(walk: DrawnSession, tmp_path: Path) -> None:
+def test_records_and_closures_are_kept_to_the_bit(walk: SyntheticSession, tmp_path: Path) -> None:
     record, closures = tmp_path / "record.npz", tmp_path / "loops.npz"
     record.write_bytes(walk.record.to_bytes())
-    closures.write_bytes(saved.to_bytes(walk.closures))
-    again, loops = SessionRecord.load(record), saved.load(closures)
+    closures.write_bytes(closures_to_bytes(walk.closures))
+    again, loops = SessionRecord.load(record), load_closures(closures)
     assert again.to_bytes() == walk.record.to_bytes()
-    assert saved.to_bytes(loops) == saved.to_bytes(walk.closures)
+    assert closures_to_bytes(loops) == closures_to_bytes(walk.closures)
     first, second = optimized(walk, walk.closures), optimize([again], [IMU], loops, CONFIG)
     assert np.array_equal(first.sessions[0].nav_T_body, second.sessions[0].nav_T_body)
     record.write_bytes(record.read_bytes()[:-100])
@@ -242,7 +241,7 @@ def test_records_and_closures_are_kept_to_the_bit(walk: DrawnSession, tmp_path: 
         SessionRecord.load(record)
 
 
-def test_other_tools_find_the_same_optimum_in_the_pose_graph(walk: DrawnSession, tmp_path: Path) -> None:
+def test_other_tools_find_the_same_optimum_in_the_pose_graph(walk: SyntheticSession, tmp_path: Path) -> None:
     """What g2o holds has its optimum about where the full graph has it: what the IMU says of states that are not
     neighbours is lost.
     """

@@ -22,13 +22,13 @@ from graphvio.config import Config
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3, se3_exp, se3_inverse, so3_exp
 from graphvio.optimization.extrinsics import RigCorrection
-from graphvio.optimization.loops.search import LoopClosure, Place
+from graphvio.optimization.loops.closures import LoopClosure, Place
 from graphvio.optimization.optimize import JudgedLoop, Optimization, optimize
 from graphvio.optimization.record import NO_MOTIONS, Inertial, Motions, SessionRecord
 from graphvio.optimization.report.calibration import calibrations
 from graphvio.optimization.report.words import length, plain
 from graphvio.optimization.report.write import write_report
-from graphvio.optimization.solve import Residuals
+from graphvio.optimization.solver import Residuals
 from graphvio.trajectory import Trajectory
 
 POSES, LAP = 120, 60

@@ -21,10 +21,9 @@ from graphvio.errors import FleetError, TrajectoryError
 from graphvio.evaluation import evaluate
 from graphvio.fleet.markers import Marker, finished, forget, refuse_others
 from graphvio.fleet.storage import Storage, fetch_recording
-from graphvio.optimization.loops import saved
+from graphvio.optimization.loops.closures import load_closures
 from graphvio.optimization.loops.database import FeatureDatabase
-from graphvio.optimization.loops.features import extract_places
-from graphvio.optimization.loops.merge import merge_places
+from graphvio.optimization.loops.features import extract_places, merge_places
 from graphvio.optimization.pipeline import DATABASE, Session, Stages
 from graphvio.optimization.record import SessionRecord
 from graphvio.optimization.workspace import digest
@@ -161,7 +160,7 @@ def graph(job: Job) -> Marker:
 
     def work(task: _Task) -> dict[str, Any]:
         task.fetch(ODOMETRY, *([LOOPS] if job.with_loops else []))
-        closures = saved.load(task.folder / "loops.npz") if job.with_loops else None
+        closures = load_closures(task.folder / "loops.npz") if job.with_loops else None
         found = task.stages.result([task.record()], closures)
         return {
             "loops_found": len(found.loops),

@@ -12,7 +12,7 @@ from graphvio.arrays import Float
 from graphvio.backend.factors import x
 from graphvio.backend.noise import gaussian
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
-from graphvio.optimization.tie import Tie
+from graphvio.optimization.solver import Edge
 
 EXACT: Final = 1e-12 * np.eye(6)
 """A micrometre, a microradian: keeps a covariance that says nothing is uncertain invertible."""
@@ -57,7 +57,7 @@ class Chains:
         adjoint = se3_adjoint(pose)
         n = len(self)
         self._append(previous_T_body, covariance, pose, self._sums[-1] + adjoint @ covariance @ adjoint.T)
-        self._factors[n] = Tie(n - 1, n, previous_T_body, covariance).factor()
+        self._factors[n] = Edge(n - 1, n, previous_T_body, covariance).factor()
 
     def motion(self, first: int, second: int) -> tuple[Float, Float]:
         """``first_T_second`` (4, 4) of two places of a fragment, and its covariance (6, 6), in body at the second."""
@@ -67,11 +67,11 @@ class Chains:
         covariance = adjoint @ (self._sums[high] - self._sums[low]) @ adjoint.T
         return relative, 0.5 * (covariance + covariance.T)
 
-    def distance(self, tie: Tie) -> float:
+    def distance(self, edge: Edge) -> float:
         """Squared Mahalanobis distance of a closure within a fragment, 6 degrees of freedom."""
-        relative, covariance = self.motion(tie.first, tie.second)
-        error = se3_log(se3_inverse(relative) @ tie.first_T_second)
-        return float(error @ np.linalg.solve(covariance + tie.covariance, error))
+        relative, covariance = self.motion(edge.first, edge.second)
+        error = se3_log(se3_inverse(relative) @ edge.first_T_second)
+        return float(error @ np.linalg.solve(covariance + edge.covariance, error))
 
     def add_to(self, graph: gtsam.NonlinearFactorGraph, fragment: int) -> None:
         """Add a fragment's motions to a graph, whose variables are the places' numbers."""

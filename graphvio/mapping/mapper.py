@@ -24,8 +24,8 @@ from graphvio.mapping.restoring import restored, to_saved
 from graphvio.mapping.stages import StageTimes
 from graphvio.mapping.store import PlaceStore
 from graphvio.measurements.sensors import FrameSet
+from graphvio.optimization.loops.closures import LoopClosure, Place, closure_of
 from graphvio.optimization.loops.features import PlaceObserver
-from graphvio.optimization.loops.search import LoopClosure, Place, closure_of
 from graphvio.optimization.loops.verification import FreshView, crossings, verified
 from graphvio.slam.interface import FrontEnd
 from graphvio.trajectory import Trajectory

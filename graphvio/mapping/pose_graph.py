@@ -20,10 +20,8 @@ from graphvio.geometry import se3_inverse
 from graphvio.mapping.chains import EXACT, Chains
 from graphvio.mapping.places import composed
 from graphvio.optimization.consistency import Joined, consistent, join_fragments
-from graphvio.optimization.loops.search import LoopClosure
-from graphvio.optimization.marginals import Marginals
-from graphvio.optimization.solve import solve
-from graphvio.optimization.tie import Tie
+from graphvio.optimization.loops.closures import LoopClosure
+from graphvio.optimization.solver import Edge, Marginals, solve
 
 _MOST_VOTES = 30  # of two fragments: votes are compared with each other
 _LEAST_DOUBTS = 3  # before all closures are judged anew,
@@ -40,13 +38,13 @@ class Judged:
 
     Attributes:
         closure: as it was found.
-        tie: the same as a factor.
+        edge: the same as a factor.
         is_used: whether the solution rests on it.
         is_refuted: whether the odometry alone refutes it, for good.
     """
 
     closure: LoopClosure
-    tie: Tie
+    edge: Edge
     is_used: bool = False
     is_refuted: bool = False
 
@@ -136,14 +134,14 @@ class PoseGraph:
         is_new, asks_votes = False, False
         for closure in found:
             one, other = closure.reference.row, closure.current.row
-            judged = Judged(closure, Tie(one, other, closure.reference_T_current, closure.covariance))
+            judged = Judged(closure, Edge(one, other, closure.reference_T_current, closure.covariance))
             self.closures.append(judged)
             is_inside = self.chains.fragment(one) == self.chains.fragment(other)
-            if is_inside and self.chains.distance(judged.tie) > self._limit:
+            if is_inside and self.chains.distance(judged.edge) > self._limit:
                 judged.is_refuted = True
             elif self._component_of(one) != self._component_of(other):
                 asks_votes = True
-            elif self._known(self._component_of(one)).distance(judged.tie) <= self._limit:
+            elif self._known(self._component_of(one)).distance(judged.edge) <= self._limit:
                 judged.is_used = is_new = True
             else:
                 self._doubts += 1
@@ -163,10 +161,10 @@ class PoseGraph:
         """Use closures of a component that were doubted once, and that the solution bears out by now."""
         taken = False
         for each in self.closures[-_LATEST:]:
-            ends = {self._component_of(each.tie.first), self._component_of(each.tie.second)}
+            ends = {self._component_of(each.edge.first), self._component_of(each.edge.second)}
             if each.is_used or each.is_refuted or ends != {root}:
                 continue
-            if self._known(root).distance(each.tie) <= self._limit:
+            if self._known(root).distance(each.edge) <= self._limit:
                 each.is_used = taken = True
         return taken
 
@@ -176,9 +174,9 @@ class PoseGraph:
         before = [each.is_used for each in self.closures], self._component
         joined, fragments = self._joined(), self.chains.fragments
         asked = [each for each in self.closures if not each.is_refuted]
-        ties = [each.tie for each in asked]
-        believed, distances = consistent(fragments, joined, self._moved(joined), ties, self.chains, self._probability)
-        joined = self._held_together(joined, [tie for tie, is_used in zip(ties, believed, strict=True) if is_used])
+        edges = [each.edge for each in asked]
+        believed, distances = consistent(fragments, joined, self._moved(joined), edges, self.chains, self._probability)
+        joined = self._held_together(joined, [edge for edge, is_used in zip(edges, believed, strict=True) if is_used])
         moved = self._moved(joined)
         changed: list[int] = []
         for number, states in enumerate(fragments):
@@ -192,7 +190,7 @@ class PoseGraph:
             for root in set(self._component):
                 self._solve(root)
             # Refused too soon: the odometry does not refute them, and the solution without them bears them out.
-            again = [k for k in np.flatnonzero(~believed & (distances <= self._limit)).tolist() if self._fits(ties[k])]
+            again = [k for k in np.flatnonzero(~believed & (distances <= self._limit)).tolist() if self._fits(edges[k])]
             if not again:
                 break
             believed[again] = True
@@ -200,9 +198,9 @@ class PoseGraph:
             self._bounds[place] = self.covariance(place)
         return before != ([each.is_used for each in self.closures], self._component)
 
-    def _fits(self, tie: Tie) -> bool:
-        root = self._component_of(tie.first)
-        return root == self._component_of(tie.second) and self._known(root).distance(tie) <= self._limit
+    def _fits(self, edge: Edge) -> bool:
+        root = self._component_of(edge.first)
+        return root == self._component_of(edge.second) and self._known(root).distance(edge) <= self._limit
 
     def _moved(self, joined: Joined) -> Float:
         """Poses (N, 4, 4) by the odometry alone, in the frames that are common."""
@@ -211,11 +209,11 @@ class PoseGraph:
             poses[states.start : states.stop] = frame @ poses[states.start : states.stop]
         return poses
 
-    def _held_together(self, joined: Joined, used: Sequence[Tie]) -> Joined:
+    def _held_together(self, joined: Joined, used: Sequence[Edge]) -> Joined:
         """Only those fragments joined that closures which are believed hold together: the others would be free."""
         root = list(range(len(joined.component)))
-        for tie in used:
-            ends = root[self.chains.fragment(tie.first)], root[self.chains.fragment(tie.second)]
+        for edge in used:
+            ends = root[self.chains.fragment(edge.first)], root[self.chains.fragment(edge.second)]
             root = [min(ends) if of in ends else of for of in root]
         frames = [se3_inverse(joined.frames[of]) @ frame for of, frame in zip(root, joined.frames, strict=True)]
         return Joined(frames, root)
@@ -224,11 +222,11 @@ class PoseGraph:
         """How the fragments lie to each other, by votes: one of each place, so that no single look decides."""
         strongest: dict[tuple[int, int], Judged] = {}
         for each in self.closures:
-            first, second = self.chains.fragment(each.tie.first), self.chains.fragment(each.tie.second)
+            first, second = self.chains.fragment(each.edge.first), self.chains.fragment(each.edge.second)
             if first != second:
-                known = strongest.get((first, each.tie.second))
+                known = strongest.get((first, each.edge.second))
                 if known is None or each.closure.inliers > known.closure.inliers:
-                    strongest[first, each.tie.second] = each
+                    strongest[first, each.edge.second] = each
         votes: dict[tuple[int, int], list[Judged]] = {}
         for (first, place), each in strongest.items():
             votes.setdefault((first, self.chains.fragment(place)), []).append(each)
@@ -237,10 +235,10 @@ class PoseGraph:
             for of_two in votes.values()
             for each in sorted(of_two, key=lambda each: -each.closure.inliers)[:_MOST_VOTES]
         ]
-        fragments, ties = self.chains.fragments, [each.tie for each in heard]
+        fragments, edges = self.chains.fragments, [each.edge for each in heard]
         # In the present solution: by the odometry alone, two views of a place may lie further apart than votes may.
-        now = join_fragments(fragments, np.array(self._poses), ties, [each.closure.inliers for each in heard])
-        seen_at = {self.chains.fragment(tie.second): tie.second for tie in reversed(ties)}
+        now = join_fragments(fragments, np.array(self._poses), edges, [each.closure.inliers for each in heard])
+        seen_at = {self.chains.fragment(edge.second): edge.second for edge in reversed(edges)}
         frames = []
         for number, states in enumerate(fragments):
             place = seen_at.get(number, states.start)
@@ -264,8 +262,8 @@ class PoseGraph:
             for place in fragments[number]:
                 values.insert(x(place), gtsam.Pose3(self._poses[place]))
         for each in self.closures:
-            if each.is_used and self._component_of(each.tie.first) == root:
-                graph.add(each.tie.factor())
+            if each.is_used and self._component_of(each.edge.first) == root:
+                graph.add(each.edge.factor())
         return graph, values
 
     def _solve(self, root: int) -> None:

@@ -11,8 +11,8 @@ from graphvio.mapping.chains import Chains
 from graphvio.mapping.pose_graph import Judged, PoseGraph
 from graphvio.mapping.recognition import Recognition
 from graphvio.mapping.saved_map import SavedMap
-from graphvio.optimization.loops.search import Place
-from graphvio.optimization.tie import Tie
+from graphvio.optimization.loops.closures import Place
+from graphvio.optimization.solver import Edge
 
 
 def to_saved(graph: PoseGraph, recognition: Recognition, places: Sequence[Place]) -> SavedMap:
@@ -47,7 +47,7 @@ def restored(kept: SavedMap, config: Config) -> tuple[PoseGraph, Recognition, li
     closures = [
         Judged(
             each,
-            Tie(each.reference.row, each.current.row, each.reference_T_current, each.covariance),
+            Edge(each.reference.row, each.current.row, each.reference_T_current, each.covariance),
             bool(is_used),
             bool(is_refuted),
         )

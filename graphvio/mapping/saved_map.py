@@ -20,8 +20,7 @@ import numpy as np
 from graphvio.arrays import AnyArray, Bool, Float, Int
 from graphvio.errors import GraphvioError, MapError
 from graphvio.mapping.store import DATABASE, PlaceStore, copy_database
-from graphvio.optimization.loops import saved
-from graphvio.optimization.loops.search import LoopClosure
+from graphvio.optimization.loops.closures import LoopClosure, closures_to_bytes, load_closures
 from graphvio.rig import Rig
 from graphvio.rig_files.same import difference, without_masks
 from graphvio.version import __version__
@@ -139,7 +138,7 @@ def load(folder: Path, rig: Rig) -> SavedMap:
             columns = {name: file[name] for name in file.files}
         columns["vectors"] = columns["vectors"].astype(np.float32)
         learnt_from = int(columns.pop("learnt_from"))
-        return SavedMap(**columns, learnt_from=learnt_from, closures=saved.load(folder / _CLOSURES))
+        return SavedMap(**columns, learnt_from=learnt_from, closures=load_closures(folder / _CLOSURES))
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, GraphvioError) as error:
         raise MapError(f"{folder / _PLACES}: holds no places ({error}); restore the map from a copy") from None
 
@@ -169,7 +168,7 @@ def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
     columns = {name: value for name, value in vars(kept).items() if name != "closures"}
     columns["vectors"] = kept.vectors.astype(np.float16)  # their ranking does not need more
     np.savez(folder / _PLACES, **columns)
-    (folder / _CLOSURES).write_bytes(saved.to_bytes(kept.closures))
+    (folder / _CLOSURES).write_bytes(closures_to_bytes(kept.closures))
     without_masks(rig).save(folder / _RIG)
     header = {
         "format": FORMAT,

@@ -20,9 +20,10 @@ from graphvio.config import Config
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.covisibility import verify_matches
+from graphvio.optimization.loops.closures import Place
 from graphvio.optimization.loops.database import FeatureDatabase, colmap, image_name
 from graphvio.optimization.loops.place_images import write_image
-from graphvio.optimization.loops.search import Place, SessionInput
+from graphvio.optimization.loops.search import SessionInput
 from graphvio.optimization.optimize import Optimization
 
 Progress = Callable[[str, int, int], None]

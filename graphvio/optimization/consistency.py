@@ -21,8 +21,7 @@ from graphvio.backend.factors import x
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.backend.noise import isotropic
 from graphvio.geometry import se3_inverse, se3_log
-from graphvio.optimization.marginals import Marginals
-from graphvio.optimization.tie import Tie
+from graphvio.optimization.solver import Edge, Marginals
 
 _AGREE_M = 0.5
 _AGREE_RAD = 0.1
@@ -38,7 +37,7 @@ class KnownMotions(Protocol):
     def motion(self, first: int, second: int) -> tuple[Float, Float]:
         """``first_T_second`` (4, 4) and its covariance (6, 6), in body at the second."""
 
-    def distance(self, tie: Tie) -> float:
+    def distance(self, edge: Edge) -> float:
         """Squared Mahalanobis distance of a closure that it does not rest on, 6 degrees of freedom."""
 
 
@@ -55,30 +54,31 @@ class Joined:
     component: list[int]
 
 
-def join_fragments(fragments: Sequence[range], poses: Float, ties: Sequence[Tie], inliers: Sequence[int]) -> Joined:
+def join_fragments(fragments: Sequence[range], poses: Float, edges: Sequence[Edge], inliers: Sequence[int]) -> Joined:
     """Bring fragments that closures tie into the frame of the first of them.
 
     Args:
         fragments: states of each, which share a nav frame.
         poses: (N, 4, 4) of all states, in their fragments' frames.
-        ties: closures, right and wrong ones.
+        edges: closures, right and wrong ones.
         inliers: points of each closure.
     """
     of = fragment_of(fragments)
     frames = [np.eye(4) for _ in fragments]
     component = list(range(len(fragments)))
     between = [
-        (int(of[tie.first]), int(of[tie.second]), tie)
-        for tie, points in zip(ties, inliers, strict=True)
-        if of[tie.first] != of[tie.second] and points >= _STRONG_POINTS
+        (int(of[edge.first]), int(of[edge.second]), edge)
+        for edge, points in zip(edges, inliers, strict=True)
+        if of[edge.first] != of[edge.second] and points >= _STRONG_POINTS
     ]
     while True:
         offers: dict[tuple[int, int], list[Float]] = {}
-        for one, other, tie in between:
+        for one, other, edge in between:
             a, c = component[one], component[other]
             if a == c:
                 continue
-            a_T_c = frames[one] @ poses[tie.first] @ tie.first_T_second @ se3_inverse(frames[other] @ poses[tie.second])
+            c_T_second = frames[other] @ poses[edge.second]
+            a_T_c = frames[one] @ poses[edge.first] @ edge.first_T_second @ se3_inverse(c_T_second)
             if a < c:
                 offers.setdefault((a, c), []).append(a_T_c)
             else:
@@ -105,7 +105,7 @@ def consistent(
     fragments: Sequence[range],
     joined: Joined,
     poses: Float,
-    ties: Sequence[Tie],
+    edges: Sequence[Edge],
     alone: KnownMotions,
     probability: float,
 ) -> tuple[Bool, Float]:
@@ -118,7 +118,7 @@ def consistent(
         fragments: states of each.
         joined: how they lie to each other; closures between those that are not joined are left out.
         poses: (N, 4, 4) of all states, in the frames that are common now.
-        ties: L closures.
+        edges: L closures.
         alone: of the solution without closures.
         probability: a closure beyond this share of the chi-square distribution is refused.
 
@@ -129,26 +129,29 @@ def consistent(
     of = fragment_of(fragments)
     component = np.array(joined.component)[of]
     limit = chi_square_quantile(probability, 6)
-    distances, asked = np.full(len(ties), np.nan), []
-    for k, tie in enumerate(ties):
-        if of[tie.first] == of[tie.second]:
-            distances[k] = alone.distance(tie)
-        if distances[k] <= limit or (of[tie.first] != of[tie.second] and component[tie.first] == component[tie.second]):
+    distances, asked = np.full(len(edges), np.nan), []
+    for k, edge in enumerate(edges):
+        if of[edge.first] == of[edge.second]:
+            distances[k] = alone.distance(edge)
+            may_be_used = distances[k] <= limit
+        else:
+            may_be_used = component[edge.first] == component[edge.second]
+        if may_be_used:
             asked.append(k)
-    ends = sorted({end for k in asked for end in (ties[k].first, ties[k].second)})
+    ends = sorted({end for k in asked for end in (edges[k].first, edges[k].second)})
     graph, values = _ends_only(ends, of, joined, poses, _odometry_between(alone, fragments, ends))
-    kept = np.zeros(len(ties), dtype=bool)
-    across = [k for k in asked if of[ties[k].first] != of[ties[k].second]]
+    kept = np.zeros(len(edges), dtype=bool)
+    across = [k for k in asked if of[edges[k].first] != of[edges[k].second]]
     if across:
         as_joined = Marginals(graph, values)
         for k in across:
-            distances[k] = as_joined.distance(ties[k])
+            distances[k] = as_joined.distance(edges[k])
     asked = [k for k in asked if distances[k] <= limit]
     if not asked:
         return kept, distances
     known = list(range(graph.size()))
     for k in asked:
-        graph.add(ties[k].factor())
+        graph.add(edges[k].factor())
     params = gtsam.GncLMParams()
     params.setKnownInliers(known)
     params.setLossType(gtsam.GncLossType.TLS)
@@ -161,7 +164,7 @@ def consistent(
 
 
 def _ends_only(
-    ends: Sequence[int], of: Int, joined: Joined, poses: Float, odometry: Sequence[Tie]
+    ends: Sequence[int], of: Int, joined: Joined, poses: Float, odometry: Sequence[Edge]
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """A graph of the states that are ends of closures; each fragment lies to its root as the votes have it, about."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -173,12 +176,12 @@ def _ends_only(
             is_root = joined.component[of[end]] == of[end]
             noise = isotropic(6, _FRAME_SIGMA) if is_root else gtsam.noiseModel.Diagonal.Sigmas(_JOINED_SIGMAS)
             graph.add(gtsam.PriorFactorPose3(x(end), gtsam.Pose3(poses[end]), noise))
-    for tie in odometry:
-        graph.add(tie.factor())
+    for edge in odometry:
+        graph.add(edge.factor())
     return graph, values
 
 
-def _odometry_between(marginals: KnownMotions, fragments: Sequence[range], ends: Sequence[int]) -> list[Tie]:
+def _odometry_between(marginals: KnownMotions, fragments: Sequence[range], ends: Sequence[int]) -> list[Edge]:
     """The motion between the states of each fragment that are ends of closures, with its covariance.
 
     Args:
@@ -190,7 +193,7 @@ def _odometry_between(marginals: KnownMotions, fragments: Sequence[range], ends:
     for states in fragments:
         inside = [end for end in ends if end in states]
         for first, second in pairwise(inside):
-            made.append(Tie(first, second, *marginals.motion(first, second)))
+            made.append(Edge(first, second, *marginals.motion(first, second)))
     return made
 
 

@@ -14,9 +14,10 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.geometry import se3_inverse
+from graphvio.optimization.loops.closures import Place
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.matching import alike, known_geometry
-from graphvio.optimization.loops.search import Place, SessionInput
+from graphvio.optimization.loops.search import SessionInput
 from graphvio.optimization.optimize import Optimization
 from graphvio.rig import Camera
 

@@ -14,9 +14,8 @@ import numpy as np
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.graph import poses_of
-from graphvio.optimization.marginals import Marginals
 from graphvio.optimization.optimize import Optimization, OptimizedSession
-from graphvio.optimization.tie import Tie
+from graphvio.optimization.solver import Edge, Marginals
 from graphvio.trajectory import tum_line
 
 _TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -62,9 +61,9 @@ def write_g2o(optimization: Optimization, path: Path) -> None:
         for pose in session.nav_T_body[session.nodes.rows]:
             values.insert(at, gtsam.Pose3(pose))
             at += 1
-    for tie in (*_edges(optimization), *optimization.ties):
-        noise = gtsam.noiseModel.Gaussian.Covariance(0.5 * (tie.covariance + tie.covariance.T), False)
-        graph.add(gtsam.BetweenFactorPose3(tie.first, tie.second, gtsam.Pose3(tie.first_T_second), noise))
+    for edge in (*_measured(optimization), *optimization.edges):
+        noise = gtsam.noiseModel.Gaussian.Covariance(0.5 * (edge.covariance + edge.covariance.T), False)
+        graph.add(gtsam.BetweenFactorPose3(edge.first, edge.second, gtsam.Pose3(edge.first_T_second), noise))
     unfinished = path.with_name(f".{path.name}.tmp")
     gtsam.writeG2o(graph, values, str(unfinished))
     try:
@@ -75,7 +74,7 @@ def write_g2o(optimization: Optimization, path: Path) -> None:
         raise OptimizationError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 
-def _edges(optimization: Optimization) -> Iterator[Tie]:
+def _measured(optimization: Optimization) -> Iterator[Edge]:
     """What is measured without closures: motions, and what leads to states that none ends in."""
     marginals: Marginals | None = None
     poses, first = poses_of(optimization.alone, int(sum(len(each.nodes.rows) for each in optimization.sessions))), 0
@@ -85,9 +84,9 @@ def _edges(optimization: Optimization) -> Iterator[Tie]:
         for k in nodes.motions.tolist():
             i, j = nodes.index_of_row(int(motions.reference[k])), nodes.index_of_row(int(motions.row[k]))
             tied[j] = True
-            yield Tie(first + i, first + j, se3_inverse(poses[first + i]) @ poses[first + j], motions.covariance[k])
+            yield Edge(first + i, first + j, se3_inverse(poses[first + i]) @ poses[first + j], motions.covariance[k])
         for n in np.flatnonzero(~tied).tolist():
             if n and nodes.epoch[n] == nodes.epoch[n - 1]:
                 marginals = marginals or Marginals(optimization.graph_alone, optimization.alone)
-                yield Tie(first + n - 1, first + n, *marginals.motion(first + n - 1, first + n))
+                yield Edge(first + n - 1, first + n, *marginals.motion(first + n - 1, first + n))
         first += len(nodes.rows)

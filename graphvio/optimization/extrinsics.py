@@ -19,7 +19,7 @@ from graphvio.backend.factors import x
 from graphvio.backend.noise import gaussian, isotropic
 from graphvio.geometry import se3_adjoint, se3_compose, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.motion import RelativeMotion
-from graphvio.optimization.marginals import Marginals
+from graphvio.optimization.solver import Marginals
 from graphvio.rig import Rig
 
 _FIRST_SIGMAS = np.repeat([0.02, 0.005], 3)  # of the first pair against the IMU: radians, metres

@@ -19,7 +19,7 @@ from graphvio.config.stages import SmootherConfig
 from graphvio.optimization.extrinsics import own_motion, unknowns
 from graphvio.optimization.nodes import Nodes
 from graphvio.optimization.record import SessionRecord
-from graphvio.optimization.tie import Tie
+from graphvio.optimization.solver import Edge
 from graphvio.rig import Imu
 
 _START_TILT_RAD = 0.2
@@ -92,20 +92,20 @@ class SessionGraph:
         self._graph.add(factor)
 
     def complete(
-        self, roots: Iterable[int], ties: Iterable[Tie] = ()
+        self, roots: Iterable[int], edges: Iterable[Edge] = ()
     ) -> tuple[gtsam.NonlinearFactorGraph, dict[str, list[int]]]:
         """The graph with closures and with what defines its frames, and its factors by kind.
 
         Args:
             roots: fragments whose first pose defines a frame; closures tie the others to one of these.
-            ties: closures.
+            edges: closures.
         """
         graph, kinds = gtsam.NonlinearFactorGraph(self._graph), dict(self._kinds)
         chosen = frozenset(roots)
         starts = [
             factor for number, each in enumerate(self.fragments) for factor in _starts(each, is_root=number in chosen)
         ]
-        for kind, factors in (("start", starts), ("loop", [tie.factor() for tie in ties])):
+        for kind, factors in (("start", starts), ("loop", [edge.factor() for edge in edges])):
             if factors:
                 kinds[kind] = list(range(graph.size(), graph.size() + len(factors)))
             for factor in factors:

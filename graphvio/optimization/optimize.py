@@ -13,15 +13,13 @@ from graphvio.backend.gating import chi_square_quantile
 from graphvio.config import Config
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse, se3_log
-from graphvio.optimization.consistency import consistent, fragment_of, join_fragments
+from graphvio.optimization.consistency import consistent, join_fragments
 from graphvio.optimization.extrinsics import RigCorrection, correction_of
 from graphvio.optimization.graph import Fragment, SessionGraph, moved, poses_of
-from graphvio.optimization.loops.search import LoopClosure
-from graphvio.optimization.marginals import Marginals
+from graphvio.optimization.loops.closures import LoopClosure
 from graphvio.optimization.nodes import Nodes, choose_nodes, spread
 from graphvio.optimization.record import SessionRecord
-from graphvio.optimization.solve import Residuals, residuals, solve
-from graphvio.optimization.tie import Tie
+from graphvio.optimization.solver import Edge, Marginals, Residuals, residuals, solve
 from graphvio.rig import Imu
 
 Progress = Callable[[str, int, float], None]
@@ -80,7 +78,7 @@ class Optimization:
         after: the same in the solution.
         graph: with all that was used.
         values: the solution.
-        ties: closures that are used, as factors.
+        edges: closures that are used, as factors.
         graph_alone: without closures, each fragment in a frame of its own.
         alone: its solution.
         corrections: of each session's rig file, or None where the calibration was not asked for.
@@ -94,7 +92,7 @@ class Optimization:
     after: dict[str, Residuals]
     graph: gtsam.NonlinearFactorGraph
     values: gtsam.Values
-    ties: Sequence[Tie]
+    edges: Sequence[Edge]
     graph_alone: gtsam.NonlinearFactorGraph
     alone: gtsam.Values
     corrections: Sequence[RigCorrection | None]
@@ -154,24 +152,23 @@ def _optimize(
     graph_alone, kinds = whole.complete(range(len(fragments)))
     before = residuals(graph_alone, kinds, whole.values)
     alone = solve(graph_alone, whole.values, _named(on_progress, "without loops"))
-    ties = [_tie(closure, sessions, whole) for closure in closures]
+    edges = [_edge(closure, sessions, whole) for closure in closures]
     states = [each.states for each in fragments]
     poses = poses_of(alone, len(whole))
-    joined = join_fragments(states, poses, ties, [closure.inliers for closure in closures])
+    joined = join_fragments(states, poses, edges, [closure.inliers for closure in closures])
     values = moved(alone, list(zip(states, joined.frames, strict=True)))
-    np.array(joined.component)[fragment_of(states)].tolist()
     poses = poses_of(values, len(whole))
     known_alone = Marginals(graph_alone, alone)
-    believed, distances = consistent(states, joined, poses, ties, known_alone, settings.loop_probability)
+    believed, distances = consistent(states, joined, poses, edges, known_alone, settings.loop_probability)
     roots = sorted(set(joined.component))
     limit = chi_square_quantile(settings.loop_probability, 6)
     while True:
-        graph, kinds = whole.complete(roots, [tie for tie, is_used in zip(ties, believed, strict=True) if is_used])
+        graph, kinds = whole.complete(roots, [edge for edge, is_used in zip(edges, believed, strict=True) if is_used])
         values = solve(graph, values, _named(on_progress, "with loops"))
         marginals = Marginals(graph, values)
         # Refused too soon are those that the odometry does not refute, and that the solution without them bears out.
         doubted = np.flatnonzero(~believed & (distances <= limit))
-        distances[doubted] = [marginals.distance(ties[k]) for k in doubted.tolist()]
+        distances[doubted] = [marginals.distance(edges[k]) for k in doubted.tolist()]
         again = doubted[distances[doubted] <= limit]
         if not len(again):
             break
@@ -185,8 +182,8 @@ def _optimize(
             for number, nodes in enumerate(sessions)
         ],
         loops=[
-            _judged(closure, tie, bool(is_used), float(distance), solution, limit)
-            for closure, tie, is_used, distance in zip(closures, ties, believed, distances, strict=True)
+            _judged(closure, edge, bool(is_used), float(distance), solution, limit)
+            for closure, edge, is_used, distance in zip(closures, edges, believed, distances, strict=True)
         ],
         fragments=fragments,
         frames=frames,
@@ -194,7 +191,7 @@ def _optimize(
         after=residuals(graph, kinds, values),
         graph=graph,
         values=values,
-        ties=[tie for tie, is_used in zip(ties, believed, strict=True) if is_used],
+        edges=[edge for edge, is_used in zip(edges, believed, strict=True) if is_used],
         graph_alone=graph_alone,
         alone=alone,
         corrections=[
@@ -206,7 +203,7 @@ def _optimize(
     )
 
 
-def _tie(closure: LoopClosure, sessions: Sequence[Nodes], whole: SessionGraph) -> Tie:
+def _edge(closure: LoopClosure, sessions: Sequence[Nodes], whole: SessionGraph) -> Edge:
     for place in (closure.reference, closure.current):
         stamps_ns = sessions[place.session].record.stamps_ns
         if place.row >= len(stamps_ns) or stamps_ns[place.row] != place.stamp_ns:
@@ -215,7 +212,7 @@ def _tie(closure: LoopClosure, sessions: Sequence[Nodes], whole: SessionGraph) -
         int(whole.firsts[place.session]) + sessions[place.session].index_of_row(place.row)
         for place in (closure.reference, closure.current)
     )
-    return Tie(first, second, closure.reference_T_current, closure.covariance)
+    return Edge(first, second, closure.reference_T_current, closure.covariance)
 
 
 def _session(
@@ -236,12 +233,12 @@ def _session(
 
 
 def _judged(
-    closure: LoopClosure, tie: Tie, is_used: bool, distance: float, solution: Float, limit: float
+    closure: LoopClosure, edge: Edge, is_used: bool, distance: float, solution: Float, limit: float
 ) -> JudgedLoop:
     """What became of a closure, whose squared distance is known if it is not used, but could have been."""
     if is_used:
-        error = se3_log(se3_inverse(se3_inverse(solution[tie.first]) @ solution[tie.second]) @ tie.first_T_second)
-        return JudgedLoop(closure, "", float(error @ np.linalg.solve(tie.covariance, error)))
+        error = se3_log(se3_inverse(se3_inverse(solution[edge.first]) @ solution[edge.second]) @ edge.first_T_second)
+        return JudgedLoop(closure, "", float(error @ np.linalg.solve(edge.covariance, error)))
     if np.isnan(distance):
         return JudgedLoop(closure, "too few closures agree on how its two parts lie to each other", distance)
     sigmas, most = np.sqrt(distance), np.sqrt(limit)

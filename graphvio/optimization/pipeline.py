@@ -11,11 +11,11 @@ from graphvio.config import Config
 from graphvio.errors import TrajectoryError
 from graphvio.optimization.colmap_export import export
 from graphvio.optimization.exchange import covariance_text, frames_text, trajectory_text, write_g2o
-from graphvio.optimization.loops import saved
+from graphvio.optimization.loops.closures import LoopClosure, Place, closures_to_bytes, load_closures
 from graphvio.optimization.loops.database import FeatureDatabase
 from graphvio.optimization.loops.features import extract_places
 from graphvio.optimization.loops.places import choose_places
-from graphvio.optimization.loops.search import LoopClosure, Place, SessionInput, find_loops
+from graphvio.optimization.loops.search import SessionInput, find_loops
 from graphvio.optimization.optimize import Optimization, optimize
 from graphvio.optimization.record import Recorder, SessionRecord
 from graphvio.optimization.report.write import write_report
@@ -153,9 +153,9 @@ class Stages:
                 found = find_loops(
                     inputs, database, self._config, lambda done, total: self._on_progress("loops", done, total)
                 )
-            self._space.write("loops.npz", saved.to_bytes(found))
+            self._space.write("loops.npz", closures_to_bytes(found))
             self._space.finish("loops", "loops.npz", DATABASE)
-        return saved.load(self._space.folder / "loops.npz")
+        return load_closures(self._space.folder / "loops.npz")
 
     def result(self, records: Sequence[SessionRecord], closures: Sequence[LoopClosure] | None) -> Optimization:
         """The solution, with its files; where closures are None, none were looked for, and there is no map."""

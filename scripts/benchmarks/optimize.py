@@ -12,9 +12,9 @@ from pathlib import Path
 
 from benchmarks.accuracy import CLIP, CLIP_NAME
 from benchmarks.command_line import Subparsers, add_command
-from benchmarks.optimize_drawn import add_false_closures, add_hour
 from benchmarks.optimize_recorded import AIMED_AT, Optimized, add_pairs, add_recordings, optimized
 from benchmarks.optimize_retrieval import add_retrieval
+from benchmarks.optimize_synthetic import add_false_closures, add_hour
 from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, machine, tell
 from graphvio.errors import GraphvioError
@@ -32,7 +32,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = add_command(subparsers, "optimize", "sessions as a whole: time, accuracy, false closures", __doc__)
     parser.add_argument("--parts", nargs="+", choices=_PARTS, default=_PARTS, help="default: all")
     parser.add_argument("--minutes", type=float, nargs="+", default=[15.0, 30.0, 60.0], metavar="M",
-                        help="lengths of the drawn sessions (default: 15 30 60)")  # fmt: skip
+                        help="lengths of the synthetic sessions (default: 15 30 60)")  # fmt: skip
     parser.add_argument("--seeds", type=int, default=5, help="walks with false closures, of each kind (default: 5)")
     parser.add_argument("--jobs", type=int, default=2, help="of these, run side by side (default: 2)")
     parser.add_argument("--scenes", nargs="*", default=list(_SCENES), choices=SCENE_NAMES, metavar="NAME",
@@ -63,7 +63,7 @@ def main(args: argparse.Namespace) -> None:
 
 
 def _hour(report: Report, args: argparse.Namespace) -> None:
-    tell("drawn sessions, each in a process of its own")
+    tell("synthetic sessions, each in a process of its own")
     add_hour(report, args.minutes)
 
 

@@ -175,3 +175,28 @@ def store_place(
             database.add_features(left, found.left, found.descriptors)
             database.add_features(right, found.right)
             database.add_matches(left, right, found.rows)
+
+
+def merge_places(
+    part: FeatureDatabase, whole: FeatureDatabase, session: str, rig: Rig, stamps_ns: Sequence[int]
+) -> None:
+    """Copy places from one database into another.
+
+    Parts that are copied in the order of time give the rows that `extract_places` gives for all places at once.
+
+    Args:
+        part: holds some of the places.
+        whole: to write.
+        session: name of the session.
+        rig: its cameras.
+        stamps_ns: of the places, in the order of time; those that the part does not hold are skipped.
+    """
+    for stamp_ns in stamps_ns:
+        seen = {}
+        for j, pair in enumerate(rig.pairs):
+            left, right = (image_name(session, camera.name, stamp_ns) for camera in (pair.left, pair.right))
+            if left in part.names and left not in whole.names:
+                in_right = part.matches(left, right)[:, 0]
+                seen[j] = PairFeatures(part.pixels(left), part.descriptors(left), part.pixels(right), in_right)
+        if seen:
+            store_place(whole, rig, session, stamp_ns, seen)

@@ -10,33 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from graphvio.arrays import AnyArray, Float, Int
+from graphvio.arrays import AnyArray, Int
 from graphvio.config import Config
-from graphvio.geometry import se3_inverse
+from graphvio.optimization.loops.closures import LoopClosure, Place, closure_of
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.places import PairObserver
-from graphvio.optimization.loops.resection import Resection
 from graphvio.optimization.loops.retrieval import candidates, describe, vocabulary
 from graphvio.optimization.loops.verification import StoredView, crossings, verified
 from graphvio.rig import Rig
 from graphvio.sources import Source
-
-_INDEPENDENT_POINTS = 10  # errors of lenses' calibrations are alike across much of an image: more points help no more
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """Where a session looked around.
-
-    Attributes:
-        session: its number.
-        row: of the session's record.
-        stamp_ns: of the frameset.
-    """
-
-    session: int
-    row: int
-    stamp_ns: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,29 +36,6 @@ class SessionInput:
     source: Source
     rig: Rig
     places: Sequence[Place]
-
-
-@dataclass(frozen=True, eq=False)
-class LoopClosure:
-    """One place seen from another.
-
-    Attributes:
-        reference: the earlier place.
-        current: the later one.
-        reference_T_current: (4, 4) of body.
-        covariance: (6, 6), tangent ``[rotation, translation]`` in body at the current place.
-        inliers: points that it rests on.
-        pairs: which pair's points which pair saw.
-        is_registered: whether it rests on patches, not on features alone.
-    """
-
-    reference: Place
-    current: Place
-    reference_T_current: Float
-    covariance: Float
-    inliers: int
-    pairs: tuple[tuple[int, int], ...]
-    is_registered: bool
 
 
 def find_loops(
@@ -222,16 +181,3 @@ class _Verifier:
         if session not in known:
             known[session] = [PairObserver(pair, self._config) for pair in self._sessions[session].rig.pairs]
         return known[session]
-
-
-def closure_of(earlier: Place, later: Place, found: Resection) -> LoopClosure:
-    """What a resection of the later place on the earlier one's points says, with a covariance that is honest."""
-    return LoopClosure(
-        earlier,
-        later,
-        se3_inverse(found.cur_T_ref),
-        found.covariance * max(1.0, found.inliers / _INDEPENDENT_POINTS),
-        found.inliers,
-        found.pairs,
-        found.is_registered,
-    )

@@ -13,7 +13,7 @@ from graphvio.arrays import Float
 from graphvio.optimization.optimize import JudgedLoop, Optimization
 from graphvio.optimization.report.calibration import SessionCalibration
 from graphvio.optimization.report.numbers import Kind, Numbers, SessionNumbers, median_sigmas
-from graphvio.optimization.solve import Residuals
+from graphvio.optimization.solver import Residuals
 
 VERSION = 1
 

@@ -11,7 +11,7 @@ from graphvio.errors import TrajectoryError
 from graphvio.evaluation import evaluate
 from graphvio.evaluation.measures import angle_between
 from graphvio.geometry import se3_inverse, se3_log
-from graphvio.optimization.loops.search import LoopClosure
+from graphvio.optimization.loops.closures import LoopClosure
 from graphvio.optimization.optimize import Optimization, OptimizedSession
 from graphvio.trajectory import Trajectory, travelled
 

@@ -25,7 +25,7 @@ from graphvio.optimization.report.measures import (
     path_length_m,
     sigmas,
 )
-from graphvio.optimization.solve import Residuals
+from graphvio.optimization.solver import Residuals
 from graphvio.rig import Rig
 from graphvio.trajectory import Trajectory
 

@@ -1,7 +1,4 @@
-"""Sessions drawn by chance: what the odometry would measure on a walk in laps, without images.
-
-For experiments with sessions of any length, whose truth and noise are known.
-"""
+"""Synthetic sessions of any length with known truth: what the odometry would measure on a walk in laps, no images."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.geometry import se3_exp, se3_inverse
-from graphvio.optimization.loops.search import LoopClosure, Place
+from graphvio.optimization.loops.closures import LoopClosure, Place
 from graphvio.optimization.record import Inertial, Motions, SessionRecord
 from graphvio.rig import Imu
 from graphvio.simulation.imu import ImuTrack, measure
@@ -33,8 +30,8 @@ _NS = 1_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnSession:
-    """A session, and what is true of it.
+class SyntheticSession:
+    """A synthetic session and its truth.
 
     Attributes:
         record: as the odometry would have it.
@@ -49,21 +46,21 @@ class DrawnSession:
     truth: Trajectory
 
 
-def draw_session(
+def make_session(
     duration_s: float, seed: int, imu: Imu, loops: int, false_share: float = 0.0, session: int = 0,
     corrections: Sequence[Float] = (), offset_s: float = 0.0,
-) -> DrawnSession:  # fmt: skip
-    """Draw a walk in laps of 90 s around a building, 20 framesets and 5 keyframes a second.
+) -> SyntheticSession:  # fmt: skip
+    """Sample a walk in laps of 90 s around a building, 20 framesets and 5 keyframes a second.
 
     Args:
         duration_s: of the walk.
         seed: of all noise; walks of different seeds go the same way.
-        imu: whose noise is drawn.
+        imu: whose noise is simulated.
         loops: closures in all.
         false_share: of them that are false: anywhere, and off by metres.
         session: number that the closures' places have.
         corrections: of each pair, what its place in the rig file must be multiplied by from the left (4, 4); single
-            pairs' motions are drawn for these.
+            pairs' motions are sampled for these.
         offset_s: how much later on the IMU's clock the images are taken than the rig file says.
     """
     rng = np.random.default_rng([seed, 7])
@@ -79,7 +76,7 @@ def draw_session(
     own, own_pair = _own_motions(seen, corrections, rng)
     drifting = _integrated(truth[0], motions, len(rows))
     record = SessionRecord(
-        name=f"drawn-{seed}",
+        name=f"synthetic-{seed}",
         stamps_ns=track.stamps_ns[rows],
         epoch=np.zeros(len(rows), dtype=np.int64),
         online=drifting,
@@ -100,10 +97,10 @@ def draw_session(
     false = round(false_share * loops)
     closures = [_true_loop(record, truth, rng, session) for _ in range(loops - false)]
     closures += [_false_loop(record, rng, session) for _ in range(false)]
-    return DrawnSession(record, closures, false, Trajectory(record.stamps_ns, truth))
+    return SyntheticSession(record, closures, false, Trajectory(record.stamps_ns, truth))
 
 
-def closure_between(one: DrawnSession, other: DrawnSession, row: int, seed: int) -> LoopClosure:
+def closure_between(one: SyntheticSession, other: SyntheticSession, row: int, seed: int) -> LoopClosure:
     """A true closure between two sessions, 0 and 1, at about the same place of the lap."""
     rng = np.random.default_rng([seed, row])
     motion = se3_inverse(one.truth.nav_T_body[row]) @ other.truth.nav_T_body[row]

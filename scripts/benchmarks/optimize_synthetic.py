@@ -13,13 +13,13 @@ from time import perf_counter, process_time
 from typing import NamedTuple
 
 import numpy as np
+from synthetic_session import SyntheticSession, make_session
 
 from benchmarks.report import Report, tell
 from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.evaluation import evaluate
-from graphvio.optimization.drawn_session import DrawnSession, draw_session
-from graphvio.optimization.loops.search import LoopClosure
+from graphvio.optimization.loops.closures import LoopClosure
 from graphvio.optimization.optimize import Optimization, optimize
 from graphvio.rig import Imu
 from graphvio.trajectory import Trajectory
@@ -100,25 +100,25 @@ def add_hour(report: Report, minutes: Sequence[float]) -> None:
 
 def _hour(minutes: float) -> _Hour:
     imu = Imu()
-    drawn = draw_session(60.0 * minutes, 1, imu, round(LOOPS_AN_HOUR * minutes / 60.0), FALSE_SHARE)
-    warm = draw_session(5.0, 1, imu, 0)
+    session = make_session(60.0 * minutes, 1, imu, round(LOOPS_AN_HOUR * minutes / 60.0), FALSE_SHARE)
+    warm = make_session(5.0, 1, imu, 0)
     optimize([warm.record], [imu], [], Config())  # what is compiled or imported at first use is not counted
     states = round(5.0 * 60.0 * minutes)
     reference_s = _reference_s(states)
     start, start_processor = perf_counter(), process_time()
-    found = optimize([drawn.record], [imu], drawn.closures, Config())
+    found = optimize([session.record], [imu], session.closures, Config())
     seconds, processor_s = perf_counter() - start, process_time() - start_processor
     reference_s = 0.5 * (reference_s + _reference_s(states))
-    right_used, false_used = _used(drawn, found)
+    right_used, false_used = _used(session, found)
     return _Hour(
         minutes,
         len(found.sessions[0].nodes.rows),
-        len(drawn.closures) - drawn.false,
+        len(session.closures) - session.false,
         right_used,
-        drawn.false,
+        session.false,
         false_used,
-        _ate_m(drawn, drawn.record.online),
-        _ate_m(drawn, found.sessions[0].nav_T_body),
+        _ate_m(session, session.record.online),
+        _ate_m(session, found.sessions[0].nav_T_body),
         seconds,
         processor_s,
         reference_s,
@@ -206,16 +206,16 @@ def _judged(case: _Case) -> _Result:
     imu = Imu()
     if case.shift_m == _ANYWHERE:
         loops = _RIGHT + case.false
-        drawn = draw_session(_WALK_S, case.seed, imu, loops, case.false / loops)
+        session = make_session(_WALK_S, case.seed, imu, loops, case.false / loops)
     else:
-        drawn = _all_alike(draw_session(_WALK_S, case.seed, imu, _RIGHT + case.false), case.shift_m, case.false)
-    found = optimize([drawn.record], [imu], drawn.closures, Config())
+        session = _all_alike(make_session(_WALK_S, case.seed, imu, _RIGHT + case.false), case.shift_m, case.false)
+    found = optimize([session.record], [imu], session.closures, Config())
     return _Result(
-        _ate_m(drawn, drawn.record.online), _ate_m(drawn, found.sessions[0].nav_T_body), *_used(drawn, found)
+        _ate_m(session, session.record.online), _ate_m(session, found.sessions[0].nav_T_body), *_used(session, found)
     )
 
 
-def _all_alike(drawn: DrawnSession, shift_m: float, false: int) -> DrawnSession:
+def _all_alike(session: SyntheticSession, shift_m: float, false: int) -> SyntheticSession:
     """The same with its last closures off by so many metres along the way."""
     shift = np.eye(4)
     shift[0, 3] = shift_m
@@ -223,20 +223,20 @@ def _all_alike(drawn: DrawnSession, shift_m: float, false: int) -> DrawnSession:
     def moved(closure: LoopClosure) -> LoopClosure:
         return replace(closure, reference_T_current=shift @ closure.reference_T_current)
 
-    right = len(drawn.closures) - false
-    closures = [each if k < right else moved(each) for k, each in enumerate(drawn.closures)]
-    return replace(drawn, closures=closures, false=false)
+    right = len(session.closures) - false
+    closures = [each if k < right else moved(each) for k, each in enumerate(session.closures)]
+    return replace(session, closures=closures, false=false)
 
 
-def _used(drawn: DrawnSession, found: Optimization) -> tuple[int, int]:
+def _used(session: SyntheticSession, found: Optimization) -> tuple[int, int]:
     """How many right and false closures are used."""
     used = [not loop.refusal for loop in found.loops]
-    right = len(used) - drawn.false
+    right = len(used) - session.false
     return sum(used[:right]), sum(used[right:])
 
 
-def _ate_m(drawn: DrawnSession, poses: Float) -> float:
-    return evaluate(Trajectory(drawn.record.stamps_ns, poses), drawn.truth).ate_position_m.rmse
+def _ate_m(session: SyntheticSession, poses: Float) -> float:
+    return evaluate(Trajectory(session.record.stamps_ns, poses), session.truth).ate_position_m.rmse
 
 
 def _kind(shift_m: float) -> str:

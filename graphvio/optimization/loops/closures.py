@@ -1,21 +1,76 @@
-"""Loop closures on disk."""
+"""Loop closures, in memory and on disk."""
 
 from __future__ import annotations
 
 import io
 import zipfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from graphvio.arrays import Int
+from graphvio.arrays import Float, Int
 from graphvio.errors import OptimizationError
-from graphvio.optimization.loops.search import LoopClosure, Place
+from graphvio.geometry import se3_inverse
+from graphvio.optimization.loops.resection import Resection
+
+_INDEPENDENT_POINTS = 10  # errors of lenses' calibrations are alike across much of an image: more points help no more
 
 
-def to_bytes(closures: Sequence[LoopClosure]) -> bytes:
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where a session looked around.
+
+    Attributes:
+        session: its number.
+        row: of the session's record.
+        stamp_ns: of the frameset.
+    """
+
+    session: int
+    row: int
+    stamp_ns: int
+
+
+@dataclass(frozen=True, eq=False)
+class LoopClosure:
+    """One place seen from another.
+
+    Attributes:
+        reference: the earlier place.
+        current: the later one.
+        reference_T_current: (4, 4) of body.
+        covariance: (6, 6), tangent ``[rotation, translation]`` in body at the current place.
+        inliers: points that it rests on.
+        pairs: which pair's points which pair saw.
+        is_registered: whether it rests on patches, not on features alone.
+    """
+
+    reference: Place
+    current: Place
+    reference_T_current: Float
+    covariance: Float
+    inliers: int
+    pairs: tuple[tuple[int, int], ...]
+    is_registered: bool
+
+
+def closure_of(earlier: Place, later: Place, found: Resection) -> LoopClosure:
+    """What a resection of the later place on the earlier one's points says, with a covariance that is honest."""
+    return LoopClosure(
+        earlier,
+        later,
+        se3_inverse(found.cur_T_ref),
+        found.covariance * max(1.0, found.inliers / _INDEPENDENT_POINTS),
+        found.inliers,
+        found.pairs,
+        found.is_registered,
+    )
+
+
+def closures_to_bytes(closures: Sequence[LoopClosure]) -> bytes:
     """As numpy's archive; equal closures give equal bytes."""
     ends = [[(end.session, end.row, end.stamp_ns) for end in (each.reference, each.current)] for each in closures]
     crossings = [(k, a, b) for k, each in enumerate(closures) for a, b in each.pairs]
@@ -32,8 +87,8 @@ def to_bytes(closures: Sequence[LoopClosure]) -> bytes:
     return buffer.getvalue()
 
 
-def load(path: Path) -> list[LoopClosure]:
-    """Read what `to_bytes` gave.
+def load_closures(path: Path) -> list[LoopClosure]:
+    """Read what `closures_to_bytes` gave.
 
     Raises:
         OptimizationError: if it cannot be read.
