@@ -6,13 +6,11 @@ from numpy.typing import NDArray
 from graphvio.arrays import AnyArray, Float, Image
 from graphvio.geometry import se3, se3_inverse
 from graphvio.simulation import Simulator, make_simulator
-from graphvio.simulation.atlas import pack
 from graphvio.simulation.default_rig import default_rig, paper_left2_T_left1
-from graphvio.simulation.film import Exposure
 from graphvio.simulation.renderer import CameraRays
 from graphvio.simulation.surfaces import Stage
-from graphvio.simulation.textures import checkerboard
-from graphvio.simulation.world import Rectangle, World
+from graphvio.simulation.textures import checkerboard, pack
+from graphvio.simulation.world import Exposure, Rectangle, World
 
 SQUARES = 8
 BOARD_M = 1.2

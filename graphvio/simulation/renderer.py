@@ -7,14 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from graphvio.arrays import Bool, Float
+from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.cameras import distort
 from graphvio.geometry import se3_inverse
 from graphvio.kernels import kernel
 from graphvio.rig import Camera
-from graphvio.simulation.atlas import Atlas
 from graphvio.simulation.raycast import TILE_PX, first_hits, ray_coefficients, shade, tile_lists
 from graphvio.simulation.surfaces import Surfaces
+from graphvio.simulation.textures import Atlas
+from graphvio.simulation.world import Exposure
+
+_VIGNETTING = 0.32  # light lost in the corner of the image
+_SHOT_VARIANCE = 0.02  # grey levels squared for every grey level of light: 50 electrons each
+_READ_NOISE = 0.7  # grey levels at gain 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,3 +94,36 @@ def _tile_boxes(rays: Float, slopes: Float) -> Float:
             x1, y1 = high[tile].max(axis=(0, 1))
             boxes.append([x0, x1, y0, y1])
     return np.array(boxes)
+
+
+class Film:
+    """The sensor behind one camera's lens."""
+
+    def __init__(self, rays: CameraRays, sensitivity: float) -> None:
+        width, height = rays.camera.size_px
+        y, x = np.mgrid[0:height, 0:width]
+        fx, fy, cx, cy = rays.camera.intrinsics
+        radius2 = ((x - cx) / fx) ** 2 + ((y - cy) / fy) ** 2
+        falloff = 1.0 - _VIGNETTING * radius2 / radius2.max()
+        self._response = (255.0 * sensitivity * falloff).astype(np.float32)
+
+    def expose(self, radiance: AnyArray, exposure: Exposure, noise: np.random.Generator | None) -> Image:
+        """Grey image (H, W) of a radiance (H, W); without noise if there is no generator for it."""
+        if noise is None:
+            normal = np.zeros(radiance.shape, dtype=np.float32)
+        else:
+            normal = noise.standard_normal(radiance.shape, dtype=np.float32)
+        return _expose(radiance, self._response, exposure.light, exposure.gain, normal, noise is not None)
+
+
+@kernel
+def _expose(radiance: AnyArray, response: AnyArray, light: float, gain: float, normal: AnyArray, noisy: bool) -> Image:
+    image = np.empty(radiance.shape, dtype=np.uint8)
+    read = gain * _READ_NOISE if noisy else 0.0
+    shot = gain * _SHOT_VARIANCE if noisy else 0.0
+    for row in range(radiance.shape[0]):
+        for column in range(radiance.shape[1]):
+            signal = gain * light * radiance[row, column] * response[row, column]
+            value = signal + normal[row, column] * np.sqrt(shot * signal + read * read)
+            image[row, column] = int(min(max(value + 0.5, 0.0), 255.0))
+    return image

@@ -11,15 +11,13 @@ from graphvio.arrays import Float, Image, Int
 from graphvio.errors import SourceError
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Imu, Rig
-from graphvio.simulation.atlas import Atlas
 from graphvio.simulation.default_rig import default_rig
-from graphvio.simulation.film import Film
 from graphvio.simulation.imu import ImuTrack, measure
-from graphvio.simulation.renderer import CameraRays, View
+from graphvio.simulation.renderer import CameraRays, Film, View
 from graphvio.simulation.scenes import build_scene
-from graphvio.simulation.scenes.scene import Scene
 from graphvio.simulation.surfaces import Stage, Surfaces
-from graphvio.simulation.textures import standard_atlas
+from graphvio.simulation.textures import Atlas, standard_atlas
+from graphvio.simulation.world import Scene
 
 EPOCH_NS = 1_700_000_000_000_000_000
 _SENSITIVITIES = (1.45, 1.50, 1.42, 1.47)  # no two cameras are equally bright

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.simulation.atlas import Atlas
 from graphvio.simulation.lighting import LightMap, light_map, light_without_shadow
+from graphvio.simulation.textures import Atlas
 from graphvio.simulation.world import Rectangle, World
 
 

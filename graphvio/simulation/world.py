@@ -14,6 +14,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.geometry import se3
 from graphvio.simulation.default_rig import rotation_zyx
+from graphvio.simulation.motion import Motion
 
 _POSTER_STANDS_OUT_M = 0.008
 _POSTER_STEP_M = 0.0015  # posters that overlap must not lie in one plane
@@ -217,3 +218,35 @@ def box_faces(
     faces.append(Rectangle(np.array([-hx, hy, height]), u, -v, texture, False, shift, tint))
     faces.append(Rectangle(np.array([-hx, -hy, 0.0]), u, v, texture, False, shift, tint))
     return tuple(faces)
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How the sensor is driven: ``light`` of the scene (1 is full), and ``gain`` of the auto-exposure."""
+
+    light: float
+    gain: float
+
+
+def full_light(time_s: float) -> Exposure:
+    """The exposure of a scene whose lamps never change."""
+    return Exposure(light=1.0, gain=1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A world, a motion through it and its light.
+
+    Attributes:
+        name: as the command line knows it.
+        world: what there is to see.
+        motion: of the body; its length is the recording's.
+        exposure: light and gain at a time in seconds.
+        events: name -> (start, end) in seconds of what the scene is there for.
+    """
+
+    name: str
+    world: World
+    motion: Motion
+    exposure: Callable[[float], Exposure] = full_light
+    events: dict[str, tuple[float, float]] = field(default_factory=dict)

@@ -8,11 +8,9 @@ import numpy as np
 
 from benchmarks.recordings import rendered_once
 from graphvio.simulation import SCENE_NAMES, Simulator, build_scene, write_recording
-from graphvio.simulation.atlas import Atlas, Map, pack
-from graphvio.simulation.scenes.scene import Scene
-from graphvio.simulation.textures import checkerboard, standard_atlas
-from graphvio.simulation.walking import Walk
-from graphvio.simulation.world import Lamp, World
+from graphvio.simulation.motion import Walk
+from graphvio.simulation.textures import Atlas, Map, checkerboard, pack, standard_atlas
+from graphvio.simulation.world import Lamp, Scene, World
 
 CORRIDOR_S = 38.0
 """Until after the door, the crowd, the blank bend and the failing lamps."""

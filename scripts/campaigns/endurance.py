@@ -27,7 +27,7 @@ from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Imu
 from graphvio.simulation.default_rig import default_rig
 from graphvio.simulation.imu import measure
-from graphvio.simulation.walking import Walk
+from graphvio.simulation.motion import Walk
 
 _PARTS = 6
 _CORNERS_M = np.array([[2.6, 2.1, 1.45], [-2.6, 2.1, 1.45], [-2.6, -2.1, 1.45], [2.6, -2.1, 1.45]])

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from graphvio.errors import SourceError
-from graphvio.simulation.scenes import calibration, corridor, loop, room, stairs
-from graphvio.simulation.scenes.scene import Scene
+from graphvio.simulation.scenes import corridor, loop, rooms, stairs
+from graphvio.simulation.world import Scene
 
 _BUILDERS: dict[str, tuple[Callable[[float, float], Scene], float]] = {
-    "calibration": (calibration.build, 40.0),
+    "calibration": (rooms.build_calibration, 40.0),
     "corridor": (corridor.build, 60.0),
     "loop": (loop.build, 73.0),
-    "room": (room.build, 40.0),
+    "room": (rooms.build_room, 40.0),
     "stairs": (stairs.build, 30.0),
 }
 

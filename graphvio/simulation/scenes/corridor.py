@@ -11,11 +11,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from graphvio.simulation.film import Exposure
+from graphvio.simulation.motion import Walk
 from graphvio.simulation.scenes import furniture
-from graphvio.simulation.scenes.scene import Scene
-from graphvio.simulation.walking import Walk
-from graphvio.simulation.world import Lamp, World
+from graphvio.simulation.world import Exposure, Lamp, Scene, World
 
 _HEIGHT_M = 2.7
 _BODY_Z_M = 1.5

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from graphvio.simulation.motion import Walk
 from graphvio.simulation.scenes import furniture
-from graphvio.simulation.scenes.scene import Scene
-from graphvio.simulation.walking import Walk
-from graphvio.simulation.world import Lamp, World
+from graphvio.simulation.world import Lamp, Scene, World
 
 _HEIGHT_M = 2.7
 _BODY_Z_M = 1.5

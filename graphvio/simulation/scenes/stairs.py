@@ -2,10 +2,9 @@
 
 import numpy as np
 
+from graphvio.simulation.motion import Gait, Walk
 from graphvio.simulation.scenes import furniture
-from graphvio.simulation.scenes.scene import Scene
-from graphvio.simulation.walking import Gait, Walk
-from graphvio.simulation.world import Lamp, World
+from graphvio.simulation.world import Lamp, Scene, World
 
 _RISE_M, _TREAD_M = 0.17, 0.29
 _FIRST_STEPS, _SECOND_STEPS = 11, 9
