@@ -192,7 +192,7 @@ def stamp_ns_from_seconds(text: str) -> int:
 
 
 def _read_session(path: Path) -> Trajectory:
-    from graphvio.sessions.opening import is_store
+    from graphvio.sessions.store import is_store
     from graphvio.sessions.truth import read_truth
 
     if not is_store(path):

@@ -17,8 +17,8 @@ from graphvio import FrameSet, Rig, open_source
 from graphvio.cli import app
 from graphvio.errors import RigError, SessionError, SourceError
 from graphvio.sessions import cdr
-from graphvio.sessions.description import describe
 from graphvio.sessions.mcap_file import McapFile
+from graphvio.sources.description import describe
 
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")

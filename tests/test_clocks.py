@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from graphvio.cli import app
 from graphvio.errors import SessionError
 from graphvio.sessions import cdr
-from graphvio.sessions.description import describe
 from graphvio.sessions.stamps import compare_clocks, compare_topics
+from graphvio.sources.description import describe
 
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")

@@ -21,10 +21,10 @@ from graphvio.geometry import quat_wxyz_from_rotation, se3, so3_exp
 from graphvio.rig import Imu
 from graphvio.rig_files.native import to_text
 from graphvio.sessions.bag_file import BagFile
-from graphvio.sessions.description import describe
 from graphvio.sessions.formats import format_of
 from graphvio.sessions.mcap_storage import McapStorage
 from graphvio.sessions.writer import SessionWriter
+from graphvio.sources.description import describe
 from graphvio.trajectory import Trajectory, tum_line
 
 pytest.importorskip("mcap")

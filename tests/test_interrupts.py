@@ -123,7 +123,7 @@ def test_a_run_that_is_interrupted_tells_where_its_results_are(
 
 
 def test_an_interrupt_anywhere_else_is_no_traceback(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("graphvio.sessions.description.describe", interrupted_kernel)
+    monkeypatch.setattr("graphvio.sources.description.describe", interrupted_kernel)
     monkeypatch.setattr(sys, "argv", ["graphvio", "info", str(recording)])
     with pytest.raises(SystemExit) as ended:
         main()

@@ -14,9 +14,9 @@ from test_sessions import same
 
 from graphvio import FrameSet, ImuSample, open_source
 from graphvio.sessions import cdr
-from graphvio.sessions.description import describe
 from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, compressed_image, stamp_of
 from graphvio.sessions.rig_of_topics import stereo_topics
+from graphvio.sources.description import describe
 
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")

@@ -25,13 +25,13 @@ from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.events import Event
 from graphvio.measurements.sensors import Measurement
 from graphvio.sessions import cdr
-from graphvio.sessions.description import describe
 from graphvio.sessions.mcap_file import McapFile
 from graphvio.sessions.mcap_storage import McapStorage
 from graphvio.sessions.messages import IMAGE, header, odometry
 from graphvio.sessions.pixels import grey
 from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
+from graphvio.sources.description import describe
 
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")

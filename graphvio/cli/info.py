@@ -10,8 +10,8 @@ import typer
 from graphvio.cli import options
 
 if TYPE_CHECKING:
-    from graphvio.sessions.description import Description, Synchronisation, TopicDescription
     from graphvio.sessions.stamps import Clock
+    from graphvio.sources.description import Description, Synchronisation, TopicDescription
 
 
 def info(
@@ -28,7 +28,7 @@ def info(
 
         graphvio info walk.bag
     """
-    from graphvio.sessions.description import describe
+    from graphvio.sources.description import describe
 
     _tell(describe(session))
 

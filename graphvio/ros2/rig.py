@@ -14,9 +14,9 @@ from graphvio.rig import Rig
 from graphvio.ros2.node import Node, Publication, Reader
 from graphvio.ros2.qos import SENSOR_DATA, TF_STATIC_READER
 from graphvio.sessions import cdr
-from graphvio.sessions.mcap_file import Place, Topic
 from graphvio.sessions.messages import CAMERA_INFO, COMPRESSED, IMAGE, IMU, TRANSFORMS
 from graphvio.sessions.rig_of_topics import info_topics, rig_of_topics, stereo_topics, transforms_in
+from graphvio.sessions.topics import Place, Topic
 
 
 class Heard:

@@ -9,8 +9,8 @@ from typing import Any
 
 from graphvio.errors import MissingExtraError, SessionError
 from graphvio.sessions import cdr, ros1
-from graphvio.sessions.mcap_file import Place, Topic
 from graphvio.sessions.messages import STAMPED
+from graphvio.sessions.topics import Place, Topic
 
 
 class BagFile:

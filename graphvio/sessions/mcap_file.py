@@ -11,14 +11,13 @@ import threading
 import zlib
 from collections import OrderedDict
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import numpy as np
 
-from graphvio.arrays import Int
 from graphvio.errors import MissingExtraError, SessionError
+from graphvio.sessions.topics import Place, Topic
 
 _MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _ATTACHMENT, _HEADER, _DATA_END = 3, 4, 5, 6, 7, 9, 1, 15
@@ -31,39 +30,6 @@ _ENTRY = np.dtype([("stamp_ns", "<u8"), ("offset", "<u8")])
 _KEPT_CHUNKS = 8
 _STAMP_END_NS = 2**62
 _DAMAGE = (struct.error, ValueError, IndexError, OverflowError, MemoryError)
-
-
-class Place(NamedTuple):
-    """Where a message is: in the chunk at a position of the file, or at a position itself if the chunk is -1.
-
-    By the channel and the time of its recording, as far as they are not -1, it is known to be the one that is meant.
-    """
-
-    chunk: int
-    offset: int
-    channel: int = -1
-    logged_ns: int = -1
-
-
-@dataclass
-class Topic:
-    """Messages of one topic, in the order of the file.
-
-    Attributes:
-        name: such as ``/imu``.
-        type_name: such as ``sensor_msgs/msg/Imu``.
-        encoding: of its messages, ``cdr`` for ROS 2.
-        logged_ns: when each was recorded.
-        places: where each is.
-        header_ns: stamps of their headers, where the reader has seen them; else empty.
-    """
-
-    name: str
-    type_name: str
-    encoding: str
-    logged_ns: list[int] = field(default_factory=list)
-    places: list[Place] = field(default_factory=list)
-    header_ns: list[int] = field(default_factory=list)
 
 
 class McapFile:
@@ -302,11 +268,6 @@ class McapFile:
         if crc and crc != zlib.crc32(data):
             raise ValueError("checksum")
         return data
-
-
-def stamps_of(topic: Topic) -> Int:
-    """When its messages were recorded (N,)."""
-    return np.array(topic.logged_ns, dtype=np.int64)
 
 
 def _text(body: bytes, at: int) -> tuple[str, int]:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from graphvio.arrays import Image
+from graphvio.image_decoding import ImageError, decode_grey
 
 _TO_GREY = {
     "bgr8": cv2.COLOR_BGR2GRAY,
@@ -33,8 +34,6 @@ def grey(message: Any, where: str) -> Image:
     Raises:
         ImageError: if it is damaged, or its encoding is not known.
     """
-    from graphvio.image_decoding import ImageError, decode_grey
-
     if hasattr(message, "format"):
         return decode_grey(bytes(message.data), where)
     height, width, step, encoding = message.height, message.width, message.step, message.encoding

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -13,26 +12,15 @@ from graphvio.errors import RigError, SessionError
 from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_inverse
 from graphvio.rig import Camera, Imu, Rig, StereoPair
 from graphvio.sessions import cdr
-from graphvio.sessions.mcap_file import Place, Topic
 from graphvio.sessions.messages import CAMERA_INFO, COMPRESSED, IMAGE, IMU, TRANSFORMS
-from graphvio.sessions.topics import camera_of, of_type, preference
+from graphvio.sessions.topics import MessageReader, Topic, camera_of, of_type, preference
 
 _MODELS = {"plumb_bob": "radial-tangential", "rational_polynomial": "radial-tangential", "equidistant": "equidistant"}
 _SIDES = (("left", "right"), ("infra1", "infra2"), ("cam0", "cam1"), ("cam2", "cam3"))
 _WORDS = tuple(side for sides in _SIDES for side in sides)
 
 
-class Store(Protocol):
-    """A file with messages by topic."""
-
-    path: Path
-    topics: dict[str, Topic]
-
-    def read(self, place: Place) -> bytes:
-        """A message."""
-
-
-def rig_of_topics(store: Store, name: str) -> Rig | None:
+def rig_of_topics(messages: MessageReader, name: str) -> Rig | None:
     """The rig of all stereo pairs whose images, calibrations and places are there; None if there is none.
 
     A pair's topics differ in one part of their name only: ``left`` and ``right``, ``infra1`` and ``infra2``. Of several
@@ -44,17 +32,17 @@ def rig_of_topics(store: Store, name: str) -> Rig | None:
         RigError: if what is told makes no rig.
         SessionError: if it is damaged.
     """
-    images = [each.name for each in of_type(store.topics, IMAGE, COMPRESSED)]
-    transforms = _transforms(store)
-    imu = next(iter(of_type(store.topics, IMU)), None)
+    images = [each.name for each in of_type(messages.topics, IMAGE, COMPRESSED)]
+    transforms = _transforms(messages)
+    imu = next(iter(of_type(messages.topics, IMU)), None)
     found = []
     for pair, (left, right) in stereo_topics(images).items():
-        infos = [_info(store, topic) for topic in (left, right)]
+        infos = [_info(messages, topic) for topic in (left, right)]
         if infos[0] is not None and infos[1] is not None:
             found.append((pair, left, right, infos[0], infos[1]))
     if not found:
         return None
-    body = _first(store, imu).header.frame_id if imu is not None else ""
+    body = _first(messages, imu).header.frame_id if imu is not None else ""
     first = _frame(found[0][3], found[0][1])
     if imu is not None and path_between(transforms, body, first) is None:
         raise RigError(
@@ -117,23 +105,23 @@ def info_topics(image_topic: str) -> list[str]:
     return ["/".join([*parts[:depth], "camera_info"]) for depth in range(len(parts) - 1, 0, -1)]
 
 
-def _info(store: Store, image_topic: str) -> Any:
+def _info(messages: MessageReader, image_topic: str) -> Any:
     """The calibration beside a topic with images."""
     for name in info_topics(image_topic):
-        topic = store.topics.get(name)
+        topic = messages.topics.get(name)
         if topic is not None and topic.type_name == CAMERA_INFO and topic.places:
-            return _first(store, topic)
+            return _first(messages, topic)
     return None
 
 
-def _first(store: Store, topic: Topic) -> Any:
+def _first(messages: MessageReader, topic: Topic) -> Any:
     """The first message of a topic that is not damaged."""
     for place in topic.places[:-1]:
         try:
-            return cdr.decode(store.read(place), topic.type_name, store.path)
+            return cdr.decode(messages.read(place), topic.type_name, messages.path)
         except SessionError:  # all say the same
             continue
-    return cdr.decode(store.read(topic.places[-1]), topic.type_name, store.path)
+    return cdr.decode(messages.read(topic.places[-1]), topic.type_name, messages.path)
 
 
 def _camera(topic: str, info: Any, body_T_cam: Float) -> Camera:
@@ -157,14 +145,14 @@ def _frame(info: Any, topic: str) -> str:
     return str(info.header.frame_id) or topic
 
 
-def _transforms(store: Store) -> dict[tuple[str, str], Float]:
+def _transforms(messages: MessageReader) -> dict[tuple[str, str], Float]:
     """All static transforms, as `transforms_in` has them."""
     made: dict[tuple[str, str], Float] = {}
-    for topic in store.topics.values():
+    for topic in messages.topics.values():
         if topic.type_name != TRANSFORMS or not topic.name.endswith("tf_static"):
             continue
         for place in topic.places:
-            made.update(transforms_in(cdr.decode(store.read(place), TRANSFORMS, store.path)))
+            made.update(transforms_in(cdr.decode(messages.read(place), TRANSFORMS, messages.path)))
     return made
 
 

@@ -4,30 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from graphvio.arrays import Int
 from graphvio.errors import SessionError
 from graphvio.sessions import cdr
-from graphvio.sessions.mcap_file import Place, Topic, stamps_of
 from graphvio.sessions.mcap_storage import LIBRARY
+from graphvio.sessions.store import Store
+from graphvio.sessions.topics import Place, Topic
 
 _BLOCKS = 10
 _FEWEST = 5 * _BLOCKS
 _SHORTEST_NS = 10_000_000_000
 _JUMP_NS = 1_000_000_000
 _NS_PER_MS, _NS_PER_MINUTE = 1e6, 60e9
-
-
-class Store(Protocol):
-    """A file with messages by topic."""
-
-    library: str
-
-    def read(self, place: Place) -> bytes:
-        """A message."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +71,11 @@ def all_header_stamps(store: Store, topics: Iterable[Topic]) -> dict[str, Int]:
     waiting: list[tuple[Place, str, int]] = []
     for topic in topics:
         if store.library.startswith(LIBRARY):
-            found[topic.name] = stamps_of(topic)
+            found[topic.name] = topic.logged_stamps_ns
         elif topic.header_ns:
             found[topic.name] = np.array(topic.header_ns, dtype=np.int64)
         else:
-            found[topic.name] = stamps_of(topic)
+            found[topic.name] = topic.logged_stamps_ns
             waiting += [(place, topic.name, row) for row, place in enumerate(topic.places)]
     for place, name, row in sorted(waiting):
         try:

@@ -1,12 +1,15 @@
-"""Names of a session's topics and attachments, for those who write and those who read them."""
+"""Topics of sessions and bags: their names, their messages, and which of several to use."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, NamedTuple, Protocol
 
-if TYPE_CHECKING:
-    from graphvio.sessions.mcap_file import Topic
+import numpy as np
+
+from graphvio.arrays import Int
 
 ImageFormat = Literal["raw", "png"]
 RIG_ATTACHMENT = "rig.yaml"
@@ -14,6 +17,67 @@ RIG_TOPIC = "/graphvio/rig"
 """The text of ``rig.yaml``, in files that have no attachments."""
 IMU_TOPIC, TRANSFORMS_TOPIC, ODOMETRY_TOPIC, LOG_TOPIC = "/imu", "/tf_static", "/odometry", "/rosout"
 TRUTH_TOPIC = "/ground_truth"
+
+
+class Place(NamedTuple):
+    """Position of a message in a file.
+
+    Attributes:
+        chunk: byte of the file at which the message's chunk begins, -1 if it is in none; of bags, the connection.
+        offset: byte of the message in the unpacked chunk, or in the file; of bags, its row or time.
+        channel: number of the message's channel, -1 if unknown.
+        logged_ns: time of its recording, -1 if unknown.
+    """
+
+    chunk: int
+    offset: int
+    channel: int = -1
+    logged_ns: int = -1
+
+
+@dataclass
+class Topic:
+    """Messages of one topic, in the order of the file.
+
+    Attributes:
+        name: such as ``/imu``.
+        type_name: such as ``sensor_msgs/msg/Imu``.
+        encoding: of its messages, ``cdr`` for ROS 2.
+        logged_ns: time of recording of each message.
+        places: position of each message.
+        header_ns: stamps of their headers if the reader decodes them, otherwise empty.
+    """
+
+    name: str
+    type_name: str
+    encoding: str
+    logged_ns: list[int] = field(default_factory=list)
+    places: list[Place] = field(default_factory=list)
+    header_ns: list[int] = field(default_factory=list)
+
+    @property
+    def logged_stamps_ns(self) -> Int:
+        """(N,) `logged_ns` as an array."""
+        return np.array(self.logged_ns, dtype=np.int64)
+
+
+class MessageReader(Protocol):
+    """Messages by topic, of a file or of a running system.
+
+    Attributes:
+        path: the file, or a name for messages.
+        topics: name -> topic.
+    """
+
+    path: Path
+    topics: dict[str, Topic]
+
+    def read(self, place: Place) -> bytes:
+        """Return a message as CDR.
+
+        Raises:
+            SessionError: if it is damaged.
+        """
 
 
 def image_topic(pair: str, side: str, image_format: ImageFormat) -> str:

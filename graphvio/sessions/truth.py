@@ -11,10 +11,9 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.errors import SessionError, TrajectoryError
 from graphvio.sessions import cdr
-from graphvio.sessions.mcap_file import Topic
 from graphvio.sessions.messages import ODOMETRY, POSE, pose_of, stamp_of
-from graphvio.sessions.opening import open_store
-from graphvio.sessions.topics import TRUTH_TOPIC
+from graphvio.sessions.store import open_store
+from graphvio.sessions.topics import TRUTH_TOPIC, Topic
 
 _log = logging.getLogger(__name__)
 

@@ -14,14 +14,12 @@ from graphvio.image_decoding import ImageError
 from graphvio.rig import Camera, Rig
 from graphvio.rig_files.native import parse
 from graphvio.sessions import cdr
-from graphvio.sessions.bag_file import BagFile
-from graphvio.sessions.mcap_file import McapFile, Place, Topic
 from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, TEXT, imu_sample, stamp_of
-from graphvio.sessions.opening import is_store
 from graphvio.sessions.pixels import grey
 from graphvio.sessions.rig_of_topics import rig_of_topics
 from graphvio.sessions.stamps import header_stamps
-from graphvio.sessions.topics import RIG_ATTACHMENT, RIG_TOPIC, image_topic, of_type, preference
+from graphvio.sessions.store import Store, is_store
+from graphvio.sessions.topics import RIG_ATTACHMENT, RIG_TOPIC, Place, Topic, image_topic, of_type, preference
 from graphvio.sessions.truth import truth_topic
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.recording import Index
@@ -36,7 +34,7 @@ def matches(path: Path) -> bool:
     return is_store(path)
 
 
-def rig_in(file: McapFile | BagFile) -> Rig | None:
+def rig_in(file: Store) -> Rig | None:
     """The rig that a session carries, or that a bag's messages tell; None if there is none.
 
     Raises:
@@ -58,11 +56,11 @@ def rig_in(file: McapFile | BagFile) -> Rig | None:
     return rig_of_topics(file, file.path.stem)
 
 
-def _damaged_rig(file: McapFile | BagFile) -> SessionError:
+def _damaged_rig(file: Store) -> SessionError:
     return SessionError(f"{file.path}: the rig in it is damaged; copy the file anew, or give a rig of your own")
 
 
-def read_index(file: McapFile | BagFile, rig: Rig, faults: FaultLog, topics: Mapping[str, str]) -> Index:
+def read_index(file: Store, rig: Rig, faults: FaultLog, topics: Mapping[str, str]) -> Index:
     """Index the cameras of a rig, and the IMU if it has one.
 
     Args:
@@ -98,7 +96,7 @@ def read_index(file: McapFile | BagFile, rig: Rig, faults: FaultLog, topics: Map
     return Index(faults.name, tracks, table, file.path if truth_topic(file.topics) is not None else None)
 
 
-def _named(file: McapFile | BagFile, name: str) -> Topic:
+def _named(file: Store, name: str) -> Topic:
     if name not in file.topics:
         raise SourceError(f"{file.path}: has no topic {name}; it has {', '.join(sorted(file.topics))}")
     return file.topics[name]
@@ -107,7 +105,7 @@ def _named(file: McapFile | BagFile, name: str) -> Topic:
 class _Images:
     """Images of one topic."""
 
-    def __init__(self, file: McapFile | BagFile, topic: Topic, faults: FaultLog) -> None:
+    def __init__(self, file: Store, topic: Topic, faults: FaultLog) -> None:
         self._file, self._type, self._name = file, topic.type_name, topic.name
         stamps = header_stamps(file, topic)
         order = np.argsort(stamps, kind="stable")
@@ -128,7 +126,7 @@ class _Images:
         return image
 
 
-def _topic_of(file: McapFile | BagFile, pair: str, side: str, camera: Camera) -> Topic:
+def _topic_of(file: Store, pair: str, side: str, camera: Camera) -> Topic:
     """The topic of a camera's images: as graphvio names it, or whose name has the camera's."""
     for name in (image_topic(pair, side, "raw"), image_topic(pair, side, "png"), camera.name):
         if name in file.topics:
@@ -141,7 +139,7 @@ def _topic_of(file: McapFile | BagFile, pair: str, side: str, camera: Camera) ->
     return min(named, key=lambda topic: preference(topic.name))
 
 
-def _imu(file: McapFile | BagFile, topic: Topic, faults: FaultLog) -> ImuTable:
+def _imu(file: Store, topic: Topic, faults: FaultLog) -> ImuTable:
     stamps: list[int] = []
     values: list[list[float]] = []
     for place, logged_ns in zip(topic.places, topic.logged_ns, strict=True):

@@ -9,12 +9,11 @@ import numpy as np
 
 from graphvio.arrays import Int
 from graphvio.errors import RigError, SessionError
-from graphvio.sessions.bag_file import BagFile
-from graphvio.sessions.mcap_file import McapFile, Topic, stamps_of
 from graphvio.sessions.messages import COMPRESSED, IMAGE, STAMPED
-from graphvio.sessions.opening import is_store, open_store
 from graphvio.sessions.rig_of_topics import stereo_topics
 from graphvio.sessions.stamps import Clock, Offset, all_header_stamps, compare_clocks, compare_topics
+from graphvio.sessions.store import Store, is_store, open_store
+from graphvio.sessions.topics import Topic
 from graphvio.sources.session import rig_in
 
 _GAP_PERIODS = 1.5
@@ -113,7 +112,7 @@ def describe(path: Path) -> Description:
             "recording of another layout by graphvio convert"
         )
     store = open_store(path)
-    logged = [stamps_of(topic) for topic in store.topics.values() if topic.places]
+    logged = [topic.logged_stamps_ns for topic in store.topics.values() if topic.places]
     begin, end = (min(each.min() for each in logged), max(each.max() for each in logged)) if logged else (0, 0)
     stamped = [topic for topic in store.topics.values() if topic.type_name in STAMPED and topic.places]
     stamps = all_header_stamps(store, stamped)
@@ -132,7 +131,7 @@ def describe(path: Path) -> Description:
     )
 
 
-def _rig(store: McapFile | BagFile) -> str:
+def _rig(store: Store) -> str:
     try:
         rig = rig_in(store)
     except (RigError, SessionError) as error:
@@ -144,7 +143,7 @@ def _rig(store: McapFile | BagFile) -> str:
 
 
 def _topic(topic: Topic, header_ns: Int | None) -> TopicDescription:
-    logged_ns = stamps_of(topic)
+    logged_ns = topic.logged_stamps_ns
     stamps, count = np.sort(logged_ns), len(logged_ns)
     if count < _FEWEST or stamps[0] == stamps[-1]:
         return TopicDescription(topic.name, topic.type_name, count)
