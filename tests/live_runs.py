@@ -11,7 +11,6 @@ from recordings import START_NS, noise_image
 
 from graphvio import Odometry, open_source
 from graphvio.arrays import Image
-from graphvio.broadcast import Subscription
 from graphvio.config import Config
 from graphvio.live.output import Output
 from graphvio.live.running import LiveOdometry
@@ -21,6 +20,7 @@ from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
 from graphvio.measurements.readings import CameraFrame, DeviceHealth, ImuReading, Reading, host_ns
 from graphvio.measurements.sensors import FrameSet, Measurement
+from graphvio.queues import BoundedQueue
 from graphvio.rig import Rig
 
 SOON_S = 60.0  # until then an end is waited for; only a test that fails takes so long
@@ -113,7 +113,7 @@ def small_readings(
             )  # fmt: skip
 
 
-def all_of(subscription: Subscription[Estimate]) -> list[Estimate]:
+def all_of(subscription: BoundedQueue[Estimate]) -> list[Estimate]:
     """What waits of a subscription whose broadcast has ended."""
     assert subscription.is_closed
     taken = []

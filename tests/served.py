@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.broadcast import Broadcast
 from graphvio.geometry import se3, so3_exp
 from graphvio.measurements.estimate import Estimate, Prediction, Status
 from graphvio.measurements.events import Event
 from graphvio.measurements.motion import Quality
+from graphvio.queues import Broadcast
 from graphvio.rig import Camera, Imu, Rig, StereoPair
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
 from graphvio.slam.keyframe_log import KeyframeLog

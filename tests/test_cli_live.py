@@ -20,7 +20,6 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from graphvio import FrameSet, open_source
-from graphvio.broadcast import Broadcast
 from graphvio.cli import app
 from graphvio.cli.dashboard import Dashboard, line_of, summary_of
 from graphvio.cli.stopping import StopSignals
@@ -28,6 +27,7 @@ from graphvio.errors import GraphvioError, RigError
 from graphvio.live import sources
 from graphvio.measurements.events import Event
 from graphvio.measurements.readings import DeviceHealth
+from graphvio.queues import Broadcast
 from graphvio.sessions.mcap_file import McapFile
 
 pytest.importorskip("mcap")

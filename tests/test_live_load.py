@@ -10,13 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from graphvio.live import inbox as inbox_module
-from graphvio.live.inbox import Inbox
+from graphvio.live import estimation
+from graphvio.live.estimation import FRAMESETS, Inbox, make_inbox
 from graphvio.live.load import LoadControl
 from graphvio.live.meter import Meter
 from graphvio.live.ordering import SampleOrder
-from graphvio.live.pipe import Pipe
-from graphvio.measurements.sensors import FrameSet, ImuSample
+from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 
 SOON_S = 20.0  # until then a thread is waited for; only a test that fails takes so long
 PERIOD_NS = 50_000_000
@@ -125,141 +124,100 @@ def test_whatever_comes_the_newest_is_never_skipped_and_corners_go_first(
 # ---------------------------------------------------------------- what waits for the odometry
 
 
+def put(inbox: Inbox, measurement: Measurement, arrival_ns: int = 0) -> None:
+    inbox.put((measurement, arrival_ns), FRAMESETS if isinstance(measurement, FrameSet) else "")
+
+
 def taken(inbox: Inbox) -> list[int]:
     stamps = []
-    while (item := inbox.take(0.0)) is not None:
+    while (item := inbox.get(0.0)) is not None:
         stamps.append(item[0].stamp_ns)
     return stamps
 
 
 def test_the_oldest_frameset_goes_and_samples_stay() -> None:
-    inbox = Inbox(2, waits=False)
+    inbox = make_inbox(2, is_realtime=True)
     for i in range(4):
-        inbox.put(sample(10 * i))
-        inbox.put(frameset(10 * i + 5))
-    assert (inbox.framesets, len(inbox), inbox.dropped_framesets) == (2, 6, 2)
+        put(inbox, sample(10 * i))
+        put(inbox, frameset(10 * i + 5))
+    assert (inbox.waiting(FRAMESETS), len(inbox), inbox.dropped(FRAMESETS)) == (2, 6, 2)
     assert taken(inbox) == [0, 10, 20, 25, 30, 35]
-    assert (inbox.framesets, inbox.dropped_samples) == (0, 0)
+    assert (inbox.waiting(FRAMESETS), inbox.dropped()) == (0, 0)
 
 
 @given(st.lists(st.booleans(), max_size=60), st.integers(1, 5), st.integers(1, 9))
 def test_no_sample_is_lost_and_every_frameset_is_taken_or_counted(
     are_framesets: list[bool], most: int, taken_every: int
 ) -> None:
-    inbox = Inbox(most, waits=False)
+    inbox = make_inbox(most, is_realtime=True)
     came: list[int] = []
     for i, is_frameset in enumerate(are_framesets):
-        inbox.put(frameset(i) if is_frameset else sample(i))
-        if i % taken_every == 0 and (item := inbox.take(0.0)) is not None:
+        put(inbox, frameset(i) if is_frameset else sample(i))
+        if i % taken_every == 0 and (item := inbox.get(0.0)) is not None:
             came.append(item[0].stamp_ns)
-        assert inbox.framesets <= most
+        assert inbox.waiting(FRAMESETS) <= most
     came += taken(inbox)
     assert came == sorted(came)
     assert {i for i in came if not are_framesets[i]} == {i for i, each in enumerate(are_framesets) if not each}
-    assert sum(are_framesets[i] for i in came) + inbox.dropped_framesets == sum(are_framesets)
-    if came and inbox.dropped_framesets and are_framesets[-1]:
+    assert sum(are_framesets[i] for i in came) + inbox.dropped(FRAMESETS) == sum(are_framesets)
+    if came and inbox.dropped(FRAMESETS) and are_framesets[-1]:
         assert came[-1] == len(are_framesets) - 1  # never the newest
 
 
 def test_arrival_goes_along() -> None:
-    inbox = Inbox(1, waits=False)
-    inbox.put(sample(1), arrival_ns=77)
-    assert inbox.take(0.0) is not None
-    inbox.put(frameset(2), arrival_ns=78)
-    item = inbox.take(0.0)
+    inbox = make_inbox(1, is_realtime=True)
+    put(inbox, sample(1), arrival_ns=77)
+    assert inbox.get(0.0) is not None
+    put(inbox, frameset(2), arrival_ns=78)
+    item = inbox.get(0.0)
     assert item is not None
     assert item[1] == 78
 
 
 def test_one_that_waits_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither framesets nor samples, however slowly they are taken."""
-    monkeypatch.setattr(inbox_module, "_MOST_SAMPLES", 5)
-    inbox = Inbox(2, waits=True)
+    monkeypatch.setattr(estimation, "_WAITING_SAMPLES", 5)
+    inbox = make_inbox(2, is_realtime=False)
 
     def bring() -> None:
         for i in range(300):
-            inbox.put(frameset(i) if i % 7 == 0 else sample(i))
+            put(inbox, frameset(i) if i % 7 == 0 else sample(i))
         inbox.close()
 
     thread, _ = in_thread(bring)
     came = []
     while not inbox.is_finished:
         assert len(inbox) <= 7
-        assert inbox.framesets <= 2
-        item = inbox.take(0.01)
+        assert inbox.waiting(FRAMESETS) <= 2
+        item = inbox.get(0.01)
         came += [] if item is None else [item[0].stamp_ns]
     thread.join(SOON_S)
     assert came == list(range(300))
-    assert inbox.dropped_framesets == inbox.dropped_samples == 0
+    assert inbox.dropped(FRAMESETS) == inbox.dropped() == 0
 
 
 def test_samples_that_nobody_takes_are_counted_at_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inbox_module, "_MOST_SAMPLES", 5)
-    inbox = Inbox(2, waits=False)
+    monkeypatch.setattr(estimation, "_WAITING_SAMPLES", 5)
+    inbox = make_inbox(2, is_realtime=True)
     for i in range(9):
-        inbox.put(sample(i))
-    assert (taken(inbox), inbox.dropped_samples) == ([0, 1, 2, 3, 4], 4)
+        put(inbox, sample(i))
+    assert (taken(inbox), inbox.dropped()) == ([0, 1, 2, 3, 4], 4)
 
 
 @pytest.mark.parametrize("measurement", [frameset(1), sample(1)], ids=["frameset", "sample"])
 def test_whoever_waits_for_room_goes_on_when_nothing_is_taken_any_more(
     measurement: FrameSet | ImuSample, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(inbox_module, "_MOST_SAMPLES", 1)
-    inbox = Inbox(1, waits=True)
-    inbox.put(frameset(0))
-    thread, _ = in_thread(lambda: inbox.put(measurement))
+    monkeypatch.setattr(estimation, "_WAITING_SAMPLES", 1)
+    inbox = make_inbox(1, is_realtime=False)
+    put(inbox, frameset(0))
+    put(inbox, sample(0))
+    thread, _ = in_thread(lambda: put(inbox, measurement))
     inbox.abandon()
     thread.join(SOON_S)
     assert not thread.is_alive()
-    inbox.put(frameset(2))
-    assert (len(inbox), inbox.framesets, inbox.is_finished) == (0, 0, True)
-
-
-# ---------------------------------------------------------------- between stages
-
-
-def test_a_pipe_hands_on_in_order_until_it_is_closed() -> None:
-    pipe: Pipe[int] = Pipe(3)
-
-    def bring() -> None:
-        for i in range(200):
-            assert pipe.put(i, waits=True)
-        pipe.close()
-
-    thread, _ = in_thread(bring)
-    came = []
-    while (item := pipe.take()) is not None:
-        assert len(pipe) <= 3
-        came.append(item)
-    thread.join(SOON_S)
-    assert came == list(range(200))
-    assert pipe.is_finished
-    assert not pipe.put(1, waits=True)
-
-
-def test_a_pipe_without_room_refuses_whoever_does_not_wait() -> None:
-    pipe: Pipe[int] = Pipe(1)
-    assert pipe.put(0, waits=False)
-    assert not pipe.put(1, waits=False)
-    pipe.close()
-    assert not pipe.is_finished
-    assert pipe.take() == 0
-    assert pipe.take() is None
-
-
-def test_both_ends_of_a_pipe_can_leave() -> None:
-    full: Pipe[int] = Pipe(1)
-    full.put(0, waits=False)
-    bringing, told = in_thread(lambda: full.put(1, waits=True))
-    empty: Pipe[int] = Pipe(1)
-    taking, got = in_thread(empty.take)
-    full.abandon()
-    empty.close()
-    for thread in (bringing, taking):
-        thread.join(SOON_S)
-    assert (told, got) == ([False], [None])
-    assert full.take() is None
+    put(inbox, frameset(2))
+    assert (len(inbox), inbox.waiting(FRAMESETS), inbox.is_finished) == (0, 0, True)
 
 
 # ---------------------------------------------------------------- samples that overtake

@@ -19,11 +19,11 @@ from ros2_loopback import PERIOD_NS, START_NS, URI, Other, free_domain, until
 from synthetic import random_covariance, transform
 
 from graphvio.arrays import Float
-from graphvio.broadcast import Broadcast
 from graphvio.errors import ServiceError
 from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_exp
 from graphvio.measurements.estimate import Estimate, Prediction, Status
 from graphvio.measurements.events import Event
+from graphvio.queues import Broadcast
 from graphvio.ros2.path import ThinnedPath
 from graphvio.ros2.publisher import Publisher
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks

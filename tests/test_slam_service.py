@@ -19,9 +19,9 @@ import pytest
 import served
 from test_slam_messages import assert_same
 
-from graphvio.broadcast import Broadcast
 from graphvio.errors import ServiceError
 from graphvio.measurements.events import Event
+from graphvio.queues import Broadcast
 from graphvio.slam.interface import FrontEnd
 from graphvio.slam.keyframe import Keyframe
 
@@ -62,7 +62,7 @@ def until(condition: Callable[[], object], what: str) -> None:
 
 
 def listeners(broadcast: Broadcast[Any]) -> int:
-    return len(broadcast._subscriptions)
+    return sum(not queue.is_closed for queue in broadcast._queues)
 
 
 def in_thread(function: Callable[[], object]) -> threading.Thread:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 from rich.text import Text
 
-from graphvio.broadcast import Subscription
 from graphvio.cli.redrawn import Redrawn
 from graphvio.measurements.events import Event
+from graphvio.queues import BoundedQueue
 
 if TYPE_CHECKING:
     from graphvio.measurements.readings import DeviceHealth
@@ -31,7 +31,7 @@ class Dashboard(Redrawn):
         events: to be shown as they come.
     """
 
-    def __init__(self, title: str, events: Subscription[Event]) -> None:
+    def __init__(self, title: str, events: BoundedQueue[Event]) -> None:
         super().__init__()
         self._title = title
         self._events = events

@@ -11,22 +11,42 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from graphvio.config.stages import LiveConfig
-from graphvio.live.inbox import Inbox
 from graphvio.live.load import LoadControl
 from graphvio.live.meter import Meter
-from graphvio.live.pipe import Pipe
 from graphvio.live.stage import Stage
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.readings import host_ns
 from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.odometry import Odometry
+from graphvio.queues import BoundedQueue, Limit, WhenFull
 
 _WAITING_FRAMESETS = 8
+_WAITING_SAMPLES = 50_000  # minutes: where so many wait, the odometry is dead
 _WAITING_RESULTS = 64  # for output
 _READ_AHEAD = 2  # wait for either, where the source waits: more would only take memory
 _KEPT_FRAMESETS = 64  # until they are estimated
 _ROUND_S = 0.05
 _START_NS = 500_000_000
+
+
+FRAMESETS = "framesets"
+"""The lane of framesets in the inbox; samples are in the default one."""
+
+Inbox = BoundedQueue[tuple[Measurement, int]]
+
+
+def make_inbox(max_framesets: int, is_realtime: bool) -> Inbox:
+    """Make the queue in front of the odometry.
+
+    Args:
+        max_framesets: that may wait.
+        is_realtime: whether the oldest frameset is dropped where there is no room, and a sample where the odometry is
+            dead; else whoever brings them waits.
+    """
+    if is_realtime:
+        framesets = Limit(max_framesets, WhenFull.DROP_OLDEST)
+        return BoundedQueue(_WAITING_SAMPLES, WhenFull.DROP_NEWEST, framesets=framesets)
+    return BoundedQueue(_WAITING_SAMPLES, WhenFull.WAIT, framesets=Limit(max_framesets, WhenFull.WAIT))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +78,7 @@ class Estimation:
         tell_events: passes on what the odometry has to tell.
 
     Attributes:
-        inbox: what waits for the odometry.
+        inbox: measurements that wait for the odometry, with the host time of their arrival.
         results: what waits for the output.
         load: what is given up.
         latest: newest estimate, or None.
@@ -73,8 +93,10 @@ class Estimation:
         publish: Callable[[Estimate], None],
         tell_events: Callable[[], None],
     ) -> None:
-        self.inbox = Inbox(_WAITING_FRAMESETS if is_realtime else _READ_AHEAD, waits=not is_realtime)
-        self.results: Pipe[Result] = Pipe(_WAITING_RESULTS if is_realtime else _READ_AHEAD)
+        self.inbox = make_inbox(_WAITING_FRAMESETS if is_realtime else _READ_AHEAD, is_realtime)
+        self.results: BoundedQueue[Result] = BoundedQueue(
+            _WAITING_RESULTS if is_realtime else _READ_AHEAD, WhenFull.DROP_NEWEST if is_realtime else WhenFull.WAIT
+        )
         self.load = LoadControl(config.max_latency_ms)
         self.latest: Estimate | None = None
         self._odometry = odometry
@@ -89,7 +111,7 @@ class Estimation:
     def estimate(self, stage: Stage) -> None:
         """Work on what comes, until its end."""
         while not self.inbox.is_finished:
-            taken = self.inbox.take(self._patience_s())
+            taken = self.inbox.get(self._patience_s())
             if taken is not None:
                 with stage.working():
                     self._process(stage, *taken)
@@ -104,7 +126,8 @@ class Estimation:
         begun_ns = host_ns()
         if isinstance(measurement, FrameSet):
             waited_ms = 1e-6 * (begun_ns - arrival_ns)
-            if self._is_limited(arrival_ns) and self.load.must_skip(waited_ms, is_newest=not self.inbox.framesets):
+            is_newest = not self.inbox.waiting(FRAMESETS)
+            if self._is_limited(arrival_ns) and self.load.must_skip(waited_ms, is_newest):
                 self._meter.count("skipped_late")
                 return
             self._under_way[measurement.stamp_ns] = _UnderWay(measurement, arrival_ns, waited_ms)
@@ -159,7 +182,7 @@ class Estimation:
         self._publish(estimate)
         result = Result(estimate, None if under_way is None else under_way.frameset)
         with stage.waiting():
-            has_room = self.results.put(result, waits=not self._is_realtime)
+            has_room = self.results.put(result)
         if not has_room:
             self._meter.count("results_not_put_out")
 

@@ -10,13 +10,13 @@ from graphvio.live.clock import ClockMaps
 from graphvio.live.meter import Meter
 from graphvio.live.ordering import SampleOrder
 from graphvio.live.pairing import FramesetAssembler
-from graphvio.live.pipe import Pipe
 from graphvio.live.shared_clock import SharedClock
 from graphvio.live.source import LiveSource
 from graphvio.live.stage import Stage
 from graphvio.measurements.events import Report
 from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, host_ns
 from graphvio.measurements.sensors import ImuSample, Measurement
+from graphvio.queues import BoundedQueue, WhenFull
 from graphvio.rig import Imu, Rig
 
 _WAITING_IMAGES = 64  # for decoding
@@ -50,7 +50,8 @@ class Reception:
         self, source: LiveSource, rig: Rig, config: Config, meter: Meter, report: Report, bring: Bring
     ) -> None:
         most_images = _WAITING_IMAGES if source.is_realtime else _READ_AHEAD_IMAGES
-        self.images: Pipe[tuple[CameraFrame, int]] = Pipe(most_images)
+        when_full = WhenFull.DROP_NEWEST if source.is_realtime else WhenFull.WAIT
+        self.images: BoundedQueue[tuple[CameraFrame, int]] = BoundedQueue(most_images, when_full)
         self.started_ns = self.last_ns = host_ns()
         self.temperature_c: float | None = None
         self._source = source
@@ -109,7 +110,7 @@ class Reception:
             return
         self._meter.came("images", reading.arrival_ns)
         with stage.waiting():
-            has_room = self.images.put((reading, stamp_ns), waits=not self._source.is_realtime)
+            has_room = self.images.put((reading, stamp_ns))
         if not has_room:
             self._meter.count("images_not_decoded")
 
@@ -121,7 +122,7 @@ class Reception:
 
     def _next_image(self, stage: Stage) -> tuple[CameraFrame, int] | None:
         """The next image; None at the end. While none comes, framesets that have waited long enough go on."""
-        while (item := self.images.take(_ROUND_S)) is None and not self.images.is_finished:
+        while (item := self.images.get(_ROUND_S)) is None and not self.images.is_finished:
             if not self._source.is_realtime:
                 continue  # its images come when they are taken: time tells nothing of them
             now_ns = host_ns()

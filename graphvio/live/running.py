@@ -8,9 +8,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 from graphvio.arrays import Float
-from graphvio.broadcast import Broadcast
 from graphvio.config import Config
-from graphvio.live.estimation import Estimation
+from graphvio.live.estimation import FRAMESETS, Estimation
 from graphvio.live.figures import device_figures, figures
 from graphvio.live.meter import Meter
 from graphvio.live.output import Output
@@ -23,6 +22,7 @@ from graphvio.measurements.events import Event
 from graphvio.measurements.readings import DeviceHealth, host_ns
 from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.odometry import Odometry
+from graphvio.queues import Broadcast
 from graphvio.rig import Rig
 from graphvio.slam.keyframe import CorrectionResult
 from graphvio.slam.keyframe_log import KeyframeLog
@@ -181,12 +181,12 @@ class LiveOdometry:
             "uptime_s": (now_ns - self._reception.started_ns) * 1e-9,
             "silent_s": (now_ns - self._reception.last_ns) * 1e-9,
             "waiting_images": len(self._reception.images),
-            "waiting_framesets": self._estimation.inbox.framesets,
+            "waiting_framesets": self._estimation.inbox.waiting(FRAMESETS),
             "waiting_results": len(self._estimation.results),
             "corner_share": self._estimation.load.corner_share,
             "temperature_c": self._reception.temperature_c,
-            "skipped_no_room": self._estimation.inbox.dropped_framesets,
-            "imu_lost": self._estimation.inbox.dropped_samples,
+            "skipped_no_room": self._estimation.inbox.dropped(FRAMESETS),
+            "imu_lost": self._estimation.inbox.dropped(),
             **figures(self._meter, self._estimation.latest, now_ns),
             **device_figures(self._source.health()),
             **{name: value for output in self._outputs for name, value in output.status().items()},
@@ -199,12 +199,13 @@ class LiveOdometry:
         self._estimation.inbox.close()
 
     def _bring(self, stage: Stage, measurement: ImuSample | FrameSet, arrival_ns: int) -> None:
-        if isinstance(measurement, FrameSet):
+        is_frameset = isinstance(measurement, FrameSet)
+        if is_frameset:
             self._meter.came("framesets", arrival_ns)
         for output in self._outputs:
             output.add_measurement(measurement)
         with stage.waiting():
-            self._estimation.inbox.put(measurement, arrival_ns)
+            self._estimation.inbox.put((measurement, arrival_ns), FRAMESETS if is_frameset else "")
 
     def _end_odometry(self) -> None:
         self._estimation.inbox.abandon()
@@ -215,7 +216,7 @@ class LiveOdometry:
 
     def _put_out(self, stage: Stage) -> None:
         """Hand estimates to the outputs."""
-        while (result := self._estimation.results.take()) is not None:
+        while (result := self._estimation.results.get()) is not None:
             with stage.working():
                 for output in self._outputs:
                     output.add_result(result.estimate, result.frameset)

@@ -7,16 +7,16 @@ import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from graphvio.live.pipe import Pipe
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
 from graphvio.measurements.sensors import FrameSet, Measurement
+from graphvio.queues import BoundedQueue, Limit, WhenFull
 from graphvio.rig import Rig
 from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
 
 _WAITING = 20_000  # samples, poses and messages: a minute of them
-_WAITING_IMAGES = 120  # framesets: a disk may pause for seconds
+_WAITING_FRAMESETS = 120  # a disk may pause for seconds
 _READ_AHEAD = 2  # framesets, where the source waits
 
 
@@ -39,10 +39,10 @@ class SessionRecorder:
 
     def __init__(self, path: Path, rig: Rig, image_format: ImageFormat = "raw", waits: bool = False) -> None:
         self._path = path
-        self._waits = waits
         self._writer = SessionWriter(path, rig, image_format)
-        self._waiting: Pipe[Callable[[], None]] = Pipe(_WAITING)
-        self._images = threading.Semaphore(_READ_AHEAD if waits else _WAITING_IMAGES)
+        when_full = WhenFull.WAIT if waits else WhenFull.DROP_NEWEST
+        framesets = Limit(_READ_AHEAD if waits else _WAITING_FRAMESETS, when_full)
+        self._waiting: BoundedQueue[Callable[[], None]] = BoundedQueue(_WAITING, when_full, framesets=framesets)
         self._left_out = 0  # framesets for which the disk was too slow,
         self._lost = 0  # and samples, poses, messages
         self._framesets = 0
@@ -55,11 +55,7 @@ class SessionRecorder:
     def add_measurement(self, measurement: Measurement) -> None:
         """See `Output`."""
         if isinstance(measurement, FrameSet):
-            if not self._images.acquire(blocking=self._waits):
-                self._left_out += 1
-            elif not self._waiting.put(lambda: self._write_frameset(measurement), self._waits):
-                self._images.release()
-                self._left_out += 1
+            self._left_out += not self._waiting.put(lambda: self._write_frameset(measurement), "framesets")
         else:
             self._put(lambda: self._writer.add(measurement))
 
@@ -88,7 +84,7 @@ class SessionRecorder:
         self._thread.join()
 
     def _put(self, write: Callable[[], None]) -> None:
-        self._lost += not self._waiting.put(lambda: self._write_message(write), self._waits)
+        self._lost += not self._waiting.put(lambda: self._write_message(write))
 
     def _free_gb(self) -> float | None:
         try:
@@ -100,7 +96,6 @@ class SessionRecorder:
         is_written = self._is_written(lambda: self._writer.add(frameset))
         self._framesets += is_written
         self._failed_framesets += not is_written
-        self._images.release()
 
     def _write_message(self, write: Callable[[], None]) -> None:
         self._failed_messages += not self._is_written(write)
@@ -115,5 +110,5 @@ class SessionRecorder:
 
     def _write(self) -> None:
         with self._writer:
-            while (write := self._waiting.take()) is not None:
+            while (write := self._waiting.get()) is not None:
                 write()

@@ -182,7 +182,7 @@ class Publisher:
         outcomes = self._corrections.outcomes
         trouble, self._trouble = self._trouble, ""
         published = {
-            "estimates_missed": self._estimates.missed,
+            "estimates_missed": self._estimates.dropped(),
             "messages_dropped": sum(each.refused for each in self._writers.values()),
         }
         hardware = self._served.rig.name

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping
 from typing import Protocol
 
 from graphvio.arrays import Float
-from graphvio.broadcast import Broadcast
 from graphvio.measurements.estimate import Estimate, Prediction
 from graphvio.measurements.events import Event
+from graphvio.queues import Broadcast
 from graphvio.rig import Rig
 from graphvio.slam.keyframe import CorrectionResult, Keyframe
 from graphvio.slam.keyframe_log import KeyframeLog

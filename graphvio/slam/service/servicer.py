@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import graphvio
-from graphvio.broadcast import Broadcast, Subscription
 from graphvio.errors import GraphvioError, ServiceError
 from graphvio.measurements.estimate import Estimate, Prediction
+from graphvio.queues import BoundedQueue, Broadcast
 from graphvio.slam.epochs import map_of_epoch, newest_epoch
 from graphvio.slam.interface import Served
 from graphvio.slam.keyframe_log import KeyframeLog
@@ -130,7 +130,7 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
                 was_closed = subscription.is_closed
                 item = subscription.get(_LOOK_S)
                 if item is not None:
-                    missed = subscription.missed
+                    missed = subscription.dropped()
                     yield item, missed - told
                     stream.taken()
                     told = missed
@@ -161,7 +161,7 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
                 "another run of the odometry is served now, in which ids of keyframes mean something else; begin anew",
             )
 
-    def _abort_if_stopping(self, read: KeyframeLog | Subscription[Any], context: Any) -> None:
+    def _abort_if_stopping(self, read: KeyframeLog | BoundedQueue[Any], context: Any) -> None:
         """End a stream that would go on; what is left of an odometry that has ended may still be read."""
         if self._stopping.is_set() and not read.is_closed:  # in this order: an odometry ends before its server stops
             context.abort(grpc.StatusCode.UNAVAILABLE, "the server stops")
