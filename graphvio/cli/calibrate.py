@@ -303,7 +303,7 @@ def _with_sigma(value: float, sigma: float, known: bool) -> str:
 
 
 def _report(found: Calibration, folder: Path, source: str, count: int) -> None:
-    from graphvio.calibration.report.write import write_report
+    from graphvio.calibration.report.page import write_report
 
     with _working("drawing the report"):
         page = write_report(found, folder, source, count)
