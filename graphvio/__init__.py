@@ -28,8 +28,10 @@ if TYPE_CHECKING:
     from graphvio.optimization.optimize import Optimization
     from graphvio.optimization.pipeline import optimize_sessions
     from graphvio.rig import Camera, Imu, Rig, StereoPair
+    from graphvio.rig_files import load_rig, save_rig
     from graphvio.sources import open_source
     from graphvio.trajectory import Trajectory
+    from graphvio.trajectory_files import load_trajectory, save_trajectory
 
 _HOME_OF = {
     "Calibration": "calibration.result",
@@ -56,8 +58,12 @@ _HOME_OF = {
     "Trajectory": "trajectory",
     "calibrate_pairs": "calibration.calibrate",
     "calibrate_trajectories": "calibration.calibrate",
+    "load_rig": "rig_files",
+    "load_trajectory": "trajectory_files",
     "open_source": "sources",
     "optimize_sessions": "optimization.pipeline",
+    "save_rig": "rig_files",
+    "save_trajectory": "trajectory_files",
 }
 
 __all__ = [
@@ -86,8 +92,12 @@ __all__ = [
     "__version__",
     "calibrate_pairs",
     "calibrate_trajectories",
+    "load_rig",
+    "load_trajectory",
     "open_source",
     "optimize_sessions",
+    "save_rig",
+    "save_trajectory",
 ]
 
 

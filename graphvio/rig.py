@@ -229,23 +229,6 @@ class Rig:
         """The same rig, cameras only."""
         return replace(self, imu=None)
 
-    @staticmethod
-    def load(path: str | Path) -> Rig:
-        """Read a rig from ``rig.yaml``, or Kalibr's, EuRoC's or KITTI's files: see `graphvio.rig_files`.
-
-        Raises:
-            RigError: if the file cannot be read or describes no usable rig.
-        """
-        from graphvio.rig_files import load_rig
-
-        return load_rig(Path(path))
-
-    def save(self, path: str | Path) -> None:
-        """Write graphvio's own ``rig.yaml``."""
-        from graphvio.rig_files import save_rig
-
-        save_rig(self, Path(path))
-
 
 def as_written(camera: Camera, body_T_cam: Float) -> Camera:
     """A camera that has just been made, with exactly the transform (4, 4) that its file holds.

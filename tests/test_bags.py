@@ -13,7 +13,7 @@ from recordings import write_euroc
 from test_sessions import same, written
 from typer.testing import CliRunner
 
-from graphvio import FrameSet, Rig, open_source
+from graphvio import FrameSet, load_rig, open_source
 from graphvio.cli import app
 from graphvio.errors import RigError, SessionError, SourceError
 from graphvio.sessions import cdr
@@ -189,4 +189,4 @@ def test_a_bag_that_is_damaged_is_refused(recording: Path, tmp_path: Path) -> No
     path = bag("ros1", messages(recording, tmp_path), tmp_path)
     path.write_bytes(path.read_bytes()[:5000])
     with pytest.raises(SessionError, match="cannot be read as a bag"):
-        open_source(path, Rig.load(recording))
+        open_source(path, load_rig(recording))

@@ -14,7 +14,7 @@ from calibration_walks import Course, on_the_spot, planar, recorded, straight, w
 from scipy.stats import chi2
 from typer.testing import CliRunner, Result
 
-from graphvio import Calibration, CalibrationError, Rig, calibrate_pairs, open_source
+from graphvio import Calibration, CalibrationError, Rig, calibrate_pairs, load_rig, open_source, save_rig
 from graphvio.arrays import Float
 from graphvio.calibration.guide import ENOUGH_MOTIONS, Advice, Guide
 from graphvio.calibration.separate_motions import SeparateMotions
@@ -52,7 +52,7 @@ def is_plausible(found: Calibration, rig: Rig) -> bool:
 
 
 def test_pairs_are_found_within_what_is_told(walk: Path, found: Calibration) -> None:
-    rig = Rig.load(walk / "rig.yaml")
+    rig = load_rig(walk / "rig.yaml")
     assert is_plausible(found, rig)
     sigmas = np.sqrt(np.diag(found.covariance))
     assert np.rad2deg(sigmas[:3].max()) < 0.05
@@ -68,7 +68,7 @@ def test_pairs_are_found_within_what_is_told(walk: Path, found: Calibration) -> 
 
 
 def test_where_the_rig_file_has_the_pairs_does_not_matter(walk: Path, found: Calibration) -> None:
-    rig = Rig.load(walk / "rig.yaml")
+    rig = load_rig(walk / "rig.yaml")
     other = calibrate_pairs(open_source(walk, with_wrong_place(rig, 3.0, 0.05)))
     np.testing.assert_allclose(other.left2_T_left1, found.left2_T_left1, atol=1e-7)  # but for rounding
     present = other.present()
@@ -80,7 +80,7 @@ def test_where_the_rig_file_has_the_pairs_does_not_matter(walk: Path, found: Cal
 
 
 def test_pairs_in_each_others_place_are_told(walk: Path) -> None:
-    rig = Rig.load(walk / "rig.yaml")
+    rig = load_rig(walk / "rig.yaml")
     places = [pair.left.body_T_cam for pair in rig.pairs]
     moved = []
     for pair, place in zip(rig.pairs, places[::-1], strict=True):
@@ -96,9 +96,9 @@ def test_pairs_in_each_others_place_are_told(walk: Path) -> None:
 
 
 def test_the_command_puts_a_wrong_rig_right(walk: Path, tmp_path: Path) -> None:
-    rig = Rig.load(walk / "rig.yaml")
+    rig = load_rig(walk / "rig.yaml")
     wrong, out, report = tmp_path / "wrong.yaml", tmp_path / "right.yaml", tmp_path / "report"
-    with_wrong_place(rig, 3.0, 0.05).save(wrong)
+    save_rig(with_wrong_place(rig, 3.0, 0.05), wrong)
     ran = command("run", walk, "--rig", wrong, "--out", tmp_path / "results")
     assert ran.exit_code == 0
     size = r"pair back is ([\d.]+) \(\+- ([\d.]+)\) deg and ([\d.]+) \(\+- ([\d.]+)\) cm from where the rig file has it"
@@ -110,7 +110,7 @@ def test_the_command_puts_a_wrong_rig_right(walk: Path, tmp_path: Path) -> None:
     done = command("calibrate", walk, "--rig", wrong, "--out", out, "--report", report)
     assert done.exit_code == 0, done.output
     assert re.search(r"the rig has back (2\.9|3\.0)\d+ degrees and 5\d\.\d mm from where it is", done.stderr)
-    right = Rig.load(out)
+    right = load_rig(out)
     assert np.rad2deg(np.linalg.norm(so3_log(right.left2_T_left1()[:3, :3] @ rig.left2_T_left1()[:3, :3].T))) < 0.1
     np.testing.assert_allclose(right.left2_T_left1()[:3, 3], rig.left2_T_left1()[:3, 3], atol=5e-3)
     np.testing.assert_array_equal(right.pairs[0].left.body_T_cam, rig.pairs[0].left.body_T_cam)
@@ -161,12 +161,12 @@ def test_motions_that_do_not_tell_all_are_diagnosed(
 def test_pairs_that_are_not_triggered_together(tmp_path: Path) -> None:
     source = recorded(tmp_path / "walk", SECONDS, trigger_offset_ms=17.0)
     found = calibrate_pairs(source)
-    assert is_plausible(found, Rig.load(source / "rig.yaml"))
+    assert is_plausible(found, load_rig(source / "rig.yaml"))
     assert np.sqrt(np.diag(found.covariance))[3:].max() < 6e-3
 
 
 def test_a_wrong_rotation_and_offset_of_the_imu_are_put_right(walk: Path) -> None:
-    rig = Rig.load(walk / "rig.yaml")
+    rig = load_rig(walk / "rig.yaml")
     assert rig.imu is not None
     turned = np.eye(4)
     turned[:3, :3] = so3_exp(np.deg2rad(2.0) * np.array([0.6, 0.0, 0.8]))
@@ -192,7 +192,7 @@ def test_a_wrong_rotation_and_offset_of_the_imu_are_put_right(walk: Path) -> Non
 
 
 def test_a_rig_that_is_right_keeps_its_imu(walk: Path, found: Calibration) -> None:
-    rig, corrected = Rig.load(walk / "rig.yaml"), found.calibrated_rig(correct_imu=True)
+    rig, corrected = load_rig(walk / "rig.yaml"), found.calibrated_rig(correct_imu=True)
     np.testing.assert_allclose(corrected.pairs[0].left.body_T_cam, rig.pairs[0].left.body_T_cam, atol=1e-15)
     assert corrected.imu == rig.imu
 
@@ -227,14 +227,14 @@ def test_the_answer_is_the_same_each_time(walk: Path, found: Calibration) -> Non
 
 
 def test_one_pair_has_nothing_to_be_related_to(walk: Path) -> None:
-    rig = Rig.load(walk / "rig.yaml").with_pairs([0])
+    rig = load_rig(walk / "rig.yaml").with_pairs([0])
     with pytest.raises(CalibrationError, match="has one stereo pair"):
         calibrate_pairs(open_source(walk, rig))
 
 
 def test_a_pair_that_sees_nothing_is_named(walk: Path) -> None:
     """Left and right of the second pair are exchanged: nothing is found where it should be."""
-    rig = Rig.load(walk / "rig.yaml")
+    rig = load_rig(walk / "rig.yaml")
     back = rig.pairs[1]
     crossed = replace(
         back, left=replace(back.left, name=back.right.name), right=replace(back.right, name=back.left.name)
@@ -245,13 +245,13 @@ def test_a_pair_that_sees_nothing_is_named(walk: Path) -> None:
 
 def test_images_of_each_others_pairs_are_told(walk: Path) -> None:
     """The rig file has the names of the cameras the other way round."""
-    front, back = Rig.load(walk / "rig.yaml").pairs
+    front, back = load_rig(walk / "rig.yaml").pairs
     names = [[each.left.name, each.right.name] for each in (back, front)]
     crossed = tuple(
         replace(pair, left=replace(pair.left, name=left), right=replace(pair.right, name=right))
         for pair, (left, right) in zip((front, back), names, strict=True)
     )
-    rig = replace(Rig.load(walk / "rig.yaml"), pairs=crossed)
+    rig = replace(load_rig(walk / "rig.yaml"), pairs=crossed)
     with pytest.raises(CalibrationError, match="another pair's"):  # each pair's own calibration is the other's
         calibrate_pairs(open_source(walk, rig))
 

@@ -16,6 +16,7 @@ from graphvio.arrays import Float
 from graphvio.calibration.trajectory_motions import ClockRelation
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 SECONDS = 40.0
 OFFSET_S = 123.4567
@@ -176,7 +177,7 @@ def test_a_relation_of_clocks_maps_stamps() -> None:
 @pytest.mark.skipif(not (REAL_DATA / "tango_triplet").is_dir(), reason="shared/data/tango_triplet is not here")
 def test_three_real_devices_close_their_loop() -> None:
     files: list[Path] = sorted((REAL_DATA / "tango_triplet").glob("*.csv"))
-    found = calibrate_trajectories([Trajectory.read(file) for file in files], [file.stem[:6] for file in files])
+    found = calibrate_trajectories([load_trajectory(file) for file in files], [file.stem[:6] for file in files])
     (loop,) = found.places.loops
     assert np.rad2deg(np.linalg.norm(loop.error[:3])) < 0.3
     assert np.linalg.norm(loop.error[3:]) < 0.012

@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 
 from graphvio.cli import app
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
-from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory, save_trajectory
 
 
 def command(*arguments: object) -> Result:
@@ -26,9 +26,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("trajectories")
     third = trajectory(3, 40.0, se3_exp(np.array([0.2, -0.5, 0.1, 0.3, 0.0, -0.2])), offset_s=-7.0)
     paths = [folder / name for name in ("front.txt", "back.txt", "side.csv")]
-    first().write(paths[0])
-    second(offset_s=OFFSET_S).write(paths[1])
-    third.write(folder / "side.txt")
+    save_trajectory(first(), paths[0])
+    save_trajectory(second(offset_s=OFFSET_S), paths[1])
+    save_trajectory(third, folder / "side.txt")
     lines = (folder / "side.txt").read_text().replace(" ", ", ").splitlines()
     paths[2].write_text("\n".join(line for i, line in enumerate(lines) for _ in range(1 + (i % 5 == 0))) + "\n")
     return paths
@@ -70,7 +70,7 @@ def test_a_file_that_holds_nan_is_named_with_its_line(files: list[Path], tmp_pat
 
 def test_too_short_a_piece_is_refused(files: list[Path], tmp_path: Path) -> None:
     piece = tmp_path / "piece.txt"
-    Trajectory.read(files[0]).select(slice(0, 100)).write(piece)
+    save_trajectory(load_trajectory(files[0]).select(slice(0, 100)), piece)
     done = command(piece, files[1])
     assert "takes 5 s or more" in str(done.exception)
     assert done.exit_code != 0

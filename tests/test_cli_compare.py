@@ -10,6 +10,7 @@ from typer.testing import CliRunner, Result
 from graphvio.cli import app
 from graphvio.geometry import se3, so3_exp
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import save_trajectory
 
 
 def walk(error_m: float, seed: int = 0) -> Trajectory:
@@ -26,11 +27,11 @@ def files(tmp_path: Path) -> dict[str, Path]:
     made = {}
     for name, error_m in (("truth", 0.0), ("good", 0.01), ("bad", 0.03)):
         made[name] = tmp_path / f"{name}.txt"
-        walk(error_m).write(made[name])
+        save_trajectory(walk(error_m), made[name])
     folder = tmp_path / "walk-1"
     folder.mkdir()
-    walk(0.02).write(folder / "trajectory.txt")
-    walk(0.005).write(folder / "trajectory_smoothed.txt")
+    save_trajectory(walk(0.02), folder / "trajectory.txt")
+    save_trajectory(walk(0.005), folder / "trajectory_smoothed.txt")
     made["folder"] = folder
     return made
 
@@ -75,7 +76,7 @@ def test_a_gate_tells_what_is_above_it(files: dict[str, Path]) -> None:
 def test_one_that_cannot_be_compared_is_told_and_stops_no_other(files: dict[str, Path], tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere.txt"
     other = walk(0.01)
-    Trajectory(other.stamps_ns + 10**15, other.nav_T_body).write(elsewhere)
+    save_trajectory(Trajectory(other.stamps_ns + 10**15, other.nav_T_body), elsewhere)
     done = command(elsewhere, files["good"], "--truth", files["truth"])
     assert done.exit_code == 4
     assert "elsewhere: " in done.stderr

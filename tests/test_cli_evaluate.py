@@ -7,6 +7,7 @@ import pytest
 from graphvio.cli import main
 from graphvio.geometry import se3, so3_exp
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import save_trajectory
 
 START_NS = 1_403_636_579_763_555_584
 
@@ -29,7 +30,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
 
 @pytest.fixture
 def files(tmp_path: Path) -> tuple[Path, Path]:
-    walk(1.01).write(tmp_path / "estimate.txt")
+    save_trajectory(walk(1.01), tmp_path / "estimate.txt")
     rows = (
         f"{stamp},{','.join(f'{v:.9f}' for v in pose[:3, 3])},{np.cos(a / 2):.12f},0,0,{np.sin(a / 2):.12f}"
         for stamp, pose, a in zip(walk().stamps_ns, walk().nav_T_body, np.linspace(0.0, 2.0 * np.pi, 400), strict=True)
@@ -79,7 +80,7 @@ def test_bad_files_give_one_line(
 def test_gap_of_the_truth_can_be_chosen(
     files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    walk().select(np.arange(0, 400, 10)).write(tmp_path / "sparse.txt")
+    save_trajectory(walk().select(np.arange(0, 400, 10)), tmp_path / "sparse.txt")
     for gap, expected in ((0.25, 40), (0.6, 391)):
         code = run(
             monkeypatch,

@@ -18,7 +18,7 @@ import pytest
 from browser import free_options
 from ros2_loopback import URI, free_domain
 
-from graphvio import Trajectory, open_source
+from graphvio import load_trajectory, open_source
 from graphvio.geometry import se3_inverse
 
 pytest.importorskip("pycolmap")
@@ -52,7 +52,7 @@ def made(room_walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_map_is_made_and_its_paths_are_those_of_the_odometry_until_a_loop_is_closed(
     made: Path, room_walk: Path
 ) -> None:
-    odom, online, kept = (Trajectory.read(made / f"{name}.txt") for name in ("odometry", "online", "trajectory"))
+    odom, online, kept = (load_trajectory(made / f"{name}.txt") for name in ("odometry", "online", "trajectory"))
     source = open_source(room_walk)
     assert len(odom) > 0.8 * source.frameset_count
     assert len(online) > 0.5 * len(odom)  # the map is where odom is, from the first place on
@@ -66,15 +66,15 @@ def test_the_way_is_found_in_a_saved_map(made: Path, room_walk: Path, tmp_path: 
     """From the middle of the walk, where the new odom frame has nothing to do with the map's."""
     done = slam(f"replay:{room_walk}?from_s=1.5&speed=0.3", "--map", made, "--out", tmp_path / "again")
     assert done.returncode == 0, done.stderr
-    online = Trajectory.read(tmp_path / "again/online.txt")
-    before, known = Trajectory.read(made / "odometry.txt").at(online.stamps_ns, 0.1)
+    online = load_trajectory(tmp_path / "again/online.txt")
+    before, known = load_trajectory(made / "odometry.txt").at(online.stamps_ns, 0.1)
     apart = [
         se3_inverse(np.ascontiguousarray(a)) @ b
         for a, b in zip(before.nav_T_body, online.select(known).nav_T_body, strict=True)
     ]
     assert len(apart) >= 3
     assert np.median([np.linalg.norm(each[:3, 3]) for each in apart]) < 0.05
-    start = Trajectory.read(tmp_path / "again/odometry.txt").positions[0]
+    start = load_trajectory(tmp_path / "again/odometry.txt").positions[0]
     assert np.linalg.norm(online.positions[0] - start) > 0.2
 
 
@@ -146,7 +146,7 @@ def test_an_odometry_whose_slam_is_killed_goes_on_to_its_end(room_walk: Path, tm
     assert "the SLAM failed (exit code -9)" in line
     assert "the odometry goes on" in line
     assert {path.name for path in out.iterdir()} == {"odometry.txt", "online.txt"}
-    assert len(Trajectory.read(out / "odometry.txt")) > 0.8 * open_source(room_walk).frameset_count
+    assert len(load_trajectory(out / "odometry.txt")) > 0.8 * open_source(room_walk).frameset_count
     assert not list(temporary.iterdir())
     with socket.socket() as probe:  # the page has gone with it
         assert probe.connect_ex(("127.0.0.1", web.port)) != 0
@@ -160,7 +160,7 @@ def test_what_is_mapped_before_the_source_fails_is_saved(room_walk: Path, tmp_pa
     assert told.splitlines()[-1] == "graphvio: the device is broken"
     assert "Traceback" not in told
     assert json.loads((out / "map.json").read_text())["places"] > 0
-    assert len(Trajectory.read(out / "odometry.txt")) > 3
+    assert len(load_trajectory(out / "odometry.txt")) > 3
     assert not list(temporary.iterdir())
 
 
@@ -197,4 +197,4 @@ def test_a_signal_to_both_processes_ends_it_with_the_map_saved(room_walk: Path, 
     finally:
         process.kill()
     assert (tmp_path / "map/map.json").is_file()
-    assert len(Trajectory.read(tmp_path / "map/odometry.txt")) > 3
+    assert len(load_trajectory(tmp_path / "map/odometry.txt")) > 3

@@ -14,7 +14,7 @@ from recordings import frame_stamps, small_rig, write_euroc, write_kitti_odometr
 from test_sessions import same
 from typer.testing import CliRunner
 
-from graphvio import FrameSet, Odometry, Rig, open_source
+from graphvio import FrameSet, Odometry, Rig, load_rig, open_source, save_rig
 from graphvio.cli import app
 from graphvio.errors import SessionError, TrajectoryError
 from graphvio.geometry import quat_wxyz_from_rotation, se3, so3_exp
@@ -25,7 +25,7 @@ from graphvio.sessions.formats import format_of
 from graphvio.sessions.mcap_storage import McapStorage
 from graphvio.sessions.writer import SessionWriter
 from graphvio.sources.description import describe
-from graphvio.trajectory import Trajectory, tum_line
+from graphvio.trajectory_files import load_trajectory, tum_line
 
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
@@ -67,7 +67,7 @@ def write_truth(recording: Path) -> None:
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rig = odd_rig()
     path = write_euroc(tmp_path_factory.mktemp("convert") / "walk", frames=FRAMES, rig=rig)
-    rig.save(path / "rig.yaml")
+    save_rig(rig, path / "rig.yaml")
     imu = path / "mav0" / "imu0" / "data.csv"
     rng = np.random.default_rng(7)
     head, *rows = imu.read_text().splitlines()
@@ -96,7 +96,7 @@ def equal(one: Path, other: Path) -> None:
     assert to_text(sources[0].rig, Path()) == to_text(sources[1].rig, Path())
     assert sources[0].truth is not None
     assert sources[1].truth is not None
-    truths = Trajectory.read(sources[0].truth), Trajectory.read(sources[1].truth)
+    truths = load_trajectory(sources[0].truth), load_trajectory(sources[1].truth)
     np.testing.assert_array_equal(truths[0].stamps_ns, truths[1].stamps_ns)
     np.testing.assert_allclose(truths[0].nav_T_body, truths[1].nav_T_body, rtol=0.0, atol=1e-14)
 
@@ -127,7 +127,7 @@ def test_the_folder_tells_its_rig_to_others_too(recording: Path, tmp_path: Path)
     """By the files of each sensor, without graphvio's own."""
     back = converted(recording, tmp_path / "euroc")
     (back / "rig.yaml").unlink()
-    found, expected = Rig.load(back), odd_rig()
+    found, expected = load_rig(back), odd_rig()
     for one, other in zip(found.cameras, expected.cameras, strict=True):
         np.testing.assert_allclose(one.body_T_cam, other.body_T_cam, atol=1e-12)
         np.testing.assert_allclose(one.intrinsics, other.intrinsics, rtol=1e-11)
@@ -138,7 +138,7 @@ def test_the_folder_tells_its_rig_to_others_too(recording: Path, tmp_path: Path)
 
 def test_a_piece_has_the_truth_of_the_piece(recording: Path, tmp_path: Path) -> None:
     piece = converted(recording, tmp_path / "piece.mcap", "--from", "0.1", "--to", "0.2")
-    stamps = Trajectory.read(piece).stamps_ns
+    stamps = load_trajectory(piece).stamps_ns
     source = open_source(piece)
     assert source.start_ns - 10_000_000 <= stamps[0] <= source.start_ns
     assert source.end_ns <= stamps[-1] <= source.end_ns + 10_000_000
@@ -167,7 +167,7 @@ def test_others_read_the_truth_and_latched_topics(recording: Path, tmp_path: Pat
         with AnyReader([path]) as reader:
             rows = list(reader.messages([c for c in reader.connections if c.topic == "/ground_truth"]))
             first = reader.deserialize(rows[0][2], rows[0][0].msgtype)
-            assert first.pose.position.x == Trajectory.read(path).positions[0, 0]  # type: ignore[attr-defined]
+            assert first.pose.position.x == load_trajectory(path).positions[0, 0]  # type: ignore[attr-defined]
             transforms = next(c for c in reader.connections if c.topic == "/tf_static")
             assert "1" in str(getattr(transforms.ext, "latching", transforms.ext))
 
@@ -283,9 +283,9 @@ def test_a_truth_that_is_missing_or_bad_is_told(recording: Path, tmp_path: Path)
     session = converted(plain, tmp_path / "plain.mcap")
     assert open_source(session).truth is None
     with pytest.raises(TrajectoryError, match="holds no true trajectory"):
-        Trajectory.read(session)
+        load_trajectory(session)
     with pytest.raises(TrajectoryError, match="is no trajectory file, and no session"):
-        Trajectory.read(plain)
+        load_trajectory(plain)
     write_rows(plain / "mav0/state_groundtruth_estimate0/data.csv", ["1,2,3"])
     done = CliRunner().invoke(app, ["convert", str(plain), "--out", str(tmp_path / "again.mcap")])
     assert done.exit_code == 0

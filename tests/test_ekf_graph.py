@@ -22,7 +22,7 @@ from graphvio.measurements.motion import RelativeMotion
 from graphvio.measurements.sensors import ImuSample
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.tables import read_imu_csv
-from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 DT, PROBABILITY = 0.05, 0.999
 SIGMAS = noise_sigmas(DT, 5.0, 10.0, 1e-3)
@@ -118,7 +118,7 @@ def real(rng: np.random.Generator, count: int) -> tuple[Iterator[Step], FilterSt
     """The IMU of EuRoC V1_01, and relative poses drawn around its truth, one of 30 far off; and the first state."""
     folder = REAL_DATA / "euroc_v101_imu" / "mav0"
     table = read_imu_csv(folder / "imu0" / "data.csv", FaultLog("euroc_v101_imu"))
-    truth = Trajectory.read(folder / "state_groundtruth_estimate0" / "data.csv")
+    truth = load_trajectory(folder / "state_groundtruth_estimate0" / "data.csv")
     buffer = ImuBuffer(50.0)
     for stamp_ns, values in zip(table.stamps_ns, table.values, strict=True):
         buffer.add(ImuSample(int(stamp_ns), values[:3], values[3:]))

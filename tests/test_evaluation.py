@@ -12,6 +12,7 @@ from graphvio.errors import TrajectoryError
 from graphvio.evaluation import Evaluation, evaluate, umeyama_se3
 from graphvio.geometry import se3, so3_exp
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory, save_trajectory
 
 RATE_HZ = 20
 ELSEWHERE = se3(so3_exp(np.array([0.2, -0.1, 2.0])), np.array([3.0, -7.0, 1.0]))
@@ -34,9 +35,9 @@ def walk(count: int = 1600, drift_m: float = 0.0, turns: float = 2.0) -> Traject
 def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Evaluation, Any, Any]:
     """Our figures, and truth and estimate as evo reads them from the same files."""
     folder: Path = tmp_path_factory.mktemp("trajectories")
-    walk(drift_m=0.01).transformed(ELSEWHERE).write(folder / "estimate.txt")
-    walk().write(folder / "truth.txt")
-    ours = evaluate(Trajectory.read(folder / "estimate.txt"), Trajectory.read(folder / "truth.txt"))
+    save_trajectory(walk(drift_m=0.01).transformed(ELSEWHERE), folder / "estimate.txt")
+    save_trajectory(walk(), folder / "truth.txt")
+    ours = evaluate(load_trajectory(folder / "estimate.txt"), load_trajectory(folder / "truth.txt"))
     truth = file_interface.read_tum_trajectory_file(str(folder / "truth.txt"))
     estimate = file_interface.read_tum_trajectory_file(str(folder / "estimate.txt"))
     truth, estimate = sync.associate_trajectories(truth, estimate, max_diff=1e-3)

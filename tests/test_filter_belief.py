@@ -18,7 +18,7 @@ from graphvio.geometry import se3_inverse
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.rig import Imu
-from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 IMU = Imu()
 PERIOD_NS = 50_000_000
@@ -211,7 +211,7 @@ def test_the_odometry_runs_with_it(room_walk: Path, bias: str) -> None:
     assert all(e.covariance is not None and np.linalg.eigvalsh(e.covariance)[0] > 0 for e in estimates)
     smoothed = odometry.take_smoothed()
     assert [stamp for stamp, _ in smoothed] == [e.stamp_ns for e in estimates]
-    truth = Trajectory.read(room_walk / "mav0/state_groundtruth_estimate0/data.csv")
+    truth = load_trajectory(room_walk / "mav0/state_groundtruth_estimate0/data.csv")
     stamps = np.array([estimates[0].stamp_ns, estimates[-1].stamp_ns])
     true, _ = truth.at(stamps, 0.1)
     walked = np.linalg.norm(true.positions[1] - true.positions[0])

@@ -20,7 +20,7 @@ from graphvio.measurements.events import Event
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.measurements.sensors import Measurement
 from graphvio.rig import Rig
-from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 Change = Callable[[float, FrameSet], FrameSet]
 """Takes seconds since the first frameset, and a frameset."""
@@ -38,7 +38,7 @@ class Walk:
         rig: Rig | None = None,
         config: Config | None = None,
     ) -> None:
-        self.truth = Trajectory.read(recording / "mav0/state_groundtruth_estimate0/data.csv")
+        self.truth = load_trajectory(recording / "mav0/state_groundtruth_estimate0/data.csv")
         self.odometry = Odometry(rig or open_source(recording).rig.without_imu(), config)
         self.results: list[VisualResult] = []
         frontend = self.odometry._frontend

@@ -28,6 +28,7 @@ from graphvio.slam.keyframes import Keyframes
 from graphvio.slam.landmarks import landmarks_of
 from graphvio.slam.map_frame import MapFrame
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 SOON_S = 30.0  # until then a thread is waited for; only a test that fails takes so long
 TIGHT = np.diag(np.repeat([1e-3, 1e-2], 3) ** 2)
@@ -55,7 +56,7 @@ def rig(room_walk: Path) -> Rig:
 
 @pytest.fixture(scope="module")
 def truth(room_walk: Path) -> Trajectory:
-    return Trajectory.read(room_walk / "mav0/state_groundtruth_estimate0/data.csv")
+    return load_trajectory(room_walk / "mav0/state_groundtruth_estimate0/data.csv")
 
 
 @pytest.fixture(scope="module")

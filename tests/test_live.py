@@ -132,7 +132,7 @@ def test_clocks_that_drift_and_readings_that_come_late(room_walk: Path) -> None:
     from graphvio.live.sources.pacing import Pace
     from graphvio.live.sources.replay import paced
     from graphvio.live.sources.simulated_faults import DeviceFaults, with_faults
-    from graphvio.trajectory import Trajectory
+    from graphvio.trajectory_files import load_trajectory
 
     source = open_source(room_walk)
     rig = source.rig
@@ -157,7 +157,7 @@ def test_clocks_that_drift_and_readings_that_come_late(room_walk: Path) -> None:
     assert 78 <= len(second) <= 80
     assert {each.epoch for each in estimates} == {0}
     assert source.truth is not None
-    truth = Trajectory.read(source.truth)
+    truth = load_trajectory(source.truth)
     true_m = truth.around(source.start_ns, source.end_ns).nav_T_body[[0, -1], :3, 3]  # at rest for the first second
     found_m = np.array([e.nav_T_body[:3, 3] for e in estimates if e.nav_T_body is not None])[[0, -1]]
     walked_m = [np.linalg.norm(at[1] - at[0]) for at in (true_m, found_m)]

@@ -18,7 +18,7 @@ from graphvio.geometry import se3_inverse, se3_log
 from graphvio.mapping import saved_map
 from graphvio.mapping.drawn_front_end import DrawnFrontEnd
 from graphvio.mapping.mapper import Mapper
-from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory, save_trajectory
 
 pytest.importorskip("pycolmap", reason="maps need the extra maps")
 
@@ -147,8 +147,8 @@ def test_a_new_epoch_is_found_in_the_map(tmp_path: Path) -> None:
     found = mapper.trajectory
     assert len(found) == len(truth)
     assert far(found.nav_T_body[-1:], (se3_inverse(truth[0]) @ truth)[-1:])[0] < 0.06
-    found.write(tmp_path / "map.txt")
-    assert len(Trajectory.read(tmp_path / "map.txt")) == len(truth)
+    save_trajectory(found, tmp_path / "map.txt")
+    assert len(load_trajectory(tmp_path / "map.txt")) == len(truth)
 
 
 def test_a_map_of_another_rig_is_refused(made: Made) -> None:

@@ -28,6 +28,7 @@ from graphvio.backend.window import Window, WindowError
 from graphvio.measurements.motion import Quality
 from graphvio.measurements.sensors import Measurement
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def measurements(room_walk: Path) -> list[Measurement]:
 
 @pytest.fixture(scope="module")
 def truth(room_walk: Path) -> Trajectory:
-    return Trajectory.read(room_walk / "mav0/state_groundtruth_estimate0/data.csv")
+    return load_trajectory(room_walk / "mav0/state_groundtruth_estimate0/data.csv")
 
 
 @pytest.fixture

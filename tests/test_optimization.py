@@ -30,6 +30,7 @@ from graphvio.optimization.solver import Marginals
 from graphvio.rig import Imu
 from graphvio.simulation import default_rig
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 IMU = Imu()
 CONFIG = Config()
@@ -288,7 +289,7 @@ def test_an_imu_that_is_found_wrong_does_not_bend_the_trajectory(room_walk: Path
     assert record.is_start.sum() == 2
     found = optimize([record], [source.rig.imu], [], CONFIG)
     assert source.truth is not None
-    truth = Trajectory.read(source.truth)
+    truth = load_trajectory(source.truth)
     before, after = (
         evaluate(Trajectory(record.stamps_ns, poses), truth).ate_position_m.rmse
         for poses in (record.online, found.sessions[0].nav_T_body)

@@ -24,8 +24,9 @@ from graphvio.config import Config
 from graphvio.errors import MissingExtraError, OptimizationError
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.optimization.pipeline import optimize_sessions
-from graphvio.rig import Rig
+from graphvio.rig_files import load_rig, save_rig
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 pycolmap: Any = pytest.importorskip("pycolmap", reason="loop closure needs the extra maps")
 pytestmark = pytest.mark.heavy
@@ -78,7 +79,7 @@ def test_the_result_is_better_than_online(done: Path) -> None:
     assert summary["cost"]["after"] < summary["cost"]["before"]
     for name in (*ALWAYS_EQUAL, "report.html", "database.db", "colmap/sparse/0/points3D.bin"):
         assert (done / name).stat().st_size > 100, name
-    trajectory = Trajectory.read(done / "trajectory_optimized.txt")
+    trajectory = load_trajectory(done / "trajectory_optimized.txt")
     assert len(trajectory) == session["framesets"]
 
 
@@ -126,13 +127,13 @@ def test_files_that_are_gone_are_made_again(done: Path, walk: Path, settings: Pa
 
 def test_the_calibration_is_refined_and_used_for_the_map(walk: Path, settings: Path, tmp_path: Path) -> None:
     rig = open_source(walk).rig
-    with_wrong_place(rig, 1.0, 0.03).save(tmp_path / "wrong.yaml")
+    save_rig(with_wrong_place(rig, 1.0, 0.03), tmp_path / "wrong.yaml")
     out = tmp_path / "walk"
     refined = command(
         walk, "--config", settings, "--rig", tmp_path / "wrong.yaml", "--refine-calibration", "--out", out
     )
     assert refined.exit_code == 0, refined.output
-    found = Rig.load(out / "walk" / "rig_optimized.yaml")
+    found = load_rig(out / "walk" / "rig_optimized.yaml")
     error = se3_log(se3_inverse(rig.left2_T_left1()) @ found.left2_T_left1())
     assert np.rad2deg(np.linalg.norm(error[:3])) < 0.2
     assert np.linalg.norm(error[3:]) < 0.5 * 0.03

@@ -17,7 +17,7 @@ from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.sensors import Measurement
 from graphvio.rig import Rig
 from graphvio.simulation import Simulator, build_scene, write_recording
-from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 pytestmark = pytest.mark.heavy
 
@@ -102,7 +102,7 @@ def outcome(
     stamps = [e.stamp_ns for e in estimates]
     assert stamps == sorted(set(stamps))  # time never goes back
     assert source.truth is not None
-    truth = Trajectory.read(source.truth)
+    truth = load_trajectory(source.truth)
     poses = dict(zip(truth.stamps_ns.tolist(), truth.nav_T_body, strict=True))
     given = sum(isinstance(measurement, FrameSet) for measurement in measurements)
     return Outcome(estimates, given, [i.kind for i in odometry.take_events()], poses, source.start_ns)

@@ -20,7 +20,7 @@ from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Imu
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.tables import read_imu_csv
-from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 FOLDER = REAL_DATA / "euroc_v101_imu" / "mav0"
 STEP_NS, STEPS = 50_000_000, 800
@@ -49,7 +49,7 @@ class Beginning:
     def read(more_bias: Float) -> Beginning:
         """Read it, and add so much (3,) rad/s to what the gyro measured."""
         path = FOLDER / "state_groundtruth_estimate0" / "data.csv"
-        truth = Trajectory.read(path)
+        truth = load_trajectory(path)
         stamps = truth.stamps_ns[0] + np.arange(STEPS + 1) * STEP_NS
         poses, known = truth.at(stamps, 0.05)
         assert known.all()

@@ -14,7 +14,9 @@ from graphvio.measurements.events import Event
 from graphvio.measurements.motion import PairReport
 from graphvio.results import PairMedians, ResultWriter, Summary
 from graphvio.rig import Camera, Imu, Rig, StereoPair
+from graphvio.rig_files import load_rig
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory, save_trajectory
 from graphvio.version import __version__
 
 START_NS = 1_403_636_579_763_555_584
@@ -66,7 +68,7 @@ def estimates() -> list[Estimate]:
 
 def written(truth: Trajectory, folder: Path) -> Path:
     path = folder.with_name(f"{folder.name}-truth.txt")
-    truth.write(path)
+    save_trajectory(truth, path)
     return path
 
 
@@ -114,16 +116,16 @@ def test_folder_holds_what_was_promised(folder: Path) -> None:
         "trajectory_smoothed.txt",
     ]
     assert (folder / "config.yaml").read_text() == "profile: balanced\n"
-    assert Rig.load(folder / "rig.yaml").pairs[0].baseline_m == pytest.approx(0.1)
+    assert load_rig(folder / "rig.yaml").pairs[0].baseline_m == pytest.approx(0.1)
 
 
 def test_trajectory_has_one_line_for_each_pose(folder: Path) -> None:
     lines = (folder / "trajectory.txt").read_text().splitlines()
     assert len(lines) == COUNT - len(LOST)
     assert lines[1].startswith("1403636579.813555584 0.100000000 ")
-    read = Trajectory.read(folder / "trajectory.txt")
+    read = load_trajectory(folder / "trajectory.txt")
     np.testing.assert_allclose(read.nav_T_body[20], pose(20), atol=1e-8)
-    assert len(Trajectory.read(folder / "trajectory_smoothed.txt")) == 2
+    assert len(load_trajectory(folder / "trajectory_smoothed.txt")) == 2
 
 
 def test_covariance_is_the_upper_triangle_row_by_row(folder: Path) -> None:

@@ -25,7 +25,7 @@ from recordings import (
 from graphvio.errors import RigError
 from graphvio.geometry import se3, se3_exp, se3_inverse
 from graphvio.rig import Camera, Imu, Rig, StereoPair
-from graphvio.rig_files import find_rig, load_rig
+from graphvio.rig_files import find_rig, load_rig, save_rig
 
 
 def assert_same(a: Rig, b: Rig) -> None:
@@ -46,7 +46,7 @@ def assert_same(a: Rig, b: Rig) -> None:
 def edited(tmp_path: Path, edit: Callable[[dict], None], pairs: int = 1) -> Path:  # type: ignore[type-arg]
     """A rig.yaml of a small rig after a change."""
     path = tmp_path / "rig.yaml"
-    small_rig(pairs).save(path)
+    save_rig(small_rig(pairs), path)
     document = yaml.safe_load(path.read_text())
     edit(document)
     path.write_text(yaml.safe_dump(document))
@@ -57,8 +57,8 @@ def edited(tmp_path: Path, edit: Callable[[dict], None], pairs: int = 1) -> Path
 @pytest.mark.parametrize("imu", [True, False])
 def test_round_trip(tmp_path: Path, pairs: int, imu: bool) -> None:
     rig = small_rig(pairs, imu)
-    rig.save(tmp_path / "rig.yaml")
-    loaded = Rig.load(tmp_path / "rig.yaml")
+    save_rig(rig, tmp_path / "rig.yaml")
+    loaded = load_rig(tmp_path / "rig.yaml")
     assert loaded.name == rig.name
     assert_same(rig, loaded)
 
@@ -91,7 +91,7 @@ def test_round_trip_of_any_values(
         for side, pose in (("l", body_T_left), ("r", body_T_right))
     )
     rig = Rig((StereoPair(name, left, right),), Imu(*[*numbers, offset_s]), name)
-    rig.save(path)
+    save_rig(rig, path)
     assert_same(rig, load_rig(path))
 
 
@@ -109,7 +109,7 @@ def test_mask_is_kept_relative_to_the_file(tmp_path: Path) -> None:
     path = edited(tmp_path, lambda d: d["pairs"][0]["left"].update(mask="masks/cam0.png"))
     rig = load_rig(path)
     assert rig.pairs[0].left.mask == tmp_path.resolve() / "masks" / "cam0.png"
-    rig.save(tmp_path / "again.yaml")
+    save_rig(rig, tmp_path / "again.yaml")
     assert 'mask: "masks/cam0.png"' in (tmp_path / "again.yaml").read_text()
     assert_same(rig, load_rig(tmp_path / "again.yaml"))
 
@@ -221,7 +221,7 @@ def test_missing_paths(tmp_path: Path) -> None:
     with pytest.raises(RigError, match="holds no calibration"):
         load_rig(tmp_path)
     with pytest.raises(RigError, match="cannot be written"):
-        small_rig().save(tmp_path / "none" / "rig.yaml")
+        save_rig(small_rig(), tmp_path / "none" / "rig.yaml")
 
 
 def test_euroc_folder(tmp_path: Path) -> None:
@@ -239,7 +239,7 @@ def test_euroc_folder(tmp_path: Path) -> None:
 
 def test_rig_yaml_in_the_folder_takes_precedence(tmp_path: Path) -> None:
     write_euroc(tmp_path, frames=1)
-    small_rig(1).save(tmp_path / "rig.yaml")
+    save_rig(small_rig(1), tmp_path / "rig.yaml")
     assert len(load_rig(tmp_path).pairs) == 1
     assert len(load_rig(tmp_path / "mav0").pairs) == 1
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from graphvio.cli.simulate import simulate as simulate_command
 from graphvio.errors import SourceError
-from graphvio.rig import Rig
+from graphvio.rig_files import load_rig
 from graphvio.simulation import SimulatedRecording, make_simulator, simulate
 
 DURATION_S = 0.5
@@ -88,7 +88,7 @@ def test_same_seed_same_bytes_on_any_number_of_threads(
 @pytest.mark.parametrize("where", ["rig.yaml", "mav0/cam0/sensor.yaml"])
 def test_rig_is_read_back(recording: SimulatedRecording, where: str) -> None:
     expected = make_simulator(SCENE, duration_s=DURATION_S).rig
-    rig = Rig.load(recording.path / where)
+    rig = load_rig(recording.path / where)
     assert len(rig.pairs) == 2
     assert rig.imu == expected.imu
     for a, b in zip(rig.cameras, expected.cameras, strict=True):

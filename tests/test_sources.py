@@ -31,6 +31,7 @@ from recordings import (
 )
 
 from graphvio import FrameSet, ImuSample, RigError, SourceError, open_source
+from graphvio.rig_files import save_rig
 from graphvio.sources import Source
 from graphvio.sources.read_ahead import read_ahead
 
@@ -494,7 +495,7 @@ def test_stamps_within_tolerance_belong_together(walk: Path) -> None:
 def test_time_offset_moves_the_frames(tmp_path: Path) -> None:
     write_euroc(tmp_path, pairs=1)
     rig_file = tmp_path / "rig.yaml"
-    small_rig(1).save(rig_file)
+    save_rig(small_rig(1), rig_file)
     rig_file.write_text(rig_file.read_text().replace("time_offset_s: 0.0", "time_offset_s: 0.02"))
     latest = 0
     for measurement in open_source(tmp_path):

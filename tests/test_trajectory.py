@@ -5,7 +5,8 @@ import pytest
 
 from graphvio.errors import TrajectoryError
 from graphvio.geometry import se3, so3_exp
-from graphvio.trajectory import Trajectory, stamp_ns_from_seconds, tum_line
+from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory, save_trajectory, stamp_ns_from_seconds, tum_line
 
 START_NS = 1_403_636_579_763_555_584
 
@@ -17,8 +18,8 @@ def some_trajectory(count: int = 20) -> Trajectory:
 
 def test_what_is_written_is_read_to_the_nanosecond(tmp_path: Path) -> None:
     written = some_trajectory()
-    written.write(tmp_path / "t.txt")
-    read = Trajectory.read(tmp_path / "t.txt")
+    save_trajectory(written, tmp_path / "t.txt")
+    read = load_trajectory(tmp_path / "t.txt")
     assert np.array_equal(read.stamps_ns, written.stamps_ns)
     np.testing.assert_allclose(read.nav_T_body, written.nav_T_body, atol=3e-9)
 
@@ -58,7 +59,7 @@ def test_euroc_has_the_scalar_part_first(tmp_path: Path) -> None:
         "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v\n"
         f"{START_NS},1.0,2.0,3.0,0.8,0.0,0.0,0.6,9,9,9\n{START_NS + 5},1,2,3,1,0,0,0,9,9,9\n"
     )
-    read = Trajectory.read(file)
+    read = load_trajectory(file)
     assert read.stamps_ns.tolist() == [START_NS, START_NS + 5]
     np.testing.assert_allclose(read.rotations[0] @ [1, 0, 0], [0.28, 0.96, 0.0], atol=1e-12)
     np.testing.assert_allclose(read.positions[0], [1, 2, 3])
@@ -67,7 +68,7 @@ def test_euroc_has_the_scalar_part_first(tmp_path: Path) -> None:
 def test_commas_with_stamps_in_seconds_are_tum(tmp_path: Path) -> None:
     file = tmp_path / "device.csv"
     file.write_text("12.5, 1, 2, 3, 0, 0, 0.6, 0.8\n12.5, 1, 2, 3, 0, 0, 0.6, 0.8\n12.53, 1, 2, 4, 0, 0, 0, 1\n")
-    read = Trajectory.read(file)
+    read = load_trajectory(file)
     assert read.stamps_ns.tolist() == [12_500_000_000, 12_530_000_000]  # a pose that was logged twice is one
     np.testing.assert_allclose(read.rotations[0] @ [1, 0, 0], [0.28, 0.96, 0.0], atol=1e-12)
 
@@ -75,7 +76,7 @@ def test_commas_with_stamps_in_seconds_are_tum(tmp_path: Path) -> None:
 def test_header_without_comment_sign_is_skipped(tmp_path: Path) -> None:
     file = tmp_path / "t.csv"
     file.write_text("stamp_ns,x,y,z,qw,qx,qy,qz\n5,1,2,3,1,0,0,0\n")
-    assert Trajectory.read(file).stamps_ns.tolist() == [5]
+    assert load_trajectory(file).stamps_ns.tolist() == [5]
 
 
 @pytest.mark.parametrize(
@@ -98,7 +99,7 @@ def test_unusable_files_are_refused_with_the_place(tmp_path: Path, text: str, me
     file = tmp_path / "bad.txt"
     file.write_text(text)
     with pytest.raises(TrajectoryError, match=message) as caught:
-        Trajectory.read(file)
+        load_trajectory(file)
     assert str(file) in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -106,11 +107,11 @@ def test_unusable_files_are_refused_with_the_place(tmp_path: Path, text: str, me
 def test_missing_and_binary_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "binary").write_bytes(bytes(range(128, 256)))
     with pytest.raises(TrajectoryError, match="not a text file"):
-        Trajectory.read(tmp_path / "binary")
+        load_trajectory(tmp_path / "binary")
     with pytest.raises(TrajectoryError, match="cannot be read"):
-        Trajectory.read(tmp_path / "absent.txt")
+        load_trajectory(tmp_path / "absent.txt")
     with pytest.raises(TrajectoryError, match="cannot be written"):
-        some_trajectory().write(tmp_path / "no" / "folder.txt")
+        save_trajectory(some_trajectory(), tmp_path / "no" / "folder.txt")
 
 
 def test_poses_that_are_none_are_refused() -> None:

@@ -17,7 +17,9 @@ from graphvio.measurements.events import Event
 from graphvio.measurements.motion import PairReport
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Camera, Imu, Rig, StereoPair
+from graphvio.rig_files import save_rig
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import save_trajectory
 from graphvio.viewer import Viewer
 
 pytest.importorskip("rerun")
@@ -283,8 +285,10 @@ def test_view_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
-    some_rig().save(tmp_path / "rig.yaml")
-    Trajectory(np.array([1, 2]), np.array([np.eye(4)] * 2)).write(tmp_path / "trajectory.txt")  # a broken-off run
+    save_rig(some_rig(), tmp_path / "rig.yaml")
+    save_trajectory(
+        Trajectory(np.array([1, 2]), np.array([np.eye(4)] * 2)), tmp_path / "trajectory.txt"
+    )  # a broken-off run
     assert code_of(str(tmp_path), "--save-rrd", str(tmp_path / "out.rrd")) == 0
     assert rows_of(tmp_path / "out.rrd")["/world/rig"] == 2
     assert code_of(str(tmp_path)) == 2

@@ -66,6 +66,7 @@ def calibrate(
     from graphvio.cli.run import open_recording
     from graphvio.config import Config
     from graphvio.errors import CalibrationError
+    from graphvio.rig_files import save_rig
     from graphvio.warmup import warm_up
 
     _check_places(out, report, [] if rig is None else [rig])
@@ -83,7 +84,7 @@ def calibrate(
         numbers = out.with_suffix(".calibration.yaml")
         write_document(found, numbers)
         if found.is_complete:
-            found.calibrated_rig(correct_imu).save(out)
+            save_rig(found.calibrated_rig(correct_imu), out)
             typer.echo(f"wrote {out}, and all numbers to {numbers}")
         else:
             typer.echo(f"graphvio: {out} is not written, only {numbers}: the motions tell a part only", err=True)
@@ -116,11 +117,11 @@ def calibrate_trajectories(
     """
     from graphvio.calibration.calibrate import calibrate_trajectories as calibrate_all
     from graphvio.calibration.report.document import write_document
-    from graphvio.trajectory import Trajectory
+    from graphvio.trajectory_files import load_trajectory
 
     mode = _scale_mode(scale)
     _check_places(out, report, trajectories)
-    read = [Trajectory.read(path) for path in trajectories]
+    read = [load_trajectory(path) for path in trajectories]
     names = _names(trajectories)
     with _working("relating clocks, motions and cameras"):
         found = calibrate_all(read, names, same_clock=same_clock, seed=seed, scale_mode=mode)

@@ -48,12 +48,12 @@ def compare(
 
     from graphvio.errors import GraphvioError
     from graphvio.evaluation.comparison import compare as compare_all
-    from graphvio.trajectory import Trajectory
+    from graphvio.trajectory_files import load_trajectory
 
-    names, trajectories = _names(results), [Trajectory.read(_file(path, smoothed)) for path in results]
+    names, trajectories = _names(results), [load_trajectory(_file(path, smoothed)) for path in results]
     if truth is None and len(results) < 2:
         raise GraphvioError("one result and no truth: there is nothing to compare; give --truth FILE or more results")
-    reference = Trajectory.read(truth) if truth is not None else trajectories[0]
+    reference = load_trajectory(truth) if truth is not None else trajectories[0]
     rest = slice(0 if truth is not None else 1, None)
     compared = compare_all(names[rest], trajectories[rest], reference)
     Console(soft_wrap=True).print(_table(compared))

@@ -43,9 +43,9 @@ def evaluate(
 
     from graphvio.errors import GraphvioError
     from graphvio.evaluation import evaluate as measure
-    from graphvio.trajectory import Trajectory
+    from graphvio.trajectory_files import load_trajectory
 
-    figures = measure(Trajectory.read(trajectory), Trajectory.read(truth), max_gap_s=max_gap)
+    figures = measure(load_trajectory(trajectory), load_trajectory(truth), max_gap_s=max_gap)
     Console().print(_table(figures))
     if json_file is not None:
         try:

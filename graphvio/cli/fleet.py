@@ -74,7 +74,7 @@ def optimize(
     from graphvio.fleet.listing import list_sessions
     from graphvio.fleet.run import optimize_fleet
     from graphvio.optimization.loops.database import colmap
-    from graphvio.rig import Rig
+    from graphvio.rig_files import load_rig
 
     if scheduler is not None and workers is not None:
         raise FleetError("--workers is for this machine, and --scheduler has its own: give one of them")
@@ -82,7 +82,7 @@ def optimize(
     if not no_loops:
         colmap()
     settings = Config.load(config)
-    loaded = None if rig is None else Rig.load(rig)
+    loaded = None if rig is None else load_rig(rig)
     listed = list_sessions(sessions)
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is told below
     try:

@@ -89,7 +89,7 @@ def run_live(
     from graphvio.live.session_recorder import SessionRecorder
     from graphvio.live.sources import open_live_source
     from graphvio.live.view_output import ViewOutput
-    from graphvio.rig import Rig
+    from graphvio.rig_files import load_rig
     from graphvio.warmup import warm_up
 
     if duration_s is not None and not duration_s > 0.0:
@@ -102,7 +102,7 @@ def run_live(
     settings = Config.load(config)
     if services is not None:
         settings = services.settings(settings)
-    opened = open_live_source(source, None if rig is None else Rig.load(rig))
+    opened = open_live_source(source, None if rig is None else load_rig(rig))
     recorder: SessionRecorder | None = None
     if services is not None:
         services.check()

@@ -116,12 +116,12 @@ def convert(
 def _truth(opened: Source, is_whole: bool) -> Trajectory | None:
     """The true trajectory of what is converted; one that cannot be read is told, and left out."""
     from graphvio.errors import TrajectoryError
-    from graphvio.trajectory import Trajectory
+    from graphvio.trajectory_files import load_trajectory
 
     if opened.truth is None:
         return None
     try:
-        truth = Trajectory.read(opened.truth)
+        truth = load_trajectory(opened.truth)
     except TrajectoryError as error:
         typer.echo(f"graphvio: the true trajectory is left out: {error}", err=True)
         return None

@@ -98,11 +98,11 @@ def open_recording(
     topics: str | None = None,
 ) -> Source:
     """A recording as the options of a command ask for it."""
-    from graphvio.rig import Rig
+    from graphvio.rig_files import load_rig
     from graphvio.sources import open_source
 
     tolerance_ms = settings.timing.simultaneous_ms
-    loaded = None if rig is None else Rig.load(rig)
+    loaded = None if rig is None else load_rig(rig)
     mapped = _topics(topics)
     opened = open_source(source, loaded, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
     chosen = _choose(opened.rig, pairs, no_imu)

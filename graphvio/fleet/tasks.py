@@ -30,7 +30,7 @@ from graphvio.optimization.workspace import digest
 from graphvio.rig import Rig
 from graphvio.rig_files.native import to_text
 from graphvio.sources import Source, open_source
-from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 from graphvio.version import __version__
 
 ODOMETRY, LOOPS, GRAPH = "odometry", "loops", "graph"
@@ -262,6 +262,6 @@ def _ate_m(trajectory: Path, truth: Path | None) -> float | None:
     if truth is None:
         return None
     try:
-        return evaluate(Trajectory.read(trajectory), Trajectory.read(truth)).ate_position_m.rmse
+        return evaluate(load_trajectory(trajectory), load_trajectory(truth)).ate_position_m.rmse
     except TrajectoryError:
         return None

@@ -12,6 +12,7 @@ from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
 from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import save_trajectory
 
 
 class PathOutput:
@@ -54,4 +55,4 @@ class PathOutput:
         for name, poses in (("odometry.txt", self._odom), ("online.txt", self._map)):
             if poses:
                 stamps = np.array([stamp for stamp, _ in poses], dtype=np.int64)
-                Trajectory(stamps, np.array([pose for _, pose in poses])).write(folder / name)
+                save_trajectory(Trajectory(stamps, np.array([pose for _, pose in poses])), folder / name)

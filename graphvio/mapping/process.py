@@ -20,6 +20,7 @@ from graphvio.optimization.loops.database import colmap
 from graphvio.slam.client import Client
 from graphvio.slam.keyframe import Keyframe
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import save_trajectory
 from graphvio.viewer import Viewer, WebOptions
 from graphvio.warmup import warm_up
 
@@ -111,7 +112,7 @@ def told(mapper: Mapper) -> str:
 
 def _save(mapper: Mapper, out: Path) -> None:
     mapper.save(out)
-    mapper.trajectory.write(out / "trajectory.txt")
+    save_trajectory(mapper.trajectory, out / "trajectory.txt")
 
 
 def _rescued(mapper: Mapper, out: Path | None) -> str:

@@ -22,6 +22,7 @@ from graphvio.errors import GraphvioError, MapError
 from graphvio.mapping.store import DATABASE, PlaceStore, copy_database
 from graphvio.optimization.loops.closures import LoopClosure, closures_to_bytes, load_closures
 from graphvio.rig import Rig
+from graphvio.rig_files import load_rig, save_rig
 from graphvio.rig_files.same import difference, without_masks
 from graphvio.version import __version__
 
@@ -122,7 +123,7 @@ def load(folder: Path, rig: Rig) -> SavedMap:
     """
     header = _header(folder)
     try:
-        other = Rig.load(folder / _RIG)
+        other = load_rig(folder / _RIG)
     except GraphvioError as error:
         raise MapError(f"{folder}: the map's rig cannot be read ({error}); restore the folder") from None
     differs = difference(rig, other)
@@ -169,7 +170,7 @@ def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
     columns["vectors"] = kept.vectors.astype(np.float16)  # their ranking does not need more
     np.savez(folder / _PLACES, **columns)
     (folder / _CLOSURES).write_bytes(closures_to_bytes(kept.closures))
-    without_masks(rig).save(folder / _RIG)
+    save_rig(without_masks(rig), folder / _RIG)
     header = {
         "format": FORMAT,
         "version": VERSION,

@@ -16,7 +16,7 @@ from graphvio.geometry import se3_inverse
 from graphvio.optimization.graph import poses_of
 from graphvio.optimization.optimize import Optimization, OptimizedSession
 from graphvio.optimization.solver import Edge, Marginals
-from graphvio.trajectory import tum_line
+from graphvio.trajectory_files import tum_line
 
 _TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
 _UPPER = np.triu_indices(6)

@@ -27,6 +27,7 @@ from graphvio.rig import Rig
 from graphvio.rig_files.native import to_text
 from graphvio.sources import Source
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 from graphvio.version import __version__
 
 DATABASE = "database.db"
@@ -240,7 +241,7 @@ def _identity(source: Source) -> str:
 def _truth(source: Source) -> Trajectory | None:
     """The true trajectory of a recording that carries a usable one."""
     try:
-        return None if source.truth is None else Trajectory.read(source.truth)
+        return None if source.truth is None else load_trajectory(source.truth)
     except TrajectoryError:
         return None  # the odometry's own summary says why
 

@@ -31,7 +31,9 @@ from graphvio.measurements.motion import PairReport
 from graphvio.results.plotting import draw_run
 from graphvio.results.summary import PairMedians, Percentiles, Summary, epoch_intervals, path_length
 from graphvio.rig import Rig
-from graphvio.trajectory import Trajectory, tum_line
+from graphvio.rig_files import save_rig
+from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory, tum_line
 from graphvio.version import __version__
 
 _TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -99,7 +101,7 @@ class ResultWriter:
                     f"{self.folder}: is not empty, and results are never overwritten; name another folder"
                 )
             (self.folder / "config.yaml").write_text(config_yaml, encoding="utf-8")
-            rig.save(self.folder / "rig.yaml")
+            save_rig(rig, self.folder / "rig.yaml")
             for name, header in (
                 ("trajectory.txt", ""),
                 ("covariance.csv", _COVARIANCE_HEADER),
@@ -305,7 +307,7 @@ def _evaluate_if_possible(
         return None, None, None
     read = None
     try:
-        read = Trajectory.read(truth)
+        read = load_trajectory(truth)
         return read, evaluate(trajectory, read), None
     except TrajectoryError as error:
         return read, None, str(error)

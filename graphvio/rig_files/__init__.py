@@ -16,7 +16,7 @@ _KNOWN = (
 )
 
 
-def load_rig(path: Path) -> Rig:
+def load_rig(path: str | Path) -> Rig:
     """Read a rig from a calibration file, or from the folder of a recording that carries one.
 
     Args:
@@ -26,6 +26,7 @@ def load_rig(path: Path) -> Rig:
     Raises:
         RigError: if there is no such file, it cannot be read, or it describes no usable rig.
     """
+    path = Path(path)
     try:
         return _load(path)
     except OSError as error:
@@ -83,10 +84,10 @@ def find_rig(folder: Path) -> Rig | None:
     return kalibr.load((with_imu or chains)[0]) if chains else None
 
 
-def save_rig(rig: Rig, path: Path) -> None:
+def save_rig(rig: Rig, path: str | Path) -> None:
     """Write graphvio's own ``rig.yaml``.
 
     Raises:
         RigError: if the file cannot be written.
     """
-    native.save(rig, path)
+    native.save(rig, Path(path))

@@ -16,6 +16,7 @@ from graphvio.errors import RigError
 from graphvio.geometry import quat_wxyz_from_rotation
 from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.rig import Rig
+from graphvio.rig_files import save_rig
 from graphvio.rig_files.native import FILE_NAME
 from graphvio.sessions import euroc_layout
 from graphvio.sessions.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
@@ -100,7 +101,7 @@ class EurocWriter:
     def _begin(self) -> None:
         self._mav0.mkdir(parents=True)
         try:
-            self.rig.save(self.path / FILE_NAME)
+            save_rig(self.rig, self.path / FILE_NAME)
         except RigError as error:
             raise OSError(None, str(error)) from None
         for camera in self.rig.cameras:

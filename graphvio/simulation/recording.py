@@ -14,6 +14,7 @@ import numpy as np
 from graphvio.arrays import Float, Image
 from graphvio.errors import SourceError
 from graphvio.geometry import quat_wxyz_from_rotation
+from graphvio.rig_files import save_rig
 from graphvio.sessions import euroc_layout
 from graphvio.sessions.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
 from graphvio.simulation.simulator import Simulator, make_simulator
@@ -100,7 +101,7 @@ def write_recording(simulator: Simulator, out: Path, progress: Progress | None =
     stamps = simulator.stamps_ns
     _write_sensors(simulator, mav0)
     _write_inertial(simulator, mav0)
-    simulator.rig.save(out / "rig.yaml")
+    save_rig(simulator.rig, out / "rig.yaml")
 
     def write(index: int) -> None:
         surfaces = simulator.surfaces(index)

@@ -45,7 +45,7 @@ class Source(Protocol):
 
     @property
     def truth(self) -> Path | None:
-        """Where `Trajectory.read` finds the true trajectory, if the recording carries one: a file, or a session."""
+        """Where `load_trajectory` finds the true trajectory, if the recording carries one: a file, or a session."""
 
     @property
     def decode_ms(self) -> Sequence[float]:

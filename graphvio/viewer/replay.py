@@ -13,8 +13,8 @@ from graphvio.arrays import Float
 from graphvio.errors import GraphvioError
 from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.events import Event
-from graphvio.rig import Rig
-from graphvio.trajectory import Trajectory
+from graphvio.rig_files import load_rig
+from graphvio.trajectory_files import load_trajectory
 from graphvio.viewer import Viewer
 
 _SMOOTHED_COLOUR = (40, 190, 90)
@@ -34,7 +34,7 @@ def replay(folder: Path, *, spawn: bool = False, save: Path | None = None) -> No
     """
     if not (folder / "trajectory.txt").is_file():
         raise GraphvioError(f"{folder}: holds no trajectory.txt; give a folder that  graphvio run  has written")
-    rig = Rig.load(folder / "rig.yaml")
+    rig = load_rig(folder / "rig.yaml")
     estimates, events = list(read_estimates(folder)), list(_read_events(folder / "events.jsonl"))
     smoothed = folder / "trajectory_smoothed.txt"
     with Viewer(rig, spawn=spawn, save=save) as viewer:
@@ -43,7 +43,7 @@ def replay(folder: Path, *, spawn: bool = False, save: Path | None = None) -> No
         for event in events:
             viewer.show_event(event)
         if smoothed.is_file() and smoothed.stat().st_size:
-            viewer.show_path("smoothed", Trajectory.read(smoothed), _SMOOTHED_COLOUR)
+            viewer.show_path("smoothed", load_trajectory(smoothed), _SMOOTHED_COLOUR)
 
 
 def read_estimates(folder: Path) -> Iterator[Estimate]:
@@ -52,7 +52,7 @@ def read_estimates(folder: Path) -> Iterator[Estimate]:
     Raises:
         GraphvioError: if a file is damaged.
     """
-    trajectory = Trajectory.read(folder / "trajectory.txt")
+    trajectory = load_trajectory(folder / "trajectory.txt")
     covariances = {stamp: _symmetric(upper) for stamp, upper in _read_rows(folder / "covariance.csv", 21)}
     biases = dict(_read_rows(folder / "imu_bias.csv", 6))
     epochs = _read_epochs(folder / "summary.json")

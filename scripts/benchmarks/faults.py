@@ -27,7 +27,7 @@ from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.measurements.motion import Quality
 from graphvio.sources import open_source
-from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 from graphvio.warmup import warm_up
 
 AIM_SHARE = 0.001
@@ -106,7 +106,7 @@ def run_case(task: Task) -> dict[bool, Outcome]:
         source = open_source(_folder(task), source.rig.with_pairs(task.pairs))
     if source.truth is None:
         raise GraphvioError(f"{source.name}: has no truth")
-    trajectory = Trajectory.read(source.truth)
+    trajectory = load_trajectory(source.truth)
     truth = dict(zip(trajectory.stamps_ns.tolist(), trajectory.nav_T_body, strict=True))
     warm_up(source.rig, task.config)
     runs = {with_imu: Run(source.rig, task.config, with_imu=with_imu) for with_imu in _MODES}

@@ -22,6 +22,7 @@ from graphvio.optimization.pipeline import Session, optimize_sessions
 from graphvio.optimization.report.measures import loop_errors
 from graphvio.sources import open_source
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 from graphvio.warmup import warm_up
 
 AIM_CLOSURE_M, AIM_ATE = 0.05, 2.0
@@ -134,7 +135,7 @@ def optimized(folder: Path, name: str, out: Path, pairs: tuple[int, ...] | None 
     session = Session(source.name, source)
     found = optimize_sessions([source], out, config, on_progress=lambda what, *_: note(_stage(what)))
     note("map")  # and the report
-    made = Optimized(out, session, Trajectory.read(source.truth), found, spent)
+    made = Optimized(out, session, load_trajectory(source.truth), found, spent)
     tell(
         f"  {name}: {sum(spent.values()):.0f} s, {int(made.used.sum())} of {len(made.used)} closures used, ATE "
         f"{100 * made.ates_m()[-1]:.2f} cm"

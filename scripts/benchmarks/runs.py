@@ -24,6 +24,7 @@ from graphvio.odometry import Odometry
 from graphvio.rig import Rig, StereoPair
 from graphvio.sources import open_source
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 from graphvio.warmup import warm_up
 
 _BLOCK = 40
@@ -130,7 +131,7 @@ def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, n
     source = open_source(recording, rig)
     if source.truth is None:
         raise GraphvioError(f"{recording}: holds no true trajectory; accuracy cannot be told without")
-    truth = Trajectory.read(source.truth)
+    truth = load_trajectory(source.truth)
     warm_up(source.rig, config)
     cv2.setNumThreads(-1)  # as in a new process; the odometry then sets what it wants
     odometry = Odometry(source.rig, config)

@@ -25,6 +25,7 @@ from graphvio.evaluation.measures import align
 from graphvio.geometry import se3_inverse
 from graphvio.sources import open_source
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 _SCENE = "loop"
 _STARTS_S = (8.0, 30.0, 50.0)
@@ -78,7 +79,7 @@ def _errors(folder: Path, out: Path) -> list[list[str]]:
     """As ``graphvio evaluate`` has them."""
     rows: list[list[str]] = [["ATE, rmse"], ["drift: the end's error where the start is aligned"]]
     for name in ("odometry.txt", "online.txt", "trajectory.txt"):
-        found = evaluate(Trajectory.read(out / name), _truth(folder))
+        found = evaluate(load_trajectory(out / name), _truth(folder))
         rows[0].append(f"{1e3 * found.ate_position_m.rmse:.1f}")
         rows[1].append(f"{10.0 * (found.drift_percent or np.nan) * found.path_length_m:.2f}")
     return rows
@@ -87,7 +88,7 @@ def _errors(folder: Path, out: Path) -> list[list[str]]:
 def _truth(folder: Path) -> Trajectory:
     path = open_source(folder).truth
     assert path is not None
-    return Trajectory.read(path)
+    return load_trajectory(path)
 
 
 def _truth_T(found: Trajectory, truth: Trajectory) -> Float:
@@ -104,7 +105,7 @@ def _off(found: Trajectory, truth: Trajectory, truth_T_map: Float) -> Float:
 
 def _smoothness(folder: Path, out: Path) -> str:
     """Largest step of odom between framesets, and the largest by which one differs from the true step."""
-    odom = Trajectory.read(out / "odometry.txt")
+    odom = load_trajectory(out / "odometry.txt")
     true, known = _truth(folder).at(odom.stamps_ns, _GAP_S)
     measured, expected = _steps(odom.select(known)), _steps(true)
     longest = [1e3 * float(np.linalg.norm(steps, axis=1).max()) for steps in (measured, expected)]
@@ -124,7 +125,7 @@ def _relocalised(folder: Path, out: Path, again: Path, start_s: float) -> list[s
     truth, begun_ns = _truth(folder), open_source(folder).start_ns
     if not (again / "online.txt").exists():
         return [f"{start_s:g}", "never", "-", "-"]
-    online = Trajectory.read(again / "online.txt")
-    errors = 1e3 * _off(online, truth, _truth_T(Trajectory.read(out / "trajectory.txt"), truth))
+    online = load_trajectory(again / "online.txt")
+    errors = 1e3 * _off(online, truth, _truth_T(load_trajectory(out / "trajectory.txt"), truth))
     found_s = 1e-9 * (int(online.stamps_ns[0]) - begun_ns) - start_s
     return [f"{start_s:g}", f"{found_s:.1f}", f"{errors[0]:.1f}", f"{errors[-1]:.1f}"]

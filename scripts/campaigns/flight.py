@@ -15,7 +15,7 @@ from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.sensors import ImuSample
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.tables import ImuTable, read_imu_csv
-from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 FRAMES_HZ = 20
 STEP_NS = 1_000_000_000 // FRAMES_HZ
@@ -65,7 +65,7 @@ class Flight:
             raise GraphvioError(f"{folder}: there is no such folder; give that of EuRoC's V1_01 with --recording")
         table = read_imu_csv(folder / "mav0" / "imu0" / "data.csv", FaultLog(folder.name))
         path = folder / "mav0" / "state_groundtruth_estimate0" / "data.csv"
-        truth = Trajectory.read(path)
+        truth = load_trajectory(path)
         columns = _bias_columns(path, len(truth))
         first = max(truth.stamps_ns[0], table.stamps_ns[0])
         stamps = np.arange(first, min(truth.stamps_ns[-1], table.stamps_ns[-1]) + 1, STEP_NS)

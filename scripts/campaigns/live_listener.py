@@ -11,7 +11,7 @@ from graphvio.arrays import Float
 from graphvio.geometry import se3_inverse
 from graphvio.live.running import LiveOdometry
 from graphvio.sources import open_source
-from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 _STAGES = ("predict", "track", "motion", "judge", "renew", "update")
 
@@ -43,7 +43,7 @@ class Listener:
         self._first_ns: int | None = None
         self._last_ns: int | None = None
         self._start_ns, self._end_ns = source.start_ns, source.end_ns
-        self._truth = Trajectory.read(source.truth)
+        self._truth = load_trajectory(source.truth)
         self._nav_T_world: Float | None = None
         self._estimates = running.estimates.subscribe(256)
         self.thread = threading.Thread(target=self._listen, daemon=True)

@@ -26,6 +26,7 @@ from graphvio.mapping.mapper import Mapper
 from graphvio.sources import open_source
 from graphvio.sources.base import Source
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 _SCENE = "loop"
 _STEP = 5  # framesets from keyframe to keyframe: four a second
@@ -107,7 +108,7 @@ class _Run:
 def _run(source: Source, draw: int, indices: Int, begin: Path | None, keep: Path | None) -> _Run:
     """Map some framesets' keyframes; a session in a map is placed in its frame, the walk's first pose."""
     assert source.truth is not None
-    truth = Trajectory.read(source.truth)
+    truth = load_trajectory(source.truth)
     first_T_world = se3_inverse(np.ascontiguousarray(truth.at(source.stamps_ns[:1], _GAP_S)[0].nav_T_body[0]))
     all_true = first_T_world @ truth.at(source.stamps_ns, _GAP_S)[0].nav_T_body
     stamps, true = source.stamps_ns[indices], all_true[indices]

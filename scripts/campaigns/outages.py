@@ -28,7 +28,7 @@ from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.events import Event
 from graphvio.odometry import Odometry
 from graphvio.sources import open_source
-from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 _SCENE = "room"
 _BEFORE_S, _AFTER_S = 1.0, 3.0
@@ -99,7 +99,7 @@ def outcome_of(case: Case, folder: Path) -> Outcome:
     """What a case leads to on a recording."""
     source = open_source(folder, to_s=case.length_s)
     assert source.truth is not None
-    truth = Trajectory.read(source.truth)
+    truth = load_trajectory(source.truth)
     odometry, delivery = Odometry(source.rig), Delivery(case, source, source.start_ns)
     estimates = [estimate for measurement in delivery if (estimate := odometry.process(measurement)) is not None]
     estimates += odometry.finish()

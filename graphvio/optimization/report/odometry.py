@@ -7,6 +7,7 @@ from pathlib import Path
 
 from graphvio.errors import RigError
 from graphvio.rig import Rig
+from graphvio.rig_files import load_rig
 
 _FOLDER = "odometry"
 
@@ -23,6 +24,6 @@ def completion(folder: Path, session: str) -> float | None:
 def rig_of(folder: Path, session: str) -> Rig | None:
     """The rig that the session was recorded with, as its file has it; None if it is not known."""
     try:
-        return Rig.load(folder / session / _FOLDER / "rig.yaml")
+        return load_rig(folder / session / _FOLDER / "rig.yaml")
     except RigError:
         return None

@@ -1,0 +1,177 @@
+"""Trajectory files: TUM, EuRoC and KITTI text formats, and the true trajectory in a session or bag.
+
+TUM: ``stamp_s x y z q_x q_y q_z q_w``, separated by blanks, or by commas where stamps have a decimal point. EuRoC:
+``stamp_ns,x,y,z,q_w,q_x,q_y,q_z,...``, separated by commas. Stamps are converted exactly: float64 resolves only
+0.2 microseconds of a Unix time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from decimal import Decimal, DecimalException
+from pathlib import Path
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.errors import SessionError, TrajectoryError
+from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
+from graphvio.sessions.store import is_store
+from graphvio.sessions.truth import read_truth
+from graphvio.trajectory import Trajectory
+
+_NS_PER_S = 1_000_000_000
+_COLUMNS = 8
+_KITTI_COLUMNS = 12
+_NORM_TOLERANCE = 0.05
+_MAX_STAMP_NS = 2**62
+_SESSION_SUFFIXES = (".mcap", ".bag")
+
+
+def load_trajectory(path: str | Path) -> Trajectory:
+    """Read a trajectory file, or the true trajectory in a session or bag.
+
+    Args:
+        path: TUM, EuRoC or KITTI poses, distinguished by separator and number of columns; KITTI's take their stamps
+            from ``times.txt`` next to them or in ``../sequences/NAME``. Or a session or bag.
+
+    Raises:
+        TrajectoryError: if the file cannot be read, a line is no pose, or the stamps do not increase; or if a
+            session has no truth.
+    """
+    path = Path(path)
+    if path.suffix in _SESSION_SUFFIXES or path.is_dir():
+        return _load_from_session(path)
+    return _load_text(path)
+
+
+def save_trajectory(trajectory: Trajectory, path: str | Path) -> None:
+    """Write a TUM file: nine decimals on the stamp, ``q_w >= 0``.
+
+    Raises:
+        TrajectoryError: if the file cannot be written.
+    """
+    text = "".join(f"{tum_line(int(s), p)}\n" for s, p in zip(trajectory.stamps_ns, trajectory.nav_T_body, strict=True))
+    try:
+        Path(path).write_text(text, encoding="ascii")
+    except OSError as error:
+        raise TrajectoryError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+
+
+def tum_line(stamp_ns: int, nav_T_body: Float) -> str:
+    """One line of a TUM file without its end: equal poses always give equal bytes."""
+    sign = "-" if stamp_ns < 0 else ""
+    seconds, nanoseconds = divmod(abs(stamp_ns), _NS_PER_S)
+    w, x, y, z = quat_wxyz_from_rotation(np.ascontiguousarray(nav_T_body[:3, :3], dtype=np.float64))
+    values = " ".join(_fixed(v) for v in (*nav_T_body[:3, 3], x, y, z, w))
+    return f"{sign}{seconds}.{nanoseconds:09d} {values}"
+
+
+def _fixed(value: float) -> str:
+    """Nine decimals, and never a negative zero."""
+    text = f"{value:.9f}"
+    return text[1:] if text == "-0.000000000" else text
+
+
+def stamp_ns_from_seconds(text: str) -> int:
+    """Nanoseconds of decimal seconds, exactly; digits beyond the ninth are rounded.
+
+    Raises:
+        ValueError: if the text is no finite number that fits.
+    """
+    try:
+        stamp = Decimal(text).scaleb(9)
+        if not stamp.is_finite() or abs(stamp) > _MAX_STAMP_NS:
+            raise ValueError(f"{text!r} is no time")
+        return int(stamp.to_integral_value())
+    except DecimalException:
+        raise ValueError(f"{text!r} is no time") from None
+
+
+def _load_from_session(path: Path) -> Trajectory:
+    if not is_store(path):
+        raise TrajectoryError(f"{path}: is no trajectory file, and no session; give a TUM or EuRoC trajectory file")
+    try:
+        return Trajectory(*read_truth(path))
+    except SessionError as error:
+        raise TrajectoryError(str(error)) from None
+
+
+def _load_text(path: Path) -> Trajectory:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise TrajectoryError(
+            f"{path}: cannot be read ({error.strerror}); give a TUM or EuRoC trajectory file"
+        ) from None
+    except UnicodeDecodeError:
+        raise TrajectoryError(f"{path}: is not a text file; give a TUM or EuRoC trajectory file") from None
+    rows = list(_rows(text))
+    if rows and not rows[0][2] and len(rows[0][1]) == _KITTI_COLUMNS:
+        return _load_kitti(path, rows)
+    stamps: list[int] = []
+    poses: list[Float] = []
+    for number, fields, is_euroc in rows:
+        where = f"{path}, line {number}"
+        stamp, pose = _pose(fields, is_euroc, where)
+        if stamps and stamp == stamps[-1] and np.array_equal(pose, poses[-1]):
+            continue  # loggers that poll an odometry write a pose twice
+        if stamps and stamp <= stamps[-1]:
+            raise TrajectoryError(f"{where}: its stamp does not come after the one before it; sort the file by time")
+        stamps.append(stamp)
+        poses.append(pose)
+    if not poses:
+        raise TrajectoryError(f"{path}: holds no pose; the run that wrote it estimated nothing, or it is another file")
+    return Trajectory(np.array(stamps, dtype=np.int64), np.array(poses))
+
+
+def _load_kitti(path: Path, rows: Sequence[tuple[int, Sequence[str], bool]]) -> Trajectory:
+    """KITTI odometry's poses, upper 3x4 blocks by rows, with the stamps of their sequence's ``times.txt``."""
+    places = (path.with_name("times.txt"), path.parent.parent / "sequences" / path.stem / "times.txt")
+    times = next((place for place in places if place.is_file()), None)
+    if times is None:
+        raise TrajectoryError(f"{path}: KITTI poses carry no stamps; put the sequence's times.txt next to them")
+    try:
+        stamps = [stamp_ns_from_seconds(line) for line in times.read_text(encoding="utf-8").split()]
+        blocks = np.array([[float(field) for field in fields] for _, fields, _ in rows]).reshape(-1, 3, 4)
+    except (ValueError, OSError) as error:
+        raise TrajectoryError(f"{path}: with {times}: is not numeric ({error}); correct the line") from None
+    poses = np.tile(np.eye(4), (len(blocks), 1, 1))
+    poses[:, :3] = blocks
+    return Trajectory(np.array(stamps, dtype=np.int64), poses)
+
+
+def _rows(text: str) -> Iterator[tuple[int, Sequence[str], bool]]:
+    first = True
+    for number, line in enumerate(text.splitlines(), start=1):
+        line = line.strip()
+        if not line or line.startswith("#"):
+            continue
+        has_commas = "," in line
+        fields = [field.strip() for field in line.split(",")] if has_commas else line.split()
+        is_euroc = has_commas and "." not in fields[0]
+        if first and fields[0][:1].isalpha() and fields[0].lower() not in ("nan", "inf"):
+            first = False
+            continue  # a header without a comment sign
+        first = False
+        yield number, fields, is_euroc
+
+
+def _pose(fields: Sequence[str], is_euroc: bool, where: str) -> tuple[int, Float]:
+    if len(fields) < _COLUMNS:
+        layout = "stamp_ns,x,y,z,qw,qx,qy,qz" if is_euroc else "stamp_s x y z qx qy qz qw"
+        raise TrajectoryError(f"{where}: has {len(fields)} columns; a pose needs {_COLUMNS}: {layout}")
+    try:
+        stamp = int(fields[0]) if is_euroc else stamp_ns_from_seconds(fields[0])
+        values = np.array([float(field) for field in fields[1:_COLUMNS]])
+    except ValueError as error:
+        raise TrajectoryError(f"{where}: is not numeric ({error}); correct or remove the line") from None
+    if not np.isfinite(values).all():
+        raise TrajectoryError(f"{where}: holds NaN or infinity; remove the line")
+    if abs(stamp) > _MAX_STAMP_NS:
+        raise TrajectoryError(f"{where}: stamp {fields[0]} is no time in nanoseconds; correct or remove the line")
+    quat_wxyz = values[3:] if is_euroc else np.array([values[6], values[3], values[4], values[5]])
+    norm = float(np.linalg.norm(quat_wxyz))
+    if abs(norm - 1.0) > _NORM_TOLERANCE:
+        raise TrajectoryError(f"{where}: its quaternion has norm {norm:.3g}, not 1; check the order of the columns")
+    return stamp, se3(rotation_from_quat_wxyz(quat_wxyz), values[:3])
