@@ -1,9 +1,9 @@
-"""A whole run: source -> odometry -> results and viewer."""
+"""A whole run: source -> odometry -> results."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -12,17 +12,23 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.measurements.estimate import Estimate, Status
-from graphvio.measurements.sensors import FrameSet, Measurement
+from graphvio.measurements.events import Event, EventKind
+from graphvio.measurements.sensors import FrameSet
+from graphvio.measurements.step import Step
 from graphvio.odometry import Odometry
-from graphvio.optimization.record import Recorder
 from graphvio.results import ResultWriter, Summary
 from graphvio.sources import Source
-from graphvio.viewer import Viewer
 
-RESETS = ("gate_reset", "new_epoch", "window_rebuilt", "imu_came", "time_jump")
-"""Kinds of events after which the estimation started anew."""
+RESETS = (
+    EventKind.GATE_RESET,
+    EventKind.NEW_EPOCH,
+    EventKind.WINDOW_REBUILT,
+    EventKind.IMU_CAME,
+    EventKind.TIME_JUMP,
+)
+"""Kinds of events after which the estimator is reinitialised."""
 
-_KEPT_FRAMESETS = 100  # held by the odometry for lack of IMU samples, at the most
+_MAX_PENDING_FRAMESETS = 100
 
 
 @dataclass
@@ -46,71 +52,76 @@ class Progress:
     latest: Estimate
 
 
-def run(
-    source: Source,
-    config: Config,
-    writer: ResultWriter,
-    *,
-    viewer: Viewer | None = None,
-    on_progress: Callable[[Progress], None] | None = None,
-    recorder: Recorder | None = None,
-) -> Summary:
+def _ignore(*_: object) -> None:
+    """Default callback."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunListener:
+    """Callbacks that follow a run, in the thread of the run.
+
+    Attributes:
+        on_step: takes what went into an estimate, see `graphvio.odometry.Odometry`.
+        on_estimate: takes each estimate, after its frameset, or None where that is no longer in memory.
+        on_event: takes each event of the odometry.
+        on_smoothed: takes stamps and poses ``nav_T_body`` (4, 4) that have left the smoother's window.
+        on_progress: takes the progress after each frameset.
+    """
+
+    on_step: Callable[[Step], None] = _ignore
+    on_estimate: Callable[[FrameSet | None, Estimate], None] = _ignore
+    on_event: Callable[[Event], None] = _ignore
+    on_smoothed: Callable[[Sequence[tuple[int, Float]]], None] = _ignore
+    on_progress: Callable[[Progress], None] = _ignore
+
+
+def run(source: Source, config: Config, writer: ResultWriter, listeners: Sequence[RunListener] = ()) -> Summary:
     """Run the odometry over a source and write the results.
 
     Args:
         source: of the measurements; its rig is used.
         config: of the odometry.
         writer: of the results.
-        viewer: shows or saves what happens, or None.
-        on_progress: called after each frameset.
-        recorder: takes all that an optimisation of the session needs, or None.
+        listeners: called in this order.
 
     Raises:
         GraphvioError: if the source cannot be read or the folder not written.
     """
-    odometry = Odometry(source.rig, config, on_step=None if recorder is None else recorder.add)
-    return _Run(source, odometry, writer, viewer, on_progress, recorder).go()
+    return _Run(source, config, writer, listeners).execute()
 
 
 class _Run:
-    def __init__(
-        self,
-        source: Source,
-        odometry: Odometry,
-        writer: ResultWriter,
-        viewer: Viewer | None,
-        on_progress: Callable[[Progress], None] | None,
-        recorder: Recorder | None,
-    ) -> None:
+    def __init__(self, source: Source, config: Config, writer: ResultWriter, listeners: Sequence[RunListener]) -> None:
         self._source = source
-        self._odometry = odometry
+        self._odometry = Odometry(source.rig, config, on_step=self._on_step)
         self._writer = writer
-        self._viewer = viewer
-        self._on_progress = on_progress
-        self._recorder = recorder
-        self._waiting: OrderedDict[int, FrameSet] = OrderedDict()  # for the viewer, until they are estimated
+        self._listeners = listeners
+        self._keeps_framesets = any(listener.on_estimate is not _ignore for listener in listeners)
+        self._pending: OrderedDict[int, FrameSet] = OrderedDict()  # not yet estimated
         self._smoothed: list[tuple[int, Float]] = []
         self._frameset_ms: list[float] = []
-        self._delivered = 0
-        self._before_start = 0  # framesets that came before the IMU did: no pose can be asked of them
+        self._framesets = 0
+        self._before_start = 0  # framesets without a pose while the odometry waits for the IMU
         self._resets = 0
         self._distance_m = 0.0
-        self._last: Estimate | None = None
+        self._previous: Estimate | None = None
         self._start = perf_counter()
 
-    def go(self) -> Summary:
-        """Feed every measurement, then what is still held; only the odometry's own time is taken for a frameset's."""
+    def execute(self) -> Summary:
+        """Process all measurements; a frameset's time is that of the odometry alone."""
         for measurement in self._source:
-            self._remember(measurement)
+            if isinstance(measurement, FrameSet):
+                self._framesets += 1
+                self._keep(measurement)
             begin = perf_counter()
             estimate = self._odometry.process(measurement)
             if estimate is not None:
                 self._frameset_ms.append(1e3 * (perf_counter() - begin))
-                self._take(estimate)
+                self._add(estimate)
         begin = perf_counter()
         for estimate in self._odometry.finish():
             self._frameset_ms.append(1e3 * (perf_counter() - begin))
-            self._take(estimate)
+            self._add(estimate)
             begin = perf_counter()
         wall_s = perf_counter() - self._start
         self._collect()
@@ -121,52 +132,54 @@ class _Run:
             frameset_ms=self._frameset_ms,
             smoothed=sorted(self._smoothed, key=lambda stamped: stamped[0]),
             input_faults=self._source.faults.counts,
-            framesets=self._delivered,
-            awaited=self._delivered - self._before_start,
+            framesets=self._framesets,
+            awaited=self._framesets - self._before_start,
             resets=self._resets,
             warnings=self._odometry.rig_warnings,
             truth=self._source.truth,
         )
 
-    def _remember(self, measurement: Measurement) -> None:
-        if isinstance(measurement, FrameSet):
-            self._delivered += 1
-            if self._viewer is not None:
-                self._waiting[measurement.stamp_ns] = measurement
-                if len(self._waiting) > _KEPT_FRAMESETS:
-                    self._waiting.popitem(last=False)
+    def _keep(self, frameset: FrameSet) -> None:
+        if self._keeps_framesets:
+            self._pending[frameset.stamp_ns] = frameset
+            if len(self._pending) > _MAX_PENDING_FRAMESETS:
+                self._pending.popitem(last=False)
 
-    def _take(self, estimate: Estimate) -> None:
+    def _add(self, estimate: Estimate) -> None:
         self._writer.add(estimate)
         self._before_start += estimate.status is Status.INITIALISING and estimate.nav_T_body is None
         self._collect()
-        if self._viewer is not None:
-            self._viewer.show(self._waiting.pop(estimate.stamp_ns, None), estimate)
-        before, self._last = self._last, estimate
-        if before is not None and before.epoch == estimate.epoch:
-            self._distance_m += _distance(before, estimate)
-        if self._on_progress is not None:
-            self._on_progress(
-                Progress(
-                    framesets=len(self._frameset_ms),
-                    total=self._source.frameset_count,
-                    recorded_s=(estimate.stamp_ns - self._source.start_ns) * 1e-9,
-                    wall_s=perf_counter() - self._start,
-                    distance_m=self._distance_m,
-                    latest=estimate,
-                )
-            )
+        frameset = self._pending.pop(estimate.stamp_ns, None)
+        for listener in self._listeners:
+            listener.on_estimate(frameset, estimate)
+        if self._previous is not None and self._previous.epoch == estimate.epoch:
+            self._distance_m += _distance(self._previous, estimate)
+        self._previous = estimate
+        progress = Progress(
+            framesets=len(self._frameset_ms),
+            total=self._source.frameset_count,
+            recorded_s=(estimate.stamp_ns - self._source.start_ns) * 1e-9,
+            wall_s=perf_counter() - self._start,
+            distance_m=self._distance_m,
+            latest=estimate,
+        )
+        for listener in self._listeners:
+            listener.on_progress(progress)
 
     def _collect(self) -> None:
-        final = self._odometry.take_smoothed()
-        self._smoothed += final
-        if self._recorder is not None:
-            self._recorder.add_smoothed(final)
+        smoothed = self._odometry.take_smoothed()
+        self._smoothed += smoothed
+        for listener in self._listeners:
+            listener.on_smoothed(smoothed)
         for event in self._odometry.take_events():
             self._resets += event.kind in RESETS
             self._writer.add_event(event)
-            if self._viewer is not None:
-                self._viewer.show_event(event)
+            for listener in self._listeners:
+                listener.on_event(event)
+
+    def _on_step(self, step: Step) -> None:
+        for listener in self._listeners:
+            listener.on_step(step)
 
 
 def _distance(before: Estimate, now: Estimate) -> float:

@@ -57,6 +57,7 @@ def run(
 
     from graphvio.cli.interrupts import interruptible
     from graphvio.config import Config
+    from graphvio.pipeline import RunListener
     from graphvio.pipeline import run as run_pipeline
     from graphvio.results import ResultWriter
     from graphvio.viewer import Viewer
@@ -67,12 +68,15 @@ def run(
     folder = out if out is not None else ResultWriter.new_folder(Path("results"), opened.name)
     with ExitStack() as stack:
         writer = stack.enter_context(ResultWriter(folder, opened.rig, settings.to_yaml()))
-        viewer = stack.enter_context(Viewer(opened.rig, spawn=view, save=save_rrd)) if view or save_rrd else None
+        listeners = []
+        if view or save_rrd:
+            viewer = stack.enter_context(Viewer(opened.rig, spawn=view, save=save_rrd))
+            listeners.append(RunListener(on_estimate=viewer.show, on_event=viewer.show_event))
         warm_up(opened.rig, settings)
-        line = stack.enter_context(_ProgressLine())
+        listeners.append(RunListener(on_progress=stack.enter_context(_ProgressLine()).show))
         try:
             with interruptible():
-                summary = run_pipeline(opened, settings, writer, viewer=viewer, on_progress=line.show)
+                summary = run_pipeline(opened, settings, writer, listeners)
         except KeyboardInterrupt:
             typer.echo(f"graphvio: interrupted; what was estimated until then is in {folder}", err=True)
             raise typer.Exit(EXIT_INTERRUPTED) from None

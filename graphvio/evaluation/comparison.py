@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphvio.errors import TrajectoryError
-from graphvio.evaluation import MAX_GAP_S, Evaluation, evaluate
+from graphvio.evaluation.evaluation import MAX_GAP_S, Evaluation, evaluate
 from graphvio.trajectory import Trajectory
 
 

@@ -21,7 +21,7 @@ from graphvio.optimization.record import Recorder, SessionRecord
 from graphvio.optimization.report.write import write_report
 from graphvio.optimization.workspace import Workspace, digest
 from graphvio.pipeline import Progress as RunProgress
-from graphvio.pipeline import run
+from graphvio.pipeline import RunListener, run
 from graphvio.results import ResultWriter
 from graphvio.rig import Rig
 from graphvio.rig_files.native import to_text
@@ -137,8 +137,9 @@ class Stages:
             def follow(progress: RunProgress) -> None:
                 self._on_progress(stage, progress.framesets, progress.total)
 
+            listener = RunListener(on_step=recorder.add, on_smoothed=recorder.add_smoothed, on_progress=follow)
             with ResultWriter(folder, session.source.rig, self._config.to_yaml()) as writer:
-                run(session.source, self._config, writer, on_progress=follow, recorder=recorder)
+                run(session.source, self._config, writer, [listener])
             self._space.write(name, recorder.record().to_bytes())
             self._space.finish(stage, name, f"{session.name}/odometry/summary.json")
         return SessionRecord.load(self._space.folder / name)

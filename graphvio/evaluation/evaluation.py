@@ -1,0 +1,197 @@
+"""How far an estimated trajectory is from the truth.
+
+Definitions, so that a figure means the same to everybody:
+
+- *Association*: truth is interpolated to the estimate's stamps (chord, slerp) where two true poses at most
+  ``max_gap_s`` apart enclose the stamp; all other estimates are left out and counted.
+- *ATE*: distance between positions, and angle between rotations, after one SE(3) alignment of all associated
+  positions (Umeyama's least squares without scale).
+- *RPE* over 1 s, or over so many metres along the truth: error of the motion from each pose to the pose that
+  is nearest to that distance (within a tenth of it). Over 100 to 800 m these are KITTI's segments.
+- *Drift*: the estimate is aligned over its beginning (the first 5 % of the path and at least 2 s, by position
+  and rotation); the position error of the last pose, in percent of the path. ``ate_percent`` is ATE rmse,
+  likewise.
+- *Loop closure*, where truth walks at least 4 m and ends within 1 m of its start: estimated minus true
+  displacement from start to end.
+
+Lengths are of the associated truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.errors import TrajectoryError
+from graphvio.evaluation.measures import (
+    RelativeError,
+    Stats,
+    align,
+    align_with_rotations,
+    angle_between,
+    relative_errors,
+)
+from graphvio.trajectory import Trajectory
+
+MAX_GAP_S = 0.25
+_START_SHARE = 0.05
+_START_S = 2.0
+_LOOP_M = 1.0
+_LOOP_MIN_PATH_M = 4.0
+_MIN_PATH_M = 0.1
+_MIN_POSES = 3
+_NS_PER_S = 1e9
+
+
+@dataclass(frozen=True)
+class LoopClosure:
+    """Difference between the estimated and the true displacement from start to end."""
+
+    error_m: float
+    error_percent: float
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """An estimate measured against the truth; the module's text defines each figure.
+
+    Attributes:
+        associated: estimates that have a true pose.
+        estimates: all estimates.
+        duration_s: from the first to the last associated stamp.
+        path_length_m: length of the truth in between.
+        ate_position_m: metres.
+        ate_rotation_deg: degrees.
+        ate_percent: ATE rmse in percent of the path; None where there is no path (under 0.1 m).
+        drift_m: position error at the end when aligned at the start.
+        drift_percent: the same in percent of the path; None where there is no path.
+        loop_closure: None where the truth does not end where it began.
+        rpe: ``1 s``, ``1 m``, ``5 m``... -> error; only distances that the trajectory is long enough for.
+        kitti_percent: mean over all segments of 100 to 800 m, or None.
+        kitti_deg_per_m: mean over all segments of 100 to 800 m, or None.
+        truth_T_nav: (4, 4) the alignment that ATE uses.
+        stamps_ns: (associated,) stamps.
+        position_error_m: (associated,) after alignment.
+        rotation_error_deg: (associated,) after alignment.
+        aligned: associated estimates in the truth's frame.
+        truth: truth at the same stamps.
+    """
+
+    associated: int
+    estimates: int
+    duration_s: float
+    path_length_m: float
+    ate_position_m: Stats
+    ate_rotation_deg: Stats
+    ate_percent: float | None
+    drift_m: float
+    drift_percent: float | None
+    loop_closure: LoopClosure | None
+    rpe: Mapping[str, RelativeError]
+    kitti_percent: float | None
+    kitti_deg_per_m: float | None
+    truth_T_nav: Float
+    stamps_ns: Int
+    position_error_m: Float
+    rotation_error_deg: Float
+    aligned: Trajectory
+    truth: Trajectory
+
+    def as_dict(self) -> dict[str, Any]:
+        """All figures, without the series, as JSON can hold them."""
+        figures = {name: value for name, value in vars(self).items() if name not in _SERIES}
+        figures["ate_position_m"] = asdict(self.ate_position_m)
+        figures["ate_rotation_deg"] = asdict(self.ate_rotation_deg)
+        figures["loop_closure"] = asdict(self.loop_closure) if self.loop_closure else None
+        figures["rpe"] = {name: asdict(error) for name, error in self.rpe.items()}
+        figures["truth_T_nav"] = self.truth_T_nav.tolist()
+        return figures
+
+
+_SERIES = ("stamps_ns", "position_error_m", "rotation_error_deg", "aligned", "truth")
+
+
+def evaluate(estimate: Trajectory, truth: Trajectory, max_gap_s: float = MAX_GAP_S) -> Evaluation:
+    """Measure an estimate against the truth.
+
+    Args:
+        estimate: poses of body in nav. Poses of several epochs are aligned as one: a break counts as error.
+        truth: poses of body in any fixed frame, on the same clock.
+        max_gap_s: greatest interval of the truth that is bridged by interpolation, seconds.
+
+    Raises:
+        TrajectoryError: if fewer than 3 estimates have a true pose.
+    """
+    at_estimates, known = truth.at(estimate.stamps_ns, max_gap_s)
+    if len(at_estimates) < _MIN_POSES:
+        raise TrajectoryError(_why_not_associated(estimate, truth, len(at_estimates), max_gap_s))
+    used = estimate.select(known)
+    truth_T_nav = align(used, at_estimates)
+    aligned = used.transformed(truth_T_nav)
+    position_m = np.linalg.norm(aligned.positions - at_estimates.positions, axis=1)
+    rotation_deg = np.rad2deg(angle_between(at_estimates.rotations, aligned.rotations))
+    path_m = float(at_estimates.distances[-1])
+    drift_m = _drift(used, at_estimates)
+    rpe, kitti = relative_errors(used, at_estimates)
+    return Evaluation(
+        associated=len(used),
+        estimates=len(estimate),
+        duration_s=used.duration_s,
+        path_length_m=path_m,
+        ate_position_m=(ate := Stats.of(position_m)),
+        ate_rotation_deg=Stats.of(rotation_deg),
+        ate_percent=_percent(ate.rmse, path_m),
+        drift_m=drift_m,
+        drift_percent=_percent(drift_m, path_m),
+        loop_closure=_loop_closure(aligned, at_estimates, path_m),
+        rpe=rpe,
+        kitti_percent=float(kitti[:, 0].mean()) if len(kitti) else None,
+        kitti_deg_per_m=float(kitti[:, 1].mean()) if len(kitti) else None,
+        truth_T_nav=truth_T_nav,
+        stamps_ns=used.stamps_ns,
+        position_error_m=position_m,
+        rotation_error_deg=rotation_deg,
+        aligned=aligned,
+        truth=at_estimates,
+    )
+
+
+def _percent(error_m: float, path_m: float) -> float | None:
+    return 100.0 * error_m / path_m if path_m >= _MIN_PATH_M else None
+
+
+def _drift(estimate: Trajectory, truth: Trajectory) -> float:
+    seconds = (truth.stamps_ns - truth.stamps_ns[0]) / _NS_PER_S
+    distances = truth.distances
+    start = (distances <= _START_SHARE * distances[-1]) | (seconds <= _START_S)
+    truth_T_nav = align_with_rotations(estimate.select(start), truth.select(start))
+    end = truth_T_nav[:3, :3] @ estimate.positions[-1] + truth_T_nav[:3, 3]
+    return float(np.linalg.norm(end - truth.positions[-1]))
+
+
+def _loop_closure(aligned: Trajectory, truth: Trajectory, path_m: float) -> LoopClosure | None:
+    true_displacement = truth.positions[-1] - truth.positions[0]
+    if np.linalg.norm(true_displacement) > _LOOP_M or path_m < _LOOP_MIN_PATH_M:
+        return None
+    error_m = float(np.linalg.norm(aligned.positions[-1] - aligned.positions[0] - true_displacement))
+    return LoopClosure(error_m, 100.0 * error_m / path_m)
+
+
+def _why_not_associated(estimate: Trajectory, truth: Trajectory, associated: int, max_gap_s: float) -> str:
+    def interval(trajectory: Trajectory) -> str:
+        if not len(trajectory):
+            return "no pose"
+        first, last = trajectory.stamps_ns[0] / _NS_PER_S, trajectory.stamps_ns[-1] / _NS_PER_S
+        return f"{first:.3f} to {last:.3f} s"
+
+    if len(estimate) < _MIN_POSES:
+        return f"the estimate has {len(estimate)} poses; at least {_MIN_POSES} are needed for an alignment"
+    return (
+        f"only {associated} of {len(estimate)} estimates ({interval(estimate)}) have a true pose ({interval(truth)}, "
+        f"at most {max_gap_s:g} s apart); at least {_MIN_POSES} are needed: check that both files are of one "
+        "recording and use one clock"
+    )
