@@ -17,7 +17,7 @@ from graphvio import FrameSet, load_rig, open_source
 from graphvio.cli import app
 from graphvio.errors import RigError, SessionError, SourceError
 from graphvio.sessions import cdr
-from graphvio.sessions.mcap_file import McapFile
+from graphvio.sessions.store import open_store
 from graphvio.sources.description import describe
 
 pytest.importorskip("mcap")
@@ -35,7 +35,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def messages(recording: Path, folder: Path) -> list[Message]:
     """All that a session of the recording holds, recorded a little after it was measured."""
-    file = McapFile(written(recording, folder / "session.mcap"))
+    file = open_store(written(recording, folder / "session.mcap"))
     found = [
         (topic.name, topic.type_name, logged_ns + LATE_NS, file.read(place))
         for topic in file.topics.values()

@@ -28,7 +28,7 @@ from graphvio.live import sources
 from graphvio.measurements.events import Event
 from graphvio.measurements.readings import DeviceHealth
 from graphvio.queues import Broadcast
-from graphvio.sessions.mcap_file import McapFile
+from graphvio.sessions.store import open_store
 
 pytest.importorskip("mcap")
 pytest.importorskip("prometheus_client")
@@ -105,7 +105,7 @@ def test_a_signal_ends_it_with_everything_saved(recording: Path, tmp_path: Path,
     told, errors = process.communicate(timeout=SOON_S)
     assert process.returncode == 0, errors
     assert "Traceback" not in errors
-    assert McapFile(out).is_whole
+    assert open_store(out).is_whole
     framesets = framesets_in(out)
     assert 0 < framesets < 400
     assert f"{out}: " in told.splitlines()[-1]
@@ -119,7 +119,7 @@ def test_what_a_killed_one_recorded_can_be_read(recording: Path, tmp_path: Path)
     process.kill()
     process.communicate(timeout=SOON_S)
     assert process.returncode == -signal.SIGKILL
-    assert not McapFile(out).is_whole
+    assert not open_store(out).is_whole
     assert framesets_in(out) > 5
 
 
@@ -246,7 +246,7 @@ def test_what_fails_in_a_thread_is_told_and_what_came_is_saved(
     out = tmp_path / "walk.mcap"
     done = live(f"replay:{recording}?speed=max", "--record", out)
     assert isinstance(done.exception, RigError)
-    assert McapFile(out).is_whole
+    assert open_store(out).is_whole
     assert framesets_in(out) >= 20
 
 

@@ -20,9 +20,9 @@ from graphvio.errors import SessionError, TrajectoryError
 from graphvio.geometry import quat_wxyz_from_rotation, se3, so3_exp
 from graphvio.rig import Imu
 from graphvio.rig_files.native import to_text
-from graphvio.sessions.bag_file import BagFile
 from graphvio.sessions.formats import format_of
 from graphvio.sessions.mcap_storage import McapStorage
+from graphvio.sessions.store import open_store
 from graphvio.sessions.writer import SessionWriter
 from graphvio.sources.description import describe
 from graphvio.trajectory_files import load_trajectory, tum_line
@@ -295,7 +295,7 @@ def test_a_truth_that_is_missing_or_bad_is_told(recording: Path, tmp_path: Path)
 def test_a_bag_is_read_at_any_place(recording: Path, tmp_path: Path) -> None:
     """In any order, and for as long a bag as may be: the library alone would go through all that comes before."""
     for path in (converted(recording, tmp_path / "walk.bag"), converted(recording, tmp_path / "rosbag2")):
-        bag = BagFile(path)
+        bag = open_store(path)
         places = bag.topics["/imu"].places
         forth = [bag.read(place) for place in places]
         assert [bag.read(place) for place in reversed(places)] == forth[::-1]

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from graphvio import FrameSet, ImuSample, open_source
 from graphvio.cli import app
 from graphvio.errors import GraphvioError, SessionError
-from graphvio.sessions.mcap_file import McapFile
 from graphvio.sessions.mcap_storage import McapStorage
+from graphvio.sessions.store import open_store
 from graphvio.sessions.writer import SessionWriter
 
 pytest.importorskip("mcap")
@@ -41,7 +41,7 @@ def session(recording: Path) -> Path:
 
 def chunks(path: Path) -> list[int]:
     """Where each begins."""
-    file = McapFile(path)
+    file = open_store(path)
     return sorted({place.chunk for topic in file.topics.values() for place in topic.places})
 
 
@@ -53,7 +53,7 @@ def changed(path: Path, to: Path, at: int, bit: int = 1) -> Path:
 
 
 def places_of(path: Path, topic: str, chunk: int) -> list[int]:
-    return [place.logged_ns for place in McapFile(path).topics[topic].places if place.chunk == chunk]
+    return [place.logged_ns for place in open_store(path).topics[topic].places if place.chunk == chunk]
 
 
 @pytest.mark.parametrize("which", [0, 6, -1])
@@ -100,7 +100,7 @@ def test_a_damaged_rig_is_refused_unless_another_is_given(session: Path, tmp_pat
 
 
 def test_a_stamp_of_the_index_that_is_not_the_messages_is_found(session: Path, tmp_path: Path) -> None:
-    file = McapFile(session)
+    file = open_store(session)
     place = file.topics["/pair0/left/image_raw"].places[3]
     entry = place.logged_ns.to_bytes(8, "little") + place.offset.to_bytes(8, "little")
     path = changed(session, tmp_path / "walk.mcap", session.read_bytes().index(entry, place.chunk))
@@ -111,11 +111,11 @@ def test_a_stamp_of_the_index_that_is_not_the_messages_is_found(session: Path, t
 
 def test_the_odometry_goes_on(session: Path, tmp_path: Path) -> None:
     """What a chunk with images is to the odometry, an image that is damaged is in a folder."""
-    chunk = McapFile(session).topics["/pair0/left/image_raw"].places[4].chunk
+    chunk = open_store(session).topics["/pair0/left/image_raw"].places[4].chunk
     path = changed(session, tmp_path / "walk.mcap", chunk + 200)
     done = CliRunner().invoke(app, ["record", str(path), "--out", str(tmp_path / "again.mcap")])
     assert done.exit_code == 0, done.output
-    assert "/rosout" in McapFile(tmp_path / "again.mcap").topics
+    assert "/rosout" in open_store(tmp_path / "again.mcap").topics
     told = CliRunner().invoke(app, ["info", str(path)])
     assert told.exit_code == 0, told.output
 

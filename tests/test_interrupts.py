@@ -18,7 +18,7 @@ from graphvio import FrameSet, open_source
 from graphvio.cli import app, main
 from graphvio.cli.interrupts import HeldInterrupt, interruptible
 from graphvio.errors import MissingExtraError
-from graphvio.sessions.mcap_file import McapFile
+from graphvio.sessions.store import open_store
 
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
@@ -103,7 +103,7 @@ def test_a_recording_that_is_interrupted_can_be_read(
         done.stderr.splitlines()[-1]
         == f"graphvio: interrupted; what was recorded until then is in {out}, which can be read"
     )
-    assert McapFile(out).is_whole
+    assert open_store(out).is_whole
     assert len([measurement for measurement in open_source(out) if isinstance(measurement, FrameSet)]) == 2
 
 
@@ -175,6 +175,6 @@ def test_a_real_interrupt_ends_a_recording(recording: Path, tmp_path: Path) -> N
     assert recorder.returncode == 130, told
     assert f"interrupted; what was recorded until then is in {out}, which can be read" in told
     assert "Traceback" not in told
-    file = McapFile(out)
+    file = open_store(out)
     assert file.is_whole
     assert 5 <= len(file.topics["/imu"].places) < 240

@@ -33,7 +33,7 @@ from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
 from graphvio.measurements.readings import Notice, Reading
 from graphvio.measurements.sensors import ImuSample, Measurement
-from graphvio.sessions.mcap_file import McapFile
+from graphvio.sessions.store import open_store
 
 
 def until(is_so: Callable[[], Any]) -> None:
@@ -69,7 +69,7 @@ def test_a_replay_is_the_plain_odometry_bit_for_bit_and_so_is_what_it_recorded(r
     assert figures["framesets"] == figures["estimates"] == recorder.status()["recorded_framesets"] == len(expected)
     assert figures["health"] == "ok"
     assert recorder.status()["recorded_poses"] == sum(each.nav_T_body is not None for each in expected)
-    assert McapFile(tmp_path / "live.mcap").is_whole
+    assert open_store(tmp_path / "live.mcap").is_whole
     assert_same(plain(tmp_path / "live.mcap"), expected)
 
 

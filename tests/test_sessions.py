@@ -25,10 +25,10 @@ from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.events import Event
 from graphvio.measurements.sensors import Measurement
 from graphvio.sessions import cdr
-from graphvio.sessions.mcap_file import McapFile
 from graphvio.sessions.mcap_storage import McapStorage
 from graphvio.sessions.messages import IMAGE, header, odometry
 from graphvio.sessions.pixels import grey
+from graphvio.sessions.store import open_store
 from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
 from graphvio.sources.description import describe
@@ -168,7 +168,7 @@ def test_killed_recordings_lose_the_last_second_at_most(tmp_path: Path) -> None:
 
 
 def check_killed(path: Path, last_ns: int) -> None:
-    file = McapFile(path)
+    file = open_store(path)
     assert not file.is_whole
     recorded = file.topics["/pair0/left/image_raw"].logged_ns
     assert last_ns - recorded[-1] < 1_000_000_000
@@ -239,7 +239,7 @@ def test_recording_keeps_what_the_odometry_made_of_it(recording: Path, tmp_path:
     out = tmp_path / "recorded.mcap"
     done = CliRunner().invoke(app, ["record", str(recording), "--out", str(out)])
     assert done.exit_code == 0, done.output
-    file = McapFile(out)
+    file = open_store(out)
     assert file.is_whole
     assert len(file.topics["/pair0/left/image_raw"].places) == 12
     assert "/rosout" in file.topics

@@ -12,37 +12,27 @@ from graphvio.sessions import cdr, ros1
 from graphvio.sessions.messages import STAMPED
 from graphvio.sessions.topics import Place, Topic
 
+try:
+    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.typesys import Stores, get_typestore
+except ImportError:
+    raise MissingExtraError("rosbags", "sessions", "reading a bag") from None
+
 
 class BagFile:
-    """A bag, for any number of threads; its messages are read as ROS 2 ones.
+    """A bag: see `graphvio.sessions.store.Store`. Its messages are read as those of ROS 2.
 
-    The whole bag is read once for the stamps in its messages' headers; messages are then read where they are asked for.
+    The whole bag is read once for the stamps of its messages' headers; messages are read again when they are wanted.
 
     Args:
         path: ``NAME.bag``, or the folder of a ROS 2 bag.
-        is_wanted: which topics are looked at.
-
-    Attributes:
-        path: of the bag.
-        library: nothing is told.
-        topics: name -> messages.
-        attachments: none.
-        is_whole: always.
-        damages: none; what is damaged is refused.
-        has_damaged_attachment: never.
-        damaged_chunks: none.
+        is_wanted: whether a topic is read.
 
     Raises:
         SessionError: if it cannot be read.
-        MissingExtraError: if the extra ``sessions`` is not installed.
     """
 
     def __init__(self, path: Path, is_wanted: Callable[[str], bool] = lambda topic: True) -> None:
-        try:
-            from rosbags.highlevel import AnyReader, AnyReaderError
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError:
-            raise MissingExtraError("rosbags", "sessions", "reading a bag") from None
         self.path = path
         self.library = ""
         self.topics: dict[str, Topic] = {}

@@ -1,7 +1,7 @@
-"""Reads MCAP files, also those whose writing was cut short: where each message is, and its bytes.
+"""Reads MCAP files, also those whose writing was cut short: the place of each message, and its bytes.
 
-The end of a file that is whole has a summary; one that was cut has none. All that is needed stands before it, after
-each chunk, so the file is read from the front, without the chunks' contents, and as far as it goes.
+A file that was cut short has no summary at its end. What the summary says also stands before it, after each chunk; so a
+file is scanned from the front, without unpacking its chunks, as far as it goes.
 """
 
 from __future__ import annotations
@@ -11,44 +11,40 @@ import threading
 import zlib
 from collections import OrderedDict
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
-
-import numpy as np
+from typing import Any, BinaryIO
 
 from graphvio.errors import MissingExtraError, SessionError
 from graphvio.sessions.topics import Place, Topic
 
-_MAGIC = b"\x89MCAP0\r\n"
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _ATTACHMENT, _HEADER, _DATA_END = 3, 4, 5, 6, 7, 9, 1, 15
-_FOOTER, _STATISTICS = 2, 11
-_LAST_KNOWN, _FIRST_PRIVATE = 15, 128
-_PREFIX = struct.Struct("<BQ")
-_CHUNK_HEAD = struct.Struct("<QQQI")
-_MESSAGE_HEAD = struct.Struct("<HIQQ")
-_ENTRY = np.dtype([("stamp_ns", "<u8"), ("offset", "<u8")])
-_KEPT_CHUNKS = 8
-_STAMP_END_NS = 2**62
-_DAMAGE = (struct.error, ValueError, IndexError, OverflowError, MemoryError)
+try:
+    from mcap.exceptions import McapError
+    from mcap.opcode import Opcode
+    from mcap.records import Attachment, Channel, Header, MessageIndex, Schema
+    from mcap.stream_reader import StreamReader, get_chunk_data_stream
+    from mcap.writer import MCAP0_MAGIC
+except ImportError:
+    raise MissingExtraError("mcap", "sessions", "reading a session") from None
+
+_PREFIX = struct.Struct("<BQ")  # opcode and length of a record
+_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, times of recording and publishing
+_COMPRESSIONS = ("", "lz4", "zstd")
+_READ_RECORDS = (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX)
+_MIN_PRIVATE = 128
+_MAX_KEPT_CHUNKS = 8
+_MAX_STAMP_NS = 2**62
+_DAMAGE = (McapError, struct.error, ValueError, IndexError, OverflowError, MemoryError)
 
 
 class McapFile:
-    """An MCAP file, for any number of threads.
+    """An MCAP file: see `graphvio.sessions.store.Store`.
 
     Args:
         path: of the file.
 
-    Attributes:
-        library: that wrote it.
-        topics: name -> messages.
-        attachments: name -> content.
-        is_whole: whether its writing was finished.
-        damages: one line for each record that cannot be used, but for chunks, which are looked at as they are read.
-        has_damaged_attachment: whether one of the attachments is left out for that.
-
     Raises:
         SessionError: if it cannot be read or is no MCAP file.
-        MissingExtraError: if the extra ``sessions`` is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -59,12 +55,12 @@ class McapFile:
         self.is_whole = False
         self.damages: list[str] = []
         self.has_damaged_attachment = False
-        self._messages = 0
-        self._broken: dict[int, str] = {}
-        self._waiting: list[tuple[int, bytes]] = []  # chunks and indexes of channels that are not known yet
         self._schemas: dict[int, str] = {}
-        self._by_channel: dict[int, Topic] = {}
+        self._channels: dict[int, Topic] = {}
+        self._pending: list[tuple[int, Any]] = []  # chunks and indexes of channels that are not known yet
+        self._message_count = 0
         self._chunks: OrderedDict[int, bytes] = OrderedDict()
+        self._damaged_chunks: dict[int, str] = {}
         self._lock = threading.Lock()
         try:
             self._file: BinaryIO = path.open("rb")
@@ -74,220 +70,171 @@ class McapFile:
             raise SessionError(f"{path}: cannot be read ({error.strerror}); check the path") from None
 
     def read(self, place: Place) -> bytes:
-        """A message.
+        """Return a message.
 
         Raises:
-            SessionError: if it, or the chunk, is damaged.
+            SessionError: if it, or its chunk, is damaged.
         """
         try:
             with self._lock:
                 if place.chunk < 0:
-                    self._file.seek(place.offset)
-                    opcode, length = _PREFIX.unpack(self._file.read(_PREFIX.size))
-                    record = self._file.read(min(length, self._size))
+                    opcode, record = _read_record(self._file, place.offset, self._size)
                 else:
-                    data = self._chunk(place.chunk)
-                    opcode, length = _PREFIX.unpack_from(data, place.offset)
-                    begin = place.offset + _PREFIX.size
-                    record = data[begin : begin + length]
-            channel, _, logged_ns, _ = _MESSAGE_HEAD.unpack_from(record)
+                    records = self._chunk(place.chunk)
+                    opcode, record = _read_record(BytesIO(records), place.offset, len(records))
+            channel, _, logged_ns, _ = _MESSAGE_HEAD.unpack_from(record, _PREFIX.size)
         except _DAMAGE as error:
             raise self._unreadable(place, str(error)) from None
         except OSError as error:
             raise self._unreadable(place, str(error.strerror)) from None
-        if opcode != _MESSAGE or len(record) != length:
-            raise self._unreadable(place, "it is none")
+        if opcode != Opcode.MESSAGE:
+            raise self._unreadable(place, "it is another record")
         if place.channel not in (-1, channel) or place.logged_ns not in (-1, logged_ns):
-            raise self._unreadable(place, "it is not the one that the index tells")
-        return record[_MESSAGE_HEAD.size :]
+            raise self._unreadable(place, "it is not the one of the index")
+        return record[_PREFIX.size + _MESSAGE_HEAD.size :]
 
     @property
     def damaged_chunks(self) -> int:
         """How many of the chunks that have been read so far are damaged."""
-        return len(self._broken)
+        return len(self._damaged_chunks)
 
     def _unreadable(self, place: Place, why: str) -> SessionError:
         where = f"byte {place.offset}" + (f" of the chunk at byte {place.chunk}" if place.chunk >= 0 else "")
-        return SessionError(f"{self.path}: the message at {where} is damaged ({why}); copy the file anew")
+        return SessionError(f"{self.path}: the message at {where} is damaged ({why}); copy the file again")
 
     def _scan(self) -> None:
-        if self._file.read(len(_MAGIC)) != _MAGIC:
-            raise SessionError(f"{self.path}: is no MCAP file; check its name, or copy it anew")
+        if self._file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+            raise SessionError(f"{self.path}: is no MCAP file; check its name, or copy it again")
         chunk = -1
-        at = len(_MAGIC)
+        at = len(MCAP0_MAGIC)
         while at + _PREFIX.size <= self._size:
             self._file.seek(at)
             opcode, length = _PREFIX.unpack(self._file.read(_PREFIX.size))
-            if opcode == _FOOTER or at + _PREFIX.size + length > self._size:
+            if opcode == Opcode.FOOTER or at + _PREFIX.size + length > self._size:
                 break  # the end, or cut short here
-            if opcode == _DATA_END:
+            if opcode == Opcode.DATA_END:
                 self.is_whole = True
-            elif opcode == _CHUNK:
+            elif opcode == Opcode.CHUNK:
                 chunk = at
-            elif opcode == 0 or _LAST_KNOWN < opcode < _FIRST_PRIVATE:
-                self._note(at, f"no record is of kind {opcode}")
-            else:
-                try:
-                    self._take_record(opcode, length, chunk, at)
-                except _DAMAGE as error:
-                    self._note(at, str(error))
-            at += _PREFIX.size + length
-        self._take_waiting()
-
-    def _take_record(self, opcode: int, length: int, chunk: int, at: int) -> None:
-        """A record outside of chunks; of those after the data, only what may have been lost with a chunk."""
-        if self.is_whole:
-            if opcode == _STATISTICS:
-                self._take_statistics(at, self._file.read(length))
-            elif opcode in (_SCHEMA, _CHANNEL) and self._waiting:
-                self._take(opcode, self._file.read(length))
-        elif opcode == _MESSAGE_INDEX:
-            self._take_index(chunk, self._file.read(length))
-        elif opcode == _MESSAGE:
-            channel, _, logged_ns, _ = _MESSAGE_HEAD.unpack(self._file.read(_MESSAGE_HEAD.size))
-            self._add(channel, logged_ns, -1, at)
-        elif opcode in (_HEADER, _SCHEMA, _CHANNEL, _ATTACHMENT):
-            self._take(opcode, self._file.read(length))
-
-    def _note(self, at: int, why: str) -> None:
-        self.damages.append(f"{self.path}: the record at byte {at} is damaged ({why}); it is left out")
-
-    def _take_index(self, chunk: int, body: bytes) -> None:
-        channel, size = struct.unpack_from("<HI", body)
-        if channel not in self._by_channel:
-            with suppress(SessionError, *_DAMAGE):  # its samples and images are missed where they are read
-                self._take_channels(self._chunk(chunk))
-            if channel not in self._by_channel:
-                self._waiting.append((chunk, body))
-                return
-        if size % _ENTRY.itemsize:
-            raise ValueError(f"an index of {size} bytes")
-        for stamp, offset in np.frombuffer(body, _ENTRY, offset=6, count=size // _ENTRY.itemsize).tolist():
-            self._add(channel, stamp, chunk, offset)
-
-    def _take_waiting(self) -> None:
-        """Indexes of damaged chunks whose channels another chunk, or the summary, tells."""
-        lost = 0
-        for chunk, body in self._waiting:
-            (channel,) = struct.unpack_from("<H", body)
-            if channel not in self._by_channel:
-                lost += 1
-                continue
             try:
-                self._take_index(chunk, body)
+                self._scan_record(opcode, chunk, at)
+            except _DAMAGE as error:
+                self.damages.append(f"{self.path}: the record at byte {at} is damaged ({error}); it is left out")
+                self.has_damaged_attachment |= opcode == Opcode.ATTACHMENT
+            at += _PREFIX.size + length
+        self._take_pending()
+
+    def _scan_record(self, opcode: int, chunk: int, at: int) -> None:
+        """Read a record outside of chunks; of the summary, only what may have been lost with a chunk."""
+        if opcode < _MIN_PRIVATE:
+            Opcode(opcode)  # raises a ValueError if there is no such record
+        if not self.is_whole:
+            if opcode == Opcode.MESSAGE:
+                channel, _, logged_ns, _ = _MESSAGE_HEAD.unpack(self._file.read(_MESSAGE_HEAD.size))
+                self._add(channel, logged_ns, -1, at)
+            elif opcode in _READ_RECORDS:
+                self._take(self._parsed(at), chunk)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL) and self._pending:
+            self._take(self._parsed(at), chunk)
+        elif opcode == Opcode.STATISTICS:
+            expected = self._parsed(at).message_count
+            found = self._message_count + sum(len(index.records) for _, index in self._pending)
+            if found != expected:
+                raise ValueError(f"it says that there are {expected} messages, {found} are there")
+
+    def _take(self, record: Any, chunk: int) -> None:
+        if isinstance(record, Header):
+            self.library = record.library
+        elif isinstance(record, Schema):
+            self._schemas[record.id] = record.name
+        elif isinstance(record, Channel):
+            type_name = self._schemas.get(record.schema_id, "")
+            topic = Topic(record.topic, type_name, record.message_encoding)
+            self._channels[record.id] = self.topics.setdefault(record.topic, topic)
+        elif isinstance(record, Attachment):
+            self.attachments[record.name] = record.data
+        elif isinstance(record, MessageIndex):
+            self._take_index(chunk, record)
+
+    def _take_index(self, chunk: int, index: Any) -> None:
+        if index.channel_id not in self._channels:
+            with suppress(SessionError, *_DAMAGE):  # raised again, and counted, where its samples and images are read
+                for record in StreamReader(BytesIO(self._chunk(chunk)), skip_magic=True).records:
+                    if isinstance(record, Schema | Channel):
+                        self._take(record, chunk)
+        if index.channel_id not in self._channels:
+            self._pending.append((chunk, index))
+            return
+        for logged_ns, offset in index.records:
+            self._add(index.channel_id, logged_ns, chunk, offset)
+
+    def _take_pending(self) -> None:
+        """Add the messages of damaged chunks whose channels are in another chunk or in the summary."""
+        pending, self._pending = self._pending, []
+        for chunk, index in pending:
+            try:
+                self._take_index(chunk, index)
             except _DAMAGE as error:
                 self.damages.append(f"{self.path}: an index of the chunk at byte {chunk} is damaged ({error})")
-        if lost:
-            self.damages.append(f"{self.path}: {lost} indexes are of channels that damaged chunks had; copy it anew")
-        if self._waiting:
+        if self._pending:
+            lost = len(self._pending)
+            self.damages.append(f"{self.path}: {lost} indexes are of channels in damaged chunks; copy the file again")
+        if pending:
             for topic in self.topics.values():
                 topic.places.sort()
                 topic.logged_ns = [place.logged_ns for place in topic.places]
 
-    def _take_statistics(self, at: int, body: bytes) -> None:
-        (told,) = struct.unpack_from("<Q", body)
-        waiting = sum((len(index) - 6) // _ENTRY.itemsize for _, index in self._waiting)
-        if told != self._messages + waiting:
-            found = self._messages + waiting
-            self._note(at, f"it tells of {told} messages, {found} are there")
-
     def _add(self, channel: int, logged_ns: int, chunk: int, offset: int) -> None:
-        if logged_ns >= _STAMP_END_NS:
+        if logged_ns >= _MAX_STAMP_NS:
             raise ValueError(f"a message recorded at {logged_ns} ns")
-        self._messages += 1
-        topic = self._by_channel.get(channel)
+        self._message_count += 1
+        topic = self._channels.get(channel)
         if topic is not None:
             topic.logged_ns.append(logged_ns)
             topic.places.append(Place(chunk, offset, channel, logged_ns))
 
-    def _take_channels(self, data: bytes) -> None:
-        """Schemas and channels of a chunk."""
-        at = 0
-        while at < len(data):
-            opcode, length = _PREFIX.unpack_from(data, at)
-            if opcode in (_SCHEMA, _CHANNEL):
-                self._take(opcode, data[at + _PREFIX.size : at + _PREFIX.size + length])
-            at += _PREFIX.size + length
-
-    def _take(self, opcode: int, body: bytes) -> None:
-        if opcode == _HEADER:
-            _, rest = _text(body, 0)
-            self.library, _ = _text(body, rest)
-        elif opcode == _SCHEMA:
-            (number,) = struct.unpack_from("<H", body)
-            self._schemas[number], _ = _text(body, 2)
-        elif opcode == _CHANNEL:
-            number, schema = struct.unpack_from("<HH", body)
-            name, at = _text(body, 4)
-            encoding, _ = _text(body, at)
-            topic = self.topics.setdefault(name, Topic(name, self._schemas.get(schema, ""), encoding))
-            self._by_channel[number] = topic
-        elif opcode == _ATTACHMENT:
-            (crc,) = struct.unpack_from("<I", body, len(body) - 4)
-            if crc and crc != zlib.crc32(body[:-4]):
-                self.has_damaged_attachment = True
+    def _parsed(self, at: int) -> Any:
+        """The record at a position, as the library has it."""
+        opcode, record = _read_record(self._file, at, self._size)
+        if opcode == Opcode.ATTACHMENT:  # the library does not verify these
+            crc = int.from_bytes(record[-4:], "little")
+            if crc and crc != zlib.crc32(record[_PREFIX.size : -4]):
                 raise ValueError("checksum of an attachment")
-            name, at = _text(body, 16)
-            _, at = _text(body, at)
-            (length,) = struct.unpack_from("<Q", body, at)
-            self.attachments[name] = body[at + 8 : at + 8 + length]
+        return next(StreamReader(BytesIO(record), skip_magic=True, emit_chunks=True).records)
 
     def _chunk(self, at: int) -> bytes:
-        """A chunk's records, unpacked."""
+        """The records of a chunk, unpacked."""
         if at in self._chunks:
             self._chunks.move_to_end(at)
             return self._chunks[at]
-        if at not in self._broken:
+        if at not in self._damaged_chunks:
             try:
-                data = self._unpacked_chunk(at)
-            except MissingExtraError:
-                raise
-            except Exception as error:  # each way of packing has errors of its own
-                self._broken[at] = str(error) or type(error).__name__
-        if at in self._broken:
-            raise SessionError(
-                f"{self.path}: the chunk at byte {at} is damaged ({self._broken[at]}); copy the file anew"
-            )
-        self._chunks[at] = data
-        if len(self._chunks) > _KEPT_CHUNKS:
+                self._chunks[at] = _unpacked(self._parsed(at))
+            except Exception as error:  # each compression has errors of its own
+                self._damaged_chunks[at] = str(error) or type(error).__name__
+        if at in self._damaged_chunks:
+            why = self._damaged_chunks[at]
+            raise SessionError(f"{self.path}: the chunk at byte {at} is damaged ({why}); copy the file again")
+        if len(self._chunks) > _MAX_KEPT_CHUNKS:
             self._chunks.popitem(last=False)
-        return data
-
-    def _unpacked_chunk(self, at: int) -> bytes:
-        if at < 0:
-            raise ValueError("there is none")
-        self._file.seek(at)
-        _, length = _PREFIX.unpack(self._file.read(_PREFIX.size))
-        body = self._file.read(min(length, self._size))
-        _, _, size, crc = _CHUNK_HEAD.unpack_from(body)
-        compression, begin = _text(body, _CHUNK_HEAD.size)
-        (packed,) = struct.unpack_from("<Q", body, begin)
-        data = _unpacked(body[begin + 8 : begin + 8 + packed], compression, size)
-        if len(data) != size:
-            raise ValueError(f"{len(data)} bytes, not {size}")
-        if crc and crc != zlib.crc32(data):
-            raise ValueError("checksum")
-        return data
+        return self._chunks[at]
 
 
-def _text(body: bytes, at: int) -> tuple[str, int]:
-    """A text, and where it ends."""
-    (length,) = struct.unpack_from("<I", body, at)
-    return body[at + 4 : at + 4 + length].decode("utf-8", "replace"), at + 4 + length
+def _read_record(stream: BinaryIO, at: int, size: int) -> tuple[int, bytes]:
+    """Opcode and bytes of a record, with its prefix, of a stream of a size."""
+    stream.seek(at)
+    opcode, length = _PREFIX.unpack(stream.read(_PREFIX.size))
+    stream.seek(at)
+    record = stream.read(min(_PREFIX.size + length, size))
+    if len(record) != _PREFIX.size + length:
+        raise ValueError("it is cut short")
+    return opcode, record
 
 
-def _unpacked(data: bytes, compression: str, size: int) -> bytes:
-    if not compression:
-        return data
-    try:
-        if compression == "lz4":
-            import lz4.frame
-
-            return bytes(lz4.frame.decompress(data))
-        if compression == "zstd":
-            import zstandard
-
-            return bytes(zstandard.ZstdDecompressor().decompress(data, max_output_size=size))
-    except ImportError:
-        raise MissingExtraError("mcap", "sessions", "reading or writing a session") from None
-    raise ValueError(f"packed by {compression}, which is not known")
+def _unpacked(chunk: Any) -> bytes:
+    if chunk.compression not in _COMPRESSIONS:
+        raise ValueError(f"unknown compression {chunk.compression}")
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    if size != chunk.uncompressed_size:
+        raise ValueError(f"{size} bytes, not {chunk.uncompressed_size}")
+    return bytes(stream.read(size))

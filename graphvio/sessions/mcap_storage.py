@@ -70,8 +70,7 @@ class McapStorage:
         now_s = time.monotonic()
         if now_s - self._last_flush_s >= _FLUSH_S:
             self._last_flush_s = now_s
-            self._mcap._Writer__finalize_chunk()  # the library ends chunks by size only
-            self._file.flush()
+            self._mcap.flush()  # ends the chunk, which the library otherwise does by size only
 
     def finish(self) -> None:
         """Write the summary."""

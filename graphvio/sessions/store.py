@@ -6,8 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from graphvio.sessions.bag_file import BagFile
-from graphvio.sessions.mcap_file import McapFile
 from graphvio.sessions.topics import MessageReader
 
 
@@ -51,4 +49,10 @@ def open_store(path: Path, is_wanted: Callable[[str], bool] = lambda topic: True
         SessionError: if it cannot be read.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
-    return McapFile(path) if path.is_file() and path.suffix == ".mcap" else BagFile(path, is_wanted)
+    if path.is_file() and path.suffix == ".mcap":
+        from graphvio.sessions.mcap_file import McapFile
+
+        return McapFile(path)
+    from graphvio.sessions.bag_file import BagFile
+
+    return BagFile(path, is_wanted)
