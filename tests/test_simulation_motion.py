@@ -32,9 +32,9 @@ def integrate(rate: Float, force: Float, step_s: float, pose: Float, velocity: F
 
 
 @pytest.mark.parametrize("name", SCENE_NAMES)
-@pytest.mark.parametrize("rest_s", [1.0, 0.0])
-def test_noise_free_imu_integrates_to_the_truth(name: str, rest_s: float) -> None:
-    motion = build_scene(name, 20.0, rest_s).motion
+@pytest.mark.parametrize("stationary_s", [1.0, 0.0])
+def test_ideal_readings_integrate_to_truth(name: str, stationary_s: float) -> None:
+    motion = build_scene(name, 20.0, stationary_s).motion
     states = motion.at(np.arange(4001) / IMU_HZ)
     rate, force = ideal_readings(states)
     end = integrate(rate, force, 1.0 / IMU_HZ, states.world_T_body[0], states.velocity[0])
@@ -42,7 +42,7 @@ def test_noise_free_imu_integrates_to_the_truth(name: str, rest_s: float) -> Non
 
 
 @pytest.mark.parametrize("name", SCENE_NAMES)
-def test_derivatives_are_those_of_the_pose(name: str) -> None:
+def test_motion_derivatives_match_poses(name: str) -> None:
     motion = build_scene(name, 20.0).motion
     times, h = np.linspace(0.5, 19.5, 80), 1e-4
     before, now, after = motion.at(times - h), motion.at(times), motion.at(times + h)
@@ -55,17 +55,17 @@ def test_derivatives_are_those_of_the_pose(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SCENE_NAMES)
-def test_rests_first_unless_told_otherwise(name: str) -> None:
-    resting = build_scene(name, 5.0).motion.at(np.linspace(0.0, 0.85, 40))
-    assert np.abs(resting.velocity).max() < 1e-12
-    assert np.abs(resting.angular_velocity).max() < 1e-12
-    _, force = ideal_readings(resting)
+def test_walk_is_stationary_first_by_default(name: str) -> None:
+    stationary = build_scene(name, 5.0).motion.at(np.linspace(0.0, 0.85, 40))
+    assert np.abs(stationary.velocity).max() < 1e-12
+    assert np.abs(stationary.angular_velocity).max() < 1e-12
+    _, force = ideal_readings(stationary)
     np.testing.assert_allclose(np.linalg.norm(force, axis=1), GRAVITY_MPS2, atol=1e-9)
-    moving = build_scene(name, 5.0, rest_s=0.0).motion.at(np.array([0.0]))
+    moving = build_scene(name, 5.0, stationary_s=0.0).motion.at(np.array([0.0]))
     assert np.linalg.norm(moving.velocity) > 0.3
 
 
-def test_walking_pace_and_head_bob() -> None:
+def test_walk_has_pace_and_bob() -> None:
     motion = build_scene("corridor", 20.0).motion
     states = motion.at(np.arange(4.0, 20.0, 0.01))
     speed = np.linalg.norm(states.velocity[:, :2], axis=1)
@@ -74,19 +74,19 @@ def test_walking_pace_and_head_bob() -> None:
     assert 0.03 < np.ptp(height) < 0.06
 
 
-def test_calibration_turns_about_all_axes() -> None:
+def test_calibration_scene_excites_all_axes() -> None:
     states = build_scene("calibration").motion.at(np.arange(3.0, 39.0, 0.02))
     assert states.angular_velocity.std(axis=0).min() > 0.25
 
 
-def test_room_ends_where_it_began() -> None:
+def test_room_walk_ends_at_first_pose() -> None:
     motion = build_scene("room").motion
     first, last = motion.at(np.array([0.0, motion.duration_s])).world_T_body
     assert np.linalg.norm(last[:3, 3] - first[:3, 3]) < 0.01
     assert np.linalg.norm(so3_log(np.ascontiguousarray(first[:3, :3].T @ last[:3, :3]))) < 0.01
 
 
-def test_imu_noise_has_its_densities() -> None:
+def test_measure_noise_has_densities() -> None:
     imu = Imu()
     motion = build_scene("corridor", 30.0).motion
     times = np.arange(6001) / imu.rate_hz

@@ -20,7 +20,7 @@ SCENE = "corridor"
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> SimulatedRecording:
     out = tmp_path_factory.mktemp("simulated") / "one"
-    return simulate(SCENE, out, duration_s=DURATION_S, seed=5, rest_s=0.0)
+    return simulate(SCENE, out, duration_s=DURATION_S, seed=5, stationary_s=0.0)
 
 
 def digest(folder: Path) -> dict[str, str]:
@@ -28,7 +28,7 @@ def digest(folder: Path) -> dict[str, str]:
     return {str(f.relative_to(folder)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
 
 
-def test_layout_is_euroc(recording: SimulatedRecording) -> None:
+def test_simulate_writes_euroc_layout(recording: SimulatedRecording) -> None:
     mav0 = recording.path / "mav0"
     assert recording.framesets == 10
     assert recording.images == 40
@@ -56,8 +56,8 @@ def test_layout_is_euroc(recording: SimulatedRecording) -> None:
     assert recording.path_length_m == pytest.approx(1.2 * DURATION_S, rel=0.15)
 
 
-def test_files_hold_what_the_simulator_gives(recording: SimulatedRecording) -> None:
-    simulator = make_simulator(SCENE, duration_s=DURATION_S, seed=5, rest_s=0.0)
+def test_simulate_files_equal_simulator(recording: SimulatedRecording) -> None:
+    simulator = make_simulator(SCENE, duration_s=DURATION_S, seed=5, stationary_s=0.0)
     stamp = simulator.stamps_ns[4]
     path = recording.path / "mav0" / "cam2" / "data" / f"{stamp}.png"
     written = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -65,7 +65,7 @@ def test_files_hold_what_the_simulator_gives(recording: SimulatedRecording) -> N
     assert np.array_equal(written, simulator.image(4, 2))
 
 
-def test_same_seed_same_bytes_on_any_number_of_threads(
+def test_simulate_same_seed_same_bytes_for_any_threads(
     recording: SimulatedRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[tuple[int, int]] = []
@@ -75,18 +75,18 @@ def test_same_seed_same_bytes_on_any_number_of_threads(
         tmp_path / "b",
         duration_s=DURATION_S,
         seed=5,
-        rest_s=0.0,
+        stationary_s=0.0,
         progress=lambda a, b: calls.append((a, b)),
     )
     assert digest(tmp_path / "b") == digest(recording.path)
     assert calls[-1] == (10, 10)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(5)), raising=False)
-    simulate(SCENE, tmp_path / "c", duration_s=DURATION_S, seed=5, rest_s=0.0)
+    simulate(SCENE, tmp_path / "c", duration_s=DURATION_S, seed=5, stationary_s=0.0)
     assert digest(tmp_path / "c") == digest(recording.path)
 
 
 @pytest.mark.parametrize("where", ["rig.yaml", "mav0/cam0/sensor.yaml"])
-def test_rig_is_read_back(recording: SimulatedRecording, where: str) -> None:
+def test_simulate_rig_is_read_back(recording: SimulatedRecording, where: str) -> None:
     expected = make_simulator(SCENE, duration_s=DURATION_S).rig
     rig = load_rig(recording.path / where)
     assert len(rig.pairs) == 2
@@ -98,7 +98,7 @@ def test_rig_is_read_back(recording: SimulatedRecording, where: str) -> None:
         np.testing.assert_allclose(a.distortion, b.distortion)
 
 
-def test_a_folder_with_files_is_refused(tmp_path: Path) -> None:
+def test_simulate_nonempty_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(SourceError, match="not empty"):
         simulate("room", tmp_path, duration_s=0.1)
@@ -112,7 +112,7 @@ def command() -> typer.Typer:
     return app
 
 
-def test_command_writes_a_recording(tmp_path: Path) -> None:
+def test_command_writes_recording(tmp_path: Path) -> None:
     result = CliRunner().invoke(
         command(), ["room", "--out", str(tmp_path / "r"), "--duration", "0.2", "--rate", "10", "--seed", "1"]
     )
@@ -121,7 +121,7 @@ def test_command_writes_a_recording(tmp_path: Path) -> None:
     assert (tmp_path / "r" / "rig.yaml").is_file()
 
 
-def test_command_names_the_scenes(tmp_path: Path) -> None:
+def test_command_lists_scenes(tmp_path: Path) -> None:
     result = CliRunner().invoke(command(), ["kitchen", "--out", str(tmp_path / "r")])
     assert isinstance(result.exception, SourceError)
     for name in ("room", "corridor", "stairs", "loop", "calibration"):

@@ -33,7 +33,7 @@ def board_world(world_T_board: Float) -> World:
 
 @pytest.mark.parametrize("camera", range(4))
 @pytest.mark.parametrize("tilt", [(0.0, 0.0, 0.2), (0.5, 0.3, 0.0), (-0.6, 0.2, 0.7)])
-def test_projected_truth_lands_on_rendered_corners(camera: int, tilt: tuple[float, float, float]) -> None:
+def test_render_corners_match_projection(camera: int, tilt: tuple[float, float, float]) -> None:
     rays = CameraRays(default_rig().cameras[camera])
     world_T_cam = rays.camera.body_T_cam
     rotation = cv2.Rodrigues(np.array(tilt))[0]
@@ -56,7 +56,7 @@ def test_projected_truth_lands_on_rendered_corners(camera: int, tilt: tuple[floa
     assert errors.max() < 0.1
 
 
-def test_rig_is_the_papers() -> None:
+def test_default_rig_matches_paper() -> None:
     rig = default_rig()
     np.testing.assert_allclose(rig.left2_T_left1(), paper_left2_T_left1(), atol=1e-12)
     np.testing.assert_allclose(rig.left2_T_left1()[:3, 3], [0.3345, 0.0667, -0.1138], atol=1e-12)
@@ -97,7 +97,7 @@ def flow_errors(simulator: Simulator, a: tuple[int, int], b: tuple[int, int]) ->
     camera_a, camera_b = simulator.rig.cameras[a[1]], simulator.rig.cameras[b[1]]
     rays, _ = camera_a.unproject(points)
     spread = [view.depth[row + dy, column + dx] for dx in (-6, 0, 6) for dy in (-6, 0, 6)]
-    smooth = np.ptp(spread, axis=0) < 0.1 * view.depth[row, column]  # not at the edge of a thing
+    smooth = np.ptp(spread, axis=0) < 0.1 * view.depth[row, column]  # not at the edge of an object
     in_a = np.column_stack([rays, np.ones(len(rays))]) * view.depth[row, column][:, None]
     world_T_a = simulator.world_T_body[a[0]] @ camera_a.body_T_cam
     b_T_a = se3_inverse(simulator.world_T_body[b[0]] @ camera_b.body_T_cam) @ world_T_a
@@ -109,32 +109,32 @@ def flow_errors(simulator: Simulator, a: tuple[int, int], b: tuple[int, int]) ->
 
 
 @pytest.mark.parametrize("left", [0, 2])
-def test_stereo_flow_agrees_with_true_depth(room: Simulator, left: int) -> None:
+def test_stereo_flow_matches_depth(room: Simulator, left: int) -> None:
     errors = flow_errors(room, (120, left), (120, left + 1))
     assert np.median(errors) < 0.15
 
 
 @pytest.mark.parametrize("camera", [0, 3])
-def test_flow_over_time_agrees_with_true_motion(room: Simulator, camera: int) -> None:
+def test_temporal_flow_matches_motion(room: Simulator, camera: int) -> None:
     errors = flow_errors(room, (120, camera), (122, camera))
     assert np.median(errors) < 0.15
 
 
-def test_images_are_a_function_of_the_seed(room: Simulator) -> None:
+def test_image_depends_on_seed_only(room: Simulator) -> None:
     again, other = make_simulator("room", duration_s=12.0), make_simulator("room", duration_s=12.0, seed=1)
     assert np.array_equal(room.image(100, 1), again.image(100, 1))
     assert not np.array_equal(room.image(100, 1), other.image(100, 1))
     assert np.array_equal(room.image(100, 1, noisy=False), other.image(100, 1, noisy=False))
 
 
-def test_noise_grows_with_light(room: Simulator) -> None:
+def test_image_noise_grows_with_light(room: Simulator) -> None:
     clean = room.image(100, 0, noisy=False).astype(float)
     difference = room.image(100, 0).astype(float) - clean
     dark, bright = (clean > 10) & (clean < 40), (clean > 110) & (clean < 180)
     assert 0.5 < difference[dark].std() < difference[bright].std() < 3.0
 
 
-def test_gain_makes_a_dark_scene_noisier() -> None:
+def test_film_gain_raises_noise() -> None:
     room = make_simulator("room", duration_s=1.0)
     radiance = np.full((480, 640), 0.4, dtype=np.float32)
     film = room.films[0]

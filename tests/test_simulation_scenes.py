@@ -26,7 +26,7 @@ def at(simulator: Simulator, time_s: float) -> int:
     return round(time_s * simulator.rate_hz)
 
 
-def test_unknown_scene_and_durations_are_refused() -> None:
+def test_build_scene_bad_arguments_are_refused() -> None:
     with pytest.raises(SourceError, match="room"):
         build_scene("kitchen")
     for duration in (0.0, -1.0, float("nan")):
@@ -39,7 +39,7 @@ def test_unknown_scene_and_durations_are_refused() -> None:
 
 
 @pytest.mark.parametrize("name", SCENE_NAMES)
-def test_every_camera_sees_texture_and_no_hole(name: str) -> None:
+def test_scene_every_camera_sees_texture_without_holes(name: str) -> None:
     simulator = make_simulator(name)
     last = len(simulator.stamps_ns) - 1
     for index in (0, last // 5, last):
@@ -53,7 +53,7 @@ def test_every_camera_sees_texture_and_no_hole(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SCENE_NAMES)
-def test_no_camera_passes_through_anything(name: str) -> None:
+def test_scene_cameras_keep_distance(name: str) -> None:
     scene = build_scene(name)
     world_T_body = scene.motion.at(np.arange(0.0, scene.motion.duration_s, 0.05)).world_T_body
     origin, u, v = np.array([(r.origin, r.edge_u, r.edge_v) for r in scene.world.rectangles]).swapaxes(0, 1)
@@ -67,7 +67,7 @@ def test_no_camera_passes_through_anything(name: str) -> None:
         assert not np.any((within[0] >= 0.0) & (within[0] <= 1.0) & (within[1] >= 0.0) & (within[1] <= 1.0))
 
 
-def test_both_pairs_go_blind_at_the_bend(corridor: Simulator) -> None:
+def test_corridor_bend_blinds_both_pairs(corridor: Simulator) -> None:
     start, end = corridor.scene.events["blank"]
     assert end < 40.0
     assert 0.8 <= end - start <= 1.5
@@ -77,7 +77,7 @@ def test_both_pairs_go_blind_at_the_bend(corridor: Simulator) -> None:
         assert max(corners(corridor.image(at(corridor, time_s), camera)) for camera in (0, 2)) > 40
 
 
-def test_door_fills_the_front_view(corridor: Simulator) -> None:
+def test_corridor_door_fills_front_view(corridor: Simulator) -> None:
     start, end = corridor.scene.events["door"]
     seen = [corridor.view(at(corridor, t), 0).is_moving.mean() for t in np.linspace(start, end, 6)]
     assert max(seen) > 0.2
@@ -85,14 +85,14 @@ def test_door_fills_the_front_view(corridor: Simulator) -> None:
     assert np.abs(first - second).max() > 0.05
 
 
-def test_people_pass_both_pairs(corridor: Simulator) -> None:
+def test_corridor_people_pass_both_pairs(corridor: Simulator) -> None:
     start, end = corridor.scene.events["people"]
     for camera in (0, 2):
         seen = [corridor.view(at(corridor, t), camera).is_moving.mean() for t in np.arange(start + 2, end - 2, 0.5)]
         assert max(seen) > 0.1
 
 
-def test_lamps_fail_and_come_back(corridor: Simulator) -> None:
+def test_corridor_lamps_dim_and_return(corridor: Simulator) -> None:
     start, end = corridor.scene.events["dim"]
     assert end < 42.0
     dark = corridor.image(at(corridor, 0.5 * (start + end)), 0)
@@ -101,14 +101,14 @@ def test_lamps_fail_and_come_back(corridor: Simulator) -> None:
     assert corners(dark) > 40
 
 
-def test_a_cut_walk_is_the_beginning_of_the_whole(corridor: Simulator) -> None:
+def test_shorter_walk_is_beginning_of_whole(corridor: Simulator) -> None:
     cut = make_simulator("corridor", duration_s=6.0)
     assert np.array_equal(cut.world_T_body, corridor.world_T_body[: len(cut.stamps_ns)])
     assert cut.scene.events == corridor.scene.events
     assert np.array_equal(cut.image(119, 0), corridor.image(119, 0))
 
 
-def test_the_loop_passes_its_start_in_both_directions() -> None:
+def test_loop_revisits_first_place_both_ways() -> None:
     scene = build_scene("loop")
     times = np.arange(0.0, scene.motion.duration_s, 0.05)
     states = scene.motion.at(times)
@@ -130,7 +130,7 @@ def test_the_loop_passes_its_start_in_both_directions() -> None:
     assert np.linalg.norm(states.velocity[times > scene.motion.duration_s - 0.5], axis=1).max() < 1e-9
 
 
-def test_all_legs_of_the_loop_have_texture_and_the_same_doors() -> None:
+def test_loop_legs_share_textures_and_doors() -> None:
     def leg(x: float, y: float) -> str:
         return "south" if y < 2.0 else "north" if y > 9.0 else "east" if x > 0.0 else "west"
 

@@ -1,6 +1,6 @@
-"""An image-level simulator: textured worlds, walked through with the paper's four cameras and an IMU.
+"""Image-level simulator: a rig of cameras and an IMU is carried through textured worlds.
 
-`simulate` writes a recording; `make_simulator` gives the same images, readings and truth in memory.
+`simulate` writes a recording; `make_simulator` yields the same images, IMU samples and truth in memory.
 """
 
 from graphvio.simulation.default_rig import default_rig

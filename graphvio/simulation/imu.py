@@ -1,4 +1,4 @@
-"""What the IMU measures. A sample is the instantaneous value at its stamp, in frame body."""
+"""IMU of the simulator. A sample is the instantaneous value at its stamp, in frame body."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FIRST_ACCEL_BIAS = 4e-2
 
 @dataclass(frozen=True, eq=False)
 class ImuTrack:
-    """Samples, and the truth at the same stamps.
+    """IMU samples, and the truth at the same stamps.
 
     Attributes:
         stamps_ns: (N,).
@@ -37,14 +37,29 @@ class ImuTrack:
 
 
 def ideal_readings(states: MotionStates) -> tuple[Float, Float]:
-    """Angular velocity (N, 3) and specific force (N, 3) without noise and bias."""
+    """Compute noise-free IMU readings.
+
+    Args:
+        states: true states of the body at N times.
+
+    Returns:
+        Angular velocity (N, 3) in rad/s and specific force (N, 3) in m/s^2, frame body.
+    """
     force_world = states.acceleration + np.array([0.0, 0.0, GRAVITY_MPS2])
     body_R_world = np.swapaxes(states.world_T_body[:, :3, :3], 1, 2)
     return states.angular_velocity, np.einsum("nij,nj->ni", body_R_world, force_world)
 
 
 def measure(motion: Motion, imu: Imu, times_s: Float, stamps_ns: Int, seed: int) -> ImuTrack:
-    """The IMU's track at times (N,); white noise, first biases and their walks come from the seed."""
+    """Sample the IMU along a motion, with white noise and random-walk biases.
+
+    Args:
+        motion: of the body.
+        imu: rate and noise densities.
+        times_s: (N,) seconds since the start of the motion.
+        stamps_ns: (N,) stamps of these times.
+        seed: of the noise, the initial biases and their random walks.
+    """
     states = motion.at(times_s)
     rate, force = ideal_readings(states)
     random = np.random.default_rng(np.random.SeedSequence([seed, 1]))
@@ -59,11 +74,5 @@ def measure(motion: Motion, imu: Imu, times_s: Float, stamps_ns: Int, seed: int)
     accel_bias = bias(_FIRST_ACCEL_BIAS, imu.accel_random_walk)
     gyro_noise = imu.gyro_noise_density * root * random.standard_normal((n, 3))
     accel_noise = imu.accel_noise_density * root * random.standard_normal((n, 3))
-    return ImuTrack(
-        stamps_ns,
-        rate + gyro_bias + gyro_noise,
-        force + accel_bias + accel_noise,
-        gyro_bias,
-        accel_bias,
-        states,
-    )
+    measured = rate + gyro_bias + gyro_noise, force + accel_bias + accel_noise
+    return ImuTrack(stamps_ns, *measured, gyro_bias, accel_bias, states)

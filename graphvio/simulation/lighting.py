@@ -1,6 +1,6 @@
-"""How much light falls on each surface: lamps with shadows, computed once for all that stands still.
+"""Light on the surfaces: lamps with shadows, computed once for all static surfaces.
 
-The light on a rectangle is known on a grid of points and interpolated between them.
+The light on a rectangle is computed on a grid of points and interpolated between them.
 """
 
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ _EVEN_LIGHT = 0.62
 
 @dataclass(frozen=True, eq=False)
 class LightMap:
-    """Light on rectangles: values (L,) float32; grid (Q, 3) of first value, columns (u) and rows (v)."""
+    """Light on rectangles: values (L,) float32; grid (Q, 3) of offset into the values, columns (u) and rows (v)."""
 
     values: np.ndarray[tuple[int], np.dtype[np.float32]]
     grid: Int
 
 
 def light_map(rectangles: list[Rectangle], lamps: list[Lamp], ambient: float) -> LightMap:
-    """The light on every rectangle, with the shadows that they cast on each other."""
+    """Compute the light on every rectangle, with the shadows that they cast on each other."""
     grid = np.zeros((len(rectangles), 3), dtype=np.int64)
     points, normals = [], []
     even: list[tuple[int, int, float]] = []
@@ -55,13 +55,23 @@ def light_map(rectangles: list[Rectangle], lamps: list[Lamp], ambient: float) ->
 
 
 def light_without_shadow(points: Float, normals: Float, lamps: list[Lamp], ambient: float) -> Float:
-    """Light (N,) at points (N, 3) with unit normals (N, 3): for parts that move."""
+    """Compute the light (N,) at points (N, 3) with unit normals (N, 3), without shadows: for moving parts."""
     return irradiance(points, normals, _lamp_array(lamps), np.zeros((0, 3, 3))) + ambient
 
 
 @kernel
 def irradiance(points: Float, normals: Float, lamps: Float, blockers: Float) -> Float:
-    """Direct light (N,) at points (N, 3) with normals (N, 3) from lamps (M, 4) past blockers (B, 3, 3)."""
+    """Compute the direct light of lamps with shadows.
+
+    Args:
+        points: (N, 3), metres.
+        normals: (N, 3) unit normals.
+        lamps: (M, 4) position and power.
+        blockers: (B, 3, 3) origin, edge_u, edge_v of rectangles that cast shadows.
+
+    Returns:
+        Light (N,), without the ambient part.
+    """
     total = np.zeros(len(points))
     for i in range(len(points)):
         for k in range(len(lamps)):

@@ -1,4 +1,4 @@
-"""Smooth motion of the body, with exact derivatives: one spline gives poses, rates and accelerations."""
+"""Motion of the body: a spline that yields poses, rates and accelerations exactly, and walks along paths as such."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ class MotionStates:
 
 
 class Motion:
-    """A motion that is four times continuously differentiable.
+    """A motion of the body, four times continuously differentiable.
 
     Args:
-        course: gives ``[x, y, z, yaw, pitch, roll]`` (N, 6) in metres and radians at times (N,) in seconds.
-            The motion is the spline with these as control values: it follows the course, its sharpest bends
-            rounded. Rotation is ``Rz(yaw) Ry(pitch) Rx(roll)``.
+        course: returns ``[x, y, z, yaw, pitch, roll]`` (N, 6) in metres and radians at times (N,) in seconds, the
+            control values of the spline, which follows them and rounds the sharpest bends. Rotation is
+            ``Rz(yaw) Ry(pitch) Rx(roll)``.
         duration_s: end; the motion is defined from 0 to there.
     """
 
@@ -64,7 +64,7 @@ class Motion:
         self._control = course(np.arange(-2.0, intervals + 3.0, dtype=np.float64) * KNOT_S)
 
     def at(self, times_s: Float) -> MotionStates:
-        """States at times (N,) in seconds.
+        """Evaluate the states at times (N,) in seconds.
 
         Raises:
             ValueError: if a time lies outside the motion.
@@ -86,7 +86,7 @@ class Motion:
 
 
 def _weights_and_derivatives(u: Float) -> tuple[Float, Float, Float]:
-    """Weights (N, 6) of the control values, and their first and second derivatives by time."""
+    """Compute weights (N, 6) of the control values, and their first and second derivatives by time."""
     powers = u ** np.arange(6)
     n = np.arange(6)
     first = np.zeros_like(powers)
@@ -98,14 +98,8 @@ def _weights_and_derivatives(u: Float) -> tuple[Float, Float, Float]:
 
 def _rotations(yaw: Float, pitch: Float, roll: Float) -> Float:
     """``Rz Ry Rx`` (N, 3, 3)."""
-    cy, sy, cp, sp, cr, sr = (
-        np.cos(yaw),
-        np.sin(yaw),
-        np.cos(pitch),
-        np.sin(pitch),
-        np.cos(roll),
-        np.sin(roll),
-    )
+    cy, sy, cp = np.cos(yaw), np.sin(yaw), np.cos(pitch)
+    sp, cr, sr = np.sin(pitch), np.cos(roll), np.sin(roll)
     rows = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
         [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
@@ -115,21 +109,16 @@ def _rotations(yaw: Float, pitch: Float, roll: Float) -> Float:
 
 
 def _body_rates(pitch: Float, roll: Float, rates: Float) -> Float:
-    """Angular velocity (N, 3) in frame body of the rates (N, 3) of yaw, pitch and roll."""
+    """Convert rates (N, 3) of yaw, pitch and roll to angular velocity (N, 3) in frame body."""
     yaw_rate, pitch_rate, roll_rate = rates.T
     cp, sp, cr, sr = np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
-    return np.column_stack(
-        [
-            roll_rate - sp * yaw_rate,
-            cr * pitch_rate + sr * cp * yaw_rate,
-            cr * cp * yaw_rate - sr * pitch_rate,
-        ]
-    )
+    wx, wy = roll_rate - sp * yaw_rate, cr * pitch_rate + sr * cp * yaw_rate
+    return np.column_stack([wx, wy, cr * cp * yaw_rate - sr * pitch_rate])
 
 
 @dataclass(frozen=True)
 class Gait:
-    """What each step does to the body: amplitudes in metres and radians, steps per second."""
+    """Periodic motion of the body by each step: amplitudes in metres and radians, steps per second."""
 
     steps_hz: float = 1.9
     vertical_m: float = 0.024
@@ -141,22 +130,27 @@ class Gait:
 
 
 class Walk:
-    """A walk along the corners (N, 3) of a path, in metres, at the height of the body.
+    """A walk along the corners of a path, which stops at its end and stays there.
 
-    It rests for ``rest_s`` first and then takes about a second to reach its speed; with no rest it is
-    under way at full speed from the start. It stops at the end of the path and stays there.
+    Args:
+        path: (N, 3) corners, metres, at the height of the body.
+        speed_mps: m/s.
+        duration_s: of the motion.
+        stationary_s: initial standstill, after which about a second passes until the walk has its speed; with 0 it is
+            at full speed from the beginning.
+        gait: None for the default one.
     """
 
     def __init__(
-        self, path: Float, speed_mps: float, duration_s: float, rest_s: float = 1.0, gait: Gait | None = None
+        self, path: Float, speed_mps: float, duration_s: float, stationary_s: float = 1.0, gait: Gait | None = None
     ) -> None:
         self.path = np.asarray(path, dtype=np.float64)
         self.gait = gait if gait is not None else Gait()
         lengths = np.linalg.norm(np.diff(self.path, axis=0), axis=1)
         self._corner_at = np.concatenate([[0.0], np.cumsum(lengths)])
-        # Smoothing spreads the start over half its window on each side: begin later, to rest truly.
-        start_s = rest_s + 0.5 * max(_CORNER_S, _HEADING_S) if rest_s > 0.0 else -2.0
-        # The whole path, however little of it is wanted: a cut recording is the beginning of the whole one.
+        # Smoothing spreads the first step over half its window on each side: begin later, for a true standstill.
+        start_s = stationary_s + 0.5 * max(_CORNER_S, _HEADING_S) if stationary_s > 0.0 else -2.0
+        # The whole path, even if a part is wanted: a shorter recording is the beginning of the whole one.
         end_s = max(duration_s, start_s + self._corner_at[-1] / speed_mps)
         self._times = np.arange(-2.0, end_s + 3.0, _STEP_S)
         walked = np.clip(speed_mps * (self._times - start_s), 0.0, None)
@@ -164,7 +158,7 @@ class Walk:
         self.motion = Motion(self._course, duration_s)
 
     def time_at(self, walked_m: float) -> float:
-        """Time in seconds at which so much of the path is walked."""
+        """Return the time in seconds at which ``walked_m`` metres of the path are walked."""
         return float(np.interp(walked_m, self._walked, self._times))
 
     def _course(self, times: Float) -> Float:
@@ -175,7 +169,7 @@ class Walk:
         position = np.column_stack([_smoothed(along[:, i], _CORNER_S) for i in range(3)])
         yaw = _smoothed(headings[leg], _HEADING_S)
         pace = _smoothed(np.gradient(self._walked, _STEP_S), _CORNER_S)
-        stride = pace / max(float(pace.max()), 1e-9)  # nobody bobs while standing still
+        stride = pace / max(float(pace.max()), 1e-9)  # no bob at standstill
         gait, t = self.gait, self._times
         step, side = 2.0 * np.pi * gait.steps_hz * t, np.pi * gait.steps_hz * t
         sway = stride * gait.lateral_m * np.sin(side)
@@ -193,7 +187,7 @@ class Walk:
 
 
 def _smoothed(values: Float, window_s: float) -> Float:
-    """Values (N,) averaged under a raised cosine of the given full width."""
+    """Smooth values (N,) by a raised cosine of the given full width."""
     half = round(0.5 * window_s / _STEP_S)
     window = np.hanning(2 * half + 3)[1:-1]
     padded = np.pad(values, half, mode="edge")

@@ -1,4 +1,4 @@
-"""Kernels of the renderer: which rectangle a ray meets first, and what is to be seen there.
+"""Kernels of the renderer: the first rectangle on each ray, and its radiance.
 
 With the ray ``(x, y, 1)`` in frame cam, every rectangle is nine numbers: inverse depth is ``w = c . ray``,
 and its coordinates (0 to 1 inside) are ``u = a . ray / w`` and ``v = b . ray / w``. Everything that decides
@@ -18,7 +18,12 @@ _MIN_DEPTH_M = 0.02
 
 @kernel
 def ray_coefficients(corners: Float, cam_T_world: Float) -> Float:
-    """Nine numbers (Q, 9) ``[c, a, b]`` of rectangles (Q, 3, 3); zeros if the camera is in their plane."""
+    """Compute the coefficients (Q, 9) ``[c, a, b]`` of rectangles; zeros if the camera is in their plane.
+
+    Args:
+        corners: (Q, 3, 3) origin, edge_u, edge_v; metres, frame world.
+        cam_T_world: (4, 4).
+    """
     coefficients = np.zeros((len(corners), 9))
     rotation, translation = cam_T_world[:3, :3].copy(), cam_T_world[:3, 3].copy()
     for i in range(len(corners)):
@@ -35,43 +40,43 @@ def ray_coefficients(corners: Float, cam_T_world: Float) -> Float:
 
 
 @kernel
-def _most(x: float, y: float, z: float, boxes: Float, n: int) -> float:
-    """Largest value of a linear form over a box ``[x0, x1, y0, y1]`` of rays."""
-    most: float = max(x * boxes[n, 0], x * boxes[n, 1]) + max(y * boxes[n, 2], y * boxes[n, 3]) + z
-    return most
+def _maximum(x: float, y: float, z: float, boxes: Float, n: int) -> float:
+    """Maximise a linear form over a box ``[x0, x1, y0, y1]`` of rays."""
+    maximum: float = max(x * boxes[n, 0], x * boxes[n, 1]) + max(y * boxes[n, 2], y * boxes[n, 3]) + z
+    return maximum
 
 
 @kernel
 def _nearest_in(k: Float, i: int, boxes: Float, n: int) -> float:
-    """Upper bound of rectangle i's inverse depth over box n of rays, or -1 if it is seen nowhere in it."""
-    nearest = _most(k[i, 0], k[i, 1], k[i, 2], boxes, n)
+    """Bound rectangle i's inverse depth over box n of rays from above; -1 if it is visible nowhere in it."""
+    nearest = _maximum(k[i, 0], k[i, 1], k[i, 2], boxes, n)
     if nearest <= 0.0:
         return -1.0
     for j in (3, 6):
-        if _most(k[i, j], k[i, j + 1], k[i, j + 2], boxes, n) < 0.0:
+        if _maximum(k[i, j], k[i, j + 1], k[i, j + 2], boxes, n) < 0.0:
             return -1.0
-        if _most(k[i, 0] - k[i, j], k[i, 1] - k[i, j + 1], k[i, 2] - k[i, j + 2], boxes, n) < 0.0:
+        if _maximum(k[i, 0] - k[i, j], k[i, 1] - k[i, j + 1], k[i, 2] - k[i, j + 2], boxes, n) < 0.0:
             return -1.0
     return nearest
 
 
 @kernel
 def tile_lists(coefficients: Float, tile_boxes: Float) -> tuple[Int, Int, Float]:
-    """Candidates of every tile, nearest first.
+    """List the candidate rectangles of every tile, nearest first.
 
     Args:
         coefficients: (Q, 9).
         tile_boxes: (T, 4) ``[x0, x1, y0, y1]`` of the rays of each tile.
 
     Returns:
-        Start of each tile's list (T + 1,), rectangles (N,), and bounds of their inverse depth (N,).
+        Offsets (T + 1,) of the tiles' lists, rectangles (N,), and upper bounds of their inverse depth (N,).
     """
     everywhere = np.array(
         [[tile_boxes[:, 0].min(), tile_boxes[:, 1].max(), tile_boxes[:, 2].min(), tile_boxes[:, 3].max()]]
     )
     in_view = np.array([i for i in range(len(coefficients)) if _nearest_in(coefficients, i, everywhere, 0) > 0.0])
     n_tiles = len(tile_boxes)
-    starts = np.zeros(n_tiles + 1, dtype=np.int64)
+    offsets = np.zeros(n_tiles + 1, dtype=np.int64)
     items = np.empty(max(1, n_tiles * len(in_view)), dtype=np.int64)
     bounds = np.empty(len(items))
     end = 0
@@ -86,15 +91,15 @@ def tile_lists(coefficients: Float, tile_boxes: Float) -> tuple[Int, Int, Float]
                     place -= 1
                 items[place], bounds[place] = i, bound
                 end += 1
-        starts[tile + 1] = end
-    return starts, items[:end], bounds[:end]
+        offsets[tile + 1] = end
+    return offsets, items[:end], bounds[:end]
 
 
 @kernel
 def _first_hit(
     coefficients: Float, items: Int, bounds: Float, first: int, last: int, x: float, y: float
 ) -> tuple[int, float]:
-    """Nearest rectangle on a ray, or -1, and its inverse depth."""
+    """Find the nearest rectangle on a ray, or -1, and its inverse depth."""
     best, nearest = -1, 0.0
     for n in range(first, last):
         if bounds[n] <= nearest:
@@ -114,8 +119,19 @@ def _first_hit(
 
 
 @kernel
-def first_hits(coefficients: Float, starts: Int, items: Int, bounds: Float, rays: Float) -> tuple[Int, Float]:
-    """Rectangle (H, W), -1 for none, and inverse depth (H, W) in 1/m at the centre of every pixel."""
+def first_hits(coefficients: Float, offsets: Int, items: Int, bounds: Float, rays: Float) -> tuple[Int, Float]:
+    """Find the first rectangle on the ray of every pixel's centre.
+
+    Args:
+        coefficients: (Q, 9).
+        offsets: (T + 1,) from `tile_lists`.
+        items: (N,) from `tile_lists`.
+        bounds: (N,) from `tile_lists`.
+        rays: (H, W, 2) normalised coordinates of the pixels.
+
+    Returns:
+        Rectangle (H, W), -1 for none, and inverse depth (H, W) in 1/m.
+    """
     height, width = rays.shape[0], rays.shape[1]
     tiles_across = (width + TILE_PX - 1) // TILE_PX
     hit = np.empty((height, width), dtype=np.int64)
@@ -127,8 +143,8 @@ def first_hits(coefficients: Float, starts: Int, items: Int, bounds: Float, rays
                 coefficients,
                 items,
                 bounds,
-                starts[tile],
-                starts[tile + 1],
+                offsets[tile],
+                offsets[tile + 1],
                 rays[row, column, 0],
                 rays[row, column, 1],
             )
@@ -137,7 +153,7 @@ def first_hits(coefficients: Float, starts: Int, items: Int, bounds: Float, rays
 
 @kernel
 def _bilinear(values: AnyArray, start: int, x: float, y: float, mask: int) -> float:
-    """Value at (x, y) of a grid stored row by row; indices wrap around (the side is ``mask + 1``)."""
+    """Interpolate a grid stored row by row at (x, y); indices wrap around (the side is ``mask + 1``)."""
     x0, y0 = np.floor(x), np.floor(y)
     fx, fy = x - x0, y - y0
     left, top = int(x0) & mask, int(y0) & mask
@@ -151,7 +167,7 @@ def _bilinear(values: AnyArray, start: int, x: float, y: float, mask: int) -> fl
 
 @kernel
 def _light(values: AnyArray, grid: Int, i: int, u: float, v: float) -> float:
-    """Light at (u, v) of rectangle i, from its grid ``[first value, columns, rows]``."""
+    """Interpolate the light at (u, v) of rectangle i from its grid ``[offset, columns, rows]``."""
     start, columns, rows = grid[i, 0], grid[i, 1], grid[i, 2]
     x, y = min(max(u, 0.0), 1.0) * (columns - 1), min(max(v, 0.0), 1.0) * (rows - 1)
     left, top = min(int(x), max(columns - 2, 0)), min(int(y), max(rows - 2, 0))
@@ -164,12 +180,12 @@ def _light(values: AnyArray, grid: Int, i: int, u: float, v: float) -> float:
 
 
 @kernel
-def _seen(
+def _radiance(
     k: Float, i: int, x: float, y: float, x_i: float, x_j: float, y_i: float, y_j: float,
-    texture: Int, mapping: Float, texels: AnyArray, level_starts: Int, sides: Int,
+    texture: Int, mapping: Float, texels: AnyArray, level_offsets: Int, sides: Int,
     values: AnyArray, grid: Int,
 ) -> float:  # fmt: skip
-    """Radiance of rectangle i on the ray (x, y), averaged over a pixel's footprint.
+    """Average the radiance of rectangle i on the ray (x, y) over a pixel's footprint.
 
     The ray changes by (x_i, y_i) with the pixel's column and by (x_j, y_j) with its row.
     """
@@ -190,13 +206,13 @@ def _seen(
     footprint = max(shortest, longest / probes)
     level = 0.0
     if footprint > 1.0:
-        level = min(np.log2(footprint), level_starts.shape[1] - 1.001)
+        level = min(np.log2(footprint), level_offsets.shape[1] - 1.001)
     fine = int(level)
     blend = level - fine
     fine_side, coarse_side = max(side >> fine, 1), max(side >> (fine + 1), 1)
     fine_start, coarse_start = (
-        level_starts[of, fine],
-        level_starts[of, min(fine + 1, level_starts.shape[1] - 1)],
+        level_offsets[of, fine],
+        level_offsets[of, min(fine + 1, level_offsets.shape[1] - 1)],
     )
     s, t = u * along_u + mapping[i, 1], v * along_v + mapping[i, 3]
     total = 0.0
@@ -217,7 +233,7 @@ def _seen(
 @kernel
 def shade(
     coefficients: Float,
-    starts: Int,
+    offsets: Int,
     items: Int,
     bounds: Float,
     rays: Float,
@@ -227,29 +243,29 @@ def shade(
     mapping: Float,
     tint: Float,
     texels: AnyArray,
-    level_starts: Int,
+    level_offsets: Int,
     sides: Int,
     values: AnyArray,
     grid: Int,
 ) -> AnyArray:
-    """Radiance (H, W) float32, with pixels at the border of two rectangles averaged over a grid of rays.
+    """Compute the radiance (H, W) float32; pixels at the border of two rectangles are averages over a grid of rays.
 
     Args:
         coefficients: (Q, 9).
-        starts: (T + 1,), with items (N,) and bounds (N,), from `tile_lists`.
-        items: see starts.
-        bounds: see starts.
+        offsets: (T + 1,) from `tile_lists`.
+        items: (N,) from `tile_lists`.
+        bounds: (N,) from `tile_lists`.
         rays: (H, W, 2) normalised coordinates of the pixels.
         slopes: (H, W, 2, 2) their derivative by the pixel's column and row.
         hit: (H, W) from `first_hits`.
-        texture: (Q,), mapping (Q, 4) and tint (Q,): see `Surfaces`.
-        mapping: see texture.
-        tint: see texture.
-        texels: (T,), level_starts (n, levels) and sides (n,): see `Atlas`.
-        level_starts: see texels.
-        sides: see texels.
-        values: (L,) and grid (Q, 3): see `LightMap`.
-        grid: see values.
+        texture: (Q,), see `Surfaces`.
+        mapping: (Q, 4), see `Surfaces`.
+        tint: (Q,), see `Surfaces`.
+        texels: (T,), see `Atlas`.
+        level_offsets: (n, levels), see `Atlas.offsets`.
+        sides: (n,), see `Atlas`.
+        values: (L,), see `LightMap`.
+        grid: (Q, 3), see `LightMap`.
     """
     height, width = hit.shape
     tiles_across = (width + TILE_PX - 1) // TILE_PX
@@ -275,11 +291,11 @@ def shade(
                     x = rays[row, column, 0] + x_i * right + x_j * down
                     y = rays[row, column, 1] + y_i * right + y_j * down
                     if border:
-                        i, _ = _first_hit(coefficients, items, bounds, starts[tile], starts[tile + 1], x, y)
+                        i, _ = _first_hit(coefficients, items, bounds, offsets[tile], offsets[tile + 1], x, y)
                     if i >= 0:
-                        total += tint[i] * _seen(
+                        total += tint[i] * _radiance(
                             coefficients, i, x, y, x_i, x_j, y_i, y_j,
-                            texture, mapping, texels, level_starts, sides, values, grid,
+                            texture, mapping, texels, level_offsets, sides, values, grid,
                         )  # fmt: skip
             radiance[row, column] = total / (rays_each * rays_each)
     return radiance

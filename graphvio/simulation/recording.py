@@ -1,4 +1,4 @@
-"""Writes a simulated recording in the EuRoC/ASL layout, with graphvio's ``rig.yaml`` next to ``mav0``."""
+"""Writer of simulated recordings in the EuRoC/ASL layout, with graphvio's ``rig.yaml`` next to ``mav0``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class SimulatedRecording:
-    """What was written.
+    """Summary of a recording that was written.
 
     Attributes:
         path: folder that holds ``mav0`` and ``rig.yaml``.
@@ -35,7 +35,7 @@ class SimulatedRecording:
         imu_samples: number of IMU samples.
         duration_s: length of the walk.
         path_length_m: length of the body's true path, at the stamps of the IMU.
-        events: name -> (start, end) in seconds since the first frameset of what makes the scene hard.
+        events: name -> (start, end), in seconds since the first frameset, of the scene's hard moments.
     """
 
     path: Path
@@ -55,7 +55,7 @@ def simulate(
     duration_s: float | None = None,
     seed: int = 0,
     rate_hz: float | Sequence[float] = 20.0,
-    rest_s: float = 1.0,
+    stationary_s: float = 1.0,
     trigger_offset_ms: float = 0.0,
     progress: Progress | None = None,
 ) -> SimulatedRecording:
@@ -64,11 +64,11 @@ def simulate(
     Args:
         name: scene, one of `graphvio.simulation.SCENE_NAMES`.
         out: folder to write; it must be empty or not exist.
-        duration_s: only so much of the walk; None for all of it.
+        duration_s: of the recording; None for the whole walk.
         seed: of all noise; the same seed gives the same bytes.
-        rate_hz: framesets per second; or one rate for each pair, of which the last holds for further pairs.
-        rest_s: how long the rig stands still at first; 0 starts at walking speed.
-        trigger_offset_ms: each pair is triggered so much later than the pair before it; 0 triggers all together.
+        rate_hz: framesets per second; or one rate for each pair, the last one also for all pairs after it.
+        stationary_s: initial standstill; 0 begins at walking speed.
+        trigger_offset_ms: delay of each pair's triggers after those of the pair before it.
         progress: called as the framesets are written.
 
     Raises:
@@ -81,7 +81,7 @@ def simulate(
         duration_s=duration_s,
         seed=seed,
         rate_hz=rate_hz,
-        rest_s=rest_s,
+        stationary_s=stationary_s,
         trigger_offset_ms=trigger_offset_ms,
     )
     return write_recording(simulator, out, progress)
@@ -136,7 +136,7 @@ def _require_empty(out: Path) -> None:
 def _in_order(
     pool: ThreadPoolExecutor, work: Callable[[int], None], indices: Sequence[int], ahead: int
 ) -> Iterator[None]:
-    """Results in order with a bounded number under way, so that an error or an interrupt stops soon."""
+    """Yield results in order, with a bounded number pending so that an error or an interrupt stops soon."""
     remaining = iter(indices)
     pending: list[Future[None]] = [pool.submit(work, i) for i in islice(remaining, ahead)]
     try:

@@ -1,4 +1,4 @@
-"""What a camera of the rig sees: radiance without noise, and the depth that belongs to it."""
+"""Images of a camera: radiance and depth along its rays, and the grey values that its sensor makes of the radiance."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _READ_NOISE = 0.7  # grey levels at gain 1
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One rendered view.
+    """One rendered view, without noise.
 
     Attributes:
         radiance: (H, W) float32, 1 for a white surface in full light.
         depth: (H, W) metres along the camera's z axis, at each pixel's centre; infinite where nothing is.
-        is_moving: (H, W) whether what is seen there moves by itself.
+        is_moving: (H, W) whether the surface there moves.
     """
 
     radiance: NDArray[np.float32]
@@ -38,7 +38,14 @@ class View:
 
 
 class CameraRays:
-    """The rays of a camera's pixels, computed once: exact for its distortion."""
+    """Rays of a camera's pixels, computed once and exact for its distortion.
+
+    Args:
+        camera: of the rig.
+
+    Raises:
+        ValueError: if a pixel has no ray.
+    """
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
@@ -53,13 +60,13 @@ class CameraRays:
         self.tile_boxes = _tile_boxes(self.rays, self.slopes)
 
     def render(self, surfaces: Surfaces, atlas: Atlas, world_T_cam: Float) -> View:
-        """The view from a pose ``world_T_cam`` (4, 4)."""
+        """Render the surfaces as seen from ``world_T_cam`` (4, 4)."""
         coefficients = ray_coefficients(surfaces.corners, se3_inverse(world_T_cam))
-        starts, items, bounds = tile_lists(coefficients, self.tile_boxes)
-        hit, inverse_depth = first_hits(coefficients, starts, items, bounds, self.rays)
+        offsets, items, bounds = tile_lists(coefficients, self.tile_boxes)
+        hit, inverse_depth = first_hits(coefficients, offsets, items, bounds, self.rays)
         radiance = shade(
-            coefficients, starts, items, bounds, self.rays, self.slopes, hit,
-            surfaces.texture, surfaces.mapping, surfaces.tint, atlas.texels, atlas.starts, atlas.sides,
+            coefficients, offsets, items, bounds, self.rays, self.slopes, hit,
+            surfaces.texture, surfaces.mapping, surfaces.tint, atlas.texels, atlas.offsets, atlas.sides,
             surfaces.light.values, surfaces.light.grid,
         )  # fmt: skip
         with np.errstate(divide="ignore"):
@@ -69,7 +76,7 @@ class CameraRays:
 
 @kernel
 def _ray_slopes(model: int, intrinsics: Float, distortion: Float, rays: Float) -> Float:
-    """Derivatives (N, 2, 2) of rays (N, 2) by the pixel's column and row."""
+    """Differentiate rays (N, 2) by the pixel's column and row: (N, 2, 2)."""
     slopes = np.empty((len(rays), 2, 2))
     for i in range(len(rays)):
         _, _, a, b, c, d = distort(model, distortion, rays[i, 0], rays[i, 1])
@@ -82,7 +89,7 @@ def _ray_slopes(model: int, intrinsics: Float, distortion: Float, rays: Float) -
 
 
 def _tile_boxes(rays: Float, slopes: Float) -> Float:
-    """Extent (T, 4) ``[x0, x1, y0, y1]`` of the rays of each tile, with half a pixel around it."""
+    """Compute the extent (T, 4) ``[x0, x1, y0, y1]`` of the rays of each tile, with half a pixel around it."""
     height, width = rays.shape[:2]
     margin = 0.51 * np.abs(slopes).sum(axis=3)
     low, high = rays - margin, rays + margin
@@ -97,7 +104,12 @@ def _tile_boxes(rays: Float, slopes: Float) -> Float:
 
 
 class Film:
-    """The sensor behind one camera's lens."""
+    """Sensor of a camera: exposure, vignetting, shot and read noise, 8 bit.
+
+    Args:
+        rays: of its pixels.
+        sensitivity: grey value of full radiance, as a fraction of white.
+    """
 
     def __init__(self, rays: CameraRays, sensitivity: float) -> None:
         width, height = rays.camera.size_px
@@ -108,7 +120,7 @@ class Film:
         self._response = (255.0 * sensitivity * falloff).astype(np.float32)
 
     def expose(self, radiance: AnyArray, exposure: Exposure, noise: np.random.Generator | None) -> Image:
-        """Grey image (H, W) of a radiance (H, W); without noise if there is no generator for it."""
+        """Convert a radiance (H, W) to a grey image (H, W), without noise if ``noise`` is None."""
         if noise is None:
             normal = np.zeros(radiance.shape, dtype=np.float32)
         else:

@@ -1,4 +1,4 @@
-"""A recording in memory: images, IMU and truth of a walk through a scene."""
+"""Simulated recordings in memory: images, IMU samples and truth of a walk through a scene."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class Simulator:
     """A rig that is carried through a scene; everything is a function of its arguments, to the bit.
 
     Args:
-        scene: where, and how it is walked.
-        rig: cameras and IMU; None for the paper's. A rig without an IMU gets the default one.
+        scene: world, motion and light.
+        rig: cameras and IMU; None for the default rig. A rig without an IMU is given the default IMU.
         seed: of all noise and biases. World and walk do not depend on it.
-        rate_hz: framesets per second; or one rate for each pair, of which the last holds for further pairs.
-        atlas: textures of the world; None for the standard ones.
-        trigger_offset_ms: each pair is triggered so much later than the pair before it; 0 triggers all together.
+        rate_hz: framesets per second; or one rate for each pair, the last one also for all pairs after it.
+        atlas: textures of the world; None for the standard textures.
+        trigger_offset_ms: delay of each pair's triggers after those of the pair before it.
 
     Attributes:
         rates_hz: of each pair, images per second.
@@ -73,11 +73,11 @@ class Simulator:
 
     @cached_property
     def stamps_ns(self) -> Int:
-        """Stamps (N,) of the framesets: all instants at which a pair is triggered."""
+        """Stamps (N,) of the framesets: all instants at which any pair is triggered."""
         return np.unique(np.concatenate([self.triggers_ns(pair) for pair in range(len(self.rig.pairs))]))
 
     def triggers_ns(self, pair: int) -> Int:
-        """Stamps (M,) at which a pair takes its images, all within the walk."""
+        """Return the stamps (M,) at which a pair takes images, all within the walk."""
         rate, duration_s = self.rates_hz[pair], self.scene.motion.duration_s
         late_ns = round(pair * self._trigger_offset_ms * 1e6)
         count = int(np.floor(duration_s * rate + 1e-9))
@@ -85,7 +85,7 @@ class Simulator:
         return np.asarray(EPOCH_NS + since_ns[(since_ns <= round(duration_s * 1e9)) | (since_ns == 0)])
 
     def triggered(self, index: int) -> tuple[int, ...]:
-        """The pairs that take images at a frameset's stamp."""
+        """Return the indices of the pairs that take images at a frameset's stamp."""
         stamp = int(self.stamps_ns[index])
         return tuple(pair for pair, triggers in enumerate(self._triggers) if stamp in triggers)
 
@@ -101,30 +101,36 @@ class Simulator:
 
     @cached_property
     def imu_track(self) -> ImuTrack:
-        """IMU samples from the first frameset to the last and beyond, with the truth at their stamps."""
+        """IMU samples over the whole motion, with the truth at their stamps."""
         imu = self.imu
         count = int(np.floor(self.scene.motion.duration_s * imu.rate_hz + 1e-9)) + 1
         stamps_ns = EPOCH_NS + np.round(np.arange(count) * (1e9 / imu.rate_hz)).astype(np.int64)
         return measure(self.scene.motion, imu, self._seconds(stamps_ns), stamps_ns, self.seed)
 
     def surfaces(self, index: int) -> Surfaces:
-        """The world at the time of a frameset."""
+        """Return the surfaces of the world at the time of a frameset."""
         return self._stage.at(float(self._seconds(self.stamps_ns[index])))
 
     def view(self, index: int, camera: int, surfaces: Surfaces | None = None) -> View:
-        """Noise-free radiance and true depth of a frameset's image; cameras count as in ``rig.cameras``."""
+        """Render the noise-free radiance and true depth of an image.
+
+        Args:
+            index: of the frameset.
+            camera: index in ``rig.cameras``.
+            surfaces: of this instant, if they are there already.
+        """
         seen = surfaces if surfaces is not None else self.surfaces(index)
         world_T_cam = self.world_T_body[index] @ self.rig.cameras[camera].body_T_cam
         return self._rays[camera].render(seen, self._stage.atlas, world_T_cam)
 
     def image(self, index: int, camera: int, noisy: bool = True, surfaces: Surfaces | None = None) -> Image:
-        """Grey image (H, W) of a frameset."""
+        """Render a grey image (H, W); see `view` for the arguments."""
         exposure = self.scene.exposure(float(self._seconds(self.stamps_ns[index])))
         noise = np.random.Generator(np.random.SFC64([self.seed, 2, camera, index])) if noisy else None
         return self.films[camera].expose(self.view(index, camera, surfaces).radiance, exposure, noise)
 
     def frameset(self, index: int, noisy: bool = True) -> FrameSet:
-        """Images of the pairs that are triggered at one instant."""
+        """Render the images of the pairs that are triggered at one instant."""
         surfaces = self.surfaces(index)
         images = {
             k: (self.image(index, 2 * k, noisy, surfaces), self.image(index, 2 * k + 1, noisy, surfaces))
@@ -147,13 +153,21 @@ def make_simulator(
     duration_s: float | None = None,
     seed: int = 0,
     rate_hz: float | Sequence[float] = 20.0,
-    rest_s: float = 1.0,
+    stationary_s: float = 1.0,
     trigger_offset_ms: float = 0.0,
 ) -> Simulator:
-    """A simulator of a scene by its name, with the paper's rig; `Simulator` tells of rates and offsets.
+    """Build a simulator of a scene by its name, with the default rig.
+
+    Args:
+        name: one of `graphvio.simulation.SCENE_NAMES`.
+        duration_s: of the recording; None for the whole walk.
+        seed: see `Simulator`.
+        rate_hz: see `Simulator`.
+        stationary_s: initial standstill; 0 begins at walking speed.
+        trigger_offset_ms: see `Simulator`.
 
     Raises:
         SourceError: if there is no such scene, or a value is impossible.
     """
-    scene = build_scene(name, duration_s, rest_s)
+    scene = build_scene(name, duration_s, stationary_s)
     return Simulator(scene, seed=seed, rate_hz=rate_hz, trigger_offset_ms=trigger_offset_ms)

@@ -1,4 +1,4 @@
-"""A world at one instant, as the arrays that the renderer's kernels read."""
+"""Arrays of a world at one instant, as the renderer's kernels read them."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from graphvio.simulation.world import Rectangle, World
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Rectangles of one instant.
+    """The rectangles of a world at one instant.
 
     Attributes:
         corners: (Q, 3, 3) origin, edge_u, edge_v; metres, frame world.
         texture: (Q,) index in the atlas.
-        mapping: (Q, 4) repetitions along u, start of u, the same for v.
-        tint: (Q,) factor on reflectance.
-        light: light on them.
+        mapping: (Q, 4) texture repetitions along u, shift along u, and the same for v.
+        tint: (Q,) factor of the reflectance.
+        light: on the rectangles.
         is_moving: (Q,).
     """
 
@@ -34,7 +34,7 @@ class Surfaces:
 
 
 class Stage:
-    """A world, prepared once, that can be asked for its surfaces at any time."""
+    """A world prepared once, from which the surfaces at any time are computed."""
 
     def __init__(self, world: World, atlas: Atlas) -> None:
         self.atlas = atlas
@@ -52,7 +52,7 @@ class Stage:
         self._grid = np.vstack([self._light.grid, np.column_stack([one_cell, np.ones((len(parts), 2), np.int64)])])
 
     def at(self, time_s: float) -> Surfaces:
-        """The surfaces at a time in seconds since the start of the walk."""
+        """Compute the surfaces at a time in seconds since the start of the walk."""
         corners, values = self._corners, self._light.values
         if self._world.moving:
             world_T_part = np.array([part.world_T_part(time_s) for part in self._world.moving])[self._part_of]

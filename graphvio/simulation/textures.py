@@ -1,7 +1,7 @@
-"""Procedural reflectance maps: what the surfaces of all scenes look like.
+"""Procedural reflectance maps of all surfaces, packed with their mipmaps into one array that the renderer samples.
 
 Every texture is square, its side a power of two, repeats without a seam where it is meant to be tiled, and
-holds diffuse reflectance between 0 and 1. Row 0 is the top. The same maps are drawn every time.
+holds diffuse reflectance between 0 and 1. Row 0 is the top. The maps are the same at every call.
 """
 
 from __future__ import annotations
@@ -28,38 +28,38 @@ class Atlas:
     """All textures with their mipmaps.
 
     Attributes:
-        texels: (T,) float32 reflectance; level k of texture i starts at ``starts[i, k]``, row by row.
-        starts: (n, levels) int64.
+        texels: (T,) float32 reflectance; level k of texture i begins at ``offsets[i, k]``, row by row.
+        offsets: (n, levels) int64.
         sides: (n,) int64 texels of a side of level 0; level k has ``sides >> k``.
         tile_m: (n,) metres that one repetition covers.
         numbers: name -> index.
     """
 
     texels: Map
-    starts: Int
+    offsets: Int
     sides: Int
     tile_m: Float
     numbers: dict[str, int]
 
 
 def pack(maps: dict[str, tuple[Map, float]]) -> Atlas:
-    """An atlas of named maps, each (side, side) with the metres that one repetition covers."""
+    """Pack named maps, each (side, side) with the metres that one repetition covers, into an atlas."""
     levels = max(int(m.shape[0]).bit_length() for m, _ in maps.values())
-    starts = np.zeros((len(maps), levels), dtype=np.int64)
+    offsets = np.zeros((len(maps), levels), dtype=np.int64)
     chunks: list[Map] = []
     end = 0
     for i, (texture, _) in enumerate(maps.values()):
         level = texture.astype(np.float32)
         for k in range(levels):
             if level.shape[0] > 0:
-                starts[i, k] = end
+                offsets[i, k] = end
                 chunks.append(level.ravel())
                 end += level.size
             half = level.shape[0] // 2
             level = level.reshape(half, 2, half, 2).mean(axis=(1, 3)) if half else level[:0]
     return Atlas(
         texels=np.concatenate(chunks),
-        starts=starts,
+        offsets=offsets,
         sides=np.array([m.shape[0] for m, _ in maps.values()], dtype=np.int64),
         tile_m=np.array([tile for _, tile in maps.values()]),
         numbers={name: i for i, name in enumerate(maps)},
@@ -68,22 +68,22 @@ def pack(maps: dict[str, tuple[Map, float]]) -> Atlas:
 
 @functools.cache
 def standard_atlas() -> Atlas:
-    """The textures that all scenes share."""
+    """Return the textures that all scenes share."""
     maps: dict[str, tuple[Map, float]] = {}
-    for i, (name, (draw, tile_m)) in enumerate(_PAINTERS.items()):
-        texture = draw(np.random.default_rng([_WORLD_SEED, i]))
+    for i, (name, (paint, tile_m)) in enumerate(_PAINTERS.items()):
+        texture = paint(np.random.default_rng([_WORLD_SEED, i]))
         maps[name] = (np.clip(texture, 0.02, 0.95).astype(np.float32), tile_m)
     return pack(maps)
 
 
 def checkerboard(squares: int) -> Map:
-    """Map (SIDE, SIDE) of ``squares`` by ``squares`` fields, dark and bright."""
+    """Make a map (SIDE, SIDE) of ``squares`` by ``squares`` fields, dark and bright."""
     row = np.arange(SIDE) * squares // SIDE
     return np.where((row[:, None] + row[None, :]) % 2 == 0, 0.12, 0.85).astype(np.float32)
 
 
 def _noise(rng: Rng, coarsest: int, octaves: int, gain: float = 0.6) -> Map:
-    """Seamless noise (SIDE, SIDE) of unit deviation; ``coarsest`` cells a side, each octave twice as fine."""
+    """Sample seamless noise (SIDE, SIDE) of unit deviation; ``coarsest`` cells a side, each octave twice as fine."""
     total = np.zeros((SIDE, SIDE), dtype=np.float32)
     amplitude, cells = 1.0, coarsest
     for _ in range(octaves):
@@ -115,7 +115,7 @@ def _concrete(rng: Rng) -> Map:
 
 
 def _cells(rng: Rng, rows: int, columns: int, joint: int, shift: bool, spread: float) -> tuple[Map, Map]:
-    """Fields of random brightness in a running bond, and the mask (SIDE, SIDE) of the joints between them."""
+    """Sample fields of random brightness in a running bond, and the mask (SIDE, SIDE) of the joints between them."""
     y, x = np.mgrid[0:SIDE, 0:SIDE]
     row = y * rows // SIDE
     offset = (row % 2) * (SIDE // columns // 2) if shift else 0
@@ -138,9 +138,9 @@ def _tiles(rng: Rng) -> Map:
 
 def _planks(rng: Rng) -> Map:
     fields, joints = _cells(rng, 12, 2, 2, shift=True, spread=0.08)
-    grain = cv2.GaussianBlur(_noise(rng, 32, 5), (31, 1), 0, borderType=cv2.BORDER_REFLECT)
+    fibres = cv2.GaussianBlur(_noise(rng, 32, 5), (31, 1), 0, borderType=cv2.BORDER_REFLECT)
     knots = (_noise(rng, 32, 2) > 2.1) * 0.15
-    return np.asarray((0.42 + fields + 0.08 * grain - knots) * (1 - 0.75 * joints), dtype=np.float32)
+    return np.asarray((0.42 + fields + 0.08 * fibres - knots) * (1 - 0.75 * joints), dtype=np.float32)
 
 
 def _wood(rng: Rng) -> Map:
@@ -173,13 +173,8 @@ def _books(rng: Rng) -> Map:
             cv2.rectangle(image, (x, bottom - height), (min(x + width, SIDE - 6), bottom), tone, -1)
             band = bottom - int(height * rng.uniform(0.3, 0.8))
             label = 0.9 - 0.8 * tone
-            cv2.rectangle(
-                image,
-                (x + 2, band),
-                (min(x + width - 2, SIDE - 8), band + int(rng.integers(4, 16))),
-                label,
-                -1,
-            )
+            end = (min(x + width - 2, SIDE - 8), band + int(rng.integers(4, 16)))
+            cv2.rectangle(image, (x + 2, band), end, label, -1)
             x += width + int(rng.integers(1, 4))
         cv2.rectangle(image, (0, top + shelf - 6), (SIDE, top + shelf), 0.45, -1)
     return np.asarray(image + 0.015 * _noise(rng, 64, 3), dtype=np.float32)

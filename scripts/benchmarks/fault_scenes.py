@@ -44,7 +44,7 @@ def texture_map(name: str) -> Map:
     """Reflectance (side, side) of one of the simulator's textures."""
     atlas = standard_atlas()
     number = atlas.numbers[name]
-    side, start = int(atlas.sides[number]), int(atlas.starts[number, 0])
+    side, start = int(atlas.sides[number]), int(atlas.offsets[number, 0])
     return atlas.texels[start : start + side * side].reshape(side, side)
 
 

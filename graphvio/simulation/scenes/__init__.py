@@ -1,4 +1,4 @@
-"""The scenes by name."""
+"""Scenes of the simulator by name."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _BUILDERS: dict[str, tuple[Callable[[float, float], Scene], float]] = {
 SCENE_NAMES = tuple(_BUILDERS)
 
 
-def build_scene(name: str, duration_s: float | None = None, rest_s: float = 1.0) -> Scene:
-    """A scene by its name.
+def build_scene(name: str, duration_s: float | None = None, stationary_s: float = 1.0) -> Scene:
+    """Build a scene by its name.
 
     Args:
         name: one of `SCENE_NAMES`.
-        duration_s: only so much of its walk; None for all. Beyond its end, the body stands still.
-        rest_s: how long the body stands still at first; 0 starts at walking speed.
+        duration_s: of the motion; None for the whole walk. After its end the body is stationary.
+        stationary_s: initial standstill; 0 begins at walking speed.
 
     Raises:
         SourceError: if there is no such scene, or the duration is not positive.
@@ -35,4 +35,4 @@ def build_scene(name: str, duration_s: float | None = None, rest_s: float = 1.0)
     build, whole_s = _BUILDERS[name]
     if duration_s is not None and not 0.0 < duration_s < 3600.0:
         raise SourceError(f"a duration of {duration_s} s cannot be simulated; give seconds between 0 and 3600")
-    return build(whole_s if duration_s is None else duration_s, rest_s)
+    return build(whole_s if duration_s is None else duration_s, stationary_s)

@@ -31,15 +31,15 @@ _D_X = 50.0  # middle of leg D
 _END_Y = 27.0
 _PATH = [(_START_X, 0.0), (_BEND_X, 0.0), (_BEND_X, _C_Y), (_D_X, _C_Y), (_D_X, _END_Y - 2.0)]
 
-_BLIND_S = (-0.3, 1.0)  # about the middle of the bend: when neither pair sees anything
+_BLIND_S = (-0.3, 1.0)  # about the middle of the bend: when neither pair sees texture
 _DIM_LIGHT = 0.12
 _DIM_S = (6.0, 10.0)  # after the bend: when the lamps go down and come back
 
 
-def build(duration_s: float, rest_s: float) -> Scene:
-    """The whole walk is 76 m; with the default rest all that is hard happens within 40 s."""
+def build(duration_s: float, stationary_s: float) -> Scene:
+    """Build a walk of 76 m; with the default standstill all hard moments lie within 40 s."""
     world = World(ambient=0.42)
-    walk = Walk(np.array([(x, y, _BODY_Z_M) for x, y in _PATH]), _SPEED_MPS, duration_s, rest_s)
+    walk = Walk(np.array([(x, y, _BODY_Z_M) for x, y in _PATH]), _SPEED_MPS, duration_s, stationary_s)
     _leg_a(world)
     _bend(world)
     _legs_c_and_d(world)
@@ -62,11 +62,7 @@ def _leg_a(world: World) -> None:
     x0, (x1, x2), x3 = -4.0, _LOBBY_X, _BEND_X - _BLANK_M
     world.wall((x0, -w), (x0, w), 0.0, h, "brick")
     world.poster((x0, -0.45), (x0, 0.45), 0.02, 2.1, "door")
-    for a, b, texture, first in (
-        (x0, _DOOR_X, "plaster", 0),
-        (_DOOR_X, x1, "brick", 3),
-        (x2, x3, "concrete", 6),
-    ):
+    for a, b, texture, first in ((x0, _DOOR_X, "plaster", 0), (_DOOR_X, x1, "brick", 3), (x2, x3, "concrete", 6)):
         world.wall((a, w), (b, w), 0.0, h, texture)
         world.wall((b, -w), (a, -w), 0.0, h, texture)
         furniture.pictures(world, (a, w), (b, w), first)
@@ -98,7 +94,7 @@ def _leg_a(world: World) -> None:
 
 
 def _bend(world: World) -> None:
-    """Leg B and the ends of the legs on both sides: nothing but blank surfaces."""
+    """Add leg B and the ends of the legs on both sides: blank surfaces only."""
     w, h = _HALF_M, _HEIGHT_M
     x0, x1 = _BEND_X - _BLANK_M, _BEND_X + _BLANK_M
     left, right = _BEND_X - w, _BEND_X + w
@@ -154,7 +150,7 @@ def _light(world: World) -> None:
 
 
 def _door(world: World, walk: Walk) -> tuple[float, float]:
-    """A wall across the corridor, whose door opens as the walker comes; when it moves, in seconds."""
+    """Add a wall whose door opens as the walker comes; returns when it begins and ends to move, in seconds."""
     width = 1.2
     side = _HALF_M - 0.5 * width
     for sign in (-1.0, 1.0):
@@ -172,7 +168,7 @@ def _door(world: World, walk: Walk) -> tuple[float, float]:
 
 
 def _crowd(world: World, walk: Walk) -> None:
-    """People who cross the lobby, each just before or just behind the walker."""
+    """Add people who cross the lobby, each just before or just behind the walker."""
     reach, pace = 2.3, 1.15
     for number in range(11):
         x = _LOBBY_X[0] + 0.7 + 0.76 * number
@@ -183,7 +179,7 @@ def _crowd(world: World, walk: Walk) -> None:
 
 
 def _pacing(x: float, crossing_s: float, reach: float, pace: float) -> Callable[[float], tuple[float, float, float]]:
-    """Back and forth across the lobby at one x, through its middle at a given time."""
+    """Return a track back and forth across the lobby at one x, through its middle at a given time."""
 
     def track(time_s: float) -> tuple[float, float, float]:
         phase = pace / reach * (time_s - crossing_s)
@@ -194,7 +190,7 @@ def _pacing(x: float, crossing_s: float, reach: float, pace: float) -> Callable[
 
 
 def _dimmed(dim: tuple[float, float]) -> Callable[[float], Exposure]:
-    """Lamps that go down and come back; the automatic exposure makes up for some of it."""
+    """Return the exposure of lamps that are dimmed for a while, of which the automatic gain compensates a part."""
 
     def exposure(time_s: float) -> Exposure:
         down = _eased((time_s - dim[0]) / 0.6) - _eased((time_s - dim[1]) / 0.6)
@@ -205,6 +201,6 @@ def _dimmed(dim: tuple[float, float]) -> Callable[[float], Exposure]:
 
 
 def _eased(x: float) -> float:
-    """From 0 at x = 0 to 1 at x = 1, with no jerk at the ends."""
+    """Ease from 0 at x = 0 to 1 at x = 1, with no jerk at the ends."""
     x = min(max(x, 0.0), 1.0)
     return x * x * x * (10.0 + x * (6.0 * x - 15.0))

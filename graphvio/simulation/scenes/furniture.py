@@ -1,34 +1,25 @@
-"""Things that stand in rooms, hang on walls and walk about."""
+"""Furniture, pictures, doors and people."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.geometry import se3
 from graphvio.simulation.default_rig import rotation_zyx
-from graphvio.simulation.world import MovingPart, Rectangle, World, box_faces
+from graphvio.simulation.world import MovingPart, World, box_faces
 
-_PICTURES = (
-    "poster0",
-    "painting0",
-    "poster1",
-    "notices",
-    "poster2",
-    "painting1",
-    "poster3",
-    "window",
-    "poster4",
-)
+_PICTURES = ["poster0", "painting0", "poster1", "notices", "poster2", "painting1", "poster3", "window", "poster4"]
 _HIP_M = 0.86
 _SHOULDER_M = 1.42
 _SWING_RAD = 0.45
 
 
 def table(world: World, x: float, y: float, yaw: float, length: float = 1.6, width: float = 0.8) -> None:
-    """A table with a few things on it."""
+    """Add a table with a few objects on it."""
     c, s = np.cos(yaw), np.sin(yaw)
 
     def at(along: float, across: float) -> tuple[float, float]:
@@ -44,7 +35,7 @@ def table(world: World, x: float, y: float, yaw: float, length: float = 1.6, wid
 
 
 def chair(world: World, x: float, y: float, yaw: float) -> None:
-    """A chair that faces along yaw."""
+    """Add a chair that faces along yaw."""
     c, s = np.cos(yaw), np.sin(yaw)
     world.box((x, y, 0.42), (0.44, 0.44, 0.06), "fabric", yaw)
     world.box((x - 0.2 * c, y - 0.2 * s, 0.48), (0.05, 0.44, 0.45), "fabric", yaw)
@@ -53,12 +44,12 @@ def chair(world: World, x: float, y: float, yaw: float) -> None:
 
 
 def bookcase(world: World, x: float, y: float, yaw: float, width: float = 1.2, height: float = 2.0) -> None:
-    """A bookcase that faces along yaw."""
+    """Add a bookcase that faces along yaw."""
     world.box((x, y, 0.0), (0.35, width, height), "wood", yaw, front="books")
 
 
 def sofa(world: World, x: float, y: float, yaw: float) -> None:
-    """A sofa that faces along yaw."""
+    """Add a sofa that faces along yaw."""
     c, s = np.cos(yaw), np.sin(yaw)
     world.box((x, y, 0.0), (0.85, 1.9, 0.42), "fabric", yaw)
     world.box((x - 0.34 * c, y - 0.34 * s, 0.42), (0.2, 1.9, 0.45), "fabric", yaw, tint=0.8)
@@ -75,7 +66,7 @@ def pictures(
     z0: float = 1.05,
     height_m: float = 0.95,
 ) -> None:
-    """A row of pictures along a wall from start to end, with the wall's direction."""
+    """Add a row of pictures along a wall from start to end, in the wall's direction."""
     a, b = np.array(start), np.array(end)
     length = float(np.linalg.norm(b - a))
     along = (b - a) / length
@@ -95,20 +86,17 @@ def pictures(
 def door_leaf(
     world: World, hinge: tuple[float, float], width: float, closed_yaw: float, angle: Callable[[float], float]
 ) -> None:
-    """A door that turns about a vertical hinge.
+    """Add a door that turns about a vertical hinge.
 
     Args:
-        world: where to add it.
+        world: to add it to.
         hinge: (x, y), metres.
         width: metres.
         closed_yaw: direction from the hinge to the lock when closed, rad.
-        angle: how far it is open at a time in seconds, rad.
+        angle: returns how far it is open at a time in seconds, rad.
     """
     faces = box_faces((0.045, width, 2.08), "wood", front="door")
-    shifted = tuple(
-        Rectangle(f.origin + np.array([0.0, 0.5 * width, 0.0]), f.edge_u, f.edge_v, f.texture, f.fit, f.shift)
-        for f in faces
-    )
+    shifted = tuple(replace(face, origin=face.origin + np.array([0.0, 0.5 * width, 0.0])) for face in faces)
 
     def pose(time_s: float) -> Float:
         yaw = closed_yaw - 0.5 * np.pi + angle(time_s)
@@ -118,19 +106,22 @@ def door_leaf(
 
 
 def person(world: World, track: Callable[[float], tuple[float, float, float]], number: int) -> None:
-    """A person who walks where ``track`` says: (x, y, yaw) at a time in seconds."""
+    """Add a person.
+
+    Args:
+        world: to add it to.
+        track: returns (x, y, yaw) at a time in seconds, metres and radians.
+        number: selects clothes and height.
+    """
     shirt = ("stripes", "fabric", "poster2", "cloth", "notices")[number % 5]
     tint = 0.7 + 0.12 * (number % 4)
     tall = 0.94 + 0.03 * (number % 5)
 
     def limb(size: tuple[float, float, float], side: float, top: float, swing: float, texture: str) -> None:
-        """A box that hangs from a joint at height ``top``, ``side`` to the left, and swings as the person walks."""
+        """Add a box that hangs from a joint at height ``top``, ``side`` to the left, and swings with the steps."""
         length = size[2]
         faces = box_faces(size, texture, tint=tint, shift=(0.17 * number, 0.31 * number))
-        hung = tuple(
-            Rectangle(f.origin - np.array([0.0, 0.0, length]), f.edge_u, f.edge_v, f.texture, f.fit, f.shift, f.tint)
-            for f in faces
-        )
+        hung = tuple(replace(face, origin=face.origin - np.array([0.0, 0.0, length])) for face in faces)
 
         def pose(time_s: float) -> Float:
             x, y, yaw = track(time_s)

@@ -1,9 +1,9 @@
-"""Office corridors around a closed rectangle, walked once around and on through their start, and some way back.
+"""Office corridors around a closed rectangle, walked once around, on through the first place, and some way back.
 
-The walk begins in the middle of the south leg and goes along +x, counterclockwise from above, through its start
-again into a lobby; there it turns round and comes back past the start. All legs have doors of the same kind, each
-with a notice board beside it, and walls of the same four kinds: many a place looks like another at first sight, but
-pictures, floors and furniture tell them apart.
+The walk begins in the middle of the south leg and goes along +x, counterclockwise as seen from above, through its first
+place again into a lobby; there it turns and comes back past the first place. All legs have doors of the same kind, each
+with a notice board next to it, and walls of the same four kinds: many places look alike, but for their pictures, floors
+and furniture.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ _DOOR_M = (1.0, 2.1)
 _BOARD_M = 0.8
 
 
-def build(duration_s: float, rest_s: float) -> Scene:
-    """The whole walk is 82 m: the round of 66 m, 6 m more, the turn, and back to 2 m before the start."""
+def build(duration_s: float, stationary_s: float) -> Scene:
+    """Build a walk of 82 m: the round of 66 m, 6 m more, the turn, and back to 2 m before the first place."""
     world = World(ambient=0.42)
     _walls(world)
     _floors(world)
     _furnish(world)
     _light(world)
     path = np.array([(x, y, _BODY_Z_M) for x, y in (*_ROUND, *_TURN, (_BACK_X, 0.0))])
-    walk = Walk(path, _SPEED_MPS, duration_s, rest_s)
+    walk = Walk(path, _SPEED_MPS, duration_s, stationary_s)
     corner_at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     events = {
         "again": (walk.time_at(_ROUND_M), walk.time_at(corner_at[-4])),
@@ -54,7 +54,7 @@ def _walls(world: World) -> None:
     inside, outside = _EAST_X - _HALF_M, _EAST_X + _HALF_M
     low, high = _NORTH_Y - _HALF_M, _NORTH_Y + _HALF_M
     w, (x1, x2) = _HALF_M, _LOBBY_X
-    # From left to right as one looks at them; the legs to the east and west look most alike.
+    # From left to right as seen; the legs to the east and west look most alike.
     _wall(world, (-inside, w), (inside, w), ("plaster", "brick", "plaster", "concrete"), first=0)
     _wall(world, (inside, w), (inside, low), ("brick", "plaster"), first=3)
     _wall(world, (inside, low), (-inside, low), ("concrete", "plaster", "brick", "plaster"), first=6)
@@ -76,7 +76,7 @@ def _walls(world: World) -> None:
 def _wall(
     world: World, start: tuple[float, float], end: tuple[float, float], textures: tuple[str, ...], first: int
 ) -> None:
-    """A wall in equal segments, each with a door in its middle, a board to its right and a picture to its left."""
+    """Add a wall in equal segments, each with a door in its middle, a board to its right and a picture to its left."""
     a, b = np.array(start), np.array(end)
     along = (b - a) / np.linalg.norm(b - a)
     half = 0.5 * float(np.linalg.norm(b - a)) / len(textures)
@@ -110,7 +110,7 @@ def _floors(world: World) -> None:
 
 
 def _furnish(world: World) -> None:
-    """Along the walls and between the doors, so that more than a metre remains to walk in."""
+    """Add furniture along the walls and between the doors, so that more than a metre remains to walk in."""
     furniture.sofa(world, 5.8, -3.0, 0.5 * np.pi)
     furniture.table(world, 3.6, -3.05, 0.0, 1.2, 0.7)
     furniture.bookcase(world, 8.3, -2.4, np.pi)

@@ -16,7 +16,7 @@ _CALIBRATION_HALF_M = 3.2
 _START_S = 1.5  # time to come to full motion
 
 
-def build_room(duration_s: float, rest_s: float) -> Scene:
+def build_room(duration_s: float, stationary_s: float) -> Scene:
     """A furnished room of 10 x 8 x 3 metres: two rounds about the table, which end where they began."""
     world = World(ambient=0.42)
     outline = [(-5.0, -4.0), (-5.0, 4.0), (5.0, 4.0), (5.0, -4.0)]
@@ -31,12 +31,12 @@ def build_room(duration_s: float, rest_s: float) -> Scene:
     for x in (-2.5, 2.5):
         for y in (-1.8, 1.8):
             world.lamps.append(Lamp(np.array([x, y, _HEIGHT_M - 0.25]), 2.1))
-    walk = Walk(_loop(), _SPEED_MPS, duration_s, rest_s)
+    walk = Walk(_loop(), _SPEED_MPS, duration_s, stationary_s)
     return Scene("room", world, walk.motion)
 
 
 def _loop() -> Float:
-    """Two rounds along a rectangle, from the middle of its long side and back to it."""
+    """Return the corners of two rounds along a rectangle, from the middle of its long side and back to it."""
     ring = [(2.6, 2.1), (-2.6, 2.1), (-2.6, -2.1), (2.6, -2.1)]
     corners = [(0.0, -2.1), *[ring[(k + 3) % 4] for k in range(8)], (0.0, -2.1)]
     return np.array([[x, y, _BODY_Z_M] for x, y in corners])
@@ -62,7 +62,7 @@ def _furnish(world: World) -> None:
     world.box((-4.4, 3.4, 0.0), (0.6, 0.6, 1.8), "wood", 0.0)
 
 
-def build_calibration(duration_s: float, rest_s: float) -> Scene:
+def build_calibration(duration_s: float, stationary_s: float) -> Scene:
     """A slow circle in a small room; the rig is turned by up to 30 degrees in pitch and roll, and all around in yaw."""
     world = World(ambient=0.42)
     h = _CALIBRATION_HALF_M
@@ -84,9 +84,9 @@ def build_calibration(duration_s: float, rest_s: float) -> Scene:
             world.lamps.append(Lamp(np.array([x, y, _HEIGHT_M - 0.2]), 1.3))
 
     def course(times: Float) -> Float:
-        """``[x, y, z, yaw, pitch, roll]`` (N, 6) of body in world, metres and radians, at times (N,) in seconds."""
-        t = np.clip(times - (rest_s if rest_s > 0.0 else -_START_S), 0.0, None)
-        # Motion time runs up smoothly, so that the first moments are truly at rest.
+        """See `Motion`."""
+        t = np.clip(times - (stationary_s if stationary_s > 0.0 else -_START_S), 0.0, None)
+        # Motion time runs up smoothly, so that the body is truly stationary at first.
         r = np.minimum(t / _START_S, 1.0)
         t = np.where(r < 1.0, _START_S * (r**4 * (2.5 - 3.0 * r + r * r)), t - 0.5 * _START_S)
         around = 0.45 * t

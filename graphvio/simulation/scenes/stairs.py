@@ -13,8 +13,8 @@ _SPEED_MPS = 0.85
 _TOP_M = 6.0
 
 
-def build(duration_s: float, rest_s: float) -> Scene:
-    """The hall runs along x; the second flight and the upper floor along y."""
+def build(duration_s: float, stationary_s: float) -> Scene:
+    """Build a hall and a first flight along x, and a second flight and an upper floor along y."""
     world = World(ambient=0.42)
     x_top = _FIRST_STEPS * _TREAD_M
     landing = _FIRST_STEPS * _RISE_M
@@ -49,7 +49,7 @@ def build(duration_s: float, rest_s: float) -> Scene:
         (middle, y_far - 1.6, upper),
     ]
     gait = Gait(steps_hz=1.6, vertical_m=0.026, lateral_m=0.022, pitch_rad=0.018)
-    walk = Walk(np.array(path) + np.array([0.0, 0.0, _BODY_M]), _SPEED_MPS, duration_s, rest_s, gait)
+    walk = Walk(np.array(path) + np.array([0.0, 0.0, _BODY_M]), _SPEED_MPS, duration_s, stationary_s, gait)
     return Scene("stairs", world, walk.motion)
 
 
