@@ -82,7 +82,7 @@ class Other:
 
 def foreign(message: Any) -> Any:
     """A message of rosbags as cyclonedds has it."""
-    from graphvio.ros2.types import idl_struct
+    from graphvio.ros2.wire import idl_struct
     from graphvio.sessions import cdr
 
     return idl_struct(message.__msgtype__).deserialize(cdr.encode(message))
@@ -99,7 +99,7 @@ class Participant:
     def _topic(self, name: str, type_name: str) -> Any:
         from cyclonedds.topic import Topic
 
-        from graphvio.ros2.types import idl_struct
+        from graphvio.ros2.wire import idl_struct
 
         return Topic(self.participant, f"rt{name}", idl_struct(type_name))
 

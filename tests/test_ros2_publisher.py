@@ -24,7 +24,7 @@ from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_exp
 from graphvio.measurements.estimate import Estimate, Prediction, Status
 from graphvio.measurements.events import Event
 from graphvio.queues import Broadcast
-from graphvio.ros2.path import ThinnedPath
+from graphvio.ros2.messages import ThinnedPath
 from graphvio.ros2.publisher import Publisher
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
 from graphvio.slam.keyframe_log import KeyframeLog
@@ -257,7 +257,7 @@ def test_a_thread_that_ends_before_its_time_is_told_of(system: System, monkeypat
         try:
             system.publisher.check()
         except ServiceError as error:
-            return "nothing of poses" in str(error) and "no figures" in str(error)
+            return "thread of poses has failed" in str(error) and "no figures" in str(error)
         return False
 
     assert until(is_told)

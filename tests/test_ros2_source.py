@@ -254,10 +254,10 @@ def test_topics_that_are_not_published_are_named(domain: int, robot: Other) -> N
     with pytest.raises(SourceError, match="best effort"):
         reliable.open()
     nameless = open_live_source(f"ros2:?domain={domain}&wait_s=1.5", rig_of_other_names())
-    with pytest.raises(SourceError, match=r"images of north; say north=/TOPIC\. Topics with images: /pair0/left"):
+    with pytest.raises(SourceError, match=r"images of north; give north=/TOPIC\. Topics with images: /pair0/left"):
         nameless.open()
     no_pair = open_live_source(f"ros2:?domain={domain}&left=/pair0/left/image_raw&wait_s=1.5")
-    with pytest.raises(RigError, match="no rig is told"):
+    with pytest.raises(RigError, match="no stereo pair has images and camera_info"):
         no_pair.open()
 
 
@@ -268,8 +268,8 @@ def test_topics_that_are_not_published_are_named(domain: int, robot: Other) -> N
         ("ros2:?cam9=/a", "no option 'cam9'"),
         ("ros2:?cam0=a", "topics begin with a slash"),
         ("ros2:?domain=1000", "from 0 to 232"),
-        ("ros2:?reliable=yes", "0 or 1"),
-        ("ros2:?wait_s=soon", "number of seconds"),
+        ("ros2:?reliable=yes", "choose one of 0, 1"),
+        ("ros2:?wait_s=soon", "write a number from 0"),
     ],
 )
 def test_options_that_are_none_are_refused(text: str, told: str) -> None:
@@ -280,7 +280,7 @@ def test_options_that_are_none_are_refused(text: str, told: str) -> None:
 def test_options_must_suit_the_rig() -> None:
     with pytest.raises(SourceError, match="small has no IMU"):
         open_live_source("ros2:?imu=/imu", small_rig().without_imu())
-    with pytest.raises(SourceError, match="body says what a rig that is given means"):
+    with pytest.raises(SourceError, match="body is an option for a rig file"):
         open_live_source("ros2:?body=base_link")
 
 

@@ -14,8 +14,12 @@ from rosbags.interfaces import Nodetype
 
 from graphvio.errors import SourceError
 from graphvio.ros2.node import domain_of
-from graphvio.ros2.qos import DEFAULT, SENSOR_DATA, TF, TF_STATIC, Profile
-from graphvio.ros2.types import (
+from graphvio.ros2.wire import (
+    DEFAULT,
+    SENSOR_DATA,
+    TF,
+    TF_STATIC,
+    Profile,
     dds_topic,
     dds_type_name,
     idl_struct,

@@ -1,4 +1,4 @@
-"""Corrections that come as ROS 2 messages: which keyframe is meant, and where it is in the map."""
+"""Corrections from ROS 2 messages: poses of keyframes in the map."""
 
 from __future__ import annotations
 
@@ -16,62 +16,62 @@ from graphvio.sessions.messages import covariance_of, pose_of, stamp_of
 from graphvio.slam.interface import Served
 from graphvio.slam.keyframe import Keyframe
 
-_TOLERANCE_NS: Final = 500_000  # stamps that went through seconds as floating-point numbers are off by less
-_REMEMBERED: Final = 20_000
-_UNIT: Final = 1e-3
+_TOLERANCE_NS: Final = 500_000  # more than the error of stamps that were seconds as floating-point numbers
+_MAX_KEYFRAMES: Final = 20_000
+_MAX_NORM_ERROR: Final = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class Outcomes:
-    """What became of the corrections so far.
+    """Outcomes of the corrections so far.
 
     Attributes:
-        accepted: how many.
-        refused: how many.
+        accepted: number of accepted ones.
+        refused: number of refused ones.
         is_refused: whether the newest one was.
-        newest: one line for people on the newest one.
+        newest: outcome of the newest one, one line for people.
     """
 
     accepted: int = 0
     refused: int = 0
     is_refused: bool = False
-    newest: str = "none came"
+    newest: str = "none received"
 
 
 class Corrections:
-    """Hands corrections on to the odometry; it is told of the keyframes in another thread.
+    """Passes corrections to the odometry; keyframes may be added in another thread.
 
     Args:
-        served: takes them.
+        served: the odometry.
     """
 
     def __init__(self, served: Served) -> None:
         self._served = served
         self._lock = threading.Lock()
-        self._stamps: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)  # with the keyframe's id
+        self._stamps: deque[tuple[int, int]] = deque(maxlen=_MAX_KEYFRAMES)  # with the keyframe's id
         self.outcomes = Outcomes()
 
-    def know(self, keyframe: Keyframe) -> None:
-        """Corrections of this keyframe may come from now on."""
+    def add_keyframe(self, keyframe: Keyframe) -> None:
+        """Accept corrections of this keyframe from now on."""
         with self._lock:
             self._stamps.append((keyframe.stamp_ns, keyframe.id))
 
     def take(self, data: bytes) -> None:
-        """Take a ``geometry_msgs/PoseWithCovarianceStamped``; what becomes of it is in ``outcomes``."""
+        """Apply a ``geometry_msgs/PoseWithCovarianceStamped`` (CDR) and update ``outcomes``."""
         try:
-            said = self._taken(data)
-            self.outcomes = Outcomes(self.outcomes.accepted + 1, self.outcomes.refused, False, said)
+            accepted = self._apply(data)
+            self.outcomes = Outcomes(self.outcomes.accepted + 1, self.outcomes.refused, False, accepted)
         except GraphvioError as error:
             self.outcomes = Outcomes(self.outcomes.accepted, self.outcomes.refused + 1, True, str(error))
 
-    def _taken(self, data: bytes) -> str:
+    def _apply(self, data: bytes) -> str:
         message = cdr.decode(data, CORRECTION, "a correction")
         frame = message.header.frame_id.lstrip("/")
         if frame != MAP:
             raise _RefusedError(f"a correction in frame {frame!r}; give the pose of {MAP} to body")
         q = message.pose.pose.orientation
         norm = float(np.linalg.norm([q.x, q.y, q.z, q.w]))
-        if not abs(norm - 1.0) < _UNIT:
+        if not abs(norm - 1.0) < _MAX_NORM_ERROR:
             raise _RefusedError(f"a correction whose orientation has norm {norm:.3g}; give a unit quaternion")
         map_T_body, covariance = pose_of(message), covariance_of(message)
         if not np.isfinite(map_T_body).all() or not _is_positive(covariance):
@@ -99,7 +99,7 @@ class Corrections:
 
 
 class _RefusedError(GraphvioError):
-    """A correction that the odometry is not even asked to take."""
+    """A correction that is refused, by these checks or by the odometry."""
 
 
 def _is_positive(covariance: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> bool:

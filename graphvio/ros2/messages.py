@@ -1,15 +1,15 @@
-"""What is published of a running odometry, as ROS 2 messages, beside what sessions hold of it."""
+"""ROS 2 messages about a running odometry: path, landmarks and diagnostics."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from enum import IntEnum
 from typing import Any, Final
 
 import numpy as np
 
 from graphvio.sessions.cdr import make
-from graphvio.sessions.messages import ODOM, TRANSFORMS, header
+from graphvio.sessions.messages import header
 from graphvio.slam.keyframe import Keyframe
 
 PATH, POINTS = "nav_msgs/msg/Path", "sensor_msgs/msg/PointCloud2"
@@ -22,7 +22,7 @@ _DATATYPES: Final = {"<f4": 7, "<u4": 6}  # of sensor_msgs/PointField
 
 
 class Level(IntEnum):
-    """Of a ``diagnostic_msgs/DiagnosticStatus``."""
+    """Levels of a ``diagnostic_msgs/DiagnosticStatus``."""
 
     OK = 0
     WARN = 1
@@ -30,33 +30,55 @@ class Level(IntEnum):
     STALE = 3
 
 
-def transforms(stamped: Sequence[Any]) -> Any:
-    """A ``tf2_msgs/TFMessage`` of ``TransformStamped``."""
-    return make(TRANSFORMS, transforms=list(stamped))
+class ThinnedPath:
+    """Poses of the whole path: when they become too many, every second one is removed, and of later ones, too.
 
+    Args:
+        max_poses: how many are kept.
+    """
 
-def path(stamp_ns: int, poses: Sequence[Any]) -> Any:
-    """A ``nav_msgs/Path`` of ``PoseStamped`` in odom."""
-    return make(PATH, header=header(stamp_ns, ODOM), poses=list(poses))
+    def __init__(self, max_poses: int) -> None:
+        self._max_poses = max_poses
+        self._poses: list[Any] = []
+        self._newest: Any = None
+        self._stride, self._count = 1, 0
+
+    def add(self, pose: Any) -> None:
+        """Append a pose."""
+        self._newest = pose
+        if self._count % self._stride == 0:
+            self._poses.append(pose)
+        self._count += 1
+        if len(self._poses) >= self._max_poses:
+            self._poses = self._poses[::2]
+            self._stride *= 2
+
+    def clear(self) -> None:
+        """Remove all poses, as those of another epoch follow."""
+        self._poses, self._newest, self._stride, self._count = [], None, 1, 0
+
+    def poses(self) -> list[Any]:
+        """Return the poses that are kept, and the newest."""
+        if not self._poses or self._poses[-1] is self._newest:
+            return list(self._poses)
+        return [*self._poses, self._newest]
 
 
 def landmarks(keyframe: Keyframe, body: str) -> Any:
-    """A keyframe's points as a ``sensor_msgs/PointCloud2`` in body, a frame, with the identities of their tracks."""
+    """Make a ``sensor_msgs/PointCloud2`` of a keyframe's landmarks, with their tracks' identities.
+
+    Args:
+        keyframe: whose landmarks are in frame body.
+        body: name of that frame in ROS.
+    """
     marks = keyframe.landmarks
     points = np.zeros(len(marks), dtype=_POINT)
     for k, axis in enumerate("xyz"):
         points[axis] = marks.points_body[:, k]
     points["track_id"], points["pair"] = marks.track_id, marks.pair
     fields = [
-        make(
-            "sensor_msgs/msg/PointField",
-            name=name,
-            offset=int(_POINT.fields[name][1]),
-            datatype=_DATATYPES[_POINT.fields[name][0].str],
-            count=1,
-        )
-        for name in _POINT.names or ()
-        if _POINT.fields is not None
+        make("sensor_msgs/msg/PointField", name=name, offset=int(offset), datatype=_DATATYPES[kind.str], count=1)
+        for name, (kind, offset, *_) in (_POINT.fields or {}).items()
     ]
     return make(
         POINTS,
@@ -73,25 +95,11 @@ def landmarks(keyframe: Keyframe, body: str) -> Any:
 
 
 def diagnosis(name: str, level: Level, message: str, hardware: str, values: Mapping[str, object]) -> Any:
-    """A ``diagnostic_msgs/DiagnosticStatus``; what is None is left out."""
-    return make(
-        "diagnostic_msgs/msg/DiagnosticStatus",
-        level=int(level),
-        name=name,
-        message=message,
-        hardware_id=hardware,
-        values=[
-            make("diagnostic_msgs/msg/KeyValue", key=key, value=_text(value))
-            for key, value in values.items()
-            if value is not None
-        ],
-    )
-
-
-def diagnostics(stamp_ns: int, statuses: Sequence[Any]) -> Any:
-    """A ``diagnostic_msgs/DiagnosticArray``."""
-    return make(DIAGNOSTICS, header=header(stamp_ns, ""), status=list(statuses))
-
-
-def _text(value: object) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    """Make a ``diagnostic_msgs/DiagnosticStatus``, without the values that are None."""
+    pairs = [
+        make("diagnostic_msgs/msg/KeyValue", key=key, value=f"{value:.6g}" if isinstance(value, float) else str(value))
+        for key, value in values.items()
+        if value is not None
+    ]
+    kind = "diagnostic_msgs/msg/DiagnosticStatus"
+    return make(kind, level=int(level), name=name, message=message, hardware_id=hardware, values=pairs)

@@ -1,67 +1,51 @@
-"""A participant of a DDS domain that writes and reads ROS 2 topics."""
+"""A participant of a DDS domain that reads and writes ROS 2 topics."""
 
 from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 from graphvio.errors import ServiceError, SourceError
-from graphvio.ros2.qos import Profile
-from graphvio.ros2.types import dds, dds_topic, ros_topic, ros_type_name, wire_type
+from graphvio.ros2.wire import Profile, dds_topic, require_dds, ros_topic, ros_type_name, wire_type
 from graphvio.sessions import cdr
 
 _DOMAIN_VARIABLE: Final = "ROS_DOMAIN_ID"
-_LAST_DOMAIN: Final = 232
+_MAX_DOMAIN: Final = 232
 _NS_PER_S: Final = 1_000_000_000
 
 
 def domain_of(text: str | None) -> int:
-    """The number of a domain: as given, or else by ``ROS_DOMAIN_ID``, or else 0.
+    """Parse the number of a domain; None stands for ``ROS_DOMAIN_ID``, or 0 if that is not set.
 
     Raises:
-        SourceError: if it is none.
+        SourceError: if it is no such number.
     """
     where, given = ("domain", text) if text is not None else (_DOMAIN_VARIABLE, os.environ.get(_DOMAIN_VARIABLE, ""))
     if not given:
         return 0
-    if not given.isdecimal() or int(given) > _LAST_DOMAIN:
-        raise SourceError(f"{where} is {given!r}; a domain of ROS 2 is a number from 0 to {_LAST_DOMAIN}")
+    if not given.isdecimal() or int(given) > _MAX_DOMAIN:
+        raise SourceError(f"{where} is {given!r}; a domain of ROS 2 is a number from 0 to {_MAX_DOMAIN}")
     return int(given)
 
 
 @dataclass(frozen=True, slots=True)
 class Publication:
-    """Somebody publishes a topic.
+    """A topic that another participant publishes.
 
     Attributes:
         topic: such as ``/imu``.
         type_name: such as ``sensor_msgs/msg/Imu``.
-        is_reliable: whether what is lost can be sent again.
     """
 
     topic: str
     type_name: str
-    is_reliable: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """What came.
-
-    Attributes:
-        data: the message, CDR.
-        sent_ns: when it was written, by the writer's host.
-    """
-
-    data: bytes
-    sent_ns: int
 
 
 class Reader:
-    """Samples of one topic; use one from one thread."""
+    """Reads samples of one topic, in one thread."""
 
     def __init__(self, node: Node, topic: str, type_name: str, profile: Profile) -> None:
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
@@ -71,27 +55,23 @@ class Reader:
         self._reader = DataReader(node.participant, node.topic(topic, type_name), qos=profile.dds(type_name))
         self.ready = ReadCondition(self._reader, SampleState.Any | ViewState.Any | InstanceState.Any)
 
-    def take(self) -> list[Sample]:
-        """What came since the last call, the oldest first."""
-        return [
-            Sample(each.data, each.sample_info.source_timestamp)
-            for each in self._reader.take(self._depth)
-            if each.sample_info.valid_data
-        ]
+    def take(self) -> list[bytes]:
+        """Return the CDR messages received since the last call, oldest first."""
+        return [each.data for each in self._reader.take(self._depth) if each.sample_info.valid_data]
 
     @property
     def writers(self) -> int:
-        """How many there are whose samples would come, and who are alive."""
+        """Number of matching writers that are alive."""
         return int(self._reader.get_liveliness_changed_status().alive_count)
 
     @property
     def lost(self) -> int:
-        """Samples that never came, so far as the protocol could tell."""
+        """Number of samples that the protocol knows to be lost."""
         return int(self._reader.get_sample_lost_status().total_count)
 
     @property
     def refused_writers(self) -> int:
-        """How many offered less than is asked for: best effort where reliable was asked for."""
+        """Number of writers whose quality of service is too low: best effort where reliable was requested."""
         return int(self._reader.get_requested_incompatible_qos_status().total_count)
 
 
@@ -106,10 +86,10 @@ class Writer:
         self.refused = 0
 
     def write(self, message: Any) -> None:
-        """Publish a message; it is dropped, and counted in ``refused``, where there is no room for it.
+        """Publish a message; if there is no room for it, it is dropped and counted in ``refused``.
 
         Raises:
-            ServiceError: if DDS does not take it for another reason.
+            ServiceError: if DDS refuses it for another reason.
         """
         from cyclonedds.core import DDSException
 
@@ -122,12 +102,12 @@ class Writer:
 
     @property
     def readers(self) -> int:
-        """How many listen."""
+        """Number of matching readers."""
         return len(self._writer.get_matched_subscriptions())
 
 
 class Node:
-    """A participant.
+    """A participant of a domain.
 
     Args:
         domain: see `domain_of`.
@@ -138,7 +118,7 @@ class Node:
     """
 
     def __init__(self, domain: int) -> None:
-        dds()
+        require_dds()
         from cyclonedds.core import DDSException, GuardCondition, WaitSet
         from cyclonedds.domain import DomainParticipant
 
@@ -147,8 +127,7 @@ class Node:
             self.participant: Any = DomainParticipant(domain)
         except DDSException as error:
             raise SourceError(
-                f"DDS domain {domain}: cannot be joined ({error.msg or error}); check the network, and what "
-                "CYCLONEDDS_URI says of it"
+                f"DDS domain {domain}: cannot be joined ({error.msg or error}); check the network and CYCLONEDDS_URI"
             ) from None
         self._lock = threading.Lock()
         self._topics: dict[tuple[str, str], Any] = {}
@@ -156,7 +135,7 @@ class Node:
         self._stop: Any = GuardCondition(self.participant)
 
     def topic(self, name: str, type_name: str) -> Any:
-        """The topic of DDS; one object for all who use it."""
+        """Return the topic of DDS, one object for all its endpoints."""
         from cyclonedds.topic import Topic
 
         with self._lock:
@@ -165,33 +144,26 @@ class Node:
                 self._topics[key] = Topic(self.participant, dds_topic(name), wire_type(type_name))
             return self._topics[key]
 
-    def reader(self, topic: str, type_name: str, profile: Profile) -> Reader:
-        """Listen to a topic."""
-        return Reader(self, topic, type_name, profile)
-
-    def writer(self, topic: str, type_name: str, profile: Profile) -> Writer:
-        """Publish a topic."""
-        return Writer(self, topic, type_name, profile)
-
-    def waiter(self, readers: Sequence[Reader]) -> Waiter:
-        """Waits for samples of several topics."""
+    def waiter(self, readers: Sequence[Reader]) -> Callable[[float], None]:
+        """Return a function that waits until a reader has samples, the node is stopped, or so many seconds are over."""
         waitset = self._waitset_class(self.participant)
-        for reader in readers:
-            waitset.attach(reader.ready)
-        waitset.attach(self._stop)
-        return Waiter(waitset)
+        for condition in (*(reader.ready for reader in readers), self._stop):
+            waitset.attach(condition)
+
+        def wait(timeout_s: float) -> None:
+            waitset.wait(round(timeout_s * _NS_PER_S))
+
+        return wait
 
     def publications(self) -> list[Publication]:
-        """What others publish, as far as it is known by now: give discovery a second after the start."""
+        """Return the known publications of others; discovery takes about a second after the node is made."""
         from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
-        from cyclonedds.qos import Policy
 
         found = []
         for each in BuiltinDataReader(self.participant, BuiltinTopicDcpsPublication).read(4096):
             topic, type_name = ros_topic(each.topic_name), ros_type_name(each.type_name)
             if topic is not None and type_name is not None and each.sample_info.valid_data:
-                is_reliable = each.qos[Policy.Reliability] != Policy.Reliability.BestEffort
-                found.append(Publication(topic, type_name, is_reliable))
+                found.append(Publication(topic, type_name))
         return found
 
     def stop(self) -> None:
@@ -200,18 +172,7 @@ class Node:
             self._stop.set(True)
 
     def leave(self) -> None:
-        """Hold the domain no more: it is left when readers and writers are gone, too."""
+        """Release the domain; it is left when readers and writers are released, too."""
         with self._lock:
             self._topics.clear()
             self._stop = self.participant = None
-
-
-class Waiter:
-    """See `Node.waiter`."""
-
-    def __init__(self, waitset: Any) -> None:
-        self._waitset = waitset
-
-    def wait(self, timeout_s: float) -> None:
-        """Until something is there to be taken, the node is stopped, or the time is over."""
-        self._waitset.wait(round(timeout_s * _NS_PER_S))

@@ -13,15 +13,16 @@ from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.readings import host_ns
 from graphvio.ros2 import messages
 from graphvio.ros2.corrections import Corrections
-from graphvio.ros2.messages import CORRECTION, DIAGNOSTICS, MAP, PATH, POINTS, Level
-from graphvio.ros2.node import Node, Reader, Waiter, domain_of
-from graphvio.ros2.path import ThinnedPath
-from graphvio.ros2.qos import DEFAULT, TF, TF_STATIC
+from graphvio.ros2.messages import CORRECTION, DIAGNOSTICS, MAP, PATH, POINTS, Level, ThinnedPath
+from graphvio.ros2.node import Node, Reader, Writer, domain_of
+from graphvio.ros2.wire import DEFAULT, TF, TF_STATIC
+from graphvio.sessions.cdr import make
 from graphvio.sessions.messages import (
     BODY,
     ODOM,
     ODOMETRY,
     TRANSFORMS,
+    header,
     odometry,
     pose_stamped,
     transform,
@@ -29,8 +30,8 @@ from graphvio.sessions.messages import (
 from graphvio.slam.epochs import map_of_epoch
 from graphvio.slam.interface import Served
 
-_STATIC: Final = "static"  # transforms that stay, among the writers by type
-_DEPTH: Final = 200  # estimates that may wait: ten seconds
+_STATIC: Final = "static"  # the static transforms, among the writers by type
+_DEPTH: Final = 200  # estimates that may be queued: ten seconds
 _POLL_S: Final = 0.1
 _PERIOD_S: Final = 1.0  # of diagnostics and the path
 _STALE_S: Final = 2.0
@@ -45,13 +46,13 @@ _LEVELS: Final = {
 
 
 class Publisher:
-    """Publishes until it is closed or the odometry has ended; the odometry never waits for it.
+    """Publishes a running odometry until one of both is closed; the odometry never waits for it.
 
     Args:
         served: the odometry.
         domain: of DDS, or None for that of ``ROS_DOMAIN_ID``.
-        namespace: what the names of graphvio's own topics begin with.
-        body: the name of the rig's body, which is the IMU's frame, among the frames of ROS.
+        namespace: prefix of graphvio's own topics.
+        body: name of the body's frame in ROS, which is the IMU's.
 
     Raises:
         SourceError: if the domain cannot be joined.
@@ -64,15 +65,15 @@ class Publisher:
         self._served, self._body = served, body
         self._node = node = Node(domain_of(None) if domain is None else domain)
         self._writers = {
-            ODOMETRY: node.writer(f"{namespace}/odometry", ODOMETRY, DEFAULT),
-            PATH: node.writer(f"{namespace}/path", PATH, DEFAULT),
-            POINTS: node.writer(f"{namespace}/landmarks", POINTS, DEFAULT),
-            DIAGNOSTICS: node.writer("/diagnostics", DIAGNOSTICS, DEFAULT),
-            TRANSFORMS: node.writer("/tf", TRANSFORMS, TF),
-            _STATIC: node.writer("/tf_static", TRANSFORMS, TF_STATIC),
+            ODOMETRY: Writer(node, f"{namespace}/odometry", ODOMETRY, DEFAULT),
+            PATH: Writer(node, f"{namespace}/path", PATH, DEFAULT),
+            POINTS: Writer(node, f"{namespace}/landmarks", POINTS, DEFAULT),
+            DIAGNOSTICS: Writer(node, "/diagnostics", DIAGNOSTICS, DEFAULT),
+            TRANSFORMS: Writer(node, "/tf", TRANSFORMS, TF),
+            _STATIC: Writer(node, "/tf_static", TRANSFORMS, TF_STATIC),
         }
         self._corrections = Corrections(served)
-        correction_reader = node.reader(f"{namespace}/correction", CORRECTION, DEFAULT)
+        correction_reader = Reader(node, f"{namespace}/correction", CORRECTION, DEFAULT)
         self._estimates = served.estimates.subscribe(_DEPTH)
         self._path = ThinnedPath(_PATH_POSES)
         self._epoch: int | None = None
@@ -81,33 +82,34 @@ class Publisher:
         self._trouble = ""
         self._failure: tuple[str, Exception] | None = None  # of a thread, with its name
         self._closing = threading.Event()
-        self._attempt(self._publish_places)
-        tasks: dict[str, tuple[Callable[..., None], tuple[Any, ...]]] = {
-            "poses": (self._publish_poses, ()),
-            "keyframes": (self._publish_keyframes, ()),
-            "corrections": (self._take_corrections, (node.waiter([correction_reader]), correction_reader)),
+        self._attempt(self._publish_camera_poses)
+        wait = node.waiter([correction_reader])
+        tasks: dict[str, Callable[[], None]] = {
+            "poses": self._publish_poses,
+            "keyframes": self._publish_keyframes,
+            "corrections": lambda: self._take_corrections(wait, correction_reader),
         }
         self._threads = [
-            threading.Thread(target=self._run, args=(name, task, *args), name=f"graphvio-ros2-{name}", daemon=True)
-            for name, (task, args) in tasks.items()
+            threading.Thread(target=self._run, args=(name, task), name=f"graphvio-ros2-{name}", daemon=True)
+            for name, task in tasks.items()
         ]
         for thread in self._threads:
             thread.start()
 
     def check(self) -> None:
-        """Find out whether all threads live.
+        """Check that all threads run.
 
         Raises:
-            ServiceError: if one ended before its time.
+            ServiceError: if one has failed.
         """
         if self._failure is not None:
             name, error = self._failure
             raise ServiceError(
-                f"ROS 2: nothing of {name} is published or taken any more ({type(error).__name__}: {error})"
+                f"ROS 2: the thread of {name} has failed ({type(error).__name__}: {error}); start the odometry again"
             ) from error
 
     def close(self) -> None:
-        """End the threads, and leave the domain; a second time does nothing."""
+        """End the threads and leave the domain; a second call does nothing."""
         self._closing.set()
         self._estimates.close()
         self._node.stop()
@@ -117,30 +119,30 @@ class Publisher:
         self._node.leave()
 
     def __enter__(self) -> Publisher:
-        """The publisher itself."""
+        """Return the publisher."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close it."""
+        """Close the publisher."""
         self.close()
 
-    def _run(self, name: str, task: Callable[..., None], *args: object) -> None:
-        """What a thread does; one that ends in an error is told of by `check`."""
+    def _run(self, name: str, task: Callable[[], None]) -> None:
+        """Run a task in its thread; `check` raises its error."""
         try:
-            task(*args)
+            task()
         except Exception as error:
             self._failure = name, error
 
-    def _publish_places(self) -> None:
+    def _publish_camera_poses(self) -> None:
         now_ns = host_ns()
-        # tf2 refuses names that begin with a slash, as those of cameras do that are called by their topics
+        # tf2 refuses names that begin with a slash, as those of cameras named by their topics do
         stamped = [
             transform(now_ns, self._body, camera.name.lstrip("/"), camera.body_T_cam)
             for camera in self._served.rig.cameras
         ]
-        self._writers[_STATIC].write(messages.transforms(stamped))
+        self._writers[_STATIC].write(make(TRANSFORMS, transforms=stamped))
 
     def _publish_poses(self) -> None:
         due_s = time.monotonic()
@@ -163,51 +165,44 @@ class Publisher:
         if estimate.epoch != self._epoch:
             self._epoch = estimate.epoch
             self._path.clear()
-        told = odometry(estimate)
-        told.child_frame_id = self._body
-        self._writers[ODOMETRY].write(told)
+        message = odometry(estimate)
+        message.child_frame_id = self._body
+        self._writers[ODOMETRY].write(message)
         stamped = [transform(estimate.stamp_ns, ODOM, self._body, estimate.nav_T_body)]
         map_T_odom = map_of_epoch(self._served, estimate.epoch)
         if map_T_odom is not None:
             stamped.append(transform(estimate.stamp_ns, MAP, ODOM, map_T_odom))
-        self._writers[TRANSFORMS].write(messages.transforms(stamped))
+        self._writers[TRANSFORMS].write(make(TRANSFORMS, transforms=stamped))
         self._path.add(pose_stamped(estimate.stamp_ns, ODOM, estimate.nav_T_body))
 
     def _publish_path(self) -> None:
         if self._newest is not None and self._writers[PATH].readers:
-            self._writers[PATH].write(messages.path(self._newest.stamp_ns, self._path.poses()))
+            path = make(PATH, header=header(self._newest.stamp_ns, ODOM), poses=self._path.poses())
+            self._writers[PATH].write(path)
 
     def _publish_diagnostics(self) -> None:
-        level, said = self._level()
-        outcomes = self._corrections.outcomes
+        outcomes, hardware = self._corrections.outcomes, self._served.rig.name
+        refused = "refused: " if outcomes.is_refused else ""
         trouble, self._trouble = self._trouble, ""
-        published = {
-            "estimates_missed": self._estimates.dropped(),
-            "messages_dropped": sum(each.refused for each in self._writers.values()),
-        }
-        hardware = self._served.rig.name
-        self._writers[DIAGNOSTICS].write(
-            messages.diagnostics(
-                host_ns(),
-                [
-                    messages.diagnosis("graphvio: odometry", level, said, hardware, self._served.status()),
-                    messages.diagnosis(
-                        "graphvio: corrections",
-                        Level.WARN if outcomes.is_refused else Level.OK,
-                        ("refused: " if outcomes.is_refused else "") + outcomes.newest,
-                        hardware,
-                        {"accepted": outcomes.accepted, "refused": outcomes.refused},
-                    ),
-                    messages.diagnosis(
-                        "graphvio: publisher",
-                        Level.WARN if trouble else Level.OK,
-                        trouble or "publishing",
-                        hardware,
-                        published,
-                    ),
-                ],
-            )
-        )
+        dropped = sum(each.refused for each in self._writers.values())
+        statuses = [
+            messages.diagnosis("graphvio: odometry", *self._level(), hardware, self._served.status()),
+            messages.diagnosis(
+                "graphvio: corrections",
+                Level.WARN if refused else Level.OK,
+                refused + outcomes.newest,
+                hardware,
+                {"accepted": outcomes.accepted, "refused": outcomes.refused},
+            ),
+            messages.diagnosis(
+                "graphvio: publisher",
+                Level.WARN if trouble else Level.OK,
+                trouble or "publishing",
+                hardware,
+                {"estimates_missed": self._estimates.dropped(), "messages_dropped": dropped},
+            ),
+        ]
+        self._writers[DIAGNOSTICS].write(make(DIAGNOSTICS, header=header(host_ns(), ""), status=statuses))
 
     def _level(self) -> tuple[Level, str]:
         silent_s = time.monotonic() - self._newest_s
@@ -229,19 +224,19 @@ class Publisher:
                     return
                 continue
             next_id = keyframe.id + 1
-            self._corrections.know(keyframe)  # first: the landmarks may be answered by a correction at once
+            self._corrections.add_keyframe(keyframe)  # first, as a correction may follow the landmarks at once
             if self._writers[POINTS].readers:
                 self._attempt(lambda: self._writers[POINTS].write(messages.landmarks(keyframe, self._body)))  # noqa: B023
 
-    def _take_corrections(self, waiter: Waiter, reader: Reader) -> None:
+    def _take_corrections(self, wait: Callable[[float], None], reader: Reader) -> None:
         while not self._closing.is_set():
-            waiter.wait(_PERIOD_S)
-            for sample in reader.take():
-                self._corrections.take(sample.data)
+            wait(_PERIOD_S)
+            for data in reader.take():
+                self._corrections.take(data)
                 self._attempt(self._publish_diagnostics)
 
     def _attempt(self, action: Callable[[], Any]) -> None:
-        """What cannot be published is told by the diagnostics; the rest goes on."""
+        """Run an action; if it fails, the diagnostics say so, and the thread goes on."""
         try:
             action()
         except GraphvioError as error:

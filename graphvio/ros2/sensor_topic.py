@@ -1,39 +1,44 @@
-"""A camera's or an IMU's topic, as readings."""
+"""Readings from the topic of a camera or of an IMU."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
 import cv2
+import numpy as np
 
-from graphvio.arrays import Image
+from graphvio.arrays import Float, Image
 from graphvio.errors import SessionError, SourceError
 from graphvio.image_decoding import ImageError
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.readings import CameraFrame, DeviceHealth, ImuReading, Notice, Reading, host_ns
 from graphvio.ros2.node import Node, Reader
-from graphvio.ros2.qos import Profile
+from graphvio.ros2.wire import Profile
 from graphvio.sessions import cdr
 from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, imu_sample
 from graphvio.sessions.pixels import grey
+from graphvio.sessions.rig_of_topics import path_between
 
-_IMAGES: Final = 10  # that are kept while nobody takes them: half a second
+_IMAGES: Final = 10  # that are kept until they are taken: half a second
 _SAMPLES: Final = 500
+_MAX_LEVER_M: Final = 0.005
 
 
 class SensorTopic:
-    """A topic: what comes, who sends it, and what went wrong.
+    """The topic of a sensor: its readings, its publishers and its losses.
 
     Args:
         node: takes part in the domain.
         name: of the topic.
         types: of all topics that are published.
-        camera: its name in the rig; None is the IMU.
+        camera: its name in the rig; None for the IMU.
         is_reliable: whether lost samples are to be sent again.
 
     Attributes:
         frame: of the newest sample of the IMU.
-        health: as it was at the last `look`.
+        health: state at the last call of `poll`.
 
     Raises:
         SourceError: if its messages are of another type.
@@ -41,50 +46,45 @@ class SensorTopic:
 
     def __init__(self, node: Node, name: str, types: Mapping[str, str], camera: str | None, is_reliable: bool) -> None:
         self.name, self.camera, self.type_name = name, camera, types[name]
-        wanted = (IMU,) if camera is None else (IMAGE, COMPRESSED)
-        if self.type_name not in wanted:
-            raise SourceError(f"{name}: has messages of type {self.type_name}; it takes {' or '.join(wanted)}")
+        expected = (IMU,) if camera is None else (IMAGE, COMPRESSED)
+        if self.type_name not in expected:
+            raise SourceError(f"{name}: has messages of type {self.type_name}; it takes {' or '.join(expected)}")
         self.depth = _SAMPLES if camera is None else _IMAGES
-        self.reader: Reader = node.reader(name, self.type_name, Profile(self.depth, is_reliable=is_reliable))
+        self.reader = Reader(node, name, self.type_name, Profile(self.depth, is_reliable=is_reliable))
+        self.counts: Counter[str] = Counter()
         self.frame = ""
-        self._is_there = True
-        self._newest_ns: int | None = None
-        self._counts: dict[str, int] = {}
         self.health = DeviceHealth(name, True, self.type_name)
+        self._newest_ns: int | None = None
 
-    def count(self, kind: str, count: int = 1) -> None:
-        """Something went wrong."""
-        self._counts[kind] = self._counts.get(kind, 0) + count
-
-    def notice(self, kind: str, detail: str) -> Notice:
-        """Something to tell."""
+    def notice(self, kind: EventKind, detail: str) -> Notice:
+        """Return a notice on this topic."""
         return Notice(kind, f"{self.name}: {detail}", host_ns())
 
-    def look(self) -> Notice | None:
-        """Who publishes it now."""
-        was_there, self._is_there = self._is_there, self.reader.writers > 0
-        counts = {"lost": self.reader.lost, **self._counts}
-        self.health = DeviceHealth(self.name, self._is_there, self.type_name, counts)
-        if was_there == self._is_there:
+    def poll(self) -> Notice | None:
+        """Update `health`; returns a notice if the topic has lost its last publisher, or has one again."""
+        was_connected, is_connected = self.health.connected, self.reader.writers > 0
+        counts = {"lost": self.reader.lost, **self.counts}
+        self.health = DeviceHealth(self.name, is_connected, self.type_name, counts)
+        if was_connected == is_connected:
             return None
-        if self._is_there:
-            return self.notice("device_back", "is published again")
-        return self.notice("device_lost", "nobody publishes it any more")
+        if is_connected:
+            return self.notice(EventKind.DEVICE_BACK, "is published again")
+        return self.notice(EventKind.DEVICE_LOST, "nobody publishes it any more")
 
-    def take(self) -> Iterator[Reading]:
-        """What came."""
+    def take(self) -> Iterator[ImuReading | CameraFrame]:
+        """Yield the readings received since the last call."""
         samples = self.reader.take()
         if len(samples) >= self.depth:  # as many as are kept: there may have been more
-            self.count("overrun")
+            self.counts["overrun"] += 1
         arrival_ns = host_ns()
-        for sample in samples:
+        for data in samples:
             try:
-                reading = self._reading(sample.data, arrival_ns)
+                reading = self._reading(data, arrival_ns)
             except SessionError:
-                self.count("damaged")
+                self.counts["damaged"] += 1
                 continue
             if self._newest_ns is not None and reading.stamp_ns <= self._newest_ns:
-                self.count("late")
+                self.counts["late"] += 1
             else:
                 self._newest_ns = reading.stamp_ns
             yield reading
@@ -105,3 +105,41 @@ class SensorTopic:
                 raise SourceError(f"{self.name}: an image cannot be decoded ({error})") from None
 
         return decode
+
+
+class BodyRotation:
+    """Rotates IMU samples into body, by the transforms between the frames.
+
+    Args:
+        body: name of the body's frame.
+        transforms: see `graphvio.sessions.rig_of_topics.transforms_in`.
+    """
+
+    def __init__(self, body: str, transforms: dict[tuple[str, str], Float]) -> None:
+        self._body, self._transforms = body, transforms
+        self._body_R_imu: dict[str, Float | None] = {}
+
+    def apply(self, reading: ImuReading, topic: SensorTopic) -> Iterator[Reading]:
+        """Yield the reading in body, after a notice if a new frame has no transform or a lever arm.
+
+        Readings of frames without a transform are left out and counted.
+        """
+        frame = topic.frame
+        if frame not in self._body_R_imu:
+            body_T_imu = path_between(self._transforms, self._body, frame)
+            self._body_R_imu[frame] = None if body_T_imu is None else body_T_imu[:3, :3]
+            if body_T_imu is None:
+                yield topic.notice(EventKind.IMU_NO_TRANSFORM, f"no transform leads from {self._body} to {frame}")
+            elif (lever_m := float(np.linalg.norm(body_T_imu[:3, 3]))) > _MAX_LEVER_M:
+                yield topic.notice(
+                    EventKind.IMU_LEVER_ARM,
+                    f"{frame} is {1e3 * lever_m:.0f} mm from {self._body}: samples are rotated only, so that "
+                    "accelerations are wrong while the rig turns; give a rig whose body is the IMU's frame",
+                )
+        R = self._body_R_imu[frame]
+        if R is None:
+            topic.counts["no_transform"] += 1
+            return
+        yield ImuReading(
+            reading.stamp_ns, R @ reading.angular_velocity, R @ reading.linear_acceleration, reading.arrival_ns
+        )

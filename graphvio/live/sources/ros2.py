@@ -1,4 +1,4 @@
-"""Cameras and an IMU that publish on ROS 2, heard over DDS: no ROS need be installed here."""
+"""Cameras and an IMU that publish on ROS 2, received over DDS; ROS need not be installed."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from graphvio.arrays import Float
 from graphvio.errors import SourceError
 from graphvio.live.source import DeviceInfo, LiveSource
 from graphvio.live.sources import SourceSpec, check_options
+from graphvio.live.spec_options import choice_of, number_of
 from graphvio.measurements.readings import DeviceHealth, ImuReading, Reading
 from graphvio.rig import Rig
 from graphvio.ros2.node import Node, Publication, domain_of
 from graphvio.ros2.rig import listen_for_rig, listen_for_transforms
-from graphvio.ros2.sensor_topic import SensorTopic
-from graphvio.ros2.turn import Turn
-from graphvio.ros2.types import dds
+from graphvio.ros2.sensor_topic import BodyRotation, SensorTopic
+from graphvio.ros2.wire import require_dds
 from graphvio.sessions import cdr
 from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU
 from graphvio.sessions.rig_of_topics import stereo_topics
@@ -25,16 +25,16 @@ from graphvio.sessions.topics import image_topic, preference
 
 _OPTIONS: Final = ("domain", "imu", "body", "reliable", "wait_s")
 _WAIT_S: Final = 10.0
-_SETTLED_S: Final = 1.0  # nothing new is published for so long: all who are there have been heard of
+_DISCOVERY_S: Final = 1.0  # without a new publication: discovery is complete
 _POLL_S: Final = 0.05
-_LOOK_S: Final = 0.2  # between looks at who is there
+_LIVENESS_S: Final = 0.2  # between checks of the publishers
 
 
 def list_devices() -> Sequence[DeviceInfo]:
-    """The domain of ``ROS_DOMAIN_ID``, if there are images on it."""
+    """See `SourceKind.list_devices`: the domain of ``ROS_DOMAIN_ID``, if images are published there."""
     domain = domain_of(None)
     node = Node(domain)
-    time.sleep(_SETTLED_S)
+    time.sleep(_DISCOVERY_S)
     types = {each.topic: each.type_name for each in node.publications()}
     images = _images(types)
     if not images:
@@ -46,13 +46,13 @@ def list_devices() -> Sequence[DeviceInfo]:
 
 
 def open_source(spec: SourceSpec, rig: Rig | None) -> LiveSource:
-    """Topics of ROS 2: ``ros2:?domain=0&CAMERA=/TOPIC&imu=/imu``.
+    """See `SourceKind.open_source`; such as ``ros2:?domain=0&CAMERA=/TOPIC&imu=/imu``.
 
-    Options are ``domain``; ``imu``, the topic of the samples; a topic for each camera by its name, where names do not
-    tell; ``body``, the frame that the rig given calls body, where that is not the IMU's: samples are then turned as
-    ``tf_static`` says; ``reliable=1`` to have lost samples sent again; ``wait_s``, how long topics may take to come.
+    Options are ``domain``; ``imu``, the topic of the samples; a topic for each camera that is not found by its name;
+    ``body``, the frame that is the rig's body where that is not the IMU's: samples are then rotated by ``tf_static``;
+    ``reliable=1`` to have lost samples sent again; ``wait_s``, how long to wait for topics.
     """
-    dds()
+    require_dds()
     cdr.types()
     if spec.what:
         raise SourceError(f"ros2:{spec.what}: topics are named by options, such as ros2:?imu=/{spec.what.lstrip('/')}")
@@ -64,12 +64,17 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> LiveSource:
     if rig is not None and rig.imu is None and {"imu", "body"} & spec.options.keys():
         raise SourceError(f"ros2: {rig.name} has no IMU; leave out imu and body, or give a rig that has one")
     if rig is None and "body" in spec.options:
-        raise SourceError("ros2: body says what a rig that is given means; without one, body is the IMU's frame")
+        raise SourceError("ros2: body is an option for a rig file (--rig); without one, body is the IMU's frame")
     return Ros2Source(spec, rig)
 
 
 class Ros2Source:
-    """See `open_source`; stamps are the messages' own, and taken to be of one clock."""
+    """Topics of ROS 2 as a `LiveSource`; stamps are those of the messages, assumed to be of one clock.
+
+    Args:
+        spec: see `open_source`.
+        rig: or None, to receive it from ``camera_info`` and ``tf_static``.
+    """
 
     is_realtime = True
 
@@ -78,8 +83,9 @@ class Ros2Source:
         self._rig, self._domain = rig, domain_of(options.get("domain"))
         self._chosen = {name: topic for name, topic in options.items() if name not in _OPTIONS}
         self._imu, self._body = options.get("imu"), options.get("body")
-        self._is_reliable = _flag(options.get("reliable", "0"))
-        self._wait_s = _seconds(options.get("wait_s", str(_WAIT_S)))
+        self._is_reliable = choice_of(spec, "reliable", ("0", "1")) == "1"
+        wait_s = number_of(spec, "wait_s", 0.0, 1e6)
+        self._wait_s = _WAIT_S if wait_s is None else wait_s
         self._closing = threading.Event()
         self._node: Node | None = None
         self._topics: list[SensorTopic] = []
@@ -95,8 +101,8 @@ class Ros2Source:
         """Find the topics, and listen to them.
 
         Raises:
-            SourceError: if one that is asked for is not published.
-            RigError: if no rig is given, and camera_info and transforms tell none.
+            SourceError: if a topic is not published.
+            RigError: if no rig is given, and camera_info and transforms do not make one.
         """
         node = Node(self._domain)
         deadline_s = time.monotonic() + self._wait_s
@@ -111,7 +117,7 @@ class Ros2Source:
         if self._rig is None:
             rig, cameras = listen_for_rig(node, published, self._chosen, imu, wait)
             if imu is not None and rig.imu is None:
-                raise SourceError(f"{self.name}: nothing came on {imu}, though it is published; start the IMU")
+                raise SourceError(f"{self.name}: no sample came on {imu}, though it is published; start the IMU")
         else:
             rig = self._rig
             cameras = _topics_of(rig, self._chosen, types, self.name)
@@ -129,44 +135,44 @@ class Ros2Source:
             if silent[0].reader.refused_writers or not wait(_POLL_S):
                 raise _no_writer(silent[0], self.name)
         for each in topics:
-            each.look()
+            each.poll()
         self._node, self._topics = node, topics
         return rig
 
     def readings(self) -> Iterator[Reading]:
-        """What comes, in the order in which it comes, until `close`."""
+        """Yield readings in the order of arrival until `close`."""
         node, topics = self._node, self._topics
         if node is None:
             return
-        waiter = node.waiter([each.reader for each in topics])
-        turn = None if self._body is None else Turn(self._body, self._transforms)
-        looked_s = time.monotonic()
+        wait = node.waiter([each.reader for each in topics])
+        rotation = None if self._body is None else BodyRotation(self._body, self._transforms)
+        polled_s = time.monotonic()
         while not self._closing.is_set():
-            waiter.wait(_LOOK_S)
+            wait(_LIVENESS_S)
             for topic in topics:
                 for reading in topic.take():
-                    if turn is not None and isinstance(reading, ImuReading):
-                        yield from turn(reading, topic)
+                    if rotation is not None and isinstance(reading, ImuReading):
+                        yield from rotation.apply(reading, topic)
                     else:
                         yield reading
-            if time.monotonic() - looked_s >= _LOOK_S:
-                looked_s = time.monotonic()
-                yield from filter(None, [each.look() for each in topics])
+            if time.monotonic() - polled_s >= _LIVENESS_S:
+                polled_s = time.monotonic()
+                yield from filter(None, [each.poll() for each in topics])
 
     def health(self) -> Sequence[DeviceHealth]:
-        """Each topic; from any thread."""
+        """Return the state of each topic; from any thread."""
         return [each.health for each in self._topics] or self._last_health
 
     def close(self) -> None:
-        """Listen no more; from any thread."""
+        """Leave the domain; from any thread."""
         self._closing.set()
         node, self._node = self._node, None
         if node is not None:
             node.stop()
-            self._last_health, self._topics = self.health(), []  # what DDS holds goes with the topics
+            self._last_health, self._topics = self.health(), []  # DDS entities are released with the topics
 
     def _published(self, node: Node, wait: Callable[[float], bool]) -> list[Publication]:
-        """What is published, once all is there that is asked for by name; where something is not, once all is still."""
+        """Wait until all named topics are published and, unless these suffice, discovery is complete."""
         named = {*self._chosen.values(), *filter(None, [self._imu])}
         has_all = self._rig is not None and self._chosen.keys() >= {each.name for each in self._rig.cameras}
         has_all = has_all and self._body is None and (self._imu is not None or self._rig is None or not self._rig.imu)
@@ -176,8 +182,8 @@ class Ros2Source:
             if len(published) != count:
                 count, since_s = len(published), time.monotonic()
             missing = named - {each.topic for each in published}
-            is_settled = has_all or time.monotonic() - since_s >= _SETTLED_S
-            if is_settled and not missing and self._suffices({each.topic: each.type_name for each in published}):
+            is_complete = has_all or time.monotonic() - since_s >= _DISCOVERY_S
+            if is_complete and not missing and self._suffices({each.topic: each.type_name for each in published}):
                 return published
             if not wait(_POLL_S):
                 break
@@ -190,7 +196,7 @@ class Ros2Source:
         return published
 
     def _suffices(self, types: Mapping[str, str]) -> bool:
-        """Whether each sensor has a topic; else its publisher may yet start."""
+        """Return whether each sensor has a topic; else its publisher may not have started yet."""
         if self._rig is None:
             return bool(stereo_topics(_images(types)))
         try:
@@ -205,7 +211,7 @@ def _images(types: Mapping[str, str]) -> list[str]:
 
 
 def _topics_of(rig: Rig, chosen: Mapping[str, str], types: Mapping[str, str], where: str) -> dict[str, str]:
-    """The topic of each camera: as given, as graphvio names it, or the one that has the camera's name in it.
+    """Find the topic of each camera: as given, as graphvio names it, or the one whose name contains the camera's.
 
     Raises:
         SourceError: if a camera has none.
@@ -219,8 +225,8 @@ def _topics_of(rig: Rig, chosen: Mapping[str, str], types: Mapping[str, str], wh
             named += sorted((name for name in images if camera.name in name.split("/")), key=preference)
             if camera.name not in found and not named:
                 raise SourceError(
-                    f"{where}: no topic tells by its name that it has the images of {camera.name}; say "
-                    f"{camera.name}=/TOPIC. Topics with images: {', '.join(images) or 'none'}"
+                    f"{where}: no topic has a name that fits the images of {camera.name}; give {camera.name}=/TOPIC. "
+                    f"Topics with images: {', '.join(images) or 'none'}"
                 )
             if camera.name not in found:
                 found[camera.name] = named[0]
@@ -230,23 +236,7 @@ def _topics_of(rig: Rig, chosen: Mapping[str, str], types: Mapping[str, str], wh
 def _no_writer(topic: SensorTopic, where: str) -> SourceError:
     if topic.reader.refused_writers:
         return SourceError(
-            f"{where}: who publishes {topic.name} sends nothing again (best effort), and reliable=1 asks for it; "
-            "leave that out"
+            f"{where}: the publisher of {topic.name} does not send lost samples again (best effort); leave out "
+            "reliable=1"
         )
     return SourceError(f"{where}: nobody publishes {topic.name} any more; start its publisher again")
-
-
-def _flag(text: str) -> bool:
-    if text not in ("0", "1"):
-        raise SourceError(f"ros2: reliable is {text!r}; it is 0 or 1")
-    return text == "1"
-
-
-def _seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = -1.0
-    if not 0.0 <= seconds < 1e6:
-        raise SourceError(f"ros2: wait_s is {text!r}; it is a number of seconds")
-    return seconds
