@@ -1,4 +1,4 @@
-"""The report of an optimisation, of walks on a circle that are made by hand."""
+"""The report of an optimisation, on two laps of a circle without images."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from graphvio.optimization.loops.closures import LoopClosure, Place
 from graphvio.optimization.optimize import JudgedLoop, Optimization, optimize
 from graphvio.optimization.record import NO_MOTIONS, Inertial, Motions, SessionRecord
 from graphvio.optimization.report.calibration import calibrations
-from graphvio.optimization.report.words import length, plain
+from graphvio.optimization.report.page import length, plain
 from graphvio.optimization.report.write import write_report
 from graphvio.optimization.solver import Residuals
 from graphvio.trajectory import Trajectory
@@ -45,7 +45,7 @@ def circle() -> Float:
 
 
 def session(name: str, seed: int, breaks: tuple[int, ...] = ()) -> SessionRecord:
-    """As an odometry without IMU would see the circle, whose poses drift; at breaks a new epoch begins."""
+    """What an odometry without IMU would record on the circle, with drift; a new epoch begins at each break."""
     rng, true = np.random.default_rng(seed), circle()
     epoch = np.searchsorted(np.array(breaks, dtype=np.int64), np.arange(POSES), side="right")
     poses, motions, rows = [np.eye(4)], [], []
@@ -82,7 +82,7 @@ def session(name: str, seed: int, breaks: tuple[int, ...] = ()) -> SessionRecord
 
 
 def loop(first: tuple[int, int], second: tuple[int, int], reference_T_current: Float, points: int) -> LoopClosure:
-    """Between places, which are a session's number and a row."""
+    """A loop closure between places, given as session and row."""
     earlier, later = (Place(number, row, STEP_NS * (row + 1)) for number, row in (first, second))
     return LoopClosure(earlier, later, reference_T_current, 1e-6 * np.eye(6), points, ((0, 0), (0, 1)), True)
 
@@ -93,13 +93,13 @@ def between(first: int, second: int) -> Float:
 
 @pytest.fixture(scope="module")
 def one() -> Optimization:
-    """A session with a right loop and a wrong one."""
+    """A session with a true loop closure and a false one."""
     loops = [loop((0, 2), (0, 62), between(2, 62), 321), loop((0, 20), (0, 110), np.eye(4), 45)]
     return optimize([session("ring<1>", 1)], [None], loops, Config())
 
 
 def two_sessions() -> Optimization:
-    """Two, of which the second's first epoch lies in a frame of its own, as its loop closures cannot say where."""
+    """Two sessions; the second's first epoch is in a frame of its own."""
     records = [session("first", 2), session("second", 3, breaks=(30,))]
     found = optimize(records, [None, None], [], Config())
     first, second = found.sessions
@@ -117,13 +117,14 @@ def truth() -> Trajectory:
 
 
 class Page(HTMLParser):
-    """Its text, and the pictures; fails where elements are not closed in turn."""
+    """Text and pictures of a page; fails if elements are not nested properly."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
         self.text, self.pictures, self._open = "", list[bytes](), list[str]()
         self.feed(html)
         self.close()
+        self.text = " ".join(self.text.split())
         assert not self._open
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -158,7 +159,7 @@ def written(
     return report(one, tmp_path_factory.mktemp("one") / "new" / "folder", [truth])
 
 
-def test_page_and_summary_tell_the_same(one: Optimization, written: tuple[Page, dict[str, Any]]) -> None:
+def test_write_report_page_and_summary_agree(one: Optimization, written: tuple[Page, dict[str, Any]]) -> None:
     page, summary = written
     assert summary["loops"]["found"] == 2
     assert summary["loops"]["used"] == 1
@@ -189,9 +190,9 @@ def test_page_and_summary_tell_the_same(one: Optimization, written: tuple[Page, 
     assert "ring<1>" in page.text
 
 
-def test_refused_loops_are_told_with_the_reason(written: tuple[Page, dict[str, Any]]) -> None:
-    page, told = written
-    wrong = told["loops"]["all"][1]
+def test_write_report_refused_loop_states_reason(written: tuple[Page, dict[str, Any]]) -> None:
+    page, summary = written
+    wrong = summary["loops"]["all"][1]
     assert wrong["refusal"]
     assert f"refused: {wrong['refusal']}" in page.text
     assert wrong["points"] == 45
@@ -199,7 +200,7 @@ def test_refused_loops_are_told_with_the_reason(written: tuple[Page, dict[str, A
     assert re.search(r"2\.00 s\s+11\.00 s\s+0 by 0; 0 by 1\s+45\s+0\.000 m, 0\.0 degrees", page.text)
 
 
-def test_pictures_hold_all_of_it(written: tuple[Page, dict[str, Any]]) -> None:
+def test_write_report_pictures_show_everything(written: tuple[Page, dict[str, Any]]) -> None:
     page, _ = written
     assert len(page.pictures) == 4  # map, moved, sigmas, residuals
     for png in page.pictures:
@@ -217,22 +218,22 @@ def test_pictures_hold_all_of_it(written: tuple[Page, dict[str, Any]]) -> None:
         assert faint[:, half].sum() > 100
 
 
-def test_parts_that_nothing_joins_are_told(truth: Trajectory, tmp_path: Path) -> None:
+def test_write_report_unjoined_parts_are_listed(truth: Trajectory, tmp_path: Path) -> None:
     found = two_sessions()
-    page, told = report(found, tmp_path, [truth, None])
-    assert told["frames"] == 2
+    page, summary = report(found, tmp_path, [truth, None])
+    assert summary["frames"] == 2
     assert "there are 2 frames" in page.text
     assert "Frame 1" in page.text
     assert "second, epoch 0: 0.0 to 2.9 s, 30 framesets" in page.text
     assert len(page.pictures) == 5
     assert "second: no ground truth" in page.text
-    error = told["loops"]["error_of_used"]
+    error = summary["loops"]["error_of_used"]
     assert error["online"]["count"] == 0
     assert error["optimized"]["count"] == 3
 
 
 def correction(angle_rad: float, shift_m: float, offset_s: float | None) -> RigCorrection:
-    """Of two pairs, of which the first is held unless there is an offset."""
+    """A correction of two pairs; the first is held unless there is an offset."""
     covariance = np.diag(np.repeat([1e-3, 2e-3], 3) ** 2)
     found = se3_exp(np.array([0.0, 0.0, angle_rad, shift_m, 0.0, 0.0]))
     first = covariance if offset_s is not None else np.zeros((6, 6))
@@ -240,9 +241,9 @@ def correction(angle_rad: float, shift_m: float, offset_s: float | None) -> RigC
     return RigCorrection(pairs, {0: first, 1: covariance}, offset_s or 0.0, None if offset_s is None else 1e-3)
 
 
-def test_the_calibration_that_is_found_is_told(one: Optimization, tmp_path: Path) -> None:
-    page, told = report(replace(one, corrections=[correction(0.01, 0.0, -0.005)]), tmp_path, [None])
-    (each,) = told["calibrations"]
+def test_write_report_calibration_contradicts_rig_file(one: Optimization, tmp_path: Path) -> None:
+    page, summary = report(replace(one, corrections=[correction(0.01, 0.0, -0.005)]), tmp_path, [None])
+    (each,) = summary["calibrations"]
     first, second = each["pairs"]
     assert not each["borne_out"]
     assert first["borne_out"]
@@ -255,26 +256,27 @@ def test_the_calibration_that_is_found_is_told(one: Optimization, tmp_path: Path
     assert each["time_offset"] == {"correction_s": -0.005, "sigma_s": 1e-3, "sigmas": 5.0, "borne_out": False}
     assert "0.573 degrees, sigma 0.057: 10.0 sigmas" in page.text
     assert "-5.00 ms, sigma 1.00: 5.0 sigmas" in page.text
-    assert "the rig file is refuted" in page.text
+    assert "contradicts the rig file" in page.text
+    assert "the calibration contradicts" in page.text
 
 
-def test_a_rig_file_that_is_borne_out_is_told(one: Optimization, tmp_path: Path) -> None:
+def test_write_report_calibration_consistent_with_rig_file(one: Optimization, tmp_path: Path) -> None:
     found = replace(one, corrections=[correction(0.001, 0.003, None)])
-    page, told = report(found, tmp_path, [None])
-    (each,) = told["calibrations"]
+    page, summary = report(found, tmp_path, [None])
+    (each,) = summary["calibrations"]
     first, second = each["pairs"]
     assert each["borne_out"]
     assert first["held"]
     assert first["angle_sigmas"] is None
     assert each["time_offset"] is None
     assert second["distance_sigmas"] == pytest.approx(1.5, rel=1e-3)
-    assert "held where the rig file has it" in page.text
-    assert "the rig file is borne out" in page.text
-    assert "refuted:" not in page.text
+    assert "held at the rig file's value" in page.text
+    assert "consistent with the rig file" in page.text
+    assert "the calibration contradicts" not in page.text
 
 
-def test_all_axes_together_can_refute_a_rig_file(one: Optimization) -> None:
-    """The largest sigma hides a shift along an axis that is known much better."""
+def test_calibrations_joint_test_can_contradict_rig_file(one: Optimization) -> None:
+    """The largest sigma hides a displacement along an axis that is known much better."""
     found = correction(0.0, 0.002, None)
     sharp = found.covariances[1].copy()
     sharp[3, 3] = 1e-4**2
@@ -282,11 +284,11 @@ def test_all_axes_together_can_refute_a_rig_file(one: Optimization) -> None:
     (each,) = calibrations(replace(one, corrections=[both]), [None])
     assert each is not None
     assert each.pairs[1].distance_sigmas == pytest.approx(1.0)
-    assert not each.is_borne_out
+    assert not each.is_consistent
 
 
-def test_a_pair_s_place_is_that_of_its_left_camera(one: Optimization) -> None:
-    """A pair that is far from the body, and turns about itself, does not move."""
+def test_calibrations_rotation_about_left_camera_is_no_displacement(one: Optimization) -> None:
+    """A pair far from body's origin that turns about its left camera does not move."""
     rig = two_pair_rig()
     place = rig.pairs[1].left.body_T_cam[:3, 3]
     turned = se3_exp(np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
@@ -300,13 +302,13 @@ def test_a_pair_s_place_is_that_of_its_left_camera(one: Optimization) -> None:
     assert calibrations(one, [rig]) == [None]
 
 
-def test_nothing_speaks_against_a_good_result(one: Optimization, tmp_path: Path) -> None:
-    page, told = report(replace(one, loops=one.loops[:1]), tmp_path, [None])
-    assert "no check here speaks against the result" in page.text
-    assert told["sessions"][0]["completion"] is None
+def test_write_report_good_result_has_no_doubts(one: Optimization, tmp_path: Path) -> None:
+    page, summary = report(replace(one, loops=one.loops[:1]), tmp_path, [None])
+    assert "no check speaks against the result" in page.text
+    assert summary["sessions"][0]["completion"] is None
 
 
-def test_many_refused_loops_are_a_doubt(one: Optimization, tmp_path: Path) -> None:
+def test_write_report_many_refused_loops_are_a_doubt(one: Optimization, tmp_path: Path) -> None:
     half, _ = report(one, tmp_path / "half", [None])
     assert "places look alike" not in half.text
     page, _ = report(replace(one, loops=[*one.loops, one.loops[1]]), tmp_path / "most", [None])
@@ -314,7 +316,7 @@ def test_many_refused_loops_are_a_doubt(one: Optimization, tmp_path: Path) -> No
     assert "2 of 3 loop closures that were found are refused: places look alike here" in page.text
 
 
-def test_used_loops_that_contradict_the_solution_are_a_doubt(one: Optimization, tmp_path: Path) -> None:
+def test_write_report_contradicting_loops_are_a_doubt(one: Optimization, tmp_path: Path) -> None:
     after = one.after | {"loop": Residuals(np.array([7.2]), 6)}
     page, _ = report(replace(one, loops=one.loops[:1], after=after), tmp_path, [None])
     assert "Read before use" in page.text
@@ -322,7 +324,7 @@ def test_used_loops_that_contradict_the_solution_are_a_doubt(one: Optimization, 
 
 
 @pytest.mark.parametrize(("completion", "is_doubtful"), [(0.89, True), (0.9, False)])
-def test_a_session_with_gaps_is_a_doubt(
+def test_write_report_incomplete_session_is_a_doubt(
     one: Optimization, tmp_path: Path, completion: float, is_doubtful: bool
 ) -> None:
     beside = tmp_path / "ring<1>" / "odometry"
@@ -334,17 +336,17 @@ def test_a_session_with_gaps_is_a_doubt(
     assert json.loads((tmp_path / "summary.json").read_text())["sessions"][0]["completion"] == completion
 
 
-def test_the_terminal_tells_medians_and_calibration(
+def test_cli_prints_medians_and_calibration(
     one: Optimization, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _tell(replace(one, corrections=[correction(0.01, 0.0, -0.005)]), tmp_path)
-    told = capsys.readouterr().out
-    assert re.search(r"^cost \S+ -> \S+; median error per motion \S+ -> \S+ sigmas$", told, re.MULTILINE)
-    assert "pair 1: turned by 0.573 degrees (sigma 0.057: 10.0 sigmas)" in told
-    assert "time offset -5.00 ms (sigma 1.00 ms: 5.0 sigmas): the rig file is refuted" in told
+    output = capsys.readouterr().out
+    assert re.search(r"^cost \S+ -> \S+; median error per motion \S+ -> \S+ sigmas$", output, re.MULTILINE)
+    assert "pair 1: turned by 0.573 degrees (sigma 0.057: 10.0 sigmas)" in output
+    assert "time offset -5.00 ms (sigma 1.00 ms: 5.0 sigmas): contradicts the rig file" in output
 
 
-def test_sessions_without_a_correction_are_told_apart() -> None:
+def test_calibrations_of_one_session_only() -> None:
     corrections: Any = [None, correction(0.0, 0.0, None)]
     found = replace(two_sessions(), corrections=corrections)
     first, second = calibrations(found, [None, None])
@@ -353,16 +355,16 @@ def test_sessions_without_a_correction_are_told_apart() -> None:
     assert second.session == "second"
 
 
-def test_long_lists_of_loops_are_cut(one: Optimization, tmp_path: Path) -> None:
+def test_write_report_many_loops_are_truncated(one: Optimization, tmp_path: Path) -> None:
     many = replace(one, loops=[one.loops[0]] * 230)
-    page, told = report(many, tmp_path, [None])
+    page, summary = report(many, tmp_path, [None])
     assert "no ground truth" in page.text
     assert "and 30 more" in page.text
     assert page.text.count("0 by 0; 0 by 1") == 200
-    assert len(told["loops"]["all"]) == 230
+    assert len(summary["loops"]["all"]) == 230
 
 
-def test_what_cannot_be_written_is_told(one: Optimization, tmp_path: Path) -> None:
+def test_write_report_bad_arguments_raise(one: Optimization, tmp_path: Path) -> None:
     with pytest.raises(OptimizationError, match="2 truths for 1 sessions"):
         write_report(one, tmp_path, [None, None])
     (tmp_path / "file").write_text("")

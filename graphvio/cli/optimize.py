@@ -143,9 +143,8 @@ def _warn(odometry: Path) -> bool:
 
 def _tell(found: Optimization, folder: Path) -> None:
     from graphvio.optimization.report.calibration import calibrations
-    from graphvio.optimization.report.numbers import median_sigmas
-    from graphvio.optimization.report.odometry import rig_of
-    from graphvio.optimization.report.words import calibration_in_words, plain
+    from graphvio.optimization.report.numbers import median_sigmas, rig_of
+    from graphvio.optimization.report.page import plain
 
     used = sum(not loop.refusal for loop in found.loops)
     typer.echo(
@@ -164,6 +163,6 @@ def _tell(found: Optimization, folder: Path) -> None:
     for each in calibrations(found, [rig_of(folder, session.record.name) for session in found.sessions]):
         if each is not None:
             name = "" if len(found.sessions) == 1 else f"{each.session}, "
-            for line in calibration_in_words(each):
+            for line in each.lines():
                 typer.echo(f"{name}{line}")
     typer.echo(f"results: {folder}")

@@ -19,7 +19,7 @@ from graphvio.optimization.graph import poses_of
 from graphvio.optimization.nodes import spread
 from graphvio.optimization.optimize import Optimization
 from graphvio.optimization.pipeline import Session, optimize_sessions
-from graphvio.optimization.report.measures import loop_errors
+from graphvio.optimization.report.numbers import loop_errors
 from graphvio.sources import open_source
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory

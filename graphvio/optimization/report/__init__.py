@@ -1,1 +1,1 @@
-"""What is written of an optimisation: all numbers, and a page for people with its pictures."""
+"""The report of an optimisation: an HTML page with figures, and all numbers as JSON."""

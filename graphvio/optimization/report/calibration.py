@@ -1,4 +1,4 @@
-"""What the solution says of the rig files: how far each pair is from where its file has it, in standard deviations."""
+"""The estimated calibration compared with the rig files, in standard deviations."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from graphvio.optimization.extrinsics import RigCorrection
 from graphvio.optimization.optimize import Optimization
 from graphvio.rig import Rig
 
-MOST_SIGMAS = 3.0
-"""A correction that is larger refutes the rig file."""
+MAX_SIGMAS = 3.0
+"""A larger correction contradicts the rig file."""
 
 _PROBABILITY = 0.9973  # of three standard deviations of one unknown
-_HELD = 1e-7  # radians and metres: no measurement is that good
+_FIXED = 1e-7  # radians and metres: no measurement is that good
 
 
 @dataclass(frozen=True)
 class PairCorrection:
-    """How far a pair is from where the rig file has it.
+    """The correction of a pair's extrinsics.
 
     Attributes:
-        pair: its number.
-        name: of it, or empty.
-        is_held: whether it is no unknown: without an IMU, the first pair is where the rig file has it.
-        of: what the distance is of: its ``left camera``; or ``body's origin``, turned and moved with it as one piece,
-            where the rig is not known.
-        angle_deg: by which it is turned.
-        angle_sigma_deg: largest standard deviation of that, over all axes.
-        distance_m: by which it is moved.
-        distance_sigma_m: largest standard deviation of that, over all directions.
-        squared_distance: Mahalanobis, of rotation and translation together, 6 degrees of freedom; None if held.
+        pair: number of the pair.
+        name: of the pair, or empty.
+        is_held: whether it is not estimated: without an IMU, the first pair defines body.
+        of: point whose displacement is given: the pair's ``left camera``, or ``body's origin`` moved with the pair if
+            the rig is unknown.
+        angle_deg: of the rotation.
+        angle_sigma_deg: its standard deviation, largest over all axes.
+        distance_m: displacement.
+        distance_sigma_m: its standard deviation, largest over all directions.
+        squared_distance: Mahalanobis, of rotation and translation, 6 degrees of freedom; None if held.
     """
 
     pair: int
@@ -50,68 +50,111 @@ class PairCorrection:
     squared_distance: float | None
 
     @property
+    def title(self) -> str:
+        """The pair's number, and its name if known."""
+        return f"pair {self.pair} ({self.name})" if self.name else f"pair {self.pair}"
+
+    @property
     def angle_sigmas(self) -> float | None:
-        """How many standard deviations the angle is."""
+        """The angle in standard deviations."""
         return None if self.is_held else self.angle_deg / self.angle_sigma_deg
 
     @property
     def distance_sigmas(self) -> float | None:
-        """How many standard deviations the distance is."""
+        """The displacement in standard deviations."""
         return None if self.is_held else self.distance_m / self.distance_sigma_m
 
     @property
-    def is_borne_out(self) -> bool:
-        """Whether nothing found speaks against the rig file, along any axis."""
+    def is_consistent(self) -> bool:
+        """Whether the correction is consistent with the rig file, along each axis and together."""
         if self.angle_sigmas is None or self.distance_sigmas is None or self.squared_distance is None:
             return True
-        is_near = max(self.angle_sigmas, self.distance_sigmas) <= MOST_SIGMAS
+        is_near = max(self.angle_sigmas, self.distance_sigmas) <= MAX_SIGMAS
         return is_near and self.squared_distance <= chi_square_quantile(_PROBABILITY, 6)
+
+    @property
+    def conclusion(self) -> str:
+        """The comparison with the rig file in words."""
+        return "held at the rig file's value" if self.is_held else _conclusion(self.is_consistent)
 
 
 @dataclass(frozen=True)
 class OffsetCorrection:
-    """What is to be added to the IMU's time offset, and its standard deviation, seconds."""
+    """The correction of the IMU's time offset and its standard deviation, in seconds."""
 
     offset_s: float
     sigma_s: float
 
     @property
     def sigmas(self) -> float:
-        """How many standard deviations it is."""
+        """The correction in standard deviations."""
         return abs(self.offset_s) / self.sigma_s
 
     @property
-    def is_borne_out(self) -> bool:
-        """Whether the rig file's may be right."""
-        return self.sigmas <= MOST_SIGMAS
+    def is_consistent(self) -> bool:
+        """Whether the correction is consistent with the rig file."""
+        return self.sigmas <= MAX_SIGMAS
+
+    @property
+    def conclusion(self) -> str:
+        """The comparison with the rig file in words."""
+        return _conclusion(self.is_consistent)
 
 
 @dataclass(frozen=True)
 class SessionCalibration:
-    """Of a session's rig file; the offset is None without an IMU."""
+    """The corrections of a session's rig file; no offset without an IMU."""
 
     session: str
     pairs: Sequence[PairCorrection]
     offset: OffsetCorrection | None
 
     @property
-    def is_borne_out(self) -> bool:
-        """Whether nothing speaks against the rig file."""
-        return all(each.is_borne_out for each in self.pairs) and (self.offset is None or self.offset.is_borne_out)
+    def is_consistent(self) -> bool:
+        """Whether all corrections are consistent with the rig file."""
+        return all(each.is_consistent for each in self.pairs) and (self.offset is None or self.offset.is_consistent)
+
+    def lines(self) -> list[str]:
+        """Describe the corrections: a line for each pair, and one for the time offset."""
+        lines = []
+        for pair in self.pairs:
+            line = pair.title
+            if not pair.is_held:
+                distance_mm, sigma_mm = 1e3 * pair.distance_m, 1e3 * pair.distance_sigma_m
+                line += (
+                    f": turned by {pair.angle_deg:.3f} degrees (sigma {pair.angle_sigma_deg:.3f}: "
+                    f"{pair.angle_sigmas:.1f} sigmas), {pair.of} moved by {distance_mm:.2f} mm (sigma {sigma_mm:.2f}: "
+                    f"{pair.distance_sigmas:.1f} sigmas)"
+                )
+            lines.append(f"{line}: {pair.conclusion}")
+        if self.offset is not None:
+            offset_ms, sigma_ms = 1e3 * self.offset.offset_s, 1e3 * self.offset.sigma_s
+            lines.append(
+                f"time offset {offset_ms:+.2f} ms (sigma {sigma_ms:.2f} ms: {self.offset.sigmas:.1f} sigmas): "
+                f"{self.offset.conclusion}"
+            )
+        return lines
 
 
 def calibrations(found: Optimization, rigs: Sequence[Rig | None]) -> list[SessionCalibration | None]:
-    """Of each session, or None where the calibration was no unknown.
+    """Compare the estimated calibration of each session with its rig file.
 
     Args:
         found: the optimisation.
-        rigs: as the sessions' files have them, or None where that is not known.
+        rigs: of each session by its file, or None if unknown.
+
+    Returns:
+        The corrections of each session; None where the calibration was not estimated.
     """
     corrections: Sequence[RigCorrection | None] = found.corrections or [None] * len(found.sessions)
     return [
         None if correction is None else _session(session.record.name, correction, rig)
         for session, correction, rig in zip(found.sessions, corrections, rigs, strict=True)
     ]
+
+
+def _conclusion(is_consistent: bool) -> str:
+    return "consistent with the rig file" if is_consistent else "contradicts the rig file"
 
 
 def _session(name: str, correction: RigCorrection, rig: Rig | None) -> SessionCalibration:
@@ -129,9 +172,9 @@ def _pair(pair: int, correction: Float, covariance: Float, rig: Rig | None) -> P
     place = np.zeros(3) if known is None else np.ascontiguousarray(known.left.body_T_cam[:3, 3])
     rotation = np.ascontiguousarray(correction[:3, :3])
     moved_m = float(np.linalg.norm(rotation @ place + correction[:3, 3] - place))
-    by_tangent = np.hstack([-skew(place), np.eye(3)])  # of the place, in directions that the correction turns
+    by_tangent = np.hstack([-skew(place), np.eye(3)])  # of the place
     angle_sigma, sigma_m = _largest(covariance[:3, :3]), _largest(by_tangent @ covariance @ by_tangent.T)
-    is_held = min(angle_sigma, sigma_m) < _HELD
+    is_held = min(angle_sigma, sigma_m) < _FIXED
     tangent = se3_log(np.ascontiguousarray(correction))
     return PairCorrection(
         pair,
@@ -147,5 +190,5 @@ def _pair(pair: int, correction: Float, covariance: Float, rig: Rig | None) -> P
 
 
 def _largest(covariance: Float) -> float:
-    """Standard deviation along the axis where it is largest."""
+    """Compute the standard deviation along the axis where it is largest."""
     return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))

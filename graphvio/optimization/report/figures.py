@@ -1,8 +1,9 @@
-"""Residuals against what chance would make of them, and over time how far poses moved and how well they are known."""
+"""Figures of an optimisation's report: maps, residuals, and changes and uncertainty over time."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,20 +11,69 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from scipy.stats import chi2
 
-from graphvio.arrays import Float
+from graphvio.arrays import Bool, Float
 from graphvio.optimization.optimize import Optimization
-from graphvio.optimization.report.maps import session_colour
-from graphvio.optimization.report.measures import seconds
-from graphvio.optimization.report.numbers import Kind, Numbers, per_dimension
-from graphvio.reporting.figures import BLUE, GREEN, GREY, add_axes, empty_figure
+from graphvio.optimization.report.numbers import Kind, Numbers, per_dimension, seconds
+from graphvio.reporting.figures import BLUE, GREEN, GREY, RED, add_axes, empty_figure
+
+_COLOURS = ("#1f5fbf", "#f28e1c", "#8e44ad", "#17a3b8", "#8c564b", "#555555", "#e377c2", "#9a9a00")
+"""Of sessions, in turn; green and red are loop closures'."""
+
+_COLUMN_IN, _HEIGHT_IN = 4.5, 6.0
+_LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _GAP_IN = 0.75, 0.15, 0.55, 0.3
+_LEGEND_ROW_IN, _HEADING_IN, _PER_ROW = 0.22, 0.4, 6
+_REFUSED, _REFUSED_ALPHA = "loop, refused", 0.15  # there may be hundreds
+_EDGE = {"markeredgecolor": "#111111", "markeredgewidth": 0.9, "linestyle": "none", "zorder": 5}
 
 _COLUMNS = 3
-_LEAST, _MOST = 1e-4, 1e6  # squared distances per dimension that are told apart
+_MIN_SQUARE, _MAX_SQUARE = 1e-4, 1e6  # squared distances per dimension within the bins
 _BINS_PER_DECADE = 5
 
 
-def draw_residuals(numbers: Numbers) -> Figure:
-    """Squared Mahalanobis distances per dimension of each kind of factor, before and after, by powers of ten."""
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """A session on a map: positions (F, 3) by column, whether they are in the frame (F,) and begin an epoch (F,)."""
+
+    number: int
+    name: str
+    colour: str
+    columns: tuple[Float, Float]
+    inside: Bool
+    begins: Bool
+
+
+def plot_map(found: Optimization, numbers: Numbers, frame: int) -> Figure:
+    """Plot online poses on the left and optimised ones on the right; plan (x, y) above, side view (x, z) below.
+
+    Args:
+        found: the optimisation.
+        numbers: of it.
+        frame: number of the frame.
+    """
+    lines = list(_lines(found, numbers, frame))
+    points = np.concatenate([column[line.inside] for line in lines for column in line.columns])
+    figure, panels = _panels(points, _LEGEND_ROW_IN * -(-_labels(found, lines) // _PER_ROW))
+    for column, plots in enumerate(panels):
+        for axes, z in zip(plots, (1, 2), strict=True):
+            _plot_loops(axes, found, lines, column, z)
+            for line in lines:
+                _plot_line(axes, line, column, z)
+    plan = panels[0][0]
+    handles, labels = plan.get_legend_handles_labels()
+    kept = dict(zip(labels, handles, strict=True))
+    width, height = figure.get_size_inches()
+    legend = figure.legend(
+        kept.values(), kept.keys(), loc="upper left", bbox_to_anchor=(_LEFT_IN / width, 1.0 - 0.05 / height),
+        ncol=_PER_ROW, frameon=False, fontsize=9, borderaxespad=0.0, handlelength=1.6, columnspacing=1.4,
+    )  # fmt: skip
+    for text, handle in zip(legend.get_texts(), legend.get_lines(), strict=True):
+        if text.get_text() == _REFUSED:
+            handle.set(alpha=0.6, linewidth=1.0)  # faint in the plot, but legible here
+    return figure
+
+
+def plot_residuals(numbers: Numbers) -> Figure:
+    """Plot histograms of squared Mahalanobis distances per dimension of each kind of factor, before and after."""
     kinds = [kind for kind in numbers.kinds if len(kind.after.distances) or len(kind.before.distances)]
     rows = max(-(-len(kinds) // _COLUMNS), 1)
     height = 0.65 + 2.2 * rows
@@ -33,7 +83,7 @@ def draw_residuals(numbers: Numbers) -> Figure:
         row, column = divmod(number, _COLUMNS)
         bottom = (0.5 + 2.2 * (rows - 1 - row)) / height
         axes = add_axes(figure, (0.06 + column * 0.32, bottom, 0.28, 1.65 / height))
-        _draw_kind(axes, kind, edges)
+        _plot_kind(axes, kind, edges)
         if column == 0:
             axes.set_ylabel("factors", fontsize=9)
         if number + _COLUMNS >= len(kinds):
@@ -53,13 +103,13 @@ def draw_residuals(numbers: Numbers) -> Figure:
     return figure
 
 
-def draw_moved(found: Optimization, numbers: Numbers) -> Figure:
-    """How far optimised poses are from online ones, over time; ticks below where used loop closures end."""
-    factor, unit = _unit(max(float(told.moved_m.max()) for told in numbers.sessions))
+def plot_moved(found: Optimization, numbers: Numbers) -> Figure:
+    """Plot the distance between online and optimised poses over time, with ticks where used loop closures end."""
+    factor, unit = _unit(max(float(each.moved_m.max()) for each in numbers.sessions))
     figure, panels = _stacked(f"position moved, {unit}", "rotation moved, degrees", with_legend=len(found.sessions) > 1)
-    for number, (session, told) in enumerate(zip(found.sessions, numbers.sessions, strict=True)):
-        for panel, values in zip(panels, (factor * told.moved_m, told.moved_deg), strict=True):
-            _plot(panel, seconds(session), values, session.record.epoch, session_colour(number), told.name)
+    for number, (session, each) in enumerate(zip(found.sessions, numbers.sessions, strict=True)):
+        for panel, values in zip(panels, (factor * each.moved_m, each.moved_deg), strict=True):
+            _plot(panel, seconds(session), values, session.record.epoch, _colour(number), each.name)
     for panel in panels:
         panel.set_ylim(0.0, None)
     for number, session in enumerate(found.sessions):
@@ -69,22 +119,22 @@ def draw_moved(found: Optimization, numbers: Numbers) -> Figure:
             at = seconds(session)[[place.row for place in places]]
             for panel in panels:
                 options = {"transform": panel.get_xaxis_transform(), "clip_on": False, "zorder": 4}
-                colour = GREEN if len(found.sessions) == 1 else session_colour(number)
+                colour = GREEN if len(found.sessions) == 1 else _colour(number)
                 panel.plot(at, np.full(len(at), 0.02), "|", color=colour, markersize=5, alpha=0.7, **options)
     _finish(panels, len(found.sessions) > 1)
     return figure
 
 
-def draw_sigmas(found: Optimization, numbers: Numbers) -> Figure:
-    """Standard deviations of positions and rotations over time, as they are now and as the odometry told them."""
-    factor, unit = _unit(max(float(told.sigma_m.max()) for told in numbers.sessions))
+def plot_sigmas(found: Optimization, numbers: Numbers) -> Figure:
+    """Plot standard deviations of positions and rotations over time, online and optimised."""
+    factor, unit = _unit(max(float(each.sigma_m.max()) for each in numbers.sessions))
     figure, panels = _stacked(f"sigma of position, {unit}", "sigma of rotation, degrees", with_legend=True)
-    for number, (session, told) in enumerate(zip(found.sessions, numbers.sessions, strict=True)):
-        colour, rows, since_s = session_colour(number), session.nodes.rows, seconds(session)
-        name = "optimised" if len(found.sessions) == 1 else told.name
+    for number, (session, each) in enumerate(zip(found.sessions, numbers.sessions, strict=True)):
+        colour, rows, since_s = _colour(number), session.nodes.rows, seconds(session)
+        name = "optimised" if len(found.sessions) == 1 else each.name
         for panel, online, now in (
-            (panels[0], factor * told.online_sigma_m, factor * told.sigma_m),
-            (panels[1], told.online_sigma_deg, told.sigma_deg),
+            (panels[0], factor * each.online_sigma_m, factor * each.sigma_m),
+            (panels[1], each.online_sigma_deg, each.sigma_deg),
         ):
             epoch = session.record.epoch
             label = "online" if number == 0 else "_"
@@ -99,16 +149,96 @@ def draw_sigmas(found: Optimization, numbers: Numbers) -> Figure:
     return figure
 
 
+def _lines(found: Optimization, numbers: Numbers, frame: int) -> Iterator[_Line]:
+    for number, (session, each) in enumerate(zip(found.sessions, numbers.sessions, strict=True)):
+        inside = np.asarray(session.frame == frame)
+        if inside.any():
+            columns = (each.online[:, :3, 3], session.nav_T_body[:, :3, 3])
+            begins = np.append(True, np.diff(session.record.epoch) != 0)
+            yield _Line(number, each.name, _colour(number), columns, inside, begins)
+
+
+def _labels(found: Optimization, lines: list[_Line]) -> int:
+    """Return the largest number of labels in the legend."""
+    judged = {not loop.refusal for loop in found.loops}
+    epochs = sum(int((line.begins & line.inside).sum()) for line in lines) > len(lines)
+    return len(lines) + len(judged) + epochs + 2
+
+
+def _plot_line(axes: Any, line: _Line, column: int, z: int) -> None:
+    positions = np.where(line.inside[:, None], line.columns[column], np.nan)
+    line_positions = np.insert(positions, np.flatnonzero(line.begins), np.nan, axis=0)
+    axes.plot(*line_positions[:, [0, z]].T, color=line.colour, linewidth=1.1, label=line.name, zorder=3)
+    rows = np.flatnonzero(line.inside)
+    again = positions[line.begins & line.inside & (np.arange(len(positions)) != rows[0])]
+    if len(again):
+        axes.plot(again[:, 0], again[:, z], "D", color=line.colour, markersize=5.5, label="new epoch", **_EDGE)
+    for row, marker, name in ((rows[0], "o", "start"), (rows[-1], "s", "end")):
+        at = positions[row]
+        axes.plot(at[0], at[z], marker, color=line.colour, markersize=6, label=name, **_EDGE)
+
+
+def _plot_loops(axes: Any, found: Optimization, lines: list[_Line], column: int, z: int) -> None:
+    by_number = {line.number: line for line in lines}
+    segments: dict[bool, list[Float]] = {True: [], False: []}
+    for loop in found.loops:
+        ends = []
+        for place in (loop.closure.reference, loop.closure.current):
+            line = by_number.get(place.session)
+            if line is not None and line.inside[place.row]:
+                ends.append(line.columns[column][place.row])
+        if len(ends) == 2:
+            segments[not loop.refusal] += [*ends, np.full(3, np.nan)]
+    refused = {"color": RED, "linewidth": 0.5, "alpha": _REFUSED_ALPHA, "zorder": 1.5}
+    used = {"color": GREEN, "linewidth": 1.2, "alpha": 0.85, "zorder": 4, "marker": ".", "markersize": 3}
+    for is_used, name, style in ((False, _REFUSED, refused), (True, "loop, used", used)):
+        if segments[is_used]:
+            axes.plot(*np.array(segments[is_used])[:, [0, z]].T, label=name, **style)
+
+
+def _panels(points: Float, legend_in: float) -> tuple[Figure, list[tuple[Any, Any]]]:
+    """Return the figure, and plan and side view of each column: equal scales, axes that fit the data."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre, extent = 0.5 * (low + high), 1.12 * (high - low)
+    extent[0] = max(extent[0], 0.6 * extent[1], 0.1)
+    extent[1] = max(extent[1], 0.35 * extent[0])
+    extent[2] = max(1.3 * extent[2], 0.2 * extent[0])
+    inch_per_m = min(_COLUMN_IN / extent[0], _HEIGHT_IN / (extent[1] + extent[2]))
+    width, plan_in, side_in = inch_per_m * extent
+    total_width = max(_LEFT_IN + 2 * width + _GAP_IN + _RIGHT_IN, 6.4)
+    total_height = _BOTTOM_IN + side_in + _GAP_IN + plan_in + _HEADING_IN + legend_in
+    figure = empty_figure(total_width, total_height)
+    made = []
+    for column, name in enumerate(("online", "optimised")):
+        left = (_LEFT_IN + column * (width + _GAP_IN)) / total_width
+        plots = []
+        for z, bottom_in, height_in in ((1, _BOTTOM_IN + side_in + _GAP_IN, plan_in), (2, _BOTTOM_IN, side_in)):
+            place = (left, bottom_in / total_height, width / total_width, height_in / total_height)
+            axes = add_axes(figure, place)
+            axes.set_aspect("equal", adjustable="box")
+            axes.set_xlim(centre[0] - extent[0] / 2, centre[0] + extent[0] / 2)
+            axes.set_ylim(centre[z] - extent[z] / 2, centre[z] + extent[z] / 2)
+            axes.tick_params(labelsize=8.5, labelbottom=z == 2, labelleft=column == 0)
+            if column == 0:
+                axes.set_ylabel("xyz"[z] + ", m", fontsize=9)
+            plots.append(axes)
+        plots[0].set_title(name, fontsize=10, loc="left")
+        plots[1].set_xlabel("x, m", fontsize=9)
+        plots[1].locator_params(axis="y", nbins=4)
+        made.append((plots[0], plots[1]))
+    return figure, made
+
+
 def _edges(kinds: Sequence[Kind]) -> Float:
-    """Of bins, for all kinds; what lies outside is counted in the outermost."""
+    """Return the edges of the bins for all kinds; the outermost bins include what lies beyond."""
     shown = [per_dimension(each) for kind in kinds for each in (kind.before, kind.after)]
     values = np.concatenate([np.ones(1), *shown])
-    lowest, highest = np.log10(np.clip(np.quantile(values[values > 0.0], [0.005, 0.995]), _LEAST, _MOST))
+    lowest, highest = np.log10(np.clip(np.quantile(values[values > 0.0], [0.005, 0.995]), _MIN_SQUARE, _MAX_SQUARE))
     low, high = min(int(np.floor(lowest)), -2), max(int(np.ceil(highest)), 2)
     return np.asarray(np.logspace(low, high, (high - low) * _BINS_PER_DECADE + 1))
 
 
-def _draw_kind(axes: Any, kind: Kind, edges: Float) -> None:
+def _plot_kind(axes: Any, kind: Kind, edges: Float) -> None:
     inside = (edges[0] * 1.0001, edges[-1] * 0.9999)
     before, after = (np.clip(per_dimension(each), *inside) for each in (kind.before, kind.after))
     axes.hist(after, bins=edges, color=BLUE, alpha=0.75, label="after")
@@ -127,9 +257,9 @@ def _draw_kind(axes: Any, kind: Kind, edges: Float) -> None:
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
-def _unit(most_m: float) -> tuple[float, str]:
-    """What metres are multiplied by, and the unit then."""
-    return (1e3, "mm") if most_m < 0.1 else (1.0, "m")
+def _unit(max_m: float) -> tuple[float, str]:
+    """Return a unit of length and its factor from metres."""
+    return (1e3, "mm") if max_m < 0.1 else (1.0, "m")
 
 
 def _stacked(*labels: str, with_legend: bool) -> tuple[Figure, list[Any]]:
@@ -149,9 +279,9 @@ def _plot(
     *, thin: bool = False,
 ) -> None:  # fmt: skip
     breaks = np.flatnonzero(np.diff(epoch)) + 1
-    drawn_s, drawn = (np.insert(each, breaks, np.nan) for each in (since_s, values))
+    times_s, values = (np.insert(each, breaks, np.nan) for each in (since_s, values))
     style: dict[str, Any] = {"linewidth": 0.9, "linestyle": (0, (2, 1.5))} if thin else {"linewidth": 1.4}
-    axes.plot(drawn_s, drawn, color=colour, label=label, **style)
+    axes.plot(times_s, values, color=colour, label=label, **style)
 
 
 def _finish(panels: Sequence[Any], with_legend: bool) -> None:
@@ -160,3 +290,7 @@ def _finish(panels: Sequence[Any], with_legend: bool) -> None:
     if with_legend:
         panels[0].legend(frameon=False, fontsize=8.5, ncol=4, loc="lower left", bbox_to_anchor=(0.0, 1.0),
                          borderaxespad=0.1)  # fmt: skip
+
+
+def _colour(session: int) -> str:
+    return _COLOURS[session % len(_COLOURS)]

@@ -1,292 +1,164 @@
-"""A page about an optimisation, for people who use trajectories: one file of HTML with its pictures."""
+"""The HTML page of an optimisation's report: ``page.html`` and its numbers in words."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from html import escape
+import math
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from graphvio.arrays import Float
+from graphvio.backend.gating import chi_square_quantile
 from graphvio.optimization.optimize import JudgedLoop, Optimization
-from graphvio.optimization.report.calibration import SessionCalibration
-from graphvio.optimization.report.document import size_of
-from graphvio.optimization.report.measures import STAGES
-from graphvio.optimization.report.numbers import Kind, Numbers, SessionNumbers, median_sigmas
-from graphvio.optimization.report.words import (
-    angle,
-    cost,
-    doubts,
-    gate_result,
-    length,
-    medians,
-    noise,
-    pair_name,
-    pairs_in_words,
-    parts_in_words,
-    plain,
-)
-from graphvio.reporting.page import bullets, html_page, picture, table
+from graphvio.optimization.report.numbers import Numbers, median_sigmas
+from graphvio.reporting.html import render
 
-MOST_LOOPS = 200
+MAX_LOOPS = 200
 """Rows of the table of loop closures."""
 
-_STAGES = ("online", "smoothed", "optimised")
-_MEANINGS = {
-    "imu": "preintegrated IMU between two states",
-    "motion": "motion of the rig, from images",
-    "view": "the error that a keyframe's motions share",
-    "rest": "the rig stands still",
-    "walk": "a segment without IMU or images: steady motion",
-    "start": "what is known of a first state",
-    "calibration": "what the rig file says of places and offset",
-    "loop": "loop closures that are used",
-}
-_WHY_LARGE = (
-    "The cost before may be large all the same: at the start of a session the odometry's poses are of different "
-    "updates, and the few motions between those dominate the sum."
-)
-_MAP = (
-    "Online poses on the left, optimised ones on the right; seen from above, and from the side below. Every loop "
-    "closure ties two places by a line: where the odometry drifted, lines of those used are longer on the left. "
-)
-_CAPTIONS = {
-    "residuals": "Squared Mahalanobis distance of each factor, divided by its dimension, before and after. Were "
-    "all noise as it is assumed, and the states not fitted to it, the bars would follow the dashed line; to the left "
-    "of it the noise is smaller than assumed, to the right larger. What lies beyond an end is counted in the last bar "
-    "there. Before, loop closures are held against the odometry's smoothed poses.",
-    "moved": "How far each optimised pose is from the one that was emitted online. Ticks at the bottom are ends of "
-    "loop closures that are used.",
-    "sigmas": "One standard deviation of a pose in its frame, x, y and z together (the root of the sum of three "
-    "variances): as it is now, and thin and dashed as the odometry told it online.",
-}
+_MAX_PARTS = 40
+_FACTOR = 2.0  # of squared residuals against the expected ones, before the noise is called different
+_PROBABILITY = 0.999
+_MAX_LOOP_SQUARES = 1.0  # mean square per dimension
+_MIN_COMPLETION = 0.9
 
 
 def page(found: Optimization, numbers: Numbers, maps: Mapping[int, bytes], pictures: Mapping[str, bytes]) -> str:
-    """The page.
+    """Render the page.
 
     Args:
         found: the optimisation.
         numbers: of it.
-        maps: frame -> PNG; frames without one are told in words.
+        maps: frame -> PNG; not all frames need one.
         pictures: name -> PNG: ``residuals``, ``moved`` and ``sigmas``.
     """
-    title = ", ".join(each.name for each in numbers.sessions)
-    doubtful = doubts(found, numbers)
-    parts = [f"<h1>Optimised: {escape(title)}</h1>"]
-    if doubtful:
-        parts += ['<div class="doubt"><b>Read before use:</b>', bullets(doubtful), "</div>"]
-    else:
-        parts.append(
-            '<p class="good"><b>All sessions lie in one frame, and no check here speaks against the result.</b></p>'
-        )
-    parts += [_head(found, numbers), _sessions(numbers.sessions), _accuracy(numbers.sessions), _loop_errors(numbers)]
-    known = [each for each in numbers.calibrations if each is not None]
-    if known:
-        parts += ["<h2>Calibration</h2>", *(_calibration(each, len(numbers.sessions) > 1) for each in known)]
-    parts += ["<h2>Trajectories</h2>", *_maps(numbers, maps)]
-    parts += ["<h2>Where the trajectory moved</h2>", picture("moved", pictures["moved"], _CAPTIONS["moved"])]
-    parts += ["<h2>Uncertainty</h2>", picture("sigmas", pictures["sigmas"], _CAPTIONS["sigmas"])]
-    parts += ["<h2>Residuals</h2>", picture("residuals", pictures["residuals"], _CAPTIONS["residuals"])]
-    parts.append(_residuals(numbers))
-    if found.loops:
-        parts += ["<h2>Loop closures</h2>", _loops(found)]
-    return html_page(f"{title}: optimisation", parts)
-
-
-def _head(found: Optimization, numbers: Numbers) -> str:
-    told = medians(numbers)
-    lead = f"<p>{escape(told)} {_WHY_LARGE}</p>" if told else ""
-    count = len(numbers.sessions)
-    framesets, states = (sum(getattr(each, name) for each in numbers.sessions) for name in ("framesets", "states"))
-    return lead + table(
-        [
-            ("sessions", f"{count}, in {numbers.frames} {'frame' if numbers.frames == 1 else 'frames'}"),
-            (
-                "length",
-                f"{length(sum(each.length_m for each in numbers.sessions))} in "
-                f"{sum(each.duration_s for each in numbers.sessions):.1f} s",
-            ),
-            ("framesets with a pose", f"{framesets}, of which {states} are states of the graph"),
-            ("loop closures", f"{len(found.loops)} found, {numbers.used} used, {numbers.refused} refused"),
-            (
-                "cost (half the sum of squared residuals, loop closures not counted)",
-                cost(found),
-            ),
-        ]
+    return render(
+        "optimization/report/page.html",
+        found=found,
+        numbers=numbers,
+        maps=maps,
+        pictures=pictures,
+        doubts=list(_doubts(found, numbers)),
+        medians=list(_medians(numbers)),
+        noise=_noise(numbers),
+        parts=[_parts(numbers, frame) for frame in range(numbers.frames)],
+        loops=[_loop(found, loop) for loop in sorted(found.loops, key=_order)[:MAX_LOOPS]],
+        length=length,
+        angle=angle,
+        plain=plain,
+        count=_count,
+        median=np.median,
+        median_sigmas=median_sigmas,
     )
 
 
-def _sessions(sessions: Sequence[SessionNumbers]) -> str:
-    rows = [
-        (
-            each.name,
-            length(each.length_m),
-            f"{each.duration_s:.1f} s",
-            str(each.framesets),
-            str(each.states),
-            f"{length(float(each.moved_m.max()))}, {angle(float(each.moved_deg.max()))}",
-            f"{length(float(np.median(each.sigma_m)))}, {angle(float(np.median(each.sigma_deg)))}",
-        )
-        for each in sessions
-    ]
-    return table(rows, ("session", "length", "time", "framesets", "states", "moved by at most", "median sigma"))
+def length(metres: float) -> str:
+    """Format a length with its unit: millimetres below a decimetre."""
+    return f"{1e3 * metres:.2f} mm" if metres < 0.1 else f"{metres:.3f} m" if metres < 10.0 else f"{metres:.1f} m"
 
 
-def _accuracy(sessions: Sequence[SessionNumbers]) -> str:
-    rows = [
-        (
-            each.name,
-            *(
-                f"{length(each.accuracy[stage].position_m)}, {angle(each.accuracy[stage].rotation_deg)}"
-                for stage in STAGES
-            ),
-        )
-        for each in sessions
-        if each.accuracy is not None
-    ]
-    missing = [f"{each.name}: {each.no_accuracy}" for each in sessions if each.accuracy is None]
-    if not rows:
-        return f"<p>Not held against a truth ({escape('; '.join(missing))}).</p>"
-    note = "<p>ATE: rmse after one alignment with the ground truth; a break between frames counts as error."
-    if missing:
-        note += f" Without: {escape('; '.join(missing))}."
-    return table(rows, ("ATE", *_STAGES)) + note + "</p>"
+def angle(degrees: float) -> str:
+    """Format an angle with its unit."""
+    return f"{degrees:.4f} degrees" if degrees < 0.1 else f"{degrees:.2f} degrees"
 
 
-def _loop_errors(numbers: Numbers) -> str:
-    if not numbers.used:
+def plain(value: float | None) -> str:
+    """Format a number without a unit, to three digits or all before the point; empty for None."""
+    if value is None:
         return ""
-    rows = []
-    for stage, name in zip(STAGES, _STAGES, strict=True):
-        each = numbers.loop_errors[stage]
-        if each.count:
-            rows.append(
-                (
-                    name,
-                    str(each.count),
-                    f"{length(each.median_m)}, {angle(each.median_deg)}",
-                    f"{length(each.max_m)}, {angle(each.max_deg)}",
-                )
-            )
-    text = "<p>By how much the poses at both ends of a loop closure that is used contradict it"
-    if numbers.loop_errors["online"].count < numbers.used:
-        text += "; before, only those within one epoch can be told"
-    return f"{text}:</p>" + table(rows, ("loop-closure error", "loops", "median", "largest"))
+    if abs(value) < 1e-9:
+        return "0"
+    if abs(value) >= 1e6:
+        return f"{value:.1e}"
+    return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
 
 
-def _calibration(each: SessionCalibration, with_name: bool) -> str:
-    rows = []
-    for pair in each.pairs:
-        if pair.is_held:
-            rows.append((pair_name(pair), "", "", gate_result(pair)))
-        else:
-            rows.append(
-                (
-                    pair_name(pair),
-                    f"{pair.angle_deg:.3f} degrees, sigma {pair.angle_sigma_deg:.3f}: {pair.angle_sigmas:.1f} sigmas",
-                    f"{1e3 * pair.distance_m:.2f} mm, sigma {1e3 * pair.distance_sigma_m:.2f}: "
-                    f"{pair.distance_sigmas:.1f} sigmas",
-                    gate_result(pair),
-                )
-            )
-    if each.offset is not None:
-        offset = each.offset
-        told = f"{1e3 * offset.offset_s:+.2f} ms, sigma {1e3 * offset.sigma_s:.2f}: {offset.sigmas:.1f} sigmas"
-        rows.append(("time offset of the IMU", "", told, gate_result(offset)))
-    name = f"{each.session}: " if with_name else ""
-    all_in_all = (
-        "<b>the rig file is borne out</b>: all of it is within three standard deviations of what is found."
-        if each.is_borne_out
-        else "<b>the rig file is refuted</b>: the result here is by the calibration that is found, which is in "
-        f"<code>{escape(each.session)}/rig_optimized.yaml</code>."
-    )
-    is_known = bool(each.pairs) and each.pairs[0].of == "left camera"
-    moved = "the left camera" if is_known else "body's origin, as if one piece with the pair"
-    note = (
-        f"<p>Between the rig file's place of each pair and the one that is found; what is moved is {moved}. Sigmas are "
-        "the largest over all axes; what the motions do not tell keeps the sigma that was assumed before. A pair's "
-        "place is refuted, too, where all axes together contradict it as surely.</p>"
-    )
-    return f"<p>{escape(name)}{all_in_all}</p>" + table(rows, ("", "turned by", "moved by", "")) + note
+def size_of(transform: Float) -> tuple[float, float]:
+    """Compute translation (m) and angle (degrees) of a relative pose (4, 4)."""
+    chord = float(np.linalg.norm(transform[:3, :3] - np.eye(3)))
+    return float(np.linalg.norm(transform[:3, 3])), math.degrees(2.0 * math.asin(min(chord / math.sqrt(8.0), 1.0)))
 
 
-def _maps(numbers: Numbers, maps: Mapping[int, bytes]) -> list[str]:
-    made = []
-    for frame in range(numbers.frames):
-        inside = parts_in_words(numbers, frame)
-        if numbers.frames > 1:
-            made.append(f"<p><b>Frame {frame}</b>, which nothing joins to the others:</p>{bullets(inside)}")
-        if frame in maps:
-            caption = _MAP if frame == 0 else "The same in this frame. "
-            if len(inside) > 1:
-                caption += "Online, an epoch or session is laid so that it begins where it begins now."
-            made.append(picture(f"map of frame {frame}", maps[frame], caption))
-    if numbers.frames == 1 and len(numbers.parts) > 1:
-        made.append(f"<p>All in one frame:</p>{bullets(parts_in_words(numbers, 0))}")
-    return made
-
-
-def _residuals(numbers: Numbers) -> str:
-    def mean(kind: Kind, when: str) -> str:
-        residuals = kind.before if when == "before" else kind.after
-        return plain(residuals.per_dimension) if residuals.dimensions else ""
-
-    rows = [
-        (
-            kind.name,
-            _MEANINGS.get(kind.name, ""),
-            str(len(kind.after.distances)),
-            str(kind.after.dimensions),
-            plain(median_sigmas(kind.before)),
-            plain(median_sigmas(kind.after)),
-            mean(kind, "before"),
-            mean(kind, "after"),
+def _doubts(found: Optimization, numbers: Numbers) -> Iterator[str]:
+    """Yield what a reader must know before using the result."""
+    if numbers.frames > 1:
+        yield (
+            f"Loop closures do not join all parts: there are {numbers.frames} frames, and positions in different ones "
+            "cannot be compared."
         )
-        for kind in numbers.kinds
+    if not numbers.used:
+        which = f"None of {len(found.loops)} loop closures" if found.loops else "No loop closure"
+        yield f"{which} is used: the drift of odometry and IMU remains."
+    if numbers.used and 2 * numbers.refused > len(found.loops):
+        yield (
+            f"{numbers.refused} of {len(found.loops)} loop closures that were found are refused: places look alike "
+            "here. Those used agree with the odometry, so they do not confirm it independently."
+        )
+    kinds = {kind.name: kind.after for kind in numbers.kinds}
+    if "loop" in kinds and kinds["loop"].per_dimension > _MAX_LOOP_SQUARES:
+        motions = f", that of motions {plain(kinds['motion'].per_dimension)}" if "motion" in kinds else ""
+        yield (
+            "The loop closures that are used contradict the solution: their mean square per dimension is "
+            f"{plain(kinds['loop'].per_dimension)}{motions}. A wrong one may be among them."
+        )
+    if _noise(numbers) > 0:
+        yield (
+            f"Residuals are larger than the assumed noise (mean square {plain(numbers.per_dimension)} per dimension, "
+            f"{plain(numbers.expected_per_dimension)} expected): sigmas are too small."
+        )
+    for each in numbers.sessions:
+        if each.completion is not None and each.completion < _MIN_COMPLETION:
+            yield (
+                f"Only {100.0 * each.completion:.0f} % of the framesets of {each.name} have a pose; its odometry's "
+                "results state why."
+            )
+        if each.accuracy is not None and each.accuracy["optimized"].position_m > each.accuracy["online"].position_m:
+            yield f"The optimised trajectory of {each.name} is farther from the ground truth than the online one."
+
+
+def _medians(numbers: Numbers) -> Iterator[str]:
+    """Yield the median errors of motions, IMU and loop closures, before and after."""
+    kinds = {kind.name: kind for kind in numbers.kinds}
+    for kind, name in (("motion", "motions from images"), ("imu", "IMU"), ("loop", "loop closures that are used")):
+        after = median_sigmas(kinds[kind].after) if kind in kinds else None
+        if after is not None:
+            before = median_sigmas(kinds[kind].before)
+            yield f"{name} {'unknown' if before is None else plain(before)} before, {plain(after)} after"
+
+
+def _noise(numbers: Numbers) -> int:
+    """Compare residuals with the assumed noise: -1 if significantly and much smaller, 1 if larger, else 0."""
+    degrees = numbers.dimensions - numbers.unknowns
+    if degrees <= 0:
+        return 0
+    squares = numbers.per_dimension * numbers.dimensions
+    if squares > max(_FACTOR * degrees, chi_square_quantile(_PROBABILITY, degrees)):
+        return 1
+    return -1 if squares < min(degrees / _FACTOR, chi_square_quantile(1.0 - _PROBABILITY, degrees)) else 0
+
+
+def _parts(numbers: Numbers, frame: int) -> list[str]:
+    """Describe the epochs in a frame."""
+    inside = [part for part in numbers.parts if part.frame == frame]
+    lines = [
+        f"{numbers.sessions[part.session].name}, epoch {part.epoch}: {part.begin_s:.1f} to {part.end_s:.1f} s, "
+        f"{_count(part.framesets, 'frameset')}"
+        for part in inside[:_MAX_PARTS]
     ]
-    rows.append(("all", "", "", str(numbers.dimensions), "", "", "", plain(numbers.per_dimension)))
-    head = (
-        "factors",
-        "",
-        "number",
-        "dimensions",
-        "median, sigmas per dimension, before",
-        "after",
-        "mean square per dimension, before",
-        "after",
-    )
-    note = (
-        f"<p>{numbers.unknowns} unknowns are fitted to {numbers.dimensions} dimensions: were all noise as assumed, the "
-        f"mean over all after would be about {plain(numbers.expected_per_dimension)}."
-    )
-    note += (
-        " It is smaller: the measurements are better than assumed, and sigmas rather too large."
-        if noise(numbers) < 0
-        else ""
-    )
-    return table(rows, head) + note + "</p>"
+    return lines + ([f"and {len(inside) - _MAX_PARTS} more"] if len(inside) > _MAX_PARTS else [])
 
 
-def _loops(found: Optimization) -> str:
-    ordered = sorted(found.loops, key=_when)
-    rows = [_loop(found, loop) for loop in ordered[:MOST_LOOPS]]
-    head = ("first place", "second place", "pairs", "points", "between them", "chi-square", "")
-    text = (
-        "<p>Places are told by seconds since their session's first pose; pairs, numbered from 0, as the first place's "
-        "and the second's that saw the same points; chi-square is the squared distance from the solution, of 6 "
-        "degrees of freedom.</p>"
-    )
-    more = len(found.loops) - MOST_LOOPS
-    note = f"<p>and {more} more; summary.json has all of them.</p>" if more > 0 else ""
-    return text + table(rows, head, small=True) + note
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def _when(loop: JudgedLoop) -> tuple[int, int, int, int]:
+def _order(loop: JudgedLoop) -> tuple[int, int, int, int]:
     first, second = loop.closure.reference, loop.closure.current
     return first.session, first.stamp_ns, second.session, second.stamp_ns
 
 
 def _loop(found: Optimization, loop: JudgedLoop) -> tuple[str, ...]:
+    """Return a row of the table of loop closures."""
     closure = loop.closure
     places = []
     for place in (closure.reference, closure.current):
@@ -296,7 +168,7 @@ def _loop(found: Optimization, loop: JudgedLoop) -> tuple[str, ...]:
     metres, degrees = size_of(closure.reference_T_current)
     return (
         *places,
-        pairs_in_words(closure.pairs),
+        "; ".join(f"{first} by {second}" for first, second in closure.pairs),
         str(closure.inliers),
         f"{metres:.3f} m, {degrees:.1f} degrees",
         plain(loop.distance) if np.isfinite(loop.distance) else "",

@@ -1,50 +1,55 @@
-"""Writes the report of an optimisation into a folder."""
+"""The files of an optimisation's report: ``report.html`` and ``summary.json``."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from graphvio.arrays import Float
 from graphvio.errors import OptimizationError
-from graphvio.optimization.optimize import Optimization
+from graphvio.optimization.loops.closures import Place
+from graphvio.optimization.optimize import JudgedLoop, Optimization
 from graphvio.optimization.report import figures
-from graphvio.optimization.report.document import document
-from graphvio.optimization.report.maps import draw_map
-from graphvio.optimization.report.numbers import Numbers, numbers_of
-from graphvio.optimization.report.odometry import completion, rig_of
-from graphvio.optimization.report.page import page
+from graphvio.optimization.report.calibration import SessionCalibration
+from graphvio.optimization.report.numbers import Numbers, SessionNumbers, median_sigmas, numbers_of
+from graphvio.optimization.report.page import page, size_of
+from graphvio.optimization.solver import Residuals
 from graphvio.reporting.figures import png
 from graphvio.reporting.files import replace_file
 from graphvio.trajectory import Trajectory
 
 PAGE, SUMMARY = "report.html", "summary.json"
-_MOST_MAPS = 6
+VERSION = 1
+_MAX_MAPS = 6
 
 
 def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory | None]) -> Path:
-    """Write ``report.html`` with everything in it, and all numbers as ``summary.json``; each is whole or absent.
+    """Write the page with its figures embedded, and all numbers as JSON; each file is whole or absent.
 
     Args:
         found: the optimisation.
-        folder: is made if it is missing; what the odometry left there of each session, in NAME/odometry, is told, too.
-        truths: of each session, poses of body on the session's clock in any frame; or None.
+        folder: where to write, made if missing; the odometry's results may be in ``NAME/odometry``.
+        truths: true trajectory of each session, poses of body in any frame; or None.
 
     Returns:
-        The page.
+        Path of the page.
 
     Raises:
-        OptimizationError: if there is not one truth, or None, for each session, or the folder cannot be written.
+        OptimizationError: if the number of truths is not that of the sessions, or the folder cannot be written.
     """
-    names = [session.record.name for session in found.sessions]
-    rigs, completions = [rig_of(folder, name) for name in names], [completion(folder, name) for name in names]
-    numbers = numbers_of(found, truths, rigs, completions)
-    summary = json.dumps(document(found, numbers), indent=2, allow_nan=False) + "\n"
-    maps = {frame: png(draw_map(found, numbers, frame)) for frame in _frames_to_draw(numbers)}
+    numbers = numbers_of(found, truths, folder)
+    summary = json.dumps(_summary(found, numbers), indent=2, allow_nan=False) + "\n"
+    maps = {frame: png(figures.plot_map(found, numbers, frame)) for frame in _largest_frames(numbers)}
     pictures = {
-        "residuals": png(figures.draw_residuals(numbers)),
-        "moved": png(figures.draw_moved(found, numbers)),
-        "sigmas": png(figures.draw_sigmas(found, numbers)),
+        "residuals": png(figures.plot_residuals(numbers)),
+        "moved": png(figures.plot_moved(found, numbers)),
+        "sigmas": png(figures.plot_sigmas(found, numbers)),
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -55,10 +60,134 @@ def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory 
     return folder / PAGE
 
 
-def _frames_to_draw(numbers: Numbers) -> list[int]:
-    """Those with most framesets, in their order."""
+def _largest_frames(numbers: Numbers) -> list[int]:
+    """Return the frames with most framesets, in order."""
     framesets = [0] * numbers.frames
     for part in numbers.parts:
         framesets[part.frame] += part.framesets
-    largest = sorted(range(numbers.frames), key=lambda frame: -framesets[frame])[:_MOST_MAPS]
-    return sorted(largest)
+    return sorted(sorted(range(numbers.frames), key=lambda frame: -framesets[frame])[:_MAX_MAPS])
+
+
+def _summary(found: Optimization, numbers: Numbers) -> dict[str, Any]:
+    """Return all numbers: metres, degrees and seconds unless a name says otherwise; null where unknown."""
+    fell = 1.0 - found.cost_after / found.cost_before if found.cost_before > 1e-6 else None
+    return {
+        "graphvio_optimization": VERSION,
+        "sessions": [_session(each) for each in numbers.sessions],
+        "frames": numbers.frames,
+        "parts": [asdict(part) for part in numbers.parts],
+        "cost": {
+            "before": found.cost_before,
+            "after": found.cost_after,
+            "fell_percent": None if fell is None else 100.0 * fell,
+        },
+        "calibrations": [None if each is None else _calibration(each) for each in numbers.calibrations],
+        "residuals": {
+            kind.name: {"before": _residuals(kind.before), "after": _residuals(kind.after)} for kind in numbers.kinds
+        },
+        "dimensions": numbers.dimensions,
+        "unknowns": numbers.unknowns,
+        "per_dimension": numbers.per_dimension,
+        "expected_per_dimension": numbers.expected_per_dimension,
+        "loops": {
+            "found": len(found.loops),
+            "used": numbers.used,
+            "refused": numbers.refused,
+            "error_of_used": {stage: asdict(spread) for stage, spread in numbers.loop_errors.items()},
+            "all": [_loop(found, loop) for loop in found.loops],
+        },
+    }
+
+
+def _session(each: SessionNumbers) -> dict[str, Any]:
+    return {
+        "name": each.name,
+        "framesets": each.framesets,
+        "completion": each.completion,
+        "states": each.states,
+        "duration_s": each.duration_s,
+        "length_m": each.length_m,
+        "ate_rmse": each.accuracy and {stage: asdict(value) for stage, value in each.accuracy.items()},
+        "no_ate": each.no_accuracy,
+        "moved": {
+            "rms_m": _rms(each.moved_m),
+            "max_m": float(each.moved_m.max()),
+            "rms_deg": _rms(each.moved_deg),
+            "max_deg": float(each.moved_deg.max()),
+        },
+        "sigma": {
+            "median_m": float(np.median(each.sigma_m)),
+            "max_m": float(each.sigma_m.max()),
+            "median_deg": float(np.median(each.sigma_deg)),
+            "max_deg": float(each.sigma_deg.max()),
+        },
+    }
+
+
+def _calibration(each: SessionCalibration) -> dict[str, Any]:
+    return {
+        "session": each.session,
+        "borne_out": each.is_consistent,
+        "pairs": [
+            {
+                "pair": pair.pair,
+                "name": pair.name or None,
+                "held": pair.is_held,
+                "of": pair.of,
+                "angle_deg": pair.angle_deg,
+                "angle_sigma_deg": pair.angle_sigma_deg,
+                "angle_sigmas": pair.angle_sigmas,
+                "distance_m": pair.distance_m,
+                "distance_sigma_m": pair.distance_sigma_m,
+                "distance_sigmas": pair.distance_sigmas,
+                "squared_distance": pair.squared_distance,
+                "borne_out": pair.is_consistent,
+            }
+            for pair in each.pairs
+        ],
+        "time_offset": each.offset
+        and {
+            "correction_s": each.offset.offset_s,
+            "sigma_s": each.offset.sigma_s,
+            "sigmas": each.offset.sigmas,
+            "borne_out": each.offset.is_consistent,
+        },
+    }
+
+
+def _residuals(residuals: Residuals) -> dict[str, Any]:
+    return {
+        "factors": len(residuals.distances),
+        "dimensions": residuals.dimensions,
+        "per_dimension": residuals.per_dimension if residuals.dimensions else None,
+        "median_sigmas": median_sigmas(residuals),
+    }
+
+
+def _loop(found: Optimization, loop: JudgedLoop) -> dict[str, Any]:
+    closure = loop.closure
+    metres, degrees = size_of(closure.reference_T_current)
+
+    def place(which: Place) -> dict[str, Any]:
+        record = found.sessions[which.session].record
+        return {
+            "session": record.name,
+            "stamp_ns": int(which.stamp_ns),
+            "since_start_s": float(which.stamp_ns - record.stamps_ns[0]) * 1e-9,
+        }
+
+    return {
+        "reference": place(closure.reference),
+        "current": place(closure.current),
+        "pairs": [list(pairs) for pairs in closure.pairs],
+        "points": int(closure.inliers),
+        "registered": bool(closure.is_registered),
+        "distance_m": metres,
+        "angle_deg": degrees,
+        "squared_distance": loop.distance if math.isfinite(loop.distance) else None,
+        "refusal": loop.refusal,
+    }
+
+
+def _rms(values: Float) -> float:
+    return float(np.sqrt(np.mean(values**2)))
