@@ -91,7 +91,7 @@ def rendered_once(data: Path, scene: str, variant: str, render: Callable[[Path],
 def _digest(scene: str, sources: tuple[Path, ...]) -> str:
     """Of everything that decides the bytes of a recording: the simulator, and what it takes from the package."""
     package = Path(graphvio.__file__).parent
-    taken = ("cameras.py", "euroc_layout.py", "geometry.py", "kernels.py", "rig.py", "rig_files/native.py")
+    taken = ("cameras.py", "geometry.py", "kernels.py", "rig.py", "rig_files/native.py", "sessions/euroc_layout.py")
     scenes = package / "simulation" / "scenes"
     others = {scenes / f"{name}.py" for name in SCENE_NAMES if name != scene}
     simulator = sorted(path for path in (package / "simulation").rglob("*.py") if path not in others)
