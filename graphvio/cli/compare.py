@@ -10,7 +10,7 @@ import typer
 from graphvio.cli import options
 
 if TYPE_CHECKING:
-    from graphvio.evaluation.comparison import Compared
+    from graphvio.evaluation import Compared
 
 EXIT_ABOVE = 4
 
@@ -47,7 +47,7 @@ def compare(
     from rich.console import Console
 
     from graphvio.errors import GraphvioError
-    from graphvio.evaluation.comparison import compare as compare_all
+    from graphvio.evaluation import compare as compare_all
     from graphvio.trajectory_files import load_trajectory
 
     names, trajectories = _names(results), [load_trajectory(_file(path, smoothed)) for path in results]

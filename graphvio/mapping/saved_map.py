@@ -12,7 +12,7 @@ import json
 import shutil
 import tempfile
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,13 +23,13 @@ from graphvio.mapping.store import DATABASE, PlaceStore, copy_database
 from graphvio.optimization.loops.closures import LoopClosure, closures_to_bytes, load_closures
 from graphvio.rig import Rig
 from graphvio.rig_files import load_rig, save_rig
-from graphvio.rig_files.same import difference, without_masks
 from graphvio.version import __version__
 
 FORMAT, VERSION = "graphvio map", 2
 _HEADER, _RIG, _PLACES, _CLOSURES = "map.json", "rig.yaml", "map.npz", "closures.npz"
 _CHECKED = (_PLACES, _CLOSURES, DATABASE)
 _OWN = (_HEADER, _RIG, *_CHECKED)
+_RIG_TOLERANCE = 1e-9  # a file keeps all digits; this is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ def load(folder: Path, rig: Rig) -> SavedMap:
         other = load_rig(folder / _RIG)
     except GraphvioError as error:
         raise MapError(f"{folder}: the map's rig cannot be read ({error}); restore the folder") from None
-    differs = difference(rig, other)
+    differs = _difference(rig, other)
     if differs:
         raise MapError(
             f"{folder}: is a map of another rig ({differs}); use the rig.yaml in it, or make a new map with this rig"
@@ -170,7 +170,7 @@ def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
     columns["vectors"] = kept.vectors.astype(np.float16)  # their ranking does not need more
     np.savez(folder / _PLACES, **columns)
     (folder / _CLOSURES).write_bytes(closures_to_bytes(kept.closures))
-    save_rig(without_masks(rig), folder / _RIG)
+    save_rig(_without_masks(rig), folder / _RIG)
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -219,3 +219,25 @@ def _digest(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return ""
+
+
+def _difference(rig: Rig, other: Rig) -> str:
+    """Describe how the cameras of two rigs differ; empty where they do not. IMU and masks do not count."""
+    names, others = [each.name for each in rig.cameras], [each.name for each in other.cameras]
+    if names != others:
+        return f"cameras {', '.join(names)} here, {', '.join(others)} there"
+    for one, two in zip(rig.cameras, other.cameras, strict=True):
+        if one.model != two.model or one.size_px != two.size_px:
+            return f"{one.name} is {one.model} {one.size_px} here, {two.model} {two.size_px} there"
+        for what in ("intrinsics", "distortion", "body_T_cam"):
+            if not np.allclose(getattr(one, what), getattr(two, what), rtol=_RIG_TOLERANCE, atol=_RIG_TOLERANCE):
+                return f"{what} of {one.name} differ"
+    return ""
+
+
+def _without_masks(rig: Rig) -> Rig:
+    """The same rig, whose file refers to no others."""
+    pairs = tuple(
+        replace(pair, left=replace(pair.left, mask=None), right=replace(pair.right, mask=None)) for pair in rig.pairs
+    )
+    return replace(rig, pairs=pairs)

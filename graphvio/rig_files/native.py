@@ -59,12 +59,13 @@ def _rig(document: Section, path: Path) -> Rig:
         return Rig(pairs, imu, name)
 
 
-def save(rig: Rig, path: Path) -> None:
-    """Write a ``rig.yaml`` that `load` reads back to the last digit.
+def save_rig(rig: Rig, path: str | Path) -> None:
+    """Write a ``rig.yaml`` that reads back to the last digit.
 
     Raises:
         RigError: if the file cannot be written.
     """
+    path = Path(path)
     try:
         path.write_text(to_text(rig, path.parent), encoding="utf-8")
     except OSError as error:

@@ -1,0 +1,82 @@
+"""Finds the calibration in a file or folder, and the reader for its format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from graphvio.errors import RigError
+from graphvio.rig import Rig
+from graphvio.rig_files import euroc, kalibr, kitti, native
+from graphvio.rig_files.reading import read_yaml
+
+_KNOWN = (
+    "rig.yaml, Kalibr's camchain-imucam.yaml, an EuRoC/ASL folder (mav0), KITTI's calib.txt or calib_cam_to_cam.txt"
+)
+
+
+def load_rig(path: str | Path) -> Rig:
+    """Read a rig from a calibration file, or from the folder of a recording that carries one.
+
+    Args:
+        path: ``rig.yaml``, a Kalibr camera chain, a ``sensor.yaml`` of an EuRoC/ASL folder, KITTI's
+            ``calib.txt`` or ``calib_cam_to_cam.txt``; or a folder, in which a ``rig.yaml`` goes first.
+
+    Raises:
+        RigError: if there is no such file, it cannot be read, or it describes no usable rig.
+    """
+    path = Path(path)
+    try:
+        return _load(path)
+    except OSError as error:
+        raise RigError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+
+
+def _load(path: Path) -> Rig:
+    if path.is_dir():
+        rig = find_rig(path)
+        if rig is None:
+            raise RigError(f"{path}: holds no calibration that graphvio knows; give one of: {_KNOWN}")
+        return rig
+    if not path.exists():
+        raise RigError(f"{path}: does not exist; give one of: {_KNOWN}")
+    if path.name == kitti.RAW_FILE:
+        return kitti.load_raw(path)
+    if path.suffix == ".txt":
+        return kitti.load_odometry(path)
+    if path.name == "sensor.yaml":
+        return euroc.load(path.parent.parent)
+    if path.suffix not in (".yaml", ".yml"):
+        raise RigError(f"{path}: is no calibration file that graphvio knows; give one of: {_KNOWN}")
+    document = read_yaml(path)
+    if native.VERSION_KEY not in document.values and kalibr.camera_names(document):
+        return kalibr.load(path)
+    return native.load(path)
+
+
+def find_rig(folder: Path) -> Rig | None:
+    """The rig that a recording's folder carries; None if it carries none.
+
+    Raises:
+        RigError: if it carries one that is not usable.
+    """
+    sensors = euroc.sensors_folder(folder)
+    places = [folder] if sensors is None else [folder, sensors]
+    if folder.resolve().name == "mav0":
+        places.append(folder.resolve().parent)
+    for place in places:
+        if (place / native.FILE_NAME).is_file():
+            return native.load(place / native.FILE_NAME)
+    if sensors is not None:
+        return euroc.load(folder)
+    if (folder / kitti.ODOMETRY_FILE).is_file():
+        return kitti.load_odometry(folder / kitti.ODOMETRY_FILE)
+    raw = kitti.raw_calibration_of(folder)
+    if raw is not None:
+        has_images = any(folder.glob("image_0[0-3]"))
+        return kitti.load_raw(raw, folder if has_images else None)
+    chains = sorted(folder.glob("*camchain*.yaml"))
+    with_imu = [chain for chain in chains if "imucam" in chain.name]
+    if len(with_imu or chains) > 1:
+        names = ", ".join(chain.name for chain in with_imu or chains)
+        raise RigError(f"{folder}: holds several camera chains ({names}); give the path of one of them")
+    return kalibr.load((with_imu or chains)[0]) if chains else None

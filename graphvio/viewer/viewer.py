@@ -1,0 +1,188 @@
+"""Shows a run in rerun's window or in browsers, or saves it to a file, without delaying the odometry.
+
+A thread logs to rerun. When it is slower than the odometry, images are left out (one frameset is pending, and the
+latest replaces it), but no pose, scalar or message.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from graphvio.errors import GraphvioError, MissingExtraError
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.events import Event
+from graphvio.measurements.sensors import FrameSet
+from graphvio.rig import Rig
+from graphvio.viewer.web import WebOptions
+
+if TYPE_CHECKING:
+    from graphvio.trajectory import Trajectory
+    from graphvio.viewer.recording import Recording
+
+_ROUND_S = 0.03
+
+
+class Viewer:
+    """Shows a run in a window or in browsers, writes it to a file, or several of these; a context manager.
+
+    Args:
+        rig: what is shown; its cameras are drawn where they are.
+        spawn: open rerun's window and stream to it.
+        save: write a recording (``.rrd``) here; needs no display.
+        web: serve browsers at ``web.url``, until the viewer is closed; needs no display.
+
+    Raises:
+        MissingExtraError: if rerun is not installed.
+        GraphvioError: if there is no display to open a window on, the file cannot be written, or a port not be used.
+    """
+
+    def __init__(
+        self, rig: Rig, *, spawn: bool = False, save: Path | None = None, web: WebOptions | None = None
+    ) -> None:
+        recording = _open_recording(rig, spawn, save, web)
+        self._web = web
+        self._changed = threading.Condition()
+        self._estimates: deque[Estimate] = deque()
+        self._extras: deque[Callable[[Recording], None]] = deque()
+        self._frameset: tuple[FrameSet, Estimate] | None = None
+        self._closing = False
+        self._dropped = 0
+        self._error: Exception | None = None
+        self._worker = threading.Thread(target=self._work, args=(recording,), name="viewer", daemon=True)
+        self._worker.start()
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.close()
+        except GraphvioError:
+            if value is None:  # else what went wrong first is what matters
+                raise
+
+    @property
+    def url(self) -> str | None:
+        """What to open in a browser, or None if browsers are not served."""
+        return None if self._web is None else self._web.url
+
+    @property
+    def dropped(self) -> int:
+        """Framesets whose images were left out so far because drawing was slower than the odometry."""
+        return self._dropped
+
+    def show(self, frameset: FrameSet | None, estimate: Estimate) -> None:
+        """Hand over an estimate, and the images it was made from if they are to be seen; returns at once."""
+        with self._changed:
+            if self._closing or self._error is not None:
+                return
+            self._estimates.append(estimate)
+            if frameset is not None:
+                self._dropped += self._frameset is not None
+                self._frameset = (frameset, estimate)
+            self._changed.notify()
+
+    def show_event(self, event: Event) -> None:
+        """Hand over a message; returns at once."""
+        self._add_extra(lambda recording: recording.add_event(event))
+
+    def show_path(self, name: str, path: Trajectory, colour: tuple[int, int, int] = (150, 150, 150)) -> None:
+        """Hand over a whole other path in nav, such as the smoothed one or truth; returns at once."""
+        self._add_extra(lambda recording: recording.add_path(name, path, colour))
+
+    def _add_extra(self, extra: Callable[[Recording], None]) -> None:
+        with self._changed:
+            if self._closing or self._error is not None:
+                return
+            self._extras.append(extra)
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Draw what is still waiting, flush and end; once closed, nothing more is shown.
+
+        Raises:
+            GraphvioError: if drawing had failed; the recording then ends there.
+        """
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._worker.join()
+        error, self._error = self._error, None
+        if error is not None:
+            raise GraphvioError(f"viewer: drawing failed ({_first_line(error)}); what was shown or saved is incomplete")
+
+    def _work(self, recording: Recording) -> None:
+        try:
+            try:
+                self._draw(recording)
+            finally:
+                recording.close()
+        except Exception as error:
+            self._error = error
+            self._estimates.clear()
+            self._extras.clear()
+            self._frameset = None
+
+    def _draw(self, recording: Recording) -> None:
+        while self._draw_waiting(recording):
+            # Many small rounds would hold up the odometry; one carries many poses as cheaply as one pose.
+            with self._changed:
+                self._changed.wait_for(lambda: self._closing, _ROUND_S)
+
+    def _draw_waiting(self, recording: Recording) -> bool:
+        """Wait for work and do it; False when all is done and there will be no more."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closing or self._estimates or self._extras)
+            estimates, self._estimates = self._estimates, deque()
+            extras, self._extras = self._extras, deque()
+            frameset, self._frameset = self._frameset, None
+            closing = self._closing
+        recording.add_estimates(list(estimates))
+        for extra in extras:
+            extra(recording)
+        if frameset is not None:
+            recording.add_images(*frameset)
+        return not closing
+
+
+def check_display() -> None:
+    """Make sure that a window can be opened at all.
+
+    Raises:
+        GraphvioError: on Linux without an X or Wayland display.
+    """
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise GraphvioError(
+            "viewer: there is no display to open a window on; save a recording with --save-rrd FILE and open "
+            "it with  rerun FILE  where there is one"
+        )
+
+
+def _open_recording(rig: Rig, spawn: bool, save: Path | None, web: WebOptions | None) -> Recording:
+    try:
+        from graphvio.viewer.recording import Recording
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "rerun":
+            raise
+        raise MissingExtraError("rerun-sdk", "viewer", "showing or saving a recording") from None
+    if spawn:
+        check_display()
+    if save is not None and not Path(save).parent.is_dir():
+        raise GraphvioError(f"{save}: cannot be written (there is no folder {Path(save).parent}); make it first")
+    try:
+        return Recording(rig, spawn=spawn, save=save, web=web)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise GraphvioError(f"viewer: cannot be opened ({_first_line(error)})") from None
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)
