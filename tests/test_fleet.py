@@ -142,7 +142,7 @@ def test_all_others_arrive_and_are_those_of_one_process(
     assert done.killer.pid != done.killer.cluster.workers[0].pid
     assert [each.name for each in done.outcomes] == [f"walk-{number:02d}" for number in range(SESSIONS)]
     assert [each.name for each in done.outcomes if each.error] == [CORRUPT]
-    for drawing in ("graphvio.results.writer.draw_run", "graphvio.optimization.pipeline.write_report"):
+    for drawing in ("graphvio.results.writer.plot_run", "graphvio.optimization.pipeline.write_report"):
         monkeypatch.setattr(drawing, lambda *_, **__: None)  # most of the time
     parts, loops = set(), 0
     for each in done.outcomes:

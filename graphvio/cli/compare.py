@@ -61,9 +61,9 @@ def compare(
         if each.evaluation is None:
             typer.echo(f"graphvio: {each.name}: {each.why_not}", err=True)
     if plot is not None:
-        from graphvio.results.plotting import draw_comparison
+        from graphvio.results.plotting import plot_comparison
 
-        draw_comparison(plot, {each.name: each.evaluation for each in compared if each.evaluation is not None})
+        plot_comparison(plot, {each.name: each.evaluation for each in compared if each.evaluation is not None})
     above = [each.name for each in compared if max_ate is not None and each.ate_m > max_ate]
     if above:
         typer.echo(f"graphvio: ATE above {max_ate:g} m: {', '.join(above)}", err=True)

@@ -53,9 +53,9 @@ def evaluate(
         except OSError as error:
             raise GraphvioError(f"{json_file}: cannot be written ({error.strerror}); choose another place") from None
     if plot is not None:
-        from graphvio.results.plotting import draw_evaluation
+        from graphvio.results.plotting import plot_evaluation
 
-        draw_evaluation(plot, figures, trajectory.stem)
+        plot_evaluation(plot, figures, trajectory.stem)
 
 
 def _table(figures: Evaluation) -> Table:

@@ -1,17 +1,15 @@
-"""Pictures of a run: plan and side view of the trajectory, and its error over time where truth is known.
+"""Plots of a run: plan and side view of the trajectory, and its error over time where truth is available.
 
-Only matplotlib's objects are used, so that a program that plots with pyplot is not disturbed.
+matplotlib is used without pyplot, so that a program that plots with pyplot is not affected.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from graphvio.arrays import Bool, Float
 from graphvio.errors import GraphvioError
@@ -20,8 +18,13 @@ from graphvio.geometry import se3_inverse
 from graphvio.measurements.estimate import Status
 from graphvio.trajectory import Trajectory, travelled
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 _DPI = 130
-_ESTIMATE, _TRUTH = "#1f5fbf", "#555555"
+_ESTIMATE = "#1f5fbf"
+_TRUTH: dict[str, Any] = {"color": "#555555", "linewidth": 1.2, "linestyle": (0, (4, 2)), "label": "truth"}
 _GRID: dict[str, Any] = {"color": "#dddddd", "linewidth": 0.6}
 _STATUS_COLOURS = {
     Status.INITIALISING: "#17a398",
@@ -34,7 +37,7 @@ _LEGEND_COLUMN_IN = 1.2
 _SERIES_WIDTH_IN, _SERIES_GAP_IN, _MIN_SERIES_HEIGHT_IN = 5.2, 1.0, 3.6
 
 
-def draw_run(
+def plot_run(
     path: Path,
     trajectory: Trajectory,
     *,
@@ -45,20 +48,20 @@ def draw_run(
     evaluation: Evaluation | None = None,
     name: str = "",
 ) -> None:
-    """Draw plan (x-y) and side view (x-z) of a run in its nav frame, and mark where it failed.
+    """Plot plan (x-y) and side view (x-z) of a run in its nav frame, with coasting, losses and new epochs marked.
 
     Args:
-        path: picture to write; its ending chooses the format.
+        path: image file; its suffix chooses the format.
         trajectory: N poses of body in nav.
-        status: N values of `graphvio.measurements.sensors.Status`, or nothing.
-        epochs: N epoch numbers, or nothing; a new epoch is marked and the line is interrupted.
+        status: N values of `graphvio.measurements.estimate.Status`, or empty.
+        epochs: N epoch numbers, or empty; a new epoch is marked and interrupts the line.
         lost_ns: stamps of framesets without a pose.
-        truth: poses of body in any frame; drawn only together with ``evaluation``, which aligns it.
+        truth: poses of body in any frame; plotted only together with ``evaluation``, which aligns it.
         evaluation: of this trajectory against that truth.
-        name: begins the title.
+        name: start of the title.
 
     Raises:
-        GraphvioError: if the picture cannot be written.
+        GraphvioError: if the file cannot be written.
     """
     positions = trajectory.positions
     true_positions = _truth_in_nav(truth, evaluation) if truth is not None and evaluation is not None else None
@@ -66,13 +69,7 @@ def draw_run(
     figure, plan, side = _maps(positions, true_positions, series=False)
     for axes, z in ((plan, 1), (side, 2)):
         if true_positions is not None:
-            axes.plot(
-                *true_positions[:, [0, z]].T,
-                color=_TRUTH,
-                linewidth=1.2,
-                linestyle=(0, (4, 2)),
-                label="truth",
-            )
+            axes.plot(*true_positions[:, [0, z]].T, **_TRUTH)
         line = np.insert(positions, breaks, np.nan, axis=0)
         axes.plot(*line[:, [0, z]].T, color=_ESTIMATE, linewidth=1.6, label="estimate")
         for which, mask in _status_masks(status, breaks).items():
@@ -84,21 +81,21 @@ def draw_run(
     _save(figure, path)
 
 
-def draw_evaluation(path: Path, evaluation: Evaluation, name: str = "") -> None:
-    """Draw the aligned estimate over the truth, in plan and from the side, and both errors over time.
+def plot_evaluation(path: Path, evaluation: Evaluation, name: str = "") -> None:
+    """Plot the aligned estimate over the truth in plan and side view, and both errors over time.
 
     Args:
-        path: picture to write; its ending chooses the format.
-        evaluation: what to draw, in the truth's frame.
-        name: begins the title.
+        path: image file; its suffix chooses the format.
+        evaluation: plotted in the truth's frame.
+        name: start of the title.
 
     Raises:
-        GraphvioError: if the picture cannot be written.
+        GraphvioError: if the file cannot be written.
     """
     estimate, truth = evaluation.aligned.positions, evaluation.truth.positions
     figure, plan, side = _maps(estimate, truth, series=True)
     for axes, z in ((plan, 1), (side, 2)):
-        axes.plot(*truth[:, [0, z]].T, color=_TRUTH, linewidth=1.2, linestyle=(0, (4, 2)), label="truth")
+        axes.plot(*truth[:, [0, z]].T, **_TRUTH)
         axes.plot(*estimate[:, [0, z]].T, color=_ESTIMATE, linewidth=1.6, label="estimate, aligned")
         _mark_ends(axes, estimate, np.empty(0, int), z)
     seconds = 1e-9 * (evaluation.stamps_ns - evaluation.stamps_ns[0])
@@ -119,19 +116,18 @@ def draw_evaluation(path: Path, evaluation: Evaluation, name: str = "") -> None:
     _save(figure, path)
 
 
-def draw_comparison(path: Path, evaluations: Mapping[str, Evaluation]) -> None:
-    """Draw the errors of several results over time, one line each.
+def plot_comparison(path: Path, evaluations: Mapping[str, Evaluation]) -> None:
+    """Plot the errors of several results over time.
 
     Args:
-        path: picture to write; its ending chooses the format.
-        evaluations: name -> what to draw, all against one truth.
+        path: image file; its suffix chooses the format.
+        evaluations: by name, all against the same truth.
 
     Raises:
-        GraphvioError: if the picture cannot be written.
+        GraphvioError: if the file cannot be written.
     """
     head_in = 0.5 + 0.22 * len(evaluations)
-    figure = Figure(figsize=(9.0, 5.6 + head_in), dpi=_DPI, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = _new_figure(9.0, 5.6 + head_in)
     share = 5.6 / (5.6 + head_in)
     panels = [figure.add_axes((0.1, share * bottom, 0.87, share * 0.42)) for bottom in (0.56, 0.09)]
     begin = min((int(each.stamps_ns[0]) for each in evaluations.values()), default=0)
@@ -150,6 +146,15 @@ def draw_comparison(path: Path, evaluations: Mapping[str, Evaluation]) -> None:
     _save(figure, path)
 
 
+def _new_figure(width_in: float, height_in: float) -> Figure:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), dpi=_DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
 def _truth_in_nav(truth: Trajectory, evaluation: Evaluation) -> Float:
     first, last = evaluation.stamps_ns[0], evaluation.stamps_ns[-1]
     during = (truth.stamps_ns >= first) & (truth.stamps_ns <= last)
@@ -157,7 +162,7 @@ def _truth_in_nav(truth: Trajectory, evaluation: Evaluation) -> Float:
 
 
 def _status_masks(status: Sequence[str], breaks: Any) -> dict[Status, Bool]:
-    """Status -> (N,) poses to draw in its colour, with the pose before, where the step into it begins."""
+    """Masks (N,) of the poses of each status, including the pose before, so that the step into the status is marked."""
     masks: dict[Status, Bool] = {}
     for which in (Status.INITIALISING, Status.COASTING):
         mask = np.array([value == which for value in status], dtype=np.bool_)
@@ -171,7 +176,7 @@ def _status_masks(status: Sequence[str], breaks: Any) -> dict[Status, Bool]:
 
 
 def _mark_lost(axes: Any, trajectory: Trajectory, lost_ns: Sequence[int], z: int) -> None:
-    """A red cross at the last pose before each segment without poses."""
+    """Mark the last pose before each segment without poses."""
     if not len(lost_ns) or not len(trajectory):
         return
     before = np.unique(np.searchsorted(trajectory.stamps_ns, np.asarray(lost_ns)) - 1)
@@ -207,8 +212,8 @@ def _figures(evaluation: Evaluation) -> str:
     return f"path {evaluation.path_length_m:.1f} m, {evaluation.duration_s:.1f} s, ATE {ate}, {rmse_deg:.2f}°"
 
 
-def _maps(first: Float, second: Float | None, series: bool) -> tuple[Figure, Any, Any]:
-    """Figure with plan above side view: same x, same scale, boxes that fit the data without waste."""
+def _maps(first: Float, second: Float | None, series: bool) -> tuple[Figure, Axes, Axes]:
+    """Figure with the plan above the side view, of equal x axis and scale."""
     points = first if second is None else np.concatenate([first, second])
     low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (-np.ones(3), np.ones(3))
     centre, interval = 0.5 * (low + high), 1.12 * (high - low)
@@ -221,8 +226,7 @@ def _maps(first: Float, second: Float | None, series: bool) -> tuple[Figure, Any
     side_room = max(side_height, _MIN_SERIES_HEIGHT_IN - plan_height - _GAP_IN) if series else side_height
     total_width = max(_MARGIN_LEFT_IN + width + right + _MARGIN_RIGHT_IN, 6.5)
     total_height = _MARGIN_BOTTOM_IN + side_room + _GAP_IN + plan_height + _MARGIN_TOP_IN
-    figure = Figure(figsize=(total_width, total_height), dpi=_DPI, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = _new_figure(total_width, total_height)
 
     def place(bottom_in: float, height_in: float) -> Any:
         left, bottom = _MARGIN_LEFT_IN / total_width, bottom_in / total_height
@@ -244,7 +248,7 @@ def _maps(first: Float, second: Float | None, series: bool) -> tuple[Figure, Any
 
 
 def _series_axes(figure: Figure, row: int) -> Any:
-    """Axes right of the maps: row 0 is the lower one."""
+    """Axes to the right of the maps; row 0 is the lower one."""
     width, height = figure.get_size_inches()
     each = (height - _MARGIN_BOTTOM_IN - _MARGIN_TOP_IN - _GAP_IN) / 2
     left = width - _MARGIN_RIGHT_IN - _SERIES_WIDTH_IN
@@ -281,4 +285,4 @@ def _save(figure: Figure, path: Path) -> None:
     except OSError as error:
         raise GraphvioError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
     except ValueError as error:
-        raise GraphvioError(f"{path}: cannot be drawn ({error}); end its name in .png, .pdf or .svg") from None
+        raise GraphvioError(f"{path}: cannot be plotted ({error}); end its name in .png, .pdf or .svg") from None

@@ -28,7 +28,7 @@ from graphvio.evaluation import Evaluation, evaluate
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
 from graphvio.measurements.motion import PairReport
-from graphvio.results.plotting import draw_run
+from graphvio.results.plotting import plot_run
 from graphvio.results.summary import PairMedians, Percentiles, Summary, epoch_intervals, path_length
 from graphvio.rig import Rig
 from graphvio.rig_files import save_rig
@@ -239,7 +239,7 @@ class ResultWriter:
         lines = (f"{tum_line(int(stamp), np.asarray(pose))}\n" for stamp, pose in smoothed)
         self._write_at_once("trajectory_smoothed.txt", "".join(lines))
         self._write_at_once("summary.json", json.dumps(asdict(summary), indent=2, allow_nan=False) + "\n")
-        draw_run(
+        plot_run(
             self.folder / "trajectory.png",
             trajectory,
             status=self._pose_status,
