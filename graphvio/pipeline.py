@@ -14,8 +14,8 @@ from graphvio.config import Config
 from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.events import Event, EventKind
 from graphvio.measurements.sensors import FrameSet
-from graphvio.measurements.step import Step
 from graphvio.odometry import Odometry
+from graphvio.odometry.step import Step
 from graphvio.results import ResultWriter, Summary
 from graphvio.sources import Source
 
@@ -93,7 +93,9 @@ def run(source: Source, config: Config, writer: ResultWriter, listeners: Sequenc
 class _Run:
     def __init__(self, source: Source, config: Config, writer: ResultWriter, listeners: Sequence[RunListener]) -> None:
         self._source = source
-        self._odometry = Odometry(source.rig, config, on_step=self._on_step)
+        self._odometry = Odometry(source.rig, config)
+        for listener in listeners:
+            self._odometry.subscribe(listener.on_step)
         self._writer = writer
         self._listeners = listeners
         self._keeps_framesets = any(listener.on_estimate is not _ignore for listener in listeners)
@@ -176,10 +178,6 @@ class _Run:
             self._writer.add_event(event)
             for listener in self._listeners:
                 listener.on_event(event)
-
-    def _on_step(self, step: Step) -> None:
-        for listener in self._listeners:
-            listener.on_step(step)
 
 
 def _distance(before: Estimate, now: Estimate) -> float:

@@ -85,7 +85,7 @@ def make_session(
         velocity_nav=track.states.velocity[rows] + _VELOCITY_SIGMA * rng.standard_normal((len(rows), 3)),
         gyro_bias=track.gyro_bias[rows] + _GYRO_BIAS_SIGMA * rng.standard_normal((len(rows), 3)),
         accel_bias=track.accel_bias[rows] + _ACCEL_BIAS_SIGMA * rng.standard_normal((len(rows), 3)),
-        at_rest=np.zeros(len(rows), dtype=bool),
+        is_stationary=np.zeros(len(rows), dtype=bool),
         is_keyframe=np.arange(len(rows)) % _KEYFRAME_FRAMES == 0,
         with_imu=np.ones(len(rows), dtype=bool),
         is_start=np.arange(len(rows)) == 0,

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from graphvio.arrays import AnyArray, Bool, Float
 from graphvio.backend.smoother import Smoother
-from graphvio.backend.states import RigState, StartUncertainty
+from graphvio.backend.states import InitialUncertainty, RigState
 from graphvio.config.stages import MotionConfig, SmootherConfig
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.refinement import Refined
@@ -369,7 +369,7 @@ def run_smoothed(
         poses = list(draw_poses(walk, last, rng))
         smoother = Smoother(_ANY_MOTION, None)
         start = RigState(poses[0], np.zeros(3), np.zeros(3), np.zeros(3))
-        smoother.start(0, start, StartUncertainty(1e-8 * np.eye(6), 1.0, 1.0))
+        smoother.initialise(0, start, InitialUncertainty(1e-8 * np.eye(6), 1.0, 1.0))
         for key in range(0, last, KEYFRAME):
             to = min(key + KEYFRAME, last)
             if renewed or key == 0:
@@ -381,13 +381,13 @@ def run_smoothed(
                 refined = solve(observe(tracks, reference, current), motion_between(poses[key], poses[k]), config, rng)
                 shared = refined.shared_covariance if split else np.zeros((6, 6))
                 smoother.extend(stamps_ns[k], None)
-                smoother.accept(
+                smoother.add_motion(
                     RelativeMotion(
                         stamps_ns[key], stamps_ns[k], se3_inverse(refined.cur_T_ref), refined.covariance, shared,
                         int(refined.inlier.sum()),
                     )
                 )  # fmt: skip
-                smoother.settle({stamps_ns[k // KEYFRAME * KEYFRAME], stamps_ns[FIRST]})
+                smoother.update({stamps_ns[k // KEYFRAME * KEYFRAME], stamps_ns[FIRST]})
         estimate = motion_between(smoother.pose(stamps_ns[FIRST]), smoother.pose(stamps_ns[last]))
         campaign.errors.append(error_of(estimate, motion_between(poses[FIRST], poses[last])))
         campaign.covariances.append(smoother.covariance_since(stamps_ns[FIRST]))

@@ -91,7 +91,7 @@ def estimate(number: int, epoch: int = 0) -> Estimate:
         time_offset_sigma_s=1e-4 / 3,
         vision=Quality.WEAK,
         vision_reason="few points: Δ = 3 px",
-        at_rest=True,
+        is_stationary=True,
     )
 
 

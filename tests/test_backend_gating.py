@@ -3,7 +3,7 @@ import pytest
 from scipy.stats import chi2
 from synthetic import random_covariance, random_transform, transform
 
-from graphvio.backend.gating import gate, relative_covariance
+from graphvio.backend.gating import gate_motion, relative_covariance
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.measurements.gate_result import GateResult
 
@@ -46,7 +46,8 @@ def test_consistent_innovations_pass_as_often_as_they_should(probability: float)
         strict=True,
     )
     passed = sum(
-        gate(truth @ se3_exp(a), of_measured, truth @ se3_exp(b), of_predicted, probability).accepted for a, b in drawn
+        gate_motion(truth @ se3_exp(a), of_measured, truth @ se3_exp(b), of_predicted, probability).accepted
+        for a, b in drawn
     )
     band = 4.0 * np.sqrt(probability * (1.0 - probability) / n) + 0.003
     assert passed / n == pytest.approx(probability, abs=band)
@@ -56,14 +57,14 @@ def test_gross_errors_are_refused() -> None:
     covariance = np.diag(np.repeat([1e-3, 1e-2], 3) ** 2)
     truth = transform([0.01, 0.02, 0.0], [0.1, 0.0, 0.0])
     for error in ([0.1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0.2, 0], [0, 0, 3.1, 0, 0, 0], [0, 0, 0, 1e3, 0, 0]):
-        gate_result = gate(truth @ se3_exp(np.array(error, dtype=float)), covariance, truth, covariance, 0.9999)
+        gate_result = gate_motion(truth @ se3_exp(np.array(error, dtype=float)), covariance, truth, covariance, 0.9999)
         assert not gate_result.accepted
         assert gate_result.statistic > gate_result.threshold == pytest.approx(chi2.ppf(0.9999, 6))
 
 
 def test_the_statistic_is_the_mahalanobis_distance() -> None:
     measured, predicted = transform([0, 0, 0], [0.3, 0, 0]), np.eye(4)
-    gate_result = gate(measured, 0.04 * np.eye(6), predicted, 0.05 * np.eye(6), 0.95)
+    gate_result = gate_motion(measured, 0.04 * np.eye(6), predicted, 0.05 * np.eye(6), 0.95)
     assert gate_result.statistic == pytest.approx(0.3**2 / 0.09)
     assert gate_result.accepted
 

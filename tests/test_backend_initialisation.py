@@ -43,7 +43,7 @@ def test_at_rest(angles_deg: tuple[float, float]) -> None:
     normalised = []
     for seed in range(10):
         at = initial_attitude(resting(truth, bias, seed), 1.0, CONFIG)
-        assert at.at_rest
+        assert at.is_stationary
         assert np.rad2deg(tilt_between(at.nav_R_body, truth)) < 0.1
         assert np.abs(at.gyro_bias - bias).max() < 1e-3
         normalised.append((at.gyro_bias - bias) / at.gyro_bias_sigma)
@@ -72,7 +72,7 @@ def test_in_motion(start_s: float, place: float) -> None:
     interval, offset_s = walking(start_s, start_s + 1.0, start_s + place)
     at = initial_attitude(interval, offset_s, CONFIG)
     truth = pose_at(start_s + place)[:3, :3]
-    assert not at.at_rest
+    assert not at.is_stationary
     assert tilt_between(at.nav_R_body, truth) < 3.0 * at.tilt_sigma_rad
     assert at.tilt_sigma_rad < 0.2
     assert_heading_is_zero(at.nav_R_body)
@@ -88,7 +88,7 @@ def test_a_turn_within_the_interval_is_followed() -> None:
     for at_s in (0.0, 0.5, 1.0):
         at = initial_attitude(interval, at_s, CONFIG)
         truth = Rotation.from_rotvec(at_s * rate).as_matrix()
-        assert not at.at_rest
+        assert not at.is_stationary
         assert np.rad2deg(tilt_between(at.nav_R_body, truth)) < 0.6
 
 
@@ -107,7 +107,7 @@ def test_rest_is_not_believed_too_easily() -> None:
         resting(np.eye(3), np.zeros(3), 0, duration_s=0.2),
     ]
     for interval in intervals:
-        assert not initial_attitude(interval, 0.1, CONFIG).at_rest
+        assert not initial_attitude(interval, 0.1, CONFIG).is_stationary
 
 
 @pytest.mark.parametrize("up", [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.9, 0.1, 0.2), (-0.95, 0.2, 0.1)])

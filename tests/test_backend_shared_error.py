@@ -15,7 +15,7 @@ from graphvio.arrays import Float
 from graphvio.backend.factors import x
 from graphvio.backend.noise import gaussian
 from graphvio.backend.smoother import Smoother
-from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
+from graphvio.backend.states import InitialUncertainty, RigState, origin_covariance
 from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 from graphvio.measurements.motion import RelativeMotion
@@ -72,8 +72,8 @@ class Run:
         pose = transform(tilt, np.zeros(3)) @ pose_at(0.0)
         gyro_bias, accel_bias = 1e-3 * rng.standard_normal(3), 0.2 * rng.standard_normal(3)
         velocity = velocity_at(0.0) + 0.1 * rng.standard_normal(3)
-        start = StartUncertainty(origin_covariance(pose[:3, :3], 3e-3), 0.1, 1e-3)
-        self.smoother.start(0, RigState(pose, velocity, np.zeros(3), np.zeros(3)), start)
+        start = InitialUncertainty(origin_covariance(pose[:3, :3], 3e-3), 0.1, 1e-3)
+        self.smoother.initialise(0, RigState(pose, velocity, np.zeros(3), np.zeros(3)), start)
         last = FIRST + FRAMES
         if self.with_imu:
             buffer = filled_buffer(IMU, last * PERIOD_NS * 1e-9, rng, gyro_bias, accel_bias)
@@ -87,9 +87,9 @@ class Run:
             interval = buffer.interval((k - 1) * PERIOD_NS, k * PERIOD_NS) if self.with_imu else None
             self.smoother.extend(k * PERIOD_NS, interval)
             if k > reference + 1:
-                self.statistics.append(self.smoother.test(motion).statistic)
-            self.smoother.accept(motion)
-            self.smoother.settle({k // KEYFRAMES * KEYFRAMES * PERIOD_NS, FIRST * PERIOD_NS})
+                self.statistics.append(self.smoother.gate(motion).statistic)
+            self.smoother.add_motion(motion)
+            self.smoother.update({k // KEYFRAMES * KEYFRAMES * PERIOD_NS, FIRST * PERIOD_NS})
 
     def nees(self) -> float:
         """Of the pose composed over twenty framesets."""
@@ -109,14 +109,14 @@ def test_covariances_of_two_motions_from_one_keyframe() -> None:
     rng = np.random.default_rng(0)
     stamps = (0, 1_000_000_000, 2_500_000_000)
     smoother = Smoother(CONFIG, None)
-    start = StartUncertainty(1e-12 * np.eye(6), 10.0, 1.0)
-    smoother.start(0, RigState(pose_at(0.0), velocity_at(0.0), np.zeros(3), np.zeros(3)), start)
+    start = InitialUncertainty(1e-12 * np.eye(6), 10.0, 1.0)
+    smoother.initialise(0, RigState(pose_at(0.0), velocity_at(0.0), np.zeros(3), np.zeros(3)), start)
     for stamp_ns in stamps[1:]:
         truth = np.linalg.inv(pose_at(0.0)) @ pose_at(stamp_ns * 1e-9)  # covariances need no errors
         motion = replace(motion_from(0, stamp_ns, np.zeros(6), rng), reference_T_current=truth)
         smoother.extend(stamp_ns, None)
-        smoother.accept(motion)
-        smoother.settle({0})
+        smoother.add_motion(motion)
+        smoother.update({0})
         sigmas = np.sqrt(np.diag(motion.covariance))
         scale = np.outer(sigmas, sigmas)
         np.testing.assert_allclose(smoother.covariance_since(0) / scale, motion.covariance / scale, atol=0.01)
@@ -164,19 +164,19 @@ def test_what_is_kept_goes_along_where_only_the_newest_states_are_corrected() ->
     """The keyframe's pose, and not only its view."""
     rng, shared_error = np.random.default_rng(5), np.zeros(6)
     smoother = Smoother(CONFIG, None)
-    anywhere = StartUncertainty(np.eye(6), 10.0, 1.0)
-    smoother.start(0, RigState(pose_at(0.0), velocity_at(0.0), np.zeros(3), np.zeros(3)), anywhere)
+    anywhere = InitialUncertainty(np.eye(6), 10.0, 1.0)
+    smoother.initialise(0, RigState(pose_at(0.0), velocity_at(0.0), np.zeros(3), np.zeros(3)), anywhere)
     for k in range(1, 5):
         smoother.extend(k * PERIOD_NS, None)
-        smoother.accept(motion_from(0, k * PERIOD_NS, shared_error, rng))
-        smoother.settle({0})
+        smoother.add_motion(motion_from(0, k * PERIOD_NS, shared_error, rng))
+        smoother.update({0})
     before, newest = smoother.pose(0), smoother.pose(4 * PERIOD_NS)
     found = gtsam.Pose3(transform(np.zeros(3), np.array([4e-3, -5e-3, 3e-3])) @ newest)
     smoother._window.add(gtsam.PriorFactorPose3(x(4), found, gaussian(1e-10 * np.eye(6))))
-    smoother.settle({0})
+    smoother.update({0})
     assert smoother._advanced
     assert np.linalg.norm(smoother.pose(0)[:3, 3] - before[:3, 3]) > 5e-3
     told, covariance = (se3_inverse(smoother.pose(0)) @ smoother.pose(4 * PERIOD_NS)), smoother.covariance_since(0)
-    smoother._window.optimise()
+    smoother._window.optimize()
     whole = se3_inverse(smoother.pose(0)) @ smoother.pose(4 * PERIOD_NS)
     assert np.abs(se3_log(se3_inverse(whole) @ told) / np.sqrt(np.diag(covariance))).max() < 0.01

@@ -9,7 +9,7 @@ from graphvio.arrays import Float
 from graphvio.backend.factors import b, v, x
 from graphvio.backend.inertial import ImuBuffer
 from graphvio.backend.smoother import Smoother
-from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
+from graphvio.backend.states import InitialUncertainty, RigState, origin_covariance
 from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.motion import RelativeMotion
@@ -22,8 +22,8 @@ TILT_SIGMA, SPEED_SIGMA, GYRO_BIAS_SIGMA = 0.01, 0.1, 0.003
 PERIOD_NS = 50_000_000
 
 
-def known_to(nav_T_body: Float, speed_sigma: float = SPEED_SIGMA) -> StartUncertainty:
-    return StartUncertainty(origin_covariance(nav_T_body[:3, :3], TILT_SIGMA), speed_sigma, GYRO_BIAS_SIGMA)
+def known_to(nav_T_body: Float, speed_sigma: float = SPEED_SIGMA) -> InitialUncertainty:
+    return InitialUncertainty(origin_covariance(nav_T_body[:3, :3], TILT_SIGMA), speed_sigma, GYRO_BIAS_SIGMA)
 
 
 @dataclass
@@ -44,7 +44,7 @@ class Run:
         pose = pose_at(0.0)
         pose[:3, :3] = transform(tilt, np.zeros(3))[:3, :3] @ pose[:3, :3]
         velocity = velocity_at(0.0) + SPEED_SIGMA * rng.standard_normal(3)
-        self.smoother.start(0, RigState(pose, velocity, np.zeros(3), np.zeros(3)), known_to(pose))
+        self.smoother.initialise(0, RigState(pose, velocity, np.zeros(3), np.zeros(3)), known_to(pose))
         self.imu: ImuBuffer | None = None
         if self.with_imu:
             self.imu = filled_buffer(IMU, self.duration_s, rng, self.gyro_bias, self.accel_bias)
@@ -62,10 +62,10 @@ class Run:
         since = self.smoother.latest_ns if reference_ns is None else reference_ns
         self.predict(stamp_ns)
         motion = measured_motion(since, stamp_ns, self.rng)
-        accepted = not gated or self.smoother.test(motion).accepted
+        accepted = not gated or self.smoother.gate(motion).accepted
         if accepted:
-            self.smoother.accept(motion)
-        self.settled += self.smoother.settle(keep)
+            self.smoother.add_motion(motion)
+        self.settled += self.smoother.update(keep)
         return accepted
 
     def until(self, end_s: float) -> bool:
@@ -78,7 +78,7 @@ class Run:
         end_ns = self.smoother.latest_ns + round(duration_s * 1e9)
         while self.smoother.latest_ns < end_ns:
             self.predict(self.smoother.latest_ns + PERIOD_NS)
-            self.settled += self.smoother.settle(keep)
+            self.settled += self.smoother.update(keep)
             sigmas.append(self.sigma())
         return sigmas
 
@@ -132,9 +132,9 @@ def test_a_walk_without_imu() -> None:
 def test_a_start_in_motion_without_imu_is_no_outlier() -> None:
     smoother = Smoother(CONFIG, None)
     standing = RigState(pose_at(0.0), np.zeros(3), np.zeros(3), np.zeros(3))
-    smoother.start(0, standing, known_to(standing.nav_T_body, 2.0))
+    smoother.initialise(0, standing, known_to(standing.nav_T_body, 2.0))
     smoother.extend(PERIOD_NS, None)
-    assert smoother.test(measured_motion(0, PERIOD_NS, np.random.default_rng(0))).accepted
+    assert smoother.gate(measured_motion(0, PERIOD_NS, np.random.default_rng(0))).accepted
 
 
 def test_settled_poses_come_once_and_in_order() -> None:
@@ -156,7 +156,7 @@ def test_poses_of_the_window_are_those_of_the_whole_solution() -> None:
     left = [run.smoother.pose(stamp) for stamp in run.smoother._stamps]
     told = [pose for _, pose in run.smoother.all_poses()]
     assert run.smoother._advanced == 0
-    run.smoother.solve()
+    run.smoother.optimize()
     whole = [pose for _, pose in run.smoother.all_poses()]
     off_m, off_before_m = (np.abs(np.array(poses) - whole)[:, :3, 3].max() for poses in (told, left))
     assert off_m < 5e-5
@@ -202,9 +202,9 @@ def test_an_imu_gap_is_bridged() -> None:
     for stamp in (2_050_000_000, 2_100_000_000):
         run.predict(stamp, with_imu=False)
         motion = measured_motion(stamp - PERIOD_NS, stamp, run.rng)
-        assert run.smoother.test(motion).accepted
-        run.smoother.accept(motion)
-        run.smoother.settle(())
+        assert run.smoother.gate(motion).accepted
+        run.smoother.add_motion(motion)
+        run.smoother.update(())
     assert run.until(3.0)
     assert run.nees() < 30.0
 
@@ -218,10 +218,10 @@ def test_a_motion_that_the_imu_contradicts_is_refused(error: tuple[list[float], 
     run.predict(2_050_000_000)
     good = measured_motion(2_000_000_000, 2_050_000_000, run.rng)
     wrong = replace(good, reference_T_current=good.reference_T_current @ transform(*error))
-    assert run.smoother.test(good).accepted
-    assert not run.smoother.test(wrong).accepted
+    assert run.smoother.gate(good).accepted
+    assert not run.smoother.gate(wrong).accepted
     untouched = run.smoother.pose(2_050_000_000)
-    run.smoother.test(wrong)
+    run.smoother.gate(wrong)
     assert np.array_equal(run.smoother.pose(2_050_000_000), untouched)
 
 
@@ -241,9 +241,9 @@ def test_a_wrong_motion_that_passes_the_gate_pulls_less() -> None:
             if k == 1:
                 off = transform(np.zeros(3), [0.0, off_m, 0.0])
                 motion = replace(motion, reference_T_current=motion.reference_T_current @ off)
-                assert run.smoother.test(motion).accepted
-            run.smoother.accept(motion)
-            run.smoother.settle(keep)
+                assert run.smoother.gate(motion).accepted
+            run.smoother.add_motion(motion)
+            run.smoother.update(keep)
         return run.smoother.pose(run.smoother.latest_ns)
 
     pulled = {}
@@ -262,9 +262,9 @@ def test_good_motions_pass_the_gate_as_often_as_they_should() -> None:
             if stamp > run.smoother.latest_ns:
                 run.predict(stamp)
                 motion = measured_motion(stamp - PERIOD_NS, stamp, run.rng)
-                passed.append(run.smoother.test(motion).accepted)
-                run.smoother.accept(motion)
-                run.smoother.settle(())
+                passed.append(run.smoother.gate(motion).accepted)
+                run.smoother.add_motion(motion)
+                run.smoother.update(())
     assert 0.85 < np.mean(passed) < 0.95
 
 
@@ -282,7 +282,7 @@ def test_a_new_start_forgets_everything() -> None:
     run = Run(6)
     run.until(1.0)
     state = RigState(transform([0.0, 0.0, 1.0], [1.0, 2.0, 3.0]), np.ones(3), np.zeros(3), np.zeros(3))
-    run.smoother.start(5_000_000_000, state, known_to(state.nav_T_body))
+    run.smoother.initialise(5_000_000_000, state, known_to(state.nav_T_body))
     assert run.smoother.latest_ns == 5_000_000_000
     assert not run.smoother.knows(1_000_000_000)
     assert run.smoother.latest_rate() is None
@@ -295,7 +295,7 @@ def test_a_new_start_forgets_everything() -> None:
 def test_tilt_is_uncertain_about_navs_axes_and_heading_is_not() -> None:
     run = Run(7)
     leaning = transform([0.0, np.pi / 2.0, 0.0], np.zeros(3))  # body's x axis points down: heading is about it
-    run.smoother.start(0, RigState(leaning, np.zeros(3), np.zeros(3), np.zeros(3)), known_to(leaning))
+    run.smoother.initialise(0, RigState(leaning, np.zeros(3), np.zeros(3), np.zeros(3)), known_to(leaning))
     sigmas = np.sqrt(np.diag(run.smoother.covariance()))
     np.testing.assert_allclose(sigmas[:3], [1e-3, 0.01, 0.01], rtol=1e-6)
 
@@ -332,7 +332,7 @@ def resting(seed: int, told: bool, duration_s: float = 4.0) -> Run:
     """A rig that stands still from a start that does not know it."""
     run = Run(seed, duration_s=0.0)
     rng, pose = run.rng, np.eye(4)
-    run.smoother.start(0, RigState(pose, np.zeros(3), np.zeros(3), np.zeros(3)), known_to(pose))
+    run.smoother.initialise(0, RigState(pose, np.zeros(3), np.zeros(3), np.zeros(3)), known_to(pose))
     run.imu = ImuBuffer(50.0)
     root = np.sqrt(IMU.rate_hz)
     for i in range(round(duration_s * IMU.rate_hz) + 1):
@@ -346,12 +346,12 @@ def resting(seed: int, told: bool, duration_s: float = 4.0) -> Run:
         noise = np.repeat([1e-3, 3e-3], 3)
         motion = transform(*(noise * rng.standard_normal(6)).reshape(2, 3))
         still = RelativeMotion(stamp - PERIOD_NS, stamp, motion, np.diag(noise**2), np.zeros((6, 6)), 100)
-        if run.smoother.test(still).accepted:
-            run.smoother.accept(still)
+        if run.smoother.gate(still).accepted:
+            run.smoother.add_motion(still)
         if told:
-            assert run.smoother.test_rest().accepted
-            run.smoother.accept_rest()
-        run.smoother.settle(())
+            assert run.smoother.gate_zero_velocity().accepted
+            run.smoother.add_zero_velocity()
+        run.smoother.update(())
     return run
 
 
@@ -374,7 +374,7 @@ def test_a_velocity_that_is_surely_another_is_no_rest() -> None:
     run.until(2.0)
     run.predict(2_050_000_000)
     assert np.linalg.norm(velocity_at(2.05)) > 0.3
-    assert not run.smoother.test_rest().accepted
+    assert not run.smoother.gate_zero_velocity().accepted
 
 
 # ------------------------------------------------------------------ resets
@@ -397,7 +397,7 @@ def test_a_reset_changes_nothing_but_the_window(with_imu: bool) -> None:
         assert np.abs(apart / np.sqrt(np.diag(one.pose))).max() < 0.05
         often.smoother.reset_position()
         assert own_position_sigma_m(often) == pytest.approx(1e-3, rel=1e-3)
-        often.smoother.settle(())
+        often.smoother.update(())
     assert own_position_sigma_m(never) > 1e-2
 
 
@@ -429,6 +429,6 @@ def test_accelerations_that_no_rig_has_are_told() -> None:
     assert excess == pytest.approx(120.0, abs=15.0)
     unsure = replace(wrong, covariance=wrong.covariance + np.diag([0, 0, 0, 1, 1, 1]) * 0.1**2)
     assert run.smoother.excess_acceleration(unsure) is None
-    run.smoother.settle(())
+    run.smoother.update(())
     run.predict(stamp + PERIOD_NS)  # the step before was not seen: where it ended is a guess
     assert run.smoother.excess_acceleration(replace(wrong, stamp_ns=stamp + PERIOD_NS)) is None

@@ -44,7 +44,7 @@ def test_marginalisation_of_a_linear_problem_is_exact() -> None:
     for k in range(12):
         add_point([short, whole], k, rng)
         for window in (short, whole):
-            window.optimise()
+            window.optimize()
         np.testing.assert_allclose(short.values.atVector(x(k)), whole.values.atVector(x(k)), atol=1e-8)
         pair = [x(k - 1), x(k)] if k else [x(0)]
         np.testing.assert_allclose(short.joint_covariance(pair), whole.joint_covariance(pair), atol=1e-8)
@@ -62,7 +62,7 @@ def test_marginalising_several_at_once_is_the_same_as_one_by_one() -> None:
     for k in (3, 0, 1):
         apart.marginalise([x(k)])
     for window in (together, apart):
-        window.optimise()
+        window.optimize()
     keys = [x(2), x(4), x(5)]
     np.testing.assert_allclose(together.joint_covariance(keys), apart.joint_covariance(keys), atol=1e-9)
     np.testing.assert_allclose(together.values.atVector(x(5)), apart.values.atVector(x(5)), atol=1e-9)
@@ -85,7 +85,7 @@ def test_marginalisation_of_poses_with_small_errors() -> None:
         for window in (short, whole):
             for factor in factors:
                 window.add(factor)
-            window.optimise()
+            window.optimize()
         if k >= 3:
             short.marginalise([x(k - 3)])
     np.testing.assert_allclose(short.values.atPose3(x(7)).matrix(), whole.values.atPose3(x(7)).matrix(), atol=5e-8)
@@ -98,7 +98,7 @@ def test_joint_covariance_is_in_the_order_asked_for() -> None:
     window = Window()
     for k in range(3):
         add_point([window], k, rng)
-    window.optimise()
+    window.optimize()
     ahead, back = window.joint_covariance([x(0), x(2)]), window.joint_covariance([x(2), x(0)])
     np.testing.assert_allclose(ahead[:3, :3], window.joint_covariance([x(0)]), atol=1e-12)
     np.testing.assert_allclose(ahead[:3, 3:], back[3:, :3], atol=1e-12)
@@ -116,7 +116,7 @@ def test_optimise_converges_from_afar() -> None:
         motion = gtsam.Pose3(np.linalg.inv(truth[j]) @ truth[j + 1])
         window.add(gtsam.BetweenFactorPose3(x(j), x(j + 1), motion, noise(np.eye(6) * 1e-4)))
     for _ in range(2):
-        window.optimise()
+        window.optimize()
     for k, pose in enumerate(truth):
         np.testing.assert_allclose(window.values.atPose3(x(k)).matrix(), pose, atol=1e-8)
 
@@ -132,7 +132,7 @@ def loose_window() -> Window:
 
 def test_what_is_not_constrained_has_no_solution_and_no_covariance() -> None:
     with pytest.raises(WindowError):
-        loose_window().optimise()
+        loose_window().optimize()
     with pytest.raises(WindowError):
         loose_window().joint_covariance([x(1)])
     with pytest.raises(WindowError):
@@ -141,7 +141,7 @@ def test_what_is_not_constrained_has_no_solution_and_no_covariance() -> None:
 
 @pytest.mark.parametrize(
     "use",
-    [lambda w: w.optimise(), lambda w: w.joint_covariance([x(5)]), lambda w: w.marginalise([x(5)])],
+    [lambda w: w.optimize(), lambda w: w.joint_covariance([x(5)]), lambda w: w.marginalise([x(5)])],
     ids=["optimise", "joint_covariance", "marginalise"],
 )
 def test_a_variable_without_any_factor_is_not_constrained(use: Callable[[Window], object]) -> None:
@@ -161,7 +161,7 @@ def test_a_state_that_hangs_in_the_air_cannot_be_marginalised() -> None:
     assert len(window.values.keys()) == 3  # as it was
     window.marginalise([x(0)])  # says nothing of the others: fine
     window.add(gtsam.PriorFactorVector(x(2), np.array([5.0, 6.0, 7.0]), noise(np.eye(3))))
-    window.optimise()
+    window.optimize()
     np.testing.assert_allclose(window.values.atVector(x(1)), [4.0, 5.0, 6.0], atol=1e-9)
     np.testing.assert_allclose(window.joint_covariance([x(1)]), 2.0 * np.eye(3), atol=1e-9)
 
@@ -170,10 +170,10 @@ def test_a_failed_solution_leaves_the_values() -> None:
     window = loose_window()
     before = window.values.atVector(x(1))
     with pytest.raises(WindowError):
-        window.optimise()
+        window.optimize()
     assert np.array_equal(window.values.atVector(x(1)), before)
     window.add(gtsam.PriorFactorVector(x(0), np.zeros(3), noise(np.eye(3))))
-    window.optimise()
+    window.optimize()
     np.testing.assert_allclose(window.values.atVector(x(1)), np.ones(3), atol=1e-9)
 
 
@@ -183,7 +183,7 @@ def test_covariances_of_followed_variables_need_no_new_solution(monkeypatch: pyt
     for k in range(6):
         add_point([followed, plain], k, rng)
     for window, last in ((followed, [x(4), x(5)]), (plain, [])):
-        window.optimise(last)
+        window.optimize(last)
         add_point([window], 6, np.random.default_rng(5))
     expected = plain.joint_covariance([x(4), x(6)])
     with monkeypatch.context() as patched:
@@ -201,9 +201,9 @@ def test_advancing_is_the_whole_solution_for_what_is_followed() -> None:
     quick, whole = Window(), Window()
     for k in range(10):
         add_point([quick, whole], k, rng, spread=1e-3)
-        whole.optimise()
+        whole.optimize()
         if k == 5:
-            quick.optimise([x(4), x(5)])
+            quick.optimize([x(4), x(5)])
         if k > 5:  # each new state is tied to the two before it, which are followed
             before = quick.values.atVector(x(3))
             assert quick.advance([x(k - 1), x(k)])
@@ -212,7 +212,7 @@ def test_advancing_is_the_whole_solution_for_what_is_followed() -> None:
                 np.testing.assert_allclose(quick.values.atVector(key), whole.values.atVector(key), atol=1e-12)
             np.testing.assert_allclose(quick.joint_covariance(pair), whole.joint_covariance(pair), atol=1e-12)
             assert np.array_equal(quick.values.atVector(x(3)), before)
-    quick.optimise()
+    quick.optimize()
     for k in range(10):
         np.testing.assert_allclose(quick.values.atVector(x(k)), whole.values.atVector(x(k)), atol=1e-12)
 
@@ -223,22 +223,22 @@ def test_advancing_counts_what_a_covariance_was_asked_with() -> None:
     asked, whole = Window(), Window()
     for k in range(4):
         add_point([asked, whole], k, rng, spread=1e-3)
-    asked.optimise([x(2), x(3)])
+    asked.optimize([x(2), x(3)])
     add_point([asked, whole], 4, rng, spread=1e-3)
     asked.joint_covariance([x(4)])
     assert asked.advance([x(4)])
-    whole.optimise()
+    whole.optimize()
     np.testing.assert_allclose(asked.values.atVector(x(4)), whole.values.atVector(x(4)), atol=1e-12)
 
 
 @pytest.mark.parametrize("reason", ["new window", "not followed", "long step", "robust kernel", "unconstrained"])
 def test_where_advancing_is_impossible_nothing_changes(reason: str) -> None:
     rng = np.random.default_rng(8)
-    window = Window(least_iterations=2 if reason == "robust kernel" else 1)
+    window = Window(min_iterations=2 if reason == "robust kernel" else 1)
     for k in range(5):
         add_point([window], k, rng)
     if reason != "new window":
-        window.optimise([x(3), x(4)])
+        window.optimize([x(3), x(4)])
     window.values.insert(x(5), window.values.atVector(x(4)))
     step, last = {"long step": np.full(3, 0.02)}.get(reason, np.full(3, 0.002)), 0 if reason == "not followed" else 4
     if reason != "unconstrained":
@@ -247,7 +247,7 @@ def test_where_advancing_is_impossible_nothing_changes(reason: str) -> None:
     assert not window.advance([x(5)])
     assert all(np.array_equal(window.values.atVector(key), value) for key, value in before.items())
     if reason != "unconstrained":
-        window.optimise([x(5)])
+        window.optimize([x(5)])
         expected = window.values.atVector(x(last)) + step
         np.testing.assert_allclose(window.values.atVector(x(5)), expected, atol=1e-9)
 
@@ -263,7 +263,7 @@ def test_values_that_hardly_change_lose_no_digits(walk: float) -> None:
             if k == 0
             else gtsam.BetweenFactorVector(x(k - 1), x(k), np.zeros(3), noise(walk**2 * unit))
         )
-    window.optimise([x(9)])
+    window.optimize([x(9)])
     np.testing.assert_allclose(window.values.atVector(x(9)), np.ones(3), rtol=1e-6)
     np.testing.assert_allclose(window.joint_covariance([x(9)]), (0.25 + 9 * walk**2) * unit, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(window.joint_covariance([x(0)]), 0.25 * unit, rtol=1e-6, atol=1e-9)

@@ -56,7 +56,8 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     source = open_source(recorded(folder / "recording", SECONDS))
     config = replace(Config(), optimization=OptimizationConfig(features=500))
     recorder = Recorder(NAME)
-    odometry = Odometry(source.rig, config, on_step=recorder.add)
+    odometry = Odometry(source.rig, config)
+    odometry.subscribe(recorder.add)
     for measurement in source:
         odometry.process(measurement)
     odometry.finish()

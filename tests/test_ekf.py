@@ -119,10 +119,10 @@ def test_a_steady_rig_agrees_with_what_it_measures() -> None:
     moved = se3_inverse(state.nav_T_body) @ after.nav_T_body
     motion = RelativeMotion(0, round(DT * 1e9), moved, np.eye(6), np.zeros((6, 6)), 100)
     np.testing.assert_allclose(vision(after, VisualRates.of(motion)).innovation, 0.0, atol=1e-10)
-    at_rest = replace(after, rate_body=np.zeros(3))
-    force = at_rest.nav_R_body.T @ GRAVITY
-    np.testing.assert_allclose(accelerometer(at_rest, force, 1.0).innovation, 0.0, atol=1e-12)
-    np.testing.assert_allclose(gyro(at_rest, at_rest.gyro_bias, 0.1).innovation, 0.0, atol=1e-12)
+    is_stationary = replace(after, rate_body=np.zeros(3))
+    force = is_stationary.nav_R_body.T @ GRAVITY
+    np.testing.assert_allclose(accelerometer(is_stationary, force, 1.0).innovation, 0.0, atol=1e-12)
+    np.testing.assert_allclose(gyro(is_stationary, is_stationary.gyro_bias, 0.1).innovation, 0.0, atol=1e-12)
 
 
 @SEEDS

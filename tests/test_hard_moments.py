@@ -163,7 +163,7 @@ def test_the_walk_as_it_is(room_walk: Path, measurements: list[Measurement]) -> 
         rotation_rad, translation_m = estimate.vision_sigmas or (np.inf, np.inf)
         assert 1e-6 < rotation_rad < 1e-3
         assert 1e-5 < translation_m < 5e-3
-    resting = [estimate.at_rest for estimate in walk.estimates]
+    resting = [estimate.is_stationary for estimate in walk.estimates]
     assert np.mean(resting[6:19]) > 0.9  # the first second, of which a quarter goes by before it can be told
     assert not any(resting[:5])
     assert not any(resting[40:])  # and then it has begun to walk

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from graphvio.slam.keyframes import Keyframes
 from scipy.stats import chi2
 from synthetic import random_covariance, transform, two_pair_rig
 
@@ -19,12 +20,12 @@ from graphvio.frontend.stereo import triangulate
 from graphvio.frontend.tracks import PairFrame, common_rows
 from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.measurements.sensors import Measurement
-from graphvio.measurements.step import Step
+from graphvio.odometry.step import Step
 from graphvio.rig import Rig
 from graphvio.simulation.simulator import make_simulator
 from graphvio.slam.descriptors import describer
+from graphvio.slam.front_end import FrontEnd
 from graphvio.slam.keyframe import Keyframe
-from graphvio.slam.keyframes import Keyframes
 from graphvio.slam.landmarks import landmarks_of
 from graphvio.slam.map_frame import MapFrame
 from graphvio.trajectory import Trajectory
@@ -36,7 +37,7 @@ TIGHT = np.diag(np.repeat([1e-3, 1e-2], 3) ** 2)
 
 @dataclass
 class Run:
-    """What came out of a run."""
+    """Results of a run."""
 
     odometry: Odometry
     estimates: list[Estimate]
@@ -66,10 +67,10 @@ def run(rig: Rig, measurements: list[Measurement]) -> Run:
 
 
 def run_of(rig: Rig, measurements: Sequence[Measurement], config: str = "{}") -> Run:
-    steps: list[Step] = []
-    keyframes: list[Keyframe] = []
-    odometry = Odometry(rig, Config.from_yaml(config), on_step=steps.append)
-    odometry.on_keyframe(keyframes.append)
+    steps, keyframes = list[Step](), list[Keyframe]()
+    odometry = Odometry(rig, Config.from_yaml(config))
+    odometry.subscribe(steps.append)
+    FrontEnd(odometry).on_keyframe(keyframes.append)
     return Run(odometry, feed(odometry, measurements), keyframes, steps)
 
 
@@ -198,14 +199,15 @@ def test_where_the_window_is_rebuilt_a_keyframe_begins(
         raise WindowError("made to fail")
 
     steps, keyframes = list[Step](), list[Keyframe]()
-    odometry = Odometry(rig, on_step=steps.append)
-    odometry.on_keyframe(keyframes.append)
+    odometry = Odometry(rig)
+    odometry.subscribe(steps.append)
+    FrontEnd(odometry).on_keyframe(keyframes.append)
     begun = until(measurements, 30)
     for measurement in begun:
         odometry.process(measurement)
     count = len(steps)
     with monkeypatch.context() as patch:
-        patch.setattr(Smoother, "settle", fail)
+        patch.setattr(Smoother, "update", fail)
         for measurement in measurements[len(begun) : len(until(measurements, 35))]:
             odometry.process(measurement)
     odometry.finish()
@@ -231,32 +233,33 @@ def test_a_start_in_motion_has_no_keyframe_until_it_is_known(rig: Rig, measureme
 def test_a_break_of_the_epoch_breaks_the_chain_and_ends_the_map(rig: Rig, measurements: list[Measurement]) -> None:
     begun, rest = until(measurements, 50), measurements[len(until(measurements, 50)) :]
     odometry, keyframes, before = Odometry(rig), list[Keyframe](), list[Estimate]()
-    odometry.on_keyframe(keyframes.append)
+    front_end = FrontEnd(odometry)
+    front_end.on_keyframe(keyframes.append)
     for measurement in begun:
         estimate = odometry.process(measurement)
         before += [] if estimate is None else [estimate]
     old = keyframes[-1].id
-    assert odometry.map_T_body(before[-1].stamp_ns) is None
-    assert odometry.correct(old, transform([0, 0, 1.0], [5.0, 0, 0]), TIGHT).accepted
-    assert odometry.map_T_body(before[-1].stamp_ns) is not None
+    assert front_end.map_T_body(before[-1].stamp_ns) is None
+    assert front_end.correct(old, transform([0, 0, 1.0], [5.0, 0, 0]), TIGHT).accepted
+    assert front_end.map_T_body(before[-1].stamp_ns) is not None
     estimates = []
     for measurement in until(rest, 15):
         estimate = odometry.process(replace(measurement, stamp_ns=measurement.stamp_ns + 10**13))
         if estimate is not None:
             estimates.append(estimate)
-            assert odometry.map_T_body(estimate.stamp_ns) is None or estimate.epoch == 0
+            assert front_end.map_T_body(estimate.stamp_ns) is None or estimate.epoch == 0
     assert estimates[-1].epoch == 1
     first = next(k for k in keyframes if k.epoch == 1)
     assert (first.previous_id, first.previous_T_body, first.relative_covariance) == (None, None, None)
     assert [k.id for k in keyframes] == list(range(len(keyframes)))
     odometry.take_events()
-    result = odometry.correct(old, np.eye(4), TIGHT)
+    result = front_end.correct(old, np.eye(4), TIGHT)
     assert (result.accepted, result.map_T_odom) == (False, None)
     event = odometry.take_events()[-1]
     assert (event.kind, event.stamp_ns) == ("correction_refused", estimates[-1].stamp_ns)
     assert "not of the newest epoch" in event.detail
-    assert odometry.correct(keyframes[-1].id, np.eye(4), TIGHT).accepted
-    assert odometry.map_T_body(estimates[-1].stamp_ns) is not None
+    assert front_end.correct(keyframes[-1].id, np.eye(4), TIGHT).accepted
+    assert front_end.map_T_body(estimates[-1].stamp_ns) is not None
     odometry.finish()
 
 
@@ -436,25 +439,25 @@ def test_neither_listeners_nor_corrections_change_an_estimate(rig: Rig, measurem
     config = "motion: {keyframe_overlap: 0.9}\n"  # has many keyframes
     alone = Odometry(rig, Config.from_yaml(config))
     expected = feed(alone, measurements)
-    assert alone._keyframes.log.next_id == 0  # nobody asked
 
     odometry = Odometry(rig, Config.from_yaml(config + "keyframes: {descriptors: sift, images: true}"))
     called, read, positions = list[Keyframe](), list[Keyframe](), list[Float]()
-    odometry.on_keyframe(called.append)
+    front_end = FrontEnd(odometry)
+    front_end.on_keyframe(called.append)
     is_over, failures, moved = threading.Event(), list[BaseException](), list[bool]()
 
     def correct_all() -> None:
         """Each keyframe at once, its neighbours by ten metres apart; and whatever comes late, too."""
-        for keyframe in odometry.keyframes():
+        for keyframe in front_end.keyframes():
             read.append(keyframe)
             for k in range(keyframe.id + 1):
                 offered = transform([0, 0, 0], [10.0 * (keyframe.id % 2), 0, 0]) @ read[k].odom_T_body
-                moved.append(odometry.correct(k, offered, TIGHT).accepted)
+                moved.append(front_end.correct(k, offered, TIGHT).accepted)
 
     def ask() -> None:
         while not is_over.is_set():
             at_ns = newest[0]
-            found = odometry.map_T_body(at_ns)
+            found = front_end.map_T_body(at_ns)
             if found is not None:
                 positions.append(found[:3, 3])
 
@@ -500,20 +503,21 @@ def test_the_map_jumps_and_odom_does_not(rig: Rig, measurements: list[Measuremen
     config = Config.from_yaml("motion: {keyframe_overlap: 0.9}")
     odometry = Odometry(rig, config, on_prediction=predictions.append)
     keyframes, in_map = list[Keyframe](), list[Float]()
-    odometry.on_keyframe(keyframes.append)
+    front_end = FrontEnd(odometry)
+    front_end.on_keyframe(keyframes.append)
     for measurement in until(measurements, 70):
         count = len(keyframes)
         estimate = odometry.process(measurement)
         if len(keyframes) > count:
             newest = keyframes[-1]
             side = transform([0, 0, 0], [8.0 if newest.stamp_ns - keyframes[0].stamp_ns > 1.5e9 else 0.0, 0, 0])
-            odometry.correct(newest.id, side @ newest.odom_T_body, TIGHT)
+            front_end.correct(newest.id, side @ newest.odom_T_body, TIGHT)
         if estimate is not None:
-            found, prediction = odometry.map_T_body(estimate.stamp_ns), odometry.predict(estimate.stamp_ns)
+            found, prediction = front_end.map_T_body(estimate.stamp_ns), odometry.predict(estimate.stamp_ns)
             assert found is not None
             assert prediction is not None
-            assert odometry.map_T_odom is not None
-            np.testing.assert_array_equal(found, odometry.map_T_odom @ prediction.nav_T_body)
+            assert front_end.map_T_odom is not None
+            np.testing.assert_array_equal(found, front_end.map_T_odom @ prediction.nav_T_body)
             in_map.append(found[:3, 3])
     odometry.finish()
     assert "map_moved" in {i.kind for i in odometry.take_events()}
@@ -524,18 +528,19 @@ def test_the_map_jumps_and_odom_does_not(rig: Rig, measurements: list[Measuremen
 
 def test_an_iterator_may_come_late_and_ends_at_the_end(rig: Rig, measurements: list[Measurement]) -> None:
     odometry, keyframes = Odometry(rig), list[Keyframe]()
+    front_end = FrontEnd(odometry)
     measurements = until(measurements, 50)
     for measurement in measurements[: len(measurements) // 2]:
         odometry.process(measurement)
-    early = odometry.keyframes()
-    odometry.on_keyframe(keyframes.append)
+    early = front_end.keyframes()
+    front_end.on_keyframe(keyframes.append)
     for measurement in measurements[len(measurements) // 2 :]:
         odometry.process(measurement)
     odometry.finish()
     assert keyframes
     assert [k.id for k in early] == list(range(len(keyframes)))
     assert keyframes[0].previous_id is None
-    assert [k.id for k in odometry.keyframes(1)] == list(range(1, len(keyframes)))
+    assert [k.id for k in front_end.keyframes(1)] == list(range(1, len(keyframes)))
 
 
 def test_corners_can_be_made_fewer_and_many_again(rig: Rig, measurements: list[Measurement]) -> None:

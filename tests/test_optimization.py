@@ -270,7 +270,8 @@ def test_an_imu_that_is_found_wrong_does_not_bend_the_trajectory(room_walk: Path
     """From 2.5 s on its biases are others: vision is refused for a second, and then believed, also in what it said."""
     source = open_source(room_walk)
     recorder = Recorder("walk")
-    odometry = Odometry(source.rig, CONFIG, on_step=recorder.add)
+    odometry = Odometry(source.rig, CONFIG)
+    odometry.subscribe(recorder.add)
     kinds = []
     for measurement in source:
         if isinstance(measurement, ImuSample) and measurement.stamp_ns - source.start_ns > 2_500_000_000:

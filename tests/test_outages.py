@@ -181,7 +181,7 @@ def test_a_window_that_fails_while_lost_glues_nothing(
 ) -> None:
     """In the dark and at the first images after it: lost stays lost, and what follows is another epoch."""
     config = Config.from_yaml("smoother: {lost_position_sigma_m: 0.05}")
-    optimise, start_ns = Window.optimise, next(e.stamp_ns for e in measurements if isinstance(e, FrameSet))
+    optimise, start_ns = Window.optimize, next(e.stamp_ns for e in measurements if isinstance(e, FrameSet))
 
     def fails_now_and_then(window: Window, followed: Sequence[int] = ()) -> None:
         if failing:
@@ -190,7 +190,7 @@ def test_a_window_that_fails_while_lost_glues_nothing(
         optimise(window, followed)
 
     failing: list[int] = []
-    monkeypatch.setattr(Window, "optimise", fails_now_and_then)
+    monkeypatch.setattr(Window, "optimize", fails_now_and_then)
     odometry, estimates = Odometry(open_source(walk_folder).rig, config), []
     for measurement in altered(measurements, START_S, START_S + 3.0, blackened):
         if isinstance(measurement, FrameSet) and (measurement.stamp_ns - start_ns) // MS in (5500, 6000, 6050):
@@ -416,7 +416,7 @@ def test_images_alone_do_not_make_a_standstill(walk_folder: Path, measurements: 
     source = open_source(walk_folder)
     start_ns, rng = source.start_ns, np.random.default_rng(0)
     still = [e for e in measurements if isinstance(e, FrameSet) and e.stamp_ns < start_ns + 900 * MS]
-    for shaking, at_rest in ((0.0, True), (1.0, False)):
+    for shaking, is_stationary in ((0.0, True), (1.0, False)):
         odometry = Odometry(source.rig)
         estimates = []
         for measurement in measurements:
@@ -428,8 +428,8 @@ def test_images_alone_do_not_make_a_standstill(walk_folder: Path, measurements: 
             estimates.append(odometry.process(measurement))
         estimates += odometry.finish()
         last = [e for e in estimates if e is not None][-1]
-        assert last.at_rest is at_rest
-        assert ("rest" in last.innovations) is at_rest
+        assert last.is_stationary is is_stationary
+        assert ("rest" in last.innovations) is is_stationary
 
 
 def test_ten_minutes_of_standing_drift_less_than_a_centimetre(
@@ -453,7 +453,7 @@ def test_ten_minutes_of_standing_drift_less_than_a_centimetre(
         estimates += [estimate for estimate in told if estimate is not None]
     odometry.finish()
     assert len(estimates) >= 1199
-    assert np.mean([e.at_rest for e in estimates]) > 0.9
+    assert np.mean([e.is_stationary for e in estimates]) > 0.9
     positions = np.array([e.nav_T_body[:3, 3] for e in estimates if e.nav_T_body is not None])
     assert len(positions) == len(estimates)
     assert np.linalg.norm(positions, axis=1).max() < 0.01

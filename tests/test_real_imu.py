@@ -11,7 +11,7 @@ from recordings import REAL_DATA
 from graphvio.arrays import Float
 from graphvio.backend.inertial import ImuBuffer
 from graphvio.backend.smoother import Smoother
-from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
+from graphvio.backend.states import InitialUncertainty, RigState, origin_covariance
 from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_exp, se3_inverse
 from graphvio.measurements.imu_interval import ImuInterval
@@ -72,10 +72,10 @@ class Beginning:
         off = np.linalg.cholesky(covariance) @ rng.standard_normal(6)
         velocity = SPEED_SIGMA * rng.standard_normal(3)
         smoother = Smoother(SmootherConfig(), Imu())
-        smoother.start(
+        smoother.initialise(
             self.stamps_ns[0],
             RigState(pose @ se3_exp(off), velocity, np.zeros(3), np.zeros(3)),
-            StartUncertainty(covariance, SPEED_SIGMA, GYRO_BIAS_SIGMA),
+            InitialUncertainty(covariance, SPEED_SIGMA, GYRO_BIAS_SIGMA),
         )
         return smoother
 
@@ -95,11 +95,11 @@ def test_the_gyros_bias_is_found(more_bias: Float) -> None:
     for k in range(1, STEPS + 1):
         smoother.extend(flight.stamps_ns[k], flight.intervals[k - 1])
         motion = flight.motion(k, rng)
-        if smoother.test(motion).accepted:
-            smoother.accept(motion)
+        if smoother.gate(motion).accepted:
+            smoother.add_motion(motion)
         else:
             refused += 1
-        smoother.settle({flight.stamps_ns[k]})
+        smoother.update({flight.stamps_ns[k]})
         errors.append(smoother.state().gyro_bias - flight.gyro_bias[k])
     assert np.abs(flight.gyro_bias).max(axis=0).min() > BIAS_AIM  # so that zero, the start, would not do
     assert np.abs(errors[STEPS // 2 :]).max() < BIAS_AIM

@@ -8,7 +8,7 @@ import pytest
 from graphvio.arrays import Float
 from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.backend.smoother_estimator import SmootherEstimator
-from graphvio.backend.states import StartUncertainty, origin_covariance
+from graphvio.backend.states import InitialUncertainty, origin_covariance
 from graphvio.config import Config
 from graphvio.geometry import se3, se3_exp, so3_exp, so3_log
 from graphvio.measurements.estimate import Status
@@ -96,7 +96,6 @@ def run(
         rig,
         config,
         lambda ns, kind, detail: out.events.append(((ns - BASE_NS) * 1e-9, kind, detail)),
-        lambda: None,
     )
     before_ns, before, true_before = BASE_NS, np.eye(4), swing.pose(0.0)
     for n in range(round(duration_s / STEP_S)):
@@ -104,18 +103,20 @@ def run(
         stamp_ns, true = BASE_NS + round(t * 1e9), swing.pose(t)
         used = n == 0
         if n == 0:
-            estimator.start(stamp_ns, synchroniser.initial_interval(stamp_ns))
+            estimator.initialise(stamp_ns, synchroniser.initial_interval(stamp_ns))
             if bias_error is not None:
                 state = replace(estimator.state(), gyro_bias=swing.gyro_bias + bias_error)
-                known = StartUncertainty(origin_covariance(state.nav_T_body[:3, :3], 0.25), 0.3, 0.001)
-                estimator._running.start(stamp_ns, state, known)
+                known = InitialUncertainty(origin_covariance(state.nav_T_body[:3, :3], 0.25), 0.3, 0.001)
+                estimator._running.initialise(stamp_ns, state, known)
         else:
             estimator.predict(stamp_ns, synchroniser.interval(before_ns, stamp_ns))
             if sigmas is not None:
                 measured = np.linalg.inv(true_before) @ true @ se3_exp(sigmas * rng.standard_normal(6))
                 motion = RelativeMotion(before_ns, stamp_ns, measured, np.diag(sigmas**2), np.zeros((6, 6)), 200)
-                used = estimator.use(VisualResult(motion, Quality.GOOD, "", {}), at_rest=False) is not None
-        out.status.append(estimator.update(stamp_ns, used, frozenset()))
+                used = (
+                    estimator.apply(VisualResult(motion, Quality.GOOD, "", {}), is_stationary=False).motion is not None
+                )
+        out.status.append(estimator.update(stamp_ns, used, frozenset()).status)
         state, told = estimator.state(), estimator.covariance
         rotation = state.nav_T_body[:3, :3]
         out.tilt_deg.append(float(np.rad2deg(np.arccos(min(rotation[2] @ true[2, :3], 1.0)))))

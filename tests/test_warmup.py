@@ -9,6 +9,7 @@ from graphvio import FrameSet, ImuSample, Odometry
 from graphvio.config import Config
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.simulation import default_rig, make_simulator
+from graphvio.slam.front_end import FrontEnd
 from graphvio.slam.keyframe import Keyframe
 from graphvio.warmup import warm_up
 
@@ -49,7 +50,7 @@ def test_no_kernel_is_compiled_after_the_warm_up() -> None:
     for rig in (simulator.rig, simulator.rig.without_imu()):
         odometry = Odometry(rig)
         keyframes: list[Keyframe] = []
-        odometry.on_keyframe(keyframes.append)
+        FrontEnd(odometry).on_keyframe(keyframes.append)
         for measurement in measurements if rig.imu is not None else framesets:
             odometry.process(measurement)
         odometry.finish()

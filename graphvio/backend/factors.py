@@ -1,4 +1,4 @@
-"""The smoother's factors besides those of vision, and the names of its variables."""
+"""Factors of the smoother other than those of vision, and the keys of its variables."""
 
 from __future__ import annotations
 
@@ -10,39 +10,41 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.noise import gaussian, isotropic
-from graphvio.backend.states import RigState, StartUncertainty
+from graphvio.backend.states import InitialUncertainty, RigState
 from graphvio.rig import Imu
 
 _ACCEL_BIAS_SIGMA = 0.2
-_REST_SIGMA_M_S = 0.005  # of the velocity while the images do not move
+_ZERO_VELOCITY_SIGMA_M_S = 0.005  # of the velocity while the images do not move
 
 
 def x(k: int) -> int:
-    """The pose of state k, ``nav_T_body``."""
+    """Return the key of the pose of state k, ``nav_T_body``."""
     return int(gtsam.symbol("x", k))
 
 
 def v(k: int) -> int:
-    """The velocity of state k, in nav."""
+    """Return the key of the velocity of state k, in nav."""
     return int(gtsam.symbol("v", k))
 
 
 def b(k: int) -> int:
-    """The biases of state k: accelerometer, gyro."""
+    """Return the key of the biases of state k: accelerometer, gyro."""
     return int(gtsam.symbol("b", k))
 
 
 def r(k: int) -> int:
-    """The pose of state k as vision sees it, see `graphvio.backend.reference_views.ReferenceViews`."""
+    """Return the key of the pose of state k as vision sees it, see `ReferenceViews`."""
     return int(gtsam.symbol("r", k))
 
 
-def first_state(k: int, state: RigState, known: StartUncertainty, with_imu: bool) -> Iterator[gtsam.NonlinearFactor]:
-    """What is known of the first state."""
-    yield gtsam.PriorFactorPose3(x(k), gtsam.Pose3(state.nav_T_body), gaussian(known.pose))
+def first_state(
+    k: int, state: RigState, uncertainty: InitialUncertainty, with_imu: bool
+) -> Iterator[gtsam.NonlinearFactor]:
+    """Yield the priors of the first state."""
+    yield gtsam.PriorFactorPose3(x(k), gtsam.Pose3(state.nav_T_body), gaussian(uncertainty.pose))
     if with_imu:
-        yield gtsam.PriorFactorVector(v(k), state.velocity_nav, isotropic(3, known.velocity_m_s))
-        sigmas = np.repeat([_ACCEL_BIAS_SIGMA, known.gyro_bias_rad_s], 3)
+        yield gtsam.PriorFactorVector(v(k), state.velocity_nav, isotropic(3, uncertainty.velocity_m_s))
+        sigmas = np.repeat([_ACCEL_BIAS_SIGMA, uncertainty.gyro_bias_rad_s], 3)
         bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
         yield gtsam.PriorFactorConstantBias(b(k), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
@@ -50,7 +52,7 @@ def first_state(k: int, state: RigState, known: StartUncertainty, with_imu: bool
 def constant_velocity(
     i: int, j: int, motion: Float, dt: float, after_s: float, rate_sigmas: Float, accel_sigmas: Float
 ) -> gtsam.NonlinearFactor:
-    """Velocity and rate go on, but for white accelerations (eq. 11).
+    """Predict constant velocity and angular rate up to white accelerations (eq. 11).
 
     Args:
         i: a state.
@@ -70,7 +72,7 @@ def constant_velocity(
 def imu_without_samples(
     i: int, j: int, dt: float, accel_sigma_m_s2: float, imu: Imu, noise_scale: float
 ) -> Iterator[gtsam.NonlinearFactor]:
-    """Velocity and biases go on as they are, but for a white acceleration and the biases' walk."""
+    """Yield factors of a constant velocity up to white accelerations, and of the biases' random walk."""
     yield gtsam.BetweenFactorVector(v(i), v(j), np.zeros(3), isotropic(3, accel_sigma_m_s2 * dt))
     walk = noise_scale * np.sqrt(dt)
     sigmas = np.repeat([walk * imu.accel_random_walk, walk * imu.gyro_random_walk], 3)
@@ -79,24 +81,23 @@ def imu_without_samples(
     )
 
 
-def rest(k: int) -> gtsam.NonlinearFactor:
-    """State k stands still."""
-    return gtsam.PriorFactorVector(v(k), np.zeros(3), rest_noise())
+def zero_velocity(k: int) -> gtsam.NonlinearFactor:
+    """Return a zero-velocity update of state k."""
+    return gtsam.PriorFactorVector(v(k), np.zeros(3), zero_velocity_noise())
 
 
-def rest_noise() -> gtsam.noiseModel.Isotropic:
-    """Of a velocity that is thought to be zero."""
-    return isotropic(3, _REST_SIGMA_M_S)
+def zero_velocity_noise() -> gtsam.noiseModel.Isotropic:
+    """Return the noise of a zero-velocity update."""
+    return isotropic(3, _ZERO_VELOCITY_SIGMA_M_S)
 
 
-def anchored_position(
+def position_reset(
     keys: list[int], covariance: Float, sigma_m: float, values: gtsam.Values
 ) -> tuple[Float, gtsam.NonlinearFactor]:
-    """Make a pose's position certain but for what it has in common with the other variables.
+    """Make a position certain up to its correlation with other variables, which stays as it is (section 5).
 
-    Given these, the position is normally distributed about a linear function of them. The factor narrows that
-    distribution about its mean: what is known of the others stays the same, and the position keeps its correlation
-    with them.
+    Given the others, the position is normally distributed about a linear function of them. The factor narrows that
+    distribution about its mean, so that the marginal of the others does not change.
 
     Args:
         keys: the pose, then the others.

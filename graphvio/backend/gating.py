@@ -20,7 +20,7 @@ def relative_covariance(a_T_b: Float, joint: Float) -> Float:
     return np.asarray(jacobian @ joint @ jacobian.T)
 
 
-def gate(
+def gate_motion(
     measured: Float,
     measured_covariance: Float,
     predicted: Float,
@@ -29,10 +29,10 @@ def gate(
 ) -> GateResult:
     """Test a motion (4, 4) against a predicted one; covariances (6, 6) in the frame that it ends in."""
     innovation = se3_log(se3_inverse(predicted) @ measured)
-    return judged(innovation, measured_covariance + predicted_covariance, probability)
+    return gate_innovation(innovation, measured_covariance + predicted_covariance, probability)
 
 
-def judged(innovation: Float, covariance: Float, probability: float) -> GateResult:
+def gate_innovation(innovation: Float, covariance: Float, probability: float) -> GateResult:
     """Test an innovation (M,) with a covariance (M, M)."""
     statistic = float(innovation @ np.linalg.solve(covariance, innovation))
     threshold = chi_square_quantile(probability, len(innovation))

@@ -1,4 +1,4 @@
-"""The first attitude and gyro bias, from the accelerometer's and gyro's samples around the first frameset."""
+"""First attitude and gyro bias, from the IMU samples around the first frameset."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from graphvio.config.stages import InitialisationConfig
 from graphvio.geometry import so3_exp
 from graphvio.measurements.imu_interval import ImuInterval
 
-_MIN_REST_S = 0.3
-_SPEED_CHANGE_SIGMA_M_S = 1.5  # a start may be anywhere in a take-off or a braking
+_MIN_STANDSTILL_S = 0.3
+_SPEED_CHANGE_SIGMA_M_S = 1.5  # the rig may be speeding up or braking
 _ACCEL_BIAS_SIGMA_M_S2 = 0.15
 _UNKNOWN_GYRO_BIAS_SIGMA = 0.1
 _STEEP = 0.8
@@ -21,35 +21,35 @@ _STEEP = 0.8
 
 @dataclass(frozen=True, eq=False)
 class InitialAttitude:
-    """What is known before vision has said anything.
+    """Attitude and gyro bias before vision has measured anything.
 
     Attributes:
         nav_R_body: (3, 3), gravity down, heading zero.
         tilt_sigma_rad: of roll and pitch.
         gyro_bias: (3,) rad/s.
         gyro_bias_sigma: rad/s.
-        at_rest: whether the rig stood still.
+        is_stationary: whether the rig stood still.
     """
 
     nav_R_body: Float
     tilt_sigma_rad: float
     gyro_bias: Float
     gyro_bias_sigma: float
-    at_rest: bool
+    is_stationary: bool
 
 
 def initial_attitude(interval: ImuInterval, at_s: float, config: InitialisationConfig) -> InitialAttitude:
-    """Attitude at an instant of an interval of the IMU, ``at_s`` seconds after the interval's start.
+    """Estimate the attitude at an instant of an IMU interval, ``at_s`` seconds from its beginning.
 
-    At rest the mean specific force is gravity and the mean rate is the gyro's bias. In motion, the specific force,
-    turned by the gyro into the instant's frame, still averages to gravity but for the change of speed, whose
+    At a standstill the mean specific force is gravity and the mean rate is the gyro's bias. In motion, the specific
+    force, turned by the gyro into the instant's frame, still averages to gravity up to the change of speed, whose
     share falls with the duration; the bias is then left to the smoother.
     """
     duration = float(interval.steps_s.sum())
     mean_force = interval.linear_acceleration.mean(axis=0)
-    at_rest = duration >= _MIN_REST_S and is_at_rest(interval, config)
+    is_stationary = duration >= _MIN_STANDSTILL_S and shows_standstill(interval, config)
     tilt_sigma = _ACCEL_BIAS_SIGMA_M_S2 / GRAVITY_M_S2
-    if at_rest:
+    if is_stationary:
         samples = len(interval.steps_s)
         bias_sigma = max(3.0 * _spread(interval.angular_velocity) / np.sqrt(samples), 1e-4)
         return InitialAttitude(level(mean_force), tilt_sigma, interval.mean_rate, float(bias_sigma), True)
@@ -72,8 +72,8 @@ def initial_attitude(interval: ImuInterval, at_s: float, config: InitialisationC
     )
 
 
-def is_at_rest(interval: ImuInterval, config: InitialisationConfig) -> bool:
-    """Whether an interval of the IMU shows nothing but gravity and noise; a short one may by chance."""
+def shows_standstill(interval: ImuInterval, config: InitialisationConfig) -> bool:
+    """Whether an IMU interval shows nothing but gravity and noise; a short one may by chance."""
     return bool(
         _spread(interval.angular_velocity) < config.static_gyro_rad_s
         and _spread(interval.linear_acceleration) < config.static_accel_m_s2
@@ -83,12 +83,12 @@ def is_at_rest(interval: ImuInterval, config: InitialisationConfig) -> bool:
 
 
 def _spread(samples: Float) -> float:
-    """The largest standard deviation of a column of (N, 3)."""
+    """Return the largest standard deviation of a column of (N, 3)."""
     return float(np.sqrt(samples.var(axis=0).max()))
 
 
 def level(up: Float) -> Float:
-    """``nav_R_body`` (3, 3) that turns a direction (3,) of body upright, with heading zero.
+    """Return ``nav_R_body`` (3, 3) that turns a direction (3,) of body upright, with heading zero.
 
     Heading is that of body's x axis, or where x is steep, of its z axis.
     """

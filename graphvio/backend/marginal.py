@@ -46,7 +46,7 @@ class Marginal:
         solution, failed = lapack.dtrtrs(self.square_root, self.right_side)
         return None if failed else np.asarray(solution)
 
-    def settled(self) -> Marginal:
+    def at_solution(self) -> Marginal:
         """The same once the step has been taken."""
         return Marginal(self.columns, self.square_root, np.zeros(len(self.right_side)))
 
@@ -59,7 +59,7 @@ class Marginal:
     def extended(
         self, factors: Sequence[gtsam.GaussianFactor], last: Sequence[int], dims: Mapping[int, int]
     ) -> Marginal | None:
-        """The joint distribution with further factors and their variables.
+        """Return the joint distribution with more factors and their variables.
 
         Args:
             factors: linearised at the present values.
@@ -76,12 +76,12 @@ class Marginal:
         rows = np.zeros((len(self.right_side) + sum(len(right) for _, right in jacobians), size + 1))
         if len(rows) < size:
             return None
-        block, rest = np.split(rows, [len(self.right_side)])
+        block, remaining = np.split(rows, [len(self.right_side)])
         block[:, size] = self.right_side
         for key, at in self.columns.items():
             block[:, columns[key]] = self.square_root[:, at]
         for factor, (jacobian, right) in zip(factors, jacobians, strict=True):
-            block, rest = np.split(rest, [len(right)])
+            block, remaining = np.split(remaining, [len(right)])
             block[:, size] = right
             start = 0
             for key in list(factor.keys()):

@@ -9,7 +9,7 @@ from graphvio.arrays import Float
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.kernels import kernel
 
-_LEAST_OWN_SHARE = 0.001  # of each direction of a motion's covariance: keeps it positive definite
+_MIN_OWN_SHARE = 0.001  # of each direction of a motion's covariance: keeps it positive definite
 
 
 def gaussian(covariance: Float) -> gtsam.noiseModel.Gaussian:
@@ -44,5 +44,5 @@ def own_covariance(covariance: Float, shared: Float) -> Float:
     white = np.linalg.solve(root, np.linalg.solve(root, shared).T)
     shares, axes = np.linalg.eigh(np.eye(6) - 0.5 * (white + white.T))
     axes = root @ np.ascontiguousarray(axes)
-    own: Float = (axes * np.maximum(shares, _LEAST_OWN_SHARE)) @ np.ascontiguousarray(axes.T)
+    own: Float = (axes * np.maximum(shares, _MIN_OWN_SHARE)) @ np.ascontiguousarray(axes.T)
     return own

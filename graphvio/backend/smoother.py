@@ -1,7 +1,7 @@
-"""The estimator: a fixed-lag smoother over poses, velocities and IMU biases at frameset times (section 5).
+"""A fixed-lag smoother over poses, velocities and IMU biases at frameset times (section 5).
 
-It has the semantics of the paper's filter. `extend` predicts, from the IMU or by constant velocity (eq. 11); `test`
-is the chi-square test of a vision measurement's innovation; `accept` and `settle` update; `start` resets.
+It has the semantics of the paper's filter. `extend` predicts, from the IMU or by constant velocity (eq. 11); `gate`
+tests the innovation of a relative motion; `add_motion` and `update` are the measurement update; `initialise` resets.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.factors import (
-    anchored_position,
     b,
     constant_velocity,
     first_state,
     imu_without_samples,
-    rest,
-    rest_noise,
+    position_reset,
     v,
     x,
+    zero_velocity,
+    zero_velocity_noise,
 )
-from graphvio.backend.gating import excess, gate, judged, relative_covariance
+from graphvio.backend.gating import excess, gate_innovation, gate_motion, relative_covariance
 from graphvio.backend.noise import gaussian, robust
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.reference_views import ReferenceViews
-from graphvio.backend.states import RigState, StartUncertainty, StateCovariance
+from graphvio.backend.states import InitialUncertainty, RigState, StateCovariance
 from graphvio.backend.window import SOLVER_ERRORS, Window
 from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
@@ -38,12 +38,17 @@ from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Imu
 
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
-_ANCHOR_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
-_MOST_ADVANCED = 2  # framesets in a row for which the window is not solved as a whole
+_RESET_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
+_MAX_ADVANCED = 2  # framesets in a row for which the window is not solved as a whole
 
 
 class Smoother:
-    """Poses, and with an IMU velocities and biases, over the last seconds."""
+    """Poses, and with an IMU velocities and biases, over the last seconds.
+
+    Args:
+        config: Configuration of the smoother.
+        imu: Noise of the IMU, or None without one.
+    """
 
     def __init__(self, config: SmootherConfig, imu: Imu | None) -> None:
         self._config = config
@@ -58,7 +63,7 @@ class Smoother:
         self._previous_motion = np.zeros(6)  # tangent per second
         self._constrained_ns = 0  # stamp of the newest state whose motion was measured
         self._seen_ns: int | None = None  # the same, by vision
-        self._beside = np.zeros((6, 6))  # covariance of nav itself, left of its poses, that is told but not estimated
+        self._nav_covariance = np.zeros((6, 6))  # of nav itself, left of its poses: reported, but not estimated
         self._rate_sigmas = np.zeros(2)  # of `_previous_motion`: rad/s and m/s
 
     @property
@@ -71,8 +76,8 @@ class Smoother:
         """Stamp of the newest state."""
         return self._stamps[-1]
 
-    def start(self, stamp_ns: int, state: RigState, uncertainty: StartUncertainty) -> None:
-        """Begin, or begin anew, with one state."""
+    def initialise(self, stamp_ns: int, state: RigState, uncertainty: InitialUncertainty) -> None:
+        """Replace the window by one with a single state."""
         self._window, self._advanced = self._new_window(), 0
         self._stamps, self._index_of, self._views = [], {}, ReferenceViews()
         velocity_body = state.nav_T_body[:3, :3].T @ state.velocity_nav
@@ -81,12 +86,12 @@ class Smoother:
         k = self._append(stamp_ns, state)
         self._constrained_ns, self._seen_ns = stamp_ns, None
         to_nav = se3_adjoint(state.nav_T_body)
-        self._beside = to_nav @ uncertainty.beside @ to_nav.T
+        self._nav_covariance = to_nav @ uncertainty.of_nav @ to_nav.T
         for factor in first_state(k, state, uncertainty, self.has_imu):
             self._window.add(factor)
 
     def extend(self, stamp_ns: int, interval: ImuInterval | None) -> RigState:
-        """Predict the next state and append it; without an interval of the IMU, by constant velocity."""
+        """Predict the next state and append it: by the IMU, or without an interval of it by constant velocity."""
         i = self._index_of[self.latest_ns]
         dt = (stamp_ns - self.latest_ns) * 1e-9
         before = self.state()
@@ -112,11 +117,11 @@ class Smoother:
         return stamp_ns in self._index_of
 
     def pose(self, stamp_ns: int) -> Float:
-        """``nav_T_body`` (4, 4) of a state in the window; of one that was not kept, as when it was last solved."""
+        """Return ``nav_T_body`` (4, 4) of a state in the window, as it was last solved for."""
         return np.asarray(self._window.values.atPose3(x(self._index_of[stamp_ns])).matrix())
 
     def state(self) -> RigState:
-        """The newest state."""
+        """Return the newest state."""
         k = self._index_of[self.latest_ns]
         values = self._window.values
         pose = np.asarray(values.atPose3(x(k)).matrix())
@@ -131,41 +136,41 @@ class Smoother:
         )
 
     def latest_rate(self) -> Float | None:
-        """Mean angular rate (3,) rad/s of body between the two newest states, or None when there is one."""
+        """Return the mean angular rate (3,) rad/s of body between the two newest states, or None when there is one."""
         return self._previous_motion[:3] if len(self._stamps) > 1 else None
 
     def covariance(self) -> Float:
-        """Covariance (6, 6) of the newest pose, tangent ``[rotation, translation]`` in body."""
-        return self._with_beside(self._window.joint_covariance([x(self._index_of[self.latest_ns])]))
+        """Return the covariance (6, 6) of the newest pose, tangent ``[rotation, translation]`` in body."""
+        return self._with_nav(self._window.joint_covariance([x(self._index_of[self.latest_ns])]))
 
     def state_covariance(self) -> StateCovariance:
-        """How well the newest state is known."""
+        """Return the covariance of the newest state."""
         k = self._index_of[self.latest_ns]
         if not self.has_imu:
             return StateCovariance(self.covariance())
         joint = self._window.joint_covariance([x(k), v(k), b(k)])
         return StateCovariance(
-            pose=self._with_beside(joint[:6, :6]),
+            pose=self._with_nav(joint[:6, :6]),
             velocity=joint[6:9, 6:9],
             gyro_bias=joint[12:, 12:],
             accel_bias=joint[9:12, 9:12],
         )
 
     def covariance_since(self, stamp_ns: int) -> Float:
-        """Covariance (6, 6) of the motion from a state that was kept to the newest one, in the newest body frame."""
+        """Return the covariance (6, 6) of the motion from a kept state to the newest one, in the newest body frame."""
         i, j = self._index_of[stamp_ns], self._index_of[self.latest_ns]
         if i == j:
             return np.zeros((6, 6))
         relative = se3_inverse(self.pose(stamp_ns)) @ self.pose(self.latest_ns)
         return relative_covariance(relative, self._window.joint_covariance([x(i), x(j)]))
 
-    def test(self, motion: RelativeMotion) -> GateResult:
-        """Chi-square test of a motion that ends in the newest state, against the window's prediction."""
+    def gate(self, motion: RelativeMotion) -> GateResult:
+        """Test the innovation of a motion that ends in the newest state against the window's prediction."""
         newest = x(self._index_of[motion.stamp_ns])
         reference, covariance = self._views.seen(self._index_of[motion.reference_stamp_ns], motion)
         nav_T_reference = np.asarray(self._window.values.atPose3(reference).matrix())
         predicted = se3_inverse(nav_T_reference) @ self.pose(motion.stamp_ns)
-        return gate(
+        return gate_motion(
             motion.reference_T_current,
             covariance,
             predicted,
@@ -173,15 +178,15 @@ class Smoother:
             self._config.gate_probability,
         )
 
-    def test_rest(self) -> GateResult:
-        """Chi-square test of a velocity of zero."""
+    def gate_zero_velocity(self) -> GateResult:
+        """Test the innovation of a velocity of zero."""
         k = self._index_of[self.latest_ns]
-        covariance = self._window.joint_covariance([v(k)]) + rest_noise().covariance()
-        return judged(-self.state().velocity_nav, covariance, self._config.gate_probability)
+        covariance = self._window.joint_covariance([v(k)]) + zero_velocity_noise().covariance()
+        return gate_innovation(-self.state().velocity_nav, covariance, self._config.gate_probability)
 
-    def accept_rest(self) -> None:
-        """Insert that the newest state stands still."""
-        self._window.add(rest(self._index_of[self.latest_ns]))
+    def add_zero_velocity(self) -> None:
+        """Insert a zero-velocity update of the newest state."""
+        self._window.add(zero_velocity(self._index_of[self.latest_ns]))
 
     def excess_acceleration(self, motion: RelativeMotion) -> float | None:
         """The acceleration, m/s^2, that a motion which ends in the newest state asks for over the newest step, if it is
@@ -195,30 +200,30 @@ class Smoother:
         return excess(accel, motion.covariance[3:, 3:] / dt**4, self._config.max_accel_m_s2)
 
     def reset_position(self) -> None:
-        """Forget what is not known of the position but through velocity, attitude and biases.
+        """Reset the position's uncertainty up to its correlation with velocity, attitude and biases (section 5).
 
-        The position's own uncertainty grows without bound, which no state of the window can ever say less of
-        (section 5). It stays in what `covariance` tells.
+        The position's own uncertainty grows without bound, and no later measurement reduces it. It remains part of what
+        `covariance` returns.
         """
         k = self._index_of[self.latest_ns]
         keys = [x(k), v(k), b(k)] if self.has_imu else [x(k)]
-        forgotten, factor = anchored_position(
-            keys, self._window.joint_covariance(keys), _ANCHOR_SIGMA_M, self._window.values
+        forgotten, factor = position_reset(
+            keys, self._window.joint_covariance(keys), _RESET_SIGMA_M, self._window.values
         )
         nav_R_body = self.pose(self.latest_ns)[:3, :3]
-        self._beside[3:, 3:] += nav_R_body @ forgotten @ nav_R_body.T
+        self._nav_covariance[3:, 3:] += nav_R_body @ forgotten @ nav_R_body.T
         self._window.add(factor)
 
     def _new_window(self) -> Window:
-        return Window(least_iterations=1 if self._config.huber_probability == 1.0 else 2)
+        return Window(min_iterations=1 if self._config.huber_probability == 1.0 else 2)
 
-    def _with_beside(self, covariance: Float) -> Float:
-        """The newest pose's covariance (6, 6), in body, with what is told beside the window."""
+    def _with_nav(self, covariance: Float) -> Float:
+        """Add the covariance of nav to that of the newest pose (6, 6), in body."""
         from_nav = se3_adjoint(se3_inverse(self.pose(self.latest_ns)))
-        return np.asarray(covariance + from_nav @ self._beside @ from_nav.T)
+        return np.asarray(covariance + from_nav @ self._nav_covariance @ from_nav.T)
 
-    def accept(self, motion: RelativeMotion) -> None:
-        """Insert a motion that ends in the newest state."""
+    def add_motion(self, motion: RelativeMotion) -> None:
+        """Insert a relative motion that ends in the newest state."""
         self._constrained_ns = self._seen_ns = motion.stamp_ns
         self._rate_sigmas = np.zeros(2)
         k = self._index_of[motion.reference_stamp_ns]
@@ -233,9 +238,11 @@ class Smoother:
             )
         )
 
-    def settle(self, keep: Iterable[int]) -> list[tuple[int, Float]]:
-        """Correct the newest states by the newest factors; every third time, or where they change by much, solve the
-        window as a whole and marginalise what is older than the lag.
+    def update(self, keep: Iterable[int]) -> list[tuple[int, Float]]:
+        """Update the newest states by the newest factors.
+
+        Every third time, or where they change by much, the window is optimised as a whole, and what is older than the
+        lag is marginalised.
 
         Args:
             keep: stamps of states that stay in the window, and whose covariance will be asked for.
@@ -248,9 +255,9 @@ class Smoother:
         """
         keep = frozenset(keep)
         followed = self._followed(keep)
-        advanced = self._advanced < _MOST_ADVANCED and self._window.advance(followed)
+        advanced = self._advanced < _MAX_ADVANCED and self._window.advance(followed)
         if not advanced:
-            self._window.optimise(followed)
+            self._window.optimize(followed)
         self._advanced = self._advanced + 1 if advanced else 0
         if len(self._stamps) > 1:
             dt = (self._stamps[-1] - self._stamps[-2]) * 1e-9
@@ -258,20 +265,20 @@ class Smoother:
             self._previous_motion = se3_log(step) / dt
         return [] if advanced else self._forget(self.latest_ns - round(self._config.lag_s * 1e9), keep)
 
-    def solve(self) -> None:
-        """Solve the window as a whole, so that what is known now corrects every state in it.
+    def optimize(self) -> None:
+        """Optimise the window as a whole.
 
         Raises:
-            WindowError: if it cannot be solved.
+            WindowError: if it has no unique solution.
         """
-        self._window.optimise(self._followed(frozenset()))
+        self._window.optimize(self._followed(frozenset()))
         self._advanced = 0
 
     def all_poses(self) -> list[tuple[int, Float]]:
-        """Stamps and poses of the window, in time order; where it can be solved, as they are by that."""
+        """Return stamps and poses of the window, in time order, optimised as a whole where that is possible."""
         if self._advanced:
             with suppress(*SOLVER_ERRORS):
-                self.solve()
+                self.optimize()
         return [(stamp, self.pose(stamp)) for stamp in self._stamps]
 
     def _append(self, stamp_ns: int, state: RigState) -> int:
@@ -288,7 +295,7 @@ class Smoother:
         return k
 
     def _link_by_constant_velocity(self, i: int, j: int, motion: Float, dt: float) -> None:
-        """Eq. (11): velocity and rate go on, but for white accelerations."""
+        """Tie two states by constant velocity and angular rate, eq. (11)."""
         config = self._config
         after_s = (self.latest_ns - self._constrained_ns) * 1e-9
         accelerations = np.array([config.motion_angular_accel_sigma_rad_s2, config.motion_accel_sigma_m_s2])
@@ -300,7 +307,7 @@ class Smoother:
                 self._window.add(factor)
 
     def _followed(self, keep: frozenset[int]) -> list[int]:
-        """Variables that the next motion and the next interval of the IMU will be tied to, or that are asked for."""
+        """Return the variables that the next factors will be tied to, or whose covariance will be needed."""
         stamps = sorted(keep & self._index_of.keys() - {self.latest_ns})
         keys = [key for stamp in stamps for key in self._views.keys(self._index_of[stamp])]
         newest = self._index_of[self.latest_ns]

@@ -1,4 +1,4 @@
-"""The state of the rig at one instant, and how well a first one is known."""
+"""The state of the rig at one instant, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ class RigState:
 
 
 @dataclass(frozen=True, eq=False)
-class StartUncertainty:
-    """How well a start is known.
+class InitialUncertainty:
+    """Uncertainty of a first state.
 
     Attributes:
         pose: (6, 6) covariance of the pose, tangent ``[rotation, translation]`` in body.
         velocity_m_s: standard deviation of each component.
         gyro_bias_rad_s: standard deviation of each component.
-        beside: (6, 6) what is to be told of the pose beyond that, such as the doubt about where an epoch begins:
-            nothing that comes later can say more about it, so it is no part of the estimation.
+        of_nav: (6, 6) More covariance of the pose that is reported but not estimated, such as the uncertainty of
+            where an epoch begins: no later measurement can reduce it.
     """
 
     pose: Float
     velocity_m_s: float
     gyro_bias_rad_s: float
-    beside: Float = field(default_factory=lambda: np.zeros((6, 6)))
+    of_nav: Float = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 @dataclass(frozen=True, eq=False)
 class StateCovariance:
-    """How well the newest state is known; None for what is not estimated.
+    """Covariance of the newest state; None for what is not estimated.
 
     Attributes:
         pose: (6, 6), tangent ``[rotation, translation]`` in body.
@@ -65,25 +65,25 @@ class StateCovariance:
 
 
 def origin_covariance(nav_R_body: Float, tilt_sigma_rad: float) -> Float:
-    """Covariance (6, 6) of a pose whose position and heading define nav, and whose roll and pitch are measured."""
+    """Return the covariance (6, 6) of a pose that defines position and heading of nav, and measures roll and pitch."""
     return _origin_covariance(nav_R_body, np.eye(2) * tilt_sigma_rad**2)
 
 
 def as_origin(nav_R_body: Float, covariance: Float) -> tuple[Float, Float]:
-    """A pose's covariance (6, 6) as that of a pose that defines nav, and what it has beside that.
+    """Split a pose's covariance (6, 6) into that of a pose that defines nav, and the remaining part.
 
     Returns:
-        With its roll and pitch, and with its heading and position; what links the two is left out.
+        (6, 6) of roll and pitch, and (6, 6) of heading and position; correlations between the two are left out.
     """
     about_nav = nav_R_body @ covariance[:3, :3] @ nav_R_body.T
-    beside = np.zeros((6, 6))
-    beside[:3, :3] = about_nav[2, 2] * np.outer(nav_R_body[2], nav_R_body[2])
-    beside[3:, 3:] = covariance[3:, 3:]
-    return _origin_covariance(nav_R_body, about_nav[:2, :2]), beside
+    of_nav = np.zeros((6, 6))
+    of_nav[:3, :3] = about_nav[2, 2] * np.outer(nav_R_body[2], nav_R_body[2])
+    of_nav[3:, 3:] = covariance[3:, 3:]
+    return _origin_covariance(nav_R_body, about_nav[:2, :2]), of_nav
 
 
 def _origin_covariance(nav_R_body: Float, tilt: Float) -> Float:
-    """Tilt's covariance (2, 2) is about nav's horizontal axes."""
+    """Return the covariance (6, 6) in body for a covariance (2, 2) of tilt about nav's horizontal axes."""
     about_nav = np.diag([0.0, 0.0, _HEADING_SIGMA_RAD**2])
     about_nav[:2, :2] = tilt
     covariance = np.zeros((6, 6))

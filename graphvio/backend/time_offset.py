@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.gating import judged
+from graphvio.backend.gating import gate_innovation
 from graphvio.backend.noise import own_covariance
 from graphvio.geometry import so3_exp, so3_log
 from graphvio.kernels import kernel, put
@@ -114,7 +114,7 @@ class TimeOffsetFilter:
         covariance = covariance + (interval.steps_s.sum() * self._gyro_variance + change**2) * np.eye(3)
         innovation = residual - by_offset * (self._mean[0] - error_s)
         spread = covariance + jacobian @ self._covariance @ jacobian.T
-        if not judged(innovation, spread, _GATE_PROBABILITY).accepted:
+        if not gate_innovation(innovation, spread, _GATE_PROBABILITY).accepted:
             return
         gain = np.linalg.solve(spread, jacobian @ self._covariance).T
         self._mean = self._mean + gain @ innovation

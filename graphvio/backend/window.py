@@ -1,4 +1,4 @@
-"""A fixed-lag window of a factor graph: optimised as a whole, its oldest states marginalised exactly.
+"""A fixed-lag window of a factor graph, optimised as a whole, whose oldest states are marginalised exactly.
 
 Factors and values are kept here, outside gtsam's solvers, so that the window can always be rebuilt.
 """
@@ -30,19 +30,19 @@ class Window:
     """Nonlinear factors and the present values of their variables.
 
     Args:
-        least_iterations: in each optimisation; robust kernels need two, as the first weighs new factors by how far the
+        min_iterations: in each optimisation; robust kernels need two, as the first weighs new factors by how far the
             start is off.
     """
 
-    def __init__(self, least_iterations: int = 1) -> None:
-        self._least_iterations = least_iterations
+    def __init__(self, min_iterations: int = 1) -> None:
+        self._min_iterations = min_iterations
         self.values = gtsam.Values()
         self._graph = gtsam.NonlinearFactorGraph()
         self._involved: dict[int, frozenset[int]] = {}  # slot of the graph -> variables of the factor in it
         self._free: list[int] = []  # slots
         self._marginal: Marginal | None = None  # of the variables that were eliminated last, and some added since
         self._unknown: list[int] = []  # slots of the factors that it does not know
-        self._settled: frozenset[int] = frozenset()  # variables of all other factors
+        self._known_keys: frozenset[int] = frozenset()  # variables of all other factors
         self._cholesky_suffices = True
         self._dims: dict[int, int] = {}  # of variables; to ask gtsam is slow
 
@@ -50,7 +50,7 @@ class Window:
         """Insert a factor; its variables must have values."""
         self._unknown.append(self._insert(factor))
 
-    def optimise(self, followed: Sequence[int] = ()) -> None:
+    def optimize(self, followed: Sequence[int] = ()) -> None:
         """Gauss-Newton from the present values.
 
         Args:
@@ -69,8 +69,8 @@ class Window:
                 if not np.isfinite(largest):
                     raise WindowError("the window's solution is not finite")
                 self.values = self.values.retract(step)
-                self._marginal = self._marginal and self._marginal.settled()
-                if largest < _CONVERGED and iteration >= self._least_iterations:
+                self._marginal = self._marginal and self._marginal.at_solution()
+                if largest < _CONVERGED and iteration >= self._min_iterations:
                     break
         except RuntimeError as error:
             self.values, self._marginal = values, None
@@ -84,12 +84,12 @@ class Window:
         staying as they are: a step of a filter, whose prior is the window's exact marginal.
 
         Args:
-            followed: the same as for `optimise`, some of these variables, for the next time.
+            followed: the same as for `optimize`, some of these variables, for the next time.
 
         Returns:
             Whether that was possible. Where it was not, or the step is too long for a linear one, nothing has changed.
         """
-        if self._least_iterations > 1:
+        if self._min_iterations > 1:
             return False
         marginal = self._extended_marginal(followed)
         step = None if marginal is None else marginal.step()
@@ -99,7 +99,7 @@ class Window:
         for key, at in marginal.columns.items():
             delta.insert(key, step[at])
         self.values = self.values.retract(delta)
-        self._take(marginal.of_last(followed).settled())
+        self._take(marginal.of_last(followed).at_solution())
         return True
 
     def joint_covariance(self, keys: Sequence[int]) -> Float:
@@ -152,7 +152,7 @@ class Window:
                 self._insert(gtsam.LinearContainerFactor(marginal, self.values))
         for key in leaving:
             self.values.erase(key)
-        self._settled -= leaving
+        self._known_keys -= leaving
 
     def _insert(self, factor: gtsam.NonlinearFactor) -> int:
         """Put a factor into a free slot of the graph, and tell which."""
@@ -197,14 +197,14 @@ class Window:
             return None
         followed = self._marginal.columns.keys()
         touched = frozenset().union(*(self._involved[slot] for slot in self._unknown))
-        if touched & self._settled - followed or not followed | touched >= set(last):
+        if touched & self._known_keys - followed or not followed | touched >= set(last):
             return None
         linear = [self._graph.at(slot).linearize(self.values) for slot in self._unknown]
         return self._marginal.extended(linear, last, self._known_dims(followed | touched))
 
     def _take(self, marginal: Marginal | None) -> None:
         """Keep a marginal that knows of all factors."""
-        self._settled |= frozenset().union(*(self._involved[slot] for slot in self._unknown))
+        self._known_keys |= frozenset().union(*(self._involved[slot] for slot in self._unknown))
         self._marginal, self._unknown = marginal, []
 
     def _known_dims(self, keys: Iterable[int]) -> dict[int, int]:

@@ -120,8 +120,8 @@ def learn_from_nothing(motion: Refined) -> None:
     alignment.learn()
 
 
-def misplaced(rig: Rig, pair: int, misalignment: Misalignment) -> str:
-    """How far a pair is from where the rig has it, relative to the first pair, as a clause."""
+def describe(rig: Rig, pair: int, misalignment: Misalignment) -> str:
+    """Describe how far a pair is from where the rig has it, relative to the first pair, as a clause."""
     adjoint = se3_adjoint(np.ascontiguousarray(rig.pairs[0].left.cam_T_body))
     turned, moved = np.split(adjoint @ misalignment.tangent, 2)
     covariance = adjoint @ misalignment.covariance @ adjoint.T

@@ -146,13 +146,13 @@ class VisualFrontend:
             reports,
             alternatives=tuple(side.motion for side in sides) if len(sides) > 1 else (),
             own=own,
-            at_rest=resting,
+            is_stationary=resting,
             frozen=frozen.pairs,
             stage_ms=watch.stage_ms,
         )
 
-    def rekey(self) -> None:
-        """Measure the next motions from the newest frames."""
+    def start_keyframe(self) -> None:
+        """Measure the next motions from the newest frameset."""
         self._references.clear()
         if not self._latest:
             return  # no image has come yet

@@ -24,6 +24,7 @@ from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.odometry import Odometry
 from graphvio.queues import Broadcast
 from graphvio.rig import Rig
+from graphvio.slam.front_end import FrontEnd
 from graphvio.slam.keyframe import CorrectionResult
 from graphvio.slam.keyframe_log import KeyframeLog
 
@@ -67,8 +68,9 @@ class LiveOdometry:
         self._outputs = list(outputs)
         self._meter = Meter()
         self._odometry = Odometry(rig, config, on_prediction=self.predictions.publish)
+        self._front_end = FrontEnd(self._odometry)
         if wants_keyframes:
-            self._odometry.on_keyframe(self.keyframe_log.add)
+            self._front_end.on_keyframe(self.keyframe_log.add)
         self._reception = Reception(source, rig, config, self._meter, self._report, self._bring)
         self._estimation = Estimation(
             self._odometry,
@@ -166,11 +168,11 @@ class LiveOdometry:
     @property
     def map_T_odom(self) -> Float | None:
         """(4, 4) in force, or None before the epoch's first correction."""
-        return self._odometry.map_T_odom
+        return self._front_end.map_T_odom
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
-        """See `graphvio.Odometry.correct`."""
-        return self._odometry.correct(keyframe_id, map_T_body, covariance)
+        """See `graphvio.slam.FrontEnd.correct`."""
+        return self._front_end.correct(keyframe_id, map_T_body, covariance)
 
     def status(self) -> Mapping[str, float | int | str | None]:
         """How it runs, by name."""

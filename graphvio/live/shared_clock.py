@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 
-from graphvio.backend.starts import MAX_UNBRIDGED_S
+from graphvio.backend.initial_state import MAX_UNBRIDGED_S
 from graphvio.measurements.events import Report
 
 BACK_NS = 250_000_000

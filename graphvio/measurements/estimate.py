@@ -50,7 +50,7 @@ class Estimate:
         vision_reason: why that is not ``good``, or empty.
         vision_sigmas: how well the geometry conditions that motion: its standard deviations in the directions that are
             known least, of the rotation (radians) and the translation (metres); None without a motion.
-        at_rest: images, and the IMU if there is one, show no motion.
+        is_stationary: images, and the IMU if there is one, show no motion.
         pairs: pair index -> what it contributed.
         stage_ms: processing time by stage, milliseconds: ``predict``; ``track``, with all pairs side by side; its parts
             ``pyramid``, ``register``, ``flow`` and ``stereo``, each of the pair that took longest; then ``motion``,
@@ -76,7 +76,7 @@ class Estimate:
     vision: Quality = Quality.FAILED
     vision_reason: str = ""
     vision_sigmas: tuple[float, float] | None = None
-    at_rest: bool = False
+    is_stationary: bool = False
     pairs: Mapping[int, PairReport] = field(default_factory=dict)
     stage_ms: Mapping[str, float] = field(default_factory=dict)
 

@@ -95,7 +95,7 @@ class VisualResult:
         reason: why it is not good, or empty.
         alternatives: where pairs contradict each other, what each side says with its own covariance: one is right.
         own: at the end of a keyframe, pair -> its own motion of body, as the rig file's place of the pair makes it.
-        at_rest: the images have shown no motion for a while.
+        is_stationary: the images have shown no motion for a while.
         frozen: pairs that were left out because a camera of theirs repeats an image.
         pairs: pair index -> report.
         stage_ms: time by stage, milliseconds: ``track``, with all pairs side by side; its parts ``pyramid``,
@@ -109,6 +109,6 @@ class VisualResult:
     pairs: Mapping[int, PairReport]
     alternatives: tuple[RelativeMotion, ...] = ()
     own: Mapping[int, RelativeMotion] = field(default_factory=dict)
-    at_rest: bool = False
+    is_stationary: bool = False
     frozen: frozenset[int] = frozenset()
     stage_ms: Mapping[str, float] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Brings IMU and framesets together: holds a frameset until the samples that cover it have come."""
+"""Brings IMU and framesets together: a frameset is held until the IMU samples that cover it have come."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Generic, Protocol, TypeVar
 from graphvio.arrays import Float, Int
 from graphvio.backend.inertial import ImuBuffer
 from graphvio.config import Config
-from graphvio.measurements.events import Report
+from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.rig import Rig
 
-_LEAST_INTERVAL_NS = 1_000_000  # between framesets: less is of one instant, and no motion can be told from it
-_SILENT_WAITS = 2.0  # an IMU so far behind is not waited for until it goes on
-_SUSPICIOUS_JUMP_NS = 5_000_000_000
+_MIN_INTERVAL_NS = 1_000_000  # framesets that are closer are of one instant
+_MAX_SILENT_WAITS = 2.0  # an IMU so far behind is not waited for until it goes on
+_MAX_JUMP_NS = 5_000_000_000
 
 
 class HasStamp(Protocol):
-    """Anything that has a time."""
+    """An object with a stamp."""
 
     @property
     def stamp_ns(self) -> int:
-        """Of one clock."""
+        """Stamp in nanoseconds."""
 
 
 Stamped = TypeVar("Stamped", bound=HasStamp)
@@ -34,9 +34,9 @@ class Synchroniser:
     """Framesets in time order, each with the IMU up to its instant.
 
     Args:
-        rig: tells the number of pairs, whether there is an IMU, and its time offset.
-        config: tells how long things are waited for.
-        report: is told what had to be left out.
+        rig: Has the number of pairs, and the time offset of an IMU if there is one.
+        config: Says how long framesets wait for the IMU.
+        report: Receives an event for each measurement that is left out.
     """
 
     def __init__(self, rig: Rig, config: Config, report: Report) -> None:
@@ -49,11 +49,11 @@ class Synchroniser:
         self._imu = ImuBuffer(config.timing.max_imu_gap_ms)
         self._held: deque[FrameSet] = deque()
         self._newest_ns: int | None = None
-        self._sample_jumps: JumpGuard[ImuSample] = JumpGuard("imu_future_stamp", report)
-        self._frameset_jumps: JumpGuard[FrameSet] = JumpGuard("frameset_future_stamp", report)
+        self._sample_jumps: JumpGuard[ImuSample] = JumpGuard(EventKind.IMU_FUTURE_STAMP, report)
+        self._frameset_jumps: JumpGuard[FrameSet] = JumpGuard(EventKind.FRAMESET_FUTURE_STAMP, report)
 
     def add_sample(self, sample: ImuSample) -> list[ImuSample]:
-        """Take a sample of the IMU; the samples that may be used from now on, with stamps on the framesets' clock."""
+        """Take an IMU sample, and return the samples that are usable now, with stamps on the framesets' clock."""
         usable = []
         for confirmed in self._sample_jumps.confirm(sample):
             fault = self._imu.add(confirmed)
@@ -64,43 +64,43 @@ class Synchroniser:
         return usable
 
     def add_frameset(self, frameset: FrameSet) -> None:
-        """Take a frameset; time never goes back.
+        """Take a frameset that is newer than those before it.
 
-        Pairs may come in framesets of their own. Less than 1 ms after a frameset that is still held, further pairs
-        join it; after one that is not, and for pairs that it has already, there is no room for another state.
+        Pairs may come in framesets of their own: less than 1 ms after a frameset that is still held, other pairs join
+        it. A frameset so soon after one that has been processed, or with pairs that it has already, is left out.
         """
         for confirmed in self._frameset_jumps.confirm(frameset):
             self._add(confirmed)
 
     def _add(self, frameset: FrameSet) -> None:
         unknown = [j for j in frameset.images if not 0 <= j < self._pairs]
-        if self._newest_ns is not None and frameset.stamp_ns < self._newest_ns + _LEAST_INTERVAL_NS:
+        if self._newest_ns is not None and frameset.stamp_ns < self._newest_ns + _MIN_INTERVAL_NS:
             if not unknown and self._joins(frameset):
                 held = self._held[-1]
                 self._held[-1] = replace(held, images={**held.images, **frameset.images})
                 return
             late = frameset.stamp_ns < self._newest_ns
-            kind = "frameset_backward_stamp" if late else "frameset_duplicate_stamp"
-            why = "time never goes back" if late else "less than 1 ms after the one before"
+            kind = EventKind.FRAMESET_BACKWARD_STAMP if late else EventKind.FRAMESET_DUPLICATE_STAMP
+            why = "older than the one before" if late else "less than 1 ms after the one before"
             self._report(frameset.stamp_ns, kind, f"frameset left out: {why}")
             return
         if unknown:
-            self._report(frameset.stamp_ns, "unknown_pair", f"pair {unknown[0]} is not in the rig: left out")
+            self._report(frameset.stamp_ns, EventKind.UNKNOWN_PAIR, f"pair {unknown[0]} is not in the rig: left out")
             frameset = replace(frameset, images={j: v for j, v in frameset.images.items() if j not in unknown})
         self._newest_ns = frameset.stamp_ns
         self._held.append(frameset)
 
     def _joins(self, frameset: FrameSet) -> bool:
-        """Whether a frameset is of the instant of the newest one, which is held, and brings other pairs."""
+        """Whether a frameset brings other pairs of the same instant as the newest one, which is held."""
         return (
             bool(self._held)
-            and abs(frameset.stamp_ns - self._held[-1].stamp_ns) < _LEAST_INTERVAL_NS
+            and abs(frameset.stamp_ns - self._held[-1].stamp_ns) < _MIN_INTERVAL_NS
             and not self._held[-1].images.keys() & frameset.images.keys()
         )
 
-    def next_due(self, *, started: bool) -> FrameSet | None:
-        """The oldest held frameset if it need wait no longer; the first one waits for samples to start from."""
-        if not self._held or not self._is_due(self._held[0], started):
+    def next_due(self, *, initialised: bool) -> FrameSet | None:
+        """Return the oldest held frameset if it is due; the first one waits for IMU samples to initialise from."""
+        if not self._held or not self._is_due(self._held[0], initialised):
             return None
         return self._held.popleft()
 
@@ -110,57 +110,55 @@ class Synchroniser:
         return self._held[0].stamp_ns if self._held else None
 
     def next_held(self) -> FrameSet | None:
-        """The oldest held frameset, due or not, or None."""
+        """Return the oldest held frameset, due or not, or None."""
         return self._held.popleft() if self._held else None
 
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
-        """The IMU between two framesets' stamps, or None where it does not cover them."""
+        """Return the IMU between two framesets' stamps, or None where it does not cover them."""
         return self._imu.interval(start_ns + self._offset_ns, end_ns + self._offset_ns)
 
     def samples_since(self, stamp_ns: int) -> tuple[Int, Float]:
-        """The IMU from a frameset's stamp on, stamps on the framesets' clock; see `ImuBuffer.since`."""
+        """Return the IMU from a frameset's stamp on, stamps on the framesets' clock; see `ImuBuffer.since`."""
         stamps, values = self._imu.since(stamp_ns + self._offset_ns)
         return stamps - self._offset_ns, values
 
     def initial_interval(self, stamp_ns: int) -> tuple[ImuInterval, float] | None:
-        """The IMU around a frameset, and the frameset's place in it in seconds, once it is long enough."""
+        """Return the IMU around a frameset and the frameset's place in it in seconds, once it is long enough."""
         at_ns = stamp_ns + self._offset_ns
-        window_ns, least_ns = (
-            round(s * 1e9) for s in (self._initialisation.window_s, self._initialisation.min_window_s)
-        )
+        window_ns, min_ns = (round(s * 1e9) for s in (self._initialisation.window_s, self._initialisation.min_window_s))
         if not self._has_imu or not self._imu.covers(at_ns):
             return None
-        for end_ns in (at_ns, at_ns + least_ns):
+        for end_ns in (at_ns, at_ns + min_ns):
             found = self._imu.segment(at_ns - window_ns, end_ns)
-            if found is not None and found[0].steps_s.sum() >= 0.95e-9 * least_ns:
+            if found is not None and found[0].steps_s.sum() >= 0.95e-9 * min_ns:
                 return found[0], (at_ns - found[1]) * 1e-9
         return None
 
     def shift_imu(self, seconds: float) -> None:
-        """From now on the IMU's stamps are later than the framesets' by so much more than was thought."""
+        """Add a correction, seconds, to the offset of the IMU's stamps from the framesets'."""
         self._offset_ns += round(seconds * 1e9)
 
     @property
     def time_offset_s(self) -> float:
-        """Add it to a frameset's stamp to get the IMU's stamp of the same instant."""
+        """The IMU's stamp less the framesets' stamp of the same instant."""
         return self._offset_ns * 1e-9
 
     def precedes_imu(self, stamp_ns: int) -> bool:
-        """Whether the first sample of the IMU has not come yet, or is later than a frameset."""
+        """Whether a frameset is before the first IMU sample, or none has come yet."""
         if not self._has_imu:
             return False
         return self._imu.oldest_ns is None or stamp_ns + self._offset_ns < self._imu.oldest_ns
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Drop samples that are older than a start at this frameset's stamp would need."""
+        """Drop samples that are older than an initialisation at this frameset's stamp would need."""
         self._imu.discard_before(stamp_ns + self._offset_ns - round(self._initialisation.window_s * 1e9))
 
-    def _is_due(self, frameset: FrameSet, started: bool) -> bool:
+    def _is_due(self, frameset: FrameSet, initialised: bool) -> bool:
         if not self._has_imu or self._imu.oldest_ns is None:
             return True
         assert self._newest_ns is not None
         waited_ns = self._newest_ns - frameset.stamp_ns
-        if not started:
+        if not initialised:
             if self.precedes_imu(frameset.stamp_ns):
                 return True
             enough = self.initial_interval(frameset.stamp_ns) is not None
@@ -169,12 +167,17 @@ class Synchroniser:
         if newest_ns is None or newest_ns >= at_ns:
             return True
         longest_ns = self._timing.max_imu_wait_ms * 1e6
-        is_silent = at_ns - newest_ns > _SILENT_WAITS * longest_ns
+        is_silent = at_ns - newest_ns > _MAX_SILENT_WAITS * longest_ns
         return is_silent or waited_ns > longest_ns
 
 
 class JumpGuard(Generic[Stamped]):
-    """Believes a jump of the clock only when a second stamp confirms it: one wild stamp must not stop time."""
+    """Accepts a jump of the clock only when a second stamp confirms it, as one wild stamp must not stop time.
+
+    Args:
+        kind: Kind of the event for a measurement that is left out.
+        report: Receives events.
+    """
 
     def __init__(self, kind: str, report: Report) -> None:
         self._kind = kind
@@ -183,24 +186,24 @@ class JumpGuard(Generic[Stamped]):
         self._suspect: Stamped | None = None
 
     def confirm(self, measurement: Stamped) -> list[Stamped]:
-        """The measurements that may be taken now, in order; far ahead is more than 5 s."""
+        """Return the measurements that may be used now, in order; a jump is more than 5 s."""
         suspect, self._suspect = self._suspect, None
         if suspect is not None:
-            if 0 < measurement.stamp_ns - suspect.stamp_ns < _SUSPICIOUS_JUMP_NS:
+            if 0 < measurement.stamp_ns - suspect.stamp_ns < _MAX_JUMP_NS:
                 self._newest_ns = measurement.stamp_ns
                 return [suspect, measurement]
             self._leave_out(suspect)
-        if self._newest_ns is not None and measurement.stamp_ns - self._newest_ns > _SUSPICIOUS_JUMP_NS:
+        if self._newest_ns is not None and measurement.stamp_ns - self._newest_ns > _MAX_JUMP_NS:
             self._suspect = measurement
             return []
         self._newest_ns = max(measurement.stamp_ns, self._newest_ns or measurement.stamp_ns)
         return [measurement]
 
     def end(self) -> None:
-        """Nothing more will come, so what was not confirmed is left out."""
+        """Leave out what was not confirmed, as nothing follows."""
         suspect, self._suspect = self._suspect, None
         if suspect is not None:
             self._leave_out(suspect)
 
     def _leave_out(self, suspect: Stamped) -> None:
-        self._report(suspect.stamp_ns, self._kind, "left out: far ahead of the stamps before and after it")
+        self._report(suspect.stamp_ns, self._kind, "left out: more than 5 s ahead of the stamps before and after it")

@@ -10,11 +10,11 @@ import gtsam
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.backend.factors import b, constant_velocity, first_state, imu_without_samples, r, rest, v, x
+from graphvio.backend.factors import b, constant_velocity, first_state, imu_without_samples, r, v, x, zero_velocity
 from graphvio.backend.noise import gaussian, isotropic
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.reference_views import ReferenceViews
-from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
+from graphvio.backend.states import InitialUncertainty, RigState, origin_covariance
 from graphvio.config.stages import SmootherConfig
 from graphvio.optimization.extrinsics import own_motion, unknowns
 from graphvio.optimization.nodes import Nodes
@@ -163,9 +163,9 @@ class SessionGraph:
                     motion = np.linalg.inv(record.smoothed[before]) @ record.smoothed[row]
                     accels = np.array([config.motion_angular_accel_sigma_rad_s2, config.motion_accel_sigma_m_s2])
                     self.add(constant_velocity(k - 1, k, motion, dt, dt, np.zeros(2), accels))
-            if record.at_rest[row] and record.with_imu[row]:
+            if record.is_stationary[row] and record.with_imu[row]:
                 self._kind = "rest"
-                self.add(rest(k))
+                self.add(zero_velocity(k))
 
     def _add_own_motions(self, session: int, first: int, nodes: Nodes) -> Int:
         """Motions of single pairs, with the calibration as unknowns; rows (K,) of the framesets in which they end."""
@@ -208,7 +208,9 @@ def _starts(fragment: Fragment, is_root: bool) -> Iterator[gtsam.NonlinearFactor
         if is_root:
             yield gtsam.PriorFactorPose3(x(k), gtsam.Pose3(pose), isotropic(6, _ORIGIN_SIGMA))
         return
-    known = StartUncertainty(origin_covariance(pose[:3, :3], _START_TILT_RAD), _START_SPEED_M_S, _START_GYRO_BIAS_RAD_S)
+    known = InitialUncertainty(
+        origin_covariance(pose[:3, :3], _START_TILT_RAD), _START_SPEED_M_S, _START_GYRO_BIAS_RAD_S
+    )
     about_pose, *others = first_state(k, fragment.start, known, True)
     if is_root:
         yield about_pose

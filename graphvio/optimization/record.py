@@ -15,7 +15,7 @@ from graphvio.arrays import Bool, Float, Int
 from graphvio.errors import OptimizationError
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.motion import RelativeMotion
-from graphvio.measurements.step import Step
+from graphvio.odometry.step import Step
 
 
 class Inertial(NamedTuple):
@@ -89,7 +89,7 @@ class SessionRecord:
         velocity_nav: (F, 3) m/s.
         gyro_bias: (F, 3) rad/s; zero without an IMU.
         accel_bias: (F, 3) m/s^2; zero without an IMU.
-        at_rest: (F,) whether images and IMU show no motion.
+        is_stationary: (F,) whether images and IMU show no motion.
         is_keyframe: (F,) whether later motions are measured from it.
         with_imu: (F,) whether the IMU takes part in the state.
         is_start: (F,) whether the estimation began here, be it anew: velocity and biases before then tell nothing.
@@ -108,7 +108,7 @@ class SessionRecord:
     velocity_nav: Float
     gyro_bias: Float
     accel_bias: Float
-    at_rest: Bool
+    is_stationary: Bool
     is_keyframe: Bool
     with_imu: Bool
     is_start: Bool
@@ -150,7 +150,7 @@ class SessionRecord:
 
 
 class Recorder:
-    """Collects the odometry's steps; its `add` is what `graphvio.Odometry` calls as ``on_step``."""
+    """Collects the steps of an odometry, whose `Odometry.subscribe` gets its `add`."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -173,7 +173,7 @@ class Recorder:
             self._refused.append(motion)
         if estimate.nav_T_body is None or estimate.covariance is None or estimate.status is Status.LOST:
             return
-        if step.started and motion is not None and step.used and self._steps:
+        if step.initialised and motion is not None and step.used and self._steps:
             # Vision is believed against the prediction: so is what it said before, and the IMU since then is not.
             self._motions += [each for each in self._refused if each is not motion]
             if estimate.epoch == self._steps[-1].estimate.epoch:
@@ -190,11 +190,11 @@ class Recorder:
                 np.concatenate([np.zeros(0), *(each[0] for each in intervals)]),
                 np.concatenate([np.zeros((0, 6)), *(each[1] for each in intervals)]),
                 self._is_covered and step.interval is not None,
-                step.started,
+                step.initialised,
             )
         )
         self._since, self._is_covered = [], True
-        if step.used or step.started:
+        if step.used or step.initialised:
             self._refused.clear()
             self._used_at = len(self._steps) - 1
 
@@ -227,7 +227,7 @@ class Recorder:
             velocity_nav=np.array([_or_zero(each.velocity_nav) for each in estimates]),
             gyro_bias=np.array([_or_zero(each.gyro_bias) for each in estimates]),
             accel_bias=np.array([_or_zero(each.accel_bias) for each in estimates]),
-            at_rest=np.array([each.at_rest for each in estimates]),
+            is_stationary=np.array([each.is_stationary for each in estimates]),
             is_keyframe=np.isin(stamps, sorted(self._references)),
             with_imu=np.array([each.gyro_bias is not None for each in estimates]),
             is_start=np.array([row.is_start for row in rows]),

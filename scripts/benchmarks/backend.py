@@ -111,7 +111,7 @@ class _Timing(NamedTuple):
 def _timed(stream: Stream, lag_s: float) -> _Timing:
     log, config = FactorLog(), Config()
     estimator = SmootherEstimator(
-        stream.rig, replace(config, smoother=replace(config.smoother, lag_s=lag_s)), lambda *_: None, lambda: None
+        stream.rig, replace(config, smoother=replace(config.smoother, lag_s=lag_s)), lambda *_: None
     )
     theirs = _Incremental(lag_s)
     rows = []

@@ -122,8 +122,8 @@ class FactorLog:
 
 
 class _NotedWindow(Window):
-    def __init__(self, log: FactorLog, least_iterations: int = 1) -> None:
-        super().__init__(least_iterations)
+    def __init__(self, log: FactorLog, min_iterations: int = 1) -> None:
+        super().__init__(min_iterations)
         self._log = log
         self._noted: set[int] = set()
 

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from graphvio.arrays import Float
+from graphvio.backend.estimator import MeasurementUpdate
 from graphvio.frontend.visual import MotionPredictor
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.estimate import Estimate, Status
@@ -67,21 +68,21 @@ def overhear(odometry: Odometry) -> Overheard:
     An estimate does not carry the motion that vision measured, only the pose that came of it, in which IMU and earlier
     motions hide an error; so the front-end's answers are overheard on their way to the odometry.
     """
-    process, use = odometry._frontend.process, odometry._estimator.use
+    process, apply = odometry._frontend.process, odometry._estimator.apply
     overheard = Overheard({}, {})
 
     def processed(frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
         result = overheard.results[frameset.stamp_ns] = process(frameset, predict)
         return result
 
-    def used(visual: VisualResult, at_rest: bool) -> RelativeMotion | None:
-        motion = use(visual, at_rest)
-        if motion is not None:
-            overheard.used[motion.stamp_ns] = motion
-        return motion
+    def applied(visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
+        update = apply(visual, is_stationary)
+        if update.motion is not None:
+            overheard.used[update.motion.stamp_ns] = update.motion
+        return update
 
     odometry._frontend.process = processed  # type: ignore[method-assign]
-    odometry._estimator.use = used  # type: ignore[method-assign]
+    odometry._estimator.apply = applied  # type: ignore[method-assign]
     return overheard
 
 

@@ -73,7 +73,7 @@ def _parts(duration_s: float) -> list[list[str]]:
     stamps = [round(k * 1e9 / FRAMES_HZ) for k in range(framesets + 1)]
     states = motion.at(np.array(stamps) * 1e-9)
     events: list[int] = []
-    estimator = SmootherEstimator(rig, Config(), lambda ns, *_: events.append(ns), lambda: None)
+    estimator = SmootherEstimator(rig, Config(), lambda ns, *_: events.append(ns))
     buffer, added = ImuBuffer(50.0), 0
     spent_ms: list[float] = []
     rows = []
@@ -87,10 +87,10 @@ def _parts(duration_s: float) -> list[list[str]]:
         if k == 0:
             found = buffer.segment(0, stamps[0] + 500_000_000)
             assert found is not None
-            estimator.start(stamp_ns, (found[0], 0.0))
+            estimator.initialise(stamp_ns, (found[0], 0.0))
         else:
             estimator.predict(stamp_ns, buffer.interval(stamps[k - 1], stamp_ns))
-        used = estimator.use(visual, at_rest=False) is not None
+        used = estimator.apply(visual, is_stationary=False).motion is not None
         estimator.update(stamp_ns, used or k == 0, frozenset())
         estimator.take_final()
         spent_ms.append(1e3 * (perf_counter() - start))

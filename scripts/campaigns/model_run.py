@@ -13,7 +13,7 @@ from campaigns.measures import tilt_error
 from campaigns.walks import FRAMES_HZ, Walk, buffer_of
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.smoother import Smoother
-from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
+from graphvio.backend.states import InitialUncertainty, RigState, origin_covariance
 from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.measurements.imu_interval import ImuInterval
@@ -66,15 +66,15 @@ class _ModelRun:
                 yield "imu", k / FRAMES_HZ, self._imu_square(interval, k), 15
             motion = self._vision.at(k)
             if motion is not None and smoother.knows(motion.reference_stamp_ns):
-                gate_result = smoother.test(motion)
+                gate_result = smoother.gate(motion)
                 if k > _SETTLED_S * FRAMES_HZ:
                     yield "vision", k / FRAMES_HZ, gate_result.statistic, 6
                 if gate_result.accepted:
-                    smoother.accept(motion)
+                    smoother.add_motion(motion)
             kept = {self._stamps[number] for number in anchors.values()}
             following = self._vision.reference(k + 1)
             kept |= set() if following is None else {self._stamps[following]}
-            smoother.settle(kept)
+            smoother.update(kept)
             if k % FRAMES_HZ == 0 and k >= _SETTLED_S * FRAMES_HZ:
                 yield from self._state_squares(k)
             for seconds, anchor in anchors.items():
@@ -87,10 +87,10 @@ class _ModelRun:
         """At the truth, but for errors of the start."""
         rng, pose = self._rng, self._truth[0]
         covariance = origin_covariance(pose[:3, :3], _TILT_SIGMA)
-        known = StartUncertainty(covariance, _SPEED_SIGMA, _GYRO_BIAS_SIGMA)
+        known = InitialUncertainty(covariance, _SPEED_SIGMA, _GYRO_BIAS_SIGMA)
         off = np.linalg.cholesky(covariance) @ rng.standard_normal(6)
         velocity = self._velocities[0] + _SPEED_SIGMA * rng.standard_normal(3)
-        self._smoother.start(0, RigState(pose @ se3_exp(off), velocity, np.zeros(3), np.zeros(3)), known)
+        self._smoother.initialise(0, RigState(pose @ se3_exp(off), velocity, np.zeros(3), np.zeros(3)), known)
 
     def _state_squares(self, k: int) -> Iterator[Square]:
         time_s, state, known = k / FRAMES_HZ, self._smoother.state(), self._smoother.state_covariance()

@@ -15,7 +15,7 @@ from graphvio.backend.ekf.measurements import Measurement, VisualRates, accelero
 from graphvio.backend.ekf.process import noise_sigmas
 from graphvio.backend.ekf.state import FilterState
 from graphvio.backend.smoother import Smoother
-from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
+from graphvio.backend.states import InitialUncertainty, RigState, origin_covariance
 from graphvio.config.stages import FilterConfig, SmootherConfig
 from graphvio.geometry import se3_exp, se3_log
 from graphvio.measurements.imu_interval import ImuInterval
@@ -94,15 +94,15 @@ class PaperRun:
         """The odometry's smoother."""
         smoother, (first, _) = Smoother(SmootherConfig(), self._imu), self._start()
         pose = first.nav_T_body
-        known = StartUncertainty(origin_covariance(pose[:3, :3], _TILT_SIGMA), _SPEED_SIGMA, _GYRO_BIAS_SIGMA)
-        smoother.start(0, RigState(pose, pose[:3, :3] @ first.velocity_body, np.zeros(3), np.zeros(3)), known)
+        known = InitialUncertainty(origin_covariance(pose[:3, :3], _TILT_SIGMA), _SPEED_SIGMA, _GYRO_BIAS_SIGMA)
+        smoother.initialise(0, RigState(pose, pose[:3, :3] @ first.velocity_body, np.zeros(3), np.zeros(3)), known)
         newest, leaving = [], []
         for k in range(1, len(self._stamps)):
             smoother.extend(self._stamps[k], self._intervals[k - 1])
             motion = self._motions[k - 1]
             if motion is not None:
-                smoother.accept(motion)
-            for stamp_ns, nav_T_body in smoother.settle(()):
+                smoother.add_motion(motion)
+            for stamp_ns, nav_T_body in smoother.update(()):
                 number = self._stamps.index(stamp_ns)
                 leaving.append((number, _posed(nav_T_body)))
             state = smoother.state()

@@ -11,7 +11,7 @@ from campaigns.flight import FRAMES_HZ, Flight, Truth
 from campaigns.measures import tilt_error
 from graphvio.arrays import Float
 from graphvio.backend.smoother import Smoother
-from graphvio.backend.states import RigState, StartUncertainty, origin_covariance
+from graphvio.backend.states import InitialUncertainty, RigState, origin_covariance
 from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.measurements.motion import RelativeMotion
@@ -67,15 +67,15 @@ def real_run(seed: int, flight: Flight, truth: Truth, config: SmootherConfig, im
     for k in range(1, len(flight.stamps_ns)):
         smoother.extend(flight.stamps_ns[k], flight.intervals[k - 1])
         motion = _drawn(flight, truth, k, rng)
-        gate_result = smoother.test(motion)
+        gate_result = smoother.gate(motion)
         settled = k >= _SETTLED_S * FRAMES_HZ
         if settled:
             misses.append(Miss("vision", k, gate_result.innovation, gate_result.covariance))
         if gate_result.accepted:
-            smoother.accept(motion)
+            smoother.add_motion(motion)
         else:
             refused += 1
-        smoother.settle({flight.stamps_ns[k], *(flight.stamps_ns[number] for number in anchors.values())})
+        smoother.update({flight.stamps_ns[k], *(flight.stamps_ns[number] for number in anchors.values())})
         states.append(smoother.state())
         if settled and k % FRAMES_HZ == 0:
             misses += _misses_of_state(smoother, truth, k)
@@ -98,10 +98,10 @@ def _started(flight: Flight, truth: Truth, config: SmootherConfig, imu: Imu, rng
     off = np.linalg.cholesky(covariance) @ rng.standard_normal(6)
     velocity = truth.velocity_world[0] + _SPEED_SIGMA * rng.standard_normal(3)
     smoother = Smoother(config, imu)
-    smoother.start(
+    smoother.initialise(
         flight.stamps_ns[0],
         RigState(pose @ se3_exp(off), velocity, np.zeros(3), np.zeros(3)),
-        StartUncertainty(covariance, _SPEED_SIGMA, _GYRO_BIAS_SIGMA),
+        InitialUncertainty(covariance, _SPEED_SIGMA, _GYRO_BIAS_SIGMA),
     )
     return smoother
 

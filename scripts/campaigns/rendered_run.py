@@ -104,7 +104,7 @@ class _Run:
         estimator = self._odometry._estimator
         assert isinstance(estimator, SmootherEstimator)
         then_ns = estimate.stamp_ns - seconds * 1_000_000_000
-        estimator._running.solve()  # that state was not kept
+        estimator._running.optimize()  # that state was not kept
         now_T_then = estimator.motion_since(then_ns)
         if now_T_then is None:
             return

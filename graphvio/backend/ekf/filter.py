@@ -10,7 +10,7 @@ from graphvio.arrays import Float
 from graphvio.backend.ekf.measurements import Measurement
 from graphvio.backend.ekf.process import jacobians, propagated
 from graphvio.backend.ekf.state import ERRORS, POSITION, FilterState
-from graphvio.backend.gating import judged
+from graphvio.backend.gating import gate_innovation
 from graphvio.measurements.gate_result import GateResult
 
 
@@ -35,7 +35,7 @@ class ExtendedKalmanFilter:
 
     def test(self, measurement: Measurement, probability: float) -> GateResult:
         """Chi-square test of an innovation."""
-        return judged(measurement.innovation, self._spread(measurement), probability)
+        return gate_innovation(measurement.innovation, self._spread(measurement), probability)
 
     def update(self, measurement: Measurement) -> None:
         """Kalman update, in Joseph's form."""

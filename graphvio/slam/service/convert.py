@@ -67,7 +67,7 @@ def estimate_message(estimate: Estimate) -> Any:
         time_offset_sigma_s=estimate.time_offset_sigma_s,
         vision=_NUMBER_OF_QUALITY[estimate.vision],
         vision_reason=estimate.vision_reason,
-        at_rest=bool(estimate.at_rest),
+        is_stationary=bool(estimate.is_stationary),
     )
 
 
@@ -93,7 +93,7 @@ def estimate_of(message: Any) -> Estimate:
         time_offset_sigma_s=_maybe(message, "time_offset_sigma_s"),
         vision=_known(_QUALITY_OF, message.vision, "estimate: vision"),
         vision_reason=message.vision_reason,
-        at_rest=message.at_rest,
+        is_stationary=message.is_stationary,
     )
 
 

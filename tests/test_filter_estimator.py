@@ -40,11 +40,11 @@ class Walk:
         self.rng = np.random.default_rng(self.seed)
         rig = two_pair_rig(IMU if self.with_imu else None)
         config = replace(Config.from_yaml(PAPER), filter=self.config)
-        self.estimator = FilterEstimator(rig, config, lambda _, kind, detail: self.told.append(kind), lambda: None)
+        self.estimator = FilterEstimator(rig, config, lambda _, kind, detail: self.told.append(kind))
         self.imu = filled_buffer(IMU, 20.0, self.rng, GYRO_BIAS, np.zeros(3))
         interval = self.imu.segment(0, 1_000_000_000) if self.with_imu else None
         self.now_ns = 1_000_000_000
-        self.estimator.start(self.now_ns, None if interval is None else (interval[0], 1.0))
+        self.estimator.initialise(self.now_ns, None if interval is None else (interval[0], 1.0))
         self.estimator.update(self.now_ns, True, frozenset())
 
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
@@ -60,10 +60,10 @@ class Walk:
             if off is not None:
                 motion = replace(motion, reference_T_current=motion.reference_T_current @ off)
         used = (
-            self.estimator.use(VisualResult(motion, Quality.GOOD if motion else Quality.FAILED, "", {}), False)
+            self.estimator.apply(VisualResult(motion, Quality.GOOD if motion else Quality.FAILED, "", {}), False).motion
             is not None
         )
-        self.statuses.append(self.estimator.update(self.now_ns, used, frozenset()))
+        self.statuses.append(self.estimator.update(self.now_ns, used, frozenset()).status)
         return used
 
     def steps(self, seconds: float, blind: bool = False, off: Float | None = None) -> list[bool]:
@@ -156,7 +156,7 @@ def test_resets_change_nothing_that_is_told() -> None:
     never, often = (Walk(FilterConfig(reset_s=reset_s)) for reset_s in (100.0, 0.5))
     for walk in (never, often):
         walk.steps(6.0)
-    assert never.estimator._forgotten.max() == 0.0 < often.estimator._forgotten.max()
+    assert never.estimator._reset_covariance.max() == 0.0 < often.estimator._reset_covariance.max()
     np.testing.assert_allclose(often.estimator.state().nav_T_body, never.estimator.state().nav_T_body, atol=1e-6)
     np.testing.assert_allclose(often.estimator.covariance.pose, never.estimator.covariance.pose, rtol=0.05, atol=1e-6)
 
@@ -186,10 +186,10 @@ def test_a_refused_translation_does_not_leave_the_gyro_out() -> None:
 def test_a_second_start_forgets_what_the_first_one_left() -> None:
     walk = Walk(FilterConfig(reset_s=0.5))
     walk.steps(5.0)
-    assert walk.estimator._forgotten.any()
-    walk.estimator.start(walk.now_ns, None)
+    assert walk.estimator._reset_covariance.any()
+    walk.estimator.initialise(walk.now_ns, None)
     walk.estimator.update(walk.now_ns, True, frozenset())
-    assert not walk.estimator._forgotten.any()
+    assert not walk.estimator._reset_covariance.any()
     assert walk.estimator.latest_rate() is None
 
 

@@ -1,0 +1,146 @@
+"""States that the smoother is initialised with: at first from the IMU, and again after each kind of break."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.initialisation import InitialAttitude, initial_attitude, level
+from graphvio.backend.states import InitialUncertainty, RigState, as_origin, origin_covariance
+from graphvio.config.stages import InitialisationConfig
+from graphvio.geometry import se3, se3_inverse, se3_log
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import RelativeMotion
+from graphvio.rig import Rig
+
+_UNKNOWN_SPEED_SIGMA = 30.0  # without an IMU any first motion is accepted, on foot or on the road
+_MOVING_SPEED_SIGMA = 5.0  # the gate lets five times as much pass
+_STATIONARY_SPEED_SIGMA = 0.02
+_REINITIALISED_SPEED_SIGMA = 1.0
+_GYRO_BIAS_SIGMA = 0.01
+_WIDE_GYRO_BIAS_SIGMA = 0.1
+_WIDE_TILT_RAD = 0.3
+_AFTER_REBUILD = np.diag([0.05] * 3 + [0.1] * 3) ** 2  # added to the pose's covariance, radians and metres
+AFTER_JUMP = np.diag([0.2] * 3 + [1.0] * 3) ** 2
+"""Added to a pose's covariance (6, 6) after a gap that nothing bridges."""
+MAX_UNBRIDGED_S = 3.0
+"""A longer gap without an IMU is not bridged by constant velocity."""
+
+
+@dataclass(frozen=True, eq=False)
+class InitialState:
+    """A first state and its uncertainty.
+
+    Attributes:
+        stamp_ns: Stamp of the state.
+        state: The rig at that instant.
+        uncertainty: How well the state is known.
+        is_known: Whether attitude and velocity are known well enough; else the first motions have to complete them.
+    """
+
+    stamp_ns: int
+    state: RigState
+    uncertainty: InitialUncertainty
+    is_known: bool = True
+
+
+def first_state_at(
+    stamp_ns: int, position: Float, imu: tuple[ImuInterval, float] | None, rig: Rig, config: InitialisationConfig
+) -> InitialState:
+    """Initialise at a position in nav, with roll and pitch from the IMU.
+
+    Args:
+        stamp_ns: Stamp of the state.
+        position: (3,) m in nav.
+        imu: The IMU around the state and the state's place in that interval, seconds. Without it, the first pair's left
+            camera is taken to be upright, and the speed is unknown.
+        rig: Cameras.
+        config: Configuration of the initialisation.
+    """
+    if imu is None:
+        attitude = InitialAttitude(level(-rig.pairs[0].left.body_T_cam[:3, 1]), 1e-3, np.zeros(3), 1.0, False)
+        speed_sigma = _UNKNOWN_SPEED_SIGMA
+    else:
+        attitude = initial_attitude(*imu, config)
+        speed_sigma = _STATIONARY_SPEED_SIGMA if attitude.is_stationary else _MOVING_SPEED_SIGMA
+    state = RigState(se3(attitude.nav_R_body, position), np.zeros(3), attitude.gyro_bias, np.zeros(3))
+    uncertainty = InitialUncertainty(
+        origin_covariance(attitude.nav_R_body, attitude.tilt_sigma_rad), speed_sigma, attitude.gyro_bias_sigma
+    )
+    return InitialState(stamp_ns, state, uncertainty, attitude.is_stationary)
+
+
+def after_failure(stamp_ns: int, state: RigState, pose_covariance: Float) -> InitialState:
+    """Reinitialise at the predicted state, after a window that has no solution.
+
+    Args:
+        stamp_ns: Stamp of the state.
+        state: The prediction.
+        pose_covariance: (6, 6) of the last pose that was known, tangent in body.
+    """
+    return _reinitialised(stamp_ns, state, pose_covariance + _AFTER_REBUILD)
+
+
+def after_gap(stamp_ns: int, state: RigState, pose_covariance: Float) -> InitialState:
+    """Reinitialise at the last state, after a gap that nothing bridges; arguments as for `after_failure`."""
+    return _reinitialised(stamp_ns, state, pose_covariance + AFTER_JUMP)
+
+
+def after_lost(motion: RelativeMotion, state: RigState, pose_covariance: Float) -> InitialState:
+    """Reinitialise at the predicted state, with the velocity of the first motion that vision measures again.
+
+    Args:
+        motion: A motion that ends in the state.
+        state: The prediction.
+        pose_covariance: (6, 6) of the prediction, tangent in body.
+    """
+    return _reinitialised(motion.stamp_ns, _with_velocity(state, motion), pose_covariance)
+
+
+def from_vision(
+    motion: RelativeMotion, nav_T_body: Float, state: RigState, pose_covariance: Float, prediction_failed: bool
+) -> InitialState:
+    """Reinitialise at the pose that a chain of motions leads to.
+
+    Args:
+        motion: The last motion of the chain.
+        nav_T_body: (4, 4) pose at its end.
+        state: The prediction for the same instant.
+        pose_covariance: (6, 6) of the pose at the beginning of the chain, tangent in body; the chain is better known.
+        prediction_failed: Whether the prediction is known to be wrong; else vision may be wrong as well, and the pose
+            is uncertain by as much as it differs from the prediction.
+    """
+    apart = np.zeros(6) if prediction_failed else se3_log(se3_inverse(nav_T_body) @ state.nav_T_body)
+    state = _with_velocity(replace(state, nav_T_body=nav_T_body), motion)
+    covariance = pose_covariance + motion.covariance + np.diag(apart**2)
+    gyro_bias_sigma = _GYRO_BIAS_SIGMA if prediction_failed else _WIDE_GYRO_BIAS_SIGMA
+    return _reinitialised(motion.stamp_ns, state, covariance, gyro_bias_sigma)
+
+
+def with_wide_attitude(initial: InitialState) -> InitialState:
+    """Return the same state with roll, pitch and gyro bias as uncertain as at a first initialisation.
+
+    For a state that is reinitialised soon after the last time: what it would take over is probably wrong.
+    """
+    nav_R_body = initial.state.nav_T_body[:3, :3]
+    pose = initial.uncertainty.pose.copy()
+    pose[:3, :3] += nav_R_body.T @ np.diag([_WIDE_TILT_RAD, _WIDE_TILT_RAD, 0.0]) ** 2 @ nav_R_body
+    uncertainty = replace(initial.uncertainty, pose=pose, gyro_bias_rad_s=_WIDE_GYRO_BIAS_SIGMA)
+    return replace(initial, uncertainty=uncertainty, is_known=False)
+
+
+def _reinitialised(
+    stamp_ns: int, state: RigState, pose_covariance: Float, gyro_bias_sigma: float = _GYRO_BIAS_SIGMA
+) -> InitialState:
+    # Position and heading must not move when the attitude becomes known better: their uncertainty is reported, but
+    # nothing is estimated of it.
+    pose, of_nav = as_origin(state.nav_T_body[:3, :3], pose_covariance)
+    return InitialState(stamp_ns, state, InitialUncertainty(pose, _REINITIALISED_SPEED_SIGMA, gyro_bias_sigma, of_nav))
+
+
+def _with_velocity(state: RigState, motion: RelativeMotion) -> RigState:
+    """Return the state with the mean velocity of a measured motion."""
+    nav_R_reference = state.nav_T_body[:3, :3] @ motion.reference_T_current[:3, :3].T
+    return replace(state, velocity_nav=nav_R_reference @ motion.reference_T_current[:3, 3] / motion.duration_s)

@@ -1,0 +1,106 @@
+"""The one place where estimates and steps are put together from what the stages return."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from graphvio.arrays import Float
+from graphvio.backend.estimator import StateEstimator
+from graphvio.frontend.visual import VisualFrontend
+from graphvio.geometry import se3_inverse
+from graphvio.measurements.estimate import Estimate, Status
+from graphvio.measurements.motion import VisualResult
+from graphvio.measurements.sensors import FrameSet
+from graphvio.odometry.step import NewKeyframe
+from graphvio.odometry.time_offset_correction import TimeOffsetCorrection
+
+
+def estimate_without_pose(stamp_ns: int, visual: VisualResult, stage_ms: Mapping[str, float]) -> Estimate:
+    """Return the estimate of a frameset before the state is initialised."""
+    return Estimate(
+        stamp_ns,
+        Status.INITIALISING,
+        None,
+        None,
+        vision=visual.quality,
+        vision_reason=visual.reason,
+        pairs=visual.pairs,
+        stage_ms=stage_ms,
+    )
+
+
+def estimate_of(
+    stamp_ns: int,
+    status: Status,
+    estimator: StateEstimator,
+    visual: VisualResult,
+    is_stationary: bool,
+    rates: Mapping[str, Float],
+    time_offset: TimeOffsetCorrection,
+    stage_ms: Mapping[str, float],
+) -> Estimate:
+    """Return the estimate of a frameset, without a pose where it is lost.
+
+    Args:
+        stamp_ns: Stamp of the frameset.
+        status: What the pose is based on.
+        estimator: Updated by the frameset's measurements.
+        visual: The front-end's result.
+        is_stationary: Whether images, and the IMU if there is one, show a standstill.
+        rates: Angular rates (3,) rad/s of body by source.
+        time_offset: Estimate of the offset between cameras and IMU.
+        stage_ms: Processing time by stage.
+    """
+    state, covariance = estimator.state(), estimator.covariance
+    has_pose = status is not Status.LOST
+    return Estimate(
+        stamp_ns=stamp_ns,
+        status=status,
+        nav_T_body=state.nav_T_body if has_pose else None,
+        covariance=covariance.pose if has_pose else None,
+        epoch=estimator.epoch,
+        velocity_nav=state.velocity_nav if has_pose else None,
+        gyro_bias=state.gyro_bias if estimator.has_imu else None,
+        accel_bias=state.accel_bias if estimator.has_imu else None,
+        velocity_covariance=covariance.velocity if has_pose else None,
+        gyro_bias_covariance=covariance.gyro_bias,
+        accel_bias_covariance=covariance.accel_bias,
+        time_offset_s=time_offset.offset_s,
+        time_offset_sigma_s=time_offset.sigma_s,
+        innovations=estimator.gate_results,
+        rates=rates,
+        vision=visual.quality,
+        vision_reason=visual.reason,
+        vision_sigmas=None if visual.motion is None else visual.motion.weakest_sigmas,
+        is_stationary=is_stationary,
+        pairs=visual.pairs,
+        stage_ms=stage_ms,
+    )
+
+
+def keyframe_of(
+    frameset: FrameSet, frontend: VisualFrontend, estimator: StateEstimator, previous_ns: int | None
+) -> NewKeyframe:
+    """Return the data of a frameset from which later motions are measured.
+
+    Args:
+        frameset: The newest frameset.
+        frontend: Has tracked it.
+        estimator: Has been updated by it.
+        previous_ns: Stamp of the keyframe before, or None.
+    """
+    previous_T_body = covariance = None
+    if previous_ns is not None:
+        body_T_previous, covariance = estimator.motion_since(previous_ns), estimator.covariance_since(previous_ns)
+        if body_T_previous is not None and covariance is not None:
+            previous_T_body = se3_inverse(body_T_previous)
+        else:
+            covariance = None
+    return NewKeyframe(
+        frames=frontend.frames_at(frameset.stamp_ns),
+        images=frameset.images,
+        body_T_left=frontend.body_T_left,
+        previous_ns=previous_ns,
+        previous_T_body=previous_T_body,
+        covariance=covariance,
+    )

@@ -1,0 +1,58 @@
+"""A step of the odometry with all that went into it, for those who subscribe to steps: recorders and SLAM."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from graphvio.arrays import Float, Image
+from graphvio.frontend.tracks import PairFrame
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import RelativeMotion
+
+
+@dataclass(frozen=True, eq=False)
+class NewKeyframe:
+    """A frameset from which later motions are measured.
+
+    Attributes:
+        frames: Pair index -> its tracks.
+        images: Pair index -> (left, right).
+        body_T_left: (P, 4, 4) of all pairs, with the corrections that are in force.
+        previous_ns: Stamp of the keyframe before, or None.
+        previous_T_body: (4, 4) motion since the keyframe before, or None if it is not known.
+        covariance: (6, 6) of that motion, tangent ``[rotation, translation]`` in body, or None with it.
+    """
+
+    frames: Mapping[int, PairFrame]
+    images: Mapping[int, tuple[Image, Image]]
+    body_T_left: Float
+    previous_ns: int | None
+    previous_T_body: Float | None
+    covariance: Float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What the odometry measured at a frameset, and the estimate that results.
+
+    Attributes:
+        estimate: The estimate as `graphvio.Odometry.process` returns it.
+        motion: The relative motion that constrains the state; where the gate refused one, that one; or None.
+        used: Whether the motion passed the gate.
+        interval: The IMU since the step before, or None.
+        initialised: Whether the state was initialised or reinitialised here: earlier steps do not count any more.
+        references: Stamps of the framesets that later motions are measured from.
+        own: Pair index -> its own motion, at the end of a keyframe whose motion is used.
+        keyframe: The frameset's data if later motions are measured from it, or None.
+    """
+
+    estimate: Estimate
+    motion: RelativeMotion | None
+    used: bool
+    interval: ImuInterval | None
+    initialised: bool
+    references: frozenset[int]
+    own: Mapping[int, RelativeMotion]
+    keyframe: NewKeyframe | None

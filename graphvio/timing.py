@@ -1,0 +1,37 @@
+"""Processing time by stage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from time import perf_counter
+from typing import Concatenate, ParamSpec, Protocol, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class HasStageTimes(Protocol):
+    """An object that collects the processing time of its stages, milliseconds by name."""
+
+    stage_ms: dict[str, float]
+
+
+T = TypeVar("T", bound=HasStageTimes)
+
+
+def timed(stage: str) -> Callable[[Callable[Concatenate[T, P], R]], Callable[Concatenate[T, P], R]]:
+    """Make a method add its processing time to ``self.stage_ms[stage]``."""
+
+    def decorate(method: Callable[Concatenate[T, P], R]) -> Callable[Concatenate[T, P], R]:
+        @wraps(method)
+        def measured(self: T, *args: P.args, **kwargs: P.kwargs) -> R:
+            start = perf_counter()
+            try:
+                return method(self, *args, **kwargs)
+            finally:
+                self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + 1e3 * (perf_counter() - start)
+
+        return measured  # type: ignore[return-value]  # `wraps` names its first argument
+
+    return decorate
