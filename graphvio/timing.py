@@ -35,3 +35,17 @@ def timed(stage: str) -> Callable[[Callable[Concatenate[T, P], R]], Callable[Con
         return measured  # type: ignore[return-value]  # `wraps` names its first argument
 
     return decorate
+
+
+class Stopwatch:
+    """Adds up the time between calls, under the name of the stage that has just ended."""
+
+    def __init__(self) -> None:
+        self.stage_ms: dict[str, float] = {}
+        self._since = perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Add the time since the last call to a stage."""
+        now = perf_counter()
+        self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + 1e3 * (now - self._since)
+        self._since = now

@@ -10,14 +10,16 @@ from synthetic import random_transform, seen_points, transform, two_pair_rig
 from graphvio.arrays import AnyArray, Float
 from graphvio.config import Config
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.agreement import Agreement, Side, _camps, _in_order, agree
+from graphvio.frontend.agreement import Agreement, MotionHypothesis, _consensus_sets, _in_order, agree
 from graphvio.frontend.alignment import Misalignment
+from graphvio.frontend.frozen import Frozen
 from graphvio.frontend.observations import Correspondences, Observations, RigArrays
-from graphvio.frontend.quality import StereoShare, doubted, graded, stereo_share
+from graphvio.frontend.pair_reports import pair_reports
+from graphvio.frontend.quality import StereoShare, graded, graded_hypothesis, stereo_share
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.selection import joint_motion
 from graphvio.frontend.tracks import PairFrame
-from graphvio.frontend.visual import VisualFrontend, _report
+from graphvio.frontend.visual import VisualFrontend, _Seen
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.motion import Quality, RelativeMotion
 
@@ -62,21 +64,21 @@ def distance(motion: Float, truth: Float) -> float:
 
 
 def test_pairs_that_see_one_world_agree() -> None:
-    tensions = []
+    distances = []
     for seed in range(40):
         agreement = judged(mixed((TRUTH, 80), (TRUTH, 80), seed), seed)
-        assert len(agreement.sides) == 1
-        assert agreement.sides[0].pairs == (0, 1)
+        assert len(agreement.hypotheses) == 1
+        assert agreement.hypotheses[0].pairs == (0, 1)
         assert set(agreement.own) == {0, 1}
-        tensions.append(agreement.tension)
-    assert np.mean(tensions) < 8.0  # chi-square of 6, and the covariances are a little too large
+        distances.append(agreement.max_distance)
+    assert np.mean(distances) < 8.0  # chi-square of 6, and the covariances are a little too large
 
 
 @pytest.mark.parametrize(("points", "first"), [((120, 60), 0), ((60, 120), 1)])
 def test_a_door_that_fills_one_view_is_a_side_of_its_own(points: tuple[int, int], first: int) -> None:
     agreement = judged(mixed((TRUTH, points[0]), (DOOR, points[1])))
-    assert [side.pairs for side in agreement.sides] == [(first,), (1 - first,)]
-    for side in agreement.sides:
+    assert [side.pairs for side in agreement.hypotheses] == [(first,), (1 - first,)]
+    for side in agreement.hypotheses:
         assert distance(side.refined.cur_T_ref, (TRUTH, DOOR)[side.pairs[0]]) < 5e-3
         assert side.refined.inlier.sum() > 0.95 * points[side.pairs[0]]
         assert len(side.refined.inlier) == sum(points)
@@ -85,28 +87,31 @@ def test_a_door_that_fills_one_view_is_a_side_of_its_own(points: tuple[int, int]
 def test_of_sides_with_about_the_same_support_the_first_pair_comes_first() -> None:
     """Else an error of P_12 would have the sides change places again and again."""
     for points in ((100, 110), (110, 100)):
-        assert [side.pairs for side in judged(mixed((TRUTH, points[0]), (DOOR, points[1]))).sides] == [(0,), (1,)]
+        assert [side.pairs for side in judged(mixed((TRUTH, points[0]), (DOOR, points[1]))).hypotheses] == [(0,), (1,)]
 
 
 def test_pairs_that_contradicted_each_other_need_less_to_be_told_apart() -> None:
     off = transform([0.001, 0.0, 0.0], [0.0, 0.0, 0.0]) @ TRUTH  # between 2 and 5 sigma
     seen = mixed((TRUTH, 80), (off, 80))
     usual, doubtful = judged(seen), judged(seen, in_doubt=True)
-    assert 12.6 < usual.tension < 40.0
-    assert (len(usual.sides), len(doubtful.sides)) == (1, 2)
+    assert 12.6 < usual.max_distance < 40.0
+    assert (len(usual.hypotheses), len(doubtful.hypotheses)) == (1, 2)
     assert not usual.contradicts
     assert not doubtful.contradicts  # or doubt would feed itself
     assert judged(mixed((TRUTH, 80), (DOOR, 80)), in_doubt=True).contradicts
-    assert len(judged(mixed((TRUTH, 80), (TRUTH, 80)), in_doubt=True).sides) == 1
+    assert len(judged(mixed((TRUTH, 80), (TRUTH, 80)), in_doubt=True).hypotheses) == 1
 
 
 def test_in_a_camp_each_pair_agrees_with_every_other() -> None:
     apart = {(0, 1): 30.0, (0, 2): 100.0, (1, 2): 30.0}  # a chain: the middle one agrees with both ends
-    assert _camps([1, 0, 2], apart, in_doubt=False) == [[1, 0], [2]]
-    assert _camps([2, 1, 0], apart, in_doubt=False) == [[2, 1], [0]]
-    assert _camps([0, 1, 2], apart, in_doubt=True) == [[0], [1], [2]]
-    assert _camps([0, 1, 2], dict.fromkeys(apart, 10.0), in_doubt=True) == [[0, 1, 2]]
-    assert _camps([], {}, in_doubt=False) == []
+    assert _consensus_sets([1, 0, 2], apart, in_doubt=False) == [[1, 0], [2]]
+    assert _consensus_sets([2, 1, 0], apart, in_doubt=False) == [[2, 1], [0]]
+    assert _consensus_sets([0, 1, 2], apart, in_doubt=True) == [[0], [1], [2]]
+    assert _consensus_sets([0, 1, 2], dict.fromkeys(apart, 10.0), in_doubt=True) == [[0, 1, 2]]
+    assert _consensus_sets([], {}, in_doubt=False) == []
+
+
+NOT_FROZEN = Frozen(frozenset(), None, "")
 
 
 def test_doubt_lasts_a_second() -> None:
@@ -115,9 +120,11 @@ def test_doubt_lasts_a_second() -> None:
     frontend = VisualFrontend(RIG, Config())
     sides = {}
     for milliseconds, seen in ((0, slightly), (500, plainly), (1450, slightly), (1550, slightly)):
-        agreement, _ = frontend._estimate(Correspondences(seen, {}, {}), STILL, milliseconds * 1_000_000)
+        frames = {0: PairFrame.empty()}
+        tracked = _Seen(milliseconds * 1_000_000, NOT_FROZEN, frames, frames, Correspondences(seen, {}, {}))
+        agreement, _ = frontend._estimate_motion(tracked, lambda _: STILL)
         assert agreement is not None
-        sides[milliseconds] = len(agreement.sides)
+        sides[milliseconds] = len(agreement.hypotheses)
     frontend.close()
     assert sides == {0: 1, 500: 2, 1450: 2, 1550: 1}
 
@@ -129,15 +136,15 @@ def test_what_is_not_known_of_a_pairs_place_is_in_its_motions_covariance() -> No
     """Together with another pair, as a side of its own, and alone."""
     seen = mixed((TRUTH, 80), (TRUTH, 80))
     exact, corrected = judged(seen), judged(seen, misaligned={1: PLACE})
-    assert len(corrected.sides) == 1
-    weighed = corrected.sides[0].refined
+    assert len(corrected.hypotheses) == 1
+    weighed = corrected.hypotheses[0].refined
     trusted = corrected.own[0].cur_T_ref
-    assert distance(weighed.cur_T_ref, trusted) < distance(exact.sides[0].refined.cur_T_ref, trusted)
-    assert np.trace(weighed.covariance) > 1.2 * np.trace(exact.sides[0].refined.covariance)
+    assert distance(weighed.cur_T_ref, trusted) < distance(exact.hypotheses[0].refined.cur_T_ref, trusted)
+    assert np.trace(weighed.covariance) > 1.2 * np.trace(exact.hypotheses[0].refined.covariance)
     np.testing.assert_array_equal(corrected.own[1].covariance, exact.own[1].covariance)  # watching P_12 needs it bare
-    contradicted = judged(mixed((TRUTH, 80), (DOOR, 80)), misaligned={1: PLACE}).sides[1]
+    contradicted = judged(mixed((TRUTH, 80), (DOOR, 80)), misaligned={1: PLACE}).hypotheses[1]
     assert contradicted.pairs == (1,)
-    alone = judged(seen.of_pair(1), misaligned={1: PLACE}).sides[0]
+    alone = judged(seen.of_pair(1), misaligned={1: PLACE}).hypotheses[0]
     for side in (contradicted, alone):
         lever = 0.1 * np.linalg.norm(se3_adjoint(side.refined.cur_T_ref) - np.eye(6), axis=1)
         assert np.all(np.sqrt(np.diag(side.refined.covariance)) > lever)
@@ -154,16 +161,17 @@ def test_a_second_motion_of_all_pairs_is_not_mixed_with_what_the_pairs_say_alone
     """Each view has a door of its own that outnumbers the world: the world's motion is nobody's, and stays itself."""
     world = mixed((TRUTH, 30), (TRUTH, 30), 3)
     seen = joined(world, mixed((DOOR, 40), (OTHER_DOOR, 40), 4))
-    sides = judged(seen, misaligned={1: Misalignment(np.zeros(6), 1e-8 * np.eye(6), 100.0)}).sides
+    sides = judged(seen, misaligned={1: Misalignment(np.zeros(6), 1e-8 * np.eye(6), 100.0)}).hypotheses
     assert sides[0].pairs == (0, 1)
     assert distance(sides[0].refined.cur_T_ref, TRUTH) < 5e-3
 
 
 def test_the_order_of_sides() -> None:
     def order(*sides: tuple[tuple[int, ...], int]) -> list[tuple[int, ...]]:
-        refined = judged(mixed((TRUTH, 60), (TRUTH, 60))).sides[0].refined
+        refined = judged(mixed((TRUTH, 60), (TRUTH, 60))).hypotheses[0].refined
         return [
-            side.pairs for side in _in_order([Side(p, replace(refined, inlier=np.arange(200) < n)) for p, n in sides])
+            side.pairs
+            for side in _in_order([MotionHypothesis(p, replace(refined, inlier=np.arange(200) < n)) for p, n in sides])
         ]
 
     assert order(((1,), 100), ((0,), 90)) == [(0,), (1,)]
@@ -178,27 +186,27 @@ def test_points_that_are_hardly_off_are_no_second_motion() -> None:
         seen = seen_points(RIG, TRUTH, 100, np.random.default_rng(7), sigma_px=0.04)
         askew = np.arange(len(seen.pair)) % 4 == 0
         off = np.where(askew[:, None], np.array([shift_px, 0.0]) / RIG.pairs[0].left.focal_px, 0.0)
-        assert len(judged(seen._replace(left=seen.left + off, right=seen.right + off)).sides) == motions
+        assert len(judged(seen._replace(left=seen.left + off, right=seen.right + off)).hypotheses) == motions
 
 
 def test_people_who_walk_through_all_views_are_a_second_motion() -> None:
     world = seen_points(RIG, TRUTH, 80, np.random.default_rng(1), sigma_px=0.2)
     people = seen_points(RIG, DOOR, 30, np.random.default_rng(2), sigma_px=0.2)
     agreement = judged(joined(world, people))
-    assert len(agreement.sides) == 2
-    assert distance(agreement.sides[0].refined.cur_T_ref, TRUTH) < 5e-3
-    assert distance(agreement.sides[1].refined.cur_T_ref, DOOR) < 1e-2
+    assert len(agreement.hypotheses) == 2
+    assert distance(agreement.hypotheses[0].refined.cur_T_ref, TRUTH) < 5e-3
+    assert distance(agreement.hypotheses[1].refined.cur_T_ref, DOOR) < 1e-2
 
 
 def test_wrong_matches_are_no_second_motion() -> None:
     seen = seen_points(RIG, TRUTH, 80, np.random.default_rng(3), sigma_px=0.2, outlier_share=0.4)
-    assert len(judged(seen).sides) == 1
+    assert len(judged(seen).hypotheses) == 1
 
 
 def test_a_single_pair_has_nobody_to_contradict_it() -> None:
     seen = seen_points(RIG, TRUTH, 60, np.random.default_rng(4), sigma_px=0.2).of_pair(1)
     agreement = judged(seen)
-    assert len(agreement.sides) == 1
+    assert len(agreement.hypotheses) == 1
     assert agreement.own == {}
 
 
@@ -208,11 +216,11 @@ def test_each_pair_is_told_its_own_error() -> None:
     loud = seen_points(RIG, TRUTH, 200, np.random.default_rng(6), sigma_px=loud_px).of_pair(1)
     seen = joined(quiet, loud)
     agreement = judged(seen)
-    assert len(agreement.sides) == 1
+    assert len(agreement.hypotheses) == 1
     rows = {j: np.arange(200) for j in range(2)}
     frame = replace(PairFrame.empty(), ids=np.arange(200), ages=np.zeros(200, dtype=np.int64))
     for j, sigma_px in enumerate((quiet_px, loud_px)):
-        report = _report(frame, Correspondences(seen, rows, {0: 200, 1: 200}), j, agreement)
+        report = pair_reports({j: frame}, Correspondences(seen, rows, {0: 200, 1: 200}), agreement, {})[j]
         assert report.inliers > 180
         assert report.rms_px == pytest.approx(sigma_px, rel=0.1)
         assert report.own_rms_px == pytest.approx(sigma_px, rel=0.1)
@@ -223,7 +231,7 @@ def test_a_pair_that_the_chosen_motion_does_not_explain_has_no_error_under_it() 
     agreement = judged(seen)
     rows = {0: np.arange(120), 1: np.arange(60)}
     frame = replace(PairFrame.empty(), ids=np.arange(60), ages=np.zeros(60, dtype=np.int64))
-    report = _report(frame, Correspondences(seen, rows, {0: 120, 1: 60}), 1, agreement)
+    report = pair_reports({1: frame}, Correspondences(seen, rows, {0: 120, 1: 60}), agreement, {})[1]
     assert (report.inliers, report.rms_px) == (0, None)
     assert report.own_rms_px == pytest.approx(0.2, rel=0.15)
 
@@ -237,9 +245,11 @@ def test_swapping_pairs_changes_only_their_names(second: Float, seed: int) -> No
     columns: list[AnyArray] = [column[order] for column in seen]
     swapped = Observations(*columns)._replace(pair=1 - seen.pair[order])
     first, again = judged(seen, seed), judged(swapped, seed, RigArrays.of(RIG.with_pairs([1, 0])))
-    assert [side.pairs for side in again.sides] == [tuple(sorted(1 - j for j in side.pairs)) for side in first.sides]
-    assert again.tension == pytest.approx(first.tension, rel=0.02)
-    for one, other in zip(first.sides, again.sides, strict=True):
+    assert [side.pairs for side in again.hypotheses] == [
+        tuple(sorted(1 - j for j in side.pairs)) for side in first.hypotheses
+    ]
+    assert again.max_distance == pytest.approx(first.max_distance, rel=0.02)
+    for one, other in zip(first.hypotheses, again.hypotheses, strict=True):
         assert_same(one.refined, other.refined)
         np.testing.assert_array_equal(other.refined.inlier, one.refined.inlier[order])
     assert again.own.keys() == {1 - j for j in first.own}
@@ -269,12 +279,12 @@ def measured(cur_T_ref: Float, inliers: int, sigma: float = 1e-4) -> RelativeMot
 
 def judgement(
     motions: Sequence[RelativeMotion],
-    tension: float,
+    max_distance: float,
     frozen_since_ns: int | None,
     stereo: StereoShare,
     noise: float = 0.5,
 ) -> tuple[RelativeMotion, Quality, str]:
-    return graded([doubted(motion, frozen_since_ns, stereo, noise) for motion in motions], tension)
+    return graded([graded_hypothesis(motion, frozen_since_ns, stereo, noise) for motion in motions], max_distance)
 
 
 def test_a_good_motion_is_left_as_it_is() -> None:
@@ -334,7 +344,7 @@ def test_the_weakest_directions_of_a_motion_are_told() -> None:
     assert replace(measured(TRUTH, 50), covariance=covariance).weakest_sigmas == pytest.approx((2e-3, 0.03))
 
 
-def test_tension_and_weak_directions_are_told() -> None:
+def test_max_distance_and_weak_directions_are_told() -> None:
     base = np.trace(measured(TRUTH, 200).covariance)
     assert np.trace(judgement([measured(TRUTH, 200)], 36.0, None, CONFIRMED)[0].covariance) == pytest.approx(3.0 * base)
     weak = replace(measured(TRUTH, 200), covariance=np.diag([1e-8] * 5 + [0.01]))

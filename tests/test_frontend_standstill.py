@@ -19,7 +19,7 @@ def told(shifts_px: Float, noise_px: float = 0.05, explained: int = 60) -> list[
         pixels = PLACES + [shift, 0.0] + noise_px * rng.standard_normal((60, 2))
         pixels[explained:] += 40.0 * k  # somebody walks by, whom the rig's motion does not explain
         frame = replace(PairFrame.empty(k * PERIOD_NS), ids=np.arange(60), pixels=pixels)
-        gate_results.append(standstill.look({0: frame}, {0: np.arange(explained)}))
+        gate_results.append(standstill.update({0: frame}, {0: np.arange(explained)}))
     return gate_results
 
 
@@ -41,4 +41,4 @@ def test_rest_ends_at_once_and_begins_anew() -> None:
 
 def test_few_points_tell_nothing() -> None:
     assert not any(told(np.zeros(12), explained=20))
-    assert not Standstill().look({}, {})
+    assert not Standstill().update({}, {})

@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from graphvio.slam.keyframes import Keyframes
 from scipy.stats import chi2
 from synthetic import random_covariance, transform, two_pair_rig
 
@@ -20,7 +19,7 @@ from graphvio.frontend.stereo import triangulate
 from graphvio.frontend.tracks import PairFrame, common_rows
 from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.measurements.sensors import Measurement
-from graphvio.odometry.step import Step
+from graphvio.odometry.step import NewKeyframe, Step
 from graphvio.rig import Rig
 from graphvio.simulation.simulator import make_simulator
 from graphvio.slam.descriptors import describer
@@ -163,17 +162,19 @@ def test_the_maps_drift_covers_what_odometry_drifts(run: Run, truth: Trajectory)
     assert 0.05 < np.mean(squares) < 10.0
 
 
-def test_where_nothing_is_known_of_the_way_all_of_the_poses_covariance_is_told(rig: Rig) -> None:
-    keyframes = Keyframes(rig, Config())
+def test_keyframe_without_a_motion_has_the_covariance_of_its_pose(rig: Rig) -> None:
+    front_end = FrontEnd(Odometry(rig))
     made: list[Keyframe] = []
-    keyframes.call(made.append)
+    front_end.on_keyframe(made.append)
     spread, known = random_covariance(np.random.default_rng(0), 6, 0.1), np.eye(6)
     poses = [transform([0, 0, 0.1 * k], [float(k), 0, 0]) for k in range(6)]
     statuses = [Status.TRACKING] * 4 + [Status.LOST, Status.TRACKING]
     for k, (pose, status) in enumerate(zip(poses, statuses, strict=True)):
         is_lost = status is Status.LOST
         estimate = Estimate(k, status, None if is_lost else pose, None if is_lost else spread, epoch=int(k == 5))
-        keyframes.add(estimate, {}, {}, np.stack([np.eye(4)] * 2), (poses[1], known) if k in (1, 3, 5) else None)
+        motion = (poses[1], known) if k in (1, 3, 5) else (None, None)
+        keyframe = NewKeyframe({}, {}, np.stack([np.eye(4)] * 2), k - 1 if k else None, *motion)
+        front_end._on_step(Step(estimate, None, False, None, False, frozenset({k}), {}, keyframe))
     assert [(k.id, k.epoch, k.previous_id) for k in made] == [
         (0, 0, None),
         (1, 0, 0),

@@ -12,10 +12,9 @@ triangulates, `slanted` aligns. `tracker` joins these, and `tracks` is what it r
 (`refinement`, with the normal equations of `linearisation` and what `noise` reads from the residuals). `selection`
 joins the pairs or decides between them.
 
-*Judgement.* `agreement` keeps apart what contradicting pairs say, `quality` grades a motion, `standstill` tells rest,
-`alignment` watches the transfer between pairs, `frozen` notices cameras that repeat an image, `images` those of a wrong
-size.
+*Decisions.* `agreement` finds consensus sets of pairs, `quality` grades a motion, `references` says when a keyframe
+ends, `alignment` monitors the transfer between pairs, `standstill`, `frozen` and `images` check the images;
+`thresholds` has all numbers that these decisions depend on.
 
-`visual` is the front-end as the odometry uses it: `references` are the framesets that it measures from, `motion` is
-what it answers, `stopwatch` takes the time.
+`visual` is the front-end as the odometry uses it.
 """

@@ -1,9 +1,9 @@
-"""Do the pairs agree? Each pair's own motion against the others', by their covariances.
+"""Whether the pairs agree: each pair's own motion against the others', by their covariances.
 
-Two pairs that both see rigid scenes must report one motion. Where they do not, something fills a view and moves (a
-door, a crowd), images are late, or the transfer between the pairs, eq. (1), is wrong. A motion refined on all points
-is then a compromise that is right for nobody: each side's own motion is kept apart instead, and the better-supported
-side comes first, as in eq. (4).
+Pairs that see rigid scenes measure one motion. Where their motions differ, a door or a crowd fills a view and moves,
+images are late, or the transfer between the pairs, eq. (1), is wrong. A motion refined on all points would then be
+right for none of them: the motion of each consensus set is kept as a hypothesis, and the better-supported one comes
+first, as in eq. (4).
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,26 +18,20 @@ from graphvio.frontend.alignment import Misalignment, combined, placed
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.ransac import search
 from graphvio.frontend.refinement import Refined, refine
+from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.geometry import se3_inverse, se3_log
 
-_BEYOND_5_SIGMA = 40.0  # chi-square of 6 degrees of freedom that a normal error exceeds once in 2 million
-_BEYOND_2_SIGMA = 12.6  # once in 20: enough for pairs that contradicted each other a moment ago
-_POORLY_EXPLAINED = 0.5  # share of a pair's points below which the pair looks for a motion of its own
-_WELL_EXPLAINED = 0.9  # from there on its own motion is next to the joint one
-_RIVAL_POINTS = 12
-_UNLIKE_PX = 1.0  # less is a lens that is not quite known: such points are left out, but they are no second motion
-_COMPARABLE = 0.85  # support over that of the best supported: support alone does not tell who is right
-_UNEXPLAINED_SHARE = 0.12  # of all points, unexplained: from there on they may have a motion of their own
+_T = THRESHOLDS.agreement
 _NONE: Mapping[int, Misalignment] = {}
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
-    """Pairs that agree, and what they say together.
+class MotionHypothesis:
+    """The motion of a consensus set of pairs.
 
     Attributes:
-        pairs: their indices.
-        refined: the motion on their points; ``inlier`` (N,) covers the points of all pairs, False for other sides'.
+        pairs: Indices of the pairs, increasing.
+        refined: The motion on their points; ``inlier`` (N,) covers the points of all pairs, False for other sets'.
     """
 
     pairs: tuple[int, ...]
@@ -51,19 +45,19 @@ class Side:
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """What all pairs say.
+    """The motions of all pairs.
 
     Attributes:
-        sides: one if all pairs that see enough agree; else one for each opinion, the best supported first; of pairs
-            with about as much support the lowest in number, from which the others' places are told.
-        own: pair -> its own motion, of the pairs that see enough, as if the pair's place were known exactly.
-        tension: the largest squared Mahalanobis distance between two pairs of one side, 0 for a single pair.
-        contradicts: whether two pairs are beyond 5 sigma of each other.
+        hypotheses: One if all pairs that see enough agree; else one for each consensus set, the best supported first.
+            Of comparable ones the pair of the lowest index comes first, as the extrinsics are relative to pair 0.
+        own: Pair index -> its own motion, of the pairs that see enough, as if its extrinsics were exact.
+        max_distance: Largest squared Mahalanobis distance between two pairs of a consensus set, 0 for a single pair.
+        contradicts: Whether two pairs are beyond 5 sigma of each other.
     """
 
-    sides: tuple[Side, ...]
+    hypotheses: tuple[MotionHypothesis, ...]
     own: dict[int, Refined]
-    tension: float = 0.0
+    max_distance: float = 0.0
     contradicts: bool = False
 
 
@@ -76,16 +70,16 @@ def agree(
     misaligned: Mapping[int, Misalignment] = _NONE,
     in_doubt: bool = False,
 ) -> Agreement:
-    """Compare the pairs' own motions with each other.
+    """Compare the pairs' own motions, and return the motion of each consensus set.
 
     Args:
-        rig: of P pairs.
-        observations: of any subset of them.
+        rig: P pairs.
+        observations: Points of any subset of them.
         joint: `graphvio.frontend.selection.joint_motion` of these.
-        config: of this stage.
-        rng: source of random triples.
-        misaligned: pairs whose place has been corrected, which leaves it uncertain.
-        in_doubt: the pairs contradicted each other a moment ago, so that less is enough to tell them apart now.
+        config: Configuration of the motion stage.
+        rng: Source of random triples.
+        misaligned: Pairs whose extrinsics have been corrected, which leaves them uncertain.
+        in_doubt: Whether the pairs contradicted each other a moment ago: less is then enough to tell them apart.
     """
     everyone = observations.pairs
     own: dict[int, Refined] = {}
@@ -94,46 +88,51 @@ def agree(
         own = {j: motion for j, motion in motions.items() if is_supported(motion.inlier, config)}
     elif everyone:
         joint = placed(joint, misaligned.get(everyone[0]))
-    opinions = {j: placed(motion, misaligned.get(j)) for j, motion in own.items()}
-    apart = {(i, j): disagreement(opinions[i], opinions[j]) for i, j in combinations(sorted(opinions), 2)}
-    camps = _camps(sorted(own, key=lambda j: -int(own[j].inlier.sum())), apart, in_doubt)
-    tension = max((apart[pair] for camp in camps for pair in combinations(sorted(camp), 2)), default=0.0)
-    if len(camps) > 1:
-        sides = _in_order([_side(rig, observations, sorted(camp), own, opinions, misaligned, config) for camp in camps])
+    placed_motions = {j: placed(motion, misaligned.get(j)) for j, motion in own.items()}
+    apart = {
+        (i, j): disagreement(placed_motions[i], placed_motions[j]) for i, j in combinations(sorted(placed_motions), 2)
+    }
+    sets = _consensus_sets(sorted(own, key=lambda j: -int(own[j].inlier.sum())), apart, in_doubt)
+    max_distance = max((apart[pair] for pairs in sets for pair in combinations(sorted(pairs), 2)), default=0.0)
+    if len(sets) > 1:
+        hypotheses = _in_order(
+            [_hypothesis(rig, observations, sorted(pairs), own, placed_motions, misaligned, config) for pairs in sets]
+        )
     else:
-        if camps and not misaligned.keys().isdisjoint(camps[0]):
-            joint = combined(joint, [opinions[j] for j in sorted(camps[0])])
-        sides = [Side(everyone, joint)]
-    second = _second_motion(rig, observations, sides, config, rng)
+        if sets and not misaligned.keys().isdisjoint(sets[0]):
+            joint = combined(joint, [placed_motions[j] for j in sorted(sets[0])])
+        hypotheses = [MotionHypothesis(everyone, joint)]
+    second = _second_motion(rig, observations, hypotheses, config, rng)
     if second is not None:
-        sides = [second, *sides] if second.support > max(side.support for side in sides) else [*sides, second]
-    return Agreement(tuple(sides), own, tension, max(apart.values(), default=0.0) >= _BEYOND_5_SIGMA)
+        best = max(hypothesis.support for hypothesis in hypotheses)
+        hypotheses = [second, *hypotheses] if second.support > best else [*hypotheses, second]
+    return Agreement(tuple(hypotheses), own, max_distance, max(apart.values(), default=0.0) >= _T.max_distance)
 
 
-def _camps(pairs: Sequence[int], apart: Mapping[tuple[int, int], float], in_doubt: bool) -> list[list[int]]:
-    """Pairs, the best supported first, gathered so that within a camp each agrees with every other."""
-    limit = _BEYOND_2_SIGMA if in_doubt else _BEYOND_5_SIGMA
-    camps: list[list[int]] = []
+def _consensus_sets(pairs: Sequence[int], apart: Mapping[tuple[int, int], float], in_doubt: bool) -> list[list[int]]:
+    """Gather pairs, the best supported first, so that within a set each agrees with every other."""
+    limit = _T.max_distance_in_doubt if in_doubt else _T.max_distance
+    sets: list[list[int]] = []
     for j in pairs:
-        for camp in camps:
-            if all(apart[min(i, j), max(i, j)] < limit for i in camp):
-                camp.append(j)
+        for members in sets:
+            if all(apart[min(i, j), max(i, j)] < limit for i in members):
+                members.append(j)
                 break
         else:
-            camps.append([j])
-    return camps
+            sets.append([j])
+    return sets
 
 
-def _in_order(sides: list[Side]) -> list[Side]:
-    """The best supported first; but an error of P_12 puts no pair in the wrong, and to change sides would add it up."""
-    enough = _COMPARABLE * max(side.support for side in sides)
-    comparable = [side for side in sides if side.support >= enough]
-    others = [side for side in sides if side.support < enough]
-    return sorted(comparable, key=lambda side: side.pairs[0]) + sorted(others, key=lambda side: -side.support)
+def _in_order(hypotheses: list[MotionHypothesis]) -> list[MotionHypothesis]:
+    """Sort by support; but an error of P_12 refutes no pair, and changing between comparable ones would add it up."""
+    enough = _T.min_comparable_support * max(hypothesis.support for hypothesis in hypotheses)
+    comparable = [hypothesis for hypothesis in hypotheses if hypothesis.support >= enough]
+    others = [hypothesis for hypothesis in hypotheses if hypothesis.support < enough]
+    return sorted(comparable, key=lambda each: each.pairs[0]) + sorted(others, key=lambda each: -each.support)
 
 
 def disagreement(one: Refined, other: Refined) -> float:
-    """Squared Mahalanobis distance between two motions of body over the same time, measured independently."""
+    """Return the squared Mahalanobis distance between two independent measurements of one motion of body."""
     apart = se3_log(np.ascontiguousarray(one.cur_T_ref @ se3_inverse(other.cur_T_ref)))
     return float(apart @ np.linalg.solve(one.covariance + other.covariance, apart))
 
@@ -153,52 +152,56 @@ def _own_motion(
 ) -> Refined:
     seen, inlier = observations.of_pair(pair), joint.inlier[observations.pair == pair]
     share = float(inlier.mean())
-    if share >= _WELL_EXPLAINED:
+    if share >= _T.min_joint_share:
         return refine(rig, seen, joint.cur_T_ref, config, known=inlier)
     start = joint.cur_T_ref
-    if share < _POORLY_EXPLAINED:
+    if share < _T.min_searched_share:
         start = search(rig, seen, start, config, rng)
     return refine(rig, seen, start, config)
 
 
-def _side(
+def _hypothesis(
     rig: RigArrays,
     observations: Observations,
-    camp: list[int],
+    pairs: list[int],
     own: Mapping[int, Refined],
-    opinions: Mapping[int, Refined],
+    placed_motions: Mapping[int, Refined],
     misaligned: Mapping[int, Misalignment],
     config: MotionConfig,
-) -> Side:
-    """The motion of pairs that agree."""
-    rows = np.isin(observations.pair, camp)
-    refined = opinions[camp[0]]
-    if len(camp) > 1:
-        first = own[max(camp, key=lambda j: int(own[j].inlier.sum()))]
+) -> MotionHypothesis:
+    """Return the motion of a consensus set."""
+    rows = np.isin(observations.pair, pairs)
+    refined = placed_motions[pairs[0]]
+    if len(pairs) > 1:
+        first = own[max(pairs, key=lambda j: int(own[j].inlier.sum()))]
         refined = refine(rig, observations.of_rows(rows), first.cur_T_ref, config)
-        if not misaligned.keys().isdisjoint(camp):
-            refined = combined(refined, [opinions[j] for j in camp])
-    return Side(tuple(camp), _spread_over(rows, refined))
+        if not misaligned.keys().isdisjoint(pairs):
+            refined = combined(refined, [placed_motions[j] for j in pairs])
+    return MotionHypothesis(tuple(pairs), _spread_over(rows, refined))
 
 
 def _second_motion(
-    rig: RigArrays, observations: Observations, sides: list[Side], config: MotionConfig, rng: np.random.Generator
-) -> Side | None:
-    """One more rigid motion, of most points that no side explains: the world's, or what moves in it."""
-    errors_px = np.fmin.reduce([side.refined.errors_px for side in sides])  # of the side that likes a point best
-    unlike = ~(errors_px < _UNLIKE_PX)
-    rest = unlike & ~np.any([side.refined.inlier for side in sides], axis=0)
-    if rest.sum() < max(_RIVAL_POINTS, _UNEXPLAINED_SHARE * len(rest)):
+    rig: RigArrays,
+    observations: Observations,
+    hypotheses: list[MotionHypothesis],
+    config: MotionConfig,
+    rng: np.random.Generator,
+) -> MotionHypothesis | None:
+    """Find one more rigid motion, of most points that none explains: the world's, or that of an object."""
+    errors_px = np.fmin.reduce([each.refined.errors_px for each in hypotheses])
+    unlike = ~(errors_px < _T.min_unlike_px)
+    unexplained = unlike & ~np.any([each.refined.inlier for each in hypotheses], axis=0)
+    if unexplained.sum() < max(_T.min_rival_points, _T.min_unexplained_share * len(unexplained)):
         return None
-    seen = observations.of_rows(rest)
-    refined = refine(rig, seen, search(rig, seen, sides[0].refined.cur_T_ref, config, rng), config)
-    if refined.inlier.sum() < max(_RIVAL_POINTS, _POORLY_EXPLAINED * rest.sum()):
+    seen = observations.of_rows(unexplained)
+    refined = refine(rig, seen, search(rig, seen, hypotheses[0].refined.cur_T_ref, config, rng), config)
+    if refined.inlier.sum() < max(_T.min_rival_points, _T.min_rival_share * unexplained.sum()):
         return None
-    return Side(seen.pairs, _spread_over(rest, refined))
+    return MotionHypothesis(seen.pairs, _spread_over(unexplained, refined))
 
 
 def _spread_over(rows: Bool, refined: Refined) -> Refined:
-    """A motion of some rows' points, its inliers and errors among all points."""
+    """Spread the inliers and errors of some rows' points over all points."""
     inlier, errors_px = np.zeros(len(rows), dtype=bool), np.full(len(rows), np.nan)
     inlier[rows], errors_px[rows] = refined.inlier, refined.errors_px
     return replace(refined, inlier=inlier, errors_px=errors_px)

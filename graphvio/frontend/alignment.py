@@ -1,8 +1,8 @@
-"""Watches P_12: whether two pairs' own motions can be those of one rigid body with the transfer that the rig file says.
+"""Online monitoring of the extrinsics between pairs: whether their own motions fit one rigid body with the rig's P_12.
 
-With an error ``d`` of ``body_T_left`` (from the left, in body), a pair reports the motion ``exp(-d) M exp(d)`` where
+With an error ``d`` of ``body_T_left`` (from the left, in body), a pair measures the motion ``exp(-d) M exp(d)`` where
 the rig's is M. Motions over whole keyframes, which share next to no noise, are collected, and d is their robust
-least-squares solution, by Gauss-Newton: section 4 in small.
+least-squares solution by Gauss-Newton: section 4 in small.
 """
 
 from __future__ import annotations
@@ -13,32 +13,24 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
 from graphvio.arrays import Float
 from graphvio.frontend.refinement import Refined
+from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.kernels import kernel
 from graphvio.rig import Rig
 
-_KEPT = 100
-_FEWEST = 6
-_ROUNDS = 8
-_CAUCHY = 9.0  # squared scale for the distance of one motion, which has 6 degrees of freedom
-_PRIOR_SIGMAS = np.repeat([0.1, 0.2], 3)  # radians and metres: decides only in directions that no motion shows
-_SIGNIFICANT = float(chi2.isf(1e-9, 6))
-_MOST_OUTLIERS = 0.3
-_VAGUE = 0.25  # a size whose sigma is a larger share of it is not told,
-_FINE_RAD, _FINE_M = np.deg2rad(0.2), 0.01  # unless the sigma is no larger than this
+_T = THRESHOLDS.alignment
 
 
 class Misalignment(NamedTuple):
     """An error of a pair's extrinsics.
 
     Attributes:
-        tangent: (6,) ``[rotation, translation]`` d: the true ``body_T_left`` is ``exp(d)`` times the assumed one.
-        covariance: (6, 6) of it.
-        statistic: chi-square (6 degrees of freedom) of d being zero.
+        tangent: (6,) ``[rotation, translation]`` d: The true ``body_T_left`` is ``exp(d)`` times the assumed one.
+        covariance: (6, 6) of d.
+        statistic: Chi-square (6 degrees of freedom) of d being zero.
     """
 
     tangent: Float
@@ -48,28 +40,28 @@ class Misalignment(NamedTuple):
     @property
     def is_significant(self) -> bool:
         """Whether chance explains it less than once in 10^9."""
-        return self.statistic > _SIGNIFICANT
+        return self.statistic > _T.significant
 
     def refutes(self, other: Misalignment) -> bool:
-        """Whether it is surely not the other one."""
+        """Whether the other error is significantly different."""
         apart = self.tangent - other.tangent
-        return float(apart @ np.linalg.solve(self.covariance, apart)) > _SIGNIFICANT
+        return float(apart @ np.linalg.solve(self.covariance, apart)) > _T.significant
 
 
 class PairAlignment:
-    """Collects what one pair's motions say of its place relative to another pair.
+    """Estimates the error of a pair's extrinsics relative to another pair, from the motions of both.
 
     Attributes:
-        in_force: the error that the pair's motions allow for from here on, or None as long as it is none.
+        in_force: The error that the pair's motions are corrected for from now on, or None.
     """
 
     def __init__(self) -> None:
-        self._motions: deque[tuple[Float, Float, Float]] = deque(maxlen=_KEPT)  # trusted, the pair's, whitener
+        self._motions: deque[tuple[Float, Float, Float]] = deque(maxlen=_T.max_motions)  # trusted, the pair's, whitener
         self.in_force: Misalignment | None = None
 
     @property
     def correction(self) -> Float:
-        """What the rig file's ``body_T_left`` of the pair is to be multiplied by from the left (4, 4)."""
+        """(4, 4) by which the rig's ``body_T_left`` of the pair is multiplied from the left."""
         return np.eye(4) if self.in_force is None else se3_exp(self.in_force.tangent)
 
     def add(self, trusted: Refined, pair: Refined) -> None:
@@ -80,7 +72,7 @@ class PairAlignment:
         self._motions.append((trusted.cur_T_ref, uncorrected, whitener))
 
     def learn(self) -> bool:
-        """Put what the motions say into force, or out of it once they refute it; whether that changes anything."""
+        """Put a significant error into force, or a refuted one out of it, and return whether that changes anything."""
         found = self.solve()
         if found is None:
             return False
@@ -93,29 +85,29 @@ class PairAlignment:
         return False
 
     def solve(self) -> Misalignment | None:
-        """The error of the rig file's extrinsics, or None while too few motions agree on one."""
-        if len(self._motions) < _FEWEST:
+        """Return the error of the rig's extrinsics, or None while too few motions agree on one."""
+        if len(self._motions) < _T.min_motions:
             return None
         trusted, pairs, whiteners = (np.array(column) for column in zip(*self._motions, strict=True))
-        prior = np.diag(1.0 / _PRIOR_SIGMAS**2)
+        prior = np.diag(1.0 / _T.prior_sigmas**2)
         d = np.zeros(6) if self.in_force is None else self.in_force.tangent
         information = prior
-        for _ in range(_ROUNDS):
+        for _ in range(_T.iterations):
             errors, derivatives = _linearised(se3_exp(d), trusted, pairs, whiteners)
             squared = np.sum(errors**2, axis=1)
-            weights = 1.0 / (1.0 + squared / _CAUCHY)
+            weights = 1.0 / (1.0 + squared / _T.cauchy_scale)
             information = prior + np.einsum("n,nki,nkj->ij", weights, derivatives, derivatives)
             gradient = prior @ d + np.einsum("n,nki,nk->i", weights, derivatives, errors)
             d = d - np.linalg.solve(information, gradient)
-        if np.mean(squared > 4.0 * _CAUCHY) > _MOST_OUTLIERS:
+        if np.mean(squared > 4.0 * _T.cauchy_scale) > _T.max_outlier_share:
             return None
         return Misalignment(d, np.asarray(np.linalg.inv(information)), float(d @ (information - prior) @ d))
 
 
 def learn_from_nothing(motion: Refined) -> None:
-    """Do what `PairAlignment` does, with one motion that says nothing, for the warm-up."""
+    """Compile the kernels of `PairAlignment` by a motion without information, for the warm-up."""
     alignment = PairAlignment()
-    for _ in range(_FEWEST):
+    for _ in range(_T.min_motions):
         alignment.add(motion, motion)
     alignment.learn()
 
@@ -129,18 +121,18 @@ def describe(rig: Rig, pair: int, misalignment: Misalignment) -> str:
     angle, distance = float(np.linalg.norm(turned)), float(np.linalg.norm(moved))
     by_angle = f"{np.rad2deg(angle):.2f} (+- {np.rad2deg(sigmas[0]):.2f}) deg"
     by_distance = f"{100 * distance:.1f} (+- {100 * sigmas[1]:.1f}) cm"
-    if sigmas[0] > max(_VAGUE * angle, _FINE_RAD):
-        by_angle = "an angle that these motions do not tell"
-    if sigmas[1] > max(_VAGUE * distance, _FINE_M):
-        by_distance = "a distance that these motions do not tell"
+    if sigmas[0] > max(_T.max_vague_share * angle, _T.max_fine_rad):
+        by_angle = "an angle that these motions do not determine"
+    if sigmas[1] > max(_T.max_vague_share * distance, _T.max_fine_m):
+        by_distance = "a distance that these motions do not determine"
     return (
-        f"pair {rig.pairs[pair].name} is {by_angle} and {by_distance} from where the rig file has it, as its motion "
-        "against the first pair's tells"
+        f"pair {rig.pairs[pair].name} is {by_angle} and {by_distance} from where the rig has it, as its motion and "
+        "the first pair's show"
     )
 
 
 def placed(motion: Refined, misalignment: Misalignment | None) -> Refined:
-    """A pair's motion, with what is not known of the pair's place in its covariance."""
+    """Add the uncertainty of a pair's extrinsics to the covariance of its motion."""
     if misalignment is None:
         return motion
     lever = np.eye(6) - se3_adjoint(motion.cur_T_ref)
@@ -148,12 +140,13 @@ def placed(motion: Refined, misalignment: Misalignment | None) -> Refined:
 
 
 def combined(joint: Refined, motions: Sequence[Refined]) -> Refined:
-    """One motion of pairs of which some have been corrected, each weighed by its covariance, see `placed`; points of
-    all pairs together would be weighed as if the corrections were exact.
+    """Combine the motions of pairs, some of which have been corrected, each weighed by its covariance, see `placed`.
+
+    Refining on the points of all pairs would weigh them as if the corrections were exact.
 
     Args:
-        joint: motion on all points, which tells the inliers.
-        motions: of each pair alone.
+        joint: Motion on all points, which has the inliers.
+        motions: Motion of each pair alone.
     """
     first = motions[0].cur_T_ref
     information, weighted, through_points = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
@@ -173,8 +166,8 @@ def combined(joint: Refined, motions: Sequence[Refined]) -> Refined:
 
 @kernel
 def _linearised(correction: Float, trusted: Float, pairs: Float, whiteners: Float) -> tuple[Float, Float]:
-    """Whitened differences (N, 6) of a pair's corrected motions from the trusted ones, and their derivatives (N, 6, 6)
-    by a further correction from the left."""
+    """Return whitened differences (N, 6) of a pair's corrected motions from the trusted ones, and their derivatives
+    (N, 6, 6) by one more correction from the left."""
     n = len(trusted)
     errors, derivatives = np.empty((n, 6)), np.empty((n, 6, 6))
     inverse = se3_inverse(correction)

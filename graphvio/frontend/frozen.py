@@ -1,4 +1,4 @@
-"""Images that are delivered twice: a camera that is stuck shows a world at rest, and shows it convincingly."""
+"""Detection of cameras that repeat their image, which would look like a standstill."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from graphvio.measurements.sensors import FrameSet
 
 @dataclass(frozen=True)
 class Frozen:
-    """What is the matter with a frameset.
+    """Repeated images of a frameset.
 
     Attributes:
-        pairs: of which a camera repeats its image while another pair's cameras do not, or its partner does not.
-        all_since_ns: stamp since which every image is the same, or None. Cameras without noise at rest do so too.
-        reason: one line for people.
+        pairs: Pairs of which a camera repeats its image while another pair's cameras or its partner do not.
+        all_since_ns: Stamp since which every image is the same, or None; so it is at a standstill without image noise.
+        reason: One line for people.
     """
 
     pairs: frozenset[int]
@@ -26,15 +26,15 @@ class Frozen:
 
 
 class FrozenImages:
-    """Compares each image with the one before it, byte for byte: a sensor that lives has noise."""
+    """Compares each image with the one before it, byte for byte: living sensors have noise."""
 
     def __init__(self) -> None:
         self._last: dict[int, tuple[Image, Image]] = {}
         self._changed_ns: dict[int, int] = {}  # when both of a pair's images last were new
         self._seen_ns: dict[int, int] = {}  # when a pair last had images
 
-    def look(self, frameset: FrameSet) -> Frozen:
-        """Judge a frameset."""
+    def update(self, frameset: FrameSet) -> Frozen:
+        """Return which images of a frameset repeat those before."""
         others_changed = self._others_changed(frameset)
         repeats: dict[int, int] = {}
         for j, images in frameset.images.items():

@@ -1,4 +1,4 @@
-"""Images as the kernels trust them to be."""
+"""Checks of images, which the kernels rely on."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from graphvio.rig import Camera, Rig
 
 
 def checked(frameset: FrameSet, rig: Rig) -> FrameSet:
-    """The frameset with contiguous images.
+    """Return the frameset with contiguous images.
 
     Raises:
         RigError: if an image is not of the type and size that the rig says.
@@ -35,7 +35,7 @@ def _checked(image: Image, camera: Camera) -> Image:
 
 
 def allowed_pixels(camera: Camera, window_px: int) -> Bool:
-    """Where (height, width) points of a camera's image may be: where no pixel of their patch is masked, or anywhere.
+    """Return where (height, width) points of an image may be: where no pixel of their patch is masked.
 
     Raises:
         RigError: if the camera's mask is no image of its size.

@@ -1,4 +1,4 @@
-"""The framesets that motion is measured from: the previous one, or keyframes that stay while enough is in view."""
+"""The framesets that motion is measured from: the previous one, or keyframes while enough of them is in view."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from graphvio.arrays import Int
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.observations import Correspondences
 from graphvio.frontend.refinement import Refined
+from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracks import PairFrame, common_rows
 
-_FEWEST_POINTS = 20
+_T = THRESHOLDS.reference
 
 
 class References:
-    """Each pair's reference frame, and whether it still serves."""
+    """Each pair's reference frame, and the decision when to take a new one."""
 
     def __init__(self, config: MotionConfig) -> None:
         self._config = config
@@ -28,11 +29,11 @@ class References:
         return frozenset(frame.stamp_ns for frame in self._frames.values())
 
     def of(self, pair: int) -> PairFrame | None:
-        """A pair's reference frame, or None."""
+        """Return a pair's reference frame, or None."""
         return self._frames.get(pair)
 
     def replace(self, frames: Mapping[int, PairFrame]) -> None:
-        """These frames are their pairs' references from here on."""
+        """Take frames as their pairs' references from now on."""
         self._frames.update(frames)
 
     def clear(self) -> None:
@@ -44,7 +45,7 @@ class References:
         self._frames.pop(pair, None)
 
     def shared(self, frames: Mapping[int, PairFrame]) -> dict[int, PairFrame]:
-        """Reference frames of one instant: of several, those with most tracks in view."""
+        """Return reference frames of one instant: of several instants, that with most tracks in view."""
         groups: dict[int, dict[int, PairFrame]] = {}
         for j in frames:
             if j in self._frames:
@@ -57,19 +58,19 @@ class References:
 
         return groups[max(groups, key=lambda stamp_ns: (in_view(stamp_ns), stamp_ns))]
 
-    def are_spent(
+    def must_be_replaced(
         self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined, contradicted: bool
     ) -> bool:
-        """Whether the next motions had better be measured from these frames.
+        """Decide whether the next motions are measured from the newest frames.
 
         A pair that the motion does not explain at all, such as one with a crowd in front of it, does not end the
         keyframe of the others.
 
         Args:
-            frames: the newest of each pair.
-            correspondences: of them with the references.
-            refined: the motion.
-            contradicted: whether more than one motion is seen. Who is right is soonest told by many short motions.
+            frames: Newest frame of each pair.
+            correspondences: Points of them that the references have, too.
+            refined: The motion.
+            contradicted: Whether more than one motion is seen. Many short motions soonest show which one is right.
         """
         if self._config.reference == "previous":
             return True
@@ -79,25 +80,27 @@ class References:
             return True  # a pair that came back takes part again from the next frameset on
         pair, overlap = correspondences.observations.pair, self._config.keyframe_overlap
         explained = {int(j) for j in np.flatnonzero(np.bincount(pair[refined.inlier]))}
-        support, offered = int(refined.inlier.sum()), sum(correspondences.candidates[j] for j in explained)
-        if support < overlap * offered or support < _FEWEST_POINTS:
+        support, candidates = int(refined.inlier.sum()), sum(correspondences.candidates[j] for j in explained)
+        if support < overlap * candidates or support < _T.min_points:
             return True
         seen = correspondences.identities(frames, refined.inlier)
-        if self._share_of_near_points({j: seen[j] for j in explained}) < 0.5 * overlap:
+        if self._share_of_near_points({j: seen[j] for j in explained}) < _T.min_near_share * overlap:
             return True
-        # One pair's keyframe may be spent long before all points together are few.
+        # One pair may have lost its points long before all points together are few.
         for j, frame in frames.items():
             usable = refined.inlier[pair == j] if j in explained else pair == j
-            if usable.sum() < 0.5 * overlap * frame.has_depth.sum():
+            if usable.sum() < _T.min_pair_share * overlap * frame.has_depth.sum():
                 return True
         return False
 
     def _share_of_near_points(self, seen: Mapping[int, Int]) -> float:
-        """Share of the references' near points that are among those still seen, pair -> identities: far ones stay in
-        view for long, but tell no translation."""
-        offered = still = 0
+        """Return the share of the references' near points that are still seen (pair index -> identities).
+
+        Far points stay in view for long, but do not constrain the translation.
+        """
+        candidates = still = 0
         for j, ids in seen.items():
             near = self._frames[j].constrains_translation(self._config.pixel_sigma_px)
-            offered += int(near.sum())
+            candidates += int(near.sum())
             still += int(near[common_rows(self._frames[j].ids, ids)[0]].sum())
-        return still / offered if offered else 1.0
+        return still / candidates if candidates else 1.0

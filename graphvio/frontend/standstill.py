@@ -1,4 +1,4 @@
-"""Standing still, recognised from the images."""
+"""Detection of a standstill from the images."""
 
 from __future__ import annotations
 
@@ -7,27 +7,24 @@ from collections.abc import Mapping
 import numpy as np
 
 from graphvio.arrays import Float, Int
+from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracks import PairFrame, common_rows
 
-_USUAL_PX = 0.15  # half of the points must not have moved more
-_MOST_PX = 0.5
-_MOST = 0.9  # of the points must not have moved more than that
-_FEWEST_POINTS = 25
-_LEAST_S = 0.25  # a slow motion does not show at once
+_T = THRESHOLDS.standstill
 
 
 class Standstill:
-    """Holds each pair's frames against the one since which it may have been at rest."""
+    """Compares each pair's frames with the one since which it may have stood still."""
 
     def __init__(self) -> None:
         self._since: dict[int, PairFrame] = {}
 
-    def look(self, frames: Mapping[int, PairFrame], explained: Mapping[int, Int]) -> bool:
-        """Whether the rig has been at rest for a while.
+    def update(self, frames: Mapping[int, PairFrame], explained: Mapping[int, Int]) -> bool:
+        """Return whether the rig has stood still for a while.
 
         Args:
-            frames: the newest of each pair.
-            explained: pair -> identities of the points that the rig's motion explains, increasing.
+            frames: Newest frame of each pair.
+            explained: Pair index -> identities, increasing, of the points that the rig's motion explains.
         """
         moved: list[Float] = []
         elapsed_s = np.inf
@@ -40,9 +37,9 @@ class Standstill:
             at_now, at_then = common_rows(frame.ids[now], since.ids)
             moved.append(np.hypot(*(frame.pixels[now[at_now]] - since.pixels[at_then]).T))
         distance = np.concatenate(moved) if moved else np.zeros(0)
-        unmoved = len(distance) >= _FEWEST_POINTS and bool(
-            np.mean(distance < _USUAL_PX) > 0.5 and np.mean(distance < _MOST_PX) >= _MOST
+        unmoved = len(distance) >= _T.min_points and bool(
+            np.mean(distance < _T.max_median_px) > 0.5 and np.mean(distance < _T.max_moved_px) >= _T.min_unmoved_share
         )
         if not unmoved:
             self._since.update(frames)
-        return unmoved and elapsed_s >= _LEAST_S
+        return unmoved and elapsed_s >= _T.min_duration_s

@@ -15,9 +15,9 @@ from graphvio.frontend.keyframe_patches import KeyframePatches
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.prediction import predict_pixels
-from graphvio.frontend.stopwatch import Stopwatch
 from graphvio.frontend.tracks import PairFrame, common_rows, passes, usable_at
 from graphvio.rig import StereoPair
+from graphvio.timing import Stopwatch
 
 _MAX_TRACKS_PER_CELL = 2
 _MAX_FLAT_FRAMES = 3  # then another corner of the cell gets its chance

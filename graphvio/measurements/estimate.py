@@ -54,8 +54,8 @@ class Estimate:
         pairs: pair index -> what it contributed.
         stage_ms: processing time by stage, milliseconds: ``predict``; ``track``, with all pairs side by side; its parts
             ``pyramid``, ``register``, ``flow`` and ``stereo``, each of the pair that took longest; then ``motion``,
-            ``judge``, ``renew`` (next to nothing unless the reference changes) and ``update``. A stage that was not
-            reached is absent.
+            ``quality``, ``replenish`` (next to nothing unless the reference changes) and ``update``. A stage that was
+            not reached is absent.
     """
 
     stamp_ns: int

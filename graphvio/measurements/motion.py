@@ -99,8 +99,8 @@ class VisualResult:
         frozen: pairs that were left out because a camera of theirs repeats an image.
         pairs: pair index -> report.
         stage_ms: time by stage, milliseconds: ``track``, with all pairs side by side; its parts ``pyramid``,
-            ``register``, ``flow`` and ``stereo``, each of the pair that took longest; then ``motion``, ``judge``, and
-            ``renew``, which is next to nothing unless the reference changes.
+            ``register``, ``flow`` and ``stereo``, each of the pair that took longest; then ``motion``, ``quality``, and
+            ``replenish``, which is next to nothing unless the reference changes.
     """
 
     motion: RelativeMotion | None

@@ -13,7 +13,7 @@ from graphvio.live.running import LiveOdometry
 from graphvio.sources import open_source
 from graphvio.trajectory_files import load_trajectory
 
-_STAGES = ("predict", "track", "motion", "judge", "renew", "update")
+_STAGES = ("predict", "track", "motion", "quality", "replenish", "update")
 
 
 class Listener:
