@@ -12,14 +12,14 @@ from recordings import START_NS, noise_image
 from graphvio import Odometry, open_source
 from graphvio.arrays import Image
 from graphvio.config import Config
-from graphvio.live.output import Output
+from graphvio.live.outputs import Output
 from graphvio.live.running import LiveOdometry
 from graphvio.live.source import LiveSource
 from graphvio.live.sources import open_live_source
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
 from graphvio.measurements.readings import CameraFrame, DeviceHealth, ImuReading, Reading, host_ns
-from graphvio.measurements.sensors import FrameSet, Measurement
+from graphvio.measurements.sensors import FrameSet
 from graphvio.queues import BoundedQueue
 from graphvio.rig import Rig
 
@@ -66,24 +66,7 @@ class Scripted:
         self._closed.set()
 
 
-class Watched(Output):
-    """An output that does nothing but what a test overrides."""
-
-    def add_measurement(self, measurement: Measurement) -> None:
-        """Nothing."""
-
-    def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
-        """Nothing."""
-
-    def add_event(self, event: Event) -> None:
-        """Nothing."""
-
-    def status(self) -> Figures:
-        """Nothing."""
-        return {}
-
-
-class Stalling(Watched):
+class Stalling(Output):
     """Is held up by its first result until it is let go."""
 
     def __init__(self) -> None:

@@ -8,14 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 import synthetic  # noqa: F401  (hypothesis' settings)
+from device_messages import Conditions, Messages, clock_errors, synthetic_messages
 from hypothesis import given
 from hypothesis import strategies as st
 
 from graphvio.arrays import Float, Int
-from graphvio.live.clock import ClockMap, ClockMaps
-from graphvio.live.drawn_clock import Conditions, Messages, clock_errors, draw_messages
+from graphvio.live.clocks import ClockMap, ClockMaps, SharedClock
 from graphvio.live.envelope import Envelope
-from graphvio.live.shared_clock import SharedClock
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -35,10 +34,10 @@ def feed(messages: Messages) -> Run:
     run = Run()
 
     def report(stamp_ns: int, kind: str, detail: str) -> None:
-        assert "clock drawn" in detail
+        assert "clock synthetic" in detail
         run.reports[kind] += 1
 
-    clock = ClockMap("drawn", report)
+    clock = ClockMap("synthetic", report)
     for k, (stamp, arrival) in enumerate(zip(messages.stamps_ns.tolist(), messages.arrivals_ns.tolist(), strict=True)):
         at = clock.map(stamp, arrival)
         if at is not None:
@@ -48,8 +47,8 @@ def feed(messages: Messages) -> Run:
     return run
 
 
-def drawn(duration_s: float = 10.0, seed: int = 0, begin_s: float = 0.0, **conditions: float) -> Messages:
-    return draw_messages(Conditions(**conditions), duration_s, np.random.default_rng(seed), begin_s)
+def messages_of(duration_s: float = 10.0, seed: int = 0, begin_s: float = 0.0, **conditions: float) -> Messages:
+    return synthetic_messages(Conditions(**conditions), duration_s, np.random.default_rng(seed), begin_s)
 
 
 def joined(*parts: Messages) -> Messages:
@@ -102,7 +101,7 @@ def test_until_the_drift_is_known_errors_are_what_it_adds_up_to() -> None:
 
 def test_a_bus_that_is_polled() -> None:
     """Delays spread evenly over 8 ms, as of a slow USB device; there is no density of small ones."""
-    messages = drawn(30.0, drift_ppm=-80.0, jitter_ms=0.0, outlier_share=0.0)
+    messages = messages_of(30.0, drift_ppm=-80.0, jitter_ms=0.0, outlier_share=0.0)
     rng = np.random.default_rng(1)
     arrivals = np.maximum.accumulate(messages.truth_ns + rng.integers(0, 8 * MS, len(messages.truth_ns)))
     run = feed(replace_arrivals(messages, arrivals))
@@ -133,7 +132,7 @@ def replace_arrivals(messages: Messages, arrivals_ns: Int) -> Messages:
 @pytest.mark.parametrize("drift_ppm", [-200.0, 30.0, 200.0])
 @pytest.mark.parametrize("jitter_ms", [0.2, 5.0, 20.0])
 def test_time_never_jumps(drift_ppm: float, jitter_ms: float) -> None:
-    messages = drawn(40.0, drift_ppm=drift_ppm, jitter_ms=jitter_ms)
+    messages = messages_of(40.0, drift_ppm=drift_ppm, jitter_ms=jitter_ms)
     run = feed(messages)
     assert len(run.kept) == len(messages.stamps_ns)
     assert not run.reports
@@ -171,10 +170,10 @@ def test_messages_that_overtake_each_other_keep_their_order_in_time(delays: list
 
 def test_sensors_of_a_device_share_one_function() -> None:
     """Images come 40 ms later than samples of the same stamp, and are mapped to the same time."""
-    samples = drawn(8.0, drift_ppm=150.0, rate_hz=200.0)
+    samples = messages_of(8.0, drift_ppm=150.0, rate_hz=200.0)
     queue = [(int(a), int(s), "imu") for a, s in zip(samples.arrivals_ns, samples.stamps_ns, strict=True)]
     queue += [(arrival + 40 * MS, stamp, "camera") for arrival, stamp, _ in queue[::10]]
-    clock = ClockMap("drawn", lambda *_: None)
+    clock = ClockMap("synthetic", lambda *_: None)
     mapped: dict[str, dict[int, int | None]] = {"imu": {}, "camera": {}}
     for arrival, stamp, sensor in sorted(queue):
         mapped[sensor][stamp] = clock.map(stamp, arrival)
@@ -185,7 +184,7 @@ def test_sensors_of_a_device_share_one_function() -> None:
 
 def test_a_backlog_at_the_start_is_made_good_within_a_second() -> None:
     """Messages of the first 0.3 s come at once, 0.3 s late."""
-    messages = drawn(3.0, outlier_share=0.0)
+    messages = messages_of(3.0, outlier_share=0.0)
     arrivals = np.maximum(messages.arrivals_ns, messages.truth_ns[0] + 300 * MS)
     run = feed(replace_arrivals(messages, arrivals))
     errors = errors_us(run, messages)
@@ -195,7 +194,7 @@ def test_a_backlog_at_the_start_is_made_good_within_a_second() -> None:
 
 
 def test_a_clock_that_goes_forward_a_little_is_followed_slowly() -> None:
-    messages = drawn(30.0)
+    messages = messages_of(30.0)
     stamps = messages.stamps_ns + np.where(np.arange(len(messages.stamps_ns)) >= 2000, 12 * MS, 0)
     run = feed(Messages(stamps, messages.arrivals_ns, messages.truth_ns))
     errors = errors_us(run, messages)
@@ -208,8 +207,8 @@ def test_a_clock_that_goes_forward_a_little_is_followed_slowly() -> None:
 
 def test_a_device_that_was_silent_goes_on() -> None:
     """For ten minutes; its drift was known to a fraction of a ppm."""
-    before = drawn(60.0, seed=1, drift_ppm=150.0)
-    later = drawn(20.0, seed=2, begin_s=660.0, drift_ppm=150.0)
+    before = messages_of(60.0, seed=1, drift_ppm=150.0)
+    later = messages_of(20.0, seed=2, begin_s=660.0, drift_ppm=150.0)
     after = Messages(later.stamps_ns + round(660 * S / 1.00015), later.arrivals_ns, later.truth_ns)
     run = feed(joined(before, after))
     assert not run.reports
@@ -218,7 +217,7 @@ def test_a_device_that_was_silent_goes_on() -> None:
 
 def test_a_busy_host_changes_nothing() -> None:
     """For ten seconds nothing comes less than 30 ms late."""
-    messages = drawn(60.0, drift_ppm=50.0)
+    messages = messages_of(60.0, drift_ppm=50.0)
     at_s = 1e-9 * (messages.truth_ns - messages.truth_ns[0])
     late = np.where((at_s > 30.0) & (at_s < 40.0), 30 * MS, 0)
     run = feed(replace_arrivals(messages, messages.arrivals_ns + late))
@@ -230,8 +229,8 @@ def test_a_busy_host_changes_nothing() -> None:
 
 @pytest.mark.parametrize("away_s", [0.0, 3.0, 600.0])
 def test_a_device_that_is_plugged_in_again(away_s: float) -> None:
-    before = drawn(20.0, seed=1, drift_ppm=120.0)
-    after = drawn(20.0, seed=2, begin_s=20.1 + away_s, drift_ppm=120.0)  # stamps from the start again
+    before = messages_of(20.0, seed=1, drift_ppm=120.0)
+    after = messages_of(20.0, seed=2, begin_s=20.1 + away_s, drift_ppm=120.0)  # stamps from the start again
     messages = joined(before, after)
     run = feed(messages)
     assert run.reports["clock_restarted"] == 1
@@ -248,33 +247,32 @@ def test_a_device_that_is_plugged_in_again(away_s: float) -> None:
 def test_a_notice_of_the_driver_saves_the_first_messages() -> None:
     reports: Counter[str] = Counter()
     maps = ClockMaps(lambda stamp_ns, kind, detail: reports.update([kind]))
-    before, after = drawn(5.0, seed=1), drawn(5.0, seed=2, begin_s=8.0)
+    before, after = messages_of(5.0, seed=1), messages_of(5.0, seed=2, begin_s=8.0)
     mapped = []
     for part in (before, after):
         for stamp, arrival in zip(part.stamps_ns.tolist(), part.arrivals_ns.tolist(), strict=True):
-            mapped.append(maps.map("drawn", stamp, arrival))
-        maps.doubt("drawn")
-        maps.doubt(None)
-        maps.doubt("never heard of")
+            mapped.append(maps.map("synthetic", stamp, arrival))
+        for name in ("synthetic", None, "unknown"):
+            maps.expect_restart(name)
     assert None not in mapped
     assert reports == {"clock_restarted": 1}
-    assert list(maps.drifts_ppm) == ["drawn"]
+    assert list(maps._maps) == ["synthetic"]
 
 
-def test_a_doubt_that_is_not_confirmed_changes_nothing() -> None:
-    messages = drawn(5.0)
-    doubted = ClockMap("drawn", lambda *_: None)
+def test_expected_restart_that_does_not_happen_changes_nothing() -> None:
+    messages = messages_of(5.0)
+    clock = ClockMap("synthetic", lambda *_: None)
     mapped = []
     for k, (stamp, arrival) in enumerate(zip(messages.stamps_ns.tolist(), messages.arrivals_ns.tolist(), strict=True)):
         if k == 500:
-            doubted.doubt()
-        mapped.append(doubted.map(stamp, arrival))
+            clock.expect_restart()
+        mapped.append(clock.map(stamp, arrival))
     assert mapped == feed(messages).mapped
 
 
 @pytest.mark.parametrize("jump_ns", [-3600 * S, -800 * MS, 700 * MS, 3600 * S])
 def test_one_wild_stamp_is_left_out(jump_ns: int) -> None:
-    messages = drawn(5.0)
+    messages = messages_of(5.0)
     stamps = messages.stamps_ns.copy()
     stamps[500] += jump_ns
     run = feed(Messages(stamps, messages.arrivals_ns, messages.truth_ns))
@@ -284,7 +282,7 @@ def test_one_wild_stamp_is_left_out(jump_ns: int) -> None:
 
 
 def test_two_wild_stamps_are_left_out() -> None:
-    messages = drawn(10.0, rate_hz=10.0)
+    messages = messages_of(10.0, rate_hz=10.0)
     stamps = messages.stamps_ns.copy()
     stamps[50:52] += 900 * S
     run = feed(Messages(stamps, messages.arrivals_ns, messages.truth_ns))
@@ -292,7 +290,7 @@ def test_two_wild_stamps_are_left_out() -> None:
 
 
 def test_a_stamp_that_is_wild_by_little_moves_no_other() -> None:
-    messages = drawn(10.0)
+    messages = messages_of(10.0)
     stamps = messages.stamps_ns.copy()
     stamps[1000] += 100 * MS
     run = feed(Messages(stamps, messages.arrivals_ns, messages.truth_ns))
@@ -302,7 +300,7 @@ def test_a_stamp_that_is_wild_by_little_moves_no_other() -> None:
 
 def test_images_that_were_stuck_are_of_no_other_clock() -> None:
     """Five come within 10 ms, each 0.8 s late and with no sample of the IMU between them."""
-    messages = drawn(5.0, jitter_ms=0.01, outlier_share=0.0)
+    messages = messages_of(5.0, jitter_ms=0.01, outlier_share=0.0)
     at = np.r_[:600, np.arange(440, 465, 5), 600:1000]
     arrivals = np.sort(messages.arrivals_ns[np.r_[:600, [600] * 5, 600:1000]])
     arrivals[600:605] += np.arange(-5, 0) * MS // 2
@@ -313,9 +311,9 @@ def test_images_that_were_stuck_are_of_no_other_clock() -> None:
 
 def test_a_new_map_begins_after_all_that_was_mapped() -> None:
     """Even after a stamp that was 0.4 s ahead."""
-    clock = ClockMap("drawn", lambda *_: None)
+    clock = ClockMap("synthetic", lambda *_: None)
     ahead = [clock.map(stamp, 7 * S + stamp) for stamp in (0, 100 * MS)] + [clock.map(600 * MS, 7 * S + 200 * MS)]
-    clock.doubt()
+    clock.expect_restart()
     first = clock.map(3600 * S, 7 * S + 210 * MS)
     assert first is not None
     assert first > max(at for at in ahead if at is not None)
@@ -323,7 +321,7 @@ def test_a_new_map_begins_after_all_that_was_mapped() -> None:
 
 @pytest.mark.parametrize("jump_ns", [-3600 * S, -700 * MS, 700 * MS, 3600 * S])
 def test_a_clock_that_is_set_is_mapped_anew(jump_ns: int) -> None:
-    messages = drawn(20.0)
+    messages = messages_of(20.0)
     stamps = messages.stamps_ns + np.where(np.arange(4000) >= 2000, jump_ns, 0)
     run = feed(Messages(stamps, messages.arrivals_ns, messages.truth_ns))
     assert run.reports["clock_restarted"] == 1
@@ -335,7 +333,7 @@ def test_a_clock_that_is_set_is_mapped_anew(jump_ns: int) -> None:
 @pytest.mark.parametrize("drain_s", [0.0, 0.4])
 def test_a_pause_of_the_host_is_no_other_clock(drain_s: float) -> None:
     """For 2 s nothing is read; then all comes at once, or in a while, and nothing is lost or moved."""
-    messages = drawn(10.0)
+    messages = messages_of(10.0)
     held = (messages.truth_ns > messages.truth_ns[0] + 5 * S) & (messages.truth_ns < messages.truth_ns[0] + 7 * S)
     read = messages.truth_ns[0] + 7 * S + np.round(0.5 * drain_s * (messages.truth_ns - messages.truth_ns[held][0]))
     arrivals = np.where(held, read.astype(np.int64), messages.arrivals_ns)
@@ -347,8 +345,8 @@ def test_a_pause_of_the_host_is_no_other_clock(drain_s: float) -> None:
 
 def test_a_clock_that_stood_still_is_mapped_anew() -> None:
     """A device that slept for 10 s, and whose stamps go on where they were."""
-    before = drawn(10.0, seed=1)
-    after = drawn(10.0, seed=2, begin_s=20.0)
+    before = messages_of(10.0, seed=1)
+    after = messages_of(10.0, seed=2, begin_s=20.0)
     shifted = Messages(after.stamps_ns + 10 * S, after.arrivals_ns, after.truth_ns)
     run = feed(joined(before, shifted))
     assert run.reports == {"clock_restarted": 1}

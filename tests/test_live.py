@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from live_runs import SOON_S, Figures, Scripted, Stalling, Watched, assert_same, plain, run, run_spec, small_readings
+from live_runs import SOON_S, Figures, Scripted, Stalling, assert_same, plain, run, run_spec, small_readings
 from recordings import noise_image, small_rig
 
 from graphvio import FrameSet, open_source
@@ -26,9 +26,10 @@ from graphvio.errors import GraphvioError, RigError, ServiceError, SourceError
 from graphvio.live import running as running_module
 from graphvio.live import session_recorder
 from graphvio.live.health import HealthServer
+from graphvio.live.outputs import Output
 from graphvio.live.running import LiveOdometry
 from graphvio.live.session_recorder import SessionRecorder
-from graphvio.live.stage import Stage
+from graphvio.live.stages import Stage
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
 from graphvio.measurements.readings import Notice, Reading
@@ -186,7 +187,7 @@ def broken_source() -> Iterator[Reading]:
     raise SourceError("the driver is gone")
 
 
-class Failing(Watched):
+class Failing(Output):
     """Fails at its third result, and from then on at everything that happens."""
 
     def __init__(self) -> None:
@@ -221,7 +222,7 @@ class Failing(Watched):
 )
 def test_a_stage_that_fails_ends_the_run_and_holds_up_nobody(
     make: Callable[[], Iterator[Reading]],
-    outputs: list[Watched],
+    outputs: list[Output],
     error: type[Exception],
     told: str,
     stage: str,
@@ -276,7 +277,7 @@ def test_what_came_before_a_failure_is_put_out() -> None:
     """A recording that breaks off has all estimates until then."""
     put_out: list[int] = []
 
-    class Noting(Watched):
+    class Noting(Output):
         def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
             put_out.append(estimate.stamp_ns)
             assert frameset is not None
@@ -374,7 +375,7 @@ def test_a_stage_tells_what_ended_it_and_cleans_up_last() -> None:
     def body(stage: Stage) -> None:
         with stage.working():
             assert stage.busy_s >= 0.0
-            stage.get_on()
+            stage.progress()
             with stage.waiting():
                 assert stage.busy_s == 0.0
         with stage.waiting():

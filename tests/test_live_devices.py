@@ -11,11 +11,9 @@ import pytest
 from recordings import small_rig
 
 from graphvio.errors import SourceError
-from graphvio.live.counts import Counts
 from graphvio.live.device_clock import MicrosecondCounter, host_ns_of_monotonic, host_ns_of_realtime
-from graphvio.live.devices import DeviceLostError, DeviceSource, HandOver
+from graphvio.live.devices import Counts, DeviceLostError, DeviceSource, HandOver, Mailbox
 from graphvio.live.imu_merging import AccelOntoGyro
-from graphvio.live.mailbox import Mailbox
 from graphvio.live.sources import SourceSpec
 from graphvio.live.spec_options import choice_of, names_of, number_of, size_of
 from graphvio.measurements.readings import ImuReading, Notice, Reading, host_ns
@@ -130,7 +128,7 @@ def test_what_cannot_be_opened_leaves_nothing_running() -> None:
 
 
 def test_who_does_not_take_readings_loses_the_oldest_but_no_notice() -> None:
-    mailbox = Mailbox(longest_ns=100)
+    mailbox = Mailbox(max_age_ns=100)
     notice = Notice("device_lost", "a", 5)
     mailbox.put("a", imu_reading(0))
     mailbox.put("a", notice)

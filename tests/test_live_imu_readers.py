@@ -16,8 +16,7 @@ import pytest
 from recordings import small_rig
 
 from graphvio.errors import SourceError
-from graphvio.live.counts import Counts
-from graphvio.live.devices import Device, DeviceSource
+from graphvio.live.devices import Counts, Device, DeviceSource
 from graphvio.live.imu_readers.iio_imu import IioImu
 from graphvio.live.imu_readers.iio_scan import ScanElement, ScanFormat, mount_matrix
 from graphvio.live.imu_readers.serial_imu import ImuLines, SerialImu

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from graphvio.live import estimation
 from graphvio.live.estimation import FRAMESETS, Inbox, make_inbox
+from graphvio.live.figures import Meter
 from graphvio.live.load import LoadControl
-from graphvio.live.meter import Meter
-from graphvio.live.ordering import SampleOrder
+from graphvio.live.reception import SampleOrder
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 
 SOON_S = 20.0  # until then a thread is waited for; only a test that fails takes so long
@@ -45,7 +45,7 @@ def worked(control: LoadControl, framesets: int, work_ms: float, waited_ms: floa
     """Shares after each of so many framesets at 20 Hz."""
     shares = []
     for i in range(first, first + framesets):
-        control.note(i * PERIOD_NS, waited_ms, work_ms)
+        control.add(i * PERIOD_NS, waited_ms, work_ms)
         shares.append(control.corner_share)
     return shares
 
@@ -116,7 +116,7 @@ def test_whatever_comes_the_newest_is_never_skipped_and_corners_go_first(
                 assert before == SHARES[-1] or waited_ms > LIMIT_MS
             assert control.corner_share <= before
         else:
-            control.note(stamp_ns, waited_ms, work_ms)
+            control.add(stamp_ns, waited_ms, work_ms)
         assert control.corner_share in SHARES
         assert abs(SHARES.index(control.corner_share) - SHARES.index(before)) <= 1
 
@@ -285,28 +285,28 @@ def test_one_that_comes_too_late_goes_on_for_the_odometry_to_tell_of() -> None:
 
 def test_latencies_of_the_whole_run() -> None:
     meter = Meter()
-    assert meter.recent_ms(50) is meter.overall_ms(99) is None
+    assert meter.recent_latency_ms(50) is meter.latency_ms(99) is None
     for latency_ms in [*([10.2] * 990), *([300.0] * 10)]:
         meter.add_latency(latency_ms)
-    assert meter.recent_ms(50) == pytest.approx(10.2)
-    assert meter.overall_ms(98) == pytest.approx(10.5)
-    assert meter.overall_ms(99.5) == pytest.approx(300.0)  # never more than the longest
-    assert meter.longest_ms == 300.0
+    assert meter.recent_latency_ms(50) == pytest.approx(10.2)
+    assert meter.latency_ms(98) == pytest.approx(10.5)
+    assert meter.latency_ms(99.5) == pytest.approx(300.0)  # never more than the longest
+    assert meter.max_latency_ms == 300.0
 
 
 def test_latencies_beyond_the_histogram_and_below_zero() -> None:
     meter = Meter()
     meter.add_latency(-3.0)
-    assert meter.overall_ms(99) == 0.0
+    assert meter.latency_ms(99) == 0.0
     for _ in range(9):
         meter.add_latency(7000.0)
-    assert meter.overall_ms(99) == 7000.0
+    assert meter.latency_ms(99) == 7000.0
 
 
 def test_rates_are_those_of_the_last_two_seconds() -> None:
     meter = Meter()
     for i in range(100):
-        meter.came("estimates", i * PERIOD_NS)
+        meter.add_arrival("estimates", i * PERIOD_NS)
     assert meter.rate_hz("estimates", 99 * PERIOD_NS) == pytest.approx(20.0)
     assert meter.rate_hz("estimates", 99 * PERIOD_NS + 3_000_000_000) == 0.0
     assert meter.rate_hz("imu_samples", 0) == 0.0

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from recordings import small_rig
 
 from graphvio.arrays import Image
-from graphvio.live.clock import ClockMaps
+from graphvio.live.clocks import ClockMaps
 from graphvio.live.pairing import FramesetAssembler
 from graphvio.measurements.sensors import FrameSet
 from graphvio.sources.matching import group_pairs, match_sides

@@ -85,10 +85,10 @@ def run_live(
     from graphvio.config import Config
     from graphvio.live.health import HealthServer
     from graphvio.live.heap import share_heap
+    from graphvio.live.outputs import ViewOutput
     from graphvio.live.running import LiveOdometry
     from graphvio.live.session_recorder import SessionRecorder
     from graphvio.live.sources import open_live_source
-    from graphvio.live.view_output import ViewOutput
     from graphvio.rig_files import load_rig
     from graphvio.warmup import warm_up
 

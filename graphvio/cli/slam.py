@@ -93,7 +93,7 @@ class _WithMapping(Services):
     def start(self, running: LiveOdometry, stack: ExitStack, is_stopped: Callable[[], bool] = lambda: False) -> Started:
         """Offer the odometry, and start the SLAM; see `Services.start`."""
         from graphvio.cli.slam_process import SlamProcess
-        from graphvio.live.path_output import PathOutput
+        from graphvio.live.outputs import PathOutput
         from graphvio.mapping.process import MappingTask
         from graphvio.viewer import WebOptions
 

@@ -17,7 +17,7 @@ from graphvio.errors import GraphvioError, MapError, ServiceError
 if TYPE_CHECKING:
     from multiprocessing.synchronize import Event
 
-    from graphvio.live.path_output import PathOutput
+    from graphvio.live.outputs import PathOutput
     from graphvio.mapping.process import MappingTask
 
 EXIT_FAILED = 2

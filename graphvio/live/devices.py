@@ -1,24 +1,24 @@
-"""Devices that come and go, as one live source: each has a thread that reads it and brings it back when it is lost."""
+"""Devices as one live source: each has a thread that reads it, and reconnects it when it was lost."""
 
 from __future__ import annotations
 
 import logging
 import threading
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Protocol
 
 from graphvio.errors import SourceError
-from graphvio.live.counts import Counts
-from graphvio.live.mailbox import Mailbox
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.readings import DeviceHealth, Notice, Reading, host_ns
 from graphvio.rig import Rig
 
 HandOver = Callable[[Reading], None]
 
-_FIRST_RETRY_S = 0.5
-_LONGEST_RETRY_S = 4.0
+_MIN_RETRY_S, _MAX_RETRY_S = 0.5, 4.0
+_MAX_AGE_NS = 2_000_000_000  # of readings that wait: some tens of megabytes of images
 _JOIN_S = 2.0
 _log = logging.getLogger(__name__)
 
@@ -27,39 +27,126 @@ class DeviceLostError(Exception):
     """A device does not deliver any more; the message says what was seen."""
 
 
+class Counts:
+    """Counts by kind; threads of drivers add to them while others read them."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+
+    def add(self, kind: str, count: int = 1) -> None:
+        """Add to the count of a kind."""
+        if count:
+            with self._lock:
+                self._counts[kind] += count
+
+    def totals(self) -> dict[str, int]:
+        """Return all counts that are not zero."""
+        with self._lock:
+            return dict(self._counts)
+
+
+class Mailbox:
+    """Queue of readings of several devices for one reader; those that wait too long are dropped, except notices.
+
+    Args:
+        max_age_ns: of readings that wait, relative to the newest one.
+    """
+
+    def __init__(self, max_age_ns: int = _MAX_AGE_NS) -> None:
+        self._max_age_ns = max_age_ns
+        self._changed = threading.Condition()
+        self._kept: deque[Notice] = deque()  # older than all that wait
+        self._waiting: deque[tuple[str, Reading]] = deque()
+        self._is_closed = False
+        self._dropped = Counts()
+
+    def put(self, owner: str, reading: Reading) -> None:
+        """Add a reading of a device; returns at once, and does nothing after `close`."""
+        with self._changed:
+            if self._is_closed:
+                return
+            self._waiting.append((owner, reading))
+            while reading.arrival_ns - self._waiting[0][1].arrival_ns > self._max_age_ns:
+                its_owner, oldest = self._waiting.popleft()
+                if isinstance(oldest, Notice):
+                    self._kept.append(oldest)
+                else:
+                    self._dropped.add(its_owner)
+            self._changed.notify()
+
+    def get(self) -> Reading | None:
+        """Wait for the oldest reading and take it; None after `close`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._kept or self._waiting or self._is_closed)
+            if self._is_closed:
+                return None
+            return self._kept.popleft() if self._kept else self._waiting.popleft()[1]
+
+    def close(self) -> None:
+        """Discard all readings, and accept no more."""
+        with self._changed:
+            self._is_closed = True
+            self._kept.clear()
+            self._waiting.clear()
+            self._changed.notify_all()
+
+    def dropped(self, owner: str) -> int:
+        """Return how many readings of a device were dropped."""
+        return self._dropped.totals().get(owner, 0)
+
+
 class Device(Protocol):
-    """One device, whose methods are called by one thread at a time, but for `detail` and `counts`."""
+    """Interface of a device, whose methods are called by one thread at a time, but for `detail` and `counts`."""
 
     @property
     def name(self) -> str:
-        """For people, unique in the source."""
+        """Name for people, unique in the source."""
 
     @property
     def clock(self) -> str | None:
         """Name of the clock that stamps its readings."""
 
     def start(self, hand_over: HandOver) -> None:
-        """Find and start it; the driver's threads may hand over from here on.
+        """Find and start the device.
+
+        Args:
+            hand_over: takes readings; the driver's threads may call it from here on.
 
         Raises:
-            SourceError: if it is not there or refuses.
+            SourceError: if the device is missing or refuses.
         """
 
     def run(self, hand_over: HandOver, stopping: threading.Event) -> None:
-        """Hand over what comes, or watch those who do, until ``stopping``; any exception says that it is lost."""
+        """Hand over readings, or monitor the driver's threads that do, until the end.
+
+        Args:
+            hand_over: takes readings.
+            stopping: set when the device is to be stopped.
+
+        Raises:
+            Exception: of any kind, if the device is lost.
+        """
 
     def stop(self) -> None:
-        """Let go of it, also where it is half started or gone."""
+        """Release the device, also where it is half started or gone."""
 
     def detail(self) -> str:
-        """One line: model, firmware, what is wrong."""
+        """Return one line for people: model, firmware, what is wrong."""
 
     def counts(self) -> Mapping[str, int]:
-        """What was lost, by kind."""
+        """Return losses by kind."""
 
 
 class DeviceSource:
-    """Devices as a `LiveSource`; see there."""
+    """Devices as a `LiveSource`; see there.
+
+    Args:
+        name: for people.
+        devices: to be read.
+        rig: returns the rig when all devices are started; may raise RigError.
+        retry_s: the first pause before a lost device is looked for, and the longest.
+    """
 
     is_realtime = True
 
@@ -68,10 +155,8 @@ class DeviceSource:
         name: str,
         devices: Sequence[Device],
         rig: Callable[[], Rig],
-        retry_s: tuple[float, float] = (_FIRST_RETRY_S, _LONGEST_RETRY_S),
+        retry_s: tuple[float, float] = (_MIN_RETRY_S, _MAX_RETRY_S),
     ) -> None:
-        # The rig is asked for when all are started, and may raise RigError; retry_s is the first pause before a lost
-        # device is looked for, and the longest.
         self.name = name
         self._devices = tuple(devices)
         self._rig = rig
@@ -96,7 +181,7 @@ class DeviceSource:
             self.close()
             raise
         for device in self._devices:
-            thread = threading.Thread(target=self._attend, args=(device,), name=device.name, daemon=True)
+            thread = threading.Thread(target=self._keep_running, args=(device,), name=device.name, daemon=True)
             self._threads.append(thread)
             thread.start()
         return rig
@@ -129,7 +214,7 @@ class DeviceSource:
         connected = lost is None and bool(self._threads) and not self._stopping.is_set()
         return DeviceHealth(device.name, connected, detail, {kind: n for kind, n in counts.items() if n})
 
-    def _attend(self, device: Device) -> None:
+    def _keep_running(self, device: Device) -> None:
         try:
             while not self._stopping.is_set():
                 reason = self._reason_of_loss(device)
@@ -137,12 +222,12 @@ class DeviceSource:
                     return
                 self._lost[device.name] = reason
                 self._losses.add(device.name)
-                self._tell(device, "device_lost", reason)
+                self._notify(device, EventKind.DEVICE_LOST, reason)
                 _stop(device)
-                if not self._bring_back(device):
+                if not self._restart(device):
                     return
                 del self._lost[device.name]
-                self._tell(device, "device_back", "found again; its clock may have begun anew")
+                self._notify(device, EventKind.DEVICE_BACK, "found again; its clock may have restarted")
         finally:
             _stop(device)
 
@@ -151,15 +236,15 @@ class DeviceSource:
             device.run(self._hand_over(device), self._stopping)
         except DeviceLostError as error:
             return str(error)
-        except Exception as error:  # whatever a driver raises, the session goes on
+        except Exception as error:  # of any kind: the run goes on
             _log.warning("%s: the driver failed", device.name, exc_info=True)
             return f"{type(error).__name__}: {error}"
-        return "it ended by itself"
+        return "it ended on its own"
 
-    def _bring_back(self, device: Device) -> bool:
-        pause_s, longest_s = self._retry_s
+    def _restart(self, device: Device) -> bool:
+        pause_s, max_pause_s = self._retry_s
         while not self._stopping.wait(pause_s):
-            pause_s = min(2.0 * pause_s, longest_s)
+            pause_s = min(2.0 * pause_s, max_pause_s)
             try:
                 device.start(self._hand_over(device))
             except SourceError as error:
@@ -172,7 +257,7 @@ class DeviceSource:
             _stop(device)
         return False
 
-    def _tell(self, device: Device, kind: str, detail: str) -> None:
+    def _notify(self, device: Device, kind: str, detail: str) -> None:
         notice = Notice(kind, f"{device.name}: {detail}", host_ns(), device.clock)
         self._mailbox.put(device.name, notice)
 

@@ -1,9 +1,9 @@
-"""The line under delays: how a clock runs, from the messages that were delayed least.
+"""A clock's offset and drift from the messages that were delayed least.
 
-Delays are never less than the least, and by chance much more. So the line lies below all points, and as close to them
-as it can: the edge of their lower convex hull at the mean of their times. Zhang, Liu, Xia: Clock synchronization
-algorithms for network measurements, INFOCOM 2002; Moon, Skelly, Towsley: Estimation and removal of clock skew from
-network delay measurements, INFOCOM 1999.
+Delays are never less than the least one, and at random much more. So the line lies below all points, and as close to
+them as possible: it is the edge of their lower convex hull at the mean of their times. Zhang, Liu, Xia: Clock
+synchronization algorithms for network measurements, INFOCOM 2002; Moon, Skelly, Towsley: Estimation and removal of
+clock skew from network delay measurements, INFOCOM 1999.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from itertools import pairwise
 
 _WINDOW_NS = 1_000_000_000
 _WINDOWS = 60  # one point of each: a crystal's rate wanders little in a minute
-_LEAST_WINDOWS = 3  # for a drift
-_MOST_DRIFT = 1e-3  # of any crystal, and ten times over
-_STEP_NS = 5_000_000  # below the line by more, and again and again: the clock was set forward
+_MIN_WINDOWS = 3  # for a drift
+_MAX_DRIFT = 1e-3  # ten times that of any crystal
+_STEP_NS = 5_000_000  # below the line by more, and repeatedly: the clock was set forward
 _STEP_READINGS = 3
 
 _Point = tuple[int, int]
@@ -30,21 +30,21 @@ class Line:
     drift: float
 
     def at(self, time_ns: float) -> float:
-        """Delay there."""
+        """Return the delay at a time."""
         return self.at_zero_ns + self.drift * time_ns
 
 
 class Envelope:
-    """Follows the least delay over time.
+    """The least delay over time, followed as points come.
 
-    It is known from the first point on; its drift, ns of delay by ns of time, once there are three windows of a second.
+    Its offset is known from the first point on; its drift, ns of delay per ns of time, after three windows of a second.
     Where the least delay grows, as on a busy machine, nothing changes for half a minute; if it stays, it is followed.
 
     Args:
-        drift: until it is known.
+        drift: to be used until there is an estimate.
 
     Attributes:
-        line: as known now.
+        line: the newest estimate.
     """
 
     def __init__(self, drift: float = 0.0) -> None:
@@ -54,12 +54,15 @@ class Envelope:
         self._opened_ns = 0
         self._below: list[_Point] = []
 
-    def add(self, time_ns: int, delay_ns: int) -> str:
+    def add(self, time_ns: int, delay_ns: int) -> bool:
         """Take a point.
 
+        Args:
+            time_ns: of the clock.
+            delay_ns: of the message, up to a constant.
+
         Returns:
-            Empty, or ``changed`` where the line is a new one, or ``stepped`` where delays are now so much less that all
-            points before are forgotten.
+            Whether the clock was set forward: delays are now so much less that all points before are forgotten.
         """
         point = (time_ns, delay_ns)
         if self._windows and delay_ns < self.line.at(time_ns) - _STEP_NS:
@@ -67,31 +70,27 @@ class Envelope:
         self._below.clear()
         if self._least is None:
             self._open(point)
-            return "changed"
-        if time_ns - self._opened_ns >= _WINDOW_NS:
+        elif time_ns - self._opened_ns >= _WINDOW_NS:
             self._windows.append(self._least)
             while self._windows[0][0] < time_ns - _WINDOWS * _WINDOW_NS and len(self._windows) > 1:
                 self._windows.popleft()
             self._fit()
             self._least, self._opened_ns = point, time_ns
-            return "changed"
-        if self._height(point) >= self._height(self._least):
-            return ""
-        self._least = point
-        if self._windows:
-            return ""
-        self._lower_to(point)
-        return "changed"
+        elif self._height(point) < self._height(self._least):
+            self._least = point
+            if not self._windows:
+                self._lower_to(point)
+        return False
 
-    def _add_below(self, point: _Point) -> str:
-        """A point that no delay explains; one alone may be a damaged stamp, and is not used."""
+    def _add_below(self, point: _Point) -> bool:
+        """Take a point that no delay explains; one alone may be a damaged stamp, and is not used."""
         self._below.append(point)
         if len(self._below) < _STEP_READINGS:
-            return ""
+            return False
         self._windows.clear()
         self._open(min(self._below, key=self._height))
         self._below.clear()
-        return "stepped"
+        return True
 
     def _open(self, point: _Point) -> None:
         self._least, self._opened_ns = point, point[0]
@@ -101,19 +100,19 @@ class Envelope:
         self.line = Line(self._height(point), self.line.drift)
 
     def _height(self, point: _Point) -> float:
-        """Where a line through a point, parallel to the one that is known, is at time zero."""
+        """Delay at time zero on the parallel to the line through a point."""
         return point[1] - self.line.drift * point[0]
 
     def _fit(self) -> None:
         points = sorted(self._windows)  # late messages have come between
         drift = self.line.drift
-        if len(points) >= _LEAST_WINDOWS:
-            drift = min(max(_slope_of_middle(_lower_hull(points), points), -_MOST_DRIFT), _MOST_DRIFT)
+        if len(points) >= _MIN_WINDOWS:
+            drift = min(max(_slope_of_middle(_lower_hull(points), points), -_MAX_DRIFT), _MAX_DRIFT)
         self.line = Line(min(delay - drift * time for time, delay in points), drift)
 
 
 def _lower_hull(points: list[_Point]) -> list[_Point]:
-    """Vertices of the lower convex hull, by time; whole numbers, so nothing is rounded."""
+    """Vertices of the lower convex hull, by time; in integers, so that nothing is rounded."""
     hull: list[_Point] = []
     for point in points:
         if hull and hull[-1][0] == point[0]:

@@ -1,6 +1,6 @@
-"""The odometry as a stage: it is fed, what there is no time for is given up, and estimates are handed on.
+"""The odometry as a stage: its queues, which framesets are skipped, and when it no longer waits for the IMU.
 
-Front-end and back-end are one stage: the front-end looks for points where the back-end's newest state foretells them,
+Front-end and back-end are one stage: the front-end looks for points where the back-end's newest state predicts them,
 so that neither has anything to do while the other works. The front-end itself has a thread for each pair.
 """
 
@@ -11,28 +11,37 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from graphvio.config.stages import LiveConfig
+from graphvio.live.figures import Meter
 from graphvio.live.load import LoadControl
-from graphvio.live.meter import Meter
-from graphvio.live.stage import Stage
+from graphvio.live.stages import Stage
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.readings import host_ns
 from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.odometry import Odometry
 from graphvio.queues import BoundedQueue, Limit, WhenFull
 
-_WAITING_FRAMESETS = 8
-_WAITING_SAMPLES = 50_000  # minutes: where so many wait, the odometry is dead
-_WAITING_RESULTS = 64  # for output
-_READ_AHEAD = 2  # wait for either, where the source waits: more would only take memory
-_KEPT_FRAMESETS = 64  # until they are estimated
-_ROUND_S = 0.05
-_START_NS = 500_000_000
-
-
 FRAMESETS = "framesets"
-"""The lane of framesets in the inbox; samples are in the default one."""
+"""The lane of framesets in an inbox; samples are in the default one."""
 
 Inbox = BoundedQueue[tuple[Measurement, int]]
+"""Measurements that wait for the odometry, with the host time of their arrival."""
+
+_WAITING_FRAMESETS = 8
+_WAITING_SAMPLES = 50_000  # minutes: where so many wait, the odometry is dead
+_WAITING_RESULTS = 64  # for the outputs
+_READ_AHEAD = 2  # framesets and results, where the source waits: more would only take memory
+_KEPT_FRAMESETS = 64  # until they are estimated
+_ROUND_S = 0.05
+_START_NS = 500_000_000  # framesets of this time after the first pose may still be late
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _UnderWay:
+    """A frameset in the odometry: its arrival, and how long it had waited when it was taken."""
+
+    frameset: FrameSet
+    arrival_ns: int
+    waited_ms: float
 
 
 def make_inbox(max_framesets: int, is_realtime: bool) -> Inbox:
@@ -41,7 +50,7 @@ def make_inbox(max_framesets: int, is_realtime: bool) -> Inbox:
     Args:
         max_framesets: that may wait.
         is_realtime: whether the oldest frameset is dropped where there is no room, and a sample where the odometry is
-            dead; else whoever brings them waits.
+            dead; else the threads that bring them wait.
     """
     if is_realtime:
         framesets = Limit(max_framesets, WhenFull.DROP_OLDEST)
@@ -49,38 +58,21 @@ def make_inbox(max_framesets: int, is_realtime: bool) -> Inbox:
     return BoundedQueue(_WAITING_SAMPLES, WhenFull.WAIT, framesets=Limit(max_framesets, WhenFull.WAIT))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Result:
-    """An estimate with the images that it was made from, if they are still known."""
-
-    estimate: Estimate
-    frameset: FrameSet | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _UnderWay:
-    """A frameset in the odometry: when it came, and how long it had waited when it was taken."""
-
-    frameset: FrameSet
-    arrival_ns: int
-    waited_ms: float
-
-
 class Estimation:
     """The stage ``odometry``.
 
     Args:
-        odometry: to be fed.
+        odometry: that estimates.
         config: the limit of the latency.
-        is_realtime: whether there is one, and framesets for which there is no room go; else whoever brings them waits.
-        meter: counts what is given up and how long the rest took.
-        publish: is handed each estimate, in this thread.
-        tell_events: passes on what the odometry has to tell.
+        is_realtime: whether the limit holds and measurements without room are dropped; else all wait for the odometry.
+        meter: counts estimates, what is given up, and latencies.
+        publish: takes each estimate, in this thread.
+        report_events: passes on the odometry's events.
 
     Attributes:
-        inbox: measurements that wait for the odometry, with the host time of their arrival.
-        results: what waits for the output.
-        load: what is given up.
+        inbox: of the odometry.
+        results: estimates that wait for the outputs, with their images if they are still kept.
+        load: decides what is given up.
         latest: newest estimate, or None.
     """
 
@@ -91,11 +83,13 @@ class Estimation:
         is_realtime: bool,
         meter: Meter,
         publish: Callable[[Estimate], None],
-        tell_events: Callable[[], None],
+        report_events: Callable[[], None],
     ) -> None:
         self.inbox = make_inbox(_WAITING_FRAMESETS if is_realtime else _READ_AHEAD, is_realtime)
-        self.results: BoundedQueue[Result] = BoundedQueue(
-            _WAITING_RESULTS if is_realtime else _READ_AHEAD, WhenFull.DROP_NEWEST if is_realtime else WhenFull.WAIT
+        self.results: BoundedQueue[tuple[Estimate, FrameSet | None]] = (
+            BoundedQueue(_WAITING_RESULTS, WhenFull.DROP_NEWEST)
+            if is_realtime
+            else BoundedQueue(_READ_AHEAD, WhenFull.WAIT)
         )
         self.load = LoadControl(config.max_latency_ms)
         self.latest: Estimate | None = None
@@ -103,18 +97,18 @@ class Estimation:
         self._is_realtime = is_realtime
         self._meter = meter
         self._publish = publish
-        self._tell_events = tell_events
+        self._report_events = report_events
         self._corner_share = 1.0
-        self._under_way: OrderedDict[int, _UnderWay] = OrderedDict()
-        self._first_pose_ns: int | None = None  # when it was made
+        self._under_way: OrderedDict[int, _UnderWay] = OrderedDict()  # by stamp
+        self._first_pose_ns: int | None = None  # host time at which it was estimated
 
     def estimate(self, stage: Stage) -> None:
-        """Work on what comes, until its end."""
+        """Process measurements until there are no more."""
         while not self.inbox.is_finished:
-            taken = self.inbox.get(self._patience_s())
-            if taken is not None:
+            item = self.inbox.get(self._patience_s())
+            if item is not None:
                 with stage.working():
-                    self._process(stage, *taken)
+                    self._process(stage, *item)
             elif self._patience_s() == 0.0:
                 with stage.working():
                     self._process_held(stage)
@@ -123,9 +117,9 @@ class Estimation:
                 self._deliver(stage, estimate)
 
     def _process(self, stage: Stage, measurement: Measurement, arrival_ns: int) -> None:
-        begun_ns = host_ns()
+        begin_ns = host_ns()
         if isinstance(measurement, FrameSet):
-            waited_ms = 1e-6 * (begun_ns - arrival_ns)
+            waited_ms = 1e-6 * (begin_ns - arrival_ns)
             is_newest = not self.inbox.waiting(FRAMESETS)
             if self._is_limited(arrival_ns) and self.load.must_skip(waited_ms, is_newest):
                 self._meter.count("skipped_late")
@@ -135,14 +129,14 @@ class Estimation:
                 self._under_way.popitem(last=False)
         estimate = self._odometry.process(measurement)
         while estimate is not None:
-            self._conclude(stage, estimate, begun_ns)
-            stage.get_on()
-            begun_ns = host_ns()
+            self._conclude(stage, estimate, begin_ns)
+            stage.progress()
+            begin_ns = host_ns()
             estimate = self._odometry.process_due()
-        self._tell_events()
+        self._report_events()
 
     def _patience_s(self) -> float:
-        """How long there is nothing to do if nothing comes: what the odometry holds must not be late for the IMU."""
+        """How long to wait for measurements: the frameset that the odometry holds for the IMU must not be late."""
         held_ns = self._odometry.held_ns
         under_way = None if held_ns is None else self._under_way.get(held_ns)
         if under_way is None or not self._is_limited(under_way.arrival_ns):
@@ -151,19 +145,19 @@ class Estimation:
         return min(max(1e-3 * (self.load.patience_ms - waited_ms), 0.0), _ROUND_S)
 
     def _process_held(self, stage: Stage) -> None:
-        """All that has come has been taken, and the oldest frameset cannot wait for what has not."""
-        begun_ns = host_ns()
+        """Estimate the oldest frameset, which cannot wait for samples that have not come."""
+        begin_ns = host_ns()
         estimate = self._odometry.process_held()
         if estimate is not None:
             self._meter.count("imu_not_awaited")
-            self._conclude(stage, estimate, begun_ns)
+            self._conclude(stage, estimate, begin_ns)
 
-    def _conclude(self, stage: Stage, estimate: Estimate, begun_ns: int) -> None:
-        """An estimate has been made since then."""
-        self._tell_events()
+    def _conclude(self, stage: Stage, estimate: Estimate, begin_ns: int) -> None:
+        """Adapt the load to an estimate on which work began at a host time, and deliver it."""
+        self._report_events()
         under_way = self._under_way.get(estimate.stamp_ns)
         if under_way is not None and self._is_limited(under_way.arrival_ns):
-            self.load.note(estimate.stamp_ns, under_way.waited_ms, 1e-6 * (host_ns() - begun_ns))
+            self.load.add(estimate.stamp_ns, under_way.waited_ms, 1e-6 * (host_ns() - begin_ns))
             if self.load.corner_share != self._corner_share:
                 self._corner_share = self.load.corner_share
                 self._odometry.limit_corners(self._corner_share)
@@ -171,24 +165,23 @@ class Estimation:
 
     def _deliver(self, stage: Stage, estimate: Estimate) -> None:
         under_way, now_ns = self._under_way.pop(estimate.stamp_ns, None), host_ns()
-        self._odometry.take_smoothed()  # else they would gather
+        self._odometry.take_smoothed()  # else they would accumulate
         self.latest = estimate
-        self._meter.came("estimates", now_ns)
+        self._meter.add_arrival("estimates", now_ns)
         self._meter.count(f"status_{estimate.status}")
         if self._first_pose_ns is None and estimate.nav_T_body is not None:
             self._first_pose_ns = now_ns
         if under_way is not None and self._is_after_start(under_way.arrival_ns):
             self._meter.add_latency(1e-6 * (now_ns - under_way.arrival_ns))
         self._publish(estimate)
-        result = Result(estimate, None if under_way is None else under_way.frameset)
         with stage.waiting():
-            has_room = self.results.put(result)
+            has_room = self.results.put((estimate, None if under_way is None else under_way.frameset))
         if not has_room:
             self._meter.count("results_not_put_out")
 
     def _is_after_start(self, arrival_ns: int) -> bool:
-        """Whether a frameset need not wait for what went before the first pose: those until then are held until the
-        IMU has told the attitude to start from, and worked on all at once."""
+        """Whether a frameset does not wait for those before the first pose, which are held until the IMU has shown the
+        initial attitude, and then processed all at once."""
         return self._first_pose_ns is not None and arrival_ns > self._first_pose_ns + _START_NS
 
     def _is_limited(self, arrival_ns: int) -> bool:

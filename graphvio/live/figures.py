@@ -1,21 +1,25 @@
-"""How a live run does, as figures by name: what the terminal, the metrics and the services show."""
+"""The figures of a live run by name, which the terminal, the metrics and the services show."""
 
 from __future__ import annotations
 
 import re
+import threading
+from collections import Counter, deque
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from graphvio.live.meter import Meter
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.readings import DeviceHealth
 
 _STATM = Path("/proc/self/statm")
 _PAGE_BYTES = 4096
-_NO_NAME = re.compile(r"[^A-Za-z0-9]+")  # what names of figures, which become metrics, must not have
-
+_NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9]+")  # of metrics
+_RECENT = 1200  # latencies: a minute at 20 Hz
+_RATE_S = 2.0
+_BIN_MS = 0.5
+_BINS = 4000
 _STALE_NS = 2_000_000_000
 STALE = "stale"
 """The status where the newest estimate is older than two seconds."""
@@ -23,59 +27,133 @@ STALE = "stale"
 Figures = dict[str, float | int | str | None]
 
 
-def figures(meter: Meter, latest: Estimate | None, now_ns: int) -> Figures:
-    """All figures of the counts and of the newest estimate."""
+class Meter:
+    """Counts, rates and latencies of a live run; called from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+        self._latencies_ms: deque[float] = deque(maxlen=_RECENT)
+        self._histogram = np.zeros(_BINS + 1, dtype=np.int64)  # of the whole run
+        self._max_latency_ms = 0.0
+        self._arrivals_ns: dict[str, deque[int]] = {}
+
+    def count(self, kind: str, by: int = 1) -> None:
+        """Add to a count."""
+        with self._lock:
+            self._counts[kind] += by
+
+    def add_arrival(self, kind: str, host_ns: int) -> None:
+        """Count an item of a kind that has a rate, and its arrival."""
+        with self._lock:
+            self._counts[kind] += 1
+            stamps = self._arrivals_ns.setdefault(kind, deque())
+            stamps.append(host_ns)
+            while host_ns - stamps[0] > _RATE_S * 1e9:
+                stamps.popleft()
+
+    def newest_ns(self, kind: str) -> int | None:
+        """Return the host time of the newest arrival, or None."""
+        with self._lock:
+            stamps = self._arrivals_ns.get(kind)
+            return stamps[-1] if stamps else None
+
+    def rate_hz(self, kind: str, now_ns: int) -> float:
+        """Return the rate of arrivals in the last two seconds."""
+        with self._lock:
+            stamps = self._arrivals_ns.get(kind, ())
+            return sum(now_ns - stamp < _RATE_S * 1e9 for stamp in stamps) / _RATE_S
+
+    def add_latency(self, latency_ms: float) -> None:
+        """Add the time from a frameset's arrival to its estimate."""
+        latency_ms = max(latency_ms, 0.0)  # the arrival is what the source says
+        with self._lock:
+            self._latencies_ms.append(latency_ms)
+            self._histogram[min(int(latency_ms / _BIN_MS), _BINS)] += 1
+            self._max_latency_ms = max(self._max_latency_ms, latency_ms)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """All counts by kind."""
+        with self._lock:
+            return dict(self._counts)
+
+    @property
+    def max_latency_ms(self) -> float:
+        """Maximum latency of the whole run."""
+        return self._max_latency_ms
+
+    def recent_latency_ms(self, percent: float) -> float | None:
+        """Return a percentile of the newest latencies."""
+        with self._lock:
+            return float(np.percentile(self._latencies_ms, percent)) if self._latencies_ms else None
+
+    def latency_ms(self, percent: float) -> float | None:
+        """Return a percentile of all latencies, to half a millisecond; beyond two seconds, their maximum."""
+        with self._lock:
+            total = int(self._histogram.sum())
+            if not total:
+                return None
+            rank = np.searchsorted(np.cumsum(self._histogram), percent / 100.0 * total)
+            return self._max_latency_ms if rank >= _BINS else min(float((rank + 1) * _BIN_MS), self._max_latency_ms)
+
+
+def run_figures(meter: Meter, latest: Estimate | None, now_ns: int) -> Figures:
+    """Return the figures of the counts and of the newest estimate.
+
+    Args:
+        meter: of the run.
+        latest: newest estimate, or None.
+        now_ns: host time.
+    """
     counts = meter.counts
-    told: Figures = {
-        "images": counts.pop("images", 0),
-        "imu_samples": counts.pop("imu_samples", 0),
-        "framesets": counts.pop("framesets", 0),
-        "estimates": counts.pop("estimates", 0),
-        "skipped_late": counts.pop("skipped_late", 0),
+    kinds = ("images", "imu_samples", "framesets", "estimates", "skipped_late")
+    found: Figures = {
+        **{kind: counts.pop(kind, 0) for kind in kinds},
         "frameset_hz": meter.rate_hz("framesets", now_ns),
         "estimate_hz": meter.rate_hz("estimates", now_ns),
         "imu_hz": meter.rate_hz("imu_samples", now_ns),
-        "latency_p50_ms": meter.recent_ms(50),
-        "latency_p99_ms": meter.recent_ms(99),
-        "latency_p99_all_ms": meter.overall_ms(99),
-        "latency_max_ms": meter.longest_ms,
-        "memory_mb": memory_mb(),
+        "latency_p50_ms": meter.recent_latency_ms(50),
+        "latency_p99_ms": meter.recent_latency_ms(99),
+        "latency_p99_all_ms": meter.latency_ms(99),
+        "latency_max_ms": meter.max_latency_ms,
+        "memory_mb": _memory_mb(),
+        **dict(sorted(counts.items())),
     }
-    told |= dict(sorted(counts.items()))
     newest_ns = meter.newest_ns("estimates")
     if latest is not None and newest_ns is not None:
-        told |= _of_estimate(latest)
-        told["estimate_age_s"] = 1e-9 * (now_ns - newest_ns)
+        found |= _estimate_figures(latest)
+        found["estimate_age_s"] = 1e-9 * (now_ns - newest_ns)
         if now_ns - newest_ns > _STALE_NS:
-            told["status"] = STALE
-    return told
+            found["status"] = STALE
+    return found
 
 
-def _of_estimate(estimate: Estimate) -> Figures:
-    told: Figures = {"status": str(estimate.status), "epoch": estimate.epoch, "stamp_ns": estimate.stamp_ns}
+def _estimate_figures(estimate: Estimate) -> Figures:
+    found: Figures = {"status": str(estimate.status), "epoch": estimate.epoch, "stamp_ns": estimate.stamp_ns}
     for j, report in sorted(estimate.pairs.items()):
-        told[f"pair{j}_points"], told[f"pair{j}_inliers"] = report.points, report.inliers
+        found[f"pair{j}_points"], found[f"pair{j}_inliers"] = report.points, report.inliers
     if estimate.gyro_bias is not None:
-        told["gyro_bias_rad_s"] = float(np.linalg.norm(estimate.gyro_bias))
+        found["gyro_bias_rad_s"] = float(np.linalg.norm(estimate.gyro_bias))
     if estimate.accel_bias is not None:
-        told["accel_bias_m_s2"] = float(np.linalg.norm(estimate.accel_bias))
+        found["accel_bias_m_s2"] = float(np.linalg.norm(estimate.accel_bias))
     if estimate.covariance is not None:
-        told["position_sigma_m"] = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[3:, 3:])[-1]))
-    return told
+        found["position_sigma_m"] = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[3:, 3:])[-1]))
+    return found
 
 
 def device_figures(devices: Sequence[DeviceHealth]) -> Figures:
-    """Whether each device is connected, 1 or 0, and what was lost in its driver."""
-    told: Figures = {}
+    """Return whether each device is connected, 1 or 0, and the losses in its driver."""
+    found: Figures = {}
     for device in devices:
-        name = "device_" + _NO_NAME.sub("_", device.name)
-        told[f"{name}_connected"] = int(device.connected)
-        told |= {f"{name}_{_NO_NAME.sub('_', kind)}": count for kind, count in sorted(device.counts.items())}
-    return told
+        name = "device_" + _NOT_IN_NAMES.sub("_", device.name)
+        found[f"{name}_connected"] = int(device.connected)
+        found |= {f"{name}_{_NOT_IN_NAMES.sub('_', kind)}": count for kind, count in sorted(device.counts.items())}
+    return found
 
 
-def memory_mb() -> float | None:
-    """What the process holds in memory, or None where the system does not tell."""
+def _memory_mb() -> float | None:
+    """Resident memory of the process, or None where the system does not report it."""
     try:
         return int(_STATM.read_text().split()[1]) * _PAGE_BYTES / 1e6
     except OSError:

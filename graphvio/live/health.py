@@ -1,4 +1,4 @@
-"""Health over HTTP: Prometheus metrics at ``/metrics``, and at ``/healthz`` whether all stages live."""
+"""Health over HTTP: Prometheus metrics at ``/metrics``, and whether all stages run at ``/healthz``."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _TOTAL_PREFIXES = (
 
 
 class HealthServer:
-    """Answers from threads of its own.
+    """HTTP server with threads of its own.
 
     Args:
-        status: how it runs, by name; ``health`` is ``ok`` where all is well.
-        host: address to listen on; by default nobody else's machine reaches it.
-        port: 0 takes a free one.
+        status: returns the figures by name; ``health`` is ``ok`` where all stages run.
+        host: address to listen on; the default cannot be reached from other machines.
+        port: to listen on; 0 takes a free one.
 
     Attributes:
         address: ``HOST:PORT`` that it listens on.
@@ -65,7 +65,7 @@ class HealthServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Answer no more."""
+        """Stop the server."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -87,13 +87,13 @@ def _reply(start_response: Callable[..., Any], status: HTTPStatus, content: Mapp
 
 
 class _Collector:
-    """Figures as metrics; of the texts, the status."""
+    """Figures as metrics; of the texts, only the status."""
 
     def __init__(self, status: Callable[[], Figures]) -> None:
         self._status = status
 
     def collect(self) -> Iterator[Any]:
-        """All metrics."""
+        """Yield all metrics."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         figures = self._status()
@@ -106,20 +106,20 @@ class _Collector:
         for each in (*map(str, Status), STALE):
             status.add_metric([each], float(figures.get("status") == each))
         yield status
-        yield GaugeMetricFamily("graphvio_up", "1 while all stages live", value=float(figures.get("health") == "ok"))
+        yield GaugeMetricFamily("graphvio_up", "1 while all stages run", value=float(figures.get("health") == "ok"))
 
 
 class _ThreadingServer(ThreadingMixIn, WSGIServer):
-    """Somebody who connects and asks nothing holds up nobody else, nor the end."""
+    """Server with a thread per connection, so that an idle client holds up neither others nor `close`."""
 
     daemon_threads = True
     block_on_close = False
 
 
 class _QuietHandler(WSGIRequestHandler):
-    """Writes no log, and waits for a question for some seconds only."""
+    """Handler that writes no log and waits for a request for some seconds only."""
 
     timeout = 10.0
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Nothing."""
+        """Log nothing."""

@@ -10,7 +10,7 @@ from dataclasses import replace
 from operator import itemgetter
 
 from graphvio.arrays import Float
-from graphvio.live.counts import Counts
+from graphvio.live.devices import Counts
 from graphvio.measurements.readings import ImuReading
 
 _LONGEST_GAP_NS = 100_000_000

@@ -1,27 +1,24 @@
-"""Real time: what is given up, and in which order, when work takes longer than there is time for.
+"""What is given up, and in which order, when the work takes longer than there is time for.
 
-First corners: fewer are followed. Then framesets: old ones are skipped where a newer one waits. Never IMU samples.
+First corners: fewer are tracked. Then framesets: old ones are skipped where a newer one waits. Never IMU samples.
 """
 
 from __future__ import annotations
 
 _SHARES = (1.0, 0.7, 0.5, 0.35)
-_LOWER_FROM = 0.5  # of the latency's limit
-_BUSY, _IDLE = 0.85, 0.7  # shares of the time between framesets that work takes, or would with more corners
-_RAISE_AFTER_NS = 2_000_000_000
-_SETTLE_FRAMESETS = 5  # before the next change, so that the last one shows
+_LATE = 0.5  # of the latency's limit
+_BUSY, _IDLE = 0.85, 0.7  # shares of the time between framesets that work takes, or would take with more corners
+_IDLE_NS = 2_000_000_000  # before more corners are tracked again
+_MIN_FRAMESETS = 5  # between changes, so that the effect of the last one shows
 _DEVIATIONS = 2.5  # mean absolute ones: two standard deviations
-_FORGET = 0.1  # share of the newest in running means
+_NEWEST_SHARE = 0.1  # in running means
 
 
 class LoadControl:
-    """Decides how many corners are followed and which framesets are skipped; a function of what it is told alone.
+    """Decides how many corners are tracked and which framesets are skipped, from its inputs alone.
 
     Args:
         max_latency_ms: from a frameset's arrival to its estimate.
-
-    Attributes:
-        corner_share: of the corners that the configuration asks for.
     """
 
     def __init__(self, max_latency_ms: float) -> None:
@@ -37,13 +34,22 @@ class LoadControl:
 
     @property
     def corner_share(self) -> float:
-        """Of the corners that the configuration asks for."""
+        """Share of the configured number of corners."""
         return _SHARES[self._level]
 
+    @property
+    def patience_ms(self) -> float:
+        """How long after its arrival the work on a frameset can begin, to end in time."""
+        return max(self._limit_ms - self._likely_ms, 0.0)
+
     def must_skip(self, waited_ms: float, is_newest: bool) -> bool:
-        """Whether a frameset that has waited so long is skipped: it would be late, and a newer one waits.
+        """Decide whether a frameset is skipped: it would be late, and a newer one waits.
 
         As long as fewer corners would help they are lowered instead, unless it is late already.
+
+        Args:
+            waited_ms: since its arrival.
+            is_newest: whether no newer one waits.
         """
         if is_newest or waited_ms + self._likely_ms <= self._limit_ms:
             return False
@@ -52,18 +58,14 @@ class LoadControl:
             return waited_ms > self._limit_ms
         return True
 
-    @property
-    def patience_ms(self) -> float:
-        """How long after its arrival the work on a frameset can begin, to end in time."""
-        return max(self._limit_ms - self._likely_ms, 0.0)
+    def add(self, stamp_ns: int, waited_ms: float, work_ms: float) -> None:
+        """Take the times of a frameset that was processed, and adapt the share of corners.
 
-    @property
-    def _likely_ms(self) -> float:
-        """What the work on a frameset will hardly exceed."""
-        return (self._work_ms or 0.0) + _DEVIATIONS * self._deviation_ms
-
-    def note(self, stamp_ns: int, waited_ms: float, work_ms: float) -> None:
-        """A frameset has been worked on."""
+        Args:
+            stamp_ns: of the frameset.
+            waited_ms: from its arrival until the work began.
+            work_ms: that it took.
+        """
         if self._last_ns is not None:
             self._interval_ms = _mean(self._interval_ms, 1e-6 * (stamp_ns - self._last_ns))
         self._last_ns = stamp_ns
@@ -71,10 +73,10 @@ class LoadControl:
         self._deviation_ms = _mean(self._deviation_ms, abs(work_ms - (self._work_ms or work_ms)))
         self._work_ms = _mean(self._work_ms, work_ms)
         self._since_change += 1
-        if self._since_change < _SETTLE_FRAMESETS or self._interval_ms is None:
+        if self._since_change < _MIN_FRAMESETS or self._interval_ms is None:
             return
         share = self._work_ms / max(self._interval_ms, 1e-3)
-        late = self._waited_ms + self._work_ms > _LOWER_FROM * self._limit_ms
+        late = self._waited_ms + self._work_ms > _LATE * self._limit_ms
         higher = _SHARES[max(self._level - 1, 0)] / _SHARES[self._level]
         if share * higher >= _IDLE or late:
             self._idle_since_ns = None
@@ -82,8 +84,13 @@ class LoadControl:
             self._idle_since_ns = stamp_ns
         if (share > _BUSY or late) and self._level < len(_SHARES) - 1:
             self._change(1)
-        elif self._level and self._idle_since_ns is not None and stamp_ns - self._idle_since_ns > _RAISE_AFTER_NS:
+        elif self._level and self._idle_since_ns is not None and stamp_ns - self._idle_since_ns > _IDLE_NS:
             self._change(-1)
+
+    @property
+    def _likely_ms(self) -> float:
+        """What the work on a frameset will hardly exceed."""
+        return (self._work_ms or 0.0) + _DEVIATIONS * self._deviation_ms
 
     def _change(self, by: int) -> None:
         self._level += by
@@ -94,4 +101,4 @@ class LoadControl:
 
 
 def _mean(before: float | None, newest: float) -> float:
-    return newest if before is None else before + _FORGET * (newest - before)
+    return newest if before is None else before + _NEWEST_SHARE * (newest - before)

@@ -1,31 +1,35 @@
-"""What sensors deliver, until it is samples and framesets: stamps on one clock, images decoded and put together."""
+"""From readings of devices to samples and framesets: stamps on one clock, images decoded, samples in order."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
+from heapq import heappop, heappush
 
 from graphvio.config import Config
 from graphvio.errors import SourceError
-from graphvio.live.clock import ClockMaps
-from graphvio.live.meter import Meter
-from graphvio.live.ordering import SampleOrder
+from graphvio.live.clocks import ClockMaps, SharedClock
+from graphvio.live.figures import Meter
 from graphvio.live.pairing import FramesetAssembler
-from graphvio.live.shared_clock import SharedClock
 from graphvio.live.source import LiveSource
-from graphvio.live.stage import Stage
-from graphvio.measurements.events import Report
-from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, host_ns
+from graphvio.live.stages import Stage
+from graphvio.measurements.events import EventKind, Report
+from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.measurements.sensors import ImuSample, Measurement
 from graphvio.queues import BoundedQueue, WhenFull
 from graphvio.rig import Imu, Rig
 
 _WAITING_IMAGES = 64  # for decoding
 _READ_AHEAD_IMAGES = 8  # likewise, of a source that waits
-_MISSING_SAMPLE_MS = 10.0  # so long one that others overtook is waited for
+_MISSING_SAMPLE_MS = 10.0  # how long a sample that others overtook is waited for
 _ROUND_S = 0.05
+_MISSING_PERIODS = 1.5  # between samples: one is missing, or late
+_PERIODS = 50  # in the mean period,
+_MIN_PERIODS = 8  # which replaces the rig's from so many on
+_MAX_HELD = 1000
 
-Bring = Callable[[Stage, Measurement, int], None]
-"""Takes the stage that brings it, a measurement, and when it came."""
+Deliver = Callable[[Stage, Measurement, int], None]
+"""Takes the stage that delivers, a measurement, and the host time of its arrival."""
 
 
 class Reception:
@@ -33,89 +37,91 @@ class Reception:
 
     Args:
         source: opened.
-        rig: of it.
+        rig: of the source.
         config: of all stages.
-        meter: counts what comes.
-        report: is told what had to be left out.
-        bring: is handed samples and framesets, from both stages.
+        meter: counts arrivals.
+        report: takes events of what is left out.
+        deliver: takes samples and framesets, from both stages.
 
     Attributes:
-        images: that wait to be decoded.
-        started_ns: what came before is not taken: sensors may have been started long before.
-        last_ns: when something came last.
+        images: that wait to be decoded, with their stamps on the host's clock.
+        started_ns: host time; readings from before are not used, as sensors may have been started long before.
+        last_ns: host time of the newest reading.
         temperature_c: of the IMU, or None.
     """
 
     def __init__(
-        self, source: LiveSource, rig: Rig, config: Config, meter: Meter, report: Report, bring: Bring
+        self, source: LiveSource, rig: Rig, config: Config, meter: Meter, report: Report, deliver: Deliver
     ) -> None:
-        most_images = _WAITING_IMAGES if source.is_realtime else _READ_AHEAD_IMAGES
-        when_full = WhenFull.DROP_NEWEST if source.is_realtime else WhenFull.WAIT
-        self.images: BoundedQueue[tuple[CameraFrame, int]] = BoundedQueue(most_images, when_full)
+        self.images: BoundedQueue[tuple[CameraFrame, int]] = (
+            BoundedQueue(_WAITING_IMAGES, WhenFull.DROP_NEWEST)
+            if source.is_realtime
+            else BoundedQueue(_READ_AHEAD_IMAGES, WhenFull.WAIT)
+        )
         self.started_ns = self.last_ns = host_ns()
         self.temperature_c: float | None = None
         self._source = source
         self._meter = meter
         self._report = report
-        self._bring = bring
+        self._deliver = deliver
         self._clocks = ClockMaps(report)
         self._shared = SharedClock(report)  # of the readings that name no clock
         self._order = SampleOrder(_MISSING_SAMPLE_MS, (rig.imu or Imu()).rate_hz)
         self._assembler = FramesetAssembler(rig, config.timing.simultaneous_ms, config.live.max_image_wait_ms, report)
 
-    def begin(self) -> None:
-        """From now on what comes is taken."""
+    def start(self) -> None:
+        """Use readings from now on."""
         self.started_ns = self.last_ns = host_ns()
 
     def capture(self, stage: Stage) -> None:
-        """Sort what the source gives, until its end."""
+        """Sort the source's readings until its end."""
         for reading in self._source.readings():
             with stage.working():
                 self.last_ns = host_ns()
                 self._take(stage, reading)
         for sample in self._order.flush():
-            self._bring(stage, sample, host_ns())
+            self._deliver(stage, sample, host_ns())
 
     def decode(self, stage: Stage) -> None:
-        """Decode images, and put them together to framesets, until there are no more."""
+        """Decode images and assemble them to framesets until there are no more."""
         while (item := self._next_image(stage)) is not None:
             frame, stamp_ns = item
             with stage.working():
                 try:
                     image = frame.decode()
                 except SourceError as error:
-                    self._report(stamp_ns, "image_damaged", str(error))
+                    self._report(stamp_ns, EventKind.IMAGE_DAMAGED, str(error))
                     continue
                 for frameset in self._assembler.add(frame.camera, stamp_ns, image, frame.arrival_ns):
-                    self._bring(stage, frameset, frame.arrival_ns)
+                    self._deliver(stage, frameset, frame.arrival_ns)
         for frameset in self._assembler.flush():
-            self._bring(stage, frameset, host_ns())
+            self._deliver(stage, frameset, host_ns())
 
-    def _take(self, stage: Stage, reading: ImuReading | CameraFrame | Notice) -> None:
+    def _take(self, stage: Stage, reading: Reading) -> None:
         if isinstance(reading, Notice):
-            self._clocks.doubt(reading.clock)
+            self._clocks.expect_restart(reading.clock)
             self._report(reading.arrival_ns, reading.kind, reading.detail)
             return
         if self._source.is_realtime and reading.arrival_ns < self.started_ns:
             return
         stamp_ns = self._mapped(reading)
         if stamp_ns is None:
-            return  # one wild stamp, or the first of a clock that begins anew: told by the clock
+            return  # the clock has reported it
         if isinstance(reading, ImuReading):
-            self._meter.came("imu_samples", reading.arrival_ns)
+            self._meter.add_arrival("imu_samples", reading.arrival_ns)
             self.temperature_c = reading.temperature_c
-            came = ImuSample(stamp_ns, reading.angular_velocity, reading.linear_acceleration)
-            for sample in self._order.add(came):
-                self._bring(stage, sample, reading.arrival_ns)
+            sample = ImuSample(stamp_ns, reading.angular_velocity, reading.linear_acceleration)
+            for each in self._order.add(sample):
+                self._deliver(stage, each, reading.arrival_ns)
             return
-        self._meter.came("images", reading.arrival_ns)
+        self._meter.add_arrival("images", reading.arrival_ns)
         with stage.waiting():
             has_room = self.images.put((reading, stamp_ns))
         if not has_room:
             self._meter.count("images_not_decoded")
 
     def _mapped(self, reading: ImuReading | CameraFrame) -> int | None:
-        """Its stamp on the clock of all sensors, or None if it cannot be believed."""
+        """Its stamp on the clock of all sensors, or None if it is implausible."""
         if reading.clock is None:
             return self._shared.map("imu" if isinstance(reading, ImuReading) else reading.camera, reading.stamp_ns)
         return self._clocks.map(reading.clock, reading.stamp_ns, reading.arrival_ns)
@@ -124,8 +130,64 @@ class Reception:
         """The next image; None at the end. While none comes, framesets that have waited long enough go on."""
         while (item := self.images.get(_ROUND_S)) is None and not self.images.is_finished:
             if not self._source.is_realtime:
-                continue  # its images come when they are taken: time tells nothing of them
+                continue  # its images come when they are taken: time means nothing for them
             now_ns = host_ns()
             for frameset in self._assembler.advance(now_ns):
-                self._bring(stage, frameset, now_ns)
+                self._deliver(stage, frameset, now_ns)
         return item
+
+
+class SampleOrder:
+    """IMU samples in the order of their stamps, for links such as a network that let one overtake another.
+
+    A sample is held only where one is missing before it, so that none waits as long as none overtakes.
+
+    Args:
+        max_wait_ms: how long the missing one is waited for, by the stamps of those that come.
+        rate_hz: nominal rate of the samples.
+    """
+
+    def __init__(self, max_wait_ms: float, rate_hz: float) -> None:
+        self._max_wait_ns = round(1e6 * max_wait_ms)
+        self._nominal_ns = 1e9 / rate_hz
+        self._held: list[tuple[int, int, ImuSample]] = []  # a heap by stamp and order of arrival
+        self._arrived = 0
+        self._given_ns: int | None = None
+        self._newest_ns: int | None = None
+        self._steps_ns: deque[int] = deque(maxlen=_PERIODS)
+
+    def add(self, sample: ImuSample) -> list[ImuSample]:
+        """Take a sample.
+
+        Args:
+            sample: as it came. One that is older than those that went on goes on, too: the odometry reports it.
+
+        Returns:
+            The samples that go on, in order.
+        """
+        if self._given_ns is not None and sample.stamp_ns <= self._given_ns:
+            return [sample]
+        self._arrived += 1
+        heappush(self._held, (sample.stamp_ns, self._arrived, sample))
+        self._newest_ns = sample.stamp_ns if self._newest_ns is None else max(self._newest_ns, sample.stamp_ns)
+        given = []
+        while self._held and self._may_go_on(self._held[0][0]):
+            given.append(heappop(self._held)[2])
+            if self._given_ns is not None:
+                self._steps_ns.append(given[-1].stamp_ns - self._given_ns)
+            self._given_ns = given[-1].stamp_ns
+        return given
+
+    def flush(self) -> list[ImuSample]:
+        """Return all samples that are held, in order."""
+        held, self._held = self._held, []
+        return [sample for _, _, sample in sorted(held, key=lambda each: each[:2])]
+
+    def _may_go_on(self, stamp_ns: int) -> bool:
+        assert self._newest_ns is not None
+        if self._given_ns is None or len(self._held) > _MAX_HELD:
+            return True
+        steps = self._steps_ns
+        period_ns = self._nominal_ns if len(steps) < _MIN_PERIODS else sum(steps) / len(steps)
+        follows = stamp_ns - self._given_ns < _MISSING_PERIODS * period_ns
+        return follows or self._newest_ns - stamp_ns >= self._max_wait_ns

@@ -1,4 +1,4 @@
-"""The odometry on live sensors: capture, decoding, odometry and output, each in a thread of its own."""
+"""The odometry on live sensors, with a thread each for capture, decoding, odometry and outputs."""
 
 from __future__ import annotations
 
@@ -10,17 +10,15 @@ from contextlib import suppress
 from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.live.estimation import FRAMESETS, Estimation
-from graphvio.live.figures import device_figures, figures
-from graphvio.live.meter import Meter
-from graphvio.live.output import Output
+from graphvio.live.figures import Meter, device_figures, run_figures
+from graphvio.live.outputs import Output
 from graphvio.live.reception import Reception
 from graphvio.live.source import LiveSource
-from graphvio.live.stage import Stage
-from graphvio.live.watchdog import Watchdog
+from graphvio.live.stages import Stage, Watchdog
 from graphvio.measurements.estimate import Estimate, Prediction
-from graphvio.measurements.events import Event
+from graphvio.measurements.events import Event, EventKind
 from graphvio.measurements.readings import DeviceHealth, host_ns
-from graphvio.measurements.sensors import FrameSet, ImuSample
+from graphvio.measurements.sensors import FrameSet, Measurement
 from graphvio.odometry import Odometry
 from graphvio.queues import Broadcast
 from graphvio.rig import Rig
@@ -33,20 +31,20 @@ _END_S = 10.0
 
 
 class LiveOdometry:
-    """Runs the odometry on a source until it ends or is stopped; what `graphvio.slam.interface.Served` asks for.
+    """Runs the odometry on a source until it ends or is stopped; implements `graphvio.slam.interface.Served`.
 
     Args:
         source: opened.
-        rig: that opening it gave.
+        rig: that opening the source returned.
         config: of all stages.
-        outputs: what is handed all that comes and all that is made of it.
+        outputs: consumers of all measurements and results.
         wants_keyframes: whether keyframes are made.
 
     Attributes:
         rig: of the source.
-        estimates: as they are made.
-        predictions: at each sample of the IMU.
-        events: as they happen.
+        estimates: of the framesets.
+        predictions: at each IMU sample.
+        events: of the run.
         keyframe_log: the newest keyframes.
     """
 
@@ -71,72 +69,75 @@ class LiveOdometry:
         self._front_end = FrontEnd(self._odometry)
         if wants_keyframes:
             self._front_end.on_keyframe(self.keyframe_log.add)
-        self._reception = Reception(source, rig, config, self._meter, self._report, self._bring)
+        self._reception = Reception(source, rig, config, self._meter, self._report, self._deliver)
         self._estimation = Estimation(
             self._odometry,
             config.live,
             source.is_realtime,
             self._meter,
             self.estimates.publish,
-            self._tell_events,
+            self._report_events,
         )
         self._failures: list[BaseException] = []
         self._ended = threading.Event()
         self._stages = [
             Stage("capture", self._reception.capture, self._fail, self._reception.images.close),
-            Stage("decode", self._reception.decode, self._fail, self._end_decode),
+            Stage("decode", self._reception.decode, self._fail, self._end_decoding),
             Stage("odometry", self._estimation.estimate, self._fail, self._end_odometry),
-            Stage("output", self._put_out, self._fail, self._end_output),
+            Stage("output", self._put_out, self._fail, self._end_outputs),
         ]
-        self._watchdog = Watchdog(self._stages, config.live.stuck_s, self._tell_now, self._silent_s)
-
-    # ------------------------------------------------------------------ for its owner
+        self._watchdog = Watchdog(self._stages, config.live.stuck_s, self._report_now, self._silences_s)
 
     def add_output(self, output: Output) -> None:
-        """Hand all to one more; before `start`."""
+        """Add a consumer of all measurements and results; before `start`."""
         self._outputs.append(output)
 
     def start(self) -> None:
-        """Start all threads; what came before is not taken."""
-        self._reception.begin()
+        """Start all threads; readings from before are not used."""
+        self._reception.start()
         for stage in self._stages:
             stage.start()
         self._watchdog.start()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait for the end of the source; whether it, or a failure, has come.
+        """Wait for the end of the source.
+
+        Args:
+            timeout_s: how long to wait; None waits for the end.
+
+        Returns:
+            Whether the run has ended.
 
         Raises:
-            GraphvioError: what ended a stage before its time.
+            GraphvioError: that ended a stage.
         """
         ended = self._ended.wait(timeout_s)
         self._raise_failure()
         return ended
 
     def stop(self) -> None:
-        """Stop the source, work on what has come, and end all threads; a second time does nothing.
+        """Stop the source, process all that has come, and end all threads; a second call does nothing.
 
-        Threads are waited for as long as anything gets on. One that does not is told as ``stage_stuck`` and left
-        behind, and those after it end without what it has.
+        Threads are waited for as long as anything progresses. One that does not is reported as ``stage_stuck`` and left
+        behind, and those after it end without what it holds.
 
         Raises:
-            GraphvioError: what ended a stage before its time.
+            GraphvioError: that ended a stage.
         """
         self._source.close()
         images, inbox, results = self._reception.images, self._estimation.inbox, self._estimation.results
         feeds = (images.close, inbox.close, results.close, results.abandon)
         for stage, end_next in zip(self._stages, feeds, strict=True):
             if stage.is_alive and not self._ends(stage):
-                self._tell_now("stage_stuck", f"{stage.name} does not end; left behind")
+                self._report_now(EventKind.STAGE_STUCK, f"{stage.name} does not end; left behind")
                 end_next()
-        self._close_listeners()
+        self._close_broadcasts()
         self._ended.set()
-        if self._watchdog.is_running:
-            self._watchdog.stop()
+        self._watchdog.stop()
         self._raise_failure()
 
     def _ends(self, stage: Stage) -> bool:
-        """Whether a stage ends; it may take long as long as it gets on, or what it waits for does. Capture has to end
+        """Whether a stage ends; it may take long while it progresses, or those do that it waits for. Capture has to end
         at once where it need not wait, as its source was closed."""
         capture, *later = self._stages
         counted = later if not self._source.is_realtime else [stage] if stage is not capture else []
@@ -150,24 +151,22 @@ class LiveOdometry:
 
     @property
     def odometry(self) -> Odometry:
-        """What estimates; its `predict`, `correct` and `map_T_body` may be asked from any thread."""
+        """The odometry, whose `predict`, `correct` and `map_T_body` may be called from any thread."""
         return self._odometry
 
     @property
     def is_healthy(self) -> bool:
-        """Whether all stages live and none is stuck."""
+        """Whether all stages run and none is stuck."""
         return not self._watchdog.stuck and not self._watchdog.dead
 
     @property
     def devices(self) -> Sequence[DeviceHealth]:
-        """Each device."""
+        """State of each device."""
         return self._source.health()
-
-    # ------------------------------------------------------------------ for the services
 
     @property
     def map_T_odom(self) -> Float | None:
-        """(4, 4) in force, or None before the epoch's first correction."""
+        """The correction in force, (4, 4), or None before the epoch's first."""
         return self._front_end.map_T_odom
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
@@ -175,7 +174,7 @@ class LiveOdometry:
         return self._front_end.correct(keyframe_id, map_T_body, covariance)
 
     def status(self) -> Mapping[str, float | int | str | None]:
-        """How it runs, by name."""
+        """Return the figures of the run by name; from any thread."""
         now_ns = host_ns()
         return {
             "health": "ok" if self.is_healthy else "failing",
@@ -189,21 +188,21 @@ class LiveOdometry:
             "temperature_c": self._reception.temperature_c,
             "skipped_no_room": self._estimation.inbox.dropped(FRAMESETS),
             "imu_lost": self._estimation.inbox.dropped(),
-            **figures(self._meter, self._estimation.latest, now_ns),
+            **run_figures(self._meter, self._estimation.latest, now_ns),
             **device_figures(self._source.health()),
             **{name: value for output in self._outputs for name, value in output.status().items()},
         }
 
     # ------------------------------------------------------------------ the stages
 
-    def _end_decode(self) -> None:
+    def _end_decoding(self) -> None:
         self._reception.images.abandon()
         self._estimation.inbox.close()
 
-    def _bring(self, stage: Stage, measurement: ImuSample | FrameSet, arrival_ns: int) -> None:
+    def _deliver(self, stage: Stage, measurement: Measurement, arrival_ns: int) -> None:
         is_frameset = isinstance(measurement, FrameSet)
         if is_frameset:
-            self._meter.came("framesets", arrival_ns)
+            self._meter.add_arrival("framesets", arrival_ns)
         for output in self._outputs:
             output.add_measurement(measurement)
         with stage.waiting():
@@ -212,23 +211,23 @@ class LiveOdometry:
     def _end_odometry(self) -> None:
         self._estimation.inbox.abandon()
         try:
-            self._tell_events()
+            self._report_events()
         finally:
             self._estimation.results.close()
 
     def _put_out(self, stage: Stage) -> None:
-        """Hand estimates to the outputs."""
+        """Hand estimates to the outputs until there are no more."""
         while (result := self._estimation.results.get()) is not None:
             with stage.working():
                 for output in self._outputs:
-                    output.add_result(result.estimate, result.frameset)
+                    output.add_result(*result)
 
-    def _end_output(self) -> None:
+    def _end_outputs(self) -> None:
         self._estimation.results.abandon()
-        self._close_listeners()
+        self._close_broadcasts()
         self._ended.set()
 
-    # ------------------------------------------------------------------ what is told
+    # ------------------------------------------------------------------ events and failures
 
     def _report(self, stamp_ns: int, kind: str, detail: str) -> None:
         event = Event(stamp_ns, kind, detail)
@@ -237,37 +236,37 @@ class LiveOdometry:
         for output in self._outputs:
             output.add_event(event)
 
-    def _tell_now(self, kind: str, detail: str) -> None:
+    def _report_now(self, kind: str, detail: str) -> None:
         self._report(host_ns(), kind, detail)
 
-    def _tell_events(self) -> None:
+    def _report_events(self) -> None:
         for event in self._odometry.take_events():
             self._report(event.stamp_ns, event.kind, event.detail)
 
     def _fail(self, stage: Stage, error: BaseException) -> None:
-        """A stage is dead: the source ends, by which all others come to their end."""
+        """Close the source as a stage is dead, so that all others come to their end."""
         self._failures.append(error)
         with suppress(Exception):  # an output may be what failed
-            self._tell_now("stage_failed", f"{stage.name}: {error}")
+            self._report_now(EventKind.STAGE_FAILED, f"{stage.name}: {error}")
         self._ended.set()
         self._source.close()
 
-    def _silent_s(self) -> Mapping[str, float]:
-        """How long nothing has come from each kind of sensor that should deliver."""
+    def _silences_s(self) -> Mapping[str, float]:
+        """For how long nothing has come, by kind of sensor, of those that should deliver."""
         if not (self._source.is_realtime and self._stages[0].is_alive):
             return {}
         awaited = {"cameras": "images"} | ({} if self.rig.imu is None else {"imu": "imu_samples"})
-        began_ns, now_ns = self._reception.started_ns, host_ns()
+        started_ns, now_ns = self._reception.started_ns, host_ns()
         return {
-            kind: 1e-9 * (now_ns - max(self._meter.newest_ns(what) or began_ns, began_ns))
-            for kind, what in awaited.items()
+            kind: 1e-9 * (now_ns - max(self._meter.newest_ns(counted) or started_ns, started_ns))
+            for kind, counted in awaited.items()
         }
 
     def _raise_failure(self) -> None:
         if self._failures:
-            raise self._failures[0]  # what came after may be for that
+            raise self._failures[0]  # later ones may be its consequences
 
-    def _close_listeners(self) -> None:
+    def _close_broadcasts(self) -> None:
         self.keyframe_log.close()
         for broadcast in (self.estimates, self.predictions, self.events):
             broadcast.close()

@@ -1,4 +1,4 @@
-"""Records a live run as a session, in a thread of its own: a disk that is slow never holds up the odometry."""
+"""Recording of a live run as a session, in a thread of its own: a slow disk never holds up the odometry."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from graphvio.live.outputs import Output
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
 from graphvio.measurements.sensors import FrameSet, Measurement
@@ -15,25 +16,28 @@ from graphvio.rig import Rig
 from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
 
-_WAITING = 20_000  # samples, poses and messages: a minute of them
+_WAITING = 20_000  # samples, poses and events: a minute of them
 _WAITING_FRAMESETS = 120  # a disk may pause for seconds
 _READ_AHEAD = 2  # framesets, where the source waits
 
 
-class SessionRecorder:
-    """An output (`graphvio.live.output.Output`) that writes all that comes and all that is made of it.
+class SessionRecorder(Output):
+    """Writes all measurements, estimates and events.
 
-    When the disk does not keep up, framesets are left out of the recording and counted; samples and poses are, too,
-    when it has stood still for more than a minute.
+    When the disk does not keep up, framesets are left out of the recording and counted; samples and poses, too, when it
+    has been stuck for more than a minute.
 
     Args:
-        path: of the session, new.
+        path: of the session, a new file.
         rig: of the framesets.
-        image_format: images as they are, or as PNG.
-        waits: for the disk instead, as for a source that waits itself.
+        image_format: ``raw``, or ``png`` to compress images.
+        waits: whether to wait for the disk instead, for a source that waits itself.
+
+    Attributes:
+        failure: newest error of writing, or None.
 
     Raises:
-        SessionError: if the file exists or cannot be made.
+        SessionError: if the file exists or cannot be created.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
 
@@ -43,10 +47,8 @@ class SessionRecorder:
         when_full = WhenFull.WAIT if waits else WhenFull.DROP_NEWEST
         framesets = Limit(_READ_AHEAD if waits else _WAITING_FRAMESETS, when_full)
         self._waiting: BoundedQueue[Callable[[], None]] = BoundedQueue(_WAITING, when_full, framesets=framesets)
-        self._left_out = 0  # framesets for which the disk was too slow,
-        self._lost = 0  # and samples, poses, messages
         self._framesets = 0
-        self._failed_framesets = 0  # which could not be written
+        self._failed_framesets = 0
         self._failed_messages = 0
         self.failure: Exception | None = None
         self._thread = threading.Thread(target=self._write, name="graphvio-record", daemon=True)
@@ -55,7 +57,7 @@ class SessionRecorder:
     def add_measurement(self, measurement: Measurement) -> None:
         """See `Output`."""
         if isinstance(measurement, FrameSet):
-            self._left_out += not self._waiting.put(lambda: self._write_frameset(measurement), "framesets")
+            self._waiting.put(lambda: self._write_frameset(measurement), "framesets")
         else:
             self._put(lambda: self._writer.add(measurement))
 
@@ -72,19 +74,19 @@ class SessionRecorder:
         return {
             "recorded_framesets": self._framesets,
             "recorded_poses": self._writer.poses,
-            "framesets_not_recorded": self._left_out + self._failed_framesets,
-            "messages_not_recorded": self._lost + self._failed_messages,
+            "framesets_not_recorded": self._waiting.dropped("framesets") + self._failed_framesets,
+            "messages_not_recorded": self._waiting.dropped() + self._failed_messages,
             "recording_stopped": self._writer.stopped or (str(self.failure) if self.failure else ""),
             "disk_free_gb": self._free_gb(),
         }
 
     def close(self) -> None:
-        """Write what waits, and finish the file."""
+        """Write all that waits, and finish the file."""
         self._waiting.close()
         self._thread.join()
 
     def _put(self, write: Callable[[], None]) -> None:
-        self._lost += not self._waiting.put(lambda: self._write_message(write))
+        self._waiting.put(lambda: self._write_message(write))
 
     def _free_gb(self) -> float | None:
         try:

@@ -12,7 +12,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,12 +22,11 @@ from benchmarks.report import Report, machine, tell
 from campaigns.live_listener import Listener
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
-from graphvio.live.output import Output
+from graphvio.live.outputs import Output
 from graphvio.live.running import LiveOdometry
 from graphvio.live.sources import open_live_source
 from graphvio.measurements.estimate import Estimate
-from graphvio.measurements.events import Event
-from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
+from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.sources import open_source
 from graphvio.warmup import warm_up
 
@@ -128,21 +126,11 @@ class _Stall(Output):
         self._seconds = seconds
         self._results = 0
 
-    def add_measurement(self, measurement: Measurement) -> None:
-        """Nothing."""
-
     def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
         """Sleep at the hundredth."""
         self._results += 1
         if self._seconds and self._results == 100:
             time.sleep(self._seconds)
-
-    def add_event(self, event: Event) -> None:
-        """Nothing."""
-
-    def status(self) -> Mapping[str, float | int | str | None]:
-        """Nothing."""
-        return {}
 
 
 def _killed(folder: Path, after_s: float) -> float:

@@ -13,9 +13,8 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.errors import SourceError
-from graphvio.live.counts import Counts
 from graphvio.live.device_clock import host_ns_of_monotonic, realtime_to_host_ns
-from graphvio.live.devices import DeviceLostError, HandOver
+from graphvio.live.devices import Counts, DeviceLostError, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
 from graphvio.live.imu_readers.iio_scan import ScanElement, ScanFormat, mount_matrix
 from graphvio.measurements.readings import ImuReading, host_ns

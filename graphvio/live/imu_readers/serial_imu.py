@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 
 from graphvio.errors import MissingExtraError, SourceError
-from graphvio.live.counts import Counts
 from graphvio.live.device_clock import MicrosecondCounter
-from graphvio.live.devices import DeviceLostError, HandOver
+from graphvio.live.devices import Counts, DeviceLostError, HandOver
 from graphvio.measurements.readings import ImuReading, Notice, host_ns
 
 _POLL_S = 0.05

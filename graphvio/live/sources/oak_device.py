@@ -13,8 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from graphvio.errors import RigError, SourceError
-from graphvio.live.counts import Counts
-from graphvio.live.devices import DeviceLostError, HandOver
+from graphvio.live.devices import Counts, DeviceLostError, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
 from graphvio.live.lens_fit import FittedLens
 from graphvio.live.sources.oak_calibration import factory_rig, fitted_lens

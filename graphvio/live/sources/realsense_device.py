@@ -12,9 +12,8 @@ import numpy as np
 
 from graphvio.arrays import Float, Image
 from graphvio.errors import RigError, SourceError
-from graphvio.live.counts import Counts
 from graphvio.live.device_clock import MicrosecondCounter, host_ns_of_realtime
-from graphvio.live.devices import DeviceLostError, HandOver
+from graphvio.live.devices import Counts, DeviceLostError, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
 from graphvio.live.sources.realsense_calibration import factory_rig
 from graphvio.measurements.readings import CameraFrame, ImuReading, host_ns

@@ -8,8 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from graphvio.errors import RigError, SourceError
-from graphvio.live.counts import Counts
-from graphvio.live.devices import Device, DeviceLostError, DeviceSource, HandOver
+from graphvio.live.devices import Counts, Device, DeviceLostError, DeviceSource, HandOver
 from graphvio.live.imu_readers.iio_imu import IioImu
 from graphvio.live.imu_readers.serial_imu import SerialImu
 from graphvio.live.source import DeviceInfo, LiveSource

@@ -1,4 +1,4 @@
-"""Messages of a device as chance delays them, with known truth: how well its clock is mapped."""
+"""Synthetic messages of a device with random delays and known truth, and the errors of its mapped clock."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.live.clock import ClockMap
+from graphvio.live.clocks import ClockMap
 
 _BEGIN_NS = 1_700_000_000_000_000_000  # host's time
 _LEAST_DELAY_NS = 700_000
@@ -49,7 +49,7 @@ class Messages:
     truth_ns: Int
 
 
-def draw_messages(
+def synthetic_messages(
     conditions: Conditions, duration_s: float, rng: np.random.Generator, begin_s: float = 0.0
 ) -> Messages:
     """Messages from some time on; each waits for the ones before it, as in a queue."""
@@ -85,8 +85,8 @@ def clock_errors(conditions: Conditions, after_s: Sequence[float], runs: int, se
     errors_us: list[list[Float]] = [[] for _ in after_s]
     drifts: list[list[float]] = [[] for _ in after_s]
     for run in range(runs):
-        messages = draw_messages(conditions, max(after_s) + 1.0, np.random.default_rng([seed, run]))
-        clock = ClockMap("drawn", lambda stamp_ns, kind, detail: None)
+        messages = synthetic_messages(conditions, max(after_s) + 1.0, np.random.default_rng([seed, run]))
+        clock = ClockMap("synthetic", lambda stamp_ns, kind, detail: None)
         mapped = np.zeros(len(messages.stamps_ns))
         found = np.zeros(len(mapped))
         for k, (stamp, arrival, truth) in enumerate(
