@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dawdling import Dawdling
+from delayed_tasks import DelayedExecutor
 
 from graphvio import (
     Config,
@@ -81,7 +81,7 @@ def test_the_threads_timing_changes_nothing(room_walk: Path, measurements: list[
         frontend = odometry._frontend
         if seed:
             frontend._workers.shutdown()
-            frontend._workers = Dawdling(len(rig.pairs), seed)
+            frontend._workers = DelayedExecutor(len(rig.pairs), seed)
         runs.append(feed(odometry, measurements))
         assert not seed or len(frontend._workers.delays_ms) > 50  # type: ignore[attr-defined]
     for again in runs[1:]:

@@ -1,4 +1,4 @@
-"""Counters of microseconds that begin again at zero, as devices have them, and the host's other clocks."""
+"""Stamps of devices by counters that wrap, and of the kernel by the host's other clocks."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _MONOTONIC_TO_HOST_NS = host_ns() - time.monotonic_ns()
 
 
 class MicrosecondCounter:
-    """Stamps in nanoseconds from a counter of 32 bits, which begins anew every 71.6 minutes.
+    """Stamps in nanoseconds from a counter of 32 bits, which wraps every 71.6 minutes.
 
-    Sensors of one device share an instance, so that theirs go on from one another; any thread may call. Wider counters
-    are taken, too, as long as nothing pauses for half an hour.
+    Sensors of one device share an instance, so that their stamps agree; any thread may call. Wider counters work, too,
+    as long as nothing pauses for half an hour.
     """
 
     _PERIOD_US = 1 << 32
@@ -24,7 +24,7 @@ class MicrosecondCounter:
         self._newest_us: float | None = None
 
     def stamp_ns(self, counter_us: float) -> int:
-        """The stamp of a counter's value: the one that is nearest to the newest stamp."""
+        """Return the stamp of a counter's value that is nearest to the newest stamp."""
         with self._lock:
             if self._newest_us is None:
                 self._newest_us = counter_us
@@ -35,19 +35,19 @@ class MicrosecondCounter:
 
 
 def host_ns_of_monotonic(monotonic_ns: int) -> int:
-    """`host_ns` of an instant that the kernel stamped by ``CLOCK_MONOTONIC``."""
+    """Convert a stamp by ``CLOCK_MONOTONIC`` to the host's time."""
     return monotonic_ns + _MONOTONIC_TO_HOST_NS
 
 
 def host_ns_of_realtime(realtime_ns: int) -> int:
-    """`host_ns` of an instant of a moment ago that was stamped by ``CLOCK_REALTIME``, which may have been set since."""
+    """Convert a recent stamp by ``CLOCK_REALTIME``, which may be set at any time, to the host's time."""
     return realtime_ns + realtime_to_host_ns()
 
 
 def realtime_to_host_ns() -> int:
-    """What to add to ``CLOCK_REALTIME`` of this moment; the tightest of three looks, as threads are interrupted."""
-    looks = []
+    """Return what to add to ``CLOCK_REALTIME`` now; the tightest of three readings, as threads are interrupted."""
+    readings = []
     for _ in range(3):
         before_ns, realtime_ns, after_ns = host_ns(), time.time_ns(), host_ns()
-        looks.append((after_ns - before_ns, (before_ns + after_ns) // 2 - realtime_ns))
-    return min(looks)[1]
+        readings.append((after_ns - before_ns, (before_ns + after_ns) // 2 - realtime_ns))
+    return min(readings)[1]

@@ -1,4 +1,4 @@
-"""Rigs of cameras that each know their own calibration: one, or several whose places to each other are guessed."""
+"""Rigs of cameras with factory calibrations: of one camera, or of several with guessed transforms between them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,16 @@ from graphvio.rig import Rig, StereoPair
 
 
 def checked_rig(rig: Rig, size_px: tuple[int, int], has_imu: bool, kind: str) -> Rig:
-    """A rig that was given, as cameras of one size deliver it.
+    """Check that a given rig fits the images.
+
+    Args:
+        rig: given.
+        size_px: (width, height) of all images.
+        has_imu: whether the devices deliver IMU samples.
+        kind: of source, for messages.
+
+    Returns:
+        The rig, without its IMU where the devices have none.
 
     Raises:
         RigError: if it is for images of another size.
@@ -28,24 +37,32 @@ def checked_rig(rig: Rig, size_px: tuple[int, int], has_imu: bool, kind: str) ->
 
 
 def refuse_unknown_places(kind: str, devices: Sequence[str]) -> Rig:
-    """What to say where several cameras are asked for and nobody told how they are mounted.
+    """Refuse several cameras without a rig file, as the transforms between them are unknown.
+
+    Args:
+        kind: of source.
+        devices: names of the cameras.
 
     Raises:
         RigError: always.
     """
     names = ",".join(devices)
     raise RigError(
-        f"{kind}: each camera knows its own calibration, but not where {len(devices)} of them are to each other; give "
+        f"{kind}: each camera has its own calibration, but not the transforms between {len(devices)} of them; give "
         f"a rig file (--rig rig.yaml). To make one, record a walk from '{kind}:{names}?places=guess' and calibrate it: "
         "graphvio calibrate RECORDING --out rig.yaml"
     )
 
 
 def guessed_rig(rigs: Sequence[Rig], name: str) -> Rig:
-    """One rig of several of one pair each, fit to record what `graphvio calibrate` needs, and for nothing else.
+    """Combine rigs of one pair each to one that only serves to record a session for `graphvio calibrate`.
 
-    The first keeps its place and its IMU; the others look from the same spot, turned about the vertical by equal steps:
-    two look forwards and backwards. Cameras are named ``cam0``, ``cam1`` and so on.
+    The first keeps its pose and its IMU; the others are at the same position, rotated about the vertical by equal
+    steps: two look forwards and backwards. Cameras are named ``cam0``, ``cam1`` and so on.
+
+    Args:
+        rigs: of the cameras.
+        name: of the combined rig.
     """
     body_T_left0 = rigs[0].pairs[0].left.body_T_cam
     pairs = []
@@ -61,23 +78,23 @@ def guessed_rig(rigs: Sequence[Rig], name: str) -> Rig:
 
 
 def camera_names(rig: Rig | None, k: int) -> tuple[str, str]:
-    """Names of the cameras of device ``k``: the rig's, or those that `guessed_rig` gives."""
+    """Return the names of the left and right camera of device ``k``: the rig's, or those of `guessed_rig`."""
     if rig is None:
         return f"cam{2 * k}", f"cam{2 * k + 1}"
     return rig.pairs[k].left.name, rig.pairs[k].right.name
 
 
 def check_one_for_each_pair(kind: str, names: Sequence[str], rig: Rig | None, named: str) -> None:
-    """Make sure that there is a camera for each pair of a rig that is given.
+    """Check that there is a camera for each pair of a given rig.
 
     Args:
         kind: of source.
         names: of the cameras.
-        rig: or None.
-        named: what a camera is named by.
+        rig: given, or None.
+        named: what identifies a camera, for messages.
 
     Raises:
-        SourceError: if there is not.
+        SourceError: if their numbers differ.
     """
     if rig is not None and len(names) != len(rig.pairs):
         raise SourceError(

@@ -1,4 +1,4 @@
-"""Gyro and accelerometer that tick by themselves, as samples of one IMU."""
+"""Gyro and accelerometer with rates of their own, as samples of one IMU."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from graphvio.arrays import Float
 from graphvio.live.devices import Counts
 from graphvio.measurements.readings import ImuReading
 
-_LONGEST_GAP_NS = 100_000_000
-_MOST_WAITING = 256
+_MAX_GAP_NS = 100_000_000
+_MAX_WAITING = 256
 _ACCELS_KEPT = 32
 
 
@@ -26,7 +26,7 @@ class AccelOntoGyro:
 
     Args:
         hand_over: takes the samples.
-        counts: of ``imu_unpaired`` and ``imu_out_of_order``.
+        counts: takes ``imu_unpaired`` and ``imu_out_of_order``.
     """
 
     def __init__(self, hand_over: Callable[[ImuReading], None], counts: Counts) -> None:
@@ -45,7 +45,7 @@ class AccelOntoGyro:
                 return
             self._newest_gyro_ns = reading.stamp_ns
             self._waiting.append(reading)
-            if len(self._waiting) > _MOST_WAITING:
+            if len(self._waiting) > _MAX_WAITING:
                 self._waiting.popleft()
                 self._counts.add("imu_unpaired")
             self._hand_over_ready()
@@ -76,7 +76,7 @@ class AccelOntoGyro:
         if index == 0:
             return None
         before_ns, before = self._accels[index - 1]
-        if after_ns - before_ns > _LONGEST_GAP_NS:
+        if after_ns - before_ns > _MAX_GAP_NS:
             return None
         share = (stamp_ns - before_ns) / (after_ns - before_ns)
         return (1.0 - share) * before + share * after

@@ -1,8 +1,8 @@
-"""Lenses of OpenCV's large models, as the nearest of the models that graphvio has, and images put right for the rest.
+"""Approximation of OpenCV's rational lens models by those of graphvio, and correction of images for the difference.
 
-Cameras that come calibrated by 8 or 14 coefficients have rational models, whose waves no model of 5 follows: with the
-figures of a real camera the nearest is off by 0.1 px in most of the image and by more than half a pixel in its corners.
-So images are moved by that little.
+Factory calibrations of 8 or 14 coefficients are rational models, which no model of 5 coefficients matches: with those
+of a real camera the nearest is off by 0.1 px in most of the image and by more than half a pixel in its corners. So
+images are resampled by that difference.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from graphvio.arrays import AnyArray, Float, Image
 from graphvio.cameras import MODEL_NAMES, project_points, unproject_pixels
 from graphvio.errors import RigError
 
-_EXACT_PX = 0.02  # nearer than any calibration is right
+_EXACT_PX = 0.02  # less than the error of any calibration
 _MAX_ERROR_PX = 8.0
 _GRID = (32, 20)
 _SAME_PX = 0.01
@@ -28,13 +28,13 @@ _MARGIN_PX = 1.0
 
 @dataclass(frozen=True, eq=False)
 class FittedLens:
-    """A lens by one of graphvio's models.
+    """A lens with one of graphvio's models.
 
     Attributes:
         model: its name.
         intrinsics: (4,), pixels.
         distortion: (5,).
-        error_px: by how much images are moved, at most.
+        error_px: maximum difference between the models, by which images are resampled.
         maps: for `corrected`, or None where the model is exact.
     """
 
@@ -45,7 +45,7 @@ class FittedLens:
     maps: tuple[AnyArray, AnyArray] | None = None
 
     def corrected(self, image: Image) -> Image:
-        """The image (height, width) that this lens would have made."""
+        """Return the image (height, width) that this lens would have made."""
         if self.maps is None:
             return image
         moved = cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
@@ -53,7 +53,7 @@ class FittedLens:
 
 
 def fit_rational(intrinsics: Float, coefficients: Float, size_px: tuple[int, int], where: str) -> FittedLens:
-    """OpenCV's model of up to 14 coefficients as radial-tangential or equidistant, whichever is nearer.
+    """Fit a radial-tangential or an equidistant model, whichever is nearer, to OpenCV's of up to 14 coefficients.
 
     Args:
         intrinsics: (4,) ``[fx, fy, cx, cy]``, pixels.
@@ -61,14 +61,17 @@ def fit_rational(intrinsics: Float, coefficients: Float, size_px: tuple[int, int
         size_px: (width, height) of the image.
         where: for messages.
 
+    Returns:
+        The fitted lens.
+
     Raises:
-        RigError: if neither comes near.
+        RigError: if neither is near enough.
     """
     coefficients = np.asarray(coefficients, dtype=np.float64)
     if not coefficients[5:].any():
         return FittedLens("radial-tangential", intrinsics, np.pad(coefficients[:5], (0, max(5 - len(coefficients), 0))))
     matrix = np.array([[intrinsics[0], 0.0, intrinsics[2]], [0.0, intrinsics[1], intrinsics[3]], [0.0, 0.0, 1.0]])
-    points, pixels = _samples(matrix, coefficients, size_px)
+    points, pixels = _sample_points(matrix, coefficients, size_px)
     best = min((_fit(model, intrinsics, points, pixels) for model in MODEL_NAMES), key=lambda fit: fit.error_px)
     if len(points) < _MIN_SHARE * _GRID[0] * _GRID[1] or best.error_px > _MAX_ERROR_PX:
         raise RigError(
@@ -82,15 +85,15 @@ def fit_rational(intrinsics: Float, coefficients: Float, size_px: tuple[int, int
     return FittedLens(best.model, best.intrinsics, best.distortion, best.error_px, maps)
 
 
-def _samples(matrix: Float, coefficients: Float, size_px: tuple[int, int]) -> tuple[Float, Float]:
+def _sample_points(matrix: Float, coefficients: Float, size_px: tuple[int, int]) -> tuple[Float, Float]:
     """Points (N, 3) in the camera's frame whose pixels (N, 2) are spread over the image, from border to border."""
     pixels = _grid(np.linspace(0, size_px[0] - 1, _GRID[0]), np.linspace(0, size_px[1] - 1, _GRID[1]))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _STEPS, 1e-12)
     rays = cv2.undistortPoints(pixels[:, None], matrix, coefficients, criteria=criteria).reshape(-1, 2)
     points: Float = np.column_stack([rays, np.ones(len(rays))]).astype(np.float64)
     again = _projected(points, matrix, coefficients)
-    known = np.linalg.norm(again - pixels, axis=1) < _SAME_PX  # the inverse is found by iteration, not everywhere
-    return points[known], again[known]
+    has_converged = np.linalg.norm(again - pixels, axis=1) < _SAME_PX  # the inverse is iterative
+    return points[has_converged], again[has_converged]
 
 
 def _fit(model: str, intrinsics: Float, points: Float, pixels: Float) -> FittedLens:
@@ -114,11 +117,11 @@ def _maps(lens: FittedLens, matrix: Float, coefficients: Float, size_px: tuple[i
     pixels = _grid(np.arange(size_px[0], dtype=np.float64), np.arange(size_px[1], dtype=np.float64))
     rays, valid = unproject_pixels(MODEL_NAMES[lens.model], lens.intrinsics, lens.distortion, pixels)
     own = _projected(np.column_stack([rays, np.ones(len(rays))]), matrix, coefficients)
-    # Beyond what the lens sees, its model folds back into the image.
-    seen = valid & (np.linalg.norm(own - pixels, axis=1) <= lens.error_px + _MARGIN_PX)
-    # Pixels of the border come from beyond it by a fraction of one; black there would be an edge that never moves.
+    # Outside its field of view, the lens model folds back into the image.
+    visible = valid & (np.linalg.norm(own - pixels, axis=1) <= lens.error_px + _MARGIN_PX)
+    # Pixels of the border come from outside by a fraction of one; black there would be an edge that never moves.
     own = np.clip(own, 0.0, np.array(size_px) - 1.0)
-    own[~seen] = _OUTSIDE
+    own[~visible] = _OUTSIDE
     x, y = own.astype(np.float32).reshape(size_px[1], size_px[0], 2).transpose(2, 0, 1)
     whole, fraction = cv2.convertMaps(np.ascontiguousarray(x), np.ascontiguousarray(y), cv2.CV_16SC2)
     return whole, fraction

@@ -1,4 +1,4 @@
-"""Values of a live source's options, as what they should be."""
+"""Options of a live source as sizes, numbers, choices and names."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _SIZE = re.compile(r"([1-9]\d{1,4})x([1-9]\d{1,4})")
 
 
 def size_of(spec: SourceSpec, key: str) -> tuple[int, int] | None:
-    """A size ``WIDTHxHEIGHT`` in pixels, or None where it is not given.
+    """Return a size ``WIDTHxHEIGHT`` in pixels, or None where it is not given.
 
     Raises:
-        SourceError: if it is none.
+        SourceError: if it is not a size.
     """
     text = spec.options.get(key)
     if text is None:
@@ -27,11 +27,11 @@ def size_of(spec: SourceSpec, key: str) -> tuple[int, int] | None:
     return int(found[1]), int(found[2])
 
 
-def number_of(spec: SourceSpec, key: str, least: float, most: float) -> float | None:
-    """A number in a range, or None where it is not given.
+def number_of(spec: SourceSpec, key: str, minimum: float, maximum: float) -> float | None:
+    """Return a number in a range, or None where it is not given.
 
     Raises:
-        SourceError: if it is none, or out of range.
+        SourceError: if it is not a number, or out of range.
     """
     text = spec.options.get(key)
     if text is None:
@@ -40,25 +40,25 @@ def number_of(spec: SourceSpec, key: str, least: float, most: float) -> float | 
         value = float(text)
     except ValueError:
         value = math.nan
-    if not least <= value <= most:  # also refuses NaN
-        raise SourceError(f"{spec.kind}: {key} is {text!r}; write a number from {least:g} to {most:g}")
+    if not minimum <= value <= maximum:  # also refuses NaN
+        raise SourceError(f"{spec.kind}: {key} is {text!r}; write a number from {minimum:g} to {maximum:g}")
     return value
 
 
-def whole_number_of(spec: SourceSpec, key: str, least: int, most: int) -> int | None:
-    """A whole number in a range, or None where it is not given.
+def whole_number_of(spec: SourceSpec, key: str, minimum: int, maximum: int) -> int | None:
+    """Return a whole number in a range, or None where it is not given.
 
     Raises:
-        SourceError: if it is none, or out of range.
+        SourceError: if it is not a whole number, or out of range.
     """
-    value = number_of(spec, key, least, most)
+    value = number_of(spec, key, minimum, maximum)
     if value is not None and not value.is_integer():
         raise SourceError(f"{spec.kind}: {key} is {spec.options[key]!r}; write a whole number")
     return None if value is None else int(value)
 
 
 def choice_of(spec: SourceSpec, key: str, choices: Sequence[str]) -> str:
-    """One of several words, of which the first is taken where none is given.
+    """Return one of several words, the first where none is given.
 
     Raises:
         SourceError: if it is none of them.
@@ -70,7 +70,7 @@ def choice_of(spec: SourceSpec, key: str, choices: Sequence[str]) -> str:
 
 
 def names_of(spec: SourceSpec) -> list[str]:
-    """The devices that a spec names, separated by commas.
+    """Return the devices that a spec names, separated by commas.
 
     Raises:
         SourceError: if one is named twice or a name is empty.

@@ -1,4 +1,4 @@
-"""Threads that take their time, each task another: what must not depend on their timing is run with these."""
+"""An executor with random delays, for code whose results must not depend on the timing of its threads."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class Dawdling(ThreadPoolExecutor):
-    """An executor whose tasks begin up to some milliseconds late, so that they begin and end in any order."""
+class DelayedExecutor(ThreadPoolExecutor):
+    """An executor whose tasks start up to some milliseconds late, so that they start and end in any order."""
 
-    def __init__(self, threads: int, seed: int, longest_ms: float = 6.0) -> None:
+    def __init__(self, threads: int, seed: int, max_delay_ms: float = 6.0) -> None:
         super().__init__(threads)
         self._rng = np.random.default_rng(seed)
-        self._longest_ms = longest_ms
+        self._max_delay_ms = max_delay_ms
         self.delays_ms: list[float] = []
 
     def submit(self, fn: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> Future[R]:
-        """Begin a task after a random time; `map` submits its tasks through here as well."""
-        delay_ms = float(self._rng.choice([0.0, self._rng.uniform(0.0, self._longest_ms)]))
+        """Start a task after a random time; `map` submits its tasks through here as well."""
+        delay_ms = float(self._rng.choice([0.0, self._rng.uniform(0.0, self._max_delay_ms)]))
         self.delays_ms.append(delay_ms)
 
         def late(*args: P.args, **kwargs: P.kwargs) -> R:
