@@ -40,8 +40,7 @@ class Messages:
     Attributes:
         stamps_ns: (N,) by the device, which counts from its start.
         arrivals_ns: (N,) by the host, increasing.
-        truth_ns: (N,) what a perfect map makes of the stamps: the host's time, with the least delay, which cannot be
-            known.
+        truth_ns: (N,) the stamps by a perfect map: the host's time, with the least delay, which cannot be estimated.
     """
 
     stamps_ns: Int

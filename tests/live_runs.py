@@ -1,10 +1,11 @@
-"""Live runs for tests: sources that give what they are told to, and all that a run tells."""
+"""Live runs for tests: scripted sources, and the estimates, events and figures of a run."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from recordings import START_NS, noise_image
@@ -27,6 +28,7 @@ SOON_S = 60.0  # until then an end is waited for; only a test that fails takes s
 FRAME_NS, IMU_NS = 50_000_000, 5_000_000
 
 Figures = Mapping[str, float | int | str | None]
+T = TypeVar("T")
 
 
 class Scripted:
@@ -83,7 +85,7 @@ class Stalling(Output):
 def small_readings(
     rig: Rig, framesets: int = 100, decode: Callable[[int, Image], Image] = lambda _, image: image
 ) -> Iterator[Reading]:
-    """A rig of noise at rest: the IMU at 200 Hz, framesets at 20 Hz, each image through ``decode``."""
+    """Readings of a stationary rig that sees noise: IMU at 200 Hz, framesets at 20 Hz, images through ``decode``."""
     for i in range(framesets * FRAME_NS // IMU_NS):
         stamp_ns = START_NS + i * IMU_NS
         yield ImuReading(stamp_ns, np.array([0.01, -0.02, 0.03]), np.array([0.1, 0.2, 9.81]), host_ns())
@@ -96,12 +98,12 @@ def small_readings(
             )  # fmt: skip
 
 
-def all_of(subscription: BoundedQueue[Estimate]) -> list[Estimate]:
-    """What waits of a subscription whose broadcast has ended."""
-    assert subscription.is_closed
+def all_of(queue: BoundedQueue[T]) -> list[T]:
+    """All items of a closed queue."""
+    assert queue.is_closed
     taken = []
-    while (estimate := subscription.get()) is not None:
-        taken.append(estimate)
+    while (item := queue.get()) is not None:
+        taken.append(item)
     return taken
 
 
@@ -115,10 +117,7 @@ def run(
     assert running.wait(SOON_S)
     assert estimates.is_closed  # all can go home without anybody's stopping it
     running.stop()
-    told = []
-    while (event := events.get()) is not None:
-        told.append(event)
-    return all_of(estimates), told, running.status()
+    return all_of(estimates), all_of(events), running.status()
 
 
 def run_spec(spec: str, outputs: Sequence[Output] = ()) -> tuple[list[Estimate], list[Event], Figures]:

@@ -60,7 +60,7 @@ def no_thread_is_left() -> Iterator[None]:
 # ---------------------------------------------------------------- the same estimates
 
 
-def test_a_replay_is_the_plain_odometry_bit_for_bit_and_so_is_what_it_recorded(room_walk: Path, tmp_path: Path) -> None:
+def test_live_replay_and_its_recording_equal_plain_odometry(room_walk: Path, tmp_path: Path) -> None:
     pytest.importorskip("mcap")
     rig, expected = open_source(room_walk).rig, plain(room_walk)
     recorder = SessionRecorder(tmp_path / "live.mcap", rig, waits=True)
@@ -75,7 +75,7 @@ def test_a_replay_is_the_plain_odometry_bit_for_bit_and_so_is_what_it_recorded(r
 
 
 @pytest.mark.parametrize("speed", ["4", "40"])
-def test_in_real_time_each_frameset_is_estimated_or_counted_and_no_sample_is_lost(room_walk: Path, speed: str) -> None:
+def test_live_realtime_run_estimates_or_counts_every_frameset(room_walk: Path, speed: str) -> None:
     """At forty times its speed there is no time for all of it on any machine."""
     source = open_source(room_walk)
     samples = sum(isinstance(measurement, ImuSample) for measurement in source)
@@ -93,25 +93,25 @@ def test_in_real_time_each_frameset_is_estimated_or_counted_and_no_sample_is_los
     assert stamps == sorted(stamps)
 
 
-def test_an_imu_that_falls_silent_is_not_awaited_beyond_the_limit(room_walk: Path) -> None:
-    estimates, told, figures = run_spec(f"simulator:room?recording={room_walk}&seed=3&legs=1&unplug=imu@3-4")
+def test_live_silent_imu_is_not_awaited_beyond_limit(room_walk: Path) -> None:
+    estimates, events, figures = run_spec(f"simulator:room?recording={room_walk}&seed=3&legs=1&unplug=imu@3-4")
     assert int(figures["imu_not_awaited"] or 0) >= 1
-    assert "imu_not_covering" in {event.kind for event in told}
+    assert "imu_not_covering" in {event.kind for event in events}
     assert {each.epoch for each in estimates} == {0}
     assert estimates[-1].status == "tracking"
 
 
-def test_devices_that_come_back_go_on_in_the_same_epoch_if_the_imu_lives(room_walk: Path) -> None:
+def test_live_cameras_back_while_imu_runs_continue_epoch(room_walk: Path) -> None:
     simulator = f"simulator:room?recording={room_walk}&seed=3&speed=max&legs=1"
-    estimates, told, figures = run_spec(f"{simulator}&unplug=front@2-3,back@2-3")
+    estimates, events, figures = run_spec(f"{simulator}&unplug=front@2-3,back@2-3")
     assert {each.epoch for each in estimates} == {0}
     assert estimates[-1].status == "tracking"
     assert figures["framesets"] == 80
-    kinds = [event.kind for event in told]
+    kinds = [event.kind for event in events]
     assert kinds.count("device_lost") == kinds.count("device_back") == 2
 
 
-def test_one_pair_goes_on_alone(room_walk: Path) -> None:
+def test_live_one_lost_pair_leaves_other_tracking(room_walk: Path) -> None:
     estimates, _, figures = run_spec(f"simulator:room?recording={room_walk}&seed=3&speed=max&legs=1&unplug=back@2-3")
     assert {(each.epoch, each.status) for each in estimates[-60:]} == {(0, "tracking")}
     assert sum(set(each.pairs) == {0} for each in estimates) >= 20
@@ -119,16 +119,16 @@ def test_one_pair_goes_on_alone(room_walk: Path) -> None:
     assert figures["framesets"] == 100
 
 
-def test_after_everything_was_gone_for_too_long_a_new_epoch_begins(room_walk: Path) -> None:
+def test_live_long_outage_of_all_starts_new_epoch(room_walk: Path) -> None:
     gone = "@1.5-4.7"
-    estimates, told, _ = run_spec(
+    estimates, events, _ = run_spec(
         f"simulator:room?recording={room_walk}&seed=3&speed=max&legs=1&unplug=front{gone},back{gone},imu{gone}"
     )
     assert sorted({each.epoch for each in estimates}) == [0, 1]
-    assert "time_jump" in {event.kind for event in told}
+    assert "time_jump" in {event.kind for event in events}
 
 
-def test_clocks_that_drift_and_readings_that_come_late(room_walk: Path) -> None:
+def test_live_drifting_clocks_and_late_readings_are_corrected(room_walk: Path) -> None:
     """With the times of arrival that a host would have noted, whatever this machine has to do meanwhile."""
     from graphvio.live.sources.pacing import Pace
     from graphvio.live.sources.replay import paced
@@ -149,8 +149,8 @@ def test_clocks_that_drift_and_readings_that_come_late(room_walk: Path) -> None:
             late_ns = 1_000_000 + round(rng.exponential(2e6))
             yield replace(reading, arrival_ns=host_start_ns + stamp_ns + late_ns)
 
-    estimates, told, figures = run(Scripted(rig, readings))
-    assert [i.kind for i in told if i.kind.startswith(("clock", "stamp", "image", "late", "imu"))] == []
+    estimates, events, figures = run(Scripted(rig, readings))
+    assert [each.kind for each in events if each.kind.startswith(("clock", "stamp", "image", "late", "imu"))] == []
     assert figures["framesets"] == len(estimates)
     assert figures["imu_samples"] == 1001
     second = [each for each in estimates if each.stamp_ns - estimates[0].stamp_ns > 1_000_000_000]
@@ -159,7 +159,7 @@ def test_clocks_that_drift_and_readings_that_come_late(room_walk: Path) -> None:
     assert {each.epoch for each in estimates} == {0}
     assert source.truth is not None
     truth = load_trajectory(source.truth)
-    true_m = truth.around(source.start_ns, source.end_ns).nav_T_body[[0, -1], :3, 3]  # at rest for the first second
+    true_m = truth.around(source.start_ns, source.end_ns).nav_T_body[[0, -1], :3, 3]  # stationary in the first second
     found_m = np.array([e.nav_T_body[:3, 3] for e in estimates if e.nav_T_body is not None])[[0, -1]]
     walked_m = [np.linalg.norm(at[1] - at[0]) for at in (true_m, found_m)]
     assert walked_m[0] > 1.0
@@ -205,7 +205,7 @@ class Failing(Output):
 
 @pytest.mark.parametrize("is_realtime", [False, True], ids=["waits", "realtime"])
 @pytest.mark.parametrize(
-    ("make", "outputs", "error", "told", "stage"),
+    ("make", "outputs", "error", "message", "stage"),
     [
         (broken_source, [], SourceError, "the driver is gone", "capture"),
         (
@@ -220,11 +220,11 @@ class Failing(Output):
     ],
     ids=["capture", "decode", "odometry", "output"],
 )
-def test_a_stage_that_fails_ends_the_run_and_holds_up_nobody(
+def test_live_failing_stage_ends_run(
     make: Callable[[], Iterator[Reading]],
     outputs: list[Output],
     error: type[Exception],
-    told: str,
+    message: str,
     stage: str,
     is_realtime: bool,
 ) -> None:
@@ -234,12 +234,12 @@ def test_a_stage_that_fails_ends_the_run_and_holds_up_nobody(
     running = LiveOdometry(source, source.open(), Config(), outputs)
     events, estimates = running.events.subscribe(1000), running.estimates.subscribe(1)
     running.start()
-    with pytest.raises(error, match=told):
+    with pytest.raises(error, match=message):
         running.wait(SOON_S)
     assert running.status()["health"] == "failing"
     assert stage in str(running.status()["stuck"])
     for _ in range(2):
-        with pytest.raises(error, match=told):
+        with pytest.raises(error, match=message):
             running.stop()
     assert threads_of_a_run() == []
     assert events.is_closed
@@ -254,7 +254,7 @@ def test_a_stage_that_fails_ends_the_run_and_holds_up_nobody(
 
 
 @pytest.mark.parametrize("is_realtime", [False, True], ids=["waits", "realtime"])
-def test_a_decoder_that_fails_lets_go_of_a_capture_that_waits_for_room(is_realtime: bool) -> None:
+def test_live_failing_decoder_releases_waiting_capture(is_realtime: bool) -> None:
     runs: list[LiveOdometry] = []
     most = 63 if is_realtime else 8  # of 64: in real time all may have come before the first one is taken
 
@@ -273,7 +273,7 @@ def test_a_decoder_that_fails_lets_go_of_a_capture_that_waits_for_room(is_realti
     assert "event_stage_stuck" not in runs[0].status()
 
 
-def test_what_came_before_a_failure_is_put_out() -> None:
+def test_live_failure_keeps_earlier_results() -> None:
     """A recording that breaks off has all estimates until then."""
     put_out: list[int] = []
 
@@ -294,19 +294,19 @@ def test_what_came_before_a_failure_is_put_out() -> None:
     assert put_out == sorted(put_out)
 
 
-def test_a_damaged_image_is_told_and_the_run_goes_on() -> None:
+def test_live_damaged_image_is_reported_and_run_continues() -> None:
     def decode(i: int, image: Image) -> Image:
         if i == 50:
             raise SourceError("half a JPEG")
         return image
 
-    estimates, told, figures = run(Scripted(small_rig(1), lambda: small_readings(small_rig(1), 20, decode)))
+    estimates, events, figures = run(Scripted(small_rig(1), lambda: small_readings(small_rig(1), 20, decode)))
     assert len(estimates) == 19
     assert figures["event_image_damaged"] == 2
-    assert [i.detail for i in told if i.kind == "image_damaged"] == ["half a JPEG"] * 2
+    assert [each.detail for each in events if each.kind == "image_damaged"] == ["half a JPEG"] * 2
 
 
-def test_a_run_that_is_stopped_works_on_what_has_come() -> None:
+def test_live_stop_processes_pending_measurements() -> None:
     source = Scripted(small_rig(1), lambda: small_readings(small_rig(1), 100_000))
     running = LiveOdometry(source, source.open(), Config())
     estimates = running.estimates.subscribe(100_000)
@@ -321,7 +321,7 @@ def test_a_run_that_is_stopped_works_on_what_has_come() -> None:
     assert threads_of_a_run() == []
 
 
-def test_one_that_was_never_started_can_be_stopped() -> None:
+def test_live_stop_before_start_closes_broadcasts() -> None:
     source = Scripted(small_rig(1), lambda: small_readings(small_rig(1)))
     running = LiveOdometry(source, source.open(), Config())
     listener = running.estimates.subscribe(1)
@@ -330,7 +330,7 @@ def test_one_that_was_never_started_can_be_stopped() -> None:
 
 
 @pytest.mark.parametrize("is_realtime", [False, True], ids=["waits", "realtime"])
-def test_an_output_that_never_goes_on_is_left_behind(is_realtime: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_live_stop_leaves_stuck_output_behind(is_realtime: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(running_module, "_END_S", 0.5)
     stalling = Stalling()
     source = Scripted(small_rig(1), lambda: small_readings(small_rig(1), 2000), is_realtime, 0.001 * is_realtime)
@@ -340,14 +340,14 @@ def test_an_output_that_never_goes_on_is_left_behind(is_realtime: bool, monkeypa
     assert stalling.is_held.wait(SOON_S)
     running.stop()
     assert events.is_closed
-    told = []
+    reported = []
     while (event := events.get()) is not None:
-        told.append(event)
-    assert "output does not end; left behind" in [each.detail for each in told if each.kind == "stage_stuck"]
+        reported.append(event)
+    assert "output does not end; left behind" in [each.detail for each in reported if each.kind == "stage_stuck"]
     stalling.may_go_on.set()  # and is gone when it does go on, see `no_thread_is_left`
 
 
-def test_a_source_that_does_not_close_is_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_live_stop_leaves_stuck_source_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(running_module, "_END_S", 0.5)
     is_hanging, goes_on = threading.Event(), threading.Event()
 
@@ -369,7 +369,7 @@ def test_a_source_that_does_not_close_is_left_behind(monkeypatch: pytest.MonkeyP
     assert estimates.is_closed
 
 
-def test_a_stage_tells_what_ended_it_and_cleans_up_last() -> None:
+def test_stage_failure_is_reported_before_cleanup() -> None:
     happened: list[str] = []
 
     def body(stage: Stage) -> None:
@@ -403,7 +403,7 @@ def asked(address: str, path: str) -> tuple[int, str]:
     return response.status, text
 
 
-def test_a_stalled_output_is_stuck_until_it_goes_on() -> None:
+def test_watchdog_stalled_output_is_stuck_until_it_recovers() -> None:
     pytest.importorskip("prometheus_client")
     stalling = Stalling()
     config = Config(live=LiveConfig(stuck_s=0.3))
@@ -423,13 +423,13 @@ def test_a_stalled_output_is_stuck_until_it_goes_on() -> None:
     until(lambda: "event_stage_recovered" in running.status())
     running.stop()
     health.close()
-    told = []
+    reported = []
     while (event := events.get()) is not None:
-        told.append((event.kind, event.detail.split()[0]))
-    assert told.index(("stage_stuck", "output")) < told.index(("stage_recovered", "output"))
+        reported.append((event.kind, event.detail.split()[0]))
+    assert reported.index(("stage_stuck", "output")) < reported.index(("stage_recovered", "output"))
 
 
-def test_silent_sensors_are_told_and_no_reason_to_begin_anew() -> None:
+def test_watchdog_silent_sensors_are_reported_as_healthy_run() -> None:
     may_go_on = threading.Event()
 
     def readings() -> Iterator[Reading]:
@@ -453,7 +453,7 @@ FIGURES: Figures = {
 }  # fmt: skip
 
 
-def test_metrics_are_what_prometheus_reads() -> None:
+def test_health_metrics_are_valid_for_prometheus() -> None:
     pytest.importorskip("prometheus_client")
     from prometheus_client.parser import text_string_to_metric_families
 
@@ -470,12 +470,12 @@ def test_metrics_are_what_prometheus_reads() -> None:
     assert counters == {f"graphvio_{name}" for name in (
         "estimates", "skipped_late", "event_device_lost", "status_tracking", "recorded_framesets"
     )}  # fmt: skip
-    told = {each.labels["status"]: each.value for each in families["graphvio_status"].samples}
-    assert told == {"initialising": 0.0, "tracking": 1.0, "coasting": 0.0, "lost": 0.0, "stale": 0.0}
+    states = {each.labels["status"]: each.value for each in families["graphvio_status"].samples}
+    assert states == {"initialising": 0.0, "tracking": 1.0, "coasting": 0.0, "lost": 0.0, "stale": 0.0}
     assert "graphvio_temperature_c" not in values
 
 
-def test_a_whole_runs_status_is_metrics_and_json() -> None:
+def test_health_of_whole_run_is_metrics_and_json() -> None:
     pytest.importorskip("prometheus_client")
     from prometheus_client.parser import text_string_to_metric_families
 
@@ -490,15 +490,15 @@ def test_a_whole_runs_status_is_metrics_and_json() -> None:
         for family in text_string_to_metric_families(asked(health.address, "/metrics")[1])
         for each in family.samples
     }
-    told = json.loads(asked(health.address, "/healthz")[1])
+    status = json.loads(asked(health.address, "/healthz")[1])
     health.close()
-    assert values["graphvio_framesets_total"] == told["framesets"] == 30
-    assert values["graphvio_imu_samples_total"] == told["imu_samples"] == 300
+    assert values["graphvio_framesets_total"] == status["framesets"] == 30
+    assert values["graphvio_imu_samples_total"] == status["imu_samples"] == 300
     assert values["graphvio_corner_share"] == 1.0
-    assert told["latency_p99_all_ms"] is None or told["latency_p99_all_ms"] > 0.0
+    assert status["latency_p99_all_ms"] is None or status["latency_p99_all_ms"] > 0.0
 
 
-def test_failing_health_and_other_paths() -> None:
+def test_health_failing_run_and_unknown_path_return_error_codes() -> None:
     pytest.importorskip("prometheus_client")
     health = HealthServer(lambda: {"health": "failing", "stuck": "odometry"})
     assert asked(health.address, "/healthz")[0] == 503
@@ -508,7 +508,7 @@ def test_failing_health_and_other_paths() -> None:
     health.close()
 
 
-def test_a_client_that_asks_nothing_holds_up_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_health_idle_client_blocks_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("prometheus_client")
     monkeypatch.setattr("graphvio.live.health._QuietHandler.timeout", 10.0 * SOON_S)
     health = HealthServer(lambda: FIGURES)
@@ -521,7 +521,7 @@ def test_a_client_that_asks_nothing_holds_up_nobody(monkeypatch: pytest.MonkeyPa
         assert not closing.is_alive()
 
 
-def test_a_port_that_is_taken() -> None:
+def test_health_taken_port_raises() -> None:
     pytest.importorskip("prometheus_client")
     health = HealthServer(lambda: FIGURES)
     port = int(health.address.split(":")[1])
@@ -534,7 +534,7 @@ def test_a_port_that_is_taken() -> None:
 
 
 class SlowDisk:
-    """The writer is held up by the first thing that it writes, until it may go on."""
+    """The writer is blocked by its first measurement until it may go on."""
 
     def __init__(self, recorder: SessionRecorder) -> None:
         self.may_go_on = threading.Event()
@@ -558,7 +558,7 @@ def measurements(framesets: int) -> Iterator[Measurement]:
     assert len(rig.pairs) == 1
 
 
-def test_a_slow_disk_costs_framesets_of_the_recording_and_holds_up_nobody(tmp_path: Path) -> None:
+def test_recorder_slow_disk_drops_framesets_only(tmp_path: Path) -> None:
     pytest.importorskip("mcap")
     recorder = SessionRecorder(tmp_path / "slow.mcap", small_rig(1))
     disk = SlowDisk(recorder)
@@ -568,16 +568,14 @@ def test_a_slow_disk_costs_framesets_of_the_recording_and_holds_up_nobody(tmp_pa
     assert recorder.status()["framesets_not_recorded"] == 80
     disk.may_go_on.set()
     recorder.close()
-    told = recorder.status()
-    assert (told["recorded_framesets"], told["messages_not_recorded"], told["recording_stopped"]) == (120, 0, "")
+    status = recorder.status()
+    assert (status["recorded_framesets"], status["messages_not_recorded"], status["recording_stopped"]) == (120, 0, "")
     recorded = list(open_source(tmp_path / "slow.mcap"))
     assert sum(isinstance(measurement, ImuSample) for measurement in recorded) == 200
     assert sum(isinstance(measurement, FrameSet) for measurement in recorded) == 120
 
 
-def test_a_disk_that_stands_still_for_long_costs_samples_too_and_they_are_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recorder_stuck_disk_drops_and_counts_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mcap")
     monkeypatch.setattr(session_recorder, "_WAITING", 50)
     recorder = SessionRecorder(tmp_path / "still.mcap", small_rig(1))
@@ -591,18 +589,22 @@ def test_a_disk_that_stands_still_for_long_costs_samples_too_and_they_are_counte
     recorder.close()
 
 
-def test_a_recorder_that_waits_records_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recorder_that_waits_records_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mcap")
     monkeypatch.setattr(session_recorder, "_WAITING", 5)
     recorder = SessionRecorder(tmp_path / "all.mcap", small_rig(1), waits=True)
     for measurement in measurements(200):
         recorder.add_measurement(measurement)
     recorder.close()
-    told = recorder.status()
-    assert (told["recorded_framesets"], told["framesets_not_recorded"], told["messages_not_recorded"]) == (200, 0, 0)
+    status = recorder.status()
+    assert (status["recorded_framesets"], status["framesets_not_recorded"], status["messages_not_recorded"]) == (
+        200,
+        0,
+        0,
+    )
 
 
-def test_a_message_that_cannot_be_written_stops_no_other(tmp_path: Path) -> None:
+def test_recorder_unwritable_message_does_not_stop_others(tmp_path: Path) -> None:
     pytest.importorskip("mcap")
     recorder = SessionRecorder(tmp_path / "odd.mcap", small_rig(1))
     recorder.add_measurement(ImuSample(-1, np.zeros(3), np.zeros(3)))
@@ -613,7 +615,7 @@ def test_a_message_that_cannot_be_written_stops_no_other(tmp_path: Path) -> None
     assert "-1" in str(recorder.status()["recording_stopped"])
 
 
-def test_a_disk_that_was_taken_away_is_no_failure_of_the_run(tmp_path: Path) -> None:
+def test_recorder_removed_disk_is_no_failure(tmp_path: Path) -> None:
     pytest.importorskip("mcap")
     folder = tmp_path / "stick"
     folder.mkdir()

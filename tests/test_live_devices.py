@@ -28,20 +28,20 @@ def imu_reading(stamp_ns: int, arrival_ns: int | None = None) -> ImuReading:
 
 
 class Script:
-    """A device whose lives are told: the readings of each, then how it ends."""
+    """A device with scripted lives: the number of readings of each, then how it ends."""
 
     clock = "script"
 
     def __init__(self, name: str, lives: list[tuple[int, Exception | None]], absences: int = 0) -> None:
         self.name = name
         self.lives, self.absences = iter(lives), absences
-        self.starts, self.stops = 0, 0
+        self.started, self.stops = 0, 0
 
     def start(self, hand_over: HandOver) -> None:
-        if self.starts and self.absences:
+        if self.started and self.absences:
             self.absences -= 1
             raise SourceError(f"{self.name}: is not there")
-        self.starts += 1
+        self.started += 1
 
     def run(self, hand_over: HandOver, stopping: threading.Event) -> None:
         count, end = next(self.lives)
@@ -66,7 +66,7 @@ def take(readings: Iterator[Reading], count: int) -> list[Reading]:
     return [next(readings) for _ in range(count)]
 
 
-def test_a_lost_device_is_told_looked_for_and_read_on() -> None:
+def test_device_source_lost_device_is_reported_and_restarted() -> None:
     device = Script(
         "a", [(2, DeviceLostError("unplugged")), (1, ValueError("what drivers say")), (1, None)], absences=2
     )
@@ -83,11 +83,11 @@ def test_a_lost_device_is_told_looked_for_and_read_on() -> None:
     assert health.connected
     assert health.counts == {"frames_lost": 3, "device_lost": 2}
     source.close()
-    assert device.starts == 3
+    assert device.started == 3
     assert device.stops >= 3
 
 
-def test_a_device_that_stays_away_is_told_as_lost() -> None:
+def test_device_source_missing_device_stays_reported() -> None:
     device = Script("a", [(0, DeviceLostError("unplugged"))], absences=10**9)
     source = DeviceSource("test", [device], lambda: small_rig(1), QUICK)
     source.open()
@@ -100,25 +100,25 @@ def test_a_device_that_stays_away_is_told_as_lost() -> None:
     source.close()
 
 
-def test_closing_from_another_thread_ends_the_readings() -> None:
+def test_device_source_close_from_other_thread_ends_readings() -> None:
     source = DeviceSource("test", [Script("a", [(1, None)])], lambda: small_rig(1), QUICK)
     source.open()
     readings = source.readings()
     take(readings, 1)
-    rest: list[Reading] = []
-    reader = threading.Thread(target=lambda: rest.extend(readings))
+    remaining: list[Reading] = []
+    reader = threading.Thread(target=lambda: remaining.extend(readings))
     reader.start()
     source.close()
     source.close()
     reader.join(10.0)
     assert not reader.is_alive()
-    assert rest == []
+    assert remaining == []
     assert list(source.readings()) == []
 
 
-def test_what_cannot_be_opened_leaves_nothing_running() -> None:
+def test_device_source_failing_open_stops_all_devices() -> None:
     first, second = Script("a", [(0, None)]), Script("b", [])
-    second.starts, second.absences = 1, 1
+    second.started, second.absences = 1, 1
     source = DeviceSource("test", [first, second], lambda: small_rig(1), QUICK)
     with pytest.raises(SourceError, match="b: is not there"):
         source.open()
@@ -127,7 +127,7 @@ def test_what_cannot_be_opened_leaves_nothing_running() -> None:
     source.close()
 
 
-def test_who_does_not_take_readings_loses_the_oldest_but_no_notice() -> None:
+def test_mailbox_drops_old_readings_but_no_notice() -> None:
     mailbox = Mailbox(max_age_ns=100)
     notice = Notice("device_lost", "a", 5)
     mailbox.put("a", imu_reading(0))
@@ -140,7 +140,7 @@ def test_who_does_not_take_readings_loses_the_oldest_but_no_notice() -> None:
     assert (mailbox.dropped("a"), mailbox.dropped("b")) == (1, 1)
 
 
-def test_counters_of_32_bits_go_on_for_all_sensors_of_a_device() -> None:
+def test_microsecond_counter_wraps_for_all_sensors() -> None:
     counter, wrap = MicrosecondCounter(), 1 << 32
     start_us = wrap - 1000.0
     assert counter.stamp_ns(start_us) == round(1e3 * start_us)
@@ -152,14 +152,14 @@ def test_counters_of_32_bits_go_on_for_all_sensors_of_a_device() -> None:
     assert MicrosecondCounter().stamp_ns(7.5 * wrap) == 7500 * wrap  # a wider counter is taken as it is
 
 
-def test_clocks_of_the_kernel_become_the_hosts() -> None:
+def test_kernel_stamps_convert_to_host_time() -> None:
     before_ns, monotonic_ns, after_ns = host_ns(), time.monotonic_ns(), host_ns()
     assert before_ns - 100_000 <= host_ns_of_monotonic(monotonic_ns) <= after_ns + 100_000
     before_ns, realtime_ns = host_ns(), time.time_ns()
     assert abs(host_ns_of_realtime(realtime_ns) - before_ns) < 100_000_000
 
 
-def test_acceleration_is_interpolated_at_the_stamps_of_the_gyro() -> None:
+def test_accel_onto_gyro_interpolates_at_gyro_stamps() -> None:
     found: list[ImuReading] = []
     counts = Counts()
     merging = AccelOntoGyro(found.append, counts)
@@ -180,7 +180,7 @@ def test_acceleration_is_interpolated_at_the_stamps_of_the_gyro() -> None:
     assert counts.totals() == {"imu_unpaired": 1, "imu_out_of_order": 2}
 
 
-def test_nothing_is_interpolated_over_a_gap() -> None:
+def test_accel_onto_gyro_does_not_interpolate_over_gap() -> None:
     found: list[ImuReading] = []
     counts = Counts()
     merging = AccelOntoGyro(found.append, counts)
@@ -194,7 +194,7 @@ def test_nothing_is_interpolated_over_a_gap() -> None:
     assert counts.totals()["imu_unpaired"] == 1 + 300 - 256
 
 
-def test_options_are_checked() -> None:
+def test_spec_options_are_checked() -> None:
     spec = SourceSpec.parse("v4l2:a,b?size=1280x720&fps=30&layout=separate")
     assert size_of(spec, "size") == (1280, 720)
     assert size_of(spec, "other") is None

@@ -39,6 +39,6 @@ def heaps(how: str) -> int:
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have one heap, or no such option")
-def test_threads_share_a_heap_where_they_would_have_their_own() -> None:
+def test_share_heap_leaves_one_heap_for_all_threads() -> None:
     assert heaps("own") > 1
     assert heaps("shared") == 1

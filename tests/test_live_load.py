@@ -50,20 +50,20 @@ def worked(control: LoadControl, framesets: int, work_ms: float, waited_ms: floa
     return shares
 
 
-def test_nothing_is_given_up_where_there_is_time() -> None:
+def test_load_control_with_time_left_gives_up_nothing() -> None:
     control = LoadControl(LIMIT_MS)
     assert set(worked(control, 500, work_ms=30.0)) == {1.0}
     assert not control.must_skip(20.0, is_newest=False)
 
 
-def test_corners_are_lowered_step_by_step_before_anything_is_late() -> None:
+def test_load_control_lowers_corners_stepwise_before_delay() -> None:
     control = LoadControl(LIMIT_MS)
     shares = worked(control, 200, work_ms=48.0)
     assert [share for i, share in enumerate(shares) if i == 0 or share != shares[i - 1]] == SHARES
     assert not control.must_skip(50.0, is_newest=False)  # 48 + 50 is less than 100
 
 
-def test_a_skip_that_lowering_can_avoid_lowers_instead() -> None:
+def test_load_control_lowers_corners_instead_of_skipping() -> None:
     control = LoadControl(LIMIT_MS)
     worked(control, 3, work_ms=60.0)
     before = control.corner_share
@@ -71,13 +71,13 @@ def test_a_skip_that_lowering_can_avoid_lowers_instead() -> None:
     assert control.corner_share < before
 
 
-def test_one_that_is_late_already_is_skipped_for_a_newer_one() -> None:
+def test_load_control_skips_late_frameset_for_newer_one() -> None:
     control = LoadControl(LIMIT_MS)
     assert control.must_skip(LIMIT_MS + 1.0, is_newest=False)
     assert not control.must_skip(10.0 * LIMIT_MS, is_newest=True)
 
 
-def test_corners_come_back_after_two_idle_seconds_and_not_before() -> None:
+def test_load_control_raises_corners_after_two_idle_seconds() -> None:
     control = LoadControl(LIMIT_MS)
     worked(control, 200, work_ms=48.0)
     assert control.corner_share == SHARES[-1]
@@ -87,7 +87,7 @@ def test_corners_come_back_after_two_idle_seconds_and_not_before() -> None:
     assert shares == sorted(shares)
 
 
-def test_work_that_is_neither_much_nor_little_changes_nothing() -> None:
+def test_load_control_medium_work_changes_nothing() -> None:
     control = LoadControl(LIMIT_MS)
     worked(control, 200, work_ms=48.0)
     assert set(worked(control, 1000, work_ms=35.0, first=200)) == {SHARES[-1]}
@@ -103,7 +103,7 @@ moments = st.tuples(
 
 
 @given(st.lists(moments, max_size=200))
-def test_whatever_comes_the_newest_is_never_skipped_and_corners_go_first(
+def test_load_control_never_skips_newest_and_lowers_corners_first(
     history: list[tuple[bool, int, float, float, bool]],
 ) -> None:
     control, stamp_ns = LoadControl(LIMIT_MS), 0
@@ -135,7 +135,7 @@ def taken(inbox: Inbox) -> list[int]:
     return stamps
 
 
-def test_the_oldest_frameset_goes_and_samples_stay() -> None:
+def test_inbox_drops_oldest_frameset_and_keeps_samples() -> None:
     inbox = make_inbox(2, is_realtime=True)
     for i in range(4):
         put(inbox, sample(10 * i))
@@ -146,7 +146,7 @@ def test_the_oldest_frameset_goes_and_samples_stay() -> None:
 
 
 @given(st.lists(st.booleans(), max_size=60), st.integers(1, 5), st.integers(1, 9))
-def test_no_sample_is_lost_and_every_frameset_is_taken_or_counted(
+def test_inbox_loses_no_sample_and_counts_dropped_framesets(
     are_framesets: list[bool], most: int, taken_every: int
 ) -> None:
     inbox = make_inbox(most, is_realtime=True)
@@ -164,7 +164,7 @@ def test_no_sample_is_lost_and_every_frameset_is_taken_or_counted(
         assert came[-1] == len(are_framesets) - 1  # never the newest
 
 
-def test_arrival_goes_along() -> None:
+def test_inbox_keeps_arrival() -> None:
     inbox = make_inbox(1, is_realtime=True)
     put(inbox, sample(1), arrival_ns=77)
     assert inbox.get(0.0) is not None
@@ -174,7 +174,7 @@ def test_arrival_goes_along() -> None:
     assert item[1] == 78
 
 
-def test_one_that_waits_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_inbox_that_waits_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither framesets nor samples, however slowly they are taken."""
     monkeypatch.setattr(estimation, "_WAITING_SAMPLES", 5)
     inbox = make_inbox(2, is_realtime=False)
@@ -196,7 +196,7 @@ def test_one_that_waits_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert inbox.dropped(FRAMESETS) == inbox.dropped() == 0
 
 
-def test_samples_that_nobody_takes_are_counted_at_last(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_inbox_full_of_samples_counts_dropped_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(estimation, "_WAITING_SAMPLES", 5)
     inbox = make_inbox(2, is_realtime=True)
     for i in range(9):
@@ -205,7 +205,7 @@ def test_samples_that_nobody_takes_are_counted_at_last(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("measurement", [frameset(1), sample(1)], ids=["frameset", "sample"])
-def test_whoever_waits_for_room_goes_on_when_nothing_is_taken_any_more(
+def test_inbox_abandon_releases_waiting_writer(
     measurement: FrameSet | ImuSample, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(estimation, "_WAITING_SAMPLES", 1)
@@ -237,7 +237,7 @@ def order_of(
 
 
 @given(st.integers(0, 2**31), st.integers(2, 80), st.sampled_from([2_500_000, 5_000_000, 10_000_000]))
-def test_samples_that_overtake_others_are_put_in_order(seed: int, count: int, period_ns: int) -> None:
+def test_sample_order_sorts_overtaking_samples(seed: int, count: int, period_ns: int) -> None:
     """Each comes up to two and a half periods late: no more than is waited for."""
     rng = np.random.default_rng(seed)
     stamps = np.arange(count, dtype=np.int64) * period_ns
@@ -249,7 +249,7 @@ def test_samples_that_overtake_others_are_put_in_order(seed: int, count: int, pe
 
 
 @given(st.lists(st.integers(0, 200), max_size=100))
-def test_none_is_lost_or_given_twice_whatever_comes(ticks: list[int]) -> None:
+def test_sample_order_loses_and_repeats_none(ticks: list[int]) -> None:
     stamps = [5_000_000 * tick for tick in ticks]
     given_out, order, _ = order_of(stamps)
     given_out += [each.stamp_ns for each in order.flush()]
@@ -258,14 +258,14 @@ def test_none_is_lost_or_given_twice_whatever_comes(ticks: list[int]) -> None:
 
 
 @given(st.lists(st.integers(-1_000_000, 1_000_000), min_size=1, max_size=100))
-def test_nothing_waits_where_nothing_is_missing(jitter_ns: list[int]) -> None:
+def test_sample_order_without_gap_holds_nothing(jitter_ns: list[int]) -> None:
     stamps = [5_000_000 * i + off for i, off in enumerate(jitter_ns)]
     given_out, _, held = order_of(stamps)
     assert given_out == stamps
     assert set(held) == {0}
 
 
-def test_a_lost_sample_is_waited_for_no_longer_than_is_said() -> None:
+def test_sample_order_lost_sample_wait_is_bounded() -> None:
     stamps = [5_000_000 * i for i in range(20) if i != 10]
     given_out, _, held = order_of(stamps)
     assert given_out == stamps
@@ -273,7 +273,7 @@ def test_a_lost_sample_is_waited_for_no_longer_than_is_said() -> None:
     assert held[-1] == 0
 
 
-def test_one_that_comes_too_late_goes_on_for_the_odometry_to_tell_of() -> None:
+def test_sample_order_passes_late_sample_on() -> None:
     stamps = [5_000_000 * i for i in range(20)]
     given_out, _, held = order_of([*stamps, stamps[3]])
     assert given_out == [*stamps, stamps[3]]
@@ -283,7 +283,7 @@ def test_one_that_comes_too_late_goes_on_for_the_odometry_to_tell_of() -> None:
 # ---------------------------------------------------------------- figures
 
 
-def test_latencies_of_the_whole_run() -> None:
+def test_meter_latency_percentiles_of_whole_run() -> None:
     meter = Meter()
     assert meter.recent_latency_ms(50) is meter.latency_ms(99) is None
     for latency_ms in [*([10.2] * 990), *([300.0] * 10)]:
@@ -294,7 +294,7 @@ def test_latencies_of_the_whole_run() -> None:
     assert meter.max_latency_ms == 300.0
 
 
-def test_latencies_beyond_the_histogram_and_below_zero() -> None:
+def test_meter_latency_outside_histogram() -> None:
     meter = Meter()
     meter.add_latency(-3.0)
     assert meter.latency_ms(99) == 0.0
@@ -303,7 +303,7 @@ def test_latencies_beyond_the_histogram_and_below_zero() -> None:
     assert meter.latency_ms(99) == 7000.0
 
 
-def test_rates_are_those_of_the_last_two_seconds() -> None:
+def test_meter_rate_is_of_last_two_seconds() -> None:
     meter = Meter()
     for i in range(100):
         meter.add_arrival("estimates", i * PERIOD_NS)

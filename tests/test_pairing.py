@@ -91,7 +91,7 @@ def play(shots: Sequence[Shot], pairs: int = 2, wait_ms: float = WAIT_MS, *, flu
     if flush:
         take(assembler.flush(), np.inf)
         assert assembler.waiting == 0
-        assert len(run.numbers) + run.reports.total() == len(shots)  # each image is in a frameset, or was told of
+        assert len(run.numbers) + run.reports.total() == len(shots)  # each image is in a frameset, or was reported
     assert len(set(run.numbers)) == len(run.numbers)  # none is in two
     assert all(np.diff([each.stamp_ns for each in run.framesets]) > 0)
     for each in run.framesets:
@@ -128,7 +128,7 @@ def steady(
 # ------------------------------------------------------------------ nothing goes wrong
 
 
-def test_framesets_are_given_out_with_their_last_image() -> None:
+def test_assembler_frameset_is_returned_with_last_image() -> None:
     run = play(steady(count=10))
     assert run.pairs == [[0, 1]] * 10
     assert run.stamps_ms == [50.0 * k for k in range(10)]
@@ -157,7 +157,7 @@ def shuffled(draw: st.DrawFn) -> list[Shot]:
 
 
 @given(shots=shuffled())
-def test_any_order_of_arrival_gives_what_a_recording_has(shots: list[Shot]) -> None:
+def test_assembler_any_order_equals_recording(shots: list[Shot]) -> None:
     pairs = 1 + max(shot.camera for shot in shots) // 2
     run = play(shots, pairs)
     assert not run.reports
@@ -165,7 +165,7 @@ def test_any_order_of_arrival_gives_what_a_recording_has(shots: list[Shot]) -> N
 
 
 @given(orders=st.lists(st.permutations(range(8)), min_size=5, max_size=5))
-def test_images_of_one_instant_come_in_any_order(orders: list[list[int]]) -> None:
+def test_assembler_any_order_within_instant_gives_one_frameset(orders: list[list[int]]) -> None:
     """Of four pairs; another order at each instant."""
     shots = [
         Shot(50.0 * k + 6.0 * i, camera, 50.0 * k) for k, order in enumerate(orders) for i, camera in enumerate(order)
@@ -182,14 +182,14 @@ def test_images_of_one_instant_come_in_any_order(orders: list[list[int]]) -> Non
         max_size=150,
     )
 )
-def test_rules_hold_for_any_images(shots: list[Shot]) -> None:
+def test_assembler_invariants_hold_for_any_images(shots: list[Shot]) -> None:
     """Whatever comes in whatever order: `play` asserts them."""
     run = play(sorted(shots))
     again = play(sorted(shots))
     assert (run.numbers, run.reports) == (again.numbers, again.reports)
 
 
-def test_pairs_that_follow_each_other_within_the_tolerance() -> None:
+def test_assembler_chained_pairs_match_recording() -> None:
     """At 1.5, 0 and 3 ms: the third is none of the first two's, and their frameset steps back to make room."""
     shots = [
         Shot(50.0 * k + 10.0 + 0.1 * camera, camera, 50.0 * k + (1.5, 0.0, 3.0)[camera // 2])
@@ -202,7 +202,7 @@ def test_pairs_that_follow_each_other_within_the_tolerance() -> None:
     assert not run.reports
 
 
-def test_two_devices_with_clocks_of_their_own() -> None:
+def test_assembler_two_devices_with_own_clocks_give_joint_framesets() -> None:
     """Pairs that are triggered together, on clocks 200 ppm apart; each has an IMU, too, and sends with jitter."""
     rng = np.random.default_rng(4)
     maps = ClockMaps(lambda *_: None)
@@ -229,9 +229,9 @@ def test_two_devices_with_clocks_of_their_own() -> None:
             framesets += assembler.add(f"cam{camera}", mapped, numbered(0), ns(arrival_ms))
     framesets += assembler.flush()
     assert not kinds
-    settled = [each for each in framesets if each.stamp_ns > ns(980.0)]
-    assert [sorted(each.images) for each in settled] == [[0, 1]] * 380
-    errors_ms = [(each.stamp_ns - ns(1001.0 + 50.0 * k)) / MS for k, each in enumerate(settled)]
+    later = [each for each in framesets if each.stamp_ns > ns(980.0)]
+    assert [sorted(each.images) for each in later] == [[0, 1]] * 380
+    errors_ms = [(each.stamp_ns - ns(1001.0 + 50.0 * k)) / MS for k, each in enumerate(later)]
     assert np.abs(errors_ms).max() < 1.0
     assert np.abs(errors_ms[180:]).max() < 0.1
 
@@ -239,7 +239,7 @@ def test_two_devices_with_clocks_of_their_own() -> None:
 # ------------------------------------------------------------------ what a frameset waits for
 
 
-def test_unsynchronised_pairs_make_framesets_of_their_own() -> None:
+def test_assembler_unsynchronised_pairs_give_separate_framesets() -> None:
     run = play(steady(offset_ms=20.0))
     assert run.pairs == [[0], [1]] * 30
     assert not run.reports
@@ -247,7 +247,7 @@ def test_unsynchronised_pairs_make_framesets_of_their_own() -> None:
     assert waits.max() <= 30.0 + 5.3 + 1e-6  # until the other pair's next image, 30 ms later
 
 
-def test_a_camera_at_half_the_rate_halves_its_pair() -> None:
+def test_assembler_camera_at_half_rate_halves_its_pair() -> None:
     shots = [shot for shot in steady(count=30) if shot.camera != 3 or shot.stamp_ms % 100.0 == 0.0]
     run = play(shots)
     assert run.pairs == [[0, 1], [0]] * 15
@@ -255,7 +255,7 @@ def test_a_camera_at_half_the_rate_halves_its_pair() -> None:
     assert np.subtract(run.given_ms, run.stamps_ms)[:-1].max() <= WAIT_MS
 
 
-def test_a_pair_at_half_the_rate_delays_the_other_until_its_next_image() -> None:
+def test_assembler_pair_at_half_rate_delays_other_to_next_image() -> None:
     shots = [shot for shot in steady(count=30) if shot.camera < 2 or shot.stamp_ms % 100.0 == 0.0]
     run = play(shots)
     assert run.pairs == [[0, 1], [0]] * 15
@@ -263,27 +263,27 @@ def test_a_pair_at_half_the_rate_delays_the_other_until_its_next_image() -> None
     assert np.subtract(run.given_ms, run.stamps_ms)[:-1].max() <= 50.0 + 5.3 + 1e-6
 
 
-def test_a_lost_image_costs_its_pair_one_frameset() -> None:
+def test_assembler_lost_image_costs_pair_one_frameset() -> None:
     shots = [shot for shot in steady(count=10) if (shot.camera, shot.stamp_ms) != (2, 200.0)]
     run = play(shots)
     assert run.pairs == [[0] if k == 4 else [0, 1] for k in range(10)]
     assert run.reports == {"image_without_partner": 1}
-    assert run.given_ms[4] < 256.0  # the camera's next image tells that it is lost
+    assert run.given_ms[4] < 256.0  # the camera's next image shows that it is lost
 
 
-def test_a_pair_dies_and_returns() -> None:
+def test_assembler_pair_that_stops_and_returns_is_used_again() -> None:
     shots = [shot for shot in steady(count=100) if shot.camera < 2 or not 1000.0 <= shot.stamp_ms < 3500.0]
     run = play(shots)
     assert run.pairs == [[0] if 20 <= k < 71 else [0, 1] for k in range(100)]
-    assert run.reports == {"late_image": 1, "image_without_partner": 1}  # nobody waited for the first after the return
+    assert run.reports == {"late_image": 1, "image_without_partner": 1}  # the first after the return was not waited for
     waits = np.subtract(run.given_ms, run.stamps_ms)
     assert waits[:20].max() < 6.0
-    assert waits[20:40].max() <= WAIT_MS + 50.0 + 6.0  # the time is told by what comes
-    assert waits[45:69].max() < 6.0  # nobody waits any more
+    assert waits[20:40].max() <= WAIT_MS + 50.0 + 6.0  # the time is given by what arrives
+    assert waits[45:69].max() < 6.0  # nothing waits any more
     assert waits[72:].max() < 6.0
 
 
-def test_a_rig_that_was_silent_goes_on() -> None:
+def test_assembler_silent_rig_continues() -> None:
     """For ten seconds, so that the first stamps afterwards have to be confirmed by the next ones."""
     shots = [shot for shot in steady(count=300) if not 2000.0 <= shot.stamp_ms < 12000.0]
     run = play(shots)
@@ -291,15 +291,15 @@ def test_a_rig_that_was_silent_goes_on() -> None:
     assert not run.reports
 
 
-def test_a_pair_that_never_came_is_not_waited_for() -> None:
+def test_assembler_missing_pair_is_not_waited_for() -> None:
     run = play([shot for shot in steady(count=60) if shot.camera < 2])
     assert run.pairs == [[0]] * 60
     waits = np.subtract(run.given_ms, run.stamps_ms)
     assert waits[25:].max() < 6.0
 
 
-def test_the_wait_ends_with_anything_that_arrives() -> None:
-    """Both pairs are alive, but only one has the instant; samples of the IMU tell the time."""
+def test_assembler_advance_ends_wait() -> None:
+    """Both pairs are alive, but only one has the instant; IMU samples give the time."""
     assembler = FramesetAssembler(small_rig(2), TOLERANCE_MS, WAIT_MS, lambda *_: None)
     for camera in range(2):
         assert not assembler.add(f"cam{camera}", ns(0.0), numbered(camera), ns(5.0 + camera))
@@ -309,7 +309,7 @@ def test_the_wait_ends_with_anything_that_arrives() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_stamps_that_jitter_by_half_a_period(seed: int) -> None:
+def test_assembler_stamp_jitter_of_half_a_period_is_handled(seed: int) -> None:
     """Each camera for itself: hardly any image has a partner, and those that have one are used."""
     rng = np.random.default_rng(seed)
     shots = [Shot(50.0 * k + 30.0, c, 50.0 * k + rng.uniform(-25.0, 25.0)) for k in range(200) for c in range(4)]
@@ -323,14 +323,14 @@ def test_stamps_that_jitter_by_half_a_period(seed: int) -> None:
 # ------------------------------------------------------------------ faults
 
 
-def test_an_image_that_comes_twice_is_used_once() -> None:
+def test_assembler_duplicate_image_is_used_once() -> None:
     shots = steady(count=5)
     run = play(sorted([*shots, Shot(107.0, 1, 100.0), Shot(105.05, 0, 100.0)]))
     assert run.pairs == [[0, 1]] * 5
     assert run.reports == {"duplicate_image": 2}
 
 
-def test_an_image_after_its_frameset_is_late() -> None:
+def test_assembler_image_after_its_frameset_is_late() -> None:
     shots = steady(count=10)
     late = [Shot(shot.arrival_ms + 140.0, shot.camera, shot.stamp_ms) for shot in shots if shot.camera >= 2][6:8]
     kept = [shot for shot in shots if (shot.camera, shot.stamp_ms) not in [(s.camera, s.stamp_ms) for s in late]]
@@ -339,7 +339,7 @@ def test_an_image_after_its_frameset_is_late() -> None:
     assert run.reports == {"late_image": 2}
 
 
-def test_one_wild_stamp_stops_nothing() -> None:
+def test_assembler_wild_stamp_blocks_nothing() -> None:
     shots = [
         Shot(shot.arrival_ms, shot.camera, shot.stamp_ms + (1e6 if 200.0 <= shot.stamp_ms < 250.0 else 0.0))
         for shot in steady(count=10)
@@ -349,8 +349,8 @@ def test_one_wild_stamp_stops_nothing() -> None:
     assert run.reports == {"image_future_stamp": 4}
 
 
-def test_a_stamp_that_is_wild_by_little_costs_a_pair_two_framesets() -> None:
-    """Its camera is not believed to be past all that follows, but for its next image."""
+def test_assembler_slightly_wild_stamp_costs_two_framesets() -> None:
+    """Its camera does not count as past all that follows, but for its next image."""
     shots = [
         Shot(
             shot.arrival_ms,
@@ -364,7 +364,7 @@ def test_a_stamp_that_is_wild_by_little_costs_a_pair_two_framesets() -> None:
     assert run.reports == {"image_without_partner": 3, "late_image": 1}
 
 
-def test_an_image_without_partner_does_not_move_the_stamp() -> None:
+def test_assembler_image_without_partner_does_not_change_stamp() -> None:
     """Pair 1 is half a millisecond before pair 0, whose stamp counts."""
     shots = steady(count=10, offset_ms=-0.5)
     run = play(sorted([*shots, Shot(200.0, 2, 180.0)]))
@@ -372,12 +372,12 @@ def test_an_image_without_partner_does_not_move_the_stamp() -> None:
     assert run.reports == {"image_without_partner": 1}
 
 
-def test_a_camera_that_is_not_in_the_rig() -> None:
+def test_assembler_unknown_camera_is_reported() -> None:
     assert play([Shot(1.0, 9, 0.0)]).reports == {"unknown_camera": 1}
 
 
 @pytest.mark.parametrize("cameras", [(0,), (0, 1), (0, 3), (0, 1, 2)])
-def test_memory_is_bounded_when_no_time_passes(cameras: tuple[int, ...]) -> None:
+def test_assembler_memory_is_bounded_when_no_time_passes(cameras: tuple[int, ...]) -> None:
     """A clock of arrivals that stands still ends no wait."""
     shots = [Shot(0.0, camera, 50.0 * k) for k in range(500) for camera in cameras]
     run = play(shots)
@@ -385,7 +385,7 @@ def test_memory_is_bounded_when_no_time_passes(cameras: tuple[int, ...]) -> None
     assert len(run.framesets) == (500 if 1 in cameras else 0)
 
 
-def test_memory_is_bounded_over_time() -> None:
+def test_assembler_memory_is_bounded_over_time() -> None:
     run = play(steady(count=2000, delay_ms=60.0), flush=False)
     assert len(run.framesets) == 2000
     assert run.most_waiting <= 12
