@@ -13,6 +13,7 @@ from graphvio.config.stages import MotionConfig
 from graphvio.frontend.cost import left_motions, robust_cost
 from graphvio.frontend.noise import noise_by_pair
 from graphvio.frontend.observations import Observations, RigArrays
+from graphvio.frontend.paper_method import PairPoints, cost
 from graphvio.frontend.ransac import hypothesise, preempt, search
 from graphvio.frontend.refinement import explained, refine
 from graphvio.frontend.selection import best_pair_motion, global_cost, joint_motion
@@ -33,23 +34,6 @@ def seed(number: int = 0) -> np.random.Generator:
 def take(seen: Observations, rows: Int) -> Observations:
     columns: list[AnyArray] = [column[rows] for column in seen]
     return Observations(*columns)
-
-
-def rho(pixels: Float, a: float) -> float:
-    return float(np.log(1.0 + pixels @ pixels / a**2))
-
-
-def paper_cost(rig: Rig, pair: int, left_next_T_left_prev: Float, seen: Observations, a: float) -> float:
-    """``c_j`` of eq. (2), as it is written."""
-    stereo, total = rig.pairs[pair], 0.0
-    for i in np.flatnonzero(seen.pair == pair):
-        x, y, w = seen.points[i]
-        point = left_next_T_left_prev @ [x, y, 1.0, w]
-        other = stereo.right_T_left @ point
-        total += rho(stereo.left.focal_px * (seen.left[i] - point[:2] / point[2]), a)
-        if seen.has_right[i]:
-            total += rho(stereo.right.focal_px * (seen.right[i] - other[:2] / other[2]), a)
-    return total
 
 
 # ------------------------------------------------------------------ the cost, eq. (1) to (3)
@@ -78,31 +62,6 @@ def test_a_point_behind_the_camera_costs_much_and_not_infinitely() -> None:
     seen = seen_points(RIG, STILL, 5, seed())
     backwards = transform([0.0, np.pi, 0.0], [0.0, 0.0, 0.0])
     assert global_cost(ARRAYS, seen, backwards, 1.5) == pytest.approx(20 * np.log(1.0 + 1e6))
-
-
-def test_motions_of_the_pairs_are_transfers_of_each_other() -> None:
-    motions = left_motions(TRUTH, ARRAYS)
-    left2_T_left1 = RIG.left2_T_left1()
-    np.testing.assert_allclose(motions[1, 0], left2_T_left1 @ motions[0, 0] @ np.linalg.inv(left2_T_left1), atol=1e-12)
-    for j, pair in enumerate(RIG.pairs):
-        np.testing.assert_allclose(motions[j, 1], pair.right_T_left @ motions[j, 0], atol=1e-12)
-
-
-def test_global_cost_is_that_of_either_pairs_motion() -> None:
-    seen = seen_points(RIG, TRUTH, 40, seed(1), sigma_px=1.0, outlier_share=0.2)
-    seen = seen._replace(has_right=seed(2).random(80) < 0.7)
-    p12, p21 = RIG.left2_T_left1(), np.linalg.inv(RIG.left2_T_left1())
-    rng = seed(3)
-    for _ in range(10):
-        p1 = TRUTH @ random_transform(rng, 0.01, 0.05)
-        p2 = p12 @ p1 @ p21  # eq. (1)
-        cost1 = paper_cost(RIG, 0, p1, seen, 1.5) + paper_cost(RIG, 1, p12 @ p1 @ p21, seen, 1.5)  # eq. (3)
-        cost2 = paper_cost(RIG, 1, p2, seen, 1.5) + paper_cost(RIG, 0, p21 @ p2 @ p12, seen, 1.5)
-        for j, motion in ((0, p1), (1, p2)):
-            body_T_left = RIG.pairs[j].left.body_T_cam
-            cur_T_ref = np.ascontiguousarray(body_T_left @ motion @ np.linalg.inv(body_T_left))
-            assert global_cost(ARRAYS, seen, cur_T_ref, 1.5) == pytest.approx(cost1, rel=1e-9)
-        assert cost1 == pytest.approx(cost2, rel=1e-9)
 
 
 # ------------------------------------------------------------------ hypotheses
@@ -344,7 +303,7 @@ def test_one_pair_is_the_single_pair_algorithm() -> None:
     assert np.array_equal(joint.inlier, best.inlier)
     left = rig.pairs[0].left
     motion = left.cam_T_body @ TRUTH @ left.body_T_cam
-    assert global_cost(arrays, seen, TRUTH, 1.5) == pytest.approx(paper_cost(rig, 0, motion, seen, 1.5))
+    assert global_cost(arrays, seen, TRUTH, 1.5) == pytest.approx(cost(motion, PairPoints.of(rig.pairs[0], seen), 1.5))
 
 
 def test_a_pair_without_points_changes_nothing() -> None:
