@@ -139,6 +139,7 @@ def test_every_profile_loads() -> None:
     loaded = {name: Config.load(name) for name in profiles()}
     assert loaded["default"] == Config()
     assert loaded["paper"].motion.selection == "best_pair"
+    assert loaded["paper"].motion.residuals == "per_image"
     assert loaded["paper"].fusion.estimator == "filter"
 
 
@@ -157,9 +158,10 @@ def test_a_switch_is_true_or_false(value: str) -> None:
 def another(value: object) -> object:
     """Another value in the same range."""
     if isinstance(value, str):
-        return {"joint": "best_pair", "previous": "keyframe", "smoother": "filter", "estimated": "none", "orb": "sift"}[
-            value
-        ]
+        return {
+            "joint": "best_pair", "previous": "keyframe", "per_point": "per_image", "smoother": "filter",
+            "estimated": "none", "orb": "sift",
+        }[value]  # fmt: skip
     if isinstance(value, bool):
         return not value
     if isinstance(value, int):

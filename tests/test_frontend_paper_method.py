@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 from synthetic import random_transform, seen_points, transform, two_pair_rig
 
 from graphvio.arrays import Float
@@ -13,14 +14,17 @@ from graphvio.config.stages import MotionConfig
 from graphvio.frontend.cost import left_motions, robust_cost
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.paper_method import PairPoints, best_pair, cost, global_cost, h, motion_of_pair, rho
+from graphvio.frontend.refinement import refine
 from graphvio.frontend.selection import best_pair_motion
 from graphvio.frontend.selection import global_cost as global_cost_of_kernel
+from graphvio.geometry import se3_exp, se3_log
 from graphvio.rig import Rig, StereoPair
 
 TRUTH = transform([0.02, -0.03, 0.05], [-0.06, 0.02, 0.01])  # cur_T_ref
 STILL = np.eye(4)
 A_PX = 1.5
 CONFIG = MotionConfig(sigma_inflation=1.0, hypotheses=60)
+PER_IMAGE = replace(CONFIG, residuals="per_image")
 
 
 def rig_of(pairs: int) -> Rig:
@@ -28,7 +32,8 @@ def rig_of(pairs: int) -> Rig:
     two = two_pair_rig()
     turned = transform([0.1, -0.2, 1.4], [0.02, -0.2, 0.1])
     left, right = (
-        replace(each, body_T_cam=turned @ each.body_T_cam) for each in (two.pairs[0].left, two.pairs[0].right)
+        replace(camera, name=f"side_{camera.name}", body_T_cam=turned @ camera.body_T_cam)
+        for camera in (two.pairs[0].left, two.pairs[0].right)
     )
     third = StereoPair("side", left, right)
     return Rig((*two.pairs, third)[:pairs], None, "synthetic")
@@ -161,3 +166,65 @@ def test_best_pair_motion_is_that_of_eq_4(pairs: int, sound: int) -> None:
     assert int(np.argmin(costs)) == sound
     best = best_pair_motion(arrays, seen, STILL, CONFIG, np.random.default_rng(0))
     np.testing.assert_allclose(best.cur_T_ref, alone[sound], atol=1e-3)
+
+
+# ------------------------------------------------------------------ the refinement by eq. (2)
+
+
+@pytest.mark.parametrize("pairs", [1, 2, 3])
+@pytest.mark.parametrize("number", [40, 41])
+def test_refine_per_image_is_the_minimum_of_eq_2_and_3(pairs: int, number: int) -> None:
+    rig = rig_of(pairs)
+    arrays, seen = RigArrays.of(rig), scene(rig, number)
+    points = points_of(rig, seen)
+    start = motions_near_truth(number, 1)[0]
+    refined = refine(arrays, seen, start, PER_IMAGE)
+    sigmas = np.sqrt(np.diag(refined.covariance))
+
+    def cost_at(step: Float) -> float:
+        cur_T_ref = se3_exp(sigmas * step) @ refined.cur_T_ref
+        return global_cost(of_left(rig, 0, cur_T_ref), 0, points, arrays.body_T_left, A_PX)
+
+    lowest = minimize(cost_at, np.full(6, 0.3), method="BFGS", options={"gtol": 1e-6})
+    assert cost_at(np.zeros(6)) == pytest.approx(lowest.fun, rel=1e-8)
+    np.testing.assert_allclose(lowest.x, 0.0, atol=2e-3)  # sigmas
+
+
+def test_refine_per_image_leaves_out_points_that_are_known_to_be_outliers() -> None:
+    rig = rig_of(2)
+    arrays, seen = RigArrays.of(rig), scene(rig, 50)
+    known = np.arange(len(seen.pair)) % 3 > 0
+    part, whole = (
+        refine(arrays, of, TRUTH, PER_IMAGE, known=rows)
+        for of, rows in ((seen.of_rows(known), np.ones(int(known.sum()), dtype=bool)), (seen, known))
+    )
+    np.testing.assert_allclose(whole.cur_T_ref, part.cur_T_ref, atol=1e-9)
+    np.testing.assert_array_equal(whole.inlier, known)
+
+
+def test_refine_per_image_covariance_is_consistent() -> None:
+    rig, nees = rig_of(2), []
+    arrays = RigArrays.of(rig)
+    for number in range(200):
+        seen = seen_points(rig, TRUTH, 50, np.random.default_rng(1000 + number), sigma_px=PER_IMAGE.pixel_sigma_px)
+        refined = refine(arrays, seen, TRUTH, PER_IMAGE)
+        error = se3_log(refined.cur_T_ref @ np.linalg.inv(TRUTH))
+        nees.append(error @ np.linalg.solve(refined.covariance, error))
+    assert 4.5 < np.mean(nees) < 8.0  # of 6
+
+
+def test_best_pair_motion_per_image_is_a_minimum_of_eq_2() -> None:
+    rig = rig_of(2)
+    arrays, seen = RigArrays.of(rig), scene(rig, 60)
+    best = best_pair_motion(arrays, seen, STILL, PER_IMAGE, np.random.default_rng(0))
+    motions = [of_left(rig, j, best.cur_T_ref) for j in range(2)]
+    steps = 0.05 * np.sqrt(np.diag(best.covariance)) * np.vstack([np.eye(6), -np.eye(6)])
+
+    def rises(j: int) -> bool:
+        """Whether eq. (2) of pair j is greater on all sides."""
+        points = points_of(rig, seen)[j]
+        lowest = cost(motions[j], points, A_PX)
+        around = (of_left(rig, j, se3_exp(step) @ best.cur_T_ref) for step in steps)
+        return all(cost(P, points, A_PX) > lowest for P in around)
+
+    assert rises(0) != rises(1)

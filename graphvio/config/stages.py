@@ -76,6 +76,9 @@ class MotionConfig(Stage):
     cauchy_scale_px: float = 1.5
     """Scale ``a`` of the robust cost, eq. (2), in pixels, for the modelled noise; the refinement shrinks it where
     residuals are smaller."""
+    residuals: Literal["per_point", "per_image"] = "per_point"
+    """What the refinement's robust cost is applied to. ``per_point``: the error of a point in both images, weighted by
+    the noise of its pixels and of its triangulation. ``per_image``: the error in each image by itself, eq. (2)."""
     pixel_sigma_px: float = 0.3
     """Standard deviation of a tracked corner's position in one image."""
     max_error_px: float = 3.0

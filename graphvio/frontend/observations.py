@@ -90,6 +90,36 @@ class Observations(NamedTuple):
         )  # fmt: skip
 
 
+def image_by_image(rig: RigArrays, observations: Observations) -> tuple[RigArrays, Observations, Int]:
+    """Take each image for a pair of its own without a right camera, and points for exact.
+
+    What kernels compute of one point is then the error of one image as a vector of two, with the plain noise of its
+    pixels, as in eq. (2).
+
+    Args:
+        rig: of P pairs.
+        observations: N points of any subset of them.
+
+    Returns:
+        The rig as 2P pairs, each pair's left camera before its right one; the M observations in one image; and the row
+        (M,) of the given observations that each is of.
+    """
+    images = RigArrays(
+        np.repeat(rig.cam_T_body.reshape(-1, 1, 4, 4), 2, axis=1),
+        np.repeat(rig.body_T_left, 2, axis=0),
+        np.repeat(rig.focal_px.reshape(-1, 1), 2, axis=1),
+    )
+    n = len(observations.pair)
+    rows = np.concatenate([np.arange(n), np.flatnonzero(observations.has_right)])
+    is_right = np.arange(len(rows)) >= n
+    image = 2 * observations.pair[rows] + is_right
+    places = np.concatenate([observations.left, observations.right[observations.has_right]])
+    order = np.argsort(image, kind="stable")
+    rows, none = rows[order], np.zeros((len(rows), 2))
+    exact, alone = np.zeros((len(rows), 3, 3)), np.zeros(len(rows), dtype=bool)
+    return images, Observations(image[order], observations.points[rows], exact, places[order], none, alone), rows
+
+
 @dataclass(frozen=True, eq=False)
 class Correspondences:
     """Observations, and which tracks they came from.

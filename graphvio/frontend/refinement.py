@@ -1,8 +1,13 @@
-"""Iterative refinement of a motion on the points of all pairs, and its covariance (section 3, 3.1, 5).
+"""Refinement of a motion on the points of all pairs, and its covariance (sections 3, 3.1 and 5).
 
 Levenberg-Marquardt minimises the Cauchy cost of the whitened errors of `graphvio.frontend.linearisation`; points that
-turn out to be no inliers are then left out, since the Cauchy weight of a coherent crowd of them never becomes nothing.
-The cost's scale is that of the configuration for the modelled noise, and less where the residuals are smaller.
+turn out to be no inliers are then left out, since the Cauchy weight of many that err alike never vanishes. The scale of
+the cost is that of the configuration for the modelled noise, and less where the residuals are smaller.
+
+With ``motion.residuals: per_image``, as in the profile ``paper``, the minimum is that of eq. (2) or (3) as
+`graphvio.frontend.paper_method` has them: of all points, each image by itself, all with the same scale. What differs
+from the paper even then is the covariance: it is that of the inliers, with the uncertainty of their triangulation,
+the noise that the residuals show, and ``motion.sigma_inflation``.
 """
 
 from dataclasses import dataclass
@@ -15,11 +20,12 @@ from graphvio.frontend.blocks import POINTS, Blocks, in_blocks, lane_by_lane, po
 from graphvio.frontend.cost import left_motions
 from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise, unexpanded
 from graphvio.frontend.noise import influence, influence_slopes, inlier_cutoff, noise_by_pair, noise_variance
-from graphvio.frontend.observations import Observations, RigArrays
+from graphvio.frontend.observations import Observations, RigArrays, image_by_image
 from graphvio.geometry import se3_compose, se3_exp
 from graphvio.kernels import kernel
 
 _MAX_ROUNDS = 3
+_MAX_REPETITIONS = 5  # of these rounds, where outliers stay in the cost and make convergence slow
 _ROUNDS_TO_FIND_INLIERS = 5
 _ROUNDS_WITH_ALL = 2
 _GROSS = 4.0  # over the cutoff of inliers: what one pair's noise may be, over that of all
@@ -71,11 +77,14 @@ def refine(
         config: of this stage.
         known: (N,) the inliers, where they are known already and the start is near; else they are found first.
     """
-    start = np.zeros(0, dtype=bool) if known is None else known
-    return Refined(*_refined(
-        np.ascontiguousarray(cur_T_ref), rig, observations, start, config.pixel_sigma_px, config.cauchy_scale_px,
-        config.max_error_px, config.sigma_inflation**2,
-    ))  # fmt: skip
+    inlier = np.zeros(0, dtype=bool) if known is None else known
+    start = np.ascontiguousarray(cur_T_ref)
+    settings = config.pixel_sigma_px, config.cauchy_scale_px, config.max_error_px, config.sigma_inflation**2
+    if config.residuals == "per_image":
+        images_rig, images, rows = image_by_image(rig, observations)
+        counted = np.ones(len(rows)) if known is None else known[rows].astype(np.float64)
+        return Refined(*_refined_per_image(start, rig, observations, inlier, images_rig, images, counted, *settings))
+    return Refined(*_refined(start, rig, observations, inlier, *settings))
 
 
 @kernel
@@ -112,6 +121,52 @@ def _refined(
     pose, hessian, errors2 = _levenberg_marquardt(
         pose, rig, blocks, at, active, sigmas_px, scale, _MAX_ROUNDS, _CONVERGED
     )
+    covariance, shared = _covariances(pose, hessian, errors2, rig, blocks, at, inlier, has_right, sigmas_px, scale)
+    errors_px = _errors_px(errors2, has_right, sigmas_px[observations.pair])
+    return pose, inflation * covariance, inflation * shared, inlier, errors_px
+
+
+@kernel
+def _refined_per_image(
+    cur_T_ref: Float, rig: RigArrays, observations: Observations, known: Bool, images_rig: RigArrays,
+    images: Observations, counted: Float, sigma: float, scale_px: float, max_error_px: float, inflation: float,
+) -> tuple[Float, Float, Float, Bool, Float]:  # fmt: skip
+    """As `_refined`, but at the minimum of eq. (2), of observations image by image (M,) of which some are counted."""
+    blocks, pose = in_blocks(images), cur_T_ref
+    at, active = unexpanded(blocks), lane_by_lane(blocks, counted)
+    sigmas_px = np.full(len(images_rig.focal_px), sigma)
+    for _ in range(_MAX_REPETITIONS):
+        before = pose
+        pose, _, _ = _levenberg_marquardt(
+            before, images_rig, blocks, at, active, sigmas_px, scale_px / sigma, _MAX_ROUNDS, _CONVERGED
+        )
+        if np.max(np.abs(pose - before)) < _CONVERGED:
+            break
+    # Inliers and covariance as in `_refined`, with the uncertainty of the triangulated points.
+    has_right, blocks, largest2 = observations.has_right, in_blocks(observations), (max_error_px / sigma) ** 2
+    at, sigmas_px = unexpanded(blocks), np.full(len(rig.focal_px), sigma)
+    errors2 = _squared_errors(pose, rig, blocks, at, sigmas_px)
+    inlier = known
+    if len(inlier) != len(has_right):
+        inlier = errors2 < inlier_cutoff(errors2, has_right, largest2)
+        inlier &= _is_of_an_explained_pair(observations.pair, inlier)
+    scale = _scale(errors2[inlier], has_right[inlier], scale_px / sigma, largest2)
+    hessian = np.empty((6, 6))
+    linearise(
+        left_motions(pose, rig), rig, blocks, at, lane_by_lane(blocks, inlier.astype(np.float64)), scale,
+        hessian, np.empty(6), np.empty((len(blocks.pair), POINTS)),
+    )  # fmt: skip
+    covariance, shared = _covariances(pose, hessian, errors2, rig, blocks, at, inlier, has_right, sigmas_px, scale)
+    errors_px = _errors_px(errors2, has_right, sigmas_px[observations.pair])
+    return pose, inflation * covariance, inflation * shared, inlier, errors_px
+
+
+@kernel
+def _covariances(
+    pose: Float, hessian: Float, errors2: Float, rig: RigArrays, blocks: Blocks, at: Expansion, inlier: Bool,
+    has_right: Bool, sigmas_px: Float, scale: float,
+) -> tuple[Float, Float]:  # fmt: skip
+    """Covariance (6, 6) of a motion at the minimum of the cost, and its shared part (6, 6), see `Refined`."""
     used = influence(errors2[inlier], has_right[inlier], scale)
     # Backward propagation of the reprojection covariance. The small prior keeps unconstrained directions finite.
     information = hessian / used.factor + np.eye(6) / _WEAK_DIRECTION_SIGMA**2
@@ -121,8 +176,7 @@ def _refined(
     through_points = information_through_points(left_motions(pose, rig), rig, blocks, at, sigmas_px, factors)
     gain = covariance / used.factor * (used.weight / used.slope)
     shared = _bounded(used.variance * gain @ through_points @ gain, root)
-    errors_px = _errors_px(errors2, has_right, sigmas_px[observations.pair])
-    return pose, inflation * covariance, inflation * shared, inlier, errors_px
+    return covariance, shared
 
 
 @kernel
