@@ -1,4 +1,4 @@
-"""Names for the array types that the whole package passes around."""
+"""Names of the array types that the whole package uses."""
 
 from typing import Any
 

@@ -3,8 +3,8 @@
 Frame ``cam``: x right, y down, z forward; pixel (0, 0) is the centre of the upper left pixel. A model is given
 by its number, ``intrinsics`` (4,) ``[fx, fy, cx, cy]`` in pixels and ``distortion`` (5,):
 ``[k1, k2, p1, p2, k3]`` (radial-tangential, OpenCV's order) or ``[k1, k2, k3, k4, 0]`` (equidistant).
-Normalised image coordinates are ``(X / Z, Y / Z)``, the paper's ``h`` (section 3), so the half-plane behind the
-camera has none, and rays beyond 80 degrees from the axis are declared invalid.
+Normalised image coordinates are ``(X / Z, Y / Z)``, the paper's ``h`` (section 3): the half-space behind the camera
+has none, and rays beyond 80 degrees from the axis are invalid.
 """
 
 import numpy as np
@@ -24,7 +24,7 @@ _NEWTON_TOLERANCE = 1e-12
 
 @kernel
 def distort(model: int, distortion: Float, x: float, y: float) -> tuple[float, float, float, float, float, float]:
-    """Distorted normalised coordinates of (x, y), and their 2x2 Jacobian.
+    """Compute the distorted normalised coordinates of (x, y), and their Jacobian (2, 2).
 
     Returns:
         ``(xd, yd, dxd/dx, dxd/dy, dyd/dx, dyd/dy)``.
@@ -67,7 +67,7 @@ def distort(model: int, distortion: Float, x: float, y: float) -> tuple[float, f
 
 @kernel
 def undistort(model: int, distortion: Float, xd: float, yd: float) -> tuple[float, float, bool]:
-    """Normalised coordinates whose distortion is (xd, yd), by Newton's method; False where there are none."""
+    """Find the normalised coordinates whose distortion is (xd, yd), by Newton's method; False where there are none."""
     x, y = xd, yd
     if model == EQUIDISTANT:
         theta_d = np.sqrt(xd * xd + yd * yd)
@@ -104,7 +104,7 @@ def undistort(model: int, distortion: Float, xd: float, yd: float) -> tuple[floa
 
 @kernel
 def fold_radius(model: int, distortion: Float) -> float:
-    """The normalised radius from which on distortion maps outer points inwards again, at most tan(80 degrees)."""
+    """Find the normalised radius from which distortion maps outer points inwards again, at most tan(80 degrees)."""
     radius = 0.0
     while radius < _MAX_TAN:
         _, _, slope, _, _, _ = distort(model, distortion, radius, 0.0)
@@ -117,7 +117,7 @@ def fold_radius(model: int, distortion: Float) -> float:
 
 @kernel
 def project_points(model: int, intrinsics: Float, distortion: Float, points: Float) -> tuple[Float, Bool]:
-    """Pixels of points in the camera frame.
+    """Project points to pixels.
 
     Args:
         model: number of the model.
@@ -134,7 +134,7 @@ def project_points(model: int, intrinsics: Float, distortion: Float, points: Flo
     limit = fold_radius(model, distortion)
     for i in range(n):
         z = points[i, 2]
-        if not z > 1e-6:  # also refuses NaN
+        if not z > 1e-6:  # also rejects NaN
             continue
         x, y = points[i, 0] / z, points[i, 1] / z
         if not x * x + y * y < limit * limit:
@@ -148,7 +148,7 @@ def project_points(model: int, intrinsics: Float, distortion: Float, points: Flo
 
 @kernel
 def unproject_pixels(model: int, intrinsics: Float, distortion: Float, pixels: Float) -> tuple[Float, Bool]:
-    """Normalised image coordinates (N, 2) of pixels (N, 2), and whether each exists (N,)."""
+    """Compute the normalised image coordinates (N, 2) of pixels (N, 2), and whether each exists (N,)."""
     n = len(pixels)
     normalised = np.zeros((n, 2))
     valid = np.zeros(n, dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""Typed errors: every message says what is wrong, where, and what to do about it."""
+"""Typed errors: every message says what is wrong, where, and what to do."""
 
 
 class GraphvioError(Exception):
@@ -18,7 +18,7 @@ class ConfigError(GraphvioError):
 
 
 class MeasurementError(GraphvioError):
-    """An IMU sample or frameset that a program hands over is malformed."""
+    """An IMU sample or frameset that a program passes in is malformed."""
 
 
 class TrajectoryError(GraphvioError):
@@ -37,20 +37,20 @@ class SessionError(GraphvioError):
 
 
 class CalibrationError(GraphvioError):
-    """Motions from which the cameras' places on the rig cannot be found."""
+    """The transform between cameras cannot be determined from their motions."""
 
 
 class OptimizationError(GraphvioError):
-    """A session cannot be optimised, or what was kept of it not be read."""
+    """A session cannot be optimised, or stored results of it cannot be read."""
 
 
 class FleetError(GraphvioError):
-    """Sessions cannot be listed, their files not be reached, or the workers not be used."""
+    """Sessions cannot be listed, their files cannot be reached, or the workers cannot be used."""
 
 
 class ServiceError(GraphvioError):
-    """A service cannot be offered or reached, refuses a client, or was told something malformed."""
+    """A service cannot be started or reached, refuses a client, or received a malformed message."""
 
 
 class MapError(GraphvioError):
-    """A map cannot be read or written, or does not fit the rig; or keyframes cannot be mapped."""
+    """A map cannot be read or written or does not fit the rig, or keyframes cannot be mapped."""

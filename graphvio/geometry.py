@@ -18,7 +18,7 @@ _SMALL_ANGLE = 1e-5
 
 @kernel
 def skew(v: Float) -> Float:
-    """Matrix (3, 3) of the cross product: ``skew(v) @ w == cross(v, w)``."""
+    """Build the matrix (3, 3) of the cross product: ``skew(v) @ w == cross(v, w)``."""
     m = np.zeros((3, 3))
     m[0, 1], m[0, 2] = -v[2], v[1]
     m[1, 0], m[1, 2] = v[2], -v[0]
@@ -28,7 +28,7 @@ def skew(v: Float) -> Float:
 
 @kernel
 def so3_exp(phi: Float) -> Float:
-    """Rotation matrix (3, 3) of a rotation vector (3,) in radians."""
+    """Compute the rotation matrix (3, 3) of a rotation vector (3,), radians."""
     angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     angle = np.sqrt(angle2)
     if angle < _SMALL_ANGLE:
@@ -43,7 +43,7 @@ def so3_exp(phi: Float) -> Float:
 
 @kernel
 def so3_log(rotation: Float) -> Float:
-    """Rotation vector (3,) in radians, of norm at most pi, of a rotation matrix (3, 3)."""
+    """Compute the rotation vector (3,), radians and of norm at most pi, of a rotation matrix (3, 3)."""
     q = quat_wxyz_from_rotation(rotation)
     sine = np.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     if sine < _SMALL_ANGLE:
@@ -55,7 +55,7 @@ def so3_log(rotation: Float) -> Float:
 
 @kernel
 def so3_right_jacobian(phi: Float) -> Float:
-    """``J`` (3, 3) with ``exp(phi + d) = exp(phi) exp(J d)`` to first order in d."""
+    """Compute ``J`` (3, 3) with ``exp(phi + d) = exp(phi) exp(J d)`` to first order in d."""
     angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     angle = np.sqrt(angle2)
     if angle < _SMALL_ANGLE:
@@ -70,7 +70,7 @@ def so3_right_jacobian(phi: Float) -> Float:
 
 @kernel
 def so3_right_jacobian_inverse(phi: Float) -> Float:
-    """Inverse (3, 3) of `so3_right_jacobian`: ``log(exp(phi) exp(d)) = phi + J^-1 d`` to first order."""
+    """Compute the inverse (3, 3) of `so3_right_jacobian`: ``log(exp(phi) exp(d)) = phi + J^-1 d`` to first order."""
     angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     angle = np.sqrt(angle2)
     if angle < 1e-3:  # the closed form below subtracts two large, nearly equal numbers
@@ -83,7 +83,7 @@ def so3_right_jacobian_inverse(phi: Float) -> Float:
 
 @kernel
 def quat_wxyz_from_rotation(rotation: Float) -> Float:
-    """Unit Hamilton quaternion (4,) ``[w, x, y, z]`` with ``w >= 0`` of a rotation matrix (3, 3)."""
+    """Convert a rotation matrix (3, 3) to a unit Hamilton quaternion (4,) ``[w, x, y, z]`` with ``w >= 0``."""
     r = rotation
     q = np.empty(4)
     trace = r[0, 0] + r[1, 1] + r[2, 2]
@@ -114,7 +114,7 @@ def quat_wxyz_from_rotation(rotation: Float) -> Float:
 
 @kernel
 def rotation_from_quat_wxyz(quat_wxyz: Float) -> Float:
-    """Rotation matrix (3, 3) of a Hamilton quaternion (4,) ``[w, x, y, z]`` of any norm but zero."""
+    """Convert a Hamilton quaternion (4,) ``[w, x, y, z]`` of any norm but zero to a rotation matrix (3, 3)."""
     w, x, y, z = quat_wxyz / np.sqrt(np.sum(quat_wxyz * quat_wxyz))
     r = np.empty((3, 3))
     r[0, 0], r[0, 1], r[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
@@ -125,7 +125,7 @@ def rotation_from_quat_wxyz(quat_wxyz: Float) -> Float:
 
 @kernel
 def se3(rotation: Float, translation: Float) -> Float:
-    """Transform (4, 4) from its rotation (3, 3) and translation (3,)."""
+    """Build a transform (4, 4) from its rotation (3, 3) and translation (3,)."""
     t = np.eye(4)
     put(t[:3, :3], rotation)
     put(t[:3, 3], translation)
@@ -134,7 +134,7 @@ def se3(rotation: Float, translation: Float) -> Float:
 
 @kernel
 def se3_inverse(a_T_b: Float) -> Float:
-    """``b_T_a`` (4, 4)."""
+    """Invert a transform (4, 4): ``b_T_a``."""
     inverse = np.eye(4)
     for i in range(3):
         for j in range(3):
@@ -146,7 +146,10 @@ def se3_inverse(a_T_b: Float) -> Float:
 
 @kernel
 def se3_compose(a_T_b: Float, b_T_c: Float) -> Float:
-    """``a_T_c`` (4, 4); in a kernel several times faster than ``@``, which calls a library for large matrices."""
+    """Multiply two transforms (4, 4): ``a_T_c``.
+
+    In a kernel this is several times faster than ``@``, which calls a library for large matrices.
+    """
     a, b = a_T_b, b_T_c
     product = np.zeros((4, 4))
     for i in range(3):
@@ -158,7 +161,7 @@ def se3_compose(a_T_b: Float, b_T_c: Float) -> Float:
 
 @kernel
 def se3_exp(xi: Float) -> Float:
-    """Transform (4, 4) of a tangent vector (6,) ``[rotation, translation]``."""
+    """Compute the transform (4, 4) of a tangent vector (6,) ``[rotation, translation]``."""
     phi = xi[:3]
     left_jacobian = so3_right_jacobian(-phi)
     return se3(so3_exp(phi), left_jacobian @ xi[3:])
@@ -166,7 +169,7 @@ def se3_exp(xi: Float) -> Float:
 
 @kernel
 def se3_log(a_T_b: Float) -> Float:
-    """Tangent vector (6,) ``[rotation, translation]`` of a transform (4, 4)."""
+    """Compute the tangent vector (6,) ``[rotation, translation]`` of a transform (4, 4)."""
     phi = so3_log(np.ascontiguousarray(a_T_b[:3, :3]))
     xi = np.empty(6)
     put(xi[:3], phi)
@@ -176,7 +179,7 @@ def se3_log(a_T_b: Float) -> Float:
 
 @kernel
 def se3_adjoint(a_T_b: Float) -> Float:
-    """Adjoint (6, 6): ``a_T_b exp(xi_b) = exp(Ad xi_b) a_T_b``."""
+    """Compute the adjoint (6, 6): ``a_T_b exp(xi_b) = exp(Ad xi_b) a_T_b``."""
     rotation = np.ascontiguousarray(a_T_b[:3, :3])
     adjoint = np.zeros((6, 6))
     put(adjoint[:3, :3], rotation)
@@ -187,7 +190,7 @@ def se3_adjoint(a_T_b: Float) -> Float:
 
 @kernel
 def se3_right_jacobian_inverse(xi: Float) -> Float:
-    """``J`` (6, 6) with ``log(exp(xi) exp(d)) = xi + J d`` to first order in d."""
+    """Compute ``J`` (6, 6) with ``log(exp(xi) exp(d)) = xi + J d`` to first order in d."""
     phi = xi[:3]
     rho = xi[3:]
     diagonal = so3_right_jacobian_inverse(phi)
@@ -201,7 +204,7 @@ def se3_right_jacobian_inverse(xi: Float) -> Float:
 
 @kernel
 def _left_coupling(phi: Float, rho: Float) -> Float:
-    """Block Q (3, 3) of SE(3)'s left Jacobian (Barfoot, *State Estimation for Robotics*, eq. 7.86)."""
+    """Compute block Q (3, 3) of SE(3)'s left Jacobian (T. Barfoot, *State Estimation for Robotics*, eq. 7.86)."""
     angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     angle = np.sqrt(angle2)
     if angle < 1e-2:  # series: the closed form loses all digits in angle^5
@@ -222,6 +225,6 @@ def _left_coupling(phi: Float, rho: Float) -> Float:
 
 
 def interpolate(a_T_b0: Float, a_T_b1: Float, fraction: float) -> Float:
-    """Pose (4, 4) between two poses: position on the chord, rotation by constant rate; fraction 0 to 1."""
+    """Interpolate between two poses (4, 4): position on the chord, rotation at a constant rate; fraction 0 to 1."""
     rotation = so3_exp(fraction * so3_log(a_T_b0[:3, :3].T @ a_T_b1[:3, :3]))
     return se3(a_T_b0[:3, :3] @ rotation, (1.0 - fraction) * a_T_b0[:3, 3] + fraction * a_T_b1[:3, 3])

@@ -1,4 +1,4 @@
-"""The one way in which numba compiles our kernels, and what is known of their cache.
+"""Compilation of numerical kernels with numba, and their cache on disk.
 
 numba notices an edit to a kernel's own file but not to a file whose kernels it calls. The cache folder
 of a module is therefore named after a digest of its source and of all that it imports from this package:
@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 
 @functools.cache
 def cache_root() -> Path:
-    """Folder of all compiled kernels: ``GRAPHVIO_CACHE_DIR``, or graphvio's folder in the user's cache."""
+    """Return the folder of all compiled kernels: ``GRAPHVIO_CACHE_DIR``, or graphvio's folder in the user's cache."""
     chosen = os.environ.get("GRAPHVIO_CACHE_DIR")
     user_cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache")
     try:
@@ -55,7 +55,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def vector_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """A kernel for sums over points, whose order is left to the compiler; NaN and infinity keep their meaning.
+    """Compile a kernel for sums over points, whose order is left to the compiler; NaN and infinity keep their meaning.
 
     Equal inputs still give equal results on one machine.
     """
@@ -63,9 +63,9 @@ def vector_kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def fast_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """The same for sums over pixels: their order is left to the compiler, so that it may use vector instructions.
+    """Compile a kernel for sums over pixels, whose order is left to the compiler; NaN and infinity must not occur.
 
-    Equal inputs still give equal results on one machine; NaN and infinity must not occur.
+    Equal inputs still give equal results on one machine.
     """
     return _compile(function, fastmath=True)
 
@@ -86,7 +86,7 @@ def _compile(function: Callable[P, R], *, fastmath: bool | set[str]) -> Callable
 
 
 def any_compiled_before(module: str) -> bool:
-    """Whether the cache holds code of a module's kernels, so that their first call need not wait for a compiler."""
+    """Return whether the cache holds code of a module's kernels, so that a first call need not compile."""
     return any((cache_root() / _digest(module)).rglob("*.nbc"))
 
 
@@ -109,19 +109,19 @@ def _digest(module: str) -> str:
 
 
 class _Announcer(numba_event.Listener):  # type: ignore[misc]
-    """Tells once in a process that a kernel is being compiled, so that the pause is no riddle."""
+    """Logs, once in a process, that kernels are being compiled."""
 
     def __init__(self) -> None:
-        self._told = False
+        self._announced = False
 
     def on_start(self, event: Any) -> None:
-        """Called by numba when it begins to compile a function that no cache holds."""
-        if not self._told and event.data["dispatcher"] in _registered:
-            self._told = True
+        """Handle that numba begins to compile a function that no cache holds."""
+        if not self._announced and event.data["dispatcher"] in _registered:
+            self._announced = True
             _log.warning("compiling numerical kernels for this machine, once; it takes one to two minutes")
 
     def on_end(self, event: Any) -> None:
-        """Called by numba when it has compiled a function."""
+        """Handle that numba has compiled a function."""
 
 
 numba_event.register("numba:compile", _Announcer())

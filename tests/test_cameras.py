@@ -41,7 +41,7 @@ def widest(model: int) -> float:
 
 
 @lens
-def test_projection_and_its_inverse(model: int, distortion: Float) -> None:
+def test_unproject_inverts_project(model: int, distortion: Float) -> None:
     points = points_within(widest(model))
     pixels, valid = project_points(model, INTRINSICS, distortion, points)
     assert valid.all()
@@ -54,7 +54,7 @@ coefficients = st.tuples(st.floats(-0.3, 0.3), st.floats(-0.1, 0.1), st.floats(-
 
 
 @given(coefficients, st.floats(-0.6, 0.6), st.floats(-0.6, 0.6))
-def test_any_moderate_distortion_is_undone(k: tuple[float, float, float, float], x: float, y: float) -> None:
+def test_undistort_inverts_moderate_distortion(k: tuple[float, float, float, float], x: float, y: float) -> None:
     for model in (RADIAL_TANGENTIAL, EQUIDISTANT):
         distortion = np.array([*k, 0.0])
         xd, yd, *_ = distort(model, distortion, x, y)
@@ -64,7 +64,7 @@ def test_any_moderate_distortion_is_undone(k: tuple[float, float, float, float],
 
 
 @lens
-def test_projection_is_opencvs(model: int, distortion: Float) -> None:
+def test_project_points_is_opencvs(model: int, distortion: Float) -> None:
     points = points_within(widest(model))
     matrix = np.array([[INTRINSICS[0], 0.0, INTRINSICS[2]], [0.0, INTRINSICS[1], INTRINSICS[3]], [0.0, 0.0, 1.0]])
     still = np.zeros(3)
@@ -77,13 +77,13 @@ def test_projection_is_opencvs(model: int, distortion: Float) -> None:
 
 
 @lens
-def test_distortion_at_the_centre_is_none(model: int, distortion: Float) -> None:
+def test_distort_at_the_centre_is_the_identity(model: int, distortion: Float) -> None:
     np.testing.assert_allclose(distort(model, distortion, 0.0, 0.0), [0, 0, 1, 0, 0, 1])
     assert undistort(model, distortion, 0.0, 0.0) == (0.0, 0.0, True)
 
 
 @lens
-def test_points_that_no_image_shows(model: int, distortion: Float) -> None:
+def test_project_points_outside_the_view_is_invalid(model: int, distortion: Float) -> None:
     nan, limit = float("nan"), np.tan(np.deg2rad(80.0))
     points = np.array(
         [[0, 0, -1], [0, 0, 0], [0, 0, nan], [nan, 0, 1], [0, nan, 1], [1.001 * limit, 0, 1], [0, -1e9, 1], [0, 0, 1]],
@@ -95,7 +95,7 @@ def test_points_that_no_image_shows(model: int, distortion: Float) -> None:
 
 
 @lens
-def test_pixels_that_no_ray_reaches(model: int, distortion: Float) -> None:
+def test_unproject_pixels_that_no_ray_reaches_is_invalid(model: int, distortion: Float) -> None:
     rays, found = unproject_pixels(model, INTRINSICS, distortion, np.array([[1e5, 0.0], [np.nan, 0.0], [322.0, 237.0]]))
     assert found.tolist() == [False, False, True]
     assert np.isfinite(rays[found]).all()

@@ -19,11 +19,11 @@ def test_round_trip_through_yaml(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "{}", "# nothing\n", "motion:\n", "motion: {}\n"])
-def test_what_is_not_mentioned_keeps_its_default(text: str) -> None:
+def test_from_yaml_keeps_defaults_of_missing_values(text: str) -> None:
     assert Config.from_yaml(text) == Config()
 
 
-def test_one_value_leaves_its_neighbours() -> None:
+def test_from_yaml_of_one_value_keeps_the_others() -> None:
     assert Config.from_yaml("motion: {seed: 3}") == Config(motion=MotionConfig(seed=3))
 
 
@@ -37,7 +37,7 @@ def test_one_value_leaves_its_neighbours() -> None:
         ("smoother: {lag: 3}", "lag_s"),
     ],
 )
-def test_an_unknown_key_names_the_nearest_one(text: str, named: str) -> None:
+def test_unknown_key_error_names_the_nearest_one(text: str, named: str) -> None:
     with pytest.raises(ConfigError, match=f"unknown key .*did you mean '{named}'"):
         Config.from_yaml(text)
 
@@ -63,7 +63,7 @@ def test_an_unknown_key_names_the_nearest_one(text: str, named: str) -> None:
         "motion: [selection]",
     ],
 )
-def test_bad_values_say_where(value: str) -> None:
+def test_bad_value_error_says_where(value: str) -> None:
     with pytest.raises(ConfigError, match=r"my\.yaml: motion"):
         Config.from_yaml(value, "my.yaml")
 
@@ -71,7 +71,7 @@ def test_bad_values_say_where(value: str) -> None:
 @pytest.mark.parametrize(
     "value", ["motion: {hypotheses: .nan}", "motion: {hypotheses: .inf}", f"motion: {{pixel_sigma_px: 1{400 * '0'}}}"]
 )
-def test_numbers_that_no_whole_number_or_float_holds(value: str) -> None:
+def test_numbers_too_large_are_rejected(value: str) -> None:
     with pytest.raises(ConfigError, match=r"my\.yaml: motion"):
         Config.from_yaml(value, "my.yaml")
 
@@ -92,7 +92,7 @@ def test_numbers_that_no_whole_number_or_float_holds(value: str) -> None:
         "motion: {min_inliers: 0}",
     ],
 )
-def test_values_with_which_nothing_can_work_are_refused(value: str) -> None:
+def test_values_out_of_range_are_rejected(value: str) -> None:
     with pytest.raises(ConfigError):
         Config.from_yaml(value)
 
@@ -106,17 +106,17 @@ def test_values_with_which_nothing_can_work_are_refused(value: str) -> None:
         ("motion", "min_inliers", 3, 1000),
     ],
 )
-def test_ranges_are_told(stage: str, name: str, least: int, most: int) -> None:
+def test_error_out_of_range_states_the_range(stage: str, name: str, least: int, most: int) -> None:
     for value in (least, most):
         assert getattr(getattr(Config.from_yaml(f"{stage}: {{{name}: {value}}}"), stage), name) == value
     for value in (least - 1, most + 1):
-        told = "it must be positive" if value == 0 else f"choose from {least} to {most}"
-        with pytest.raises(ConfigError, match=f"{name}: is {value}; {told}"):
+        expected = "it must be positive" if value == 0 else f"choose from {least} to {most}"
+        with pytest.raises(ConfigError, match=f"{name}: is {value}; {expected}"):
             Config.from_yaml(f"{stage}: {{{name}: {value}}}")
 
 
 @pytest.mark.parametrize("text", ["motion: {", "3", "- motion", "just words"])
-def test_what_is_no_mapping(text: str) -> None:
+def test_from_yaml_of_no_mapping_is_rejected(text: str) -> None:
     with pytest.raises(ConfigError, match=r"^my\.yaml: "):
         Config.from_yaml(text, "my.yaml")
 
@@ -144,13 +144,13 @@ def test_every_profile_loads() -> None:
 
 
 @pytest.mark.parametrize("text", ["{estimator: filter}", "{estimate_time_offset: true}\nmotion: {reference: previous}"])
-def test_stages_that_do_not_fit_together_are_refused(text: str) -> None:
+def test_stages_that_do_not_fit_together_are_rejected(text: str) -> None:
     with pytest.raises(ConfigError, match=r"set motion: {reference: (previous|keyframe)}"):
         Config.from_yaml(f"fusion: {text}")
 
 
 @pytest.mark.parametrize("value", ["1", "yes please", "[true]"])
-def test_a_switch_is_true_or_false(value: str) -> None:
+def test_switch_must_be_true_or_false(value: str) -> None:
     with pytest.raises(ConfigError, match=r"estimate_time_offset: is .*; it must be true or false"):
         Config.from_yaml(f"fusion: {{estimate_time_offset: {value}}}")
 
@@ -170,7 +170,7 @@ def another(value: object) -> object:
     return 0.5 * value or 0.1
 
 
-def test_sha256_tells_configurations_apart_by_what_they_do() -> None:
+def test_sha256_differs_with_every_value() -> None:
     config = Config.from_yaml("motion: {reference: previous}")  # suits both estimators
     assert config.sha256() == Config.from_yaml("motion: {reference: previous}").sha256() != Config().sha256()
     assert Config().sha256() == Config.from_yaml("motion: {min_inliers: 12.0, max_error_px: 3}").sha256()

@@ -47,7 +47,7 @@ def flattened(seen: Observations, truth: Float) -> Observations:
     return seen._replace(points=points, left=places[0], right=places[1])
 
 
-def test_the_error_is_on_the_side_that_the_covariance_describes() -> None:
+def test_covariance_is_of_the_current_body_frame() -> None:
     truth, seen = draw_frame(replace(FAR, noise_px=0.0), np.random.default_rng(1))
     refined = refine(arrays_of_walks(), seen, truth, CONFIG)
     np.testing.assert_allclose(refined.cur_T_ref, truth, atol=1e-6)
@@ -66,22 +66,22 @@ def test_the_error_is_on_the_side_that_the_covariance_describes() -> None:
     [RICH, FAR, FEW, Conditions(per_pair=(150, 0)), Conditions(outlier_share=0.3)],
     ids=["rich", "far", "few points", "one pair blind", "outliers"],
 )
-def test_covariance_is_honest(conditions: Conditions) -> None:
+def test_covariance_is_consistent(conditions: Conditions) -> None:
     campaign = run_campaign(conditions, CONFIG, FRAMES, seed=11)
     low, high = band(FRAMES)
     assert low < campaign.nees().mean() < high
     assert campaign.nees().max() < 50.0  # no frame that the covariance does not cover at all
 
 
-def test_far_points_do_not_bias_the_motion() -> None:
-    """Noisy depths must not shorten the motion: its mean error along it is nothing beside one motion's own sigma."""
+def test_refine_of_far_points_is_unbiased() -> None:
+    """Noisy depths must not shorten the motion: its mean error along it is small compared with its sigma."""
     campaign = run_campaign(FAR, CONFIG, 300, seed=12)
     standardised = np.array(campaign.errors) / np.sqrt([np.diag(c) for c in campaign.covariances])
     assert np.abs(standardised.mean(axis=0)).max() < 0.25  # the mean of 300 is known to 0.06
 
 
 @pytest.mark.parametrize("noise_px", [0.15, 0.6])
-def test_covariance_follows_the_noise_that_there_is(noise_px: float) -> None:
+def test_covariance_follows_the_actual_noise(noise_px: float) -> None:
     """Within 10 % of 6 beyond the band of the mean: the Cauchy scale follows only noise that is less than modelled."""
     campaign = run_campaign(replace(RICH, noise_px=noise_px, per_pair=(80, 80)), CONFIG, FRAMES, seed=13)
     low, high = band(FRAMES)
@@ -99,14 +99,14 @@ def test_covariance_follows_the_noise_that_there_is(noise_px: float) -> None:
     ],
     ids=["one side", "no right image", "four points", "few and outliers", "far and outliers"],
 )
-def test_covariance_is_near_the_truth_in_poor_geometry(conditions: Conditions, most: float) -> None:
+def test_covariance_in_poor_geometry_is_nearly_consistent(conditions: Conditions, most: float) -> None:
     """The NEES may leave its band by so much: the variance of few residuals is itself not known well."""
     campaign = run_campaign(conditions, CONFIG, FRAMES, seed=14)
     low, high = band(FRAMES)
     assert low - most < campaign.nees().mean() < high + most
 
 
-def test_far_points_leave_translation_uncertain_and_rotation_sure() -> None:
+def test_covariance_of_far_points_is_large_in_translation_only() -> None:
     near, far = (
         np.mean(run_campaign(replace(c, per_pair=(80, 80)), CONFIG, 30, seed=15).covariances, axis=0)
         for c in (RICH, FAR)
@@ -116,7 +116,7 @@ def test_far_points_leave_translation_uncertain_and_rotation_sure() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_too_few_points_make_a_large_covariance_and_no_failure(count: int) -> None:
+def test_refine_of_too_few_points_gives_a_large_covariance(count: int) -> None:
     truth, seen = draw_frame(Conditions(per_pair=(count, 0)), np.random.default_rng(2))
     for has_right in (True, False):
         part = seen._replace(has_right=np.full(count, has_right))
@@ -128,7 +128,7 @@ def test_too_few_points_make_a_large_covariance_and_no_failure(count: int) -> No
             assert sigmas.max() > 1.0  # the direction that nothing constrains
 
 
-def test_points_in_one_plane_constrain_all_directions() -> None:
+def test_refine_of_points_in_one_plane_constrains_all_directions() -> None:
     truth, seen = draw_frame(Conditions(per_pair=(100, 0)), np.random.default_rng(4))
     flat = flattened(seen, truth)
     refined = solve(flat, truth, CONFIG, np.random.default_rng(5))
@@ -159,10 +159,10 @@ def test_shared_covariance_is_that_between_motions_of_one_reference(conditions: 
         for name in ("shared_covariance", "covariance")
     )
     white = np.linalg.inv(np.linalg.cholesky(total))
-    found, told = (white @ c @ white.T for c in (drawn.cross_covariance(), shared))
+    found, stated = (white @ c @ white.T for c in (drawn.cross_covariance(), shared))
     # an element of a covariance of unit variables, from 600 draws, is known to 0.04
-    assert np.abs(found - told).max() < 0.2
-    assert np.trace(found) == pytest.approx(np.trace(told), rel=0.15)
+    assert np.abs(found - stated).max() < 0.2
+    assert np.trace(found) == pytest.approx(np.trace(stated), rel=0.15)
     assert np.linalg.eigvalsh(total - shared).min() > 0.0
 
 
@@ -170,22 +170,22 @@ CHAINS = 100
 
 
 @pytest.mark.parametrize("conditions", [RICH, FAR], ids=["near", "far"])
-def test_a_pose_composed_over_twenty_frames_is_within_its_covariance(conditions: Conditions) -> None:
+def test_pose_over_twenty_frames_is_consistent(conditions: Conditions) -> None:
     """From between two keyframes, through three, to between two others; each keyframe has tracks of its own."""
     some = replace(conditions, per_pair=(40, 40))
     low, high = band(CHAINS)
     assert low < run_smoothed(some, CONFIG, CHAINS, seed=17, renewed=True).nees().mean() < high
 
 
-def test_a_pose_composed_as_if_motions_from_one_keyframe_had_nothing_in_common_is_not() -> None:
+def test_pose_without_shared_covariance_is_overconfident() -> None:
     some = replace(RICH, per_pair=(40, 40))
     unaware = run_smoothed(some, CONFIG, CHAINS, seed=17, renewed=True, split=False)
     assert unaware.nees().mean() < band(CHAINS)[0] - 0.3
 
 
 @pytest.mark.parametrize("conditions", [RICH, FAR], ids=["near", "far"])
-def test_tracks_that_go_on_through_keyframes_make_the_covariance_too_large(conditions: Conditions) -> None:
-    """Noise of a keyframe's images then cancels in part, of which the smoother is not told: it errs on the safe side,
+def test_pose_of_tracks_through_keyframes_is_conservative(conditions: Conditions) -> None:
+    """Noise of a keyframe's images then cancels in part, which the smoother does not know: it errs on the safe side,
     by less than a factor of 1.8 in sigma."""
     some = replace(conditions, per_pair=(40, 40))
     _, high = band(CHAINS)

@@ -1,4 +1,4 @@
-"""The anchor's patches, found again in views of a slanted wall whose places are known."""
+"""A keyframe's patches, found again in views of a slanted wall whose places are known."""
 
 from dataclasses import replace
 
@@ -81,16 +81,16 @@ def errors_px(frame: PairFrame, slopes: Float) -> tuple[Float, float]:
     return np.linalg.norm(pixels - truth, axis=1)[found], float(found.mean())
 
 
-def test_patches_are_found_on_a_slanted_wall_by_its_slope() -> None:
+def test_find_on_a_slanted_wall_needs_its_slope() -> None:
     frame = tracks()
-    told, found = errors_px(frame, frame.slopes)
-    untold, _ = errors_px(frame, np.zeros_like(frame.slopes))
+    known, found = errors_px(frame, frame.slopes)
+    unknown, _ = errors_px(frame, np.zeros_like(frame.slopes))
     assert found > 0.9
-    assert np.median(told) < 0.04
-    assert np.median(untold) > 3.0 * np.median(told)
+    assert np.median(known) < 0.04
+    assert np.median(unknown) > 3.0 * np.median(known)
 
 
-def test_what_the_anchor_does_not_know_is_not_found() -> None:
+def test_find_of_unknown_tracks_returns_the_guess() -> None:
     frame = tracks()
     frame = replace(frame, has_depth=np.arange(len(frame.ids)) % 3 > 0)
     strangers = np.concatenate([[3], frame.ids[:5] + 1, [10**9]])
@@ -106,7 +106,7 @@ def test_what_the_anchor_does_not_know_is_not_found() -> None:
 
 
 @pytest.mark.parametrize("frame", [None, PairFrame.empty()], ids=["never placed", "no tracks"])
-def test_an_anchor_without_tracks_finds_nothing(frame: PairFrame | None) -> None:
+def test_find_without_patches_finds_nothing(frame: PairFrame | None) -> None:
     patches = KeyframePatches(pair(), WINDOW_PX) if frame is None else placed(frame)
     guess = np.array([[100.0, 80.0]])
     pixels, found = patches.find(np.array([0]), guess, view(np.eye(4)), np.eye(4), MIN_GRADIENT)
@@ -114,14 +114,14 @@ def test_an_anchor_without_tracks_finds_nothing(frame: PairFrame | None) -> None
     assert not found.any()
 
 
-def test_no_tracks_are_asked_for() -> None:
+def test_find_of_no_tracks_returns_empty() -> None:
     none = np.zeros((0, 2))
     pixels, found = placed(tracks()).find(np.zeros(0, dtype=np.int64), none, view(np.eye(4)), np.eye(4), MIN_GRADIENT)
     assert pixels.shape == (0, 2)
     assert found.shape == (0,)
 
 
-def test_a_prediction_that_turns_the_wall_away_finds_nothing() -> None:
+def test_find_with_a_prediction_that_hides_the_wall_finds_nothing() -> None:
     frame = tracks()
     away = transform([0.0, 0.0, 0.0], [0.0, 0.0, -50.0])
     _, found = placed(frame).find(frame.ids, frame.pixels, view(np.eye(4)), away, MIN_GRADIENT)

@@ -122,7 +122,7 @@ def expanded(seen: Observations, cur_T_ref: Float) -> Expansion:
 
 
 @given(counts=st.lists(st.integers(0, 70), min_size=1, max_size=4))
-def test_blocks_hold_every_point_once(counts: list[int]) -> None:
+def test_in_blocks_holds_every_point_once(counts: list[int]) -> None:
     rng = np.random.default_rng(sum(counts))
     n = sum(counts)
     points, covariances = rng.random((n, 3)), rng.random((n, 3, 3))
@@ -143,7 +143,7 @@ def test_blocks_hold_every_point_once(counts: list[int]) -> None:
 
 
 @PAIRS_AND_RIGHTS
-def test_the_gradient_is_the_costs_numerical_derivative(pairs: tuple[int, ...], share: float) -> None:
+def test_linearise_gradient_is_the_numerical_derivative_of_the_cost(pairs: tuple[int, ...], share: float) -> None:
     """``sum w J^T r``, r being measured minus predicted, is ``-scale^2 / 2`` times the derivative of the cost."""
     seen, cur_T_ref = scene(pairs, share)
     at = expanded(seen, cur_T_ref)
@@ -156,7 +156,7 @@ def test_the_gradient_is_the_costs_numerical_derivative(pairs: tuple[int, ...], 
 
 
 @PAIRS_AND_RIGHTS
-def test_the_normal_equations_are_those_of_numerical_derivatives(pairs: tuple[int, ...], share: float) -> None:
+def test_linearise_normal_equations_match_numerical_derivatives(pairs: tuple[int, ...], share: float) -> None:
     seen, cur_T_ref = scene(pairs, share)
     expansion = expanded(seen, cur_T_ref)
     cost, hessian, gradient, errors2 = linearised(seen, cur_T_ref, expansion)
@@ -181,7 +181,7 @@ def test_the_normal_equations_are_those_of_numerical_derivatives(pairs: tuple[in
 
 
 @PAIRS_AND_RIGHTS
-def test_points_are_whitened_where_both_instants_say_that_they_are(pairs: tuple[int, ...], share: float) -> None:
+def test_expand_whitens_at_the_point_of_both_instants(pairs: tuple[int, ...], share: float) -> None:
     """The covariance ``sigma^2 (1 + J C J^T)``, and the correction ``C J^T S^-1 r`` that leads to the same place."""
     seen, cur_T_ref = scene(pairs, share)
     at = Places.of(seen, expanded(seen, cur_T_ref))
@@ -206,7 +206,7 @@ def test_points_are_whitened_where_both_instants_say_that_they_are(pairs: tuple[
 
 
 @PAIRS_AND_RIGHTS
-def test_information_through_points_is_its_formula(pairs: tuple[int, ...], share: float) -> None:
+def test_information_through_points_matches_its_formula(pairs: tuple[int, ...], share: float) -> None:
     seen, cur_T_ref = scene(pairs, share)
     expansion = expanded(seen, cur_T_ref)
     at, blocks = Places.of(seen, expansion), in_blocks(seen)
@@ -224,7 +224,7 @@ def test_information_through_points_is_its_formula(pairs: tuple[int, ...], share
     np.testing.assert_allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-5)
 
 
-def test_points_behind_a_camera_and_inactive_ones_give_no_equations() -> None:
+def test_linearise_leaves_out_points_behind_a_camera_and_inactive_ones() -> None:
     seen, cur_T_ref = scene((0, 1), 0.6)
     at = Places.of(seen, expanded(seen, cur_T_ref))
     behind, n = 7, len(seen.pair)
@@ -233,16 +233,16 @@ def test_points_behind_a_camera_and_inactive_ones_give_no_equations() -> None:
     active = np.arange(n) != 3
     cost, hessian, gradient, errors2 = linearised(seen, cur_T_ref, at.expansion(seen), active.astype(float))
     assert np.flatnonzero(np.isinf(errors2)).tolist() == [behind]
-    rest = active & (np.arange(n) != behind)
-    few = seen.of_rows(rest)
-    places = Places(at.points[rest], at.offsets[rest], at.whiteners[rest])
+    counted = active & (np.arange(n) != behind)
+    few = seen.of_rows(counted)
+    places = Places(at.points[counted], at.offsets[counted], at.whiteners[counted])
     part = linearised(few, cur_T_ref, places.expansion(few))
     assert cost == pytest.approx(part[0] + np.log1p(1e6))
     np.testing.assert_allclose(hessian, part[1], rtol=1e-11)
     np.testing.assert_allclose(gradient, part[2], rtol=1e-9, atol=1e-9)
 
 
-def test_points_next_to_the_plane_of_a_camera_leave_the_others_their_equations() -> None:
+def test_linearise_with_points_next_to_the_camera_plane_stays_finite() -> None:
     """The derivatives of such points are without bounds; what is made of them must stay a number."""
     seen, cur_T_ref = scene((0, 1), 0.6)
     depth = left_motions(np.ascontiguousarray(cur_T_ref), ARRAYS)[0, 0, 2]

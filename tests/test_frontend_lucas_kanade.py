@@ -29,17 +29,17 @@ def grid() -> Float:
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.37, -0.21), (6.5, 3.25), (-14.2, 9.9)])
-def test_a_known_shift_is_found(shift: tuple[float, float]) -> None:
+def test_track_finds_a_known_shift(shift: tuple[float, float]) -> None:
     source, target = build_pyramid(texture(), LEVELS), build_pyramid(texture(shift), LEVELS)
     moved, found = track(source, target, grid(), grid(), window_px=15, levels=LEVELS, max_return_px=0.5)
-    assert found.mean() > 0.85  # the rest sees the edge
+    assert found.mean() > 0.85  # the others see the edge
     error = np.linalg.norm(moved - grid() - shift, axis=1)[found]
     assert np.median(error) < 0.02
     assert np.quantile(error, 0.95) < 0.1
 
 
 @pytest.mark.parametrize(("gain", "offset", "within_px"), [(1.0, -20.0, 0.03), (0.9, -10.0, 0.12)])
-def test_a_change_of_exposure_hardly_moves_a_point(gain: float, offset: float, within_px: float) -> None:
+def test_track_under_a_change_of_exposure_hardly_moves(gain: float, offset: float, within_px: float) -> None:
     darker = (texture((1.3, 0.6)) * gain + offset).clip(0, 255).astype(np.uint8)
     source, target = build_pyramid(texture(), LEVELS), build_pyramid(darker, LEVELS)
     moved, found = track(source, target, grid(), grid(), window_px=15, levels=LEVELS, max_return_px=0.5)
@@ -51,8 +51,8 @@ def blurred(image: Image, length: int) -> Image:
     return np.asarray(cv2.filter2D(image, -1, np.full((1, length), 1.0 / length)), dtype=np.uint8)
 
 
-def test_a_place_that_a_blur_leaves_open_is_refused() -> None:
-    """Along the blur an alignment ends where it starts; many points with one such error look like a motion."""
+def test_track_along_a_blur_is_rejected() -> None:
+    """Along the blur an alignment ends where it begins; many points with one such error look like a motion."""
     images = [picture(waves(*np.meshgrid(np.arange(320.0) - x, np.arange(240.0)))) for x in (0.0, 0.6)]
     sharp, moved_by = build_pyramid(images[0], LEVELS), np.array([0.6, 0.0])
     level, everything = np.tile(np.eye(2), (len(grid()), 1, 1)), np.ones(len(grid()), dtype=bool)
@@ -72,7 +72,7 @@ def test_a_place_that_a_blur_leaves_open_is_refused() -> None:
     assert max(kept[2]) < 0.15
 
 
-def test_it_agrees_with_opencv() -> None:
+def test_track_agrees_with_opencv() -> None:
     first, second = texture(), texture((4.2, -2.7))
     ours, found = track(
         build_pyramid(first, LEVELS), build_pyramid(second, LEVELS), grid(), grid(),
@@ -87,7 +87,7 @@ def test_it_agrees_with_opencv() -> None:
     assert np.median(np.linalg.norm(ours - theirs, axis=1)[both]) < 0.02
 
 
-def test_what_cannot_be_localised_is_not_found() -> None:
+def test_track_without_texture_finds_nothing() -> None:
     flat = np.full((240, 320), 120, dtype=np.uint8)
     edge = flat.copy()
     edge[:, 160:] = 200
@@ -98,7 +98,7 @@ def test_what_cannot_be_localised_is_not_found() -> None:
         assert not found.any()
 
 
-def test_points_at_the_edge_and_no_points() -> None:
+def test_track_of_points_at_the_edge_and_of_none() -> None:
     pyramid = build_pyramid(texture(), LEVELS)
     edge = np.array([[2.0, 2.0], [318.0, 100.0], [-5.0, 20.0], [1e6, 1e6]])
     _, found = track(pyramid, pyramid, edge, edge, window_px=15, levels=LEVELS, max_return_px=0.5)
@@ -109,7 +109,7 @@ def test_points_at_the_edge_and_no_points() -> None:
     assert found.shape == (0,)
 
 
-def test_another_scene_fails_the_way_back() -> None:
+def test_track_into_another_scene_fails_the_way_back() -> None:
     source, target = build_pyramid(texture(seed=1), LEVELS), build_pyramid(texture(seed=2), LEVELS)
     _, found = track(source, target, grid(), grid(), window_px=15, levels=LEVELS, max_return_px=0.5)
     assert found.mean() < 0.2
@@ -148,21 +148,21 @@ def registered(warp: Float, assumed: Float, guess_error: Float) -> tuple[Float, 
 
 
 @pytest.mark.parametrize("warp", WARPS)
-def test_deformed_patches_are_found_between_the_pixels(warp: Float) -> None:
+def test_register_finds_deformed_patches_to_sub_pixel_precision(warp: Float) -> None:
     errors, found = registered(warp, warp, np.array([0.6, -0.5]))
     assert found.mean() > 0.8
     assert np.median(np.linalg.norm(errors[found], axis=1)) < 0.03
 
 
 @pytest.mark.parametrize("warp", WARPS[1:])
-def test_without_their_deformation_they_are_off_or_lost(warp: Float) -> None:
+def test_register_without_the_deformation_is_off_or_fails(warp: Float) -> None:
     right, found = registered(warp, warp, np.zeros(2))
     wrong, kept = registered(warp, np.eye(2), np.zeros(2))
     off = np.where(kept, np.linalg.norm(wrong, axis=1), np.inf)
     assert np.median(off) > 3.0 * np.median(np.linalg.norm(right[found], axis=1))
 
 
-def test_what_is_not_registered_stays_where_it_was() -> None:
+def test_register_returns_the_guess_where_it_fails() -> None:
     image = warped(np.eye(2), np.zeros(2), np.zeros(2))
     flat = np.full_like(image, 90)
     pixels = np.vstack([grid()[:3], [[4.0, 4.0], [-50.0, 10.0], [1e6, 1e6]]])
@@ -178,13 +178,13 @@ def test_what_is_not_registered_stays_where_it_was() -> None:
     np.testing.assert_array_equal(localised, found)
     np.testing.assert_array_equal(moved[~found], guess[~found])
     _, found, _, _ = register(packed(image), image, pixels[:3], warps[:3], guess[:3], everything[:3], 7, 0.1, 1.0)
-    assert not found.any()  # they are further from the guess than that
+    assert not found.any()  # they are farther from the guess than that
 
 
 # ------------------------------------------------------------------ levels and thresholds
 
 
-def test_few_levels_are_enough_for_a_good_guess_and_failures_get_all() -> None:
+def test_track_tries_failures_of_few_levels_again_with_all() -> None:
     shift = (-14.2, 9.9)
     source, target = build_pyramid(texture(), LEVELS), build_pyramid(texture(shift), LEVELS)
     good, poor = grid() + shift + [0.8, -0.6], grid() + 1.0
@@ -197,7 +197,7 @@ def test_few_levels_are_enough_for_a_good_guess_and_failures_get_all() -> None:
         assert right.mean() > 0.8  # the finest levels alone may take a similar place for the right one
 
 
-def test_the_least_gradient_is_a_choice() -> None:
+def test_track_min_gradient_admits_weaker_patches() -> None:
     faint = np.round(128.0 + (texture().astype(np.float64) - 128.0) / 40.0).astype(np.uint8)
     pyramid = build_pyramid(faint, LEVELS)
     shares = [
@@ -209,14 +209,14 @@ def test_the_least_gradient_is_a_choice() -> None:
 
 
 @pytest.mark.parametrize("window_px", [9, 15, 17, 33])  # with and without a whole vector register to a row
-def test_patches_of_any_size(window_px: int) -> None:
+def test_track_with_patches_of_any_size(window_px: int) -> None:
     source, target = build_pyramid(texture(), LEVELS), build_pyramid(texture((0.6, -0.3)), LEVELS)
     moved, found = track(source, target, grid(), grid(), window_px=window_px, levels=2, max_return_px=0.5)
     assert found.mean() > 0.85
     assert np.median(np.linalg.norm(moved - grid() - (0.6, -0.3), axis=1)[found]) < 0.03
 
 
-def test_patches_up_to_the_very_edge_stay_within_the_image() -> None:
+def test_sample_up_to_the_edge_stays_within_the_image() -> None:
     image = texture()
     pyramid = build_pyramid(image, 1)
     x, y = np.meshgrid(np.arange(0.0, 320.0, 3.1), np.arange(0.0, 240.0, 3.1))
@@ -229,7 +229,7 @@ def test_patches_up_to_the_very_edge_stay_within_the_image() -> None:
 
 
 @pytest.mark.parametrize("half", [4, 7, 8])
-def test_a_deformed_patch_is_interpolated_pixel_by_pixel(half: int) -> None:
+def test_sample_affine_interpolates_pixel_by_pixel(half: int) -> None:
     image = np.random.default_rng(0).integers(0, 256, (60, 80)).astype(np.uint8)
     warp, middle = np.array([[1.1, 0.2], [-0.15, 0.9]]), np.array([41.3, 30.6])
     inside, scratch, out, side = lattice(half).inside, scratch_room(half), room(half), 2 * half + 1
@@ -246,7 +246,7 @@ def test_a_deformed_patch_is_interpolated_pixel_by_pixel(half: int) -> None:
 
 
 @pytest.mark.parametrize("half", [3, 6, 7, 10, 15])
-def test_a_patch_of_any_size_has_its_gradients(half: int) -> None:
+def test_prepare_computes_gradients_of_any_size(half: int) -> None:
     """Central differences of the patch with its border, all of zero mean, and zero in the padding."""
     side = 2 * half + 1
     bordered, patch, gx, gy = room(half + 1), room(half), room(half), room(half)

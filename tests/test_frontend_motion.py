@@ -39,7 +39,7 @@ def take(seen: Observations, rows: Int) -> Observations:
 # ------------------------------------------------------------------ the cost, eq. (1) to (3)
 
 
-def test_cost_of_one_and_two_points_by_hand() -> None:
+def test_global_cost_of_one_and_two_points_by_hand() -> None:
     focal, a = RIG.pairs[0].left.focal_px, 1.5
     seen = seen_points(RIG.with_pairs([0]), STILL, 2, seed())
     one = take(seen, np.array([0]))
@@ -58,7 +58,7 @@ def test_cost_of_one_and_two_points_by_hand() -> None:
     assert robust_cost(STILL, arrays, two, np.array([1]), a) == pytest.approx(np.log(1.0 + 1.0 / a**2))
 
 
-def test_a_point_behind_the_camera_costs_much_and_not_infinitely() -> None:
+def test_global_cost_of_points_behind_the_camera_is_finite() -> None:
     seen = seen_points(RIG, STILL, 5, seed())
     backwards = transform([0.0, np.pi, 0.0], [0.0, 0.0, 0.0])
     assert global_cost(ARRAYS, seen, backwards, 1.5) == pytest.approx(20 * np.log(1.0 + 1e6))
@@ -67,7 +67,7 @@ def test_a_point_behind_the_camera_costs_much_and_not_infinitely() -> None:
 # ------------------------------------------------------------------ hypotheses
 
 
-def test_hypotheses_of_each_pair_are_motions_of_body() -> None:
+def test_hypothesise_returns_motions_of_body() -> None:
     seen = seen_points(RIG, TRUTH, 60, seed(4))
     found, sources = hypothesise(ARRAYS, seen, 100, 0.3, seed())
     assert len(found) == len(sources)
@@ -78,7 +78,7 @@ def test_hypotheses_of_each_pair_are_motions_of_body() -> None:
         assert np.mean(errors < 1e-6) > 0.9
 
 
-def test_no_hypotheses_without_three_near_points() -> None:
+def test_hypothesise_without_three_near_points_returns_none() -> None:
     seen = seen_points(RIG, TRUTH, 2, seed())
     assert hypothesise(ARRAYS, seen, 10, 0.3, seed())[0].shape == (0, 4, 4)
     far = seen_points(RIG, TRUTH, 30, seed())
@@ -87,12 +87,12 @@ def test_no_hypotheses_without_three_near_points() -> None:
     assert np.array_equal(preempt(ARRAYS, far, TRUTH[None], 100, 1.5, seed()), TRUTH)
 
 
-def test_a_pair_that_something_stands_in_front_of_draws_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_search_with_an_obstructed_pair_samples_few(monkeypatch: pytest.MonkeyPatch) -> None:
     """One pair's right triple is enough."""
-    drawn: list[int] = []
+    sampled: list[int] = []
 
     def counted(*arguments: Any) -> tuple[Float, Int]:
-        drawn.append(arguments[2])
+        sampled.append(arguments[2])
         return hypothesise(*arguments)
 
     monkeypatch.setattr("graphvio.frontend.ransac.hypothesise", counted)
@@ -100,15 +100,15 @@ def test_a_pair_that_something_stands_in_front_of_draws_no_more(monkeypatch: pyt
     blocked = seen_points(RIG, TRUTH, 60, seed(4), sigma_px=0.3, outlier_share=1.0)
     seen = Observations(*(np.concatenate([a, b]) for a, b in zip(sound.of_pair(0), blocked.of_pair(1), strict=True)))
     best = search(ARRAYS, seen, STILL, CONFIG, seed())
-    assert sum(drawn) <= 24  # of 500
+    assert sum(sampled) <= 24  # of 500
     assert np.abs(best - TRUTH).max() < 0.02
-    drawn.clear()
+    sampled.clear()
     search(ARRAYS, blocked, STILL, CONFIG, seed())
-    assert sum(drawn) == 500
+    assert sum(sampled) == 500
 
 
 @pytest.mark.parametrize("chunk_points", [1, 10, 1000])
-def test_preemption_keeps_the_best(chunk_points: int) -> None:
+def test_preempt_keeps_the_best(chunk_points: int) -> None:
     seen = seen_points(RIG, TRUTH, 80, seed(5), sigma_px=0.2, outlier_share=0.2)
     wrong = [TRUTH @ random_transform(seed(10 + i), 0.1, 0.3) for i in range(50)]
     hypotheses = np.ascontiguousarray(np.array([*wrong[:31], TRUTH, *wrong[31:]]))
@@ -143,7 +143,7 @@ def eliminated_cost(seen: Observations, cur_T_ref: Float, config: MotionConfig) 
     return total
 
 
-def test_the_refined_motion_is_a_minimum_of_the_cost() -> None:
+def test_refine_finds_a_minimum_of_the_cost() -> None:
     seen = seen_points(RIG, TRUTH, 25, seed(6), sigma_px=0.3)
     seen = seen._replace(has_right=seed(7).random(50) < 0.8)
     everyone = np.ones(50, dtype=bool)  # known, so that both pairs count for the same
@@ -156,11 +156,11 @@ def test_the_refined_motion_is_a_minimum_of_the_cost() -> None:
             moved = se3_exp(sign * steps[axis] * np.eye(6)[axis]) @ refined.cur_T_ref
             costs.append(eliminated_cost(seen, np.ascontiguousarray(moved), CONFIG) - lowest)
         assert min(costs) > 0.0
-        assert abs(costs[1] - costs[0]) < 0.2 * (costs[0] + costs[1])  # the gradient is nothing beside the curvature
+        assert abs(costs[1] - costs[0]) < 0.2 * (costs[0] + costs[1])  # the gradient is much less than the curvature
 
 
 @pytest.mark.parametrize("pairs", [[0], [1], [0, 1]])
-def test_truth_is_recovered_from_points_without_noise(pairs: list[int]) -> None:
+def test_refine_without_noise_recovers_the_truth(pairs: list[int]) -> None:
     rig = RIG.with_pairs(pairs)
     seen = seen_points(rig, TRUTH, 60, seed(8))
     for start in (STILL, TRUTH @ transform([0.05, 0.05, -0.05], [0.1, -0.1, 0.1])):
@@ -170,7 +170,7 @@ def test_truth_is_recovered_from_points_without_noise(pairs: list[int]) -> None:
 
 
 @pytest.mark.parametrize("number", range(5))
-def test_truth_is_recovered_among_outliers(number: int) -> None:
+def test_motion_among_outliers_recovers_the_truth(number: int) -> None:
     seen = seen_points(RIG, TRUTH, 80, seed(20 + number), sigma_px=0.3, outlier_share=0.3)
     far_away = transform([0.3, 0.2, -0.2], [0.5, 0.5, 0.5])  # a prediction of no use
     for solve in (joint_motion, best_pair_motion):
@@ -181,8 +181,8 @@ def test_truth_is_recovered_among_outliers(number: int) -> None:
 
 
 @pytest.mark.parametrize("number", range(5))
-def test_the_answer_does_not_depend_on_the_start(number: int) -> None:
-    """So that which triples are drawn does not show in a trajectory."""
+def test_refine_does_not_depend_on_the_initial_motion(number: int) -> None:
+    """So that which triples are sampled does not show in a trajectory."""
     seen = seen_points(RIG, TRUTH, 80, seed(400 + number), sigma_px=0.3, outlier_share=0.3)
     steps = 0.01 * seed(500 + number).normal(size=(4, 6))
     ends = [refine(ARRAYS, seen, np.ascontiguousarray(se3_exp(step) @ TRUTH), CONFIG) for step in steps]
@@ -192,7 +192,7 @@ def test_the_answer_does_not_depend_on_the_start(number: int) -> None:
 
 
 @pytest.mark.parametrize("off_px", [2.0, 4.0, 8.0])
-def test_wrong_points_next_to_the_camera_have_no_leverage(off_px: float) -> None:
+def test_refine_with_wrong_points_next_to_the_camera_is_unbiased(off_px: float) -> None:
     """Where images are sharp, an error of a few pixels is many times the noise, and must count as such."""
     seen, wrong = seen_points(RIG, TRUTH, 100, seed(30), sigma_px=0.04), 20
     points, left, right = seen.points.copy(), seen.left.copy(), seen.right.copy()
@@ -210,7 +210,7 @@ def test_wrong_points_next_to_the_camera_have_no_leverage(off_px: float) -> None
     assert refined.inlier[wrong:].mean() > 0.95
 
 
-def test_what_stands_for_a_missing_right_image_means_nothing() -> None:
+def test_refine_ignores_values_of_missing_right_images() -> None:
     seen = seen_points(RIG, TRUTH, 40, seed(31), sigma_px=0.3)
     seen = seen._replace(has_right=seed(32).random(80) < 0.6)
     none = np.where(seen.has_right[:, None], seen.right, 0.0)
@@ -219,7 +219,7 @@ def test_what_stands_for_a_missing_right_image_means_nothing() -> None:
     np.testing.assert_allclose(refined.covariance, again.covariance, rtol=1e-9)
 
 
-def test_covariance_tells_the_truth_about_the_error() -> None:
+def test_covariance_is_consistent() -> None:
     nees = []
     for number in range(300):
         seen = seen_points(RIG, TRUTH, 50, seed(1000 + number), sigma_px=CONFIG.pixel_sigma_px)
@@ -250,8 +250,8 @@ def pairs_of_unlike_noise(number: int, sigmas_px: tuple[float, float]) -> Observ
     return Observations(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def test_a_pair_with_noisier_images_counts_for_less() -> None:
-    """Each pair has a noise of its own: the sharper one leads, and the covariance stays honest."""
+def test_refine_weighs_a_noisier_pair_less() -> None:
+    """Each pair has a noise of its own: the sharper one leads, and the covariance stays consistent."""
     squares: dict[str, list[float]] = {"both": [], "sharper": []}
     nees = []
     for number in range(200):
@@ -266,7 +266,7 @@ def test_a_pair_with_noisier_images_counts_for_less() -> None:
 
 
 @pytest.mark.parametrize(("sigmas_px", "ratio"), [((0.2, 0.2), 1.0), ((0.15, 0.3), 4.0)])
-def test_each_pairs_noise_is_told_by_its_residuals(sigmas_px: tuple[float, float], ratio: float) -> None:
+def test_noise_by_pair_is_that_of_the_residuals(sigmas_px: tuple[float, float], ratio: float) -> None:
     seen, px = pairs_of_unlike_noise(3, sigmas_px), CONFIG.pixel_sigma_px
     _, errors_px = explained(ARRAYS, seen, TRUTH, CONFIG)
     noise = noise_by_pair(4.0 * (errors_px / px) ** 2, seen.has_right, seen.pair, 2, 100.0)
@@ -275,7 +275,7 @@ def test_each_pairs_noise_is_told_by_its_residuals(sigmas_px: tuple[float, float
     np.testing.assert_array_equal(noise_by_pair(errors_px, seen.has_right, one, 2, 100.0), 1.0)
 
 
-def test_directions_that_nothing_constrains_are_uncertain() -> None:
+def test_refine_of_far_points_leaves_translation_uncertain() -> None:
     seen = seen_points(RIG, STILL, 50, seed(10), sigma_px=0.3)
     far = seen._replace(points=seen.points * [1.0, 1.0, 0.0])  # at infinity: rotation only
     far = far._replace(left=far.points[:, :2].copy(), has_right=np.zeros(100, dtype=bool))
@@ -293,7 +293,7 @@ def noisy(rig: Rig = RIG) -> Observations:
     return seen_points(rig, TRUTH, 60, seed(11), sigma_px=0.3, outlier_share=0.1)
 
 
-def test_one_pair_is_the_single_pair_algorithm() -> None:
+def test_motion_of_one_pair_is_that_of_the_single_pair_algorithm() -> None:
     rig = RIG.with_pairs([1])
     arrays, seen = RigArrays.of(rig), noisy(rig)
     joint = joint_motion(arrays, seen, STILL, CONFIG, seed())
@@ -306,7 +306,7 @@ def test_one_pair_is_the_single_pair_algorithm() -> None:
     assert global_cost(arrays, seen, TRUTH, 1.5) == pytest.approx(cost(motion, PairPoints.of(rig.pairs[0], seen), 1.5))
 
 
-def test_a_pair_without_points_changes_nothing() -> None:
+def test_joint_motion_with_a_pair_without_points_is_unchanged() -> None:
     alone = noisy(RIG.with_pairs([0]))
     one = joint_motion(RigArrays.of(RIG.with_pairs([0])), alone, STILL, CONFIG, seed())
     two = joint_motion(ARRAYS, alone, STILL, CONFIG, seed())
@@ -314,7 +314,7 @@ def test_a_pair_without_points_changes_nothing() -> None:
     np.testing.assert_allclose(one.covariance, two.covariance, rtol=1e-9)
 
 
-def test_swapping_pairs_changes_only_their_names() -> None:
+def test_refine_with_swapped_pairs_is_unchanged() -> None:
     seen = noisy()
     order = np.concatenate([np.flatnonzero(seen.pair == 1), np.flatnonzero(seen.pair == 0)])
     swapped = take(seen, order)._replace(pair=1 - seen.pair[order])
@@ -327,8 +327,8 @@ def test_swapping_pairs_changes_only_their_names() -> None:
 
 
 @pytest.mark.parametrize("number", range(5))
-def test_swapping_pairs_changes_no_joint_motion(number: int) -> None:
-    """Other triples are drawn, from another start; refinement ends in the same place, to a hundredth of a sigma."""
+def test_joint_motion_with_swapped_pairs_is_unchanged(number: int) -> None:
+    """Other triples are sampled, from another initial motion; the result is the same to a hundredth of a sigma."""
     seen = seen_points(RIG, TRUTH, 60, seed(60 + number), sigma_px=0.3, outlier_share=0.2)
     order = np.concatenate([np.flatnonzero(seen.pair == 1), np.flatnonzero(seen.pair == 0)])
     swapped = take(seen, order)._replace(pair=1 - seen.pair[order])
@@ -342,7 +342,7 @@ def test_swapping_pairs_changes_no_joint_motion(number: int) -> None:
 
 
 @pytest.mark.parametrize("solve", [joint_motion, best_pair_motion])
-def test_the_same_seed_gives_the_same_motion(solve: Callable[..., object]) -> None:
+def test_motion_of_the_same_seed_is_the_same(solve: Callable[..., object]) -> None:
     seen = noisy()
     first, again = (solve(ARRAYS, seen, STILL, CONFIG, seed(5)) for _ in range(2))
     assert vars(first).keys() == vars(again).keys()
@@ -350,7 +350,7 @@ def test_the_same_seed_gives_the_same_motion(solve: Callable[..., object]) -> No
         assert np.array_equal(value, getattr(again, name)), name
 
 
-def test_eq_4_chooses_the_pair_whose_points_are_sound() -> None:
+def test_best_pair_motion_is_of_the_pair_with_sound_points() -> None:
     sound, broken = noisy(), noisy()
     places = seed(12).uniform(-0.5, 0.5, (2, 60, 2))
     for pair in range(2):
@@ -369,7 +369,7 @@ def test_eq_4_chooses_the_pair_whose_points_are_sound() -> None:
         assert np.abs(joint.cur_T_ref - TRUTH).max() < 5e-3
 
 
-def test_all_pairs_together_are_better_than_the_best_one() -> None:
+def test_joint_motion_is_better_than_the_best_pairs() -> None:
     errors: dict[str, list[float]] = {"joint": [], "best": []}
     for number in range(40):
         seen = seen_points(RIG, TRUTH, 40, seed(500 + number), sigma_px=0.3)
@@ -379,7 +379,7 @@ def test_all_pairs_together_are_better_than_the_best_one() -> None:
     assert np.mean(errors["joint"]) < 0.7 * np.mean(errors["best"])
 
 
-def test_explained_points_are_the_refinements_inliers() -> None:
+def test_explained_returns_the_inliers_of_refine() -> None:
     seen = noisy()
     refined = refine(ARRAYS, seen, TRUTH, CONFIG)
     again, errors_px = explained(ARRAYS, seen, refined.cur_T_ref, CONFIG)

@@ -17,7 +17,7 @@ from graphvio.frontend.paper_method import PairPoints, best_pair, cost, global_c
 from graphvio.frontend.refinement import refine
 from graphvio.frontend.selection import best_pair_motion
 from graphvio.frontend.selection import global_cost as global_cost_of_kernel
-from graphvio.geometry import se3_exp, se3_log
+from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.rig import Rig, StereoPair
 
 TRUTH = transform([0.02, -0.03, 0.05], [-0.06, 0.02, 0.01])  # cur_T_ref
@@ -74,7 +74,7 @@ def test_motion_of_pair_moves_points_as_the_first_pair_sees_them_move() -> None:
     P_1, P_12 = random_transform(rng, 0.3, 0.5), random_transform(rng, 2.0, 0.4)
     X_1 = np.array([0.4, -0.2, 3.0, 1.0])
     np.testing.assert_allclose(motion_of_pair(P_1, P_12) @ (P_12 @ X_1), P_12 @ (P_1 @ X_1), atol=1e-12)
-    back = motion_of_pair(motion_of_pair(P_1, P_12), np.linalg.inv(P_12))
+    back = motion_of_pair(motion_of_pair(P_1, P_12), se3_inverse(P_12))
     np.testing.assert_allclose(back, P_1, atol=1e-12)
 
 

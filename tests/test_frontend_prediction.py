@@ -27,7 +27,7 @@ def rays(n: int = 50) -> Float:
     return np.random.default_rng(0).uniform(-0.4, 0.4, (n, 2))
 
 
-def test_pixels_and_inverse_depths() -> None:
+def test_predict_pixels_returns_pixels_and_inverse_depths() -> None:
     depths = np.random.default_rng(1).uniform(1.0, 10.0, 50)
     pixels, inverse_depths, valid = predict_pixels(rays(), 1.0 / depths, MOTION, *MODEL)
     points = np.column_stack([rays(), np.ones(50)]) * depths[:, None] @ MOTION[:3, :3].T + MOTION[:3, 3]
@@ -38,7 +38,7 @@ def test_pixels_and_inverse_depths() -> None:
     np.testing.assert_allclose(inverse_depths, 1.0 / points[:, 2], rtol=1e-12)
 
 
-def test_points_that_come_behind_the_camera_have_no_pixel() -> None:
+def test_predict_pixels_behind_the_camera_is_invalid() -> None:
     back = transform([0.0, 0.0, 0.0], [0.0, 0.0, -2.0])
     pixels, inverse_depths, valid = predict_pixels(rays(3), np.array([1.0, 0.4, 0.0]), back, *MODEL)
     assert valid.tolist() == [False, True, True]
@@ -79,7 +79,7 @@ def seen_after(at: Float, motion: Float, camera: Camera = CAMERA, after: Camera 
 
 
 @with_lenses
-def test_warps_are_the_affine_maps_nearest_to_a_slanted_walls_deformation(lens: tuple[str, Float]) -> None:
+def test_predict_warps_are_nearest_to_the_deformation_of_a_slanted_wall(lens: tuple[str, Float]) -> None:
     camera = through(lens).left
     motion = transform([0.01, -0.03, 0.02], [0.05, 0.05, -0.35])
     at = around(pixels(), STEP_PX)
@@ -101,7 +101,7 @@ def test_warps_are_the_affine_maps_nearest_to_a_slanted_walls_deformation(lens: 
     assert np.abs(by_centre).max() > 0.015  # what a map that is right at the centre alone would add to every point
 
 
-def test_without_motion_nothing_is_deformed() -> None:
+def test_predict_warps_without_motion_are_the_identity() -> None:
     rays = unprojected(around(pixels(), STEP_PX))
     warps, shifts, valid = predict_warps(
         rays, on_wall(rays), STEP_PX, np.eye(4), CAMERA.model_number, CAMERA.intrinsics, CAMERA.distortion
@@ -111,7 +111,7 @@ def test_without_motion_nothing_is_deformed() -> None:
     np.testing.assert_allclose(shifts, 0.0, atol=1e-6)
 
 
-def test_warps_need_a_visible_surface() -> None:
+def test_predict_warps_of_hidden_surfaces_are_invalid() -> None:
     rays = unprojected(around(pixels(3), STEP_PX))
     behind = transform([0.0, 0.0, 0.0], [0.0, 0.0, -50.0])
     edge_on = np.repeat([[0.5], [0.5], [0.9], [0.5], [0.5]], 3, axis=1)
@@ -121,24 +121,24 @@ def test_warps_need_a_visible_surface() -> None:
 
 
 @with_lenses
-def test_the_slopes_of_stereo_matches_tell_the_wall(lens: tuple[str, Float]) -> None:
+def test_inverse_depths_around_follow_the_slopes_of_stereo_matches(lens: tuple[str, Float]) -> None:
     pair = through(lens)
     at = around(pixels(), STEP_PX)
     rays = unprojected(at, pair.left)
-    told = inverse_depths_around(rays, on_wall(rays[0]), slopes(pair, at[0]), STEP_PX, *right_view(pair))
-    np.testing.assert_allclose(told, on_wall(rays), rtol=5e-3)
+    found = inverse_depths_around(rays, on_wall(rays[0]), slopes(pair, at[0]), STEP_PX, *right_view(pair))
+    np.testing.assert_allclose(found, on_wall(rays), rtol=5e-3)
     assert np.ptp(on_wall(rays) / on_wall(rays[0]), axis=0).min() > 0.01  # the wall is slanted, all over
 
 
-def test_what_the_right_image_does_not_show_is_taken_for_a_surface_that_faces_the_camera() -> None:
+def test_inverse_depths_around_unseen_points_are_their_own() -> None:
     at = around(pixels(3), STEP_PX)
     rays, steep = unprojected(at), np.full((3, 2), 0.3)
     behind = transform([0.0, 0.0, 0.0], [0.0, 0.0, -50.0])  # of all points
-    told = inverse_depths_around(rays, on_wall(rays[0]), steep, STEP_PX, behind, *right_view(PAIR)[1:])
-    np.testing.assert_array_equal(told, np.tile(on_wall(rays[0]), (5, 1)))
+    found = inverse_depths_around(rays, on_wall(rays[0]), steep, STEP_PX, behind, *right_view(PAIR)[1:])
+    np.testing.assert_array_equal(found, np.tile(on_wall(rays[0]), (5, 1)))
 
 
-def test_far_surfaces_have_no_slant() -> None:
+def test_inverse_depths_around_far_points_have_no_slant() -> None:
     """At infinity the right image is the left one turned, and its slopes are those of the rotation."""
     at = around(pixels(), STEP_PX)
     rays, far = unprojected(at), np.zeros(50)
@@ -147,8 +147,8 @@ def test_far_surfaces_have_no_slant() -> None:
     for k, step in enumerate(np.eye(2)):
         ahead, behind = (right_pixel(PAIR, unprojected(at[0] + sign * step), far) for sign in (1.0, -1.0))
         turned[:, k] = np.sum((0.5 * (ahead - behind) - step) * direction, axis=1)
-    told = inverse_depths_around(rays, far, turned, STEP_PX, *right_view(PAIR))
-    np.testing.assert_allclose(told, 0.0, atol=1e-4)  # 1/m
+    found = inverse_depths_around(rays, far, turned, STEP_PX, *right_view(PAIR))
+    np.testing.assert_allclose(found, 0.0, atol=1e-4)  # 1/m
 
 
 def right_view(pair: StereoPair) -> tuple[Float, int, Float, Float]:

@@ -26,7 +26,7 @@ def distance(a: Float, b: Float) -> float:
 
 @settings(max_examples=300)
 @given(seeds)
-def test_every_solution_is_one_and_they_differ(seed: int) -> None:
+def test_resect_solutions_are_valid_and_differ(seed: int) -> None:
     points, rays, _ = three_points(seed)
     poses, count = resect(points, rays)
     assert 1 <= count <= 4
@@ -39,7 +39,7 @@ def test_every_solution_is_one_and_they_differ(seed: int) -> None:
         assert np.sum(moved * rays, axis=1).min() > 0.0  # in front
 
 
-def test_the_truth_is_among_the_solutions() -> None:
+def test_resect_solutions_contain_the_truth() -> None:
     missed = 0
     for seed in range(1000):
         points, rays, truth = three_points(seed)
@@ -48,7 +48,7 @@ def test_the_truth_is_among_the_solutions() -> None:
     assert missed <= 5  # a double root is only known to half the digits
 
 
-def test_solutions_are_opencvs() -> None:
+def test_resect_solutions_are_opencvs() -> None:
     agree = 0
     for seed in range(300):
         points, rays, _ = three_points(seed)
@@ -67,7 +67,7 @@ def test_solutions_are_opencvs() -> None:
     assert agree >= 290
 
 
-def test_an_equilateral_triangle_seen_straight_on() -> None:
+def test_resect_of_an_equilateral_triangle_seen_straight_on() -> None:
     angle = 2.0 * np.pi / 3.0 * np.arange(3)
     points = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(3)])
     seen = points + np.array([0.0, 0.0, 4.0])
@@ -77,7 +77,7 @@ def test_an_equilateral_triangle_seen_straight_on() -> None:
     assert min((distance(pose, truth) for pose in poses[:count]), default=np.inf) < 1e-4
 
 
-def test_triangles_that_are_none() -> None:
+def test_resect_of_degenerate_triangles_has_no_solution() -> None:
     rays = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.0, 0.1, 1.0]])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     line = np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 5.0], [2.0, 0.0, 5.0]])
@@ -95,7 +95,7 @@ def roots_of(coefficients: Float) -> Float:
 
 @settings(max_examples=300)
 @given(seeds)
-def test_quartic_roots_against_numpys(seed: int) -> None:
+def test_real_quartic_roots_are_numpys(seed: int) -> None:
     coefficients = np.random.default_rng(seed).uniform(-3.0, 3.0, 5)
     expected = np.roots(coefficients)
     real = np.abs(expected.imag) < 1e-9 * (1.0 + np.abs(expected))
@@ -115,7 +115,7 @@ def test_quartic_roots_against_numpys(seed: int) -> None:
         [-1e3, -1.0, 1e-3, 10.0],
     ],
 )
-def test_quartic_with_known_roots(roots: list[float]) -> None:
+def test_real_quartic_roots_are_the_known_ones(roots: list[float]) -> None:
     found = roots_of(np.asarray(-2.5 * np.poly(roots), dtype=np.float64))
     for root in roots:
         assert np.abs(found - root).min() < 1e-3 * max(1.0, abs(root))
@@ -123,7 +123,7 @@ def test_quartic_with_known_roots(roots: list[float]) -> None:
         assert np.abs(np.array(roots) - x).min() < 1e-3 * max(1.0, abs(x))
 
 
-def test_quartics_without_roots() -> None:
+def test_real_quartic_roots_of_none() -> None:
     assert len(roots_of(np.array([1.0, 0.0, 2.0, 0.0, 1.5]))) == 0
     assert len(roots_of(np.array([1.0, 0.2, 5.0, -0.3, 9.0]))) == 0
     assert len(roots_of(np.array([0.0, 1.0, 0.0, 0.0, -1.0]))) == 0  # a cubic is not solved

@@ -22,8 +22,8 @@ def views(slope_x: float, slope_y: float, seed: int = 0, noise: float = 1.0) -> 
     source_x = (X + DISPARITY - slope_x * MIDDLE[0] + slope_y * (Y - MIDDLE[1])) / (1.0 - slope_x)
     rng = np.random.default_rng(seed)
     left, right = waves(X, Y, seed), waves(source_x, Y, seed)
-    grain = noise / 45.0 * rng.standard_normal((2, *X.shape))
-    return picture(left + grain[0]), picture(right + grain[1])
+    white = noise / 45.0 * rng.standard_normal((2, *X.shape))
+    return picture(left + white[0]), picture(right + white[1])
 
 
 def grid() -> Float:
@@ -51,7 +51,7 @@ SLANTS = [(0.0, 0.0), (0.15, 0.0), (0.0, 0.3), (-0.25, 0.2), (0.3, -0.35)]
 
 
 @pytest.mark.parametrize("slant", SLANTS)
-def test_place_and_slopes_are_found(slant: tuple[float, float]) -> None:
+def test_align_slanted_finds_place_and_slopes(slant: tuple[float, float]) -> None:
     right = truth(grid(), *slant)
     moved, slopes, correlations, found = aligned(views(*slant), right + np.array([0.7, 0.2]))
     assert found.mean() > 0.8
@@ -63,7 +63,7 @@ def test_place_and_slopes_are_found(slant: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize("slant", SLANTS[2:])
-def test_a_shift_alone_is_off_or_lost(slant: tuple[float, float]) -> None:
+def test_align_slanted_without_slopes_is_off_or_fails(slant: tuple[float, float]) -> None:
     images, right = views(*slant), truth(grid(), *slant)
     n, packed_left = len(right), packed(images[0])
     level, everything = np.tile(np.eye(2), (n, 1, 1)), np.ones(n, dtype=bool)
@@ -74,7 +74,7 @@ def test_a_shift_alone_is_off_or_lost(slant: tuple[float, float]) -> None:
     assert np.median(by_shift) > 3.0 * np.median(by_slant)
 
 
-def test_it_may_start_with_the_slopes_of_before() -> None:
+def test_align_slanted_accepts_initial_slopes() -> None:
     slant = (-0.25, 0.2)
     images, right = views(*slant), truth(grid(), *slant)
     before = np.tile(slant, (len(right), 1)) + np.array([0.03, -0.03])
@@ -87,7 +87,7 @@ def test_it_may_start_with_the_slopes_of_before() -> None:
 
 
 @pytest.mark.parametrize(("gain", "offset", "within_px"), [(1.0, -20.0, 0.05), (0.9, -10.0, 0.2)])
-def test_a_change_of_exposure_hardly_counts(gain: float, offset: float, within_px: float) -> None:
+def test_align_slanted_under_a_change_of_exposure_hardly_moves(gain: float, offset: float, within_px: float) -> None:
     left, right_image = views(0.1, 0.1)
     darker = np.clip(np.round(gain * right_image + offset), 0, 255).astype(np.uint8)
     right = truth(grid(), 0.1, 0.1)
@@ -97,7 +97,7 @@ def test_a_change_of_exposure_hardly_counts(gain: float, offset: float, within_p
     assert np.median(correlations[found]) > 0.97
 
 
-def test_what_is_not_there_does_not_correlate() -> None:
+def test_align_slanted_in_another_scene_does_not_correlate() -> None:
     left, _ = views(0.0, 0.0)
     _, other = views(0.0, 0.0, seed=1)
     _, _, correlations, found = aligned((left, other), truth(grid(), 0.0, 0.0))
@@ -109,7 +109,7 @@ def test_what_is_not_there_does_not_correlate() -> None:
     assert correlations.max() <= 0.0
 
 
-def test_only_wanted_patches_are_aligned_and_none_beyond_the_edge() -> None:
+def test_align_slanted_leaves_out_unwanted_patches_and_the_edge() -> None:
     images, right = views(0.0, 0.0), truth(grid(), 0.0, 0.0)
     wanted = np.arange(len(right)) % 2 == 0
     assert not aligned(images, right, wanted=wanted)[3][~wanted].any()

@@ -31,7 +31,7 @@ def scattered(n: int, seed: int = 0) -> Float:
     return np.column_stack([rng.uniform(-0.6, 0.6, n), rng.uniform(-0.5, 0.5, n), np.ones(n)]) * depths[:, None]
 
 
-def test_rectified_pair_is_depth_from_disparity() -> None:
+def test_triangulate_rectified_pair_is_depth_from_disparity() -> None:
     disparity_px = np.array([0.5, 1.0, 7.0, 40.0, 120.0])
     left = np.column_stack([np.linspace(-0.3, 0.3, 5), np.linspace(0.2, -0.2, 5)])
     right = left - np.column_stack([disparity_px / FOCAL, np.zeros(5)])
@@ -46,7 +46,7 @@ def test_rectified_pair_is_depth_from_disparity() -> None:
     np.testing.assert_allclose(covariances[:, 0, 2], 1.0 / (FOCAL**2 * BASELINE), rtol=1e-8)
 
 
-def test_any_pair_finds_the_points_and_opencv_agrees() -> None:
+def test_triangulate_any_pair_agrees_with_opencv() -> None:
     points = scattered(200)
     left, right = views(points, SKEWED)
     found, _, errors = triangulate(left, right, SKEWED, FOCAL, 1.1 * FOCAL)
@@ -56,14 +56,14 @@ def test_any_pair_finds_the_points_and_opencv_agrees() -> None:
     np.testing.assert_allclose(found, homogeneous((by_opencv[:3] / by_opencv[3]).T), atol=1e-6)
 
 
-def test_error_is_the_distance_from_the_epipolar_line() -> None:
+def test_triangulate_error_is_the_distance_from_the_epipolar_line() -> None:
     left = np.array([[0.1, 0.05]])
     right = left - [[0.03, 6.0 / FOCAL]]
     _, _, errors = triangulate(left, right, RECTIFIED, FOCAL, FOCAL)
     assert errors[0] == pytest.approx(6.0 / np.sqrt(2.0))  # shared evenly by both images
 
 
-def test_infinitely_far_points_are_regular() -> None:
+def test_triangulate_infinitely_far_points_is_regular() -> None:
     left = np.array([[0.0, 0.0], [0.3, -0.2]])
     rays = np.column_stack([left, np.ones(2)]) @ SKEWED[:3, :3].T
     found, covariances, errors = triangulate(left, rays[:, :2] / rays[:, 2:], SKEWED, FOCAL, FOCAL)
@@ -72,14 +72,14 @@ def test_infinitely_far_points_are_regular() -> None:
     assert np.linalg.eigvalsh(covariances).min() > 0.0
 
 
-def test_negative_disparity_is_a_negative_inverse_depth() -> None:
+def test_triangulate_negative_disparity_is_a_negative_inverse_depth() -> None:
     left = np.array([[0.1, 0.0]])
     found, _, _ = triangulate(left, left + np.array([2.0 / FOCAL, 0.0]), RECTIFIED, FOCAL, FOCAL)
     assert found[0, 2] == pytest.approx(-2.0 / (FOCAL * BASELINE))
 
 
 @pytest.mark.parametrize("depth", [0.5, 3.0, 50.0])
-def test_covariance_against_monte_carlo(depth: float) -> None:
+def test_triangulate_covariance_matches_monte_carlo(depth: float) -> None:
     n, sigma_px = 20000, 0.3
     rng = np.random.default_rng(3)
     left, right = views(np.array([[0.2, -0.1, 1.0]]) * depth, SKEWED)
@@ -119,7 +119,7 @@ def grid() -> Float:
 
 
 @pytest.mark.parametrize("disparity", [0, 3, 17, 60])
-def test_the_known_disparity_is_found(disparity: int) -> None:
+def test_epipolar_search_finds_the_known_disparity(disparity: int) -> None:
     left = textured()
     right = np.roll(left, -disparity, axis=1)
     noise = np.random.default_rng(1).normal(0.0, 3.0, right.shape)
@@ -129,7 +129,7 @@ def test_the_known_disparity_is_found(disparity: int) -> None:
     np.testing.assert_allclose(matches, pixels - [disparity, 0.0], atol=0.76)
 
 
-def test_a_texture_that_repeats_is_refused() -> None:
+def test_epipolar_search_of_a_repeating_texture_is_rejected() -> None:
     tile = textured()[:, :24]
     left = np.ascontiguousarray(np.tile(tile, (1, 14))[:, :320])
     _, found = search(left, np.roll(left, -30, axis=1), grid())
@@ -138,7 +138,7 @@ def test_a_texture_that_repeats_is_refused() -> None:
     assert found.mean() > 0.8
 
 
-def test_what_is_not_in_the_other_image_is_refused() -> None:
+def test_epipolar_search_without_the_patch_is_rejected() -> None:
     _, found = search(textured(), textured(1), grid())
     assert found.mean() < 0.25  # a fine texture looks like any other somewhere
     flat = np.full((240, 320), 90, dtype=np.uint8)
@@ -146,7 +146,7 @@ def test_what_is_not_in_the_other_image_is_refused() -> None:
     assert not search(textured(), flat, grid())[1].any()
 
 
-def test_the_search_follows_the_curve_of_a_distorted_lens() -> None:
+def test_epipolar_search_follows_the_curve_of_a_distorted_lens() -> None:
     left, lens = textured(2), np.array([-0.25, 0.06, 1e-3, -1e-3, 0.0])
     pixels = grid()[::5]
     rays, _ = unproject_pixels(RADIAL_TANGENTIAL, INTRINSICS, np.zeros(5), pixels)
@@ -169,7 +169,7 @@ def test_the_search_follows_the_curve_of_a_distorted_lens() -> None:
     assert np.abs(matches[good] - places[good]).max() < 1.5
 
 
-def test_of_a_curve_that_leaves_the_lens_the_rest_is_searched() -> None:
+def test_epipolar_search_covers_the_part_of_a_curve_within_the_lens() -> None:
     """Half a metre away the points would be beyond the radius at which this lens folds back."""
     left, lens = textured(), np.array([-0.9, 0.0, 0.0, 0.0, 0.0])
     pixels = grid()[::3]
@@ -195,7 +195,7 @@ def test_of_a_curve_that_leaves_the_lens_the_rest_is_searched() -> None:
 # ------------------------------------------------------------------ epipolar lines
 
 
-def test_lines_of_a_rectified_pair_are_rows() -> None:
+def test_epipolar_lines_of_a_rectified_pair_are_rows() -> None:
     rays = np.array([[0.1, -0.05], [-0.2, 0.1], [0.0, 0.0]])
     pixels, directions, valid = epipolar_lines(
         rays, np.array([0.0, 0.5, 2.0]), RECTIFIED, RADIAL_TANGENTIAL, INTRINSICS, np.zeros(5)
@@ -207,7 +207,7 @@ def test_lines_of_a_rectified_pair_are_rows() -> None:
     np.testing.assert_allclose(directions, np.tile([-1.0, 0.0], (3, 1)), atol=1e-9)
 
 
-def test_lines_of_any_pair_follow_the_projection() -> None:
+def test_epipolar_lines_of_any_pair_follow_the_projection() -> None:
     lens, points = np.array([-0.25, 0.06, 1e-3, -1e-3, 0.0]), scattered(50, seed=4)
     points = points[points[:, 2] > 1.0]
     rays, _ = views(points, SKEWED)
@@ -226,7 +226,7 @@ def test_lines_of_any_pair_follow_the_projection() -> None:
     assert valid.mean() > 0.9
 
 
-def test_points_behind_the_right_camera_have_no_line() -> None:
+def test_epipolar_lines_behind_the_right_camera_are_invalid() -> None:
     ahead = transform([0.0, 0.0, 0.0], [-BASELINE, 0.0, -1.0])
     _, _, valid = epipolar_lines(
         np.zeros((2, 2)), np.array([2.0, 0.5]), ahead, RADIAL_TANGENTIAL, INTRINSICS, np.zeros(5)

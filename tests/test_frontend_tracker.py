@@ -12,7 +12,7 @@ from waves import picture, waves
 from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.config import Config
 from graphvio.config.stages import CornerConfig
-from graphvio.frontend.image_noise import noise_sigma
+from graphvio.frontend.corners import noise_sigma
 from graphvio.frontend.lucas_kanade import build_pyramid
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.tracker import PairTracker
@@ -69,26 +69,26 @@ def walk(frames: int) -> list[Float]:
 
 
 def followed(
-    poses: list[Float], *, anchored: bool, tracker: PairTracker | None = None, renewed: tuple[int, ...] = ()
+    poses: list[Float], *, with_keyframe: bool, tracker: PairTracker | None = None, replenished_at: tuple[int, ...] = ()
 ) -> list[PairFrame]:
     """Frames of a walk, some of them with new corners."""
     tracker = PairTracker(rectified(), Config()) if tracker is None else tracker
     frames = []
     for k, pose in enumerate(poses):
         since_last = pose @ np.linalg.inv(poses[k - 1]) if k else None
-        since_first = pose @ np.linalg.inv(poses[0]) if k and anchored else None
+        since_first = pose @ np.linalg.inv(poses[0]) if k and with_keyframe else None
         frame = tracker.observe(k, *views(pose, k), since_last, since_first)
-        frames.append(tracker.replenish() if k in renewed else frame)
+        frames.append(tracker.replenish() if k in replenished_at else frame)
         if k == 0:
             tracker.keep_keyframe_patches()
     return frames
 
 
-def test_identities_and_ages() -> None:
-    renewed = (2, 4)
-    frames = followed(walk(6), anchored=True, renewed=renewed)
+def test_observe_keeps_identities_and_counts_ages() -> None:
+    replenished_at = (2, 4)
+    frames = followed(walk(6), with_keyframe=True, replenished_at=replenished_at)
     added = [int((frame.ages == 0).sum()) for frame in frames]
-    assert [k for k in range(1, 6) if added[k]] == list(renewed)
+    assert [k for k in range(1, 6) if added[k]] == list(replenished_at)
     for before, after in pairwise(frames):
         assert (np.diff(after.ids) > 0).all()
         old = np.isin(after.ids, before.ids)
@@ -99,9 +99,9 @@ def test_identities_and_ages() -> None:
     assert frames[-1].ages.max() == 5
 
 
-def test_depths_are_those_of_the_wall() -> None:
+def test_observe_measures_depths_of_a_wall() -> None:
     poses = walk(5)
-    frame = followed(poses, anchored=True)[-1]
+    frame = followed(poses, with_keyframe=True)[-1]
     good = frame.has_depth
     assert good.mean() > 0.8
     points = on_wall(frame.pixels[good], poses[-1])
@@ -110,22 +110,22 @@ def test_depths_are_those_of_the_wall() -> None:
     assert np.median(np.abs(frame.points[good, 2] - 1.0 / depths) / sigma) < 1.0
 
 
-def test_the_anchor_keeps_points_where_they_are() -> None:
+def test_keyframe_patches_prevent_drift() -> None:
     poses = walk(16)
     errors = {}
-    for anchored in (False, True):
-        frames = followed(poses, anchored=anchored)
+    for with_keyframe in (False, True):
+        frames = followed(poses, with_keyframe=with_keyframe)
         first, last = frames[0], frames[-1]
         both, at_first, at_last = np.intersect1d(first.ids, last.ids, return_indices=True)
         assert len(both) > 12
         expected = seen(on_wall(first.pixels[at_first], poses[0]), poses[-1])
-        errors[anchored] = np.median(np.linalg.norm(last.pixels[at_last] - expected, axis=1))
+        errors[with_keyframe] = np.median(np.linalg.norm(last.pixels[at_last] - expected, axis=1))
     assert errors[True] < 0.1
     assert errors[True] < 0.6 * errors[False]
 
 
-def test_every_rejection_is_counted() -> None:
-    frames = followed(walk(8), anchored=True)
+def test_observe_counts_every_rejection() -> None:
+    frames = followed(walk(8), with_keyframe=True)
     for before, after in pairwise(frames):
         entered = int((before.flat_for <= 3).sum())
         kept = int((after.ages > 0).sum())
@@ -134,27 +134,27 @@ def test_every_rejection_is_counted() -> None:
     assert set(frames[-1].rejected) == {*FOLLOWED, *MATCHED}
 
 
-def test_new_corners_come_on_demand_or_when_few_tracks_are_left() -> None:
+def test_new_corners_by_replenish_or_when_few_tracks_are_left() -> None:
     poses = walk(4)
     tracker = PairTracker(rectified(), Config())
-    first, second = followed(poses[:2], anchored=True, tracker=tracker)
+    first, second = followed(poses[:2], with_keyframe=True, tracker=tracker)
     assert np.isin(second.ids, first.ids).all()
-    renewed = tracker.replenish()
-    new = ~np.isin(renewed.ids, second.ids)
+    replenished = tracker.replenish()
+    new = ~np.isin(replenished.ids, second.ids)
     assert new.any()
-    np.testing.assert_array_equal(renewed.ids[~new], second.ids)
+    np.testing.assert_array_equal(replenished.ids[~new], second.ids)
     cell_px = CornerConfig().cell_px(WIDTH)
     taken = {tuple(cell) for cell in (second.pixels[second.has_depth] // cell_px).astype(int)}
     # Sub-pixel precision may carry a corner by half a pixel into the next cell.
-    inside = np.all(np.abs(renewed.pixels % cell_px - 0.5 * cell_px) < 0.5 * cell_px - 0.5, axis=1)
-    assert not taken & {tuple(cell) for cell in (renewed.pixels[new & inside] // cell_px).astype(int)}
-    tracker.drop(renewed.ids[8:])
+    inside = np.all(np.abs(replenished.pixels % cell_px - 0.5 * cell_px) < 0.5 * cell_px - 0.5, axis=1)
+    assert not taken & {tuple(cell) for cell in (replenished.pixels[new & inside] // cell_px).astype(int)}
+    tracker.drop(replenished.ids[8:])
     scarce = tracker.observe(2, *views(poses[2], 2), poses[2] @ np.linalg.inv(poses[1]), None)
     assert len(scarce.ids) > 20
-    assert not np.isin(renewed.ids[8:], scarce.ids).any()
+    assert not np.isin(replenished.ids[8:], scarce.ids).any()
 
 
-def test_a_frame_stays_as_it_was_when_the_next_one_comes() -> None:
+def test_observe_leaves_earlier_frames_unchanged() -> None:
     """Frames are the front-end's references: following their tracks, foreseen or not, must not move them."""
     poses = walk(2)
     for predicted in (None, poses[1] @ np.linalg.inv(poses[0])):
@@ -169,7 +169,7 @@ def test_a_frame_stays_as_it_was_when_the_next_one_comes() -> None:
             np.testing.assert_array_equal(getattr(first, name), value, err_msg=name)
 
 
-def test_dropped_tracks_are_gone() -> None:
+def test_drop_removes_tracks() -> None:
     tracker = PairTracker(rectified(), Config())
     poses = walk(2)
     first = tracker.observe(0, *views(poses[0]), None, None)
@@ -179,7 +179,7 @@ def test_dropped_tracks_are_gone() -> None:
     assert np.isin(first.ids[1::2], second.ids).mean() > 0.6
 
 
-def test_a_wrong_prediction_costs_few_tracks() -> None:
+def test_observe_with_a_wrong_prediction_loses_few_tracks() -> None:
     poses = walk(2)
     tracker = PairTracker(rectified(), Config())
     first = tracker.observe(0, *views(poses[0]), None, None)
@@ -188,7 +188,7 @@ def test_a_wrong_prediction_costs_few_tracks() -> None:
     assert np.isin(first.ids, second.ids).mean() > 0.7
 
 
-def test_only_a_prediction_keeps_tracks_through_a_fast_turn() -> None:
+def test_observe_through_a_fast_turn_needs_a_prediction() -> None:
     """By 14 degrees from one image to the next, as a head may turn at 5 rad/s: 60 pixels, of 320."""
     turned = transform([0.0, 0.24, 0.0], [0.0, 0.0, 0.0])
     shares, errors_px = [], []
@@ -213,14 +213,14 @@ def mask_of(allowed: Bool, path: Path) -> Path:
     return path
 
 
-def test_the_left_mask_keeps_corners_and_tracks_out(tmp_path: Path) -> None:
+def test_left_mask_excludes_corners_and_tracks(tmp_path: Path) -> None:
     pair = rectified(left_mask=mask_of(X < 200, tmp_path / "left.png"))
-    for frame in followed(walk(4), anchored=True, tracker=PairTracker(pair, Config())):
+    for frame in followed(walk(4), with_keyframe=True, tracker=PairTracker(pair, Config())):
         assert len(frame.ids) > 10
         assert frame.pixels[:, 0].max() < 200.5 - 8.0  # no pixel of its patch of 15
 
 
-def test_what_a_mask_hides_changes_nothing(tmp_path: Path) -> None:
+def test_masked_pixels_do_not_influence_tracks(tmp_path: Path) -> None:
     """Corners are the same, so are those with depth, and their points to a millimetre."""
     pair = rectified(mask_of(X < 200, tmp_path / "left.png"), mask_of(X < 200, tmp_path / "right.png"))
     results = []
@@ -234,7 +234,7 @@ def test_what_a_mask_hides_changes_nothing(tmp_path: Path) -> None:
     np.testing.assert_allclose(results[0].points[known], results[1].points[known], atol=1e-3)
 
 
-def test_the_right_mask_keeps_matches_out(tmp_path: Path) -> None:
+def test_right_mask_excludes_matches(tmp_path: Path) -> None:
     pair = rectified(right_mask=mask_of(X < 200, tmp_path / "right.png"))
     images = views(np.eye(4))
     frame = PairTracker(pair, Config()).observe(0, *images, None, None)
@@ -248,7 +248,7 @@ def test_the_right_mask_keeps_matches_out(tmp_path: Path) -> None:
     assert frame.rejected["masked"] == int((whole.has_depth & ~frame.has_depth).sum())
 
 
-def test_a_match_must_be_a_corner_in_the_right_image_too() -> None:
+def test_match_of_no_corner_in_the_right_image_is_rejected() -> None:
     left, right = views(np.eye(4))
     pair = rectified()
     matcher = StereoMatcher(pair, Config(), np.ones(left.shape, dtype=bool))
@@ -273,12 +273,12 @@ def test_a_match_must_be_a_corner_in_the_right_image_too() -> None:
 def half_blank(brightness: float, noise: float, seed: int = 0) -> Image:
     """Texture on the left, a blank wall on the right."""
     light = 128.0 + 45.0 * np.where(X < 160, waves(X, Y), 0.0)
-    grain = noise * np.random.default_rng(seed).standard_normal(X.shape)
-    return np.asarray(np.clip(np.round(brightness * light + grain), 0, 255), dtype=np.uint8)
+    white = noise * np.random.default_rng(seed).standard_normal(X.shape)
+    return np.asarray(np.clip(np.round(brightness * light + white), 0, 255), dtype=np.uint8)
 
 
 @pytest.mark.parametrize("noise", [0.3, 0.7])
-def test_weak_corners_are_admitted_in_low_light_but_no_noise(noise: float) -> None:
+def test_weak_corners_in_low_light_are_above_the_noise(noise: float) -> None:
     dark = half_blank(0.1, noise)
     frame = PairTracker(rectified(), Config()).observe(0, dark, dark, None, None)
     plain = PairTracker(rectified(), Config(corners=CornerConfig(scarce_share=0.0)))
@@ -299,7 +299,7 @@ def test_weak_corners_are_tracked_and_matched() -> None:
     assert frame.has_depth.mean() > 0.5
 
 
-def test_a_rich_image_gets_no_weak_corners() -> None:
+def test_weak_corners_are_not_added_to_a_rich_image() -> None:
     frames = []
     for share in (0.0, CornerConfig().scarce_share):
         tracker = PairTracker(rectified(), Config(corners=CornerConfig(scarce_share=share)))
@@ -308,13 +308,13 @@ def test_a_rich_image_gets_no_weak_corners() -> None:
     np.testing.assert_array_equal(frames[0].pixels, frames[1].pixels)
 
 
-def test_noise_is_told_from_texture() -> None:
+def test_noise_sigma_ignores_texture() -> None:
     flat = np.full((HEIGHT, WIDTH), 100.0)
     for sigma in (0.7, 2.0, 6.0):
-        grain = sigma * np.random.default_rng(1).standard_normal(flat.shape)
+        white = sigma * np.random.default_rng(1).standard_normal(flat.shape)
         for scene in (flat, flat + 0.2 * X, flat + 40.0 * (X > 150)):
-            assert noise_sigma(np.round(scene + grain).astype(np.uint8)) == pytest.approx(sigma, rel=0.12)
-        smooth = picture(waves(0.5 * X, 0.5 * Y) + grain / 45.0)
+            assert noise_sigma(np.round(scene + white).astype(np.uint8)) == pytest.approx(sigma, rel=0.12)
+        smooth = picture(waves(0.5 * X, 0.5 * Y) + white / 45.0)
         assert noise_sigma(smooth) == pytest.approx(sigma, rel=0.5)
     assert noise_sigma(flat.astype(np.uint8)) == pytest.approx(1.0 / np.sqrt(12.0))  # rounding is noise
     assert noise_sigma(np.zeros((HEIGHT, WIDTH), dtype=np.uint8)) > 0.0

@@ -96,7 +96,7 @@ def test_se3_exp_is_the_matrix_exponential(angle: float) -> None:
 
 
 @given(transforms, transforms, transforms)
-def test_group_axioms(a: Float, b: Float, c: Float) -> None:
+def test_transforms_form_a_group(a: Float, b: Float, c: Float) -> None:
     np.testing.assert_allclose((a @ b) @ c, a @ (b @ c), atol=1e-12)
     np.testing.assert_allclose(a @ se3_inverse(a), np.eye(4), atol=1e-13)
     np.testing.assert_allclose(se3_inverse(a) @ a, np.eye(4), atol=1e-13)
@@ -105,14 +105,14 @@ def test_group_axioms(a: Float, b: Float, c: Float) -> None:
 
 
 @given(transforms, tangents)
-def test_adjoint_carries_a_tangent_over(a_T_b: Float, xi: Float) -> None:
+def test_se3_adjoint_moves_a_tangent(a_T_b: Float, xi: Float) -> None:
     left = a_T_b @ se3_exp(xi) @ se3_inverse(a_T_b)
     np.testing.assert_allclose(left, se3_exp(se3_adjoint(a_T_b) @ xi), atol=1e-9)
     np.testing.assert_allclose(se3_adjoint(se3_inverse(a_T_b)) @ se3_adjoint(a_T_b), np.eye(6), atol=1e-11)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_rotation_jacobians(angle: float) -> None:
+def test_so3_right_jacobian_and_inverse(angle: float) -> None:
     for axis in axes(3):
         phi = angle * axis
         jacobian = numerical(lambda d, phi=phi: so3_log(so3_exp(-phi) @ so3_exp(phi + d)), 3)  # type: ignore[misc]
@@ -121,14 +121,14 @@ def test_rotation_jacobians(angle: float) -> None:
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_jacobian_of_log(angle: float) -> None:
+def test_se3_right_jacobian_inverse_is_the_derivative_of_log(angle: float) -> None:
     for axis in axes(4):
         xi = np.concatenate([angle * axis, [0.7, -0.4, 1.1]])
         jacobian = numerical(lambda d, xi=xi: se3_log(se3_exp(xi) @ se3_exp(d)), 6)  # type: ignore[misc]
         np.testing.assert_allclose(se3_right_jacobian_inverse(xi), jacobian, atol=1e-7 if angle > 2.0 else 1e-8)
 
 
-def test_jacobian_of_log_is_smooth_where_series_and_closed_form_meet() -> None:
+def test_se3_right_jacobian_inverse_is_smooth_at_the_end_of_the_series() -> None:
     for boundary in (1e-5, 1e-3, 1e-2):
         for axis in axes(5):
             below, above = (
@@ -138,7 +138,7 @@ def test_jacobian_of_log_is_smooth_where_series_and_closed_form_meet() -> None:
             np.testing.assert_allclose(below, above, atol=1e-10)
 
 
-def test_the_tangent_is_gtsams(rng: np.random.Generator) -> None:
+def test_tangent_is_gtsams(rng: np.random.Generator) -> None:
     for _ in range(30):
         xi = np.concatenate([rng.uniform(-1.5, 1.5, 3), rng.uniform(-5.0, 5.0, 3)])
         pose = gtsam.Pose3.Expmap(xi)
@@ -150,7 +150,7 @@ def test_the_tangent_is_gtsams(rng: np.random.Generator) -> None:
 
 
 @given(rotation_vectors)
-def test_quaternions(phi: Float) -> None:
+def test_quaternions_of_rotations_and_back(phi: Float) -> None:
     rotation = Rotation.from_rotvec(phi)
     quat_wxyz = quat_wxyz_from_rotation(rotation.as_matrix())
     np.testing.assert_allclose(quat_wxyz, rotation.as_quat(canonical=True, scalar_first=True), atol=1e-12)
@@ -170,7 +170,7 @@ def test_quaternions_of_half_turns_have_no_preferred_axis() -> None:
 
 @settings(max_examples=30)
 @given(transforms, transforms, st.floats(0.0, 1.0))
-def test_interpolation(a_T_b0: Float, b0_T_b1: Float, fraction: float) -> None:
+def test_interpolate_between_two_poses(a_T_b0: Float, b0_T_b1: Float, fraction: float) -> None:
     a_T_b1 = a_T_b0 @ b0_T_b1
     found = interpolate(a_T_b0, a_T_b1, fraction)
     np.testing.assert_allclose(interpolate(a_T_b0, a_T_b1, 0.0), a_T_b0, atol=1e-12)

@@ -28,7 +28,7 @@ def forgetful() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("forgetful")
-def test_cache_folder_is_the_users_choice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_root_is_the_users_choice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GRAPHVIO_CACHE_DIR", str(tmp_path / "chosen"))
     assert kernels.cache_root() == tmp_path / "chosen"
     assert (tmp_path / "chosen").is_dir()
@@ -39,7 +39,7 @@ def test_cache_folder_is_the_users_choice(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.usefixtures("forgetful")
-def test_a_cache_that_cannot_be_written_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_root_that_cannot_be_written_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("GRAPHVIO_CACHE_DIR", str(tmp_path / "file" / "below"))
     root = kernels.cache_root()
@@ -126,13 +126,13 @@ def test_every_import_between_modules_of_kernels_is_of_the_form_that_the_digest_
     assert offenders == []
 
 
-def test_kernels_are_whole_of_their_own() -> None:
+def test_kernels_inline_what_they_call() -> None:
     """Else the linker would choose between copies of what they call, and the run that compiles be unlike later ones."""
     assert len(kernels._registered) > 20
     assert all(kernel.targetoptions["forceinline"] for kernel in kernels._registered)
 
 
-def test_compiled_functions_do_what_their_python_says() -> None:
+def test_kernels_compute_what_their_python_does() -> None:
     rng = np.random.default_rng(3)
     xi = rng.standard_normal(6)
     a_T_b = se3_exp(xi)

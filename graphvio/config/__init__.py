@@ -1,4 +1,4 @@
-"""Configuration: all stages together, read from profiles and files.
+"""Configuration of all stages, read from profiles and files.
 
 A profile is a YAML file in ``configs/`` that overrides some of the values; so is a user's own file.
 """
@@ -29,7 +29,7 @@ from graphvio.errors import ConfigError
 
 @dataclass(frozen=True)
 class Config:
-    """All stages."""
+    """Configuration of all stages."""
 
     corners: CornerConfig = field(default_factory=CornerConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
@@ -45,7 +45,7 @@ class Config:
     live: LiveConfig = field(default_factory=LiveConfig)
 
     def __post_init__(self) -> None:
-        """Refuse stages that do not fit together.
+        """Check that the stages fit together.
 
         Raises:
             ConfigError: if they do not.
@@ -84,7 +84,11 @@ class Config:
 
     @staticmethod
     def from_yaml(text: str, where: str = "configuration") -> Config:
-        """Parse YAML; what it does not mention keeps its default.
+        """Parse YAML; missing values keep their default.
+
+        Args:
+            text: a mapping of stages to mappings of names to values.
+            where: where it was read, for messages.
 
         Raises:
             ConfigError: if it is no YAML mapping, or a key or value is not valid.
@@ -99,19 +103,19 @@ class Config:
         return config
 
     def to_yaml(self) -> str:
-        """All values as YAML, in the order of the dataclasses."""
+        """Return all values as YAML, in the order of the dataclasses."""
         import yaml
 
         text: str = yaml.safe_dump(asdict(self), sort_keys=False)
         return text
 
     def sha256(self) -> str:
-        """Digest of all values: equal for configurations that do the same."""
+        """Return a digest of all values: equal for configurations that do the same."""
         return hashlib.sha256(self.to_yaml().encode()).hexdigest()
 
 
 def profiles() -> dict[str, Path]:
-    """Name -> file of the configurations that come with graphvio."""
+    """Return name -> file of the configurations that come with graphvio."""
     here = Path(__file__).parent.parent
     for folder in (here / "configs", here.parent / "configs"):  # as installed, as checked out
         if folder.is_dir():

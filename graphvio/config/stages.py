@@ -1,4 +1,4 @@
-"""What each stage can be told, with defaults that need no tuning."""
+"""Settings of each stage, with defaults that need no tuning."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ class CornerConfig(Stage):
     cells_across: int = 18
     """Square cells across an image's width, whatever its size: at most one new corner in each."""
     min_response: float = 4.0
-    """Least rms gradient along a corner's weaker direction, grey levels per pixel."""
+    """Smallest rms gradient along a corner's weaker direction, grey levels per pixel."""
     scarce_share: float = 0.33
-    """Where fewer of the cells hold a track with depth, new corners are looked for before the reference changes, too;
-    where few do even with the new corners, weaker ones are admitted."""
+    """Where fewer of the cells hold a track with depth, new corners are also found before the reference changes; where
+    few do even with them, weaker corners are admitted."""
     noise_factor: float = 1.5
-    """What they must still have: so many times the standard deviation of the image's noise."""
+    """Smallest rms gradient of weaker corners, as a multiple of the standard deviation of the image's noise."""
     border_px: int = 8
     """Corners and tracks nearer to the image's edge are dropped."""
 
     def cell_px(self, width_px: int) -> int:
-        """Side of a cell in an image of some width."""
+        """Return the side of a cell, pixels, in an image of some width."""
         return max(round(width_px / self.cells_across), 1)
 
 
 @dataclass(frozen=True)
 class TrackingConfig(Stage):
-    """Temporal 2D-2D matching by Lucas-Kanade (section 3): each track is looked for on the keyframe's own patch at its
-    predicted place, and through pyramids from the frame before where that fails."""
+    """Temporal 2D-2D matching by Lucas-Kanade (section 3): each track is registered on the keyframe's patch at its
+    predicted place, and followed through pyramids from the previous frame where that fails."""
 
     window_px: int = 15
-    """Side of the patch that is compared, odd (an even one counts as the next); also of the patch that registration on
-    the keyframe and the alignment in stereo take."""
+    """Side of the patch that is compared, odd (an even one counts as the next); also of the patches of registration on
+    the keyframe and of stereo alignment."""
     levels: int = 4
     """Pyramid levels, each of half the size."""
     max_forward_backward_px: float = 0.7
-    """Largest distance from a corner after the way forth and back: of tracks followed from the frame before, and from
-    left to right and back in stereo."""
+    """Largest distance from a corner after tracking forth and back: from the previous frame, and from left to right in
+    stereo."""
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,12 @@ class StereoConfig(Stage):
     """Left-right matching under the epipolar and disparity constraints, and triangulation (section 3)."""
 
     min_depth_m: float = 0.3
-    """Nearest depth that is searched; there is no farthest."""
+    """Smallest depth that is searched; there is no largest."""
     max_epipolar_px: float = 1.0
     """Largest reprojection error of the triangulated point, over both images together: how far a match is off the
     epipolar line."""
     min_correlation: float = 0.7
-    """Least normalised cross-correlation of the two patches."""
+    """Smallest normalised cross-correlation of the two patches."""
 
 
 @dataclass(frozen=True)
@@ -62,15 +62,16 @@ class MotionConfig(Stage):
     """Robust resection and refinement, and the choice between pairs (section 3, 3.1)."""
 
     selection: Literal["best_pair", "joint"] = "joint"
-    """``best_pair``: each pair alone, the least global cost wins, eq. (4). ``joint``: all pairs together, 3.1."""
+    """``best_pair``: each pair alone, the least global cost wins, eq. (4). ``joint``: all pairs together, section
+    3.1."""
     reference: Literal["previous", "keyframe"] = "keyframe"
     """Motion is measured from the previous frameset, or from one that stays while enough of it is in view."""
     keyframe_overlap: float = 0.7
     """Share of a keyframe's points that must still be tracked for it to stay."""
     hypotheses: int = 500
-    """Most 3-point hypotheses of each pair."""
+    """Maximum number of 3-point hypotheses of each pair."""
     confidence: float = 0.99999
-    """Probability of a hypothesis on three right points after which no more are drawn; 1 always draws them all."""
+    """Probability of a hypothesis on three right points after which no more are sampled; 1 always samples them all."""
     chunk_points: int = 100
     """Points of each pair on which the hypotheses are scored before half of them are dropped."""
     cauchy_scale_px: float = 1.5
@@ -84,32 +85,33 @@ class MotionConfig(Stage):
     max_error_px: float = 3.0
     """Reprojection error beyond which a point is no inlier."""
     sigma_inflation: float = 1.2
-    """Factor on a motion's standard deviations, for errors that residuals do not show: matches that share a patch."""
+    """Factor on a motion's standard deviations, for errors that residuals do not show, such as those of matches that
+    share a patch."""
     calibration_error_share: float = 0.002
-    """What errors of the calibration may add to a motion, as a share of its angle and distance, one sigma, where there
-    is an IMU to weigh it against."""
+    """Standard deviation that errors of the calibration add to a motion, as a share of its angle and distance, where
+    there is an IMU."""
     min_inliers: int = 12
-    """Motions that explain fewer points are refused."""
+    """Motions that explain fewer points are rejected."""
     min_inlier_share: float = 0.3
-    """Motions that explain a smaller share of the points are refused."""
+    """Motions that explain a smaller share of the points are rejected."""
     seed: int = 0
     """Of the random triples: equal seeds give equal results, to the bit."""
 
 
 @dataclass(frozen=True)
 class InitialisationConfig(Stage):
-    """The first pose: tilt from the accelerometer, at rest or in motion."""
+    """The first pose: tilt from the accelerometer, while stationary or in motion."""
 
     window_s: float = 1.0
-    """IMU samples before the first frameset that are used, as far as there are."""
+    """Time before the first frameset whose IMU samples are used."""
     min_window_s: float = 0.5
-    """Where there are fewer before it, the first frameset is held until samples after it make up for them."""
+    """With samples of less time before it, the first frameset is held until samples after it make up for them."""
     static_gyro_rad_s: float = 0.02
-    """Largest standard deviation of the angular rate that counts as rest."""
+    """Largest standard deviation of the angular rate that counts as stationary."""
     static_accel_m_s2: float = 0.15
-    """Largest standard deviation of the specific force that counts as rest."""
+    """Largest standard deviation of the specific force that counts as stationary."""
     tilt_sigma_deg: float = 3.0
-    """After a start in motion, estimates are ``initialising`` until the attitude is known this well,"""
+    """After an initialisation in motion, estimates are ``initialising`` until the attitude is known this well,"""
     velocity_sigma_m_s: float = 0.3
     """and the velocity this well: one standard deviation of roll and pitch, and of each component."""
 
@@ -122,19 +124,19 @@ class SmootherConfig(Stage):
     """Age from which a state may leave the window, unless later motions are measured from it: when the window is next
     solved as a whole, up to two framesets later."""
     gate_probability: float = 0.9999
-    """Vision is refused where its innovation lies outside this share of the chi-square distribution."""
+    """Vision is rejected where its innovation lies outside this share of the chi-square distribution."""
     huber_probability: float = 1.0
-    """Motions that the gate let in pull less, by Huber's kernel, where the solution leaves them outside this share of
-    the chi-square distribution; 1 lets all pull by their covariance. Below 1 the window is solved twice."""
+    """Motions that passed the gate are down-weighted by Huber's kernel where the solution leaves them outside this
+    share of the chi-square distribution; 1 weighs all by their covariance. Below 1 the window is solved twice."""
     max_accel_m_s2: float = 50.0
-    """Vision is refused where it asks for a larger acceleration."""
+    """Vision is rejected where it implies a larger acceleration."""
     max_gated_s: float = 1.0
-    """When the gate has refused for longer, the prediction is at fault and is started anew."""
+    """When the gate has rejected vision for longer, the prediction is at fault and is reinitialised."""
     reset_s: float = 60.0
     """Time from one reset of the position's covariance to the next."""
     imu_noise_scale: float = 3.0
-    """Factor on the rig's IMU noise densities, which data sheets state for a sensor that does not vibrate: what a real
-    flight needs to be told honestly."""
+    """Factor on the rig's IMU noise densities, which data sheets state for a sensor that does not vibrate: real flights
+    need it for a consistent covariance."""
     motion_accel_sigma_m_s2: float = 5.0
     """Without an IMU: standard deviation of the acceleration, eq. (11)."""
     motion_angular_accel_sigma_rad_s2: float = 10.0
@@ -145,14 +147,14 @@ class SmootherConfig(Stage):
 
 @dataclass(frozen=True)
 class FusionConfig(Stage):
-    """Which back-end makes estimates of motions and the IMU."""
+    """Choice of the back-end, which fuses motions and the IMU."""
 
     estimator: Literal["smoother", "filter"] = "smoother"
-    """``smoother``: the fixed-lag window. ``filter``: the paper's, as a baseline; it needs ``motion.reference:
+    """``smoother``: the fixed-lag window. ``filter``: the paper's filter, as a baseline; it needs ``motion.reference:
     previous``, since it measures velocities over one step."""
     estimate_time_offset: bool = False
-    """Whether the time offset between cameras and IMU is estimated from rotations and corrected as it runs; else the
-    rig's is taken as it is. Needs ``motion.reference: keyframe``."""
+    """Whether the time offset between cameras and IMU is estimated from rotations and corrected during the run; else
+    the rig's is used. Needs ``motion.reference: keyframe``."""
 
 
 @dataclass(frozen=True)
@@ -169,81 +171,82 @@ class FilterConfig(Stage):
     """Standard deviation of the gyro's mean rate over a step: much more than vision's when its poses are good."""
     gravity_sigma_m_s2: float = 10.0
     """Standard deviation of the accelerometer as a measurement of gravity: the rig's own acceleration, which lasts for
-    several steps, so that it must look larger than it is."""
+    several steps, so that it is set larger than it is."""
     gate_probability: float = 0.9999
-    """A measurement is refused where its innovation lies outside this share of the chi-square distribution."""
+    """A measurement is rejected where its innovation lies outside this share of the chi-square distribution."""
     max_accel_m_s2: float = 30.0
-    """Vision is refused where it asks for a larger acceleration."""
+    """Vision is rejected where it implies a larger acceleration."""
     max_gated_s: float = 1.0
-    """When the gates have refused vision for longer, the velocities are forgotten."""
+    """When the gates have rejected vision for longer, the velocities are forgotten."""
     reset_s: float = 10.0
     """Time from one reset of the position's covariance to the next."""
     bias: Literal["estimated", "none"] = "estimated"
-    """``none`` is the first approach: no gyro bias in the state, and the gyro is used only where it differs from
-    vision by more than ``gyro_threshold_rad_s``."""
+    """``none`` is the paper's first approach: no gyro bias in the state, and the gyro is used only where it differs
+    from vision by more than ``gyro_threshold_rad_s``."""
     gyro_threshold_rad_s: float = 0.1
     """For the first approach: the largest difference, in each axis, at which vision alone is used."""
 
 
 @dataclass(frozen=True)
 class TimingConfig(Stage):
-    """How long things are waited for."""
+    """Times to wait, and gaps that are tolerated."""
 
     simultaneous_ms: float = 2.0
     """Images of a recording whose stamps differ by no more are of the same instant."""
     max_imu_wait_ms: float = 100.0
-    """A frameset whose IMU samples have not come is held until one arrives that is newer by this much."""
+    """A frameset whose IMU samples are missing is held until a measurement arrives that is newer by this much."""
     max_imu_gap_ms: float = 50.0
     """A longer gap between IMU samples is not integrated over."""
     max_prediction_ms: float = 200.0
-    """Poses are predicted no farther beyond the newest IMU sample, or without an IMU beyond the newest frameset."""
+    """Poses are predicted no later than this after the newest IMU sample, or without an IMU after the newest
+    frameset."""
     max_imu_start_wait_s: float = 2.0
-    """When no IMU sample has come for this long, the odometry starts without."""
+    """When no IMU sample has arrived for this long, the odometry begins without the IMU."""
 
 
 @dataclass(frozen=True)
 class OptimizationConfig(Stage):
-    """Sessions as a whole, afterwards: states, places and loop closures."""
+    """Optimisation of whole sessions: states, places and loop closures."""
 
     keyframe_interval_s: float = 0.2
     """Longest time between two states of the graph; all keyframes are states."""
     place_distance_m: float = 0.4
-    """Keyframes so far from the place before are places, which are looked at for loop closures,"""
+    """Keyframes this far from the previous place are places, which are compared for loop closures,"""
     place_angle_deg: float = 15.0
     """or turned by so much."""
     features: int = 1000
     """SIFT features of a place's left image, the largest ones."""
     loop_interval_s: float = 10.0
-    """Places of one session that are nearer in time are not compared."""
+    """Places of one session that are closer in time are not compared."""
     loop_candidates: int = 3
-    """Places that each is compared with: those that look most alike."""
+    """Number of places that each is compared with: those that look most alike."""
     loop_min_inliers: int = 30
-    """Points that a loop closure must explain."""
+    """Minimum number of points that a loop closure explains."""
     loop_probability: float = 0.999
-    """A loop closure is refused where what it says and what all others say lies outside this share of the chi-square
+    """A loop closure is rejected where its difference from all others lies outside this share of the chi-square
     distribution."""
 
 
 @dataclass(frozen=True)
 class KeyframesConfig(Stage):
-    """What a SLAM system is given, and how it is believed; without one, nothing of it is done."""
+    """Keyframes for a SLAM system, and the gate of its corrections; unused without one."""
 
     descriptors: Literal["orb", "sift", "none"] = "orb"
     """Of the landmarks in the left images."""
     images: bool = False
     """Whether keyframes carry their images."""
     gate_probability: float = 0.999
-    """A correction is refused where what it says lies outside this share of the chi-square distribution."""
+    """A correction is rejected where its innovation lies outside this share of the chi-square distribution."""
 
 
 @dataclass(frozen=True)
 class LiveConfig(Stage):
-    """Real time, on live sensors."""
+    """Real-time operation on live sensors."""
 
     max_latency_ms: float = 100.0
-    """From the arrival of a frameset's last image to its estimate: before this is exceeded fewer corners are followed,
-    and then framesets are skipped."""
+    """Time from the arrival of a frameset's last image to its estimate: before it is exceeded fewer corners are
+    followed, and then framesets are skipped."""
     max_image_wait_ms: float = 50.0
-    """So long an image waits for its partner, and a pair for the others."""
+    """Time that an image waits for its partner, and a pair for the others."""
     stuck_s: float = 5.0
-    """A stage that works on one thing for longer is stuck."""
+    """A stage that works on one item for longer is stuck."""

@@ -1,4 +1,4 @@
-"""What a value of the configuration may be, and how mappings become dataclasses."""
+"""Types and ranges of configuration values, and construction of dataclasses from mappings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, get_args, get_type_hints
 
 from graphvio.errors import ConfigError
 
-_LARGEST = 1e12
+_MAX_VALUE = 1e12
 _MAY_BE_ZERO = frozenset(
     ("seed", "border_px", "keyframe_overlap", "min_inlier_share", "min_response",
      "scarce_share", "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s",
@@ -22,24 +22,29 @@ _SHARES = ("_share", "_overlap", "_probability", "_correlation", "confidence")
 
 
 class Stage:
-    """A part of the configuration, a frozen dataclass, whose values are checked however it is made."""
+    """A part of the configuration: a frozen dataclass whose values are checked whenever it is constructed."""
 
     def __post_init__(self) -> None:
-        """Refuse values that nothing can work with.
+        """Check all values.
 
         Raises:
-            ConfigError: that names the value.
+            ConfigError: if a value is not valid; the message names it.
         """
         for name, hint in get_type_hints(type(self)).items():
             value = checked(hint, getattr(self, name), f"{type(self).__name__}: {name}")
-            object.__setattr__(self, name, value)  # 12.0 as 12, so that what does the same is equal
+            object.__setattr__(self, name, value)  # 12.0 as 12, so that equal configurations have equal digests
 
 
 def build(kind: type[Any], data: object, where: str) -> Any:
-    """A dataclass from a mapping of names to values; what it does not mention keeps its default.
+    """Build a dataclass from a mapping of names to values; what is missing keeps its default.
+
+    Args:
+        kind: the dataclass.
+        data: the mapping, as read from a file.
+        where: where it was read, for messages.
 
     Raises:
-        ConfigError: if it is no mapping, or a key or value is not valid.
+        ConfigError: if ``data`` is no mapping, or a key or value is not valid.
     """
     if not isinstance(data, Mapping):
         raise ConfigError(f"{where}: must be a mapping of names to values, not {type(data).__name__}")
@@ -58,10 +63,15 @@ def build(kind: type[Any], data: object, where: str) -> Any:
 
 
 def checked(hint: Any, value: object, where: str) -> object:
-    """A value as the type that it should have.
+    """Convert a value to the type that it should have.
+
+    Args:
+        hint: the type.
+        value: as read from a file, or passed in.
+        where: where it was read, for messages; ends in the value's name.
 
     Raises:
-        ConfigError: if it is none, or out of the range that its name asks for.
+        ConfigError: if it is of another type, or out of the range that its name implies.
     """
     choices = get_args(hint)
     if choices:
@@ -74,14 +84,14 @@ def checked(hint: Any, value: object, where: str) -> object:
         return value
     if not isinstance(value, int | float) or isinstance(value, bool):
         raise ConfigError(f"{where}: is {value!r}; it must be a number")
-    if not 0 <= value <= _LARGEST:  # also refuses NaN
+    if not 0 <= value <= _MAX_VALUE:  # also rejects NaN
         raise ConfigError(f"{where}: is {value!r}; it must be finite and not negative")
     name = where.rsplit(" ", 1)[-1]
     if value == 0 and name not in _MAY_BE_ZERO:
         raise ConfigError(f"{where}: is 0; it must be positive")
-    least, most = _RANGES.get(name, (0, _LARGEST))
-    if not least <= value <= most:
-        raise ConfigError(f"{where}: is {value!r}; choose from {least} to {most}")
+    lowest, highest = _RANGES.get(name, (0, _MAX_VALUE))
+    if not lowest <= value <= highest:
+        raise ConfigError(f"{where}: is {value!r}; choose from {lowest} to {highest}")
     if name.endswith(_SHARES) and value > 1:
         raise ConfigError(f"{where}: is {value!r}; a share or probability is at most 1")
     if hint is float:
@@ -92,11 +102,11 @@ def checked(hint: Any, value: object, where: str) -> object:
 
 
 def nearest(key: str, names: Iterable[str]) -> str:
-    """What to add to a message where a name is unknown: the known one that is most like it."""
+    """Suggest, for the end of a message, the known name that is most like an unknown one."""
     close = difflib.get_close_matches(key, list(names), n=1, cutoff=0.3)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def _number_of_text(value: object) -> object:
-    """YAML takes 1e-9 and 1.5e0 for text; numbers in quotes stay text."""
+    """Convert numbers such as 1e-9, which YAML takes for text; numbers in quotes stay text."""
     return float(value) if isinstance(value, str) and _EXPONENT.fullmatch(value) else value

@@ -1,7 +1,7 @@
 """Points in blocks of 32, column by column, as vector instructions take them.
 
-A block is one flat array of rows of 32 numbers, one for each point, whose places in it are constants: a loop over
-the points of a block then compiles to instructions that work on eight points at once.
+A block is one flat array of rows of 32 numbers, one for each point, at constant offsets: a loop over the points of a
+block then compiles to instructions that work on eight points at once.
 """
 
 from typing import NamedTuple
@@ -26,8 +26,8 @@ def _rows(count: int) -> tuple[int, ...]:
     LEFT_U, LEFT_V, RIGHT_U, RIGHT_V,
     SEEN, SIZE,
 ) = _rows(15)  # fmt: skip
-"""Where a block has its points ``[x, y, 1/Z]``, their covariances, normalised coordinates in both images, and 1 where
-the right image sees a point, else 0; and the length of all that."""
+"""Offsets in a block: points ``[x, y, 1/Z]``, their covariances, normalised coordinates in both images, and 1 where the
+right image sees a point, else 0; and the size of a block."""
 
 
 class Blocks(NamedTuple):
@@ -35,7 +35,7 @@ class Blocks(NamedTuple):
 
     Attributes:
         pair: (B,) index of the pair.
-        first: (B,) the block's first point among all; they follow each other.
+        first: (B,) the block's first point among all; points follow each other.
         size: (B,) number of points; the lanes beyond repeat the last one and mean nothing.
         values: (B, SIZE).
     """
@@ -48,10 +48,10 @@ class Blocks(NamedTuple):
 
 @kernel
 def in_blocks(observations: Observations) -> Blocks:
-    """Take observations, which are sorted by pair, apart into blocks."""
+    """Split observations, which are sorted by pair, into blocks."""
     pair = observations.pair
     n, blocks = len(pair), 0
-    first = np.empty(n + 1, dtype=np.int64)  # more than enough
+    first = np.empty(n + 1, dtype=np.int64)  # more than needed
     for i in range(n):
         if i == 0 or pair[i] != pair[i - 1] or i - first[blocks - 1] == POINTS:
             first[blocks] = i
@@ -83,7 +83,7 @@ def in_blocks(observations: Observations) -> Blocks:
 
 @kernel
 def point_by_point(blocks: Blocks, lanes: Float) -> Float:
-    """Values of the blocks' lanes (B, POINTS), point by point (N,)."""
+    """Gather values of the blocks' lanes (B, POINTS) point by point (N,)."""
     values = np.empty(blocks.size.sum())
     for b in range(len(blocks.pair)):
         for lane in range(blocks.size[b]):
@@ -93,7 +93,7 @@ def point_by_point(blocks: Blocks, lanes: Float) -> Float:
 
 @kernel
 def lane_by_lane(blocks: Blocks, values: Float) -> Float:
-    """Values of points (N,), lane by lane (B, POINTS); zero beyond the last point of a block."""
+    """Scatter values of points (N,) lane by lane (B, POINTS), with zero beyond the last point of a block."""
     lanes = np.zeros((len(blocks.pair), POINTS))
     for b in range(len(blocks.pair)):
         for lane in range(blocks.size[b]):

@@ -1,4 +1,4 @@
-"""Harris corners, one in each cell that has no track (section 3 and its reference [5])."""
+"""Harris corners, one in each cell of the image that has no track (section 3 and its reference [5]); image noise."""
 
 import numpy as np
 
@@ -7,12 +7,16 @@ from graphvio.kernels import fast_kernel, kernel, put
 
 _HARRIS_K = 0.04
 _RADIUS = 3  # of the 7x7 window over which gradients are summed
-_BORDER = 2  # around a cell: one pixel to smooth the response, one to see whether it peaks
+_BORDER = 2  # around a cell: one pixel to smooth the response, one to check that it peaks
+_NOISE_STEP = 6  # pixels and rows from one sample to the next
+_MAX_RESPONSE = 2047
+_NOISE_QUANTILE = 0.5
+_NOISE_GAIN = 6.0 * 0.6745  # the operator's gain on the noise's deviation, times a normal deviate's median
 
 
 @kernel
 def occupied_cells(pixels: Float, cell_px: int, rows: int, columns: int) -> Bool:
-    """Which cells (rows, columns) hold at least one of the pixels (N, 2)."""
+    """Mark the cells (rows, columns) that hold at least one of the pixels (N, 2)."""
     occupied = np.zeros((rows, columns), dtype=np.bool_)
     for i in range(len(pixels)):
         row = int(pixels[i, 1]) // cell_px
@@ -24,7 +28,7 @@ def occupied_cells(pixels: Float, cell_px: int, rows: int, columns: int) -> Bool
 
 @kernel
 def thinned(pixels: Float, found: Bool, cell_px: int, most: int) -> Bool:
-    """Of the found tracks (N, 2) that have gathered in one cell, only the first ones, at most so many, stay (N,)."""
+    """Select (N,) the found tracks that stay where several share a cell: the first ones of each, at most ``most``."""
     keep = np.zeros(len(pixels), dtype=np.bool_)
     rows = columns = 1
     for i in np.flatnonzero(found):
@@ -43,28 +47,28 @@ def find_corners(
     image: Image,
     allowed: Bool,
     tracked: Float,
-    settled: Bool,
+    occupying: Bool,
     cell_px: int,
     border_px: int,
     min_response: float,
 ) -> Float:
-    """The strongest Harris corner of each cell without a settled track, to sub-pixel precision.
+    """Find the strongest Harris corner of each cell that no track occupies, to sub-pixel precision.
 
     Args:
         image: (height, width).
         allowed: (height, width), False where the image must not be used.
         tracked: (N, 2) pixels that are tracked already; a new corner keeps half a cell of distance to them.
-        settled: (N,) which of them are good enough for their cell to need no other.
+        occupying: (N,) which of them occupy their cell, so that it gets no other corner.
         cell_px: side of a cell.
         border_px: width of the margin without corners.
-        min_response: least rms gradient, in grey levels per pixel, along a corner's weaker direction.
+        min_response: smallest rms gradient along a corner's weaker direction, grey levels per pixel.
 
     Returns:
         Pixels (M, 2).
     """
     height, width = image.shape
     rows, columns = (height + cell_px - 1) // cell_px, (width + cell_px - 1) // cell_px
-    occupied = occupied_cells(tracked[settled], cell_px, rows, columns)
+    occupied = occupied_cells(tracked[occupying], cell_px, rows, columns)
     margin = max(border_px, _RADIUS + _BORDER + 1)
     found = np.empty((rows * columns + len(tracked), 2))
     put(found[: len(tracked)], tracked)
@@ -107,7 +111,7 @@ def _harris(
     image: Image, x0: int, y0: int, high: int, wide: int, lines: AnyArray, sums: AnyArray,
     response: AnyArray, weaker2: AnyArray,
 ) -> None:  # fmt: skip
-    """Fill Harris' response, and the mean square gradient along the weaker direction, from pixel (x0, y0) on.
+    """Fill the Harris response, and the mean square gradient along the weaker direction, from pixel (x0, y0) on.
 
     Sums over the window's columns are carried from row to row; all numbers in them are exact in single precision.
     """
@@ -146,7 +150,7 @@ def _harris(
 
 @fast_kernel
 def _smooth(response: AnyArray, high: int, wide: int, smooth: AnyArray) -> None:
-    """Fill the response smoothed, because a box window leaves it level over several pixels around a corner."""
+    """Fill the smoothed response, because a box window leaves it level over several pixels around a corner."""
     two, scale = np.float32(2.0), np.float32(1.0 / 16.0)
     for j in range(1, high - 1):
         above, at, below, out = response[j - 1], response[j], response[j + 1], smooth[j]
@@ -160,7 +164,7 @@ def _smooth(response: AnyArray, high: int, wide: int, smooth: AnyArray) -> None:
 
 @kernel
 def _within(pixels: Float, x0: int, y0: int, x1: int, y1: int, distance: float, near: Float) -> int:
-    """Fill those of pixels (N, 2) that are nearer than a distance to the rectangle; return their number."""
+    """Fill ``near`` with the pixels (N, 2) that are nearer than a distance to the rectangle; return their number."""
     count = 0
     for i in range(len(pixels)):
         x, y = pixels[i, 0], pixels[i, 1]
@@ -175,7 +179,7 @@ def _strongest(
     response: AnyArray, weaker2: AnyArray, least2: float, allowed: Bool, x0: int, y0: int, x1: int, y1: int,
     near: Float, distance: float,
 ) -> tuple[int, int]:  # fmt: skip
-    """Column and row of the response's largest value that is allowed and keeps its distance, or (-1, -1)."""
+    """Find column and row of the largest response that is allowed and keeps its distance, or (-1, -1)."""
     best, bx, by = np.float32(0.0), -1, -1
     least_distance2 = distance * distance
     for y in range(_BORDER, y1 - y0 + _BORDER):
@@ -190,7 +194,7 @@ def _strongest(
 
 @kernel
 def _distance2(pixels: Float, x: float, y: float) -> float:
-    """Squared distance from (x, y) to the nearest of pixels (N, 2)."""
+    """Compute the squared distance from (x, y) to the nearest of pixels (N, 2)."""
     least = np.inf
     for i in range(len(pixels)):
         dx, dy = pixels[i, 0] - x, pixels[i, 1] - y
@@ -200,7 +204,7 @@ def _distance2(pixels: Float, x: float, y: float) -> float:
 
 @kernel
 def _is_peak(response: AnyArray, x: int, y: int) -> bool:
-    """False on the slope towards a corner of the next cell."""
+    """Check that no neighbour is greater, as it is on the slope towards a corner of the next cell."""
     for j in range(-1, 2):
         for i in range(-1, 2):
             if response[y + j, x + i] > response[y, x]:
@@ -210,8 +214,39 @@ def _is_peak(response: AnyArray, x: int, y: int) -> bool:
 
 @kernel
 def _peak_offset(before: float, at: float, after: float) -> float:
-    """Where a parabola through three values has its peak, from the middle one, within half a pixel."""
+    """Compute where a parabola through three values peaks, from the middle one, within half a pixel."""
     curvature = before - 2.0 * at + after
     if curvature >= 0.0:
         return 0.0
     return min(max(0.5 * (before - after) / curvature, -0.5), 0.5)
+
+
+@kernel
+def noise_sigma(image: Image) -> float:
+    """Estimate the standard deviation of an image's noise in grey levels, at least that of rounding to whole ones.
+
+    The operator of J. Immerkaer (*Fast noise variance estimation*, CVIU 64(2), 1996) is blind to anything that is
+    linear along rows or columns; the median over the image leaves out most of the remaining texture. Pixels that are
+    black or saturated show no noise and do not count.
+    """
+    height, width = image.shape
+    histogram = np.zeros(_MAX_RESPONSE + 1, dtype=np.int64)
+    count = 0
+    for y in range(1, height - 1, _NOISE_STEP):
+        for x in range(1, width - 1, _NOISE_STEP):
+            middle = int(image[y, x])
+            if middle == 0 or middle == 255:
+                continue
+            corners = int(image[y - 1, x - 1]) + int(image[y - 1, x + 1])
+            corners += int(image[y + 1, x - 1]) + int(image[y + 1, x + 1])
+            edges = int(image[y - 1, x]) + int(image[y + 1, x]) + int(image[y, x - 1]) + int(image[y, x + 1])
+            histogram[min(abs(corners - 2 * edges + 4 * middle), _MAX_RESPONSE)] += 1
+            count += 1
+    rounding = float(1.0 / np.sqrt(12.0))
+    below = 0
+    for value in range(_MAX_RESPONSE + 1):
+        if below + histogram[value] > _NOISE_QUANTILE * count:
+            within = (_NOISE_QUANTILE * count - below) / histogram[value]
+            return float(max((value - 0.5 + within) / _NOISE_GAIN, rounding))
+        below += histogram[value]
+    return rounding

@@ -7,10 +7,10 @@ from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.geometry import se3_compose
 from graphvio.kernels import fast_kernel, kernel, vector_kernel
 
-NEAREST = 1e-3
-"""Depth over the reference depth, below which a point is behind the camera."""
-WORST = 1e6
-"""Squared error that stands for a point behind the camera; no other counts for more."""
+MIN_DEPTH_RATIO = 1e-3
+"""Depth over the reference depth below which a point counts as behind the camera."""
+MAX_ERROR2 = 1e6
+"""Squared error over the squared scale of a point behind the camera, and the maximum of all others."""
 _BLOCK = 32  # (1 + 1e6)^32 is below the largest float; so it is for the points of `graphvio.frontend.blocks`
 
 Matrix = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
@@ -19,7 +19,7 @@ Matrix = tuple[float, float, float, float, float, float, float, float, float, fl
 
 @vector_kernel
 def elements(transform: Float) -> Matrix:
-    """The upper three rows of a transform (4, 4), which a loop then holds in registers."""
+    """Return the upper three rows of a transform (4, 4), which a loop then holds in registers."""
     t = transform
     return (
         t[0, 0], t[0, 1], t[0, 2], t[0, 3],
@@ -30,9 +30,11 @@ def elements(transform: Float) -> Matrix:
 
 @kernel
 def left_motions(cur_T_ref: Float, rig: RigArrays) -> Float:
-    """``cam_T_left`` (P, 2, 4, 4): from each left camera at the reference instant to its pair's cameras now.
+    """Transfer a motion of body to each camera, eq. (1).
 
-    Side 0 is the transfer of the motion to the pair, eq. (1); side 1 has the paper's ``P^s`` in front.
+    Returns:
+        ``cam_T_left`` (P, 2, 4, 4), from each left camera at the reference instant to its pair's cameras now: the
+        paper's ``P_j``, and on side 1 ``P^s P_j``.
     """
     n_pairs = len(rig.body_T_left)
     motions = np.empty((n_pairs, 2, 4, 4))
@@ -45,10 +47,10 @@ def left_motions(cur_T_ref: Float, rig: RigArrays) -> Float:
 
 @kernel
 def squared_error_px(motion: Float, point: Float, seen: Float, focal_px: float) -> float:
-    """Squared reprojection error in pixels of a point ``[x, y, 1/Z]``; infinite behind the camera."""
+    """Compute the squared reprojection error in pixels of a point ``[x, y, 1/Z]``; infinite behind the camera."""
     a, b, w = point[0], point[1], point[2]
     z = motion[2, 0] * a + motion[2, 1] * b + motion[2, 2] + w * motion[2, 3]
-    if z < NEAREST:
+    if z < MIN_DEPTH_RATIO:
         return np.inf
     x = motion[0, 0] * a + motion[0, 1] * b + motion[0, 2] + w * motion[0, 3]
     y = motion[1, 0] * a + motion[1, 1] * b + motion[1, 2] + w * motion[1, 3]
@@ -60,7 +62,7 @@ def squared_error_px(motion: Float, point: Float, seen: Float, focal_px: float) 
 def robust_cost(
     cur_T_ref: Float, rig: RigArrays, observations: Observations, rows: Int, cauchy_scale_px: float
 ) -> float:
-    """Sum of ``rho(y) = log(1 + |y|^2 / a^2)`` over both images of the given rows: eq. (3), or eq. (2) for one pair.
+    """Sum ``rho(y) = log(1 + |y|^2 / a^2)`` over both images of the given rows: eq. (3), or eq. (2) for one pair.
 
     A point that falls behind a camera counts as one with an error of a thousand scales.
     """
@@ -71,7 +73,7 @@ def robust_cost(
 def score_all(
     hypotheses: Float, rig: RigArrays, observations: Observations, rows: Int, cauchy_scale_px: float
 ) -> Float:
-    """`robust_cost` (H,) of each hypothesis (H, 4, 4) on the given rows."""
+    """Compute `robust_cost` (H,) of each hypothesis (H, 4, 4) on the given rows."""
     scores = np.zeros(len(hypotheses))
     for j in range(len(rig.body_T_left)):
         points, left, right, n = _columns_of_pair(observations, rows, j)
@@ -88,8 +90,10 @@ def score_all(
 
 @kernel
 def _columns_of_pair(observations: Observations, rows: Int, pair: int) -> tuple[Float, Float, Float, int]:
-    """One pair's n points, and their left and right coordinates with weights, as columns in memory: (3, n) but for a
-    last block that is filled with points of no weight."""
+    """Collect one pair's n points, and their left and right coordinates with weights, as columns in memory.
+
+    Each is (3, n), filled up to whole blocks with points of no weight.
+    """
     n = 0
     for i in rows:
         n += observations.pair[i] == pair
@@ -113,7 +117,7 @@ def _columns_of_pair(observations: Observations, rows: Int, pair: int) -> tuple[
 
 @fast_kernel
 def _image_cost(motion: Float, points: Float, seen: Float, scale: float) -> float:
-    """Robust cost in one image; logarithms are taken of products, which fit into a float for a block of points."""
+    """Sum the robust cost in one image; one logarithm is taken of a block's product, which fits into a float."""
     m, total = elements(motion), 0.0
     a, b, w = points[0], points[1], points[2]
     u, v, weight = seen[0], seen[1], seen[2]
@@ -123,9 +127,9 @@ def _image_cost(motion: Float, points: Float, seen: Float, scale: float) -> floa
             x = m[0] * a[i] + m[1] * b[i] + m[2] + w[i] * m[3]
             y = m[4] * a[i] + m[5] * b[i] + m[6] + w[i] * m[7]
             z = m[8] * a[i] + m[9] * b[i] + m[10] + w[i] * m[11]
-            inverse_z = 1.0 / max(z, NEAREST)
+            inverse_z = 1.0 / max(z, MIN_DEPTH_RATIO)
             dx, dy = scale * (u[i] - x * inverse_z), scale * (v[i] - y * inverse_z)
-            error = min(dx * dx + dy * dy, WORST) if z >= NEAREST else WORST
+            error = min(dx * dx + dy * dy, MAX_ERROR2) if z >= MIN_DEPTH_RATIO else MAX_ERROR2
             product *= 1.0 + weight[i] * error
         total += np.log(product)
     return total

@@ -1,4 +1,4 @@
-"""The frame that tracks are registered on: its patches, and the surfaces that they show."""
+"""The patches of a keyframe, on which tracks are registered, and the slant of the surfaces that they show."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _SAME_PATCH = 0.8  # correlation of the patches
 
 
 class KeyframePatches:
-    """One frame's patches, which later images are held against.
+    """Patches of one keyframe, which are found again in later images.
 
-    Following a point from frame to frame adds up the errors of each step. The anchor's patch, deformed as a predicted
-    motion and the slant of its surface would have it, shows where the point really is.
+    Following a point from frame to frame adds up the errors of each step. The keyframe's patch, deformed by the
+    predicted motion and the slant of its surface, gives the point's place without that drift.
 
     Args:
-        pair: whose left images these are.
+        pair: to which the left images belong.
         window_px: side of the patches; an even one counts as the next.
     """
 
@@ -33,7 +33,7 @@ class KeyframePatches:
         self._step_px = float(np.sqrt((side**2 - 1) / 12.0))  # standard deviation of a patch's pixels
         self._frame = PairFrame.empty()
         self._image: AnyArray | None = None  # packed
-        self._rays: Float = np.zeros((5, 0, 2))  # of what is around each of the tracks
+        self._rays: Float = np.zeros((5, 0, 2))  # around each of the tracks
         self._inverse_depths: Float = np.zeros((5, 0))
 
     def take(self, frame: PairFrame, image: Image) -> None:
@@ -56,17 +56,17 @@ class KeyframePatches:
     def find(
         self, ids: Int, guess: Float, image: Image, left_T_left_keyframe: Float, min_gradient: float
     ) -> tuple[Float, Bool]:
-        """Where the patches of tracks are in another image.
+        """Find the patches of tracks in another image.
 
         Args:
             ids: (N,) the tracks.
             guess: (N, 2) pixels, nearly right.
             image: (height, width), left.
-            left_T_left_keyframe: (4, 4) predicted motion of points since the anchor.
-            min_gradient: least rms gradient of a patch along its weaker direction, grey levels per pixel.
+            left_T_left_keyframe: (4, 4) predicted motion of points since the keyframe.
+            min_gradient: smallest rms gradient of a patch along its weaker direction, grey levels per pixel.
 
         Returns:
-            Pixels (N, 2), those guessed where there is no patch or it is not found, and which were found (N,).
+            Pixels (N, 2), equal to the guess where there is no patch or it is not found, and which were found (N,).
         """
         frame = self._frame
         if self._image is None or not len(frame.ids) or not len(ids):

@@ -1,9 +1,9 @@
-"""Whitened reprojection errors of many points, and their normal equations for a step of the motion (section 3, 5).
+"""Whitened reprojection errors of many points, and their normal equations for a step of the motion (sections 3 and 5).
 
 A point's error in both images is one vector of four. Its covariance is that of its pair's pixels plus that of the
 triangulated point as it is seen from here, ``S = sigma^2 (1 + J_X C_X J_X^T)``: near points, whose depth is known
-well, count for more. Points are errors in variables: derivatives are taken where both instants together say that a
-point is, not where it was triangulated, whose noise is in the residual too and would bias the motion (maximum
+well, count for more. Points are errors in variables: derivatives are taken at the place that both instants together
+give a point, not at the triangulated one, whose noise is in the residual too and would bias the motion (maximum
 likelihood with the points eliminated; R. Hartley, A. Zisserman, *Multiple View Geometry*, 2004, section 5.2).
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.frontend.blocks import LEFT_U, LEFT_V, POINTS, RIGHT_U, RIGHT_V, SEEN, Blocks, W, X, Y
-from graphvio.frontend.cost import WORST, elements
+from graphvio.frontend.cost import MAX_ERROR2, elements
 from graphvio.frontend.observations import RigArrays
 from graphvio.frontend.point_errors import (
     covariance_times,
@@ -31,17 +31,19 @@ from graphvio.frontend.point_errors import (
 from graphvio.kernels import put, vector_kernel
 
 _EXPANSIONS = 2
-_FARTHEST = 16.0  # squared whitened error up to which a point may follow its residual; outliers would gain leverage
+_MAX_FOLLOWED_ERROR2 = (
+    16.0  # squared whitened error up to which a point may follow its residual; outliers would gain leverage
+)
 _COLUMN = 4 * POINTS  # of whitened derivatives: the four rows of each of a block's points
 
 
 class Expansion(NamedTuple):
-    """Where the errors of points are linearised, in blocks as `graphvio.frontend.blocks.Blocks`.
+    """Places at which the errors of points are linearised, in blocks as `graphvio.frontend.blocks.Blocks`.
 
     Attributes:
-        shifts: (B, 3 POINTS) by how much what both instants say corrects the points.
+        shifts: (B, 3 POINTS) corrections of the points, by the errors at both instants.
         points: (B, 3 POINTS) corrected, by the shifts of before.
-        offsets: (B, 4 POINTS) what that correction is worth, pixels.
+        offsets: (B, 4 POINTS) effect of that correction, pixels.
         whiteners: (B, 10 POINTS) inverse Cholesky factors of the covariances S, lower triangles row by row.
     """
 
@@ -53,7 +55,7 @@ class Expansion(NamedTuple):
 
 @vector_kernel
 def unexpanded(blocks: Blocks) -> Expansion:
-    """Room for an expansion, with no correction of the points."""
+    """Allocate an expansion, with no correction of the points."""
     n = len(blocks.pair)
     return Expansion(
         np.zeros((n, 3 * POINTS)), np.empty((n, 3 * POINTS)), np.empty((n, 4 * POINTS)), np.empty((n, 10 * POINTS))
@@ -62,10 +64,16 @@ def unexpanded(blocks: Blocks) -> Expansion:
 
 @vector_kernel
 def expand(motions: Float, rig: RigArrays, blocks: Blocks, sigmas_px: Float, at: Expansion) -> None:
-    """Linearise all points at motions (P, 2, 4, 4), see `graphvio.frontend.cost.left_motions`.
+    """Linearise the errors of all points by the points, and compute their whiteners.
 
-    The pixels of each pair have a noise of their own (P,). The search for the points' places goes on from those of
-    the last expansion.
+    The search for the points' places continues from those of the last expansion.
+
+    Args:
+        motions: (P, 2, 4, 4), see `graphvio.frontend.cost.left_motions`.
+        rig: of P pairs.
+        blocks: of N points.
+        sigmas_px: (P,) pixel noise of each pair.
+        at: output.
     """
     for b in range(len(blocks.pair)):
         j = blocks.pair[b]
@@ -81,7 +89,7 @@ def _expand_block(
     to_left: Float, to_right: Float, focal_left: float, focal_right: float, sigma: float, block: Float,
     shifts: Float, points: Float, offsets: Float, whiteners: Float,
 ) -> None:  # fmt: skip
-    """`expand` for one block."""
+    """Expand one block, see `expand`."""
     left, right = elements(to_left), elements(to_right)
     for i in range(POINTS):
         shift = shifts[X + i], shifts[Y + i], shifts[W + i]
@@ -104,7 +112,7 @@ def _expand_block(
         )  # fmt: skip
         wa, wb, wd, we = whiten(lower, (ra - oa, rb - ob, rd - od, re - oe))
         e2 = wa * wa + wb * wb + wd * wd + we * we
-        share = sigma * sigma * min(1.0, _FARTHEST / max(e2, 1e-12))
+        share = sigma * sigma * min(1.0, _MAX_FOLLOWED_ERROR2 / max(e2, 1e-12))
         # C J^T S^-1 r: where the residual r would have the point
         ba, bb, bd, be = whiten_transposed(lower, (share * wa, share * wb, share * wd, share * we))
         put3(shifts, i, (
@@ -128,7 +136,7 @@ def linearise(
         motions: (P, 2, 4, 4) at which to linearise.
         rig: of P pairs.
         blocks: of N points.
-        at: where the points are linearised.
+        at: expansion of the points.
         active: (B, POINTS) 1 for points that count; the others, which are 0, only get their errors.
         scale: of the Cauchy cost, in whitened units.
         hessian: (6, 6) output.
@@ -141,9 +149,9 @@ def linearise(
         _whiten_block(motions, rig, blocks, at, b, columns, errors2[b])
         product = 1.0  # see `graphvio.frontend.cost`
         for i in range(POINTS):
-            e2 = min(errors2[b, i] * inverse_scale2, WORST)
+            e2 = min(errors2[b, i] * inverse_scale2, MAX_ERROR2)
             product *= 1.0 + active[b, i] * e2
-            weights[i] = active[b, i] / (1.0 + e2) if e2 < WORST else 0.0
+            weights[i] = active[b, i] / (1.0 + e2) if e2 < MAX_ERROR2 else 0.0
         cost += np.log(product)
         _add_squares(columns, weights, normal)
     put(hessian, _symmetric(normal))
@@ -155,8 +163,10 @@ def linearise(
 def information_through_points(
     motions: Float, rig: RigArrays, blocks: Blocks, at: Expansion, sigmas_px: Float, factors: Float
 ) -> Float:
-    """``sum f (J^T S^-1 J - sigma^2 J^T S^-2 J)`` (6, 6): the part of the score's variance that the points' own errors
-    contribute, each point with a factor f (B, POINTS)."""
+    """Sum ``f (J^T S^-1 J - sigma^2 J^T S^-2 J)`` (6, 6) over the points, each with a factor f (B, POINTS).
+
+    It is the part of the score's variance that the points' own errors contribute.
+    """
     columns, weights, normal = np.empty(7 * _COLUMN), np.empty(POINTS), np.zeros((7, 7))
     for b in range(len(blocks.pair)):
         _whiten_block(motions, rig, blocks, at, b, columns, weights)
@@ -172,7 +182,7 @@ def information_through_points(
 def _whiten_block(
     motions: Float, rig: RigArrays, blocks: Blocks, at: Expansion, b: int, columns: Float, errors2: Float
 ) -> None:
-    """Fill a block's whitened derivatives (6, 4, POINTS), behind them its errors (4, POINTS), and their squares."""
+    """Fill a block's whitened derivatives (6, 4, POINTS), after them its errors (4, POINTS), and their squares."""
     j, block, points, offsets, whiteners = (
         blocks.pair[b], blocks.values[b], at.points[b], at.offsets[b], at.whiteners[b],
     )  # fmt: skip
@@ -215,7 +225,7 @@ def _whiten_again(whiteners: Float, columns: Float) -> None:
 
 @vector_kernel
 def _add_squares(columns: Float, weights: Float, normal: Float) -> None:
-    """Add a block's derivatives and errors, each times each and weighted, to the upper triangle of a matrix (7, 7)."""
+    """Add the weighted products of a block's derivatives and errors to the upper triangle of a matrix (7, 7)."""
     weighted = np.empty(_COLUMN)
     for c in range(7):
         for start in range(0, _COLUMN, POINTS):
@@ -231,7 +241,7 @@ def _add_squares(columns: Float, weights: Float, normal: Float) -> None:
 
 @vector_kernel
 def _symmetric(normal: Float) -> Float:
-    """The matrix (6, 6) of which only the upper triangle is there."""
+    """Return the symmetric matrix (6, 6) of its upper triangle."""
     whole = normal[:6, :6].copy()
     for c in range(6):
         put(whole[c:, c], whole[c, c:])

@@ -1,4 +1,4 @@
-"""Sparse pyramidal Lucas-Kanade: where small patches of one image are in another.
+"""Sparse pyramidal Lucas-Kanade: finds small patches of one image in another.
 
 Inverse compositional (S. Baker, I. Matthews, *Lucas-Kanade 20 years on*, IJCV 56(3), 2004): gradients and normal
 matrix belong to the patch and are computed once for all iterations. The patch's mean brightness is left out of the
@@ -28,17 +28,17 @@ from graphvio.frontend.patches import (
 from graphvio.kernels import fast_kernel
 
 MIN_GRADIENT = 1.0
-"""Rms grey levels per pixel along a patch's weaker direction; below, it is not localised."""
+"""Smallest rms gradient of a localised patch along its weaker direction, grey levels per pixel."""
 
 _MAX_SIGMA_PX = 0.2
-"""Of a place along the weaker direction; sharp images have less than half of it."""
+"""Largest standard deviation of a place along the weaker direction; sharp images have less than half of it."""
 
 Pyramid = tuple[Image, ...]
 """An image and its halves, quarters..."""
 
 
 def build_pyramid(image: Image, levels: int) -> Pyramid:
-    """The image and ``levels - 1`` smaller ones, each of half the size; computed once, used by every match."""
+    """Build a pyramid: the image and ``levels - 1`` smaller ones, each of half the size."""
     pyramid = [image]
     for _ in range(levels - 1):
         pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), dtype=np.uint8))
@@ -57,18 +57,18 @@ def track(
     min_gradient: float = MIN_GRADIENT,
     first_levels: int | None = None,
 ) -> tuple[Float, Bool]:
-    """Where corners of one image are in another, forth and, for a check, back again.
+    """Track corners from one image to another and, as a check, back again.
 
     Args:
         source: of the image that holds the corners.
         target: of the image to find them in.
         pixels: (N, 2) corners.
-        guess: (N, 2) where the search starts.
+        guess: (N, 2) initial pixels in the target.
         window_px: side of the patch that is compared, odd.
         levels: pyramid levels that are used, 1 for the image alone.
         max_return_px: largest distance from the corner after tracking forth and back.
-        min_gradient: least rms gradient of a patch along its weaker direction, grey levels per pixel.
-        first_levels: where the guess is good: levels that are tried first; what fails is tried again with all.
+        min_gradient: smallest rms gradient of a patch along its weaker direction, grey levels per pixel.
+        first_levels: levels that are tried first, where the guess is good; tracks that fail are tried again with all.
 
     Returns:
         Pixels (N, 2) and whether each was found (N,), also to a sigma of 0.2 px along its weaker direction.
@@ -89,7 +89,7 @@ def _forth_and_back(
     source: Sequence[Image], target: Sequence[Image], pixels: Float, guess: Float, half: int, levels: int,
     max_return_px: float, min_gradient: float,
 ) -> tuple[Float, Bool]:  # fmt: skip
-    """Points (N, 2) tracked through some levels, the coarsest first, and whether they are found and come back (N,)."""
+    """Track points (N, 2) through some levels, the coarsest first, and back; the flags (N,) say which were found."""
     n = len(pixels)
     moved = guess.copy()
     found = np.zeros(n, dtype=np.bool_)
@@ -125,18 +125,18 @@ def register(
     source: AnyArray, target: Image, pixels: Float, warps: Float, guess: Float, wanted: Bool, half: int,
     max_shift_px: float, min_gradient: float,
 ) -> tuple[Float, Bool, Bool, Float]:  # fmt: skip
-    """Where patches of one image are in another that sees them deformed, from a guess that is nearly right.
+    """Register patches of one image in another that shows them deformed, from a guess that is nearly right.
 
     Args:
-        source: image that holds the patches, see `graphvio.frontend.patches.packed`.
+        source: image that holds the patches, as of `graphvio.frontend.patches.packed`.
         target: image to find them in.
         pixels: (N, 2) centres of the patches.
         warps: (N, 2, 2) derivative of the source pixel by the target pixel.
         guess: (N, 2) in the target.
-        wanted: (N,) which patches to look for.
+        wanted: (N,) which patches to find.
         half: of the patch's side, without its middle.
         max_shift_px: largest distance from the guess.
-        min_gradient: least rms gradient of a patch along its weaker direction, grey levels per pixel.
+        min_gradient: smallest rms gradient of a patch along its weaker direction, grey levels per pixel.
 
     Returns:
         Pixels (N, 2), equal to the guess where not found; whether each was found (N,), also to a sigma of 0.2 px along

@@ -18,7 +18,7 @@ from graphvio.rig import StereoPair
 _SEARCH_CORRELATION = 0.6  # of undeformed patches; aligned ones must reach `StereoConfig.min_correlation`
 _MAX_REFINEMENT_PX = 3.0
 _SEARCH_MARGIN_PX = 6.0
-_FORETOLD_PX = 0.5
+_PREDICTED_PX = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,8 @@ class StereoMatches:
         points: (N, 3) ``[x, y, 1/Z]`` in the left camera's frame.
         covariances: (N, 3, 3) of ``points``, for a pixel noise of 1 px.
         slopes: (N, 2) derivative of the shift along the epipolar line by the left pixel.
-        good: (N,) whether the match passed all tests; elsewhere the others mean nothing.
-        rejected: test -> how many corners it threw out that had passed the tests before it.
+        good: (N,) whether the match passed all tests; elsewhere the other values mean nothing.
+        rejected: test -> number of corners that failed it, of those that had passed the tests before it.
     """
 
     right: Float
@@ -43,7 +43,7 @@ class StereoMatches:
 
 
 class StereoMatcher:
-    """Finds the left image's corners in the right one."""
+    """Matcher of one pair's left corners in the right image."""
 
     def __init__(self, pair: StereoPair, config: Config, allowed_right: Bool) -> None:
         self._pair = pair
@@ -61,16 +61,16 @@ class StereoMatcher:
         slopes: Float,
         min_gradient: float,
     ) -> StereoMatches:
-        """Search, refine, test, triangulate.
+        """Match corners left to right, test the matches and triangulate them.
 
         Args:
-            left: image and the one of half the size, at least.
-            right: image and the one of half the size, at least.
+            left: pyramid of the left image, of two levels at least.
+            right: pyramid of the right image, of two levels at least.
             pixels: (N, 2) corners in the left image.
             rays: (N, 2) their normalised coordinates.
-            inverse_depths: (N,) expected, 1/m, NaN where nothing is known.
-            slopes: (N, 2) expected, zero where nothing is known.
-            min_gradient: least rms gradient of a right patch along its weaker direction, grey levels per pixel.
+            inverse_depths: (N,) expected, 1/m, NaN where unknown.
+            slopes: (N, 2) expected, zero where unknown.
+            min_gradient: smallest rms gradient of a right patch along its weaker direction, grey levels per pixel.
         """
         pair, settings = self._pair, self._config.stereo
         rejected: dict[str, int] = {}
@@ -95,7 +95,7 @@ class StereoMatcher:
         self, left: Pyramid, right: Pyramid, pixels: Float, rays: Float, inverse_depths: Float, slopes: Float,
         min_gradient: float, rejected: dict[str, int],
     ) -> tuple[Float, Float, Bool]:  # fmt: skip
-        """Pixels (N, 2) in the right image to sub-pixel precision, slopes (N, 2), and whether appearance agrees."""
+        """Find sub-pixel matches (N, 2) in the right image, slopes (N, 2), and whether appearance agrees (N,)."""
         pair, settings, tracking = self._pair, self._config.stereo, self._config.tracking
         known = np.isfinite(inverse_depths)
         nearest = 1.0 / settings.min_depth_m
@@ -120,8 +120,8 @@ class StereoMatcher:
         close = shift <= np.where(known, _SEARCH_MARGIN_PX, _MAX_REFINEMENT_PX)
         found = passes(found, converged & close, "alignment", rejected)
         found = passes(found, correlations >= settings.min_correlation, "appearance", rejected)
-        # A match that the motion and the depth of before foretold has been checked by them.
-        unchecked = np.flatnonzero(found & ~(known & (shift < _FORETOLD_PX)))
+        # A match where motion and earlier depth predict it needs no other check.
+        unchecked = np.flatnonzero(found & ~(known & (shift < _PREDICTED_PX)))
         localised, returned = np.ones(len(found), dtype=bool), np.ones(len(found), dtype=bool)
         if len(unchecked):
             _, returned[unchecked], localised[unchecked], _ = register(

@@ -1,4 +1,4 @@
-"""What the residuals of a robust fit say of the noise, and of the covariance that the fit has.
+"""Noise and covariance of a robust fit, from its residuals.
 
 For an influence function ``psi(r) = w r`` the covariance of the minimum is ``E[psi^2] / E[psi']^2`` times the inverse
 of the unweighted normal matrix (P. Huber, *Robust Statistics*, 1981, chapter 7).
@@ -11,20 +11,20 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Int
 from graphvio.kernels import kernel
 
-_PRIOR_RESIDUALS = 3.0  # the noise model counts for so many, which helps where there are few points
-_COUNTED_AT_NOISY_POINTS = 1.04  # normal matrices at noisy points promise that much more than there is, by Monte Carlo
-_CUTOFF = 25.0  # squared error over the noise variance: one right point in 20,000 lies beyond (4 degrees of freedom)
+_PRIOR_RESIDUALS = 3.0  # weight of the modelled noise, for where there are few points
+_EXCESS_INFORMATION = 1.04  # of normal matrices at noisy points, by Monte Carlo
+_CUTOFF = 25.0  # squared error over the noise variance: exceeded by one right point in 20,000 (4 degrees of freedom)
 _MEDIAN_CHI2_OF_2, _MEDIAN_CHI2_OF_4 = 1.386, 3.357
 _MIN_VARIANCE = 0.05
-_POINTS_OF_EQUAL_NOISE = 10.0  # a pair's noise is thought to be that of the others by so many points
-_MAX_RATIO = 4.0  # variance over that of all; more is no noise, but another motion
+_POINTS_OF_EQUAL_NOISE = 10.0  # weight of the prior that a pair's noise is that of the others
+_MAX_RATIO = 4.0  # variance over that of all; a larger one is another motion, not noise
 
 
 class Influence(NamedTuple):
     """Moments of the residuals.
 
     Attributes:
-        factor: what the inverse of the weighted normal matrix is to be multiplied by.
+        factor: for the inverse of the weighted normal matrix, which gives the covariance.
         weight: mean of ``w``.
         slope: mean of ``psi'``.
         variance: of the noise, over the modelled one.
@@ -38,7 +38,7 @@ class Influence(NamedTuple):
 
 @kernel
 def influence(errors2: Float, has_right: Bool, scale: float) -> Influence:
-    """Moments of squared whitened errors (N,), of points with (4 dimensions) or without (2) a right image."""
+    """Compute the moments of squared whitened errors (N,), of dimension 4 with a right image and 2 without."""
     finite = np.isfinite(errors2)
     e2, d = errors2[finite], np.where(has_right[finite], 4.0, 2.0)
     n = d.sum()
@@ -48,22 +48,22 @@ def influence(errors2: Float, has_right: Bool, scale: float) -> Influence:
     weight = (d * w).sum() / n
     slope = (d * influence_slopes(e2, has_right[finite], scale)).sum() / n
     square = (w**2 * e2).sum() / slope**2
-    # The mean of 1 / chi^2 lacks two degrees of freedom: without them the answer is honest on average.
+    # The mean of 1 / chi^2 lacks two degrees of freedom: without them the variance is right on average.
     variance = (square + _PRIOR_RESIDUALS) / (max(n - 6.0, 0.0) + _PRIOR_RESIDUALS - 2.0)
-    variance *= _COUNTED_AT_NOISY_POINTS
+    variance *= _EXCESS_INFORMATION
     return Influence(weight * variance, weight, slope, variance)
 
 
 @kernel
 def influence_slopes(errors2: Float, has_right: Bool, scale: float) -> Float:
-    """The mean of ``psi'`` over the dimensions of each point's error (N,)."""
+    """Compute the mean of ``psi'`` over the dimensions of each point's error (N,)."""
     w = 1.0 / (1.0 + errors2 / scale**2)
     return w - 2.0 * w * (1.0 - w) / np.where(has_right, 4.0, 2.0)
 
 
 @kernel
 def noise_variance(errors2: Float, has_right: Bool, largest2: float) -> float:
-    """Variance of the noise that most points have, over the modelled one, by the median of those below ``largest2``."""
+    """Estimate the variance of most points' noise, over the modelled one, by the median of those below ``largest2``."""
     near = errors2 < largest2
     if not near.any():
         return 1.0
@@ -73,7 +73,7 @@ def noise_variance(errors2: Float, has_right: Bool, largest2: float) -> float:
 
 @kernel
 def noise_by_pair(errors2: Float, has_right: Bool, pair: Int, pairs: int, largest2: float) -> Float:
-    """Variance of each pair's noise (P,), over that of all points together; near 1 for pairs with few points."""
+    """Estimate the variance of each pair's noise (P,) over that of all points; near 1 for pairs with few points."""
     ratios = np.ones(pairs)
     usual = noise_variance(errors2, has_right, largest2)
     for j in range(pairs):
@@ -88,5 +88,5 @@ def noise_by_pair(errors2: Float, has_right: Bool, pair: Int, pairs: int, larges
 
 @kernel
 def inlier_cutoff(errors2: Float, has_right: Bool, largest2: float) -> float:
-    """Squared error below which a point is an inlier: by the noise that most points have, at most ``largest2``."""
+    """Compute the squared error below which a point is an inlier: by the noise of most points, at most ``largest2``."""
     return min(largest2, _CUTOFF * noise_variance(errors2, has_right, largest2))

@@ -1,4 +1,4 @@
-"""What the motion between two framesets is estimated from: the tracks of all pairs, side by side in arrays.
+"""Correspondences between two framesets, from which their relative motion is estimated, of all pairs in one.
 
 All pairs are expressed in one frame, body: a motion hypothesis is ``cur_T_ref``, which maps points of the rig's body
 frame from the reference instant to the current one. Pair j's own motion, the paper's ``P_j``, is
@@ -20,12 +20,12 @@ from graphvio.rig import Rig
 
 
 class RigArrays(NamedTuple):
-    """The rig as kernels take it, for P pairs; side 0 is left, 1 right.
+    """Calibration of a rig of P pairs, as kernels take it; side 0 is left, 1 right.
 
     Attributes:
         cam_T_body: (P, 2, 4, 4).
-        body_T_left: (P, 4, 4) of the left camera whose points are seen: where one pair sees another's, not its own.
-        focal_px: (P, 2), what a normalised image unit is worth.
+        body_T_left: (P, 4, 4) of the left camera that saw the points at the reference, of another pair in `crossed`.
+        focal_px: (P, 2), pixels per normalised image unit.
     """
 
     cam_T_body: Float
@@ -42,12 +42,12 @@ class RigArrays(NamedTuple):
         )
 
     def crossed(self, pairs: Sequence[tuple[int, int]]) -> RigArrays:
-        """A rig of (a, b): what was a point in pair a's left camera is seen by pair b's cameras now."""
+        """Return a rig of (a, b): points of pair a's left camera at the reference are seen by pair b's cameras now."""
         of, by = [a for a, _ in pairs], [b for _, b in pairs]
         return RigArrays(self.cam_T_body[by], self.body_T_left[of], self.focal_px[by])
 
     def corrected(self, nominal: RigArrays, pair: int, correction: Float) -> RigArrays:
-        """The same, one pair's cameras moved: its ``body_T_left`` is ``correction`` (4, 4) times the nominal one."""
+        """Return the rig with one pair moved: its ``body_T_left`` is ``correction`` (4, 4) times the nominal one."""
         cam_T_body, body_T_left = self.cam_T_body.copy(), self.body_T_left.copy()
         body_T_left[pair] = correction @ nominal.body_T_left[pair]
         cam_T_body[pair] = nominal.cam_T_body[pair] @ np.linalg.inv(correction)
@@ -75,15 +75,15 @@ class Observations(NamedTuple):
 
     @property
     def pairs(self) -> tuple[int, ...]:
-        """The pairs that have points, in order."""
+        """Pairs that have points, in order."""
         return tuple(int(j) for j in np.flatnonzero(np.bincount(self.pair)))
 
     def of_pair(self, pair: int) -> Observations:
-        """Only one pair's points, not copied."""
+        """Return one pair's points, not copied."""
         return self.of_rows(slice(*np.searchsorted(self.pair, [pair, pair + 1])))
 
     def of_rows(self, rows: Bool | slice) -> Observations:
-        """Only some points (N,), or those of a range."""
+        """Return some of the points: by a mask (N,), or a range."""
         return Observations(
             self.pair[rows], self.points[rows], self.covariances[rows], self.left[rows], self.right[rows],
             self.has_right[rows],
@@ -122,7 +122,7 @@ def image_by_image(rig: RigArrays, observations: Observations) -> tuple[RigArray
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Observations, and which tracks they came from.
+    """Observations, and the tracks that they came from.
 
     Attributes:
         observations: of all pairs.
@@ -135,7 +135,7 @@ class Correspondences:
     candidates: Mapping[int, int]
 
     def identities(self, frames: Mapping[int, PairFrame], inlier: Bool) -> dict[int, Int]:
-        """Pair -> identities, increasing, of those of its current tracks that are inliers among all points (N,)."""
+        """Return pair -> identities, increasing, of its current tracks that are inliers among all points (N,)."""
         return {j: frames[j].ids[rows[inlier[self.observations.pair == j]]] for j, rows in self.rows.items()}
 
 
@@ -162,7 +162,7 @@ def _join(
     pair: int, ids_then: Int, known: Bool, points: Float, covariances: Float,
     ids_now: Int, has_right: Bool, left: Float, right: Float,
 ) -> tuple[Observations, Int]:  # fmt: skip
-    """One pair's observations of the tracks whose depth is known at the reference, and their rows (M,) now."""
+    """Join one pair's tracks whose depth is known at the reference: observations, and their rows (M,) now."""
     at_then, at_now = common_rows(ids_then, ids_now)
     of_known = known[at_then]
     at_then, at_now = at_then[of_known], at_now[of_known]

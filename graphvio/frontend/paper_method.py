@@ -25,13 +25,13 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.frontend.cost import NEAREST, WORST
+from graphvio.frontend.cost import MAX_ERROR2, MIN_DEPTH_RATIO
 from graphvio.frontend.observations import Observations
 from graphvio.rig import StereoPair
 
 
 class PairPoints(NamedTuple):
-    """What the cost of one pair, eq. (2), is computed from: K points known at t_k and seen at t_k+1.
+    """K points of one pair, known at t_k and seen at t_k+1, on which eq. (2) is computed.
 
     Attributes:
         X: (K, 4) homogeneous coordinates ``[X/Z, Y/Z, 1, 1/Z]`` in the left camera's frame at t_k.
@@ -74,17 +74,17 @@ def motion_of_pair(P_1: Float, P_12: Float) -> Float:
 
 
 def h(X: Float) -> Float:
-    """Normalised image coordinates (..., 2) of homogeneous coordinates (..., 4)."""
-    return X[..., :2] / X[..., 2:3]
+    """Convert homogeneous coordinates (..., 4) to normalised image coordinates (..., 2)."""
+    return np.asarray(X[..., :2] / X[..., 2:3])
 
 
 def rho(y: Float, a: float) -> Float:
-    """Robust cost ``log(1 + |y|^2 / a^2)`` of errors (..., 2), each a vector; Cauchy's, as of eq. (2)."""
-    return np.log1p(np.sum(y**2, axis=-1) / a**2)
+    """Compute the Cauchy cost ``log(1 + |y|^2 / a^2)`` of errors (..., 2), each a vector, as in eq. (2)."""
+    return np.asarray(np.log1p(np.sum(y**2, axis=-1) / a**2))
 
 
 def cost(P: Float, points: PairPoints, a_px: float) -> float:
-    """Robust reprojection cost ``c_j`` of a pair's motion on the pair's own points, eq. (2).
+    """Compute the robust reprojection cost ``c_j`` of a pair's motion on the pair's own points, eq. (2).
 
     Args:
         P: (4, 4) ``left_next_T_left_prev`` of the pair.
@@ -99,20 +99,20 @@ def cost(P: Float, points: PairPoints, a_px: float) -> float:
 
 
 def _image_cost(x: Float, X: Float, focal_px: float, a_px: float) -> float:
-    """Sum over one image in eq. (2).
+    """Sum the cost over one image in eq. (2).
 
     The paper does not say what a point costs that is behind the camera, or so near to the camera's plane that its error
     has no bound: here its cost is limited.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         costs = rho(focal_px * (x - h(X)), a_px)
-    limit = np.log1p(WORST)
-    costs = np.where(X[:, 2] < NEAREST, limit, np.minimum(costs, limit))
+    limit = np.log1p(MAX_ERROR2)
+    costs = np.where(X[:, 2] < MIN_DEPTH_RATIO, limit, np.minimum(costs, limit))
     return float(np.sum(costs[~np.isnan(x[:, 0])]))
 
 
 def global_cost(P: Float, pair: int, points: Sequence[PairPoints], body_T_left: Float, a_px: float) -> float:
-    """Cost of one pair's motion on the points of all pairs, eq. (3); with two pairs ``c_1(P) + c_2(P_12 P P_21)``.
+    """Compute the cost of one pair's motion on the points of all pairs, eq. (3): of two, ``c_1(P) + c_2(P_12 P P_21)``.
 
     Args:
         P: (4, 4) ``left_next_T_left_prev`` of the pair.
@@ -129,7 +129,7 @@ def global_cost(P: Float, pair: int, points: Sequence[PairPoints], body_T_left: 
 
 
 def best_pair(motions: Sequence[Float], points: Sequence[PairPoints], body_T_left: Float, a_px: float) -> int:
-    """Index of the pair whose motion has the least global cost, eq. (4).
+    """Choose the pair whose motion has the least global cost, eq. (4).
 
     Args:
         motions: (4, 4) ``left_next_T_left_prev`` of each pair.

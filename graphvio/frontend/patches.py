@@ -1,8 +1,7 @@
 """Square patches of an image: sampled with sub-pixel precision, compared with each other, and aligned.
 
 A patch of ``2 half + 1`` pixels on each side has rows that are padded with zeros to a multiple of `LANES`: loops over
-its pixels then run in whole vector registers, and what stands in the padding of the image that it is compared with
-has no weight.
+its pixels then run in whole vector registers, and the padding of the image that it is compared with has no weight.
 """
 
 from typing import NamedTuple
@@ -17,12 +16,12 @@ LANES = 16
 
 _NOWHERE_PX2 = 1e6
 _MAX_ITERATIONS = 20
-_CONVERGED_PX = 0.03  # the step is still taken: what is left after it is several times smaller
+_CONVERGED_PX = 0.03  # the step is still taken, after which the error is several times smaller
 _ONE, _ZERO, _HALF = np.float32(1.0), np.float32(0.0), np.float32(0.5)
 
 
 class Patch(NamedTuple):
-    """Numbers for each pixel of a patch.
+    """One number for each pixel of a patch.
 
     Attributes:
         rows: (side, padded side).
@@ -34,8 +33,13 @@ class Patch(NamedTuple):
 
 
 class Lattice(NamedTuple):
-    """What is the same for all patches of one size: columns and rows, counted from the middle, and 1 for its own
-    pixels, 0 for the padding."""
+    """Coordinates of the pixels of all patches of one size.
+
+    Attributes:
+        columns: counted from the middle.
+        rows: counted from the middle.
+        inside: 1 for the patch's own pixels, 0 for the padding.
+    """
 
     columns: Patch
     rows: Patch
@@ -43,7 +47,7 @@ class Lattice(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Where a deformed patch's pixels are in the image's memory, and between which of its pixels."""
+    """Sampling places of a deformed patch: positions in the image's memory, and fractions of a pixel beyond them."""
 
     places: Patch
     right_of: Patch
@@ -52,7 +56,7 @@ class Scratch(NamedTuple):
 
 @fast_kernel
 def room(half: int) -> Patch:
-    """Room for a patch, all zero."""
+    """Allocate a patch, all zero."""
     side = 2 * half + 1
     rows = np.zeros((side, (side + LANES - 1) // LANES * LANES), dtype=np.float32)
     return Patch(rows, rows.reshape(-1))
@@ -60,14 +64,14 @@ def room(half: int) -> Patch:
 
 @fast_kernel
 def scratch_room(half: int) -> Scratch:
-    """Room for what `sample_affine` computes on the way."""
+    """Allocate the intermediate results of `sample_affine`."""
     places = np.zeros(room(half).rows.shape, dtype=np.uint32)
     return Scratch(Patch(places, places.reshape(-1)), room(half), room(half))
 
 
 @fast_kernel
 def lattice(half: int) -> Lattice:
-    """The lattice of patches of a size."""
+    """Build the lattice of patches of a size."""
     columns, rows, inside = room(half), room(half), room(half)
     for j in range(2 * half + 1):
         for i in range(2 * half + 1):
@@ -101,14 +105,14 @@ def sample(image: Image, x: float, y: float, half: int, out: Patch) -> bool:
 
 @fast_kernel
 def prepare(bordered: Patch, inside: Patch, patch: Patch, gx: Patch, gy: Patch) -> tuple[float, float, float]:
-    """Fill the patch and its gradients, all of zero mean, and return the normal matrix's xx, xy, yy.
+    """Fill a patch and its gradients, all of zero mean, and return the normal matrix's xx, xy, yy.
 
     Args:
         bordered: the patch with one more pixel on each side.
         inside: of the patch's `Lattice`.
-        patch: to fill, as are the gradients.
-        gx: along the rows.
-        gy: along the columns.
+        patch: output.
+        gx: output, along the rows.
+        gy: output, along the columns.
     """
     side, stride = patch.rows.shape
     columns = min(stride, bordered.rows.shape[1] - 2)  # whole registers, as far as the bordered patch reaches
@@ -145,7 +149,7 @@ def prepare(bordered: Patch, inside: Patch, patch: Patch, gx: Patch, gy: Patch) 
 
 @fast_kernel
 def mismatch(image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patch) -> tuple[float, float, bool]:
-    """Gradients times the difference between the image at (u, v) and the patch, summed; False outside the image.
+    """Sum the gradients times the difference between the image at (u, v) and the patch; False outside the image.
 
     The gradients have zero mean, so a constant difference of brightness contributes nothing.
     """
@@ -167,7 +171,7 @@ def mismatch(image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patc
             start = first + j * width + k
             upper, lower = flat[start : start + LANES + 1], flat[start + width : start + width + LANES + 1]
             values, dx, dy = patch.rows[j, k : k + LANES], gx.rows[j, k : k + LANES], gy.rows[j, k : k + LANES]
-            row_x = row_y = _ZERO  # sums of their own: a row need not wait for the one before
+            row_x = row_y = _ZERO  # separate sums: a row need not wait for the one before
             for i in range(LANES):
                 difference = (
                     w00 * np.float32(upper[i])
@@ -188,7 +192,7 @@ def align(
     image: Image, u: float, v: float, patch: Patch, gx: Patch, gy: Patch,
     xx: float, xy: float, yy: float, min_gradient: float,
 ) -> tuple[float, float, bool]:  # fmt: skip
-    """Gauss-Newton from (u, v): the patch's place in an image, and whether the iteration converged there.
+    """Find a patch in an image by Gauss-Newton from (u, v); the flag says whether the iteration converged.
 
     A patch whose rms gradient along the weaker direction is less than ``min_gradient`` is not localised.
     """
@@ -210,13 +214,15 @@ def align(
 
 @fast_kernel
 def weaker2(xx: float, xy: float, yy: float) -> float:
-    """Smaller eigenvalue of a normal matrix: the sum of squared gradients along their weaker direction."""
+    """Compute the smaller eigenvalue of a normal matrix: the sum of squared gradients along their weaker direction."""
     return float(0.5 * (xx + yy - np.sqrt((xx - yy) * (xx - yy) + 4.0 * xy * xy)))
 
 
 def packed(image: Image) -> AnyArray:
-    """Each pixel (height, width) with those to its right, below, and to the right below, a byte each: what bilinear
-    interpolation needs is then one word. The last row and column are zero."""
+    """Join each pixel (height, width) with those to its right, below, and to the right below, a byte each.
+
+    What bilinear interpolation needs is then one word. The last row and column are zero.
+    """
     words = np.zeros(image.shape, dtype=np.uint32)
     pack(image, words)
     return words
@@ -224,7 +230,7 @@ def packed(image: Image) -> AnyArray:
 
 @kernel
 def pack(image: Image, words: AnyArray) -> None:
-    """Fill what `packed` returns, but for the last row and column."""
+    """Fill the result of `packed`, except the last row and column."""
     height, width = image.shape
     for y in range(height - 1):
         upper, lower, row = image[y], image[y + 1], words[y]
@@ -244,7 +250,8 @@ def sample_affine(
 ) -> bool:  # fmt: skip
     """Fill a patch around (x, y) of a `packed` image; False where it leaves the image.
 
-    Its pixels are the columns of ``[[xx, xy], [yx, yy]]`` apart, along its rows and along its columns.
+    The columns of ``[[xx, xy], [yx, yy]]`` are the steps in the image from pixel to pixel along the patch's rows and
+    columns.
     """
     height, width = image.shape
     side, stride = out.rows.shape
@@ -281,7 +288,7 @@ def sample_affine(
 
 @fast_kernel
 def correlation(patch: Patch, other: Patch) -> float:
-    """Normalised cross-correlation of a patch of zero mean with another."""
+    """Compute the normalised cross-correlation of a patch of zero mean with another."""
     a, b = patch.flat, other.flat
     product = square = total = own = _ZERO
     for k in range(a.size):
@@ -297,15 +304,17 @@ def correlation(patch: Patch, other: Patch) -> float:
 
 @fast_kernel
 def localisation2(patch: Patch, other: Patch, xx: float, xy: float, yy: float) -> float:
-    """Variance of a patch's place in an image along the weaker direction, square pixels.
+    """Compute the variance of a patch's place in an image along the weaker direction, square pixels.
 
-    What differs between patch and image, but for contrast and brightness, is taken for white noise. A blurred image
-    leaves a place free along the blur: an iteration that starts there ends there.
+    Differences between patch and image other than contrast and brightness are taken for white noise. A blurred image
+    leaves a place free along the blur: an iteration that begins there ends there.
 
     Args:
         patch: of zero mean.
-        other: the image at the patch's place, likewise.
-        xx: normal matrix of ``other``, as are xy and yy.
+        other: the image at the patch's place, of zero mean.
+        xx: normal matrix of ``other``.
+        xy: likewise.
+        yy: likewise.
     """
     a, b = patch.flat, other.flat
     product = own = square = _ZERO

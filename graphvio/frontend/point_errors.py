@@ -1,15 +1,15 @@
 """One point's errors in both images, their derivatives and their whitening, as scalars.
 
 These kernels become part of loops over a block's points (`graphvio.frontend.blocks`), which then work on several
-points at once. A point is ``[x, y, 1/Z]`` in the left camera at the reference instant; the four errors are the left
-image's two and the right one's two.
+points at once. A point is ``[x, y, 1/Z]`` in the left camera at the reference instant; its four errors are two of the
+left image and two of the right one.
 """
 
 import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.frontend.blocks import C00, C01, C02, C11, C12, C22, POINTS
-from graphvio.frontend.cost import NEAREST, Matrix
+from graphvio.frontend.cost import MIN_DEPTH_RATIO, Matrix
 from graphvio.kernels import vector_kernel
 
 Row = tuple[float, float, float, float, float, float, float]
@@ -20,21 +20,25 @@ Lower = tuple[float, float, float, float, float, float, float, float, float, flo
 
 @vector_kernel
 def project(m: Matrix, point: Vector) -> tuple[float, float, float, bool]:
-    """Normalised coordinates of a point ``[x, y, 1/Z]`` after a motion, its depth over the one before, at least what
-    counts as in front of the camera, and whether it is there."""
+    """Project a point ``[x, y, 1/Z]`` after a motion.
+
+    Returns:
+        Normalised coordinates, the depth over the one before, bounded to be in front of the camera, and whether the
+        point is in front of the camera.
+    """
     x, y, w = point
     depth = m[8] * x + m[9] * y + m[10] + w * m[11]
-    z = max(depth, NEAREST)
+    z = max(depth, MIN_DEPTH_RATIO)
     u = (m[0] * x + m[1] * y + m[2] + w * m[3]) / z
     v = (m[4] * x + m[5] * y + m[6] + w * m[7]) / z
-    return u, v, z, depth >= NEAREST
+    return u, v, z, depth >= MIN_DEPTH_RATIO
 
 
 @vector_kernel
 def derivatives_by_point(
     m: Matrix, point: Vector, focal_px: float, at_u: float, at_v: float
 ) -> tuple[Vector, Vector, float, float]:
-    """Derivatives of a point's two coordinates in one image by ``[x, y, 1/Z]``, and their errors, pixels."""
+    """Compute the derivatives of a point's coordinates in one image by ``[x, y, 1/Z]``, and their errors, pixels."""
     u, v, z, _ = project(m, point)
     scale = focal_px / z
     return (
@@ -49,8 +53,12 @@ def derivatives_by_point(
 def derivatives_by_motion(
     m: Matrix, cam_T_body: Matrix, focal_px: float, point: Vector, at_u: float, at_v: float
 ) -> tuple[Row, Row, bool]:
-    """Derivatives of a point's two coordinates in one image by ``d`` in ``exp(d) cur_T_ref``, and their errors behind
-    them; whether the point ``[x, y, 1/Z]`` is in front of the camera."""
+    """Compute the derivatives of a point's two coordinates in one image by ``d`` in ``exp(d) cur_T_ref``, pixels.
+
+    Returns:
+        The derivatives of each coordinate with its error as last element; and whether the point is in front of the
+        camera.
+    """
     r, w = cam_T_body, point[2]
     u, v, z, in_front = project(m, point)
     # d cam point = R_cam_body (-[p]x d_rotation + w d_translation), p the homogeneous point in body now
@@ -70,13 +78,13 @@ def derivatives_by_motion(
 
 @vector_kernel
 def dot(a: Vector, b: Vector) -> float:
-    """Inner product."""
+    """Compute the inner product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @vector_kernel
 def covariance_times(block: Float, i: int, a: Vector) -> Vector:
-    """Covariance of a block's point times a vector."""
+    """Multiply the covariance of a block's point by a vector."""
     c00, c01, c02 = block[C00 + i], block[C01 + i], block[C02 + i]
     c11, c12, c22 = block[C11 + i], block[C12 + i], block[C22 + i]
     return (
@@ -91,8 +99,10 @@ def inverse_cholesky(
     s00: float, s10: float, s11: float, s20: float, s21: float, s22: float,
     s30: float, s31: float, s32: float, s33: float, factor: float,
 ) -> Lower:  # fmt: skip
-    """A factor times the inverse of the lower Cholesky factor of ``1 + A``, A positive semidefinite (4, 4), element by
-    element. Its pivots are at least 1; rounding takes them below where a point is next to the plane of the camera."""
+    """Invert the lower Cholesky factor of ``1 + A``, A positive semidefinite (4, 4), and multiply it by a factor.
+
+    Its pivots are at least 1; rounding takes them below where a point is next to the plane of the camera.
+    """
     d0 = 1.0 / np.sqrt(s00)
     c10, c20, c30 = s10 * d0, s20 * d0, s30 * d0
     d1 = 1.0 / np.sqrt(max(s11 - c10 * c10, 1.0))
@@ -112,7 +122,7 @@ def inverse_cholesky(
 
 @vector_kernel
 def whiten(lower: Lower, errors: Four) -> Four:
-    """A lower triangle (4, 4) times a vector."""
+    """Multiply a lower triangle (4, 4) by a vector."""
     l00, l10, l11, l20, l21, l22, l30, l31, l32, l33 = lower
     a, b, d, e = errors
     return l00 * a, l10 * a + l11 * b, l20 * a + l21 * b + l22 * d, l30 * a + l31 * b + l32 * d + l33 * e
@@ -120,7 +130,7 @@ def whiten(lower: Lower, errors: Four) -> Four:
 
 @vector_kernel
 def whiten_transposed(lower: Lower, whitened: Four) -> Four:
-    """The transpose of a lower triangle (4, 4) times a vector."""
+    """Multiply the transpose of a lower triangle (4, 4) by a vector."""
     l00, l10, l11, l20, l21, l22, l30, l31, l32, l33 = lower
     a, b, d, e = whitened
     return l00 * a + l10 * b + l20 * d + l30 * e, l11 * b + l21 * d + l31 * e, l22 * d + l32 * e, l33 * e
@@ -128,7 +138,7 @@ def whiten_transposed(lower: Lower, whitened: Four) -> Four:
 
 @vector_kernel
 def whitener_of(whiteners: Float, i: int, seen: float) -> Lower:
-    """The whitener of a block's point, its last two rows times a factor."""
+    """Read the whitener of a block's point, with its last two rows multiplied by ``seen``."""
     w = whiteners
     return (
         w[i], w[POINTS + i], w[2 * POINTS + i],
@@ -139,18 +149,18 @@ def whitener_of(whiteners: Float, i: int, seen: float) -> Lower:
 
 @vector_kernel
 def put3(rows: Float, i: int, values: Vector) -> None:
-    """Store a vector, an element a row."""
+    """Store a vector of three, one element in each row."""
     rows[i], rows[POINTS + i], rows[2 * POINTS + i] = values
 
 
 @vector_kernel
 def put4(rows: Float, i: int, values: Four) -> None:
-    """Store four numbers, one a row."""
+    """Store a vector of four, one element in each row."""
     rows[i], rows[POINTS + i], rows[2 * POINTS + i], rows[3 * POINTS + i] = values
 
 
 @vector_kernel
 def put_whitener(rows: Float, i: int, values: Lower) -> None:
-    """Store what `whitener_of` reads."""
+    """Store a whitener, as `whitener_of` reads it."""
     for k in range(10):
         rows[k * POINTS + i] = values[k]

@@ -1,4 +1,4 @@
-"""Where points should be after a predicted motion, and how it deforms their surroundings."""
+"""Prediction of tracks: where a motion puts points, and how it deforms their surroundings."""
 
 import numpy as np
 
@@ -14,13 +14,15 @@ _MIN_AREA = 0.1  # a patch that has shrunk more than this is no longer comparabl
 def predict_pixels(
     rays: Float, inverse_depths: Float, motion: Float, model: int, intrinsics: Float, distortion: Float
 ) -> tuple[Float, Float, Bool]:
-    """Pixels and inverse depths of points after a motion.
+    """Predict pixels and inverse depths of points after a motion.
 
     Args:
         rays: (N, 2) normalised coordinates before.
         inverse_depths: (N,) before, 1/m.
         motion: (4, 4) maps points before to points after.
-        model: of the camera, with its ``intrinsics`` (4,) and ``distortion`` (5,).
+        model: number of the camera's model.
+        intrinsics: (4,) of the camera.
+        distortion: (5,) of the camera.
 
     Returns:
         Pixels (N, 2), inverse depths (N,), and whether each point is in front of the camera (N,).
@@ -40,7 +42,7 @@ def predict_pixels(
 def predict_warps(
     rays: Float, inverse_depths: Float, step_px: float, motion: Float, model: int, intrinsics: Float, distortion: Float
 ) -> tuple[Float, Float, Bool]:
-    """How a motion deforms the surroundings of points.
+    """Predict how a motion deforms the surroundings of points.
 
     The affine map that is nearest to the deformation over a whole patch is not the one that is right at its centre:
     the deformation's curvature shifts the patch as a whole. Along a wall that one walks by it has the same sign all
@@ -48,10 +50,12 @@ def predict_warps(
 
     Args:
         rays: (5, N, 2) normalised coordinates before, see `around`.
-        inverse_depths: (5, N) of what is seen there, 1/m: where they differ, the surface is slanted.
+        inverse_depths: (5, N) of the surface there, 1/m: where they differ, the surface is slanted.
         step_px: of `around`.
         motion: (4, 4) maps points before to points after.
-        model: of the camera, with its ``intrinsics`` (4,) and ``distortion`` (5,).
+        model: number of the camera's model.
+        intrinsics: (4,) of the camera.
+        distortion: (5,) of the camera.
 
     Returns:
         Derivatives (N, 2, 2) of the pixel before by the pixel after; the shift (N, 2) of the affine map's centre from
@@ -84,7 +88,7 @@ def predict_warps(
 
 
 def around(pixels: Float, step_px: float) -> Float:
-    """Pixels (5, N, 2): those given (N, 2), and those a step to their left, right, above and below."""
+    """Return pixels (5, N, 2): those given (N, 2), and those a step to their left, right, above and below."""
     steps = np.array([[0.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
     return np.asarray(pixels + step_px * steps[:, None])
 
@@ -94,10 +98,10 @@ def inverse_depths_around(
     rays: Float, inverse_depths: Float, slopes: Float, step_px: float, right_T_left: Float, model: int,
     intrinsics: Float, distortion: Float,
 ) -> Float:  # fmt: skip
-    """What surrounds points in depth, by what stereo matching says of their surface's slant.
+    """Compute the inverse depths around points from the slant of their surface, which stereo matching measured.
 
     The right image shows a patch's surroundings shifted along the epipolar line, by the left pixel times the slope.
-    The cameras' rotation and lenses make some of that shift; depth makes the rest.
+    The cameras' rotation and lenses account for a part of that shift, depth for the remainder.
 
     Args:
         rays: (5, N, 2) normalised coordinates in the left camera, see `around`.
@@ -105,7 +109,9 @@ def inverse_depths_around(
         slopes: (N, 2), see `graphvio.frontend.slanted`.
         step_px: of `around`.
         right_T_left: (4, 4).
-        model: of the right camera, with its ``intrinsics`` (4,) and ``distortion`` (5,).
+        model: number of the right camera's model.
+        intrinsics: (4,) of the right camera.
+        distortion: (5,) of the right camera.
 
     Returns:
         Inverse depths (5, N) of the surface's plane; the point's own where the right image does not show it.
@@ -140,7 +146,7 @@ def inverse_depths_around(
 
 @kernel
 def _moved(x: float, y: float, w: float, motion: Float) -> tuple[float, float, float]:
-    """The point ``[x, y, 1, w]`` after a motion, up to scale: in units of the depth before it."""
+    """Move a point ``[x, y, 1, w]``; the result is up to scale, in units of the depth before."""
     m = motion
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] + w * m[0, 3],
@@ -153,7 +159,7 @@ def _moved(x: float, y: float, w: float, motion: Float) -> tuple[float, float, f
 def _project(
     x: float, y: float, z: float, limit: float, model: int, intrinsics: Float, distortion: Float
 ) -> tuple[float, float, bool]:
-    """Pixel of a point, and whether the camera's model reaches that far from its axis."""
+    """Project a point to a pixel; False where the camera's model does not reach that far from its axis."""
     if not z > 1e-6 or not x * x + y * y < (limit * z) ** 2:
         return 0.0, 0.0, False
     xd, yd, a, b, c, d = distort(model, distortion, x / z, y / z)

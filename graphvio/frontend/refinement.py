@@ -28,10 +28,10 @@ _MAX_ROUNDS = 3
 _MAX_REPETITIONS = 5  # of these rounds, where outliers stay in the cost and make convergence slow
 _ROUNDS_TO_FIND_INLIERS = 5
 _ROUNDS_WITH_ALL = 2
-_GROSS = 4.0  # over the cutoff of inliers: what one pair's noise may be, over that of all
+_GROSS = 4.0  # over the cutoff of inliers, as one pair's noise may be larger than that of all
 _STEPS_PER_ROUND = 6
 _CONVERGED = 1e-6  # radians and metres
-_NEAR = 1e-4  # enough to tell inliers
+_NEAR = 1e-4  # precise enough to determine inliers
 _WEAK_DIRECTION_SIGMA = 10.0
 _MIN_SHARE_OF_A_PAIR = 0.25
 _MIN_POINTS_OF_A_PAIR = 5
@@ -46,10 +46,10 @@ class Refined:
         cur_T_ref: (4, 4) of body.
         covariance: (6, 6), tangent ``[rotation, translation]`` in the body frame at the current instant.
         shared_covariance: (6, 6) the part of it that all motions from the same reference have in common, since they
-            rest on the same triangulated points.
+            depend on the same triangulated points.
         inlier: (N,) the points that it explains.
-        errors_px: (N,) each point's reprojection error in one direction, root mean square over its images, the point's
-            own uncertainty allowed for: what is left is the noise of the pixels. Infinite behind a camera, NaN for
+        errors_px: (N,) each point's reprojection error in one direction, root mean square over its images, with the
+            point's own uncertainty removed, so that the noise of the pixels remains. Infinite behind a camera, NaN for
             points that the motion was not tried on.
     """
 
@@ -60,7 +60,7 @@ class Refined:
     errors_px: Float
 
     def rms_px(self, among: Bool | None = None) -> float | None:
-        """Root mean square of the inliers' errors, of all or among some points (N,); None where there are none."""
+        """Compute the root mean square error of the inliers, all or among some points (N,); None without any."""
         errors_px = self.errors_px[self.inlier if among is None else self.inlier & among]
         return float(np.sqrt(np.mean(errors_px**2))) if len(errors_px) else None
 
@@ -73,9 +73,9 @@ def refine(
     Args:
         rig: of P pairs.
         observations: N points of any subset of them.
-        cur_T_ref: start (4, 4).
+        cur_T_ref: initial motion (4, 4).
         config: of this stage.
-        known: (N,) the inliers, where they are known already and the start is near; else they are found first.
+        known: (N,) the inliers, where they are known already and the initial motion is near; else they are found first.
     """
     inlier = np.zeros(0, dtype=bool) if known is None else known
     start = np.ascontiguousarray(cur_T_ref)
@@ -92,7 +92,7 @@ def _refined(
     cur_T_ref: Float, rig: RigArrays, observations: Observations, known: Bool, sigma: float, scale_px: float,
     max_error_px: float, inflation: float,
 ) -> tuple[Float, Float, Float, Bool, Float]:  # fmt: skip
-    """What `Refined` holds, in its order; inliers that are not known have no elements."""
+    """Compute the fields of `Refined`, in their order; ``known`` has no elements where inliers are not known."""
     widest, largest2 = scale_px / sigma, (max_error_px / sigma) ** 2
     has_right, blocks = observations.has_right, in_blocks(observations)
     at = unexpanded(blocks)
@@ -102,8 +102,8 @@ def _refined(
     if len(inlier) == len(has_right):
         scale = _scale(errors2[inlier], has_right[inlier], widest, largest2)
     else:
-        # Until the answer does not depend on the start. Gross errors are left out as soon as they can be told: near
-        # the camera, they would pull a bit farther in each round.
+        # Until the result does not depend on the initial motion. Gross errors are left out as soon as they stand out:
+        # near the camera, they would bias the motion more in each round.
         candidates = np.ones(len(has_right))
         for number in range(_ROUNDS_TO_FIND_INLIERS):
             scale = _scale(errors2, has_right, widest, largest2)
@@ -181,14 +181,16 @@ def _covariances(
 
 @kernel
 def _scale(errors2: Float, has_right: Bool, widest: float, largest2: float) -> float:
-    """Scale of the Cauchy cost where the noise is less than modelled: a wrong point next to a camera has the leverage
-    of a hundred others, and must look as wrong as it is."""
+    """Compute the scale of the Cauchy cost, less where the noise is less than modelled.
+
+    A wrong point next to a camera has the leverage of a hundred others, and must look as wrong as it is.
+    """
     return float(widest * np.sqrt(min(noise_variance(errors2, has_right, largest2), 1.0)))
 
 
 @kernel
 def _is_of_an_explained_pair(pair: Int, inlier: Bool) -> Bool:
-    """Which points (N,) belong to a pair of which more than a few fit, as some always do by chance; all, if no pair."""
+    """Select the points (N,) of pairs of which more fit than would by chance; all points, if there is no such pair."""
     fitting = np.bincount(pair, weights=inlier.astype(np.float64))
     explained = fitting >= np.maximum(_MIN_SHARE_OF_A_PAIR * np.bincount(pair), _MIN_POINTS_OF_A_PAIR)
     those: Bool = explained[pair] | (not explained.any())
@@ -197,7 +199,7 @@ def _is_of_an_explained_pair(pair: Int, inlier: Bool) -> Bool:
 
 @kernel
 def _bounded(shared: Float, root: Float) -> Float:
-    """The shared part of a covariance ``root root^T``, so that both it and the rest are surely positive definite."""
+    """Bound the shared part of a covariance ``root root^T``, so that it and the remainder are positive definite."""
     inverse = np.linalg.inv(root)
     shares, axes = np.linalg.eigh(inverse @ shared @ inverse.T)
     turned = root @ axes
@@ -210,10 +212,11 @@ def _levenberg_marquardt(
     cur_T_ref: Float, rig: RigArrays, blocks: Blocks, at: Expansion, active: Float, sigmas_px: Float, scale: float,
     rounds: int, tolerance: float,
 ) -> tuple[Float, Float, Float]:  # fmt: skip
-    """Pose, normal matrix (6, 6) and squared whitened errors (N,) at the minimum, but for the last step,
-    which is smaller than the tolerance; ``at`` is expanded where the last round began.
+    """Minimise the cost; in each round the places at which the points are linearised are found again.
 
-    In each round the places at which the points are linearised are found anew.
+    Returns:
+        Pose, normal matrix (6, 6) and squared whitened errors (N,) at the minimum, except for the last step, which is
+        smaller than the tolerance; ``at`` is expanded where the last round began.
     """
     pose = cur_T_ref.copy()
     hessian, gradient, errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), POINTS))
@@ -251,7 +254,7 @@ def _levenberg_marquardt(
 
 
 def explained(rig: RigArrays, observations: Observations, cur_T_ref: Float, config: MotionConfig) -> tuple[Bool, Float]:
-    """Which points (N,) are inliers of a motion (4, 4), and the errors (N,) of all, see `Refined`."""
+    """Determine which points (N,) are inliers of a motion (4, 4), and the errors (N,) of all, see `Refined`."""
     sigma, has_right = config.pixel_sigma_px, observations.has_right
     sigmas_px = np.full(len(rig.focal_px), sigma)
     blocks = in_blocks(observations)
@@ -262,13 +265,13 @@ def explained(rig: RigArrays, observations: Observations, cur_T_ref: Float, conf
 
 @kernel
 def _errors_px(errors2: Float, has_right: Bool, sigmas_px: Float) -> Float:
-    """Squared whitened errors (N,) of points with a noise (N,), as pixels in one direction."""
+    """Convert squared whitened errors (N,) of points with a noise (N,) to pixels in one direction."""
     return sigmas_px * np.sqrt(errors2 / np.where(has_right, 4.0, 2.0))
 
 
 @kernel
 def _squared_errors(cur_T_ref: Float, rig: RigArrays, blocks: Blocks, at: Expansion, sigmas_px: Float) -> Float:
-    """Squared whitened errors (N,) where ``at`` is expanded now."""
+    """Compute squared whitened errors (N,), and expand ``at`` there."""
     motions = left_motions(cur_T_ref, rig)
     expand(motions, rig, blocks, sigmas_px, at)
     errors2 = np.empty((len(blocks.pair), POINTS))

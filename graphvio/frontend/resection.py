@@ -12,14 +12,14 @@ from graphvio.kernels import kernel
 
 @kernel
 def resect(points: Float, rays: Float) -> tuple[Float, int]:
-    """All poses of a camera that sees three points along three rays.
+    """Find all poses of a camera that sees three points along three rays.
 
     Args:
         points: (3, 3) one point in each row, frame a.
         rays: (3, 3) one unit ray in each row, frame cam.
 
     Returns:
-        ``cam_T_a`` (4, 4, 4), of which only the first so many are set, and their number, 0 to 4.
+        ``cam_T_a`` (4, 4, 4), of which only the first ones are set, and their number, 0 to 4.
     """
     poses = np.zeros((4, 4, 4))
     a2 = np.sum((points[1] - points[2]) ** 2)
@@ -72,7 +72,7 @@ def resect(points: Float, rays: Float) -> tuple[Float, int]:
 
 @kernel
 def _side_ratio(v: float, cos_a: float, cos_b: float, cos_g: float, a2_b2: float, c2_b2: float) -> float:
-    """The u = s2 / s1 that the side a demands, and of its two values the one that fits the side c better."""
+    """Compute the u = s2 / s1 that side a demands, of its two values the one that fits side c better."""
     first = 1.0 + v * v - 2.0 * v * cos_b
     half = np.sqrt(max((v * cos_a) ** 2 - v * v + a2_b2 * first, 0.0))
     best, least = 0.0, np.inf
@@ -103,7 +103,7 @@ def _align_triangles(points: Float, axes_a: Float, seen: Float, axes_cam: Float,
 
 @kernel
 def _triangle_axes(corners: Float, axes: Float) -> bool:
-    """Orthonormal axes (rows) attached to a triangle; False if it is a line."""
+    """Fill orthonormal axes (rows) attached to a triangle; False if it is a line."""
     for c in range(3):
         axes[0, c] = corners[1, c] - corners[0, c]
         axes[1, c] = corners[2, c] - corners[0, c]
@@ -117,7 +117,7 @@ def _triangle_axes(corners: Float, axes: Float) -> bool:
 
 @kernel
 def _normalise(v: Float) -> float:
-    """Divide a vector (3,) by its length, which is returned."""
+    """Divide a vector (3,) by its length, and return the length."""
     length = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     v /= length
     return length
@@ -133,10 +133,10 @@ def _cross(a: Float, b: Float, out: Float) -> None:
 
 @kernel
 def real_quartic_roots(c: Float) -> tuple[Float, int]:
-    """Real roots of ``c0 x^4 + c1 x^3 + c2 x^2 + c3 x + c4`` by Ferrari's method, polished by Newton's.
+    """Find the real roots of ``c0 x^4 + c1 x^3 + c2 x^2 + c3 x + c4`` by Ferrari's method, polished by Newton's.
 
     Returns:
-        Roots (4,), of which only the first so many are set, and their number.
+        Roots (4,), of which only the first ones are set, and their number.
     """
     roots = np.zeros(4)
     if abs(c[0]) < 1e-14 * np.max(np.abs(c)):
@@ -180,7 +180,7 @@ def real_quartic_roots(c: Float) -> tuple[Float, int]:
 
 @kernel
 def _largest_cubic_root(a: float, b: float, c: float) -> float:
-    """Largest real root of ``x^3 + a x^2 + b x + c``."""
+    """Find the largest real root of ``x^3 + a x^2 + b x + c``."""
     q = (a * a - 3.0 * b) / 9.0
     r = (2.0 * a**3 - 9.0 * a * b + 27.0 * c) / 54.0
     if r * r < q**3:

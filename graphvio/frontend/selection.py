@@ -19,7 +19,7 @@ def joint_motion(
     config: MotionConfig,
     rng: np.random.Generator,
 ) -> Refined:
-    """Hypotheses of every pair, scored on every pair, and the winner refined on all points (section 3.1).
+    """Estimate one motion from all pairs: hypotheses scored on every pair, the best one refined (section 3.1).
 
     Args:
         rig: of P pairs.
@@ -38,7 +38,10 @@ def best_pair_motion(
     config: MotionConfig,
     rng: np.random.Generator,
 ) -> Refined:
-    """Each pair estimates alone; the pose of least global cost wins, eq. (4). For arguments see `joint_motion`."""
+    """Estimate a motion from each pair alone, and choose the one of least global cost, eq. (4).
+
+    For arguments see `joint_motion`; for the plain equation `graphvio.frontend.paper_method.best_pair`.
+    """
     candidates = [joint_motion(rig, observations.of_pair(pair), predicted, config, rng) for pair in observations.pairs]
     costs = [global_cost(rig, observations, candidate.cur_T_ref, config.cauchy_scale_px) for candidate in candidates]
     winner = candidates[int(np.argmin(costs))]
@@ -47,6 +50,6 @@ def best_pair_motion(
 
 
 def global_cost(rig: RigArrays, observations: Observations, cur_T_ref: Float, cauchy_scale_px: float) -> float:
-    """The cost of a motion (4, 4) on the points of all pairs, eq. (3)."""
+    """Compute the cost of a motion (4, 4) on the points of all pairs, eq. (3)."""
     rows = np.arange(len(observations.pair))
     return robust_cost(cur_T_ref, rig, observations, rows, cauchy_scale_px)

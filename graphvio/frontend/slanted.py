@@ -1,8 +1,8 @@
 """Alignment of a left patch in the right image, where the surface that it shows may be slanted.
 
 Seen from two places, the patch of a slanted surface is sheared along the epipolar line: its disparity varies
-linearly over the patch. Two slopes beside the translation make the alignment exact for any plane, to first order.
-Inverse compositional Gauss-Newton, as in `graphvio.frontend.lucas_kanade`.
+linearly over the patch. Two slopes in addition to the translation make the alignment exact for any plane, to first
+order. Inverse compositional Gauss-Newton, as in `graphvio.frontend.lucas_kanade`.
 """
 
 import numpy as np
@@ -24,10 +24,10 @@ from graphvio.frontend.patches import (
 from graphvio.kernels import fast_kernel
 
 _MAX_ITERATIONS = 10
-_CONVERGED_PX = 0.01  # where texture is weak, much of a step is left to do; it would lean to the depth of before
-_CONVERGED_SLOPE = 0.003  # a slope from before must be free to change, or its error would last
+_CONVERGED_PX = 0.01  # where texture is weak, steps are short: stopping early would bias towards the depth of before
+_CONVERGED_SLOPE = 0.003  # a slope of before must be free to change, or its error would persist
 _MAX_SLOPE = 0.8
-_SLOPE_PRIOR = 100.0  # squared grey levels: a slope of 0.3 against noise of 3 grey levels; decides where nothing else
+_SLOPE_PRIOR = 100.0  # squared grey levels: a slope of 0.3 against noise of 3 grey levels; decides without texture
 _SHIFT_PRIOR = 1e-3  # keeps the normal matrix of a flat patch regular
 
 _Columns = tuple[Patch, Patch, Patch, Patch]
@@ -44,11 +44,11 @@ def align_slanted(
     Args:
         left: image (height, width).
         right: image (height, width).
-        packed_right: the same, see `graphvio.frontend.patches.packed`.
+        packed_right: the right image as of `graphvio.frontend.patches.packed`.
         pixels: (N, 2) centres of the patches.
-        guess: (N, 2) where the search starts.
+        guess: (N, 2) initial pixels in the right image.
         directions: (N, 2) unit vectors along the epipolar lines in the right image.
-        slopes: (N, 2) where their search starts: derivative of the shift along the line by the left pixel.
+        slopes: (N, 2) initial slopes: derivative of the shift along the line by the left pixel.
         known: (N,) whether guess and slopes are known from before; elsewhere the patch is first shifted alone.
         wanted: (N,) which patches to align.
         half: of the patch's side, without its middle.
@@ -113,7 +113,7 @@ def _steepest_descent(columns: _Columns, grid: Lattice, ex: float, ey: float) ->
 
 @fast_kernel
 def _factorise(columns: _Columns, xx: float, xy: float, yy: float, factor: Float) -> None:
-    """Fill the lower Cholesky factor (4, 4) of the normal matrix; its block of the shift alone is known."""
+    """Fill the lower Cholesky factor (4, 4) of the normal matrix, of which the block of the shift is given."""
     c0, c1, c2, c3 = columns[0].flat, columns[1].flat, columns[2].flat, columns[3].flat
     h02 = h03 = h12 = h13 = h22 = h23 = h33 = np.float32(0.0)
     for k in range(c0.size):
@@ -160,14 +160,14 @@ def _is_small(step: Float) -> bool:
 def _sample_sheared(
     image: AnyArray, parameters: Float, ex: float, ey: float, inside: Patch, scratch: Scratch, out: Patch
 ) -> bool:
-    """Fill the patch that the parameters ``[u, v, slope x, slope y]`` point at; False where it leaves the image."""
+    """Sample the patch at the parameters ``[u, v, slope x, slope y]``; False where it leaves the image."""
     u, v, a, b = parameters[0], parameters[1], parameters[2], parameters[3]
     return sample_affine(image, u, v, 1.0 + ex * a, ex * b, ey * a, 1.0 + ey * b, inside, scratch, out)
 
 
 @fast_kernel
 def _compose(parameters: Float, step: Float, ex: float, ey: float) -> None:
-    """Undo a step before the warp: ``W <- W o dW^-1``, where both are a shift and a shear along the line."""
+    """Apply the inverse of a step before the warp: ``W <- W o dW^-1``, both a shift and a shear along the line."""
     share = (1.0 + parameters[2] * ex + parameters[3] * ey) / (1.0 + step[2] * ex + step[3] * ey)
     for k in range(2, 4):
         parameters[k] = min(max(parameters[k] - share * step[k], -_MAX_SLOPE), _MAX_SLOPE)

@@ -1,4 +1,4 @@
-"""The simplest prediction of motion: the last one goes on."""
+"""Constant-velocity prediction of relative motion."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from graphvio.measurements.motion import RelativeMotion
 
 
 class SteadyMotion:
-    """Chains measured motions and predicts that the last one is repeated, as the odometry does without an IMU."""
+    """Chain of measured motions, which predicts that the last one is repeated, as the odometry does without an IMU."""
 
     def __init__(self) -> None:
         self._nav_T_body: dict[int, Float] = {}
@@ -25,7 +25,7 @@ class SteadyMotion:
         self._nav_T_now = np.eye(4) if self._latest_ns is None else self._nav_T_body[self._latest_ns] @ self._step
 
     def predict(self, then_ns: int) -> Float | None:
-        """``now_T_then`` (4, 4) of body."""
+        """Return the predicted ``now_T_then`` (4, 4) of body, or None for an unknown stamp."""
         then = self._nav_T_body.get(then_ns)
         return None if then is None else se3_inverse(self._nav_T_now) @ then
 

@@ -1,8 +1,8 @@
 """Left-right matching along the epipolar curve, and triangulation with covariance (section 3).
 
-A point is held in the left camera's frame by its inverse depth, ``(x, y, w)`` with ``w = 1 / Z``: homogeneous
+A point is represented in the left camera's frame by its inverse depth, ``(x, y, w)`` with ``w = 1 / Z``: homogeneous
 coordinates ``[x, y, 1, w]``. Points so far away that their depth is unknown are then as regular as any other, and
-keep what they say about rotation.
+still constrain rotation.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ _GAUSS_NEWTON_STEPS = 4
 _HALVINGS = 6
 
 _Camera = tuple[Float, int, Float, Float, float]
-"""right_T_left; model, intrinsics and distortion of the right camera; and how far its model reaches."""
+"""right_T_left; model, intrinsics and distortion of the right camera; and the largest radius of its model."""
 
 
 @kernel
@@ -38,7 +38,7 @@ def epipolar_search(
     distortion: Float,
     min_correlation: float,
 ) -> tuple[Float, Bool]:
-    """The inverse depth at which each corner is seen best on its epipolar curve in the right image, to the pixel.
+    """Search the right image for each corner along its epipolar curve, to the pixel.
 
     The curve is searched in images of half the size; the whole image then decides around the best place there.
 
@@ -50,8 +50,10 @@ def epipolar_search(
         inverse_depths: (N, 2) range that is searched, 1/m; near ends that the right camera's lens does not reach are
             left out.
         right_T_left: (4, 4).
-        model: of the right camera, with its ``intrinsics`` (4,) and ``distortion`` (5,).
-        min_correlation: least normalised cross-correlation.
+        model: number of the right camera's model.
+        intrinsics: (4,) of the right camera.
+        distortion: (5,) of the right camera.
+        min_correlation: smallest normalised cross-correlation.
 
     Returns:
         Inverse depths (N,), 1/m, and whether there is one clear best place (N,).
@@ -81,7 +83,7 @@ def epipolar_search(
 
 @kernel
 def _nearest_in_reach(ray: Float, w0: float, w1: float, camera: _Camera) -> float:
-    """The largest inverse depth up to ``w1`` at which the right camera's model holds, about."""
+    """Find, roughly, the largest inverse depth up to ``w1`` at which the right camera's model holds."""
     for _ in range(_HALVINGS):
         if _on_curve(ray, w1, camera)[2]:
             break
@@ -93,7 +95,7 @@ def _nearest_in_reach(ray: Float, w0: float, w1: float, camera: _Camera) -> floa
 def _scan(
     image: Image, scale: float, patch: AnyArray, ray: Float, w0: float, w1: float, camera: _Camera, scores: Float,
 ) -> tuple[int, int]:  # fmt: skip
-    """Fill a patch's correlations along its epipolar curve, a pixel apart, in an image of so many times the size.
+    """Fill a patch's correlations along its epipolar curve, a pixel apart, in an image scaled by ``scale``.
 
     Returns:
         Which is the best, and the number of steps, 0 where the curve's ends are not in the image plane.
@@ -120,7 +122,7 @@ def _scan(
 
 @kernel
 def _is_ambiguous(scores: Float, best: int) -> bool:
-    """Whether another place of a curve is as good as the best: a texture that repeats."""
+    """Check whether another place of the curve is as good as the best, as in a texture that repeats."""
     for k in range(len(scores)):  # noqa: SIM110 (numba knows no generators)
         if abs(k - best) > _FINE_STEPS and scores[k] > _AMBIGUOUS * scores[best]:
             return True
@@ -131,7 +133,15 @@ def _is_ambiguous(scores: Float, best: int) -> bool:
 def epipolar_lines(
     rays: Float, inverse_depths: Float, right_T_left: Float, model: int, intrinsics: Float, distortion: Float
 ) -> tuple[Float, Float, Bool]:
-    """Where points of known depth fall in the right image.
+    """Project points of known depth into the right image.
+
+    Args:
+        rays: (N, 2) normalised coordinates in the left camera.
+        inverse_depths: (N,) 1/m.
+        right_T_left: (4, 4).
+        model: number of the right camera's model.
+        intrinsics: (4,) of the right camera.
+        distortion: (5,) of the right camera.
 
     Returns:
         Pixels (N, 2), the directions (N, 2) in which they move when they come nearer, and whether both exist (N,).
@@ -155,14 +165,14 @@ def epipolar_lines(
 def triangulate(
     left: Float, right: Float, right_T_left: Float, focal_left: float, focal_right: float
 ) -> tuple[Float, Float, Float]:
-    """Points of least squared reprojection error in both images, with covariance for a pixel noise of 1 px.
+    """Triangulate points by least squared reprojection error in both images, with covariance for a pixel noise of 1 px.
 
     Args:
         left: (N, 2) normalised coordinates.
         right: (N, 2) normalised coordinates.
         right_T_left: (4, 4).
-        focal_left: pixels, which weigh the two images.
-        focal_right: pixels.
+        focal_left: pixels, weighs the left image.
+        focal_right: pixels, weighs the right image.
 
     Returns:
         Points (N, 3) ``[x, y, 1/Z]`` in the left camera's frame, their covariances (N, 3, 3) per px^2, and the
@@ -225,7 +235,7 @@ def _invert_symmetric(xx: float, xy: float, xz: float, yy: float, yz: float, zz:
 
 @kernel
 def _on_curve(ray: Float, w: float, camera: _Camera) -> tuple[float, float, bool]:
-    """Pixel of a ray's point of some inverse depth in the right image, and whether the camera's model reaches it."""
+    """Project a ray's point of some inverse depth into the right image; False beyond the camera's model."""
     r, model, intrinsics, distortion, limit = camera
     z = r[2, 0] * ray[0] + r[2, 1] * ray[1] + r[2, 2] + w * r[2, 3]
     if z < 1e-3:
@@ -245,7 +255,7 @@ def _square(half: int) -> AnyArray:
 
 @kernel
 def _normalised_patch(image: Image, x: float, y: float, patch: AnyArray) -> bool:
-    """Fill the patch around (x, y) with zero mean and unit norm; False at the edge or without contrast."""
+    """Fill a patch around (x, y) with zero mean and unit norm; False at the edge or without contrast."""
     cx, cy, side = round(x), round(y), len(patch)
     half = side // 2
     height, width = image.shape
@@ -263,14 +273,14 @@ def _normalised_patch(image: Image, x: float, y: float, patch: AnyArray) -> bool
 
 @fast_kernel
 def _correlation(image: Image, cx: int, cy: int, patch: AnyArray) -> float:
-    """Normalised cross-correlation of a patch of zero mean and unit norm with the image around a pixel."""
+    """Correlate a patch of zero mean and unit norm with the image around a pixel, normalised."""
     total = square = 0
     product = np.float32(0.0)
     side = len(patch)
     left, top = cx - side // 2, cy - side // 2
     for j in range(side):
         values, weights = image[top + j, left : left + side], patch[j]
-        row = np.float32(0.0)  # of its own: a row need not wait for the one before
+        row = np.float32(0.0)  # a separate sum: a row need not wait for the one before
         for i in range(side):
             value = int(values[i])
             total += value

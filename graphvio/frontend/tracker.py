@@ -1,4 +1,4 @@
-"""Corners of one stereo pair through time: tracked, registered, renewed, matched left to right and triangulated."""
+"""Corners of one stereo pair through time: tracked, matched left to right, triangulated and replenished."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
-from graphvio.frontend.corners import find_corners, occupied_cells, thinned
-from graphvio.frontend.image_noise import noise_sigma
+from graphvio.frontend.corners import find_corners, noise_sigma, occupied_cells, thinned
 from graphvio.frontend.images import allowed_pixels
 from graphvio.frontend.keyframe_patches import KeyframePatches
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
@@ -20,12 +19,12 @@ from graphvio.rig import StereoPair
 from graphvio.timing import Stopwatch
 
 _MAX_TRACKS_PER_CELL = 2
-_MAX_FLAT_FRAMES = 3  # then another corner of the cell gets its chance
-_LEVELS_AFTER_PREDICTION = 2  # are enough where the motion is known; tracks that fail are tried again with all
+_MAX_FLAT_FRAMES = 3  # then the track is dropped for another corner of its cell
+_LEVELS_AFTER_PREDICTION = 2  # suffice where the motion is predicted; tracks that fail are tried again with all
 
 
 class PairTracker:
-    """Follows the corners of one stereo pair from frame to frame."""
+    """Tracker of the corners of one stereo pair from frame to frame."""
 
     def __init__(self, pair: StereoPair, config: Config) -> None:
         self._pair = pair
@@ -48,14 +47,14 @@ class PairTracker:
         left_T_left_prev: Float | None,
         left_T_left_keyframe: Float | None,
     ) -> PairFrame:
-        """Follow the tracks, match them left to right and triangulate; where few are left, add new ones.
+        """Follow the tracks, match them left to right and triangulate; replenish them where few are left.
 
         Args:
             stamp_ns: of these images.
-            left: (height, width), contiguous, of the size that the rig says.
+            left: (height, width), contiguous, of the rig's image size.
             right: likewise.
-            left_T_left_prev: (4, 4) predicted motion of points since the images before, or None if unknown.
-            left_T_left_keyframe: (4, 4) the same since the anchor, or None.
+            left_T_left_prev: (4, 4) predicted motion of points since the previous images, or None if unknown.
+            left_T_left_keyframe: (4, 4) the same since the keyframe of `keep_keyframe_patches`, or None.
         """
         watch = Stopwatch()
         before, levels = self._left, max(self._config.tracking.levels, 2)
@@ -82,7 +81,7 @@ class PairTracker:
         return self.replenish() if self._share_of_cells(self._last) < self._config.corners.scarce_share else self._last
 
     def replenish(self) -> PairFrame:
-        """Add new corners to the newest frame, where no track gives geometry."""
+        """Add new corners to the newest frame, where no track constrains translation."""
         watch = Stopwatch()
         pixels = self._new_corners(self._last)
         watch.lap("corners")
@@ -95,23 +94,23 @@ class PairTracker:
         return self._last
 
     def limit_corners(self, share: float) -> None:
-        """From now on have only a share of the image's cells, and so of the corners."""
+        """Use only a share of the image's cells, and so of the corners, from now on."""
         self._cell_px = round(self._config.corners.cell_px(self._pair.left.size_px[0]) / np.sqrt(share))
 
     def keep_keyframe_patches(self) -> None:
-        """Hold the tracks against the newest frame's own patches from here on."""
+        """Register the tracks on the newest frame's patches from now on."""
         if self._left:
             self._patches.take(self._last, self._left[0])
 
     def drop(self, ids: Int) -> None:
-        """Forget tracks, so that fresh corners may take their place."""
+        """Drop tracks, so that new corners may take their place."""
         if len(ids):
             stays = np.ones(len(self._last.ids), dtype=bool)
             stays[common_rows(self._last.ids, ids)[0]] = False
             self._last = self._last.keep(stays)
 
     def _predict(self, left_T_left_prev: Float | None) -> tuple[PairFrame, Float, Float]:
-        """The tracks worth following, and their pixels (N, 2) and inverse depths (N,), or NaN, after a motion."""
+        """Select the tracks to follow, and predict their pixels (N, 2) and inverse depths (N,), NaN if unknown."""
         last, camera = self._last.keep(self._last.flat_for <= _MAX_FLAT_FRAMES), self._pair.left
         if left_T_left_prev is None:
             return last, last.pixels, np.where(last.has_depth, last.points[:, 2], np.nan)
@@ -132,22 +131,22 @@ class PairTracker:
         left_T_left_keyframe: Float | None,
         watch: Stopwatch,
     ) -> tuple[Float, Bool]:
-        """Where the tracks are now (N, 2), and which of them were found (N,).
+        """Find the tracks' pixels now (N, 2), and which of them were found (N,).
 
-        Most are found on the anchor's patches at once, near their predicted place. The others go by way of the frame
-        before.
+        Most are found on the keyframe's patches directly, near their predicted place; the others by way of the previous
+        frame.
         """
         pixels, found = guess.copy(), np.zeros(len(guess), dtype=bool)
         if left_T_left_keyframe is not None and left_T_left_prev is not None:
             pixels, found = self._patches.find(last.ids, guess, self._left[0], left_T_left_keyframe, self._min_gradient)
         watch.lap("register")
-        rest, settings = np.flatnonzero(~found), self._config.tracking
-        if len(rest):
-            pixels[rest], found[rest] = track(
+        others, settings = np.flatnonzero(~found), self._config.tracking
+        if len(others):
+            pixels[others], found[others] = track(
                 before,
                 self._left,
-                last.pixels[rest],
-                guess[rest],
+                last.pixels[others],
+                guess[others],
                 window_px=settings.window_px,
                 levels=settings.levels,
                 max_return_px=settings.max_forward_backward_px,
@@ -156,15 +155,15 @@ class PairTracker:
             )
         watch.lap("flow")
         if left_T_left_keyframe is not None:
-            rest = rest[found[rest]]
-            pixels[rest], _ = self._patches.find(
-                last.ids[rest], pixels[rest], self._left[0], left_T_left_keyframe, self._min_gradient
+            others = others[found[others]]
+            pixels[others], _ = self._patches.find(
+                last.ids[others], pixels[others], self._left[0], left_T_left_keyframe, self._min_gradient
             )
         watch.lap("register")
         return pixels, found
 
     def _still_wanted(self, pixels: Float, found: Bool, rejected: dict[str, int]) -> Bool:
-        """Which tracks (N,) stay: found, where the image may be used, and not crowded together."""
+        """Select the tracks (N,) that stay: found, where the image may be used, and not crowded together."""
         corners = self._config.corners
         found = passes(np.ones(len(found), dtype=bool), found, "flow", rejected)
         inside, usable = usable_at(pixels, self._allowed, corners.border_px)
@@ -177,7 +176,7 @@ class PairTracker:
         self, stamp_ns: int, ids: Int, ages: Int, pixels: Float, inverse_depths: Float, slopes: Float, flat_for: Int,
         rejected: dict[str, int],
     ) -> PairFrame:  # fmt: skip
-        """Tracks of the newest left image, matched to the right one and triangulated."""
+        """Match tracks of the newest left image to the right one, and triangulate them."""
         rays, has_ray = self._pair.left.unproject(pixels)
         matches = self._matcher.match(self._left, self._right, pixels, rays, inverse_depths, slopes, self._min_gradient)
         has_depth = matches.good & has_ray
@@ -198,25 +197,25 @@ class PairTracker:
 
     @property
     def _min_gradient(self) -> float:
-        """Least rms gradient along a patch's weaker direction: one of nothing but noise has 0.7 of its deviation."""
+        """Smallest rms gradient along a patch's weaker direction; for pure noise it is 0.7 of the noise's deviation."""
         return min(MIN_GRADIENT, self._noise_sigma)
 
     def _share_of_cells(self, frame: PairFrame, new: Float | None = None) -> float:
-        """The share of the image's cells that hold a track with depth, or a new corner (M, 2)."""
+        """Compute the share of the image's cells that hold a track with depth, or a new corner (M, 2)."""
         cell_px, (width, height) = self._cell_px, self._pair.left.size_px
         pixels = frame.pixels[frame.has_depth]
         both = pixels if new is None else np.concatenate([pixels, new])
         return float(occupied_cells(both, cell_px, -(-height // cell_px), -(-width // cell_px)).mean())
 
     def _new_corners(self, frame: PairFrame) -> Float:
-        """Corners (M, 2) where no track of a frame gives geometry, weak ones too where there are few."""
+        """Find corners (M, 2) where no track of a frame constrains translation, weak ones too where there are few."""
         settings, image = self._config.corners, self._left[0]
-        tracked, settled = frame.pixels, frame.constrains_translation(self._config.motion.pixel_sigma_px)
+        tracked, occupying = frame.pixels, frame.constrains_translation(self._config.motion.pixel_sigma_px)
         cell_px, border_px = self._cell_px, settings.border_px
-        new = find_corners(image, self._allowed, tracked, settled, cell_px, border_px, settings.min_response)
+        new = find_corners(image, self._allowed, tracked, occupying, cell_px, border_px, settings.min_response)
         admitted = settings.noise_factor * self._noise_sigma
         if admitted >= settings.min_response or self._share_of_cells(frame, new) >= settings.scarce_share:
             return new
-        tracked, settled = np.concatenate([tracked, new]), np.concatenate([settled, np.ones(len(new), dtype=bool)])
-        weak = find_corners(image, self._allowed, tracked, settled, cell_px, border_px, admitted)
+        tracked, occupying = np.concatenate([tracked, new]), np.concatenate([occupying, np.ones(len(new), dtype=bool)])
+        weak = find_corners(image, self._allowed, tracked, occupying, cell_px, border_px, admitted)
         return np.concatenate([new, weak])

@@ -1,4 +1,4 @@
-"""What one stereo pair saw at one instant: its tracks, as columns."""
+"""Observations of one stereo pair at one instant: its tracks, as columns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NEAR_SIGMAS = 10.0  # a depth that is known to a tenth
 
 @dataclass(frozen=True, eq=False)
 class PairFrame:
-    """What one pair saw at one instant: N tracks.
+    """Observations of one pair at one instant: N tracks.
 
     Attributes:
         stamp_ns: of the frameset.
@@ -30,7 +30,7 @@ class PairFrame:
         slopes: (N, 2) of the right patch, see `graphvio.frontend.slanted`; meaningful where ``has_depth``.
         has_depth: (N,) whether the stereo match passed all its tests.
         flat_for: (N,) number of frames, up to this one, without depth.
-        rejected: what each test of tracking and stereo matching threw out.
+        rejected: test of tracking or stereo matching -> number of tracks that failed it.
         stage_ms: time by stage.
     """
 
@@ -49,18 +49,18 @@ class PairFrame:
     stage_ms: Mapping[str, float] = field(default_factory=dict)
 
     def constrains_translation(self, sigma_px: float) -> Bool:
-        """Which tracks (N,) are near enough for their motion to tell more than rotation, with pixels so noisy."""
+        """Select the tracks (N,) so near that their motion constrains more than rotation, for a pixel noise."""
         sigma_w = sigma_px * np.sqrt(self.covariances[:, 2, 2])
         return np.asarray(self.has_depth & (self.points[:, 2] > _NEAR_SIGMAS * sigma_w))
 
     def keep(self, rows: Bool) -> PairFrame:
-        """The same with only some of its tracks."""
+        """Return the frame with only some of its tracks (N,)."""
         if rows.all():
             return self
         return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
     def extended(self, other: PairFrame) -> PairFrame:
-        """The same with the tracks of another frame of this instant, whose ids are greater; counts and times add up."""
+        """Append the tracks of another frame of this instant, whose ids are greater; counts and times add up."""
         both = self, other
         columns: dict[str, Any] = {name: np.concatenate([getattr(each, name) for each in both]) for name in _COLUMNS}
         return replace(
@@ -72,7 +72,7 @@ class PairFrame:
 
     @staticmethod
     def empty(stamp_ns: int = 0) -> PairFrame:
-        """A frame without tracks."""
+        """Return a frame without tracks."""
         none, whole = np.zeros(0), np.zeros(0, dtype=np.int64)
         return PairFrame(
             stamp_ns,
@@ -98,7 +98,7 @@ def _added(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
 
 @kernel
 def common_rows(first: Int, second: Int) -> tuple[Int, Int]:
-    """Where (K,) each of two columns of increasing identities, (N,) and (M,), holds those that are in both."""
+    """Find the identities common to two increasing columns (N,) and (M,): their rows in each (K,)."""
     at_first = np.empty(min(len(first), len(second)), dtype=np.int64)
     at_second = np.empty_like(at_first)
     i = j = k = 0
@@ -115,7 +115,7 @@ def common_rows(first: Int, second: Int) -> tuple[Int, Int]:
 
 @kernel
 def usable_at(pixels: Float, allowed: Bool, border_px: float) -> tuple[Bool, Bool]:
-    """Which pixels (N, 2) lie so far inside the image (N,), and which of these may be used (N,).
+    """Check which pixels (N, 2) lie so far inside the image (N,), and which of these may be used (N,).
 
     Args:
         pixels: NaN is outside.
@@ -133,7 +133,7 @@ def usable_at(pixels: Float, allowed: Bool, border_px: float) -> tuple[Bool, Boo
 
 
 def passes(candidates: Bool, test: Bool, name: str, rejected: dict[str, int]) -> Bool:
-    """Which candidates (N,) pass a test (N,); how many did not is noted under the test's name."""
+    """Select the candidates (N,) that pass a test (N,), and count the others under the test's name."""
     passed = candidates & test
     rejected[name] = int(np.count_nonzero(candidates) - np.count_nonzero(passed))
     return np.asarray(passed)
