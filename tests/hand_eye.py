@@ -21,14 +21,14 @@ LEFT2_T_LEFT1 = se3_exp(np.array([0.05, 3.0, 0.1, 0.3345, 0.0667, -0.1138]))  # 
 
 
 @dataclass(frozen=True)
-class Drawn:
+class SyntheticPairs:
     """Pose pairs and which of them are outliers (N,)."""
 
     pairs: PosePairs
     outlier: Bool
 
 
-def drawn(
+def synthetic_pairs(
     count: int,
     rng: np.random.Generator,
     rotation_sigma: float = 0.0,
@@ -37,7 +37,7 @@ def drawn(
     left2_T_left1: Float = LEFT2_T_LEFT1,
     turns: tuple[float, float, float] = (0.1, 0.1, 0.1),
     steps: tuple[float, float, float] = (0.05, 0.05, 0.05),
-) -> Drawn:
+) -> SyntheticPairs:
     """Random motions, of which both cameras see their part.
 
     Args:
@@ -66,7 +66,9 @@ def drawn(
     )
     covariance = np.broadcast_to(np.diag(sigmas**2), (count, 6, 6)).copy()
     start_ns = np.arange(count) * PERIOD_NS
-    return Drawn(PosePairs(start_ns, start_ns + PERIOD_NS, motion_1, covariance, motion_2, covariance), outlier)
+    return SyntheticPairs(
+        PosePairs(start_ns, start_ns + PERIOD_NS, motion_1, covariance, motion_2, covariance), outlier
+    )
 
 
 def turning(time_s: float) -> Float:

@@ -16,8 +16,8 @@ from typer.testing import CliRunner, Result
 
 from graphvio import Calibration, CalibrationError, Rig, calibrate_pairs, load_rig, open_source, save_rig
 from graphvio.arrays import Float
+from graphvio.calibration.camera_motions import SeparateMotions
 from graphvio.calibration.guide import ENOUGH_MOTIONS, Advice, Guide
-from graphvio.calibration.separate_motions import SeparateMotions
 from graphvio.cli import app
 from graphvio.config import Config
 from graphvio.geometry import se3_exp, se3_inverse, se3_log, so3_exp, so3_log
@@ -61,7 +61,7 @@ def test_pairs_are_found_within_what_is_told(walk: Path, found: Calibration) -> 
     assert found.inliers.mean() > 0.95
     assert found.pair.frame_inlier.mean() > 0.97
     assert found.pair.frame_errors_m.mean() < 3.29e-3
-    present = found.present()
+    present = found.compare_rig()
     assert present is not None
     assert not present.is_off
     assert not found.warnings
@@ -71,7 +71,7 @@ def test_where_the_rig_file_has_the_pairs_does_not_matter(walk: Path, found: Cal
     rig = load_rig(walk / "rig.yaml")
     other = calibrate_pairs(open_source(walk, with_wrong_place(rig, 3.0, 0.05)))
     np.testing.assert_allclose(other.left2_T_left1, found.left2_T_left1, atol=1e-7)  # but for rounding
-    present = other.present()
+    present = other.compare_rig()
     assert present is not None
     assert present.is_off
     assert not present.is_swapped
@@ -89,7 +89,7 @@ def test_pairs_in_each_others_place_are_told(walk: Path) -> None:
             replace(pair, left=replace(pair.left, body_T_cam=place), right=replace(pair.right, body_T_cam=right))
         )
     swapped = calibrate_pairs(open_source(walk, replace(rig, pairs=tuple(moved))))
-    present = swapped.present()
+    present = swapped.compare_rig()
     assert present is not None
     assert present.is_swapped
     assert any("changed places" in sentence for sentence in swapped.warnings)
@@ -239,7 +239,7 @@ def test_a_pair_that_sees_nothing_is_named(walk: Path) -> None:
     crossed = replace(
         back, left=replace(back.left, name=back.right.name), right=replace(back.right, name=back.left.name)
     )
-    with pytest.raises(CalibrationError, match="back told no motion"):
+    with pytest.raises(CalibrationError, match="back measured no motion"):
         calibrate_pairs(open_source(walk, replace(rig, pairs=(rig.pairs[0], crossed))))
 
 
@@ -264,7 +264,7 @@ def test_sigmas_are_those_of_the_numbers_beside_them(found: Calibration) -> None
         drawn = found.left2_T_left1 @ se3_exp(root @ rng.standard_normal(6))
         offsets.append(drawn[:3, 3])
         turns.append(so3_log(np.ascontiguousarray(drawn[:3, :3])))
-    shown = found.shown(1)
+    shown = found.pose_summary(1)
     np.testing.assert_allclose(np.std(offsets, axis=0), shown.offset_sigmas_m, rtol=0.08)
     np.testing.assert_allclose(np.std(turns, axis=0), shown.turn_sigmas_rad, rtol=0.08)
     np.testing.assert_allclose(shown.offset_m, found.left2_T_left1[:3, 3])

@@ -6,7 +6,7 @@ from hand_eye import FRAMES, PERIOD_NS, Walk, motions, straight, turning
 
 from graphvio.arrays import Float, Int
 from graphvio.calibration.imu_alignment import ImuAlignment, align
-from graphvio.calibration.intervals import all_segments
+from graphvio.calibration.segments import all_segments
 from graphvio.errors import CalibrationError
 from graphvio.geometry import so3_exp, so3_log
 from graphvio.rig import Imu

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_eye import LEFT2_T_LEFT1, Drawn, by_dual_quaternions, drawn
+from hand_eye import LEFT2_T_LEFT1, SyntheticPairs, by_dual_quaternions, synthetic_pairs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from monte_carlo import band
@@ -37,7 +37,7 @@ def both(pairs: PosePairs) -> tuple[paper_method.PaperSolution, graph.GraphSolut
 )
 def test_without_noise_all_methods_are_exact(tangent: list[float], seed: int, count: int) -> None:
     true = se3_exp(np.array(tangent))
-    pairs = drawn(count, np.random.default_rng(seed), left2_T_left1=true).pairs
+    pairs = synthetic_pairs(count, np.random.default_rng(seed), left2_T_left1=true).pairs
     paper, found = both(pairs)
     assert np.abs(error_of(paper.left2_T_left1, true)).max() < 1e-9
     assert np.abs(error_of(found.left2_T_left1, true)).max() < 1e-9
@@ -48,7 +48,7 @@ def test_without_noise_all_methods_are_exact(tangent: list[float], seed: int, co
 
 def test_equation_5_holds_in_the_order_that_the_eigenvector_takes() -> None:
     """With all axes turned about, so that no order of the products but the right one fits."""
-    parts = PoseParts.of(drawn(20, np.random.default_rng(1)).pairs)
+    parts = PoseParts.of(synthetic_pairs(20, np.random.default_rng(1)).pairs)
     R, eigenvalues = paper_method.rotation(parts.R_1, parts.R_2)
     np.testing.assert_allclose(R @ parts.R_1, parts.R_2 @ R, atol=1e-12)
     np.testing.assert_allclose(R, LEFT2_T_LEFT1[:3, :3], atol=1e-12)
@@ -57,13 +57,13 @@ def test_equation_5_holds_in_the_order_that_the_eigenvector_takes() -> None:
 
 def test_signs_of_quaternions_do_not_matter() -> None:
     """Turns of more than a half, whose quaternions change their sign."""
-    pairs = drawn(30, np.random.default_rng(2), turns=(1.2, 1.2, 1.2)).pairs
+    pairs = synthetic_pairs(30, np.random.default_rng(2), turns=(1.2, 1.2, 1.2)).pairs
     assert np.linalg.norm(pairs.rotations_rad, axis=1).max() > 2.5
     assert np.abs(error_of(paper_method.calibrate(pairs).left2_T_left1)).max() < 1e-9
 
 
 def test_the_alignment_error_is_where_both_motions_put_the_second_camera() -> None:
-    pairs = drawn(10, np.random.default_rng(3), ANGLE, STEP_M).pairs
+    pairs = synthetic_pairs(10, np.random.default_rng(3), ANGLE, STEP_M).pairs
     R = LEFT2_T_LEFT1[:3, :3]
     t = -R.T @ LEFT2_T_LEFT1[:3, 3]
     left1_T_left2 = np.linalg.inv(LEFT2_T_LEFT1)
@@ -73,7 +73,7 @@ def test_the_alignment_error_is_where_both_motions_put_the_second_camera() -> No
 
 
 def test_the_papers_jacobian_is_the_derivative() -> None:
-    parts = PoseParts.of(drawn(10, np.random.default_rng(4), ANGLE, STEP_M).pairs)
+    parts = PoseParts.of(synthetic_pairs(10, np.random.default_rng(4), ANGLE, STEP_M).pairs)
     R, t, h = LEFT2_T_LEFT1[:3, :3], np.array([0.1, -0.2, 0.3]), 1e-6
     numeric = []
     for axis in np.eye(3):
@@ -86,7 +86,7 @@ def test_the_papers_jacobian_is_the_derivative() -> None:
 
 
 def test_the_graphs_jacobian_is_the_derivative() -> None:
-    pairs, h = drawn(5, np.random.default_rng(5), ANGLE, STEP_M).pairs, 1e-6
+    pairs, h = synthetic_pairs(5, np.random.default_rng(5), ANGLE, STEP_M).pairs, 1e-6
     flat = replace(pairs, covariance_1=1e-12 * pairs.covariance_1)  # else the whitener changes, too
     _, jacobians = whitened(flat, LEFT2_T_LEFT1)
     numeric = []
@@ -102,7 +102,7 @@ def test_errors_are_within_what_is_told(outlier_share: float) -> None:
     runs = 24
     squares, differences, kept, missed = [], [], 0, 0
     for seed in range(runs):
-        made: Drawn = drawn(150, np.random.default_rng([seed, 1]), ANGLE, STEP_M, outlier_share)
+        made: SyntheticPairs = synthetic_pairs(150, np.random.default_rng([seed, 1]), ANGLE, STEP_M, outlier_share)
         paper, found = both(made.pairs)
         error = error_of(found.left2_T_left1)
         squares.append(error @ np.linalg.solve(found.covariance, error))
@@ -119,7 +119,7 @@ def test_errors_are_within_what_is_told(outlier_share: float) -> None:
 def test_a_good_start_serves_where_most_motions_are_wild() -> None:
     """Slow turns and little noise: outliers are so far off that a solution for all motions leads nowhere."""
     for seed in range(8):
-        made = drawn(300, np.random.default_rng([seed, 2]), 2e-4, 4e-4, 0.6, turns=(0.05, 0.1, 0.05))
+        made = synthetic_pairs(300, np.random.default_rng([seed, 2]), 2e-4, 4e-4, 0.6, turns=(0.05, 0.1, 0.05))
         start = LEFT2_T_LEFT1 @ se3_exp(np.repeat([3e-4, 3e-4], 3))
         found = graph.solve(made.pairs, start)
         assert not np.any(found.inlier & made.outlier)
@@ -127,7 +127,7 @@ def test_a_good_start_serves_where_most_motions_are_wild() -> None:
 
 
 def test_methods_that_differ_by_more_than_they_may_are_told() -> None:
-    pairs = drawn(100, np.random.default_rng(6), ANGLE, STEP_M).pairs
+    pairs = synthetic_pairs(100, np.random.default_rng(6), ANGLE, STEP_M).pairs
     paper, found = both(pairs)
     assert compare(pairs, paper, found).agrees
     wrong = replace(paper, left2_T_left1=paper.left2_T_left1 @ se3_exp(np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.03])))
@@ -135,32 +135,32 @@ def test_methods_that_differ_by_more_than_they_may_are_told() -> None:
 
 
 def test_the_same_seed_gives_the_same_bits() -> None:
-    pairs = drawn(80, np.random.default_rng(7), ANGLE, STEP_M, 0.4).pairs
+    pairs = synthetic_pairs(80, np.random.default_rng(7), ANGLE, STEP_M, 0.4).pairs
     one, other = both(pairs), both(pairs)
     assert np.array_equal(one[0].left2_T_left1, other[0].left2_T_left1)
     assert np.array_equal(one[1].left2_T_left1, other[1].left2_T_left1)
 
 
 def test_too_few_pose_pairs_are_refused() -> None:
-    pairs = drawn(2, np.random.default_rng(8)).pairs
+    pairs = synthetic_pairs(2, np.random.default_rng(8)).pairs
     with pytest.raises(CalibrationError, match="needs 3 pose pairs and has 2"):
         paper_method.calibrate(pairs)
 
 
 def test_motions_without_rotation_are_refused() -> None:
-    pairs = drawn(50, np.random.default_rng(9), turns=(0.0, 0.0, 0.0)).pairs
+    pairs = synthetic_pairs(50, np.random.default_rng(9), turns=(0.0, 0.0, 0.0)).pairs
     with pytest.raises(CalibrationError, match="without rotation"):
         paper_method.calibrate(pairs)
 
 
 def test_motions_that_have_nothing_in_common_are_refused() -> None:
-    made = drawn(60, np.random.default_rng(10), ANGLE, STEP_M, outlier_share=1.0)
+    made = synthetic_pairs(60, np.random.default_rng(10), ANGLE, STEP_M, outlier_share=1.0)
     with pytest.raises(CalibrationError, match="one rig"):
         both(made.pairs)
 
 
 def test_values_that_are_not_finite_are_refused() -> None:
-    pairs = drawn(5, np.random.default_rng(11)).pairs
+    pairs = synthetic_pairs(5, np.random.default_rng(11)).pairs
     broken = pairs.motion_2.copy()
     broken[3, 0, 3] = np.nan
     with pytest.raises(CalibrationError, match="motion_2 of pair 3 holds NaN"):

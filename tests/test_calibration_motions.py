@@ -11,7 +11,7 @@ from synthetic import pose_at, random_covariance, transform
 from graphvio.arrays import Float
 from graphvio.calibration.camera_motions import CameraMotions
 from graphvio.calibration.consistency import information
-from graphvio.calibration.intervals import LENGTHS_S, all_segments, most_telling, of_one_length, worth
+from graphvio.calibration.segments import LENGTHS_S, all_segments, information_gains, most_informative, of_one_length
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 from graphvio.measurements.motion import RelativeMotion
 
@@ -86,10 +86,10 @@ def test_no_instant_is_used_twice_and_the_choice_tells_more_than_any_length(gap_
     other = CameraMotions(stamps, [], BODY_T_LEFT)
     other._edge, other._reference = motions._edge, motions._reference
     segments = all_segments(stamps, [motions.between, other.between])
-    first = segments.chosen(of_one_length(segments)).pairs
+    first = segments.select(of_one_length(segments)).pairs
     covariance = np.asarray(np.linalg.inv(information(first, LEFT2_T_LEFT1)))
-    rows = most_telling(segments, worth(segments.pairs, LEFT2_T_LEFT1, covariance))
-    pairs = segments.chosen(rows).pairs
+    rows = most_informative(segments, information_gains(segments.pairs, LEFT2_T_LEFT1, covariance))
+    pairs = segments.select(rows).pairs
     assert np.all(pairs.start_ns[1:] >= pairs.end_ns[:-1])
     assert np.all(pairs.end_ns - pairs.start_ns <= LENGTHS_S[-1] * 1e9)
     if gap_at is not None:
@@ -97,7 +97,7 @@ def test_no_instant_is_used_twice_and_the_choice_tells_more_than_any_length(gap_
         assert not across.any()
 
     def gained(chosen: list[int]) -> float:
-        told = information(segments.chosen(chosen).pairs, LEFT2_T_LEFT1)
+        told = information(segments.select(chosen).pairs, LEFT2_T_LEFT1)
         return float(np.trace(covariance @ told))
 
     for length in (1, 2, 7, 20):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hand_eye import LEFT2_T_LEFT1, drawn
+from hand_eye import LEFT2_T_LEFT1, synthetic_pairs
 
 from graphvio.calibration import graph, paper_method
 from graphvio.calibration.observability import Observability, observe
@@ -19,7 +19,9 @@ ON_THE_SPOT = (
 
 
 def observed(turns: Three, steps: Three, noise: float) -> Observability:
-    return observe(drawn(400, np.random.default_rng(0), noise, noise, turns=turns, steps=steps).pairs, LEFT2_T_LEFT1)
+    return observe(
+        synthetic_pairs(400, np.random.default_rng(0), noise, noise, turns=turns, steps=steps).pairs, LEFT2_T_LEFT1
+    )
 
 
 @pytest.mark.parametrize("noise", [2e-3, 1e-5])
@@ -80,7 +82,7 @@ def test_directions_of_motion_tell_the_rotation_where_nothing_turns(noise: float
 
 def test_an_axis_that_is_none_of_the_cameras_is_told_by_its_numbers() -> None:
     axis = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5)])
-    pairs = drawn(300, np.random.default_rng(1), turns=NONE, steps=NONE).pairs
+    pairs = synthetic_pairs(300, np.random.default_rng(1), turns=NONE, steps=NONE).pairs
     angles = 0.1 * np.random.default_rng(2).standard_normal(300)
     motion_1 = np.array([se3_exp(np.concatenate([angle * axis, np.zeros(3)])) for angle in angles])
     motion_2 = LEFT2_T_LEFT1 @ motion_1 @ np.linalg.inv(LEFT2_T_LEFT1)
@@ -91,7 +93,7 @@ def test_an_axis_that_is_none_of_the_cameras_is_told_by_its_numbers() -> None:
 
 
 def test_where_all_is_determined_the_covariance_is_the_graphs() -> None:
-    pairs = drawn(200, np.random.default_rng(3), 1e-3, 2e-3).pairs
+    pairs = synthetic_pairs(200, np.random.default_rng(3), 1e-3, 2e-3).pairs
     found = graph.solve(pairs, paper_method.calibrate(pairs).left2_T_left1)
     told = observe(pairs, found.left2_T_left1).covariance
     np.testing.assert_allclose(told, found.covariance, rtol=0.02, atol=1e-2 * np.abs(found.covariance).max())

@@ -8,8 +8,8 @@ from hand_eye import FRAMES, LEFT2_T_LEFT1, PERIOD_NS, Walk, motions, planar, st
 from monte_carlo import band
 
 from graphvio.arrays import Float
-from graphvio.calibration.intervals import Segments, all_segments
 from graphvio.calibration.pair_calibration import PairCalibration, calibrate_pair
+from graphvio.calibration.segments import Segments, all_segments
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 

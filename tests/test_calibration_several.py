@@ -9,9 +9,9 @@ from monte_carlo import band
 from scipy.stats import chi2
 
 from graphvio.arrays import Float
-from graphvio.calibration.intervals import Segments, all_segments
+from graphvio.calibration.nuisances import ScaleMode
 from graphvio.calibration.pair_calibration import SEEN_FROM, PairCalibration, calibrate_pair
-from graphvio.calibration.scale import ScaleMode
+from graphvio.calibration.segments import Segments, all_segments
 from graphvio.calibration.several import Places, pairwise, place_all
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_exp, se3_inverse, se3_log

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from graphvio import Calibration, CalibrationError, calibrate_trajectories
 from graphvio.arrays import Float
-from graphvio.calibration.trajectory_motions import ClockRelation
+from graphvio.calibration.clocks import ClockRelation
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory

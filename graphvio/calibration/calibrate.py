@@ -1,4 +1,4 @@
-"""Calibration of a rig from a recording, or of cameras from trajectories that others' software made."""
+"""Calibration of a rig from a recording, or of cameras from trajectories of any odometry."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.calibration.camera_motions import CameraMotions
+from graphvio.calibration.camera_motions import CameraMotions, SeparateMotions
 from graphvio.calibration.imu_alignment import ImuAlignment, align
-from graphvio.calibration.intervals import Segments, all_segments
+from graphvio.calibration.nuisances import ScaleMode
 from graphvio.calibration.pair_calibration import PairCalibration, calibrate_pair
 from graphvio.calibration.result import Calibration, Clock, rig_warnings
-from graphvio.calibration.scale import ScaleMode
-from graphvio.calibration.separate_motions import SeparateMotions
+from graphvio.calibration.segments import Segments, all_segments
 from graphvio.calibration.several import pairwise, place_all
 from graphvio.calibration.trajectory_motions import TwoTrajectories, aligned, of_all
 from graphvio.config import Config
@@ -27,9 +26,9 @@ from graphvio.sources import Source, open_source
 from graphvio.trajectory import Trajectory
 
 OnFrameset = Callable[[int, SeparateMotions], bool]
-"""Called after each frameset with how many there were, and all that the pairs have told; True ends the recording."""
+"""Called after each frameset with the number of framesets and all motions so far; returns True to end the recording."""
 
-_EXACT = np.zeros((6, 6))
+_NO_ERROR = np.zeros((6, 6))
 
 
 def calibrate_pairs(
@@ -40,27 +39,27 @@ def calibrate_pairs(
     scale_mode: ScaleMode = "auto",
     on_frameset: OnFrameset | None = None,
 ) -> Calibration:
-    """Find where the stereo pairs of a rig are relative to each other, from a recording of its motion (section 4).
+    """Calibrate the relative poses of a rig's stereo pairs from a recording of its motion (section 4).
 
-    Every pair tracks by itself; where the rig file has the pairs does not matter, nor whether they see the same. Pairs
+    Every pair tracks by itself; the poses of the pairs in the rig file do not matter, nor whether views overlap. Pairs
     must have one clock but need not be triggered together.
 
     Args:
         source: a recording, or its folder.
         config: of the front-ends.
         seed: of all random choices.
-        scale_mode: whether lengths that a pair measures may be wrong by a factor.
+        scale_mode: whether to estimate ratios of the lengths that pairs measure, see `calibrate_pair`.
         on_frameset: follows the recording, and may end it.
 
     Raises:
-        CalibrationError: if the rig has one pair only, or the recording does not tell where the pairs are.
+        CalibrationError: if the rig has one pair only, or the recording does not determine the poses of the pairs.
         SourceError: if the recording cannot be read.
-        RigError: if it carries no usable calibration of the cameras themselves.
+        RigError: if it has no usable calibration of each pair's own cameras.
     """
     opened = open_source(source) if isinstance(source, str | Path) else source
     rig = opened.rig
     if len(rig.pairs) < 2:
-        raise CalibrationError(f"{rig.name} has one stereo pair; there is no other whose place could be found")
+        raise CalibrationError(f"{rig.name} has one stereo pair; there is no other to calibrate it against")
     separate = SeparateMotions(rig, config or Config())
     stamps_ns: list[int] = []
     gyro: list[Float] = []
@@ -78,10 +77,10 @@ def calibrate_pairs(
     finally:
         separate.close()
     motions, names = separate.motions(), tuple(pair.name for pair in rig.pairs)
-    for name, told in zip(names, motions, strict=True):
-        if not told.count:
+    for name, measured in zip(names, motions, strict=True):
+        if not measured.count:
             raise CalibrationError(
-                f"{name} told no motion at all in {number} framesets: does it see texture, are its left and right "
+                f"{name} measured no motion at all in {number} framesets: does it see texture, are its left and right "
                 "images in this order and not another pair's, and is its own calibration right?"
             )
     segments = segments_of_motions(motions)
@@ -104,21 +103,21 @@ def calibrate_trajectories(
     seed: int = 0,
     scale_mode: ScaleMode = "auto",
 ) -> Calibration:
-    """Find where cameras are relative to each other, from what any odometry has made of their motion (section 4).
+    """Calibrate the relative poses of cameras from their trajectories by any odometry (section 4).
 
     Args:
-        trajectories: J of them, ``world_T_camera`` each in a world frame of its own, on a clock of its own.
-        names: (J) of the cameras.
-        same_clock: whether all stamps are of one clock; else offsets are found, and drifts.
+        trajectories: J trajectories ``world_T_camera``, each in a world frame and on a clock of its own.
+        names: of the J cameras.
+        same_clock: whether all stamps are of one clock; else offsets and drifts are estimated.
         seed: of all random choices.
-        scale_mode: whether lengths that an odometry measures may be wrong by a factor.
+        scale_mode: whether to estimate ratios of the lengths that odometries measure, see `calibrate_pair`.
 
     Raises:
-        CalibrationError: if there are fewer than two, their clocks cannot be related, or they do not tell where the
-            cameras are.
+        CalibrationError: if there are fewer than two, their clocks cannot be related, or the motions do not determine
+            the poses of the cameras.
     """
     if len(trajectories) < 2:
-        raise CalibrationError(f"{len(trajectories)} trajectories; to relate cameras takes two or more")
+        raise CalibrationError(f"{len(trajectories)} trajectories; calibration takes two or more")
     if names is None:
         names = [f"camera {j}" for j in range(len(trajectories))]
     for i, j in combinations(range(len(trajectories)), 2):
@@ -132,14 +131,14 @@ def calibrate_trajectories(
         if (one, other) not in two:
             two[one, other] = aligned(trajectories[one], trajectories[other], same_clock, seed)
         both = two[one, other]
-        return calibrate_pair(both.segments, seed, further=both.further, scale_mode=mode, seen_from=_EXACT)
+        return calibrate_pair(both.segments, seed, nuisances=both.nuisances, scale_mode=mode, seen_from=_NO_ERROR)
 
     found, missing = pairwise(names, calibrate, scale_mode)
-    places = place_all(found, names, of_all(trajectories, {each: two[each] for each in found}), _EXACT)
+    places = place_all(found, names, of_all(trajectories, {each: two[each] for each in found}), _NO_ERROR)
     clocks = None if same_clock else {each: _clock(two[each], found[each]) for each in found}
     drifts = [
         f"the clocks of {names[i]} and {names[j]} drift apart by {1e6 * clock.relation.drift:.0f} (+- "
-        f"{1e6 * clock.drift_sigma:.0f}) microseconds a second; it is corrected here"
+        f"{1e6 * clock.drift_sigma:.0f}) microseconds per second; it is corrected here"
         for (i, j), clock in (clocks or {}).items()
         if clock.drifts
     ]
@@ -147,12 +146,12 @@ def calibrate_trajectories(
 
 
 def segments_of_motions(motions: Sequence[CameraMotions]) -> Segments:
-    """Segments between the first camera's instants, of all cameras."""
+    """List segments of all cameras between the instants of the first."""
     return all_segments(motions[0].stamps_ns.tolist(), [each.between for each in motions])
 
 
 def _imu(rig: Rig, segments: Segments, stamps_ns: Int, gyro: Float) -> tuple[dict[int, ImuAlignment], list[str]]:
-    """All left cameras against the IMU, and why some could not be compared."""
+    """Align all left cameras with the IMU; the second value says why some could not be."""
     if rig.imu is None or not len(stamps_ns):
         return {}, []
     found, missing = {}, []
@@ -165,4 +164,4 @@ def _imu(rig: Rig, segments: Segments, stamps_ns: Int, gyro: Float) -> tuple[dic
 
 
 def _clock(both: TwoTrajectories, found: PairCalibration) -> Clock:
-    return Clock(both.clock, float(found.further_sigmas[0]), float(found.further_sigmas[1]))
+    return Clock(both.clock, float(found.nuisance_sigmas[0]), float(found.nuisance_sigmas[1]))

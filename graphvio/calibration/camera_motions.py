@@ -1,31 +1,36 @@
-"""What one stereo pair alone tells of its own motion, between any two of its instants, with an honest covariance."""
+"""The motion that each stereo pair measures by itself, between any two instants, with its covariance (section 4)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.backend.noise import own_covariance
+from graphvio.config import Config
+from graphvio.frontend.steady_motion import SteadyMotion
+from graphvio.frontend.visual import VisualFrontend
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
-from graphvio.measurements.motion import RelativeMotion
+from graphvio.measurements.motion import Quality, RelativeMotion
+from graphvio.measurements.sensors import FrameSet
+from graphvio.rig import Rig
 
-_LONGEST_NS = 150_000_000  # from one instant to the next, over which a motion is interpolated
+_MAX_GAP_NS = 150_000_000  # between instants, over which a motion is interpolated
 _INTERPOLATION_SIGMA = 5e-5  # radians and metres, over 50 ms; a cubic's error grows with the fourth power
 
 
 class CameraMotions:
     """Motions of a left camera, each measured from an earlier instant.
 
-    Instants form a tree: each hangs on the one that it was measured from, its reference, as vision sees that one. The
-    reference as seen differs from the reference itself by the error of its triangulated points, which all motions from
-    it share; that error is counted once on the way between two instants, or not at all where both were measured from
-    the same reference.
+    Instants form a tree: the parent of each is its reference, as vision sees that one. The reference as seen differs
+    from the reference itself by the error of its triangulated points, which all motions from it share; that error is
+    counted once on the way between two instants, or not at all where both were measured from the same reference.
 
     Args:
-        stamps_ns: (N,) instants, with motions that end there or without.
+        stamps_ns: N instants, with or without motions that end there.
         motions: of body.
         body_T_left: (4, 4).
 
@@ -51,23 +56,26 @@ class CameraMotions:
 
     @property
     def count(self) -> int:
-        """How many motions there are."""
+        """Number of motions."""
         return len(self._edge)
 
     def between(self, start_ns: int, end_ns: int) -> tuple[Float, Float] | None:
-        """The motion (4, 4) from one instant to a later one, and its covariance (6, 6), tangent in the camera's frame
-        at the end; None where no motions lead from one to the other.
+        """Chain motions from one instant to a later one.
 
-        An instant between two of the camera's own, such as another pair's that is triggered at other times, is
+        An instant between two of the camera's own, such as that of a pair that is triggered at other times, is
         interpolated.
+
+        Returns:
+            Motion (4, 4) and its covariance (6, 6), tangent in the camera's frame at the end; None where no motions
+            connect the two.
         """
         start, end = self._placed(start_ns), self._placed(end_ns)
         if start is None or end is None:
             return None
-        told = self._between_own(start.near_ns, end.near_ns)
-        if told is None:
+        measured = self._between_own(start.near_ns, end.near_ns)
+        if measured is None:
             return None
-        motion, covariance = told
+        motion, covariance = measured
         if start.near_ns != start_ns:
             covariance = covariance + _carried(start.covariance, se3_inverse(motion) @ start.near_T_instant)
             motion = se3_inverse(start.near_T_instant) @ motion
@@ -77,12 +85,12 @@ class CameraMotions:
         return motion, covariance
 
     def _placed(self, stamp_ns: int) -> _Placed | None:
-        """Where the camera is at any instant; None where it tells nothing of it."""
+        """Interpolate the camera's pose at any instant; None where its motion around that is unknown."""
         stamps = self.stamps_ns
         after = int(np.searchsorted(stamps, stamp_ns))
         if after < len(stamps) and stamps[after] == stamp_ns:
             return _Placed(stamp_ns, np.eye(4), np.zeros((6, 6)))
-        if not 0 < after < len(stamps) or stamps[after] - stamps[after - 1] > _LONGEST_NS:
+        if not 0 < after < len(stamps) or stamps[after] - stamps[after - 1] > _MAX_GAP_NS:
             return None
         near_ns, next_ns = int(stamps[after - 1]), int(stamps[after])
         step = self._between_own(near_ns, next_ns)
@@ -90,12 +98,12 @@ class CameraMotions:
             return None
         nodes_s, places = [0.0, (next_ns - near_ns) * 1e-9], [np.zeros(6), se3_log(step[0])]
         for index in (after - 2, after + 1):
-            if 0 <= index < len(stamps) and abs(int(stamps[index]) - near_ns) <= 2 * _LONGEST_NS:
+            if 0 <= index < len(stamps) and abs(int(stamps[index]) - near_ns) <= 2 * _MAX_GAP_NS:
                 ends = sorted((int(stamps[index]), near_ns))
-                further = self._between_own(*ends)
-                if further is not None:
+                step_to = self._between_own(*ends)
+                if step_to is not None:
                     nodes_s.append((int(stamps[index]) - near_ns) * 1e-9)
-                    places.append(se3_log(further[0] if ends[0] == near_ns else se3_inverse(further[0])))
+                    places.append(se3_log(step_to[0] if ends[0] == near_ns else se3_inverse(step_to[0])))
         at_s = (stamp_ns - near_ns) * 1e-9
         share = at_s / nodes_s[1]
         place = se3_exp(np.asarray(_polynomial(nodes_s, places, at_s)))
@@ -115,7 +123,7 @@ class CameraMotions:
                 covariance = covariance + self._shared_of(stamp)
             covariance = _carried(covariance + self._edge[stamp][1], self._edge[stamp][0])
             motion = motion @ se3_inverse(self._edge[stamp][0])
-        if bool(ups) != bool(downs):  # not both were measured from its view: the way begins or ends at itself
+        if bool(ups) != bool(downs):  # the way begins or ends at the common reference itself
             covariance = covariance + self._shared_of(common)
         for i, stamp in enumerate(reversed(downs)):
             edge, own = self._edge[stamp]
@@ -126,7 +134,7 @@ class CameraMotions:
         return motion, covariance
 
     def _seen_from(self, reference_ns: int, moved: Float, shared: Float) -> Float:
-        """The covariance of a reference's view, which its first motion tells, in the frame at a motion's end."""
+        """Covariance of a reference's view, as given by its first motion, in the frame at a motion's end."""
         if reference_ns not in self._shared:
             self._shared[reference_ns] = _carried(shared, moved)
         return _carried(self._shared[reference_ns], se3_inverse(moved))
@@ -135,7 +143,7 @@ class CameraMotions:
         return self._shared.get(reference_ns, np.zeros((6, 6)))
 
     def _ancestors(self, stamp_ns: int) -> list[int]:
-        """An instant, what it was measured from, and so on."""
+        """An instant, its reference, the reference of that, and so on."""
         line = [stamp_ns]
         while line[-1] in self._reference:
             line.append(self._reference[line[-1]])
@@ -143,7 +151,7 @@ class CameraMotions:
 
 
 class _Placed(NamedTuple):
-    """The camera at an instant: its own instant before it, the pose from there, and the covariance (6, 6) of that."""
+    """The camera at an instant: its own instant before it, the pose relative to that, and its covariance (6, 6)."""
 
     near_ns: int
     near_T_instant: Float
@@ -151,7 +159,7 @@ class _Placed(NamedTuple):
 
 
 def _polynomial(nodes: list[float], values: list[Float], at: float) -> Float:
-    """Lagrange's polynomial through values at nodes."""
+    """Lagrange polynomial through values at nodes."""
     total = np.zeros_like(values[0])
     for i, value in enumerate(values):
         total += value * np.prod([(at - other) / (nodes[i] - other) for k, other in enumerate(nodes) if k != i])
@@ -159,6 +167,53 @@ def _polynomial(nodes: list[float], values: list[Float], at: float) -> Float:
 
 
 def _carried(covariance: Float, start_T_end: Float) -> Float:
-    """A covariance (6, 6), tangent in the frame at the end, in the frame at the start."""
+    """Transport a covariance (6, 6) from the tangent in the frame at the end to that at the start."""
     adjoint = se3_adjoint(np.ascontiguousarray(start_T_end))
     return np.asarray(adjoint @ covariance @ adjoint.T)
+
+
+class SeparateMotions:
+    """Visual odometry of every pair of a rig by itself, independent of the poses of the pairs in the rig file.
+
+    Args:
+        rig: of the framesets; of its extrinsics only those within a pair matter.
+        config: of the front-ends.
+    """
+
+    def __init__(self, rig: Rig, config: Config) -> None:
+        self._rig = rig
+        self._pairs = [_PairOdometry(rig.with_pairs([j]).without_imu(), config) for j in range(len(rig.pairs))]
+        self._workers = ThreadPoolExecutor(len(rig.pairs), thread_name_prefix="graphvio-calibration")
+
+    def add(self, frameset: FrameSet) -> None:
+        """Process the next frameset, all pairs in parallel."""
+        list(self._workers.map(lambda j: self._pairs[j].add(j, frameset), sorted(frameset.images)))
+
+    def motions(self) -> list[CameraMotions]:
+        """Return the motions of each pair's left camera up to now."""
+        pairs = zip(self._pairs, self._rig.pairs, strict=True)
+        return [CameraMotions(each.stamps_ns, each.motions, pair.left.body_T_cam) for each, pair in pairs]
+
+    def close(self) -> None:
+        """Stop all threads."""
+        for each in self._pairs:
+            each.frontend.close()
+        self._workers.shutdown()
+
+
+class _PairOdometry:
+    def __init__(self, rig: Rig, config: Config) -> None:
+        self.frontend = VisualFrontend(rig, config)
+        self.stamps_ns: list[int] = []
+        self.motions: list[RelativeMotion] = []
+        self._steady = SteadyMotion()
+
+    def add(self, number: int, frameset: FrameSet) -> None:
+        alone = FrameSet(frameset.stamp_ns, {0: frameset.images[number]})
+        self._steady.begin(alone.stamp_ns)
+        result = self.frontend.process(alone, self._steady.predict)
+        motion = result.motion if result.quality is Quality.GOOD else None
+        self._steady.end(motion)
+        self.stamps_ns.append(alone.stamp_ns)
+        if motion is not None:
+            self.motions.append(motion)

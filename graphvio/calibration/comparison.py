@@ -1,7 +1,7 @@
-"""The paper's method against the graph: do they differ by more than they may?
+"""Test whether the paper's method and the graph differ by more than noise explains.
 
-Both are functions of the same noisy motions, so their errors have much in common: the covariance of their difference
-is found from what each pose pair's noise does to both of them, to first order.
+Both are functions of the same noisy motions, so their errors are correlated: the covariance of their difference is
+propagated, to first order, from each pose pair's noise to both solutions.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from graphvio.calibration.paper_method import PaperSolution, PoseParts, jacobian
 from graphvio.calibration.pose_pairs import PosePairs
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log, skew
 
-_CHANCE = 1e-3  # that honest solutions are called different
-_LINEARISATION = 0.1  # of the solution's sigmas: differences that influences of first order leave
+_CHANCE = 1e-3  # of a false alarm
+_LINEARISATION = 0.1  # error of the first-order propagation, in the solution's sigmas
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +29,9 @@ class Comparison:
 
     Attributes:
         difference: (6,) tangent from the graph's solution to the paper's, ``[rotation, translation]`` in left1.
-        covariance: (6, 6) that the difference has where only the told noise makes it.
+        covariance: (6, 6) of the difference due to the noise of the motions.
         determined: (K, 6) orthonormal directions in which they are compared.
-        paper_covariance: (6, 6) of the paper's solution, which does not weigh the motions, by the same noise.
+        paper_covariance: (6, 6) of the paper's solution, which does not weight the motions, due to the same noise.
     """
 
     difference: Float
@@ -47,7 +47,7 @@ class Comparison:
 
     @property
     def limit(self) -> float:
-        """The largest statistic that chance explains."""
+        """Largest statistic that chance explains."""
         return float(chi2.isf(_CHANCE, len(self.determined)))
 
     @property
@@ -57,18 +57,18 @@ class Comparison:
 
 
 def compare(pairs: PosePairs, paper: PaperSolution, graph: GraphSolution, dispersion: float = 1.0) -> Comparison:
-    """The two solutions for the same N pose pairs.
+    """Compare two solutions for the same N pose pairs.
 
     Args:
         pairs: the pose pairs.
         paper: the paper's solution.
-        graph: the graph's, at further unknowns that are about zero.
-        dispersion: factor on the noise that the pose pairs tell.
+        graph: the graph's, where nuisance variables are about zero.
+        dispersion: factor on the covariances of the motions.
     """
     by_paper = _influence_on_paper(pairs, paper)
     determined = null_space(graph.observability.undetermined).T if not graph.observability.is_complete else np.eye(6)
     by_graph = _influence_on_graph(pairs, graph, determined)
-    first_order = _LINEARISATION**2 * dispersion * graph.covariance  # what it does not explain
+    first_order = _LINEARISATION**2 * dispersion * graph.covariance
     noise = dispersion * np.concatenate([pairs.covariance_1, pairs.covariance_2])
     apart = by_paper - by_graph
     return Comparison(
@@ -80,7 +80,7 @@ def compare(pairs: PosePairs, paper: PaperSolution, graph: GraphSolution, disper
 
 
 def _influence_on_paper(pairs: PosePairs, paper: PaperSolution) -> Float:
-    """Derivatives (2 N, 6, 6) of the solution by the errors of all first motions, and of all second ones."""
+    """Derivatives (2 N, 6, 6) of the paper's solution by errors of all first motions, then of all second ones."""
     R = paper.left2_T_left1[:3, :3]
     t = -R.T @ paper.left2_T_left1[:3, 3]
     J = jacobians(PoseParts.of(pairs), R) * paper.inlier[:, None, None]
@@ -92,10 +92,10 @@ def _influence_on_paper(pairs: PosePairs, paper: PaperSolution) -> Float:
 
 
 def _influence_on_graph(pairs: PosePairs, graph: GraphSolution, determined: Float) -> Float:
-    """The same for the graph's solution."""
-    pose, chosen = graph.left2_T_left1, pairs.chosen(graph.inlier)
-    told = determined @ information(chosen, pose) @ determined.T
-    covariance = determined.T @ np.linalg.solve(told, determined)
+    """Derivatives (2 N, 6, 6) of the graph's solution, in the same order."""
+    pose, chosen = graph.left2_T_left1, pairs.select(graph.inlier)
+    known = determined @ information(chosen, pose) @ determined.T
+    covariance = determined.T @ np.linalg.solve(known, determined)
     gains = np.zeros((len(pairs), 6, 6))
     for k in np.flatnonzero(graph.inlier):
         _, jacobian = error_of(pose, pairs.motion_1[k], pairs.motion_2[k])

@@ -1,7 +1,7 @@
-"""How well motions of two cameras fit a relative pose: errors, derivatives, outliers.
+"""Errors of pose pairs given the relative pose of the cameras, and which pose pairs are outliers.
 
 A motion of the first camera, seen from the second, is ``left2_T_left1 motion_1 left1_T_left2``; it must be motion_2
-(section 4, eq. 1). Errors are weighed by the covariances of both motions.
+(section 4, eq. 1). Errors are weighted by the covariances of both motions.
 """
 
 from __future__ import annotations
@@ -11,165 +11,145 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from graphvio.arrays import Bool, Float, Int
+from graphvio.arrays import Bool, Float
+from graphvio.calibration.nuisances import Nuisances
 from graphvio.calibration.pose_pairs import PosePairs
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log, se3_right_jacobian_inverse
 from graphvio.kernels import kernel, put
 
-_PROBABILITY = 0.999  # of an honest pose pair, to be within what is no outlier
-LIMIT = float(chi2.ppf(_PROBABILITY, 6))
-_MOST_ROUNDS = 100
+LIMIT = float(chi2.ppf(0.999, 6))
+"""Squared Mahalanobis distance from which a pose pair is an outlier."""
+
+_MAX_ROUNDS = 100
 _STEPS_A_ROUND = 2
 _SHARPENING = 1.4  # of the cost from round to round, towards truncated least squares
-_CERTAIN = 1e-3  # weights this near to 0 or 1 are that
-_SETTLED = 1e-12
-_LONGEST_STEP = 0.5  # radians and metres: from few motions the first steps may lead anywhere
-_NOTHING = np.zeros((0, 6))
-
-
-class Further(NamedTuple):
-    """Further unknowns, on which the pose pairs' errors depend linearly: an offset between clocks, a scale.
-
-    Attributes:
-        derivatives: (N, 6, M) of the errors, see `error_of`.
-        sigmas: (M,) of what is known of them beforehand, around zero.
-    """
-
-    derivatives: Float
-    sigmas: Float
-
-    def chosen(self, rows: Bool | Int) -> Further:
-        """Those of some pose pairs."""
-        return Further(self.derivatives[rows], self.sigmas)
-
-    def beside(self, other: Further | None) -> Further:
-        """With some more unknowns, before these."""
-        if other is None:
-            return self
-        return Further(
-            np.concatenate([other.derivatives, self.derivatives], axis=2),
-            np.concatenate([other.sigmas, self.sigmas]),
-        )
-
-    @staticmethod
-    def none(pairs: PosePairs) -> Further:
-        """No further unknowns."""
-        return Further(np.zeros((len(pairs), 6, 0)), np.zeros(0))
+_CERTAIN = 1e-3  # weights this near to 0 or 1 count as such
+_CONVERGED = 1e-12
+_MAX_STEP = 0.5  # radians and metres: from few motions the first steps may lead anywhere
 
 
 class Consensus(NamedTuple):
-    """What most pose pairs agree on.
+    """A solution that most pose pairs agree on.
 
     Attributes:
         left2_T_left1: (4, 4).
-        further: (M,) further unknowns.
-        squares: (N,) squared Mahalanobis distances of the errors there.
+        nuisances: (M,) values of the nuisance variables.
+        squares: (N,) squared Mahalanobis distances of all pose pairs' errors.
     """
 
     left2_T_left1: Float
-    further: Float
+    nuisances: Float
     squares: Float
 
     @property
     def inlier(self) -> Bool:
-        """(N,) pose pairs that are no outliers."""
+        """Mask (N,) of pose pairs that are not outliers."""
         return np.asarray(self.squares <= LIMIT)
 
 
-def without_outliers(
-    pairs: PosePairs, start: Float, held: Float = _NOTHING, further: Further | None = None
-) -> Consensus:
-    """The relative pose by truncated least squares, from a start that may be off, by graduated non-convexity.
+def without_outliers(pairs: PosePairs, start: Float, held: Float, nuisances: Nuisances) -> Consensus:
+    """Minimise truncated least squares by graduated non-convexity.
 
     H. Yang, P. Antonante, V. Tzoumas, L. Carlone, *Graduated Non-Convexity for Robust Spatial Perception: From
     Non-Minimal Solvers to Global Outlier Rejection*, IEEE RA-L 5(2), 2020.
 
     Args:
         pairs: N pose pairs.
-        start: ``left2_T_left1`` (4, 4).
-        held: (K, 6) orthonormal directions, tangent in left1, in which the start is kept.
-        further: unknowns besides.
+        start: initial ``left2_T_left1`` (4, 4).
+        held: orthonormal directions (K, 6), tangent in left1, in which the initial pose is kept.
+        nuisances: variables to estimate with the pose.
     """
-    further = Further.none(pairs) if further is None else further
-    begun = Consensus(start, np.zeros(len(further.sigmas)), np.empty(0))
-    found = _graduated(pairs, begun, held, further)
-    # Where most pose pairs are wild, a solution for all of them is no beginning, but the start may be.
-    near = _refined(pairs, solved(pairs, begun, np.zeros(len(pairs)), 0, held, further), held, further)
-    return min(found, near, key=lambda each: float(np.minimum(each.squares, LIMIT).sum()))
+    initial = Consensus(start, np.zeros(len(nuisances.sigmas)), np.empty(0))
+    graduated = _graduated(pairs, initial, held, nuisances)
+    # Where most pose pairs are outliers, a solution for all of them is no good start, but the given one may be.
+    near = _solve(pairs, initial, np.zeros(len(pairs)), 0, held, nuisances)
+    near = _refined(pairs, near, held, nuisances)
+    return min(graduated, near, key=lambda each: float(np.minimum(each.squares, LIMIT).sum()))
 
 
-def _graduated(pairs: PosePairs, begun: Consensus, held: Float, further: Further) -> Consensus:
-    """From a cost that is convex to truncated least squares."""
-    found = solved(pairs, begun, np.ones(len(pairs)), _MOST_ROUNDS, held, further)
+def _graduated(pairs: PosePairs, initial: Consensus, held: Float, nuisances: Nuisances) -> Consensus:
+    """Go from a convex cost to truncated least squares."""
+    found = _solve(pairs, initial, np.ones(len(pairs)), _MAX_ROUNDS, held, nuisances)
     sharpness = 1.0 / max(2.0 * found.squares.max() / LIMIT - 1.0, 1.0)
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         weights = _weights(found.squares, sharpness)
-        found = solved(pairs, found, weights, _STEPS_A_ROUND, held, further)
+        found = _solve(pairs, found, weights, _STEPS_A_ROUND, held, nuisances)
         if np.all((weights < _CERTAIN) | (weights > 1.0 - _CERTAIN)):
             break
         sharpness *= _SHARPENING
-    return _refined(pairs, found, held, further)
+    return _refined(pairs, found, held, nuisances)
 
 
-def _refined(pairs: PosePairs, found: Consensus, held: Float, further: Further) -> Consensus:
-    """Inliers and solution in turns, until the inliers stay the same."""
-    for _ in range(_MOST_ROUNDS):
+def _refined(pairs: PosePairs, found: Consensus, held: Float, nuisances: Nuisances) -> Consensus:
+    """Alternate between inliers and solution until the inliers stay the same."""
+    for _ in range(_MAX_ROUNDS):
         before = found.inlier
-        found = solved(pairs, found, before.astype(np.float64), _STEPS_A_ROUND, held, further)
+        found = _solve(pairs, found, before.astype(np.float64), _STEPS_A_ROUND, held, nuisances)
         if np.array_equal(before, found.inlier):
             break
-    return solved(pairs, found, found.inlier.astype(np.float64), _MOST_ROUNDS, held, further)
+    return _solve(pairs, found, found.inlier.astype(np.float64), _MAX_ROUNDS, held, nuisances)
 
 
-def squared_distances(pairs: PosePairs, left2_T_left1: Float) -> Float:
-    """Squared Mahalanobis distances (N,) of the pose pairs' errors, 6 degrees of freedom each."""
-    errors, _ = whitened(pairs, left2_T_left1)
-    return np.asarray(np.sum(errors**2, axis=1))
+def _solve(
+    pairs: PosePairs, start: Consensus, weights: Float, max_steps: int, held: Float, nuisances: Nuisances
+) -> Consensus:
+    """Gauss-Newton with weights (N,) of the pose pairs; directions ``held`` (K, 6) stay as they are."""
+    left2_T_left1, values = start.left2_T_left1, start.nuisances
+    free = np.eye(6 + len(values))
+    free[:6, :6] -= held.T @ held
+    prior = np.diag(np.concatenate([np.zeros(6), nuisances.sigmas**-2]))
+    for _ in range(max_steps):
+        errors, jacobians = whitened(pairs, left2_T_left1, nuisances, values)
+        jacobians = jacobians @ free
+        normal = np.einsum("n,nki,nkj->ij", weights, jacobians, jacobians) + prior
+        gradient = np.einsum("n,nki,nk->i", weights, jacobians, errors) + prior[:, 6:] @ values
+        step = -np.linalg.lstsq(normal, gradient, rcond=1e-14)[0]
+        step /= max(np.abs(step).max() / _MAX_STEP, 1.0)
+        left2_T_left1 = left2_T_left1 @ se3_exp(step[:6])
+        values = values + step[6:]
+        if np.abs(step).max() < _CONVERGED:
+            break
+    errors, _ = whitened(pairs, left2_T_left1, nuisances, values)
+    return Consensus(left2_T_left1, values, np.sum(errors**2, axis=1))
+
+
+def _weights(squares: Float, sharpness: float) -> Float:
+    """Eq. (14) of the paper on graduated non-convexity."""
+    low, high = (LIMIT * bound for bound in (sharpness / (sharpness + 1.0), (sharpness + 1.0) / sharpness))
+    between = np.sqrt(LIMIT * sharpness * (sharpness + 1.0) / np.maximum(squares, low)) - sharpness
+    return np.where(squares <= low, 1.0, np.where(squares >= high, 0.0, between))
 
 
 def information(pairs: PosePairs, left2_T_left1: Float) -> Float:
-    """What pose pairs tell of ``left2_T_left1`` (6, 6), tangent in left1."""
+    """Fisher information (6, 6) of pose pairs on ``left2_T_left1``, tangent in left1."""
     _, jacobians = whitened(pairs, left2_T_left1)
     return np.asarray(np.einsum("nki,nkj->ij", jacobians, jacobians))
 
 
 def whitened(
-    pairs: PosePairs, left2_T_left1: Float, further: Further | None = None, values: Float | None = None
+    pairs: PosePairs, left2_T_left1: Float, nuisances: Nuisances | None = None, values: Float | None = None
 ) -> tuple[Float, Float]:
-    """Errors (N, 6) of unit covariance, and derivatives (N, 6, 6 + M) by the tangent of ``left2_T_left1`` in left1 and
-    by further unknowns, at some values (M,) of these."""
-    if further is None or values is None:
-        further, values = Further.none(pairs), np.empty(0)
+    """Whiten the errors of pose pairs, and linearise them.
+
+    Args:
+        pairs: N pose pairs.
+        left2_T_left1: (4, 4).
+        nuisances: M variables.
+        values: (M,) of the nuisance variables.
+
+    Returns:
+        Errors (N, 6) of unit covariance, and derivatives (N, 6, 6 + M) by the tangent of ``left2_T_left1`` in left1
+        and by the nuisance variables.
+    """
+    if nuisances is None or values is None:
+        nuisances, values = Nuisances.none(len(pairs)), np.empty(0)
     motions = pairs.motion_1, pairs.covariance_1, pairs.motion_2, pairs.covariance_2
-    return _whitened(left2_T_left1, *motions, np.ascontiguousarray(further.derivatives), values)
-
-
-def solved(
-    pairs: PosePairs, start: Consensus, weights: Float, most_steps: int, held: Float, further: Further
-) -> Consensus:
-    """Gauss-Newton with weighted pose pairs (N,) from a start, of which some directions (K, 6) are kept."""
-    left2_T_left1, values = start.left2_T_left1, start.further
-    free = np.eye(6 + len(values))
-    free[:6, :6] -= held.T @ held
-    known = np.diag(np.concatenate([np.zeros(6), further.sigmas**-2]))
-    for _ in range(most_steps):
-        errors, jacobians = whitened(pairs, left2_T_left1, further, values)
-        jacobians = jacobians @ free
-        normal = np.einsum("n,nki,nkj->ij", weights, jacobians, jacobians) + known
-        gradient = np.einsum("n,nki,nk->i", weights, jacobians, errors) + known[:, 6:] @ values
-        step = -np.linalg.lstsq(normal, gradient, rcond=1e-14)[0]
-        step /= max(np.abs(step).max() / _LONGEST_STEP, 1.0)
-        left2_T_left1 = left2_T_left1 @ se3_exp(step[:6])
-        values = values + step[6:]
-        if np.abs(step).max() < _SETTLED:
-            break
-    errors, _ = whitened(pairs, left2_T_left1, further, values)
-    return Consensus(left2_T_left1, values, np.sum(errors**2, axis=1))
+    return _whitened(left2_T_left1, *motions, np.ascontiguousarray(nuisances.derivatives), values)
 
 
 @kernel
 def error_of(left2_T_left1: Float, motion_1: Float, motion_2: Float) -> tuple[Float, Float]:
-    """Error (6,) of a pose pair in left2 at the motion's end, and its derivative (6, 6)."""
+    """Compute the error (6,) of a pose pair in left2 at the end, and its derivative (6, 6) by the tangent in left1."""
     seen = left2_T_left1 @ motion_1 @ se3_inverse(left2_T_left1)
     error = se3_log(se3_inverse(motion_2) @ seen)
     by_tangent = se3_adjoint(left2_T_left1) @ (se3_adjoint(se3_inverse(motion_1)) - np.eye(6))
@@ -178,7 +158,7 @@ def error_of(left2_T_left1: Float, motion_1: Float, motion_2: Float) -> tuple[Fl
 
 @kernel
 def errors_of(left2_T_left1: Float, motions_1: Float, motions_2: Float) -> Float:
-    """Errors (N, 6) of N pose pairs, see `error_of`."""
+    """Compute the errors (N, 6) of N pose pairs, see `error_of`."""
     errors = np.empty((len(motions_1), 6))
     for i in range(len(motions_1)):
         error, _ = error_of(left2_T_left1, motions_1[i], motions_2[i])
@@ -188,16 +168,9 @@ def errors_of(left2_T_left1: Float, motions_1: Float, motions_2: Float) -> Float
 
 @kernel
 def error_covariance(left2_T_left1: Float, covariance_1: Float, covariance_2: Float) -> Float:
-    """Covariance (6, 6) of a pose pair's error, from both motions'."""
+    """Compute the covariance (6, 6) of a pose pair's error from those of both motions."""
     adjoint = se3_adjoint(left2_T_left1)
     return covariance_2 + adjoint @ covariance_1 @ adjoint.T
-
-
-def _weights(squares: Float, sharpness: float) -> Float:
-    """Eq. (14) of the paper on graduated non-convexity."""
-    low, high = (LIMIT * bound for bound in (sharpness / (sharpness + 1.0), (sharpness + 1.0) / sharpness))
-    between = np.sqrt(LIMIT * sharpness * (sharpness + 1.0) / np.maximum(squares, low)) - sharpness
-    return np.where(squares <= low, 1.0, np.where(squares >= high, 0.0, between))
 
 
 @kernel
@@ -210,13 +183,13 @@ def _whitened(
     derivatives: Float,
     values: Float,
 ) -> tuple[Float, Float]:
-    n, further = len(motion_1), len(values)
-    errors, jacobians = np.empty((n, 6)), np.empty((n, 6, 6 + further))
+    n, nuisances = len(motion_1), len(values)
+    errors, jacobians = np.empty((n, 6)), np.empty((n, 6, 6 + nuisances))
     for i in range(n):
         error, jacobian = error_of(left2_T_left1, motion_1[i], motion_2[i])
         root = np.linalg.cholesky(error_covariance(left2_T_left1, covariance_1[i], covariance_2[i]))
         put(jacobians[i, :, :6], jacobian)
-        if further:
+        if nuisances:
             error = error + derivatives[i] @ values
             put(jacobians[i, :, 6:], derivatives[i])
         put(errors[i], error)
@@ -227,7 +200,7 @@ def _whitened(
 
 @kernel
 def _divide(root: Float, values: Float) -> None:
-    """Forward substitution: ``values`` (6, K) become ``root^-1 values`` for a lower triangle, in place."""
+    """Replace values (6, K) by ``root^-1 values``, with a lower triangular root, by forward substitution."""
     for row in range(6):
         for column in range(values.shape[1]):
             total = values[row, column]

@@ -1,4 +1,4 @@
-"""Tells a person who is recording what is known so far, which motions are still needed, and when it is enough."""
+"""Advice while recording: the accuracy so far, which motions are still needed, and when it is enough."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.calibration import graph, paper_method
 from graphvio.calibration.camera_motions import CameraMotions
-from graphvio.calibration.pair_calibration import SEEN_FROM, allowance
-from graphvio.calibration.pose_pairs import FEWEST, PosePairs
+from graphvio.calibration.pair_calibration import SEEN_FROM, systematic_covariance
+from graphvio.calibration.pose_pairs import MIN_PAIRS, PosePairs
 from graphvio.errors import CalibrationError
 
 ENOUGH_DEG, ENOUGH_M, ENOUGH_MOTIONS = 0.05, 2e-3, 40
-"""One standard deviation in the direction that is known least with which a recording is long enough, and how many
-motions, each of a third of a second, there must be: from fewer, errors that last cannot be told from others."""
+"""Largest standard deviations and smallest number of motions, each of a third of a second, for a recording that is long
+enough; from fewer motions, errors that neighbouring motions share cannot be detected."""
 
 _SEGMENT_NS = 350_000_000
-_BEGINNING = "turn the rig about two axes, one after the other, by 30 degrees and more, while you walk"
+_INITIAL_ADVICE = "turn the rig about two axes, one after the other, by 30 degrees and more, while you walk"
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What is known so far of the place that is known least.
+    """Accuracy so far of the pair whose pose is least accurate.
 
     Attributes:
         name: of the pair.
-        motions: that tell of it.
-        rotation_sigma_deg: in the direction that is known least; infinite as long as nothing is known.
-        translation_sigma_m: the same.
-        turning_deg_s: (3,) rms turning about the principal axes, in descending order.
-        missing: what to do, a sentence; empty if only more of the same is needed.
+        motions: number of its motions.
+        rotation_sigma_deg: largest over all directions; infinite without a solution.
+        translation_sigma_m: largest over all directions; infinite without a solution.
+        turning_deg_s: (3,) rms angular velocity about the principal axes, in descending order.
+        missing: a sentence on what to do; empty if only more of the same is needed.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Advice:
 
     @property
     def text(self) -> str:
-        """One line."""
+        """The advice in one line."""
         begin = "enough" if self.is_enough else self.missing or "go on like this"
         if not np.isfinite(self.rotation_sigma_deg):
             return f"{begin} ({self.motions} motions)"
@@ -61,26 +61,30 @@ class Advice:
 
 
 class Guide:
-    """Follows a recording.
+    """Follows a recording and gives advice.
 
     Args:
-        names: of the pairs; where each of the others is relative to the first is asked for.
+        names: of the pairs; each one's pose relative to the first is estimated.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
-        self._told: list[list[tuple[int, int, Float, Float, Float, Float]]] = [[] for _ in names]
-        self._place: list[Float | None] = [None] * len(self._names)
+        self._segments: list[list[tuple[int, int, Float, Float, Float, Float]]] = [[] for _ in names]
+        self._left_T_left1: list[Float | None] = [None] * len(self._names)
         self._until_ns: int | None = None
 
     def advise(self, motions: Sequence[CameraMotions]) -> Advice:
-        """What to do next, from all that the pairs have told of their motions until now."""
+        """Return what to do next.
+
+        Args:
+            motions: all that each pair has measured up to now.
+        """
         self._take(motions)
         advice = [self._advice(j) for j in range(1, len(self._names))]
         return max(advice, key=lambda each: (bool(each.missing), each.translation_sigma_m, each.rotation_sigma_deg))
 
     def _take(self, motions: Sequence[CameraMotions]) -> None:
-        """Segments of some tenths of a second, one after the other, as they come in."""
+        """Append new segments of some tenths of a second, one after the other."""
         stamps = motions[0].stamps_ns
         if self._until_ns is None and len(stamps):
             self._until_ns = int(stamps[0])
@@ -93,32 +97,32 @@ class Guide:
             for j in range(1, len(motions)):
                 other = motions[j].between(start_ns, end_ns)
                 if first is not None and other is not None:
-                    self._told[j].append((start_ns, end_ns, *first, *other))
+                    self._segments[j].append((start_ns, end_ns, *first, *other))
             self._until_ns = end_ns
 
     def _advice(self, j: int) -> Advice:
-        told = self._told[j]
-        nothing = Advice(self._names[j], len(told), np.inf, np.inf, (0.0, 0.0, 0.0), _BEGINNING)
-        if len(told) < FEWEST:
+        segments = self._segments[j]
+        nothing = Advice(self._names[j], len(segments), np.inf, np.inf, (0.0, 0.0, 0.0), _INITIAL_ADVICE)
+        if len(segments) < MIN_PAIRS:
             return nothing
-        start_ns, end_ns, *arrays = (np.array(column) for column in zip(*told, strict=True))
+        start_ns, end_ns, *arrays = (np.array(column) for column in zip(*segments, strict=True))
         pairs = PosePairs(start_ns.astype(np.int64), end_ns.astype(np.int64), *arrays)
         try:
-            start = self._place[j]
+            start = self._left_T_left1[j]
             found = graph.solve(pairs, paper_method.calibrate(pairs).left2_T_left1 if start is None else start)
         except CalibrationError:
-            self._place[j] = None
+            self._left_T_left1[j] = None
             return nothing
         observability = found.observability
-        # A start that one axis told wrongly is not held on to.
-        self._place[j] = found.left2_T_left1 if observability.is_complete else None
-        covariance = found.covariance + allowance(found.left2_T_left1, SEEN_FROM)
+        # A solution from rotation about one axis may be wrong, and is no start for the next.
+        self._left_T_left1[j] = found.left2_T_left1 if observability.is_complete else None
+        covariance = found.covariance + systematic_covariance(found.left2_T_left1, SEEN_FROM)
         blocks = np.stack([covariance[:3, :3], covariance[3:, 3:]])
         rotation, translation = np.sqrt(np.linalg.eigvalsh(blocks)[:, -1])
         seconds = float(np.mean(pairs.end_ns - pairs.start_ns)) * 1e-9
         turning = tuple((np.rad2deg(observability.turning_rad) / seconds).tolist())
         missing = "; ".join(observability.missing)
-        return Advice(self._names[j], len(told), float(np.rad2deg(rotation)), float(translation), turning, missing)
+        return Advice(self._names[j], len(segments), float(np.rad2deg(rotation)), float(translation), turning, missing)
 
 
 def _length(metres: float) -> str:

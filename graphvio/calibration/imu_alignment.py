@@ -1,8 +1,8 @@
-"""How a camera is turned against the IMU, and the offset of their clocks, from rotations by gyro and vision.
+"""Rotation of a camera in body (= IMU) and their time offset, from rotations by gyro and vision.
 
 With ``R`` the camera's rotation in body, body turns by ``R turn R^T`` where the camera turns by ``turn``; the gyro,
-less its bias, must have measured that over the same time by its own clock. Unknowns are a small rotation of ``R``, the
-bias, and a correction of the offset; where the gyro sits does not matter, nor where the camera is.
+less its bias, must have measured that over the same interval by its own clock. Unknowns are a small rotation of ``R``,
+the bias, and a correction of the offset; the positions of gyro and camera do not matter.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from graphvio.arrays import Float, Int
 from graphvio.calibration import paper_method
-from graphvio.calibration.intervals import Segments, of_one_length
+from graphvio.calibration.segments import Segments, of_one_length
 from graphvio.errors import CalibrationError
 from graphvio.geometry import skew, so3_exp, so3_log
 from graphvio.kernels import kernel
@@ -23,30 +23,29 @@ from graphvio.rig import Imu
 
 _LIMIT = float(chi2.isf(1e-3, 3))
 _SIGMAS = 4.0
-_FLOOR_RAD = 1e-3  # a gyro's scale and axes are no better
+_FLOOR_RAD = 1e-3  # systematic: scale and axes of a gyro
 _FLOOR_S = 2e-4
-_FEWEST = 10
-_LEAST_TURNED = 3.0  # rms about the second axis over the noise
+_MIN_MOTIONS = 10
+_MIN_TURNED = 3.0  # rms rotation about the second axis over the noise
 _ROUNDS = 20
 _STEP_S = 1e-3
-_WIDEST_S, _COARSE_S = 0.1, 0.005  # offsets that are tried at first
-_BIAS_SIGMA = 0.1  # rad/s, beforehand
+_MAX_OFFSET_S, _COARSE_S = 0.1, 0.005  # range and step of the first search
+_BIAS_SIGMA = 0.1  # rad/s, a priori
 _NS_PER_S = 1e9
 
 
 @dataclass(frozen=True, eq=False)
 class ImuAlignment:
-    """A left camera against the IMU.
+    """Rotation and time offset of a left camera against the IMU.
 
     Attributes:
         body_R_left: (3, 3).
         misrotation: (3,) rotation vector, radians in body, from the rig's rotation to this one.
-        covariance: (3, 3) of it.
+        covariance: (3, 3) of misrotation.
         time_offset_s: add it to the camera's stamps to get the IMU's.
-        time_offset_sigma_s: of it.
-        rig_time_offset_s: what the rig says of it.
+        time_offset_sigma_s: standard deviation of time_offset_s.
+        rig_time_offset_s: time offset in the rig.
         gyro_bias: (3,) rad/s.
-        segments: number of motions that agree.
     """
 
     body_R_left: Float
@@ -56,64 +55,63 @@ class ImuAlignment:
     time_offset_sigma_s: float
     rig_time_offset_s: float
     gyro_bias: Float
-    segments: int
 
     @property
     def is_turned(self) -> bool:
-        """Whether the rig's rotation is wrong beyond doubt."""
+        """Whether the rig's rotation is significantly wrong."""
         return float(self.misrotation @ np.linalg.solve(self.covariance, self.misrotation)) > _LIMIT
 
     @property
     def is_late(self) -> bool:
-        """Whether the rig's time offset is wrong beyond doubt."""
+        """Whether the rig's time offset is significantly wrong."""
         return abs(self.time_offset_s - self.rig_time_offset_s) > _SIGMAS * self.time_offset_sigma_s
 
     def warnings(self, name: str) -> list[str]:
-        """A sentence for each of both."""
-        told = []
+        """Describe a wrong rotation and a wrong time offset, a sentence each, of the pair of this name."""
+        sentences = []
         if self.is_turned:
             angle, sigma = np.linalg.norm(self.misrotation), np.sqrt(np.linalg.eigvalsh(self.covariance)[-1])
-            told.append(
+            sentences.append(
                 f"{name} is turned by {np.rad2deg(angle):.2f} degrees (+- {np.rad2deg(sigma):.2f}) from where the rig "
                 "has it against the IMU"
             )
         if self.is_late:
-            told.append(
+            sentences.append(
                 f"{name}: the time offset between cameras and IMU is {1e3 * self.time_offset_s:.2f} ms (+- "
                 f"{1e3 * self.time_offset_sigma_s:.2f}), and {1e3 * self.rig_time_offset_s:.2f} ms in the rig"
             )
-        return told
+        return sentences
 
 
 def align(segments: Segments, camera: int, stamps_ns: Int, gyro: Float, imu: Imu, body_R_left: Float) -> ImuAlignment:
-    """Find rotation and time offset of one camera.
+    """Estimate rotation and time offset of one camera.
 
     Args:
         segments: of all cameras.
-        camera: which of them.
+        camera: its index.
         stamps_ns: (S,) of the gyro, increasing.
         gyro: (S, 3) rad/s in body.
-        imu: its noise, and the time offset that the rig says.
-        body_R_left: (3, 3) that the rig says.
+        imu: noise, and the time offset in the rig.
+        body_R_left: (3, 3) in the rig.
 
     Raises:
-        CalibrationError: if gyro and vision do not overlap in time, or the rig hardly turned.
+        CalibrationError: if gyro and vision do not overlap in time, or the rig did not turn about two axes.
     """
-    of_camera = segments.chosen(segments.known[:, camera])
-    chosen = of_camera.chosen(of_one_length(of_camera))
-    turned = _Turned(chosen, camera, stamps_ns, gyro, imu)
-    if len(turned.turns) < _FEWEST:
+    of_camera = segments.select(segments.known[:, camera])
+    chosen = of_camera.select(of_one_length(of_camera))
+    rotations = _Rotations(chosen, camera, stamps_ns, gyro, imu)
+    if len(rotations.turns) < _MIN_MOTIONS:
         raise CalibrationError("gyro and camera have less than a few seconds in common: the IMU cannot be checked")
-    offset_s = turned.likeliest_offset(imu.time_offset_s)
-    by_gyro = turned.by_gyro(offset_s, np.zeros(3))
-    if not turned.is_about_two_axes:
+    offset_s = rotations.likeliest_offset(imu.time_offset_s)
+    by_gyro = rotations.by_gyro(offset_s, np.zeros(3))
+    if not rotations.is_about_two_axes:
         raise CalibrationError(
             "the rig turned about one axis only, or hardly at all, so the camera's rotation against the IMU cannot be "
             "checked; turn it about two axes"
         )
-    closed_form, _ = paper_method.rotation(np.swapaxes(turned.turns, 1, 2), np.swapaxes(by_gyro, 1, 2))
-    starts = (np.ascontiguousarray(body_R_left), closed_form)
-    found = min((turned.solve(start, offset_s) for start in starts), key=lambda each: each.cost)
+    closed_form, _ = paper_method.rotation(np.swapaxes(rotations.turns, 1, 2), np.swapaxes(by_gyro, 1, 2))
+    initial = (np.ascontiguousarray(body_R_left), closed_form)
+    found = min((rotations.solve(each, offset_s) for each in initial), key=lambda each: each.cost)
     covariance = found.covariance
     return ImuAlignment(
         body_R_left=found.rotation,
@@ -123,29 +121,27 @@ def align(segments: Segments, camera: int, stamps_ns: Int, gyro: Float, imu: Imu
         time_offset_sigma_s=float(np.hypot(np.sqrt(covariance[6, 6]), _FLOOR_S)),
         rig_time_offset_s=imu.time_offset_s,
         gyro_bias=found.bias,
-        segments=found.agreeing,
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class _Solution:
     rotation: Float
     bias: Float
     offset_s: float
     covariance: Float  # (7, 7) of rotation, bias, offset
-    agreeing: int
     cost: float
 
 
-class _Turned:
-    """Rotations of a camera, and of body as the gyro has them over the same time."""
+class _Rotations:
+    """Rotations of a camera by vision, and of body by the gyro over the same intervals."""
 
     def __init__(self, segments: Segments, camera: int, stamps_ns: Int, gyro: Float, imu: Imu) -> None:
         self._origin_ns = int(stamps_ns[0])
         self._times_s = (stamps_ns - self._origin_ns) / _NS_PER_S
         self._gyro = np.ascontiguousarray(gyro)
         self._gyro_variance = imu.gyro_noise_density**2
-        margin_s = abs(imu.time_offset_s) + _WIDEST_S
+        margin_s = abs(imu.time_offset_s) + _MAX_OFFSET_S
         start, end = ((each - self._origin_ns) / _NS_PER_S for each in (segments.start_ns, segments.end_ns))
         inside = (start > margin_s) & (end < self._times_s[-1] - margin_s)
         self._start_s, self._end_s = start[inside], end[inside]
@@ -158,17 +154,17 @@ class _Turned:
         turns = _logs(self.turns)
         second = np.linalg.eigvalsh(turns.T @ turns / len(turns))[1]
         noise = np.median(np.trace(self._covariances, axis1=1, axis2=2)) / 3.0
-        return bool(second > _LEAST_TURNED**2 * noise)
+        return bool(second > _MIN_TURNED**2 * noise)
 
     def by_gyro(self, offset_s: float, bias: Float) -> Float:
-        """Rotations (N, 3, 3) of body from start to end, by the gyro."""
+        """Integrate rotations (N, 3, 3) of body from start to end."""
         start, end = self._start_s + offset_s, self._end_s + offset_s
         return np.asarray(_integrated(self._times_s, self._gyro - bias, start, end))
 
     def likeliest_offset(self, around_s: float) -> float:
-        """The offset at which both turn by angles that are most alike: these do not depend on the rotation."""
+        """Find the offset at which the angles of both agree best; angles do not depend on the rotation in body."""
         angles = np.array([np.linalg.norm(so3_log(turn)) for turn in self.turns])
-        tried = around_s + np.arange(-_WIDEST_S, _WIDEST_S + 1e-9, _COARSE_S)
+        tried = around_s + np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + 1e-9, _COARSE_S)
 
         def misfit(offset_s: float) -> float:
             by_gyro = self.by_gyro(offset_s, np.zeros(3))
@@ -176,8 +172,8 @@ class _Turned:
 
         return float(min(tried.tolist(), key=misfit))
 
-    def solve(self, rotation: Float, offset_s: float) -> _Found:
-        """Gauss-Newton on those that agree, from a start."""
+    def solve(self, rotation: Float, offset_s: float) -> _Solution:
+        """Gauss-Newton on the inliers, from an initial rotation and offset."""
         bias = np.zeros(3)
         normal, cost, weight = np.eye(7), np.inf, np.zeros(0)
         duration = self._end_s - self._start_s
@@ -187,7 +183,7 @@ class _Turned:
             noise = noise + (self._gyro_variance * duration)[:, None, None] * np.eye(3)
             information = np.linalg.inv(noise)
             squares = np.einsum("ni,nij,nj->n", errors, information, errors)
-            scale = max(float(np.median(squares)) / float(chi2.median(3)), 1.0)  # of a noise that is told too small
+            scale = max(float(np.median(squares)) / float(chi2.median(3)), 1.0)  # of the noise
             weight = (squares < scale * _LIMIT).astype(np.float64)
             cost = float(np.minimum(squares, _LIMIT).sum())
             weighted = np.einsum("n,nki,nkl->nil", weight, jacobians, information)
@@ -197,16 +193,16 @@ class _Turned:
             gradient[3:6] += bias / _BIAS_SIGMA**2
             step = -np.linalg.lstsq(normal, gradient, rcond=1e-12)[0]
             rotation = so3_exp(np.ascontiguousarray(step[:3])) @ rotation
-            bias, offset_s = bias + step[3:6], offset_s + float(np.clip(step[6], -_WIDEST_S, _WIDEST_S))
+            bias, offset_s = bias + step[3:6], offset_s + float(np.clip(step[6], -_MAX_OFFSET_S, _MAX_OFFSET_S))
             if number > 2 and np.abs(step).max() < 1e-9:
                 break
         used = weight > 0.0
         factor = max(float(np.mean(squares[used])) / 3.0, 1.0) if used.any() else 1.0
         covariance = np.asarray(factor * np.linalg.pinv(normal, hermitian=True), dtype=np.float64)
-        return _Found(rotation, bias, offset_s, covariance, int(used.sum()), cost)
+        return _Solution(rotation, bias, offset_s, covariance, cost)
 
     def _linearised(self, rotation: Float, bias: Float, offset_s: float) -> tuple[Float, Float]:
-        """Errors (N, 3) in body at the end, and derivatives (N, 3, 7) by rotation (from the left), bias, offset."""
+        """Compute errors (N, 3) in body at the end, and derivatives (N, 3, 7) by left rotation, bias and offset."""
         by_vision = rotation @ self.turns @ rotation.T
         by_gyro = self.by_gyro(offset_s, bias)
         later = self.by_gyro(offset_s + _STEP_S, bias)
@@ -225,7 +221,7 @@ def _logs(rotations: Float) -> Float:
 
 @kernel
 def _integrated(times_s: Float, rates: Float, start_s: Float, end_s: Float) -> Float:
-    """Rotations (N, 3, 3) from start to end of a body that turns at rates (S, 3), linear between times (S,)."""
+    """Integrate rotations (N, 3, 3) of a body with angular velocities (S, 3), linear between times (S,)."""
     out = np.empty((len(start_s), 3, 3))
     for k in range(len(start_s)):
         turned = np.eye(3)
@@ -243,7 +239,7 @@ def _integrated(times_s: Float, rates: Float, start_s: Float, end_s: Float) -> F
 
 @kernel
 def _rate_at(times_s: Float, rates: Float, after: int, at: float) -> Any:
-    """The rate at a time between two samples, of which the later one is known; at the ends, that of the last."""
+    """Interpolate between a sample and the one before it; beyond the ends, return the first or last."""
     if after <= 0:
         return rates[0].copy()
     if after >= len(times_s):

@@ -1,7 +1,7 @@
-"""All pairs at once: one graph, whose relative poses close every loop.
+"""All cameras at once: one factor graph, whose relative poses close every loop.
 
-For each segment of time the first camera's true motion is an unknown, of which every camera's own motion is a
-measurement through that camera's place on the rig. With two cameras this is the graph of `calibration.graph`; with
+For each segment the first camera's true motion is an unknown, of which every camera's own motion is a
+measurement through that camera's pose on the rig. With two cameras this is the graph of `calibration.graph`; with
 more, no motion's noise is counted twice, as it would be by an average of results for two at a time.
 """
 
@@ -18,24 +18,24 @@ from graphvio.arrays import Bool, Float
 from graphvio.backend.noise import gaussian
 from graphvio.calibration.consistency import LIMIT, error_covariance, error_of
 from graphvio.calibration.graph import holding
-from graphvio.calibration.intervals import Segments
-from graphvio.calibration.pose_pairs import FEWEST
+from graphvio.calibration.pose_pairs import MIN_PAIRS
+from graphvio.calibration.segments import Segments
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_right_jacobian_inverse
 from graphvio.kernels import kernel
 
-_ROUNDS = 3  # what is an outlier depends on the solution
-_AGREEING = 0.5  # of the other cameras that tell a motion, so that it counts
+_ROUNDS = 3  # outliers depend on the solution
+_AGREEING = 0.5  # share of the other cameras that a motion must agree with
 
 
 @dataclass(frozen=True, eq=False)
 class JointSolution:
-    """Places of J cameras in the first one.
+    """Poses of the first camera in each of J cameras.
 
     Attributes:
         left_T_left1: (J, 4, 4) pose of the first left camera in each; the first is the identity.
-        covariance: (6 (J - 1), 6 (J - 1)) of the others', tangents ``[rotation, translation]`` in left1.
-        used: (N, J) motions that agree with the others'.
+        covariance: (6 (J - 1), 6 (J - 1)) of the others, tangents ``[rotation, translation]`` in left1.
+        used: (N, J) motions that agree with the others.
     """
 
     left_T_left1: Float
@@ -43,17 +43,17 @@ class JointSolution:
     used: Bool
 
     def between(self, one: int, other: int) -> Float:
-        """``left_other_T_left_one`` (4, 4)."""
+        """Return ``left_other_T_left_one`` (4, 4)."""
         return np.asarray(self.left_T_left1[other] @ se3_inverse(np.ascontiguousarray(self.left_T_left1[one])))
 
 
 def solve(segments: Segments, start: Float, held: Sequence[Float]) -> JointSolution:
-    """The most likely places of all cameras.
+    """Find the maximum-likelihood poses of all cameras.
 
     Args:
         segments: N that do not overlap, of J cameras.
-        start: ``left_T_left1`` (J, 4, 4).
-        held: for each camera but the first, directions (K, 6) in which the start is kept.
+        start: initial ``left_T_left1`` (J, 4, 4).
+        held: for each camera but the first, directions (K, 6) in which the initial pose is kept.
 
     Raises:
         CalibrationError: if a camera agrees with the others in fewer than three motions.
@@ -62,9 +62,9 @@ def solve(segments: Segments, start: Float, held: Sequence[Float]) -> JointSolut
     cameras = range(1, segments.cameras)
     for _ in range(_ROUNDS):
         used = _agreeing(segments, left_T_left1)
-        if used[:, 1:].sum(axis=0).min() < FEWEST:
+        if used[:, 1:].sum(axis=0).min() < MIN_PAIRS:
             worst = int(np.argmin(used[:, 1:].sum(axis=0))) + 1
-            raise CalibrationError(f"camera {worst} agrees with the others in fewer than {FEWEST} motions")
+            raise CalibrationError(f"camera {worst} agrees with the others in fewer than {MIN_PAIRS} motions")
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for j in cameras:
             values.insert(_place(j), gtsam.Pose3(left_T_left1[j]))
@@ -93,7 +93,7 @@ def _motion(segment: int) -> int:
 
 
 def _factor(segment: int, camera: int, measured: Float, covariance: Float) -> gtsam.NonlinearFactor:
-    """A camera's motion as a measurement of the first one's, which alone is known for the first itself."""
+    """Factor of a camera's motion as a measurement of the first camera's; a prior where it is the first camera."""
     noise, measured = gaussian(covariance), np.ascontiguousarray(measured)
     if camera == 0:
         return gtsam.PriorFactorPose3(_motion(segment), gtsam.Pose3(measured), noise)
@@ -111,7 +111,7 @@ def _factor(segment: int, camera: int, measured: Float, covariance: Float) -> gt
 
 
 def _agreeing(segments: Segments, left_T_left1: Float) -> Bool:
-    """(N, J) motions that agree with at least half of the others over the same segment."""
+    """Mask (N, J) of motions that agree with at least half of the others over the same segment."""
     agree = _agreements(segments.motions, segments.covariances, segments.known, left_T_left1, LIMIT)
     others = segments.known.sum(axis=1, keepdims=True) - 1
     return np.asarray(segments.known & (agree > 0) & (agree >= _AGREEING * others))
@@ -119,7 +119,7 @@ def _agreeing(segments: Segments, left_T_left1: Float) -> Bool:
 
 @kernel
 def _agreements(motions: Float, covariances: Float, known: Bool, left_T_left1: Float, limit: float) -> Float:
-    """(N, J) with how many others each motion agrees."""
+    """Count (N, J) with how many others each motion agrees."""
     segments, cameras = known.shape
     agree = np.zeros((segments, cameras))
     for k in range(segments):

@@ -1,8 +1,8 @@
-"""What the motions of a recording can tell of the relative pose of two cameras, and what they cannot.
+"""Observability of the relative pose of two cameras from the motions of a recording.
 
-Turning about one axis only, nothing tells how far apart the cameras are along it; without any turning, nothing tells
-their offset at all. The noise of the motions looks like a little turning about every axis, and so like information:
-what is not well above the noise counts as not known.
+Rotation about one axis only leaves the offset of the cameras along it undetermined; without rotation, all of the offset
+is. The noise of the motions looks like a little rotation about every axis, and so like information: information that is
+not well above that of the noise does not count.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from graphvio.calibration.pose_pairs import PosePairs
 from graphvio.geometry import se3_adjoint, se3_inverse, skew
 from graphvio.kernels import kernel
 
-_LEAST_LEAD = 4.0  # information over what noise alone would give
-_FLOOR = 1e-9  # of the noise's information over the largest, so that it can be divided by
-_UNKNOWN_SIGMAS = np.repeat([np.pi, 5.0], 3)  # radians and metres: of what nothing tells
-_ALONG = 0.9  # cosine from which an axis is called by the camera's own
+_MIN_LEAD = 4.0  # information over that of noise alone
+_FLOOR = 1e-9  # of the noise's information over the largest, for a stable division
+_UNKNOWN_SIGMAS = np.repeat([np.pi, 5.0], 3)  # radians and metres, of undetermined directions
+_ALONG = 0.9  # cosine from which an axis is named after the camera's own
 _AXES = ("x (right)", "y (down)", "z (forward)")
 
 
 @dataclass(frozen=True, eq=False)
 class Observability:
-    """How well a recording's motions suit the calibration.
+    """The directions of a relative pose that motions determine, and those that they do not.
 
     Attributes:
-        translation_singular_values: (3,) of the problem of the translation, eq. (6), as rms turning, rad, in descending
-            order; two of them must be well above the noise.
-        turning_axes: (3, 3) rows: principal axes of the turning, in left1.
-        turning_rad: (3,) rms turning about these, the singular values of the problem of the rotation, eq. (5).
-        undetermined: (K, 6) orthonormal directions, tangent in left1, of which the motions tell nothing.
-        covariance: (6, 6) of ``left2_T_left1``, tangent in left1; very large along what is not determined.
-        missing: what is not determined and what to do about it, a sentence each; none where all is.
+        translation_singular_values: (3,) of the problem of the translation, eq. (6), as rms rotation, rad, in
+            descending order; two of them must be well above the noise.
+        turning_axes: (3, 3) rows: principal axes of the rotation, in left1.
+        turning_rad: (3,) rms rotation about these, the singular values of the problem of the rotation, eq. (5).
+        undetermined: (K, 6) orthonormal directions, tangent in left1, that the motions do not determine.
+        covariance: (6, 6) of ``left2_T_left1``, tangent in left1; very large along undetermined directions.
+        missing: a sentence on each undetermined part and what to do about it; empty if everything is determined.
     """
 
     translation_singular_values: Float
@@ -53,19 +53,19 @@ class Observability:
 
 
 def observe(pairs: PosePairs, left2_T_left1: Float) -> Observability:
-    """What pose pairs tell, at a solution (4, 4)."""
-    told, by_noise = information(pairs, left2_T_left1), _noise_information(pairs, left2_T_left1)
+    """Determine what pose pairs determine of ``left2_T_left1``, at a solution (4, 4)."""
+    motions = pairs.motion_1, pairs.covariance_1, pairs.covariance_2
+    known, by_noise = information(pairs, left2_T_left1), _noise_information(left2_T_left1, *motions)
     scale = np.diag(_UNKNOWN_SIGMAS)  # so that radians and metres compare
-    told, by_noise = scale @ told @ scale, scale @ by_noise @ scale
-    floor = _FLOOR * np.trace(told) + 1.0  # 1: what is known before
-    leads, directions = eigh(told, by_noise + floor * np.eye(6))
-    weak = directions[:, leads < _LEAST_LEAD]
+    known, by_noise = scale @ known @ scale, scale @ by_noise @ scale
+    floor = _FLOOR * np.trace(known) + 1.0  # 1: a priori
+    leads, directions = eigh(known, by_noise + floor * np.eye(6))
+    weak = directions[:, leads < _MIN_LEAD]
     undetermined = np.linalg.qr(scale @ weak)[0].T if weak.size else np.zeros((0, 6))
-    # Of what is determined, the information without what is not; of the rest, nothing but that it is somewhere.
+    # Invert the information on the determined directions alone; the others keep their a-priori variance.
     basis = np.linalg.qr(np.hstack([weak, np.eye(6)]))[0]
-    known = basis[:, weak.shape[1] :]
-    covariance = known @ np.linalg.inv(known.T @ told @ known) @ known.T
-    covariance = covariance + basis[:, : weak.shape[1]] @ basis[:, : weak.shape[1]].T
+    across, along = basis[:, : weak.shape[1]], basis[:, weak.shape[1] :]
+    covariance = along @ np.linalg.inv(along.T @ known @ along) @ along.T + across @ across.T
     turning, axes = np.linalg.eigh(pairs.rotations_rad.T @ pairs.rotations_rad / len(pairs))
     turning_rad, axes = np.sqrt(np.maximum(turning[::-1], 0.0)), axes[:, ::-1].T
     lever = np.concatenate([np.eye(3) - motion[:3, :3] for motion in pairs.motion_2])
@@ -79,13 +79,9 @@ def observe(pairs: PosePairs, left2_T_left1: Float) -> Observability:
     )
 
 
-def _noise_information(pairs: PosePairs, left2_T_left1: Float) -> Float:
-    """What the noise of the motions adds to the information (6, 6), on average."""
-    return np.asarray(_added_by_noise(left2_T_left1, pairs.motion_1, pairs.covariance_1, pairs.covariance_2))
-
-
 @kernel
-def _added_by_noise(left2_T_left1: Float, motion_1: Float, covariance_1: Float, covariance_2: Float) -> Float:
+def _noise_information(left2_T_left1: Float, motion_1: Float, covariance_1: Float, covariance_2: Float) -> Float:
+    """Expected information (6, 6) that the noise of the motions adds."""
     total = np.zeros((6, 6))
     adjoint = se3_adjoint(left2_T_left1)
     for k in range(len(motion_1)):
@@ -100,7 +96,7 @@ def _added_by_noise(left2_T_left1: Float, motion_1: Float, covariance_1: Float, 
 
 @kernel
 def _small_adjoint(tangent: Float) -> Float:
-    """(6, 6) with ``Ad(exp(d)) = 1 + ad(d)`` to first order."""
+    """Matrix ad(d) (6, 6), with ``Ad(exp(d)) = 1 + ad(d)`` to first order."""
     small = np.zeros((6, 6))
     turn, shift = skew(tangent[:3]), skew(tangent[3:])
     for i in range(3):
@@ -110,42 +106,42 @@ def _small_adjoint(tangent: Float) -> Float:
 
 
 def _missing(undetermined: Float, axes: Float, turning_rad: Float) -> list[str]:
-    """What is not determined, in words."""
+    """Describe what is not determined, and what to do."""
     if not len(undetermined):
         return []
     turns = np.rad2deg(turning_rad)
     rotations, translations = (_directions(undetermined[:, part]) for part in (slice(0, 3), slice(3, 6)))
     if len(rotations) == 3:
-        return ["the rig hardly moved: nothing tells how the cameras are placed; walk, and turn it about two axes"]
-    told = []
+        return ["the rig hardly moved: the pose between the cameras cannot be found; walk, and turn it about two axes"]
+    sentences = []
     if len(translations) == 3:
-        told.append(
+        sentences.append(
             f"the rig hardly turned ({turns[0]:.2g} degrees rms in a motion): the offset between the cameras cannot be "
             "found; turn it about two axes"
         )
     elif len(translations):
         along = " and ".join(map(_named, translations))
-        told.append(
+        sentences.append(
             f"rotation only about the axis {_named(axes[0])} of the first left camera ({turns[0]:.2g} degrees rms, "
             f"{turns[1]:.2g} about others): the offset along {along} cannot be found; tilt the rig while turning"
         )
     if len(rotations):
         about = " and ".join(map(_named, rotations))
-        told.append(
+        sentences.append(
             f"the angle between the cameras about {about} of the first left camera cannot be found; turn the rig about "
             "another axis, or move it sideways"
         )
-    return told
+    return sentences
 
 
 def _directions(parts: Float) -> Float:
-    """An orthonormal basis (K, 3) of what vectors (N, 3) interval, but for what is small."""
+    """Orthonormal basis (K, 3) of the space that vectors (N, 3) generate, without directions that are small."""
     _, sizes, rows = np.linalg.svd(parts)
     return np.asarray(rows[: int(np.sum(sizes > 0.3))])
 
 
 def _named(axis: Float) -> str:
-    """An axis by its name in the camera, or by its numbers."""
+    """Name an axis after the camera's, or by its coordinates."""
     nearest = int(np.argmax(np.abs(axis)))
     if abs(axis[nearest]) > _ALONG:
         return _AXES[nearest]

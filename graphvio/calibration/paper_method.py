@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from graphvio.arrays import Bool, Float, Int
-from graphvio.calibration.pose_pairs import FEWEST, PosePairs, inverses
+from graphvio.calibration.pose_pairs import MIN_PAIRS, PosePairs, inverses
 from graphvio.errors import CalibrationError
 from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3, skew, so3_exp
 
@@ -24,12 +24,12 @@ _TRIPLES = 500
 _LIKELY = 10  # of the best triples, which are refined before one is chosen
 _LIMIT = float(chi2.isf(1e-3, 3))
 _TRIPLE_LIMIT = 9.0 * _LIMIT  # a solution from three pose pairs is off by itself
-_LEAST_TURN, _MOST_TURN = np.deg2rad([0.2, 170.0])  # of a pose pair in a triple: both signs of q fit a half turn
-_LEAST_TURNED = 3.0  # rms of the turning about an axis over the noise of a rotation
+_MIN_TURN, _MAX_TURN = np.deg2rad([0.2, 170.0])  # of a pose pair in a triple: both signs of q fit a half turn
+_MIN_TURNED = 3.0  # rms of the turning about an axis over the noise of a rotation
 _ROUNDS = 5
 _ITERATIONS = 50
 _FIRST_DAMPING, _STIFFER, _LOOSER = 1e-6, 10.0, 0.1
-_SMALLEST_STEP = 1e-14
+_MIN_STEP = 1e-14
 _TINY = 1e-12
 
 
@@ -47,7 +47,7 @@ class PoseParts(NamedTuple):
         P_1, P_2 = inverses(pairs.motion_1), inverses(pairs.motion_2)
         return PoseParts(P_1[:, :3, :3], P_1[:, :3, 3], P_2[:, :3, :3], P_2[:, :3, 3])
 
-    def chosen(self, rows: Bool | Int) -> PoseParts:
+    def select(self, rows: Bool | Int) -> PoseParts:
         """Some of them."""
         return PoseParts(*(part[rows] for part in self))
 
@@ -77,18 +77,18 @@ def calibrate(pairs: PosePairs, seed: int = 0) -> PaperSolution:
     Raises:
         CalibrationError: with fewer than three pose pairs, without rotation, or if no solution explains three of them.
     """
-    if len(pairs) < FEWEST:
-        raise CalibrationError(f"calibration needs {FEWEST} pose pairs and has {len(pairs)}; record for longer")
+    if len(pairs) < MIN_PAIRS:
+        raise CalibrationError(f"calibration needs {MIN_PAIRS} pose pairs and has {len(pairs)}; record for longer")
     weighed = _Weighed(pairs)
     best = _best_triples(weighed, np.random.default_rng(seed))
     _, R, t = min((_refined_on_inliers(weighed, R, t) for R, t in best), key=lambda found: found[0])
     parts, inlier = weighed.parts, weighed.distances(R, t) < _LIMIT
-    if inlier.sum() < FEWEST:
+    if inlier.sum() < MIN_PAIRS:
         raise CalibrationError(
             f"the best relative pose of the cameras explains {inlier.sum()} of {len(pairs)} motions; are they on one "
             "rig, and are their clocks the same?"
         )
-    R, t = refine(parts.chosen(inlier), R, t, weighed.noise_rad)
+    R, t = refine(parts.select(inlier), R, t, weighed.noise_rad)
     return PaperSolution(se3(R, -R @ t), inlier, alignment_errors(parts, R, t))
 
 
@@ -114,7 +114,7 @@ def translation(R: Float, parts: PoseParts, noise_rad: float = 0.0) -> Float:
     A = (np.eye(3) - parts.R_2).reshape(-1, 3)
     b = (parts.T_2 - parts.T_1 @ R.T).ravel()  # eq. (10) has A T plus R T_1 - T_2: the paper's b lacks a sign
     left, sizes, right = np.linalg.svd(A, full_matrices=False)
-    turned = sizes > _least_size(sizes, len(parts.R_2), noise_rad)
+    turned = sizes > _min_singular_value(sizes, len(parts.R_2), noise_rad)
     return np.asarray(right[turned].T @ ((left.T @ b)[turned] / sizes[turned]))
 
 
@@ -156,7 +156,7 @@ def refine(parts: PoseParts, R: Float, t: Float, noise_rad: float = 0.0) -> tupl
             damping *= _LOOSER
         else:
             damping *= _STIFFER
-        if np.abs(step).max() < _SMALLEST_STEP:
+        if np.abs(step).max() < _MIN_STEP:
             break
     return R, t
 
@@ -164,12 +164,12 @@ def refine(parts: PoseParts, R: Float, t: Float, noise_rad: float = 0.0) -> tupl
 def _turned_axes(parts: PoseParts, noise_rad: float) -> Float:
     """Orthonormal directions (3, K), in left1, in which t makes a difference."""
     _, sizes, right = np.linalg.svd((np.swapaxes(parts.R_1, 1, 2) - np.eye(3)).reshape(-1, 3), full_matrices=False)
-    return np.asarray(right[sizes > _least_size(sizes, len(parts.R_1), noise_rad)].T)
+    return np.asarray(right[sizes > _min_singular_value(sizes, len(parts.R_1), noise_rad)].T)
 
 
-def _least_size(sizes: Float, count: int, noise_rad: float) -> float:
+def _min_singular_value(sizes: Float, count: int, noise_rad: float) -> float:
     """The singular value of N rotations, less the identity, that noise does not explain."""
-    return max(_LEAST_TURNED * noise_rad * float(np.sqrt(count)), _TINY * float(sizes[0]))
+    return max(_MIN_TURNED * noise_rad * float(np.sqrt(count)), _TINY * float(sizes[0]))
 
 
 class _Weighed:
@@ -196,18 +196,18 @@ def _best_triples(weighed: _Weighed, rng: np.random.Generator) -> list[tuple[Flo
     """Rotations and t of the triples that explain most, the best first."""
     parts, turns = weighed.parts, weighed.turns
     normals = _normal_matrices(parts.R_1, parts.R_2)
-    fit = np.flatnonzero((turns > _LEAST_TURN) & (turns < _MOST_TURN))
-    if len(fit) < FEWEST:
+    fit = np.flatnonzero((turns > _MIN_TURN) & (turns < _MAX_TURN))
+    if len(fit) < MIN_PAIRS:
         raise CalibrationError(
-            f"{len(fit)} of {len(turns)} motions turn by more than {np.rad2deg(_LEAST_TURN):g} degrees, and {FEWEST} "
+            f"{len(fit)} of {len(turns)} motions turn by more than {np.rad2deg(_MIN_TURN):g} degrees, and {MIN_PAIRS} "
             "are needed: without rotation nothing tells where the cameras are on the rig; turn it about two axes"
         )
-    triples = rng.permuted(np.broadcast_to(fit, (_TRIPLES, len(fit))), axis=1)[:, :FEWEST]
+    triples = rng.permuted(np.broadcast_to(fit, (_TRIPLES, len(fit))), axis=1)[:, :MIN_PAIRS]
     _, vectors = np.linalg.eigh(normals[triples].sum(axis=1))
     scored = []
     for triple, q in zip(triples, vectors[:, :, 0], strict=True):
         R = rotation_from_quat_wxyz(np.ascontiguousarray(q))
-        t = -R.T @ translation(R, parts.chosen(triple), weighed.noise_rad)
+        t = -R.T @ translation(R, parts.select(triple), weighed.noise_rad)
         cost = np.minimum(weighed.distances(R, t), _TRIPLE_LIMIT).sum()
         scored.append((float(cost), R, t))
     scored.sort(key=lambda each: each[0])
@@ -219,9 +219,9 @@ def _refined_on_inliers(weighed: _Weighed, R: Float, t: Float) -> tuple[float, F
     before = None
     for number in range(_ROUNDS):
         inlier = weighed.distances(R, t) < (_TRIPLE_LIMIT if number == 0 else _LIMIT)
-        if inlier.sum() < FEWEST or (before is not None and np.array_equal(inlier, before)):
+        if inlier.sum() < MIN_PAIRS or (before is not None and np.array_equal(inlier, before)):
             break
-        chosen, before = weighed.parts.chosen(inlier), inlier
+        chosen, before = weighed.parts.select(inlier), inlier
         if number == 0:
             R, _ = rotation(chosen.R_1, chosen.R_2)
             t = -R.T @ translation(R, chosen, weighed.noise_rad)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -10,8 +10,8 @@ from graphvio.arrays import Bool, Float, Int
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_inverse, se3_log
 
-FEWEST = 3
-"""Pose pairs from which the paper's method can start."""
+MIN_PAIRS = 3
+"""Pose pairs that the paper's method needs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,9 +25,9 @@ class PosePairs:
         start_ns: (N,) int64.
         end_ns: (N,) int64.
         motion_1: (N, 4, 4) of the first pair's left camera.
-        covariance_1: (N, 6, 6) of it, tangent ``[rotation, translation]`` in the frame at its end.
-        motion_2: (N, 4, 4) of the other pair's left camera.
-        covariance_2: (N, 6, 6) of it.
+        covariance_1: (N, 6, 6) of motion_1, tangent ``[rotation, translation]`` in the frame at its end.
+        motion_2: (N, 4, 4) of the second pair's left camera.
+        covariance_2: (N, 6, 6) of motion_2, in the same way.
 
     Raises:
         CalibrationError: if the shapes disagree, or a value is not finite.
@@ -60,23 +60,16 @@ class PosePairs:
     def __len__(self) -> int:
         return len(self.start_ns)
 
-    def chosen(self, rows: Bool | Int) -> PosePairs:
-        """Some of them."""
-        return PosePairs(
-            self.start_ns[rows],
-            self.end_ns[rows],
-            self.motion_1[rows],
-            self.covariance_1[rows],
-            self.motion_2[rows],
-            self.covariance_2[rows],
-        )
+    def select(self, rows: Bool | Int) -> PosePairs:
+        """Return some of the pose pairs, by mask or indices."""
+        return PosePairs(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @property
     def rotations_rad(self) -> Float:
-        """(N, 3) rotation vectors of the first camera, in its frame at the start (and at the end)."""
+        """Rotation vectors (N, 3) of the first camera, in its frame at the start (and at the end)."""
         return np.array([se3_log(motion)[:3] for motion in self.motion_1]).reshape(-1, 3)
 
 
 def inverses(poses: Float) -> Float:
-    """Inverses (N, 4, 4) of poses (N, 4, 4)."""
+    """Invert poses (N, 4, 4)."""
     return np.array([se3_inverse(pose) for pose in poses]).reshape(-1, 4, 4)

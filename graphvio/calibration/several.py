@@ -1,4 +1,4 @@
-"""Any number of pairs: two at a time, and all at once."""
+"""Calibration of any number of cameras: two at a time, and all at once."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from scipy.stats import chi2
 
 from graphvio.arrays import Float
 from graphvio.calibration import joint
-from graphvio.calibration.intervals import Segments, most_telling, worth
+from graphvio.calibration.nuisances import ScaleMode
 from graphvio.calibration.pair_calibration import SEEN_FROM, PairCalibration, size_in_words
-from graphvio.calibration.scale import ScaleMode
+from graphvio.calibration.segments import Segments, information_gains, most_informative
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 
@@ -22,12 +22,12 @@ _CHANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Results for two at a time around three cameras, which should lead back to where they began.
+    """Results for two cameras at a time, chained around three cameras; without errors the chain is the identity.
 
     Attributes:
-        cameras: their numbers.
+        cameras: their indices.
         error: (6,) tangent ``[rotation, translation]`` in the first of the three.
-        covariance: (6, 6) of it, were the three results independent.
+        covariance: (6, 6) of the error, if the three results were independent.
     """
 
     cameras: tuple[int, int, int]
@@ -36,22 +36,22 @@ class Loop:
 
     @property
     def statistic(self) -> float:
-        """Squared Mahalanobis distance from zero, 6 degrees of freedom."""
+        """Squared Mahalanobis distance of the error from zero, 6 degrees of freedom."""
         return float(self.error @ np.linalg.solve(self.covariance, self.error))
 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Where all cameras are.
+    """The poses of all cameras relative to the first.
 
     Attributes:
         left_T_left1: (J, 4, 4) pose of the first left camera in each; the first is the identity.
-        covariance: (6 (J - 1), 6 (J - 1)) of the others', tangents ``[rotation, translation]`` in left1.
-        pairwise: (first, second) -> two at a time.
-        loops: how well these close; none for two cameras.
-        distances: (first, second) -> squared Mahalanobis distance (6 degrees of freedom) of the result for all from
-            that for two at a time, by the latter's covariance.
-        warnings: a sentence each.
+        covariance: (6 (J - 1), 6 (J - 1)) of the others, tangents ``[rotation, translation]`` in left1.
+        pairwise: (first, second) -> result for these two alone.
+        loops: of three cameras; empty for two cameras.
+        distances: (first, second) -> squared Mahalanobis distance (6 degrees of freedom) of the result for all cameras
+            from that for these two alone, by the latter's covariance.
+        warnings: sentences.
     """
 
     left_T_left1: Float
@@ -62,7 +62,7 @@ class Places:
     warnings: tuple[str, ...]
 
     def covariance_between(self, one: int, other: int) -> Float:
-        """Covariance (6, 6) of ``left_other_T_left_one``, tangent in the camera ``one``."""
+        """Compute the covariance (6, 6) of ``left_other_T_left_one``, tangent in the camera ``one``."""
         # X_ij = X_j X_i^-1: changes d_j of X_j and d_i of X_i, in left1, make Ad(X_i) (d_j - d_i).
         apart = np.zeros((6, len(self.covariance)))
         for camera, sign in ((other, 1.0), (one, -1.0)):
@@ -75,15 +75,18 @@ class Places:
 def pairwise(
     names: Sequence[str], calibrate: Callable[[int, int, ScaleMode], PairCalibration], scale_mode: ScaleMode
 ) -> tuple[dict[tuple[int, int], PairCalibration], list[str]]:
-    """Results for two at a time, and what was wrong with those that are missing.
+    """Calibrate all cameras, two at a time.
 
     Args:
-        names: (J) of the cameras.
-        calibrate: does it for two cameras.
-        scale_mode: see `calibrate_pair`; where the scale of one is wrong beyond doubt, that of all is estimated.
+        names: of J cameras.
+        calibrate: function that calibrates two cameras.
+        scale_mode: see `calibrate_pair`; where one scale is significantly wrong, all are estimated.
+
+    Returns:
+        (first, second) -> result, and a sentence on each result that is missing.
 
     Raises:
-        CalibrationError: if one of the cameras cannot be placed relative to the first.
+        CalibrationError: if the pose of one of the cameras relative to the first cannot be found.
     """
     found: dict[tuple[int, int], PairCalibration] = {}
     missing: list[str] = []
@@ -91,10 +94,10 @@ def pairwise(
         try:
             found[one, other] = calibrate(one, other, scale_mode)
         except CalibrationError as error:
-            told = f"{names[one]} and {names[other]}: {error}"
+            message = f"{names[one]} and {names[other]}: {error}"
             if one == 0:
-                raise CalibrationError(told) from None
-            missing.append(told)
+                raise CalibrationError(message) from None
+            missing.append(message)
     if any(each.scale_estimated for each in found.values()):
         found = {
             cameras: each if each.scale_estimated else calibrate(*cameras, "estimate")
@@ -109,21 +112,23 @@ def place_all(
     segments: Segments,
     seen_from: Float = SEEN_FROM,
 ) -> Places:
-    """Places that fit all motions at once.
+    """Find the poses that fit all motions at once.
 
     Args:
-        found: results for two at a time, among them those of the first camera and each other one.
-        names: (J) of the cameras.
-        segments: all that may be chosen from, of J cameras.
-        seen_from: covariance (6, 6) of where each camera is, as its images have it.
+        found: results for two cameras at a time, including those of the first camera and each other one.
+        names: of J cameras.
+        segments: of J cameras, all that may be chosen from.
+        seen_from: covariance (6, 6) of each camera's pose as its images see it.
 
     Raises:
         CalibrationError: if a camera agrees with the others in too few motions.
     """
-    warnings = [f"{names[i]} and {names[j]}: {told}" for (i, j), each in found.items() for told in each.warnings]
+    warnings = [
+        f"{names[i]} and {names[j]}: {sentence}" for (i, j), each in found.items() for sentence in each.warnings
+    ]
     warnings += [
-        f"{names[i]} and {names[j]}: {each.scale.told(names[i], names[j])}"
-        + ("; this was taken out of the result" if each.scale_estimated else "; the result has it in")
+        f"{names[i]} and {names[j]}: {each.scale.describe(names[i], names[j])}"
+        + ("; the result is corrected for it" if each.scale_estimated else "; the result is not corrected for it")
         for (i, j), each in found.items()
         if each.scale.is_wrong
     ]
@@ -132,11 +137,11 @@ def place_all(
     if count == 2:
         return Places(start, found[0, 1].covariance, found, (), {}, tuple(warnings))
     segments = _rescaled(segments, found)
-    chosen = segments.chosen(most_telling(segments, _worths(segments, found, count)))
+    chosen = segments.select(most_informative(segments, _gains(segments, found, count)))
     held = [found[0, j].observability.undetermined for j in range(1, count)]
     solution = joint.solve(chosen, start, held)
     covariance = max(each.dispersion for each in found.values()) * solution.covariance
-    covariance = covariance + _seen_from(solution.left_T_left1, seen_from) + _unknown(found, count)
+    covariance = covariance + _systematic(solution.left_T_left1, seen_from) + _undetermined(found, count)
     apart = {(i, j): se3_log(se3_inverse(_in_first_lengths(found, i, j)) @ solution.between(i, j)) for i, j in found}
     distances = {
         cameras: float(apart[cameras] @ np.linalg.solve(each.covariance, apart[cameras]))
@@ -153,7 +158,7 @@ def place_all(
 
 
 def _rescaled(segments: Segments, found: Mapping[tuple[int, int], PairCalibration]) -> Segments:
-    """Segments on which all cameras measure lengths as the first does, where that was an unknown."""
+    """Scale all motions to the lengths that the first camera measures, where scales were estimated."""
     motions = segments.motions.copy()
     for j in range(1, segments.cameras):
         if found[0, j].scale_estimated:
@@ -161,18 +166,18 @@ def _rescaled(segments: Segments, found: Mapping[tuple[int, int], PairCalibratio
     return replace(segments, motions=motions)
 
 
-def _worths(segments: Segments, found: Mapping[tuple[int, int], PairCalibration], count: int) -> Float:
-    """What segments (N,) tell of all places, to first order."""
-    worths = np.zeros(len(segments))
+def _gains(segments: Segments, found: Mapping[tuple[int, int], PairCalibration], count: int) -> Float:
+    """Information gains (N,) of segments, summed over all cameras."""
+    gains = np.zeros(len(segments))
     for j in range(1, count):
         both = segments.known[:, 0] & segments.known[:, j]
         each = found[0, j]
-        worths[both] += worth(segments.of_both(0, j).pairs, each.left2_T_left1, each.covariance)
-    return worths
+        gains[both] += information_gains(segments.of_both(0, j).pairs, each.left2_T_left1, each.covariance)
+    return gains
 
 
-def _seen_from(left_T_left1: Float, seen_from: Float) -> Float:
-    """What all cameras' own errors make of their places: the first's is common to all."""
+def _systematic(left_T_left1: Float, seen_from: Float) -> Float:
+    """Covariance of all poses due to the cameras' systematic errors; that of the first camera is common to all."""
     others = len(left_T_left1) - 1
     covariance = np.tile(seen_from, (others, others))
     for j in range(others):
@@ -181,8 +186,8 @@ def _seen_from(left_T_left1: Float, seen_from: Float) -> Float:
     return covariance
 
 
-def _unknown(found: Mapping[tuple[int, int], PairCalibration], count: int) -> Float:
-    """Covariance of what the motions do not tell at all, of each camera's place."""
+def _undetermined(found: Mapping[tuple[int, int], PairCalibration], count: int) -> Float:
+    """Covariance of all poses in directions that the motions do not determine."""
     covariance = np.zeros((6 * (count - 1), 6 * (count - 1)))
     for j in range(1, count):
         each = found[0, j]
@@ -192,7 +197,7 @@ def _unknown(found: Mapping[tuple[int, int], PairCalibration], count: int) -> Fl
 
 
 def _in_first_lengths(found: Mapping[tuple[int, int], PairCalibration], one: int, other: int) -> Float:
-    """``left_other_T_left_one`` (4, 4), measured with the first camera's lengths where cameras differ in them."""
+    """Result ``left_other_T_left_one`` (4, 4) for two cameras alone, in lengths as the first camera measures them."""
     place = np.array(found[one, other].left2_T_left1)
     if one and found[0, one].scale_estimated:
         place[:3, 3] *= np.exp(-found[0, one].scale.log_ratio)

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from graphvio.arrays import Float
+    from graphvio.calibration.camera_motions import SeparateMotions
     from graphvio.calibration.guide import Advice
+    from graphvio.calibration.nuisances import ScaleMode
     from graphvio.calibration.result import Calibration
-    from graphvio.calibration.scale import ScaleMode
-    from graphvio.calibration.separate_motions import SeparateMotions
 
 EXIT_PARTIAL = 3
 
@@ -212,7 +212,7 @@ def _working(text: str) -> AbstractContextManager[object]:
 def _scale_mode(text: str) -> ScaleMode:
     from typing import get_args
 
-    from graphvio.calibration.scale import ScaleMode
+    from graphvio.calibration.nuisances import ScaleMode
     from graphvio.errors import ConfigError
 
     for mode in get_args(ScaleMode):
@@ -259,9 +259,9 @@ def _tell(found: Calibration) -> None:
             f"{1e3 * errors[fits].mean():.2f} mm"
         )
     for j in range(1, len(found.names)):
-        present = found.present(j)
-        if present is not None and not present.is_off:
-            typer.echo(f"the rig file has {found.names[j]} {_size(present.tangent)} away{present.doubt}")
+        in_file = found.compare_rig(j)
+        if in_file is not None and not in_file.is_off:
+            typer.echo(f"the rig file has {found.names[j]} {_size(in_file.tangent)} away{in_file.reliability}")
     for loop in found.places.loops:
         around = ", ".join(found.names[k] for k in loop.cameras)
         typer.echo(f"around {around}: two at a time miss by {_size(loop.error)}")
@@ -269,7 +269,7 @@ def _tell(found: Calibration) -> None:
         typer.echo(
             f"{found.names[i]} to {found.names[j]}: add {1e-9 * clock.relation.offset_ns:.6f} s to a stamp of "
             f"{found.names[i]} (+- {1e3 * clock.offset_sigma_s:.2f} ms); drift {1e6 * clock.relation.drift:.0f} (+- "
-            f"{1e6 * clock.drift_sigma:.0f}) microseconds a second"
+            f"{1e6 * clock.drift_sigma:.0f}) microseconds per second"
         )
     for warning in found.warnings:
         typer.echo(f"graphvio: {warning}", err=True)
@@ -290,9 +290,9 @@ def _table(found: Calibration) -> Table:
     for column in ("", "x", "y", "z"):
         table.add_column(column, justify="right" if column else "left", no_wrap=bool(column))
     for j in range(1, len(found.names)):
-        shown = found.shown(j)
-        place = map(_with_sigma, 1e3 * shown.offset_m, 1e3 * shown.offset_sigmas_m, shown.offset_known)
-        turn = map(_with_sigma, np.rad2deg(shown.turn_rad), np.rad2deg(shown.turn_sigmas_rad), shown.turn_known)
+        summary = found.pose_summary(j)
+        place = map(_with_sigma, 1e3 * summary.offset_m, 1e3 * summary.offset_sigmas_m, summary.offset_known)
+        turn = map(_with_sigma, np.rad2deg(summary.turn_rad), np.rad2deg(summary.turn_sigmas_rad), summary.turn_known)
         table.add_row(f"{found.names[j]}, mm", *place)
         table.add_row("rotation vector, deg", *turn, end_section=True)
     return table

@@ -1,4 +1,4 @@
-"""``scripts/campaign calibration``: how well P_12 is found, and what it is worth to the odometry.
+"""``scripts/campaign calibration``: how well P_12 is found, and what it is information_gains to the odometry.
 
 Three parts. Drawn errors: 200 runs at each of several noise levels and shares of outliers, judged against what the
 covariance tells. Images: two minutes of the scene ``calibration``, of which more and more framesets are used. Odometry:
@@ -22,9 +22,9 @@ from scipy.stats import chi2
 from campaigns.calibration_draws import PAIRS, Run, one_run
 from graphvio.arrays import Float
 from graphvio.calibration.calibrate import calibrate_pairs, segments_of_motions
+from graphvio.calibration.camera_motions import SeparateMotions
 from graphvio.calibration.pair_calibration import PairCalibration, calibrate_pair
 from graphvio.calibration.result import Calibration
-from graphvio.calibration.separate_motions import SeparateMotions
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.geometry import se3_inverse, se3_log

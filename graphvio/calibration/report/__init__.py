@@ -1,1 +1,1 @@
-"""What is written of a calibration: all numbers, pictures, and a page for people."""
+"""The report of a calibration: page, figures and numbers."""

@@ -1,4 +1,4 @@
-"""All numbers of a calibration as plain lists, to the last digit, and the file that holds them."""
+"""All numbers of a calibration as plain lists, in full precision, and as a YAML file."""
 
 from __future__ import annotations
 
@@ -16,8 +16,11 @@ VERSION = 1
 
 
 def document(found: Calibration) -> dict[str, Any]:
-    """All numbers, as YAML and JSON can hold them. Metres, radians, seconds; transforms are ``a_T_b``, 4x4 by rows;
-    covariances have the tangent ``[rotation, translation]`` in the frame b."""
+    """Convert a calibration to plain lists and dicts, as YAML and JSON hold them.
+
+    Units are metres, radians, seconds; transforms are ``a_T_b``, 4x4 by rows; covariances have the tangent
+    ``[rotation, translation]`` in the frame b.
+    """
     made: dict[str, Any] = {
         "graphvio_calibration": VERSION,
         "names": list(found.names),
@@ -54,7 +57,7 @@ def document(found: Calibration) -> dict[str, Any]:
         "warnings": list(found.warnings),
     }
     if found.rig is not None:
-        made["rig_before"] = [_present(found, j) for j in range(1, len(found.names))]
+        made["rig_before"] = [_rig_before(found, j) for j in range(1, len(found.names))]
     if found.imu:
         made["imu"] = [
             {
@@ -142,28 +145,28 @@ def _pair(each: PairCalibration) -> dict[str, Any]:
 
 
 def _known(found: Calibration, j: int) -> dict[str, Any]:
-    """Values one by one, where the motions tell them; null elsewhere."""
-    shown = found.shown(j)
+    """Single values, null where they are not determined."""
+    shown = found.pose_summary(j)
 
-    def told(values: Float, known: Bool) -> list[float | None]:
+    def where_known(values: Float, known: Bool) -> list[float | None]:
         return [float(value) if is_known else None for value, is_known in zip(values, known, strict=True)]
 
     return {
-        "offset_m": told(shown.offset_m, shown.offset_known),
-        "offset_sigmas_m": told(shown.offset_sigmas_m, shown.offset_known),
-        "rotation_vector_rad": told(shown.turn_rad, shown.turn_known),
-        "rotation_vector_sigmas_rad": told(shown.turn_sigmas_rad, shown.turn_known),
+        "offset_m": where_known(shown.offset_m, shown.offset_known),
+        "offset_sigmas_m": where_known(shown.offset_sigmas_m, shown.offset_known),
+        "rotation_vector_rad": where_known(shown.turn_rad, shown.turn_known),
+        "rotation_vector_sigmas_rad": where_known(shown.turn_sigmas_rad, shown.turn_known),
     }
 
 
-def _present(found: Calibration, j: int) -> dict[str, Any]:
-    present = found.present(j)
-    assert present is not None
+def _rig_before(found: Calibration, j: int) -> dict[str, Any]:
+    rig = found.compare_rig(j)
+    assert rig is not None
     return {
         "name": found.names[j],
-        "rotation_deg": present.angle_deg,
-        "translation_m": present.distance_m,
-        "sigmas": present.sigmas,
-        "off": present.is_off,
-        "swapped": present.is_swapped,
+        "rotation_deg": rig.angle_deg,
+        "translation_m": rig.distance_m,
+        "sigmas": rig.sigmas,
+        "off": rig.is_off,
+        "swapped": rig.is_swapped,
     }

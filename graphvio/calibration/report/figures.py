@@ -1,4 +1,4 @@
-"""Pictures of a calibration of two cameras."""
+"""Figures of the calibration of two cameras."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NS_PER_S = 1e9
 
 
 def alignment_errors(each: PairCalibration) -> Figure:
-    """Histogram of alignment errors, as the paper's figure 4."""
+    """Plot a histogram of alignment errors, as the paper's figure 4."""
     by_frame = len(each.frames) > 0
     errors = 1e3 * (each.frame_errors_m if by_frame else each.alignment_errors_m)
     inlier = each.frame_inlier if by_frame else each.inlier
@@ -36,10 +36,10 @@ def alignment_errors(each: PairCalibration) -> Figure:
 
 
 def residuals(each: PairCalibration) -> Figure:
-    """Errors over time, in standard deviations, with outliers marked."""
+    """Plot errors over time, in standard deviations, with outliers marked."""
     figure, axes = single(6.4, 3.2)
     since_s = (0.5 * (each.pairs.start_ns + each.pairs.end_ns) - each.pairs.start_ns[0]) / _NS_PER_S
-    size = np.sqrt(each.squares / 6.0)
+    size = np.sqrt(each.solution.squares / 6.0)
     limit = float(np.sqrt(LIMIT / 6.0))
     top = max(1.15 * limit, min(float(size.max()), 3.0 * limit))
     axes.plot(since_s[each.inlier], size[each.inlier], ".", color=BLUE, markersize=4, label="fits")
@@ -53,7 +53,7 @@ def residuals(each: PairCalibration) -> Figure:
 
 
 def turning(each: PairCalibration) -> Figure:
-    """About which axes of the first left camera the rig turned, on the sphere of directions."""
+    """Plot the axes about which the rig turned, in the first left camera, on the sphere of directions."""
     figure = empty_figure(6.4, 3.6)
     axes: Any = figure.add_axes((0.04, 0.05, 0.78, 0.85), projection="mollweide")
     turns = each.pairs.rotations_rad / ((each.pairs.end_ns - each.pairs.start_ns) / _NS_PER_S)[:, None]
@@ -62,7 +62,7 @@ def turning(each: PairCalibration) -> Figure:
     x, y, z = (turns[moving] / speed[moving, None]).T
     deg_s = np.rad2deg(speed[moving])
     longitude, latitude = np.arctan2(x, z), np.arcsin(np.clip(-y, -1.0, 1.0))
-    drawn = axes.scatter(
+    points = axes.scatter(
         longitude, latitude, c=deg_s, s=10 + 40 * deg_s / max(deg_s.max(), 1e-9), cmap="viridis", alpha=0.8
     )
     for name, at in {"forward": (0, 0), "right": (np.pi / 2, 0), "left": (-np.pi / 2, 0)}.items():
@@ -73,19 +73,19 @@ def turning(each: PairCalibration) -> Figure:
     axes.set_xticklabels([])
     axes.set_yticklabels([])
     axes.grid(**GRID)
-    bar = figure.colorbar(drawn, cax=figure.add_axes((0.86, 0.15, 0.025, 0.65)))
+    bar = figure.colorbar(points, cax=figure.add_axes((0.86, 0.15, 0.025, 0.65)))
     bar.set_label("turning, degrees/s", fontsize=8)
     bar.ax.tick_params(labelsize=8)
     return figure
 
 
 def growth(each: PairCalibration, count: int, unit: str) -> Figure:
-    """Angles and translation with their sigmas as the recording grew, against the end's.
+    """Plot the change of the result, with its sigmas, as the recording grew, relative to the final result.
 
     Args:
         each: the calibration.
-        count: of framesets or poses of the whole recording.
-        unit: what was counted.
+        count: number of framesets or poses of the whole recording.
+        unit: "framesets" or "poses".
     """
     figure = empty_figure(6.4, 5.0)
     panels = [figure.add_axes((0.13, bottom, 0.83, 0.38)) for bottom in (0.57, 0.1)]

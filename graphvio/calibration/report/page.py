@@ -113,11 +113,11 @@ def page(found: Calibration, pictures: dict[tuple[int, int], dict[str, bytes]], 
 
 
 def _place(found: Calibration, j: int) -> Sequence[str]:
-    shown, present = found.shown(j), found.present(j)
+    shown, rig = found.pose_summary(j), found.compare_rig(j)
     in_rig_file = ""
-    if present is not None:
-        agreement = "is off" if present.is_off else "agrees"
-        in_rig_file = f"{agreement}: {size_in_words(present.tangent)} away{present.doubt}"
+    if rig is not None:
+        agreement = "is off" if rig.is_off else "agrees"
+        in_rig_file = f"{agreement}: {size_in_words(rig.tangent)} away{rig.reliability}"
     return (
         f"{found.names[0]}, seen from {found.names[j]}",
         _vector(1e3 * shown.offset_m, 1e3 * shown.offset_sigmas_m, shown.offset_known, "mm", 2),
