@@ -1,4 +1,4 @@
-"""Decoding of image files to 8-bit grey, refusing what is damaged."""
+"""Decoding of image files to 8-bit grey, with detection of damaged files."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from graphvio.arrays import Image
+from graphvio.measurements.events import EventKind
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8"
@@ -19,7 +20,7 @@ class ImageError(Exception):
     """An image that cannot be used.
 
     Attributes:
-        kind: ``image_missing`` or ``image_undecodable``.
+        kind: ``IMAGE_MISSING`` or ``IMAGE_UNDECODABLE``.
         detail: one line with the file.
     """
 
@@ -30,7 +31,7 @@ class ImageError(Exception):
 
 
 def read_grey(path: Path) -> Image:
-    """An image (height, width) uint8: 16 bits are scaled to 8, colour to grey.
+    """Read an image file as (height, width) uint8; 16 bits are scaled to 8, colour is converted to grey.
 
     Raises:
         ImageError: if the file is missing, truncated or damaged.
@@ -38,35 +39,35 @@ def read_grey(path: Path) -> Image:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        raise ImageError("image_missing", f"{path} does not exist") from None
+        raise ImageError(EventKind.IMAGE_MISSING, f"{path} does not exist") from None
     except OSError as error:
-        raise ImageError("image_undecodable", f"{path} cannot be read ({error.strerror})") from None
+        raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{path} cannot be read ({error.strerror})") from None
     return decode_grey(data, str(path))
 
 
 def decode_grey(data: bytes, where: str) -> Image:
-    """The image (height, width) uint8 in a PNG, JPEG or what else OpenCV knows.
+    """Decode a PNG, a JPEG or any other format of OpenCV to (height, width) uint8.
 
     Args:
-        data: of the file.
-        where: it is from, for what is told of a fault.
+        data: contents of the file.
+        where: path or other source, for messages.
 
     Raises:
         ImageError: if it is truncated or damaged.
     """
     damage = damage_of(data)
     if damage:
-        raise ImageError("image_undecodable", f"{where} {damage}")
+        raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} {damage}")
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise ImageError("image_undecodable", f"{where} is no image ({error.err})") from None
+        raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} is no image ({error.err})") from None
     if image is None:
-        raise ImageError("image_undecodable", f"{where} is no image")
+        raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} is no image")
     if image.dtype == np.uint16:
         image = np.right_shift(image, 8).astype(np.uint8)
     if image.dtype != np.uint8:
-        raise ImageError("image_undecodable", f"{where} holds {image.dtype} pixels, not 8 or 16 bits")
+        raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} holds {image.dtype} pixels, not 8 or 16 bits")
     if image.ndim == 3:
         codes = {1: None, 3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
         code = codes.get(image.shape[2])
@@ -75,9 +76,9 @@ def decode_grey(data: bytes, where: str) -> Image:
 
 
 def damage_of(data: bytes) -> str | None:
-    """What is wrong with a file's bytes, as the end of a sentence; None if nothing shows.
+    """Describe damage of an image file, to follow its name in a message; None if none is found.
 
-    Decoders fill what is missing with grey and report success, so PNG's chunks and JPEG's end are looked at.
+    Decoders fill missing parts with grey and report success, so PNG chunks and the JPEG end marker are checked.
     """
     if not data:
         return "is empty"

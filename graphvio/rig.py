@@ -1,12 +1,12 @@
-"""The rig: stereo pairs and an IMU, rigidly joined, with everything that calibration knows of them.
+"""The calibrated rig: stereo pairs and an IMU, rigidly mounted.
 
-All extrinsics are ``body_T_cam``. Body is the IMU's frame; a rig without an IMU may choose any. The objects
-check themselves when they are made and are never changed afterwards.
+All extrinsics are ``body_T_cam``. Body is the IMU's frame; a rig without an IMU may choose any. The objects are
+immutable and validate their values on construction.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,10 +38,10 @@ class Camera:
         intrinsics: (4,) ``[fx, fy, cx, cy]``, pixels.
         distortion: (5,), see `graphvio.cameras`; shorter input is filled with zeros.
         body_T_cam: (4, 4), metres.
-        mask: image file whose black pixels are never used (the person's own body or the rig), or None.
+        mask: image file whose black pixels are not used (parts of the rig or of its carrier), or None.
 
     Raises:
-        RigError: if a value is missing, not finite, or impossible.
+        RigError: if a value has the wrong shape, is not finite or out of range.
     """
 
     name: str
@@ -73,7 +73,7 @@ class Camera:
 
     @property
     def focal_px(self) -> float:
-        """Mean focal length, pixels: what one normalised image unit is worth in the middle of the image."""
+        """Mean focal length, pixels: the scale from normalised image units at the image centre."""
         return float(0.5 * (self.intrinsics[0] + self.intrinsics[1]))
 
     @cached_property
@@ -83,22 +83,22 @@ class Camera:
 
     @property
     def model_number(self) -> int:
-        """The model as the kernels of `graphvio.cameras` take it."""
+        """Number of the model in the kernels of `graphvio.cameras`."""
         return MODEL_NAMES[self.model]
 
     def project(self, points: Float) -> tuple[Float, Bool]:
-        """Pixels (N, 2) of points (N, 3) in the camera frame, and whether each is inside the image (N,)."""
+        """Project points (N, 3) of the camera frame: pixels (N, 2), and whether each is inside the image (N,)."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         pixels, valid = project_points(self.model_number, self.intrinsics, self.distortion, points)
         return pixels, valid & self.contains(pixels)
 
     def unproject(self, pixels: Float) -> tuple[Float, Bool]:
-        """Normalised coordinates (N, 2) of pixels (N, 2), and whether each has a ray (N,)."""
+        """Unproject pixels (N, 2): normalised coordinates (N, 2), and whether each pixel has a ray (N,)."""
         pixels = np.ascontiguousarray(pixels, dtype=np.float64)
         return unproject_pixels(self.model_number, self.intrinsics, self.distortion, pixels)
 
     def contains(self, pixels: Float, border_px: float = 0.0) -> Bool:
-        """Whether pixels (N, 2) lie inside the image, at least ``border_px`` from its edge (N,)."""
+        """Test whether pixels (N, 2) are inside the image, at least ``border_px`` from its edge (N,)."""
         width, height = self.size_px
         x, y = pixels[:, 0], pixels[:, 1]
         inside_x = (x >= border_px) & (x <= width - 1 - border_px)
@@ -107,10 +107,15 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class StereoPair:
-    """Two cameras that see the same scene.
+    """Left and right camera with overlapping views.
+
+    Attributes:
+        name: unique in the rig.
+        left: the camera whose corners are tracked.
+        right: the camera in which they are matched.
 
     Raises:
-        RigError: if there is no baseline, or the optical axes disagree by more than 45 degrees.
+        RigError: if the baseline is below 1 mm, or the optical axes are more than 45 degrees apart.
     """
 
     name: str
@@ -133,18 +138,18 @@ class StereoPair:
 
     @cached_property
     def right_T_left(self) -> Float:
-        """``P^s`` of the paper's eq. (2): (4, 4), maps points of the left camera to the right one."""
+        """Transform (4, 4) from left to right camera, ``P^s`` of the paper's eq. (2)."""
         return self.right.cam_T_body @ self.left.body_T_cam
 
     @property
     def baseline_m(self) -> float:
-        """Distance between the two optical centres."""
+        """Distance between the optical centres, metres."""
         return float(np.linalg.norm(self.right_T_left[:3, 3]))
 
 
 @dataclass(frozen=True)
 class Imu:
-    """The inertial sensor, whose frame is the body's.
+    """The inertial sensor; its frame is body.
 
     Attributes:
         rate_hz: nominal rate.
@@ -152,11 +157,10 @@ class Imu:
         gyro_random_walk: bias diffusion, rad/s^2/sqrt(Hz).
         accel_noise_density: white noise, m/s^2/sqrt(Hz).
         accel_random_walk: bias diffusion, m/s^3/sqrt(Hz).
-        time_offset_s: add it to a camera's stamp to get the IMU's stamp of the same instant
-            (``t_imu = t_cam + time_offset``, Kalibr's ``timeshift_cam_imu``).
+        time_offset_s: ``t_imu = t_cam + time_offset``, Kalibr's ``timeshift_cam_imu``.
 
     Raises:
-        RigError: if a density is not positive or a value is not finite.
+        RigError: if the rate or a density is not positive, or a value is not finite.
     """
 
     rate_hz: float = 200.0
@@ -183,7 +187,12 @@ class Imu:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Any number of stereo pairs, and an IMU or None.
+    """Stereo pairs and at most one IMU.
+
+    Attributes:
+        pairs: at least one.
+        imu: None for vision only.
+        name: used in messages and results.
 
     Raises:
         RigError: if there is no pair, or two cameras or pairs share a name.
@@ -191,7 +200,7 @@ class Rig:
 
     pairs: tuple[StereoPair, ...]
     imu: Imu | None = None
-    name: str = field(default="rig")
+    name: str = "rig"
 
     def __post_init__(self) -> None:
         _set(self, "pairs", tuple(self.pairs))
@@ -205,18 +214,21 @@ class Rig:
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """All cameras: left and right of the first pair, then of the next."""
+        """All cameras: left and right of the first pair, then of the second, and so on."""
         return tuple(camera for pair in self.pairs for camera in (pair.left, pair.right))
 
     def left2_T_left1(self, first: int = 0, second: int = 1) -> Float:
-        """``P_12`` of the paper's eq. (1): (4, 4), maps points of the first left camera to the second's."""
+        """Transform (4, 4) from one pair's left camera to another's, ``P_12`` of the paper's eq. (1)."""
         return self.pairs[second].left.cam_T_body @ self.pairs[first].left.body_T_cam
 
     def with_pairs(self, indices: Sequence[int]) -> Rig:
-        """The same rig with only some of its pairs, in the order given.
+        """Select pairs of the rig.
+
+        Args:
+            indices: of the pairs, in the order wanted.
 
         Raises:
-            RigError: if an index does not exist or is there twice.
+            RigError: if an index does not exist or is repeated.
         """
         for index in indices:
             if not 0 <= index < len(self.pairs):
@@ -226,15 +238,15 @@ class Rig:
         return replace(self, pairs=tuple(self.pairs[i] for i in indices))
 
     def without_imu(self) -> Rig:
-        """The same rig, cameras only."""
+        """Drop the IMU."""
         return replace(self, imu=None)
 
 
 def as_written(camera: Camera, body_T_cam: Float) -> Camera:
-    """A camera that has just been made, with exactly the transform (4, 4) that its file holds.
+    """Restore the exact digits of the transform (4, 4) in a camera that was read from a file.
 
-    The constructor makes rotations orthonormal, and so changes the last digit of those that are. What was written is
-    thus read back as it was; a transform that differs by more than rounding stays as the constructor made it.
+    The constructor orthonormalises rotations, which may change the last digit. A transform that differs by more than
+    rounding stays as the constructor made it.
     """
     given = np.array(body_T_cam, dtype=np.float64)
     if np.abs(given - camera.body_T_cam).max() <= _ROUNDING:
@@ -243,10 +255,14 @@ def as_written(camera: Camera, body_T_cam: Float) -> Camera:
 
 
 def checked_transform(matrix: object, where: str) -> Float:
-    """A 4x4 array that is surely a rigid transform; its rotation is made orthonormal to the last digit.
+    """Validate a rigid transform and orthonormalise its rotation.
+
+    Args:
+        matrix: (4, 4).
+        where: start of the error message.
 
     Raises:
-        RigError: if the shape is wrong, a value is not finite, or the rotation is none.
+        RigError: if the shape is wrong, a value is not finite, or the upper left block is no rotation.
     """
     transform = _finite(matrix, (4, 4), where)
     rotation = transform[:3, :3]

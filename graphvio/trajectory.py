@@ -19,10 +19,10 @@ class Trajectory:
 
     Attributes:
         stamps_ns: (N,) int64 nanoseconds, strictly increasing.
-        nav_T_body: (N, 4, 4), metres; "nav" stands for whatever world frame the file is in.
+        nav_T_body: (N, 4, 4), metres; nav may be any world frame.
 
     Raises:
-        TrajectoryError: if the shapes disagree, a value is not finite, or the stamps do not increase.
+        TrajectoryError: if the shapes differ, a value is not finite, or the stamps do not increase.
     """
 
     stamps_ns: Int
@@ -50,17 +50,17 @@ class Trajectory:
 
     @property
     def positions(self) -> Float:
-        """(N, 3) metres in nav."""
+        """Positions (N, 3) in nav, metres."""
         return self.nav_T_body[:, :3, 3]
 
     @property
     def rotations(self) -> Float:
-        """(N, 3, 3) ``nav_R_body``."""
+        """Rotations (N, 3, 3) ``nav_R_body``."""
         return self.nav_T_body[:, :3, :3]
 
     @property
     def distances(self) -> Float:
-        """(N,) metres travelled since the first pose: sums of straight lines from pose to pose."""
+        """Path lengths (N,) from the first pose, metres."""
         return travelled(self.positions)
 
     @property
@@ -69,29 +69,28 @@ class Trajectory:
         return float(self.stamps_ns[-1] - self.stamps_ns[0]) / _NS_PER_S if len(self) else 0.0
 
     def select(self, which: Bool | Int | slice) -> Trajectory:
-        """The poses at some indices, or where a mask (N,) is true."""
+        """Select poses by indices, a slice, or a mask (N,)."""
         return Trajectory(self.stamps_ns[which], self.nav_T_body[which])
 
     def around(self, begin_ns: int, end_ns: int) -> Trajectory:
-        """The poses from ``begin_ns`` to ``end_ns``, and the nearest one before and after, to interpolate with."""
+        """Select the poses from ``begin_ns`` to ``end_ns``, with one more on either side for interpolation."""
         first = int(np.searchsorted(self.stamps_ns, begin_ns, side="right")) - 1
         last = int(np.searchsorted(self.stamps_ns, end_ns)) + 1
         return self.select(slice(max(first, 0), last))
 
     def transformed(self, other_T_nav: Float) -> Trajectory:
-        """The same motion seen from another frame: ``other_T_body`` for ``other_T_nav`` (4, 4)."""
+        """Transform to another world frame by ``other_T_nav`` (4, 4)."""
         return Trajectory(self.stamps_ns, np.asarray(other_T_nav) @ self.nav_T_body)
 
     def at(self, stamps_ns: Int, max_gap_s: float) -> tuple[Trajectory, Bool]:
-        """Poses at other stamps: position on the chord, rotation at constant rate (slerp).
+        """Interpolate poses, linearly in position and by slerp in rotation.
 
         Args:
             stamps_ns: (M,) strictly increasing.
-            max_gap_s: greatest interval between two poses that is bridged.
+            max_gap_s: longest interval between two poses that is bridged, seconds.
 
         Returns:
-            The poses at those stamps that coincide with a pose or lie between two of them, and a mask (M,)
-            that tells which stamps these are.
+            Poses at the stamps that coincide with a pose or lie between two, and a mask (M,) of these stamps.
         """
         stamps = np.asarray(stamps_ns, dtype=np.int64)
         if not len(self):
@@ -115,6 +114,6 @@ class Trajectory:
 
 
 def travelled(positions: Float) -> Float:
-    """Metres (N,) along the line through positions (N, 3)."""
+    """Compute path lengths (N,) along positions (N, 3), metres."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])[: len(positions)]

@@ -59,7 +59,7 @@ def save_trajectory(trajectory: Trajectory, path: str | Path) -> None:
 
 
 def tum_line(stamp_ns: int, nav_T_body: Float) -> str:
-    """One line of a TUM file without its end: equal poses always give equal bytes."""
+    """Format a pose ``nav_T_body`` (4, 4) as a line of a TUM file, without line end."""
     sign = "-" if stamp_ns < 0 else ""
     seconds, nanoseconds = divmod(abs(stamp_ns), _NS_PER_S)
     w, x, y, z = quat_wxyz_from_rotation(np.ascontiguousarray(nav_T_body[:3, :3], dtype=np.float64))
@@ -68,16 +68,16 @@ def tum_line(stamp_ns: int, nav_T_body: Float) -> str:
 
 
 def _fixed(value: float) -> str:
-    """Nine decimals, and never a negative zero."""
+    """Format with nine decimals, without negative zero."""
     text = f"{value:.9f}"
     return text[1:] if text == "-0.000000000" else text
 
 
 def stamp_ns_from_seconds(text: str) -> int:
-    """Nanoseconds of decimal seconds, exactly; digits beyond the ninth are rounded.
+    """Convert decimal seconds to nanoseconds exactly; digits beyond the ninth are rounded.
 
     Raises:
-        ValueError: if the text is no finite number that fits.
+        ValueError: if the text is not a finite number within the range of stamps.
     """
     try:
         stamp = Decimal(text).scaleb(9)
@@ -126,7 +126,7 @@ def _load_text(path: Path) -> Trajectory:
 
 
 def _load_kitti(path: Path, rows: Sequence[tuple[int, Sequence[str], bool]]) -> Trajectory:
-    """KITTI odometry's poses, upper 3x4 blocks by rows, with the stamps of their sequence's ``times.txt``."""
+    """Read KITTI odometry poses, upper 3x4 blocks by rows, with the stamps of the sequence's ``times.txt``."""
     places = (path.with_name("times.txt"), path.parent.parent / "sequences" / path.stem / "times.txt")
     times = next((place for place in places if place.is_file()), None)
     if times is None:

@@ -1,17 +1,16 @@
-"""How far an estimated trajectory is from the truth.
+"""Error of estimated trajectories against the truth.
 
-Definitions, so that a figure means the same to everybody:
+Definitions:
 
-- *Association*: truth is interpolated to the estimate's stamps (chord, slerp) where two true poses at most
-  ``max_gap_s`` apart enclose the stamp; all other estimates are left out and counted.
-- *ATE*: distance between positions, and angle between rotations, after one SE(3) alignment of all associated
+- *Association*: truth is interpolated to the estimate's stamps (linearly, slerp) between true poses at most
+  ``max_gap_s`` apart; other estimates are left out and counted.
+- *ATE*: distance between positions, and angle between rotations, after SE(3) alignment of all associated
   positions (Umeyama's least squares without scale).
-- *RPE* over 1 s, or over so many metres along the truth: error of the motion from each pose to the pose that
-  is nearest to that distance (within a tenth of it). Over 100 to 800 m these are KITTI's segments.
-- *Drift*: the estimate is aligned over its beginning (the first 5 % of the path and at least 2 s, by position
-  and rotation); the position error of the last pose, in percent of the path. ``ate_percent`` is ATE rmse,
-  likewise.
-- *Loop closure*, where truth walks at least 4 m and ends within 1 m of its start: estimated minus true
+- *RPE* over 1 s, or a distance along the truth: error of the motion from each pose to the pose nearest to that
+  distance (within a tenth of it). Over 100 to 800 m these are KITTI's segments.
+- *Drift*: position error of the last pose with the start aligned by position and rotation (the first 5 % of the path
+  and at least 2 s), in percent of the path. ``ate_percent`` is ATE rmse in percent of the path.
+- *Loop-closure error*, where the truth is at least 4 m long and ends within 1 m of its start: estimated minus true
   displacement from start to end.
 
 Lengths are of the associated truth.
@@ -49,7 +48,7 @@ _NS_PER_S = 1e9
 
 @dataclass(frozen=True)
 class LoopClosure:
-    """Difference between the estimated and the true displacement from start to end."""
+    """Error of the displacement from start to end, in metres and in percent of the path."""
 
     error_m: float
     error_percent: float
@@ -57,23 +56,23 @@ class LoopClosure:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """An estimate measured against the truth; the module's text defines each figure.
+    """Error of an estimate against the truth; the module defines each figure.
 
     Attributes:
-        associated: estimates that have a true pose.
-        estimates: all estimates.
+        associated: number of estimates that have a true pose.
+        estimates: number of all estimates.
         duration_s: from the first to the last associated stamp.
-        path_length_m: length of the truth in between.
+        path_length_m: of the truth in between.
         ate_position_m: metres.
         ate_rotation_deg: degrees.
-        ate_percent: ATE rmse in percent of the path; None where there is no path (under 0.1 m).
-        drift_m: position error at the end when aligned at the start.
-        drift_percent: the same in percent of the path; None where there is no path.
-        loop_closure: None where the truth does not end where it began.
-        rpe: ``1 s``, ``1 m``, ``5 m``... -> error; only distances that the trajectory is long enough for.
+        ate_percent: ATE rmse in percent of the path; None for paths under 0.1 m.
+        drift_m: position error at the end with the start aligned.
+        drift_percent: the same in percent of the path; None for paths under 0.1 m.
+        loop_closure: None where the truth does not return to its start.
+        rpe: ``1 s``, ``1 m``, ``5 m``... -> error, for distances within the path's length.
         kitti_percent: mean over all segments of 100 to 800 m, or None.
         kitti_deg_per_m: mean over all segments of 100 to 800 m, or None.
-        truth_T_nav: (4, 4) the alignment that ATE uses.
+        truth_T_nav: (4, 4) alignment of the ATE.
         stamps_ns: (associated,) stamps.
         position_error_m: (associated,) after alignment.
         rotation_error_deg: (associated,) after alignment.
@@ -102,7 +101,7 @@ class Evaluation:
     truth: Trajectory
 
     def as_dict(self) -> dict[str, Any]:
-        """All figures, without the series, as JSON can hold them."""
+        """Convert all figures, without the series, to values of JSON."""
         figures = {name: value for name, value in vars(self).items() if name not in _SERIES}
         figures["ate_position_m"] = asdict(self.ate_position_m)
         figures["ate_rotation_deg"] = asdict(self.ate_rotation_deg)
@@ -116,12 +115,12 @@ _SERIES = ("stamps_ns", "position_error_m", "rotation_error_deg", "aligned", "tr
 
 
 def evaluate(estimate: Trajectory, truth: Trajectory, max_gap_s: float = MAX_GAP_S) -> Evaluation:
-    """Measure an estimate against the truth.
+    """Evaluate an estimate against the truth.
 
     Args:
-        estimate: poses of body in nav. Poses of several epochs are aligned as one: a break counts as error.
+        estimate: poses of body in nav. All epochs are aligned as one, so that a break counts as error.
         truth: poses of body in any fixed frame, on the same clock.
-        max_gap_s: greatest interval of the truth that is bridged by interpolation, seconds.
+        max_gap_s: longest interval of the truth that is bridged by interpolation, seconds.
 
     Raises:
         TrajectoryError: if fewer than 3 estimates have a true pose.
@@ -162,13 +161,13 @@ def evaluate(estimate: Trajectory, truth: Trajectory, max_gap_s: float = MAX_GAP
 
 @dataclass(frozen=True)
 class Compared:
-    """One of the results.
+    """One of several results that are compared.
 
     Attributes:
-        name: of it.
-        evaluation: against the truth, or None where they could not be compared.
-        why_not: why they could not, or empty.
-        ate_ratio: position's ATE rmse over the first comparable result's.
+        name: of the result.
+        evaluation: against the truth, or None where that failed.
+        why_not: reason of the failure, or empty.
+        ate_ratio: ATE rmse of position relative to the first result that could be evaluated.
     """
 
     name: str
@@ -178,32 +177,32 @@ class Compared:
 
     @property
     def ate_m(self) -> float:
-        """Position's ATE rmse; infinite where there is none."""
+        """ATE rmse of position, metres; infinite where there is none."""
         return np.inf if self.evaluation is None else self.evaluation.ate_position_m.rmse
 
 
 def compare(
     names: Sequence[str], results: Sequence[Trajectory], truth: Trajectory, max_gap_s: float = MAX_GAP_S
 ) -> list[Compared]:
-    """Measure each result by the same truth; one that cannot be compared does not stop the others.
+    """Evaluate several results against the same truth; one that fails does not affect the others.
 
     Args:
-        names: (N) of the results.
+        names: of the N results.
         results: N trajectories of body.
-        truth: that all are held against.
-        max_gap_s: greatest interval of the truth that is interpolated.
+        truth: see `evaluate`.
+        max_gap_s: see `evaluate`.
     """
-    made: list[Compared] = []
+    compared: list[Compared] = []
     for name, result in zip(names, results, strict=True):
         try:
             evaluation = evaluate(result, truth, max_gap_s)
         except TrajectoryError as error:
-            made.append(Compared(name, None, str(error), None))
+            compared.append(Compared(name, None, str(error), None))
             continue
-        first = next((each.ate_m for each in made if each.evaluation is not None), evaluation.ate_position_m.rmse)
+        first = next((each.ate_m for each in compared if each.evaluation is not None), evaluation.ate_position_m.rmse)
         ratio = evaluation.ate_position_m.rmse / first if first > 0.0 else None
-        made.append(Compared(name, evaluation, "", ratio))
-    return made
+        compared.append(Compared(name, evaluation, "", ratio))
+    return compared
 
 
 def _percent(error_m: float, path_m: float) -> float | None:

@@ -1,4 +1,4 @@
-"""The measures that `graphvio.evaluation` is made of: alignment, statistics, errors of relative motions."""
+"""Alignment of trajectories, statistics of errors, and errors of relative motions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Stats:
 
     @staticmethod
     def of(errors: Float) -> Stats:
-        """Of errors (N,), N at least 1."""
+        """Compute the statistics of errors (N,), N at least 1."""
         return Stats(
             rmse=float(np.sqrt(np.mean(errors**2))),
             mean=float(errors.mean()),
@@ -41,14 +41,14 @@ class Stats:
 
 @dataclass(frozen=True)
 class RelativeError:
-    """Error of the motion over one distance.
+    """Relative pose error (RPE) over one distance or duration.
 
     Attributes:
-        pairs: number of motions compared.
+        pairs: number of motions.
         position_m: metres.
         rotation_deg: degrees.
-        percent: mean position error in percent of the distance walked; None for a distance in time.
-        deg_per_m: mean rotation error by distance walked; None for a distance in time.
+        percent: mean position error in percent of the distance; None for a duration.
+        deg_per_m: mean rotation error by distance; None for a duration.
     """
 
     pairs: int
@@ -59,9 +59,9 @@ class RelativeError:
 
 
 def umeyama_se3(source: Float, target: Float) -> Float:
-    """Least-squares ``target_T_source`` (4, 4), without scale, of corresponding points (N, 3).
+    """Compute least-squares ``target_T_source`` (4, 4), without scale, of corresponding points (N, 3).
 
-    Points on one line leave the turn around it undefined: see `align`.
+    Points on one line leave the rotation about it undefined: see `align`.
     Reference: S. Umeyama, *Least-squares estimation of transformation parameters between two point patterns*,
     PAMI 13(4), 1991.
     """
@@ -71,10 +71,10 @@ def umeyama_se3(source: Float, target: Float) -> Float:
 
 
 def align(estimate: Trajectory, truth: Trajectory) -> Float:
-    """``truth_T_nav`` (4, 4) by Umeyama's method over poses of equal stamps.
+    """Compute ``truth_T_nav`` (4, 4) by Umeyama's method from poses of equal stamps.
 
-    Where truth stays within a centimetre of one line, positions do not define a rotation: the rotations then
-    help, as in `align_with_rotations`.
+    Where the truth stays within a centimetre of one line, positions do not define a rotation and
+    `align_with_rotations` is used.
     """
     centred = truth.positions - truth.positions.mean(axis=0)
     spread = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(truth))
@@ -84,33 +84,41 @@ def align(estimate: Trajectory, truth: Trajectory) -> Float:
 
 
 def align_with_rotations(estimate: Trajectory, truth: Trajectory) -> Float:
-    """``truth_T_nav`` (4, 4) by positions and rotations of poses of equal stamps.
+    """Compute ``truth_T_nav`` (4, 4) from positions and rotations of poses of equal stamps.
 
-    A rotation counts like points 1 m along the body's axes, so that the result is defined even at rest.
+    A rotation counts like points 1 m along the body's axes, so that the result is defined at standstill, too.
     """
     p, q = estimate.positions, truth.positions
     p_mean, q_mean = p.mean(axis=0), q.mean(axis=0)
     spread = (q - q_mean).T @ (p - p_mean)
-    turn = np.einsum("nij,nkj->ik", truth.rotations, estimate.rotations)
-    rotation = _nearest_rotation(spread + _LEVER_M**2 * turn)
+    rotations = np.einsum("nij,nkj->ik", truth.rotations, estimate.rotations)
+    rotation = _nearest_rotation(spread + _LEVER_M**2 * rotations)
     return np.asarray(se3(rotation, q_mean - rotation @ p_mean))
 
 
 def _nearest_rotation(correlation: Float) -> Float:
-    """Rotation R (3, 3) with the greatest trace(R^T C)."""
+    """Rotation R (3, 3) of maximal trace(R^T C)."""
     u, _, vt = np.linalg.svd(correlation)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     return np.ascontiguousarray((u * sign) @ vt)
 
 
 def angle_between(first: Float, second: Float) -> Float:
-    """Angles (N,) between rotations (N, 3, 3), radians; precise near zero, where the trace is not."""
+    """Compute angles (N,) between rotations (N, 3, 3), radians; unlike by the trace, also precise near zero."""
     chord = np.linalg.norm(first - second, axis=(1, 2))
     return np.asarray(2.0 * np.arcsin(np.minimum(chord / np.sqrt(8.0), 1.0)))
 
 
 def relative_errors(estimate: Trajectory, truth: Trajectory) -> tuple[dict[str, RelativeError], Float]:
-    """RPE by distance, and (percent, degrees per metre) of all of KITTI's segments (N, 2)."""
+    """Compute relative errors of poses of equal stamps.
+
+    Args:
+        estimate: N poses.
+        truth: N poses.
+
+    Returns:
+        RPE by name of the distance, and percent and degrees per metre (M, 2) of all KITTI segments.
+    """
     seconds = (truth.stamps_ns - truth.stamps_ns[0]) / _NS_PER_S
     distances = truth.distances
     errors: dict[str, RelativeError] = {}
@@ -126,8 +134,8 @@ def relative_errors(estimate: Trajectory, truth: Trajectory) -> tuple[dict[str, 
         position, rotation = _motion_errors(estimate, truth, pairs)
         if not len(position):
             continue
-        walked = distances[pairs[:, 1]] - distances[pairs[:, 0]]
-        percent, deg_per_m = 100.0 * position / walked, rotation / walked
+        travelled_m = distances[pairs[:, 1]] - distances[pairs[:, 0]]
+        percent, deg_per_m = 100.0 * position / travelled_m, rotation / travelled_m
         errors[f"{length:g} m"] = RelativeError(
             len(position), Stats.of(position), Stats.of(rotation), float(percent.mean()), float(deg_per_m.mean())
         )
@@ -137,26 +145,26 @@ def relative_errors(estimate: Trajectory, truth: Trajectory) -> tuple[dict[str, 
 
 
 def _pairs(along: Float, length: float) -> Int:
-    """Indices (N, 2) of poses ``length`` apart on an increasing measure (M,): one pair for each beginning."""
+    """Indices (N, 2) of poses ``length`` apart along an increasing measure (M,), one pair for each first pose."""
     goal = along + length
     after = np.clip(np.searchsorted(along, goal), 1, len(along) - 1)
     nearest = np.where(goal - along[after - 1] <= along[after] - goal, after - 1, after)
-    nearest = np.searchsorted(along, along[nearest])  # of poses at one place, the first
+    nearest = np.searchsorted(along, along[nearest])  # the first of those at the same position
     begin = np.arange(len(along))
     good = (nearest > begin) & (np.abs(along[nearest] - goal) <= _RPE_TOLERANCE * length)
     return np.column_stack([begin[good], nearest[good]])
 
 
 def _motion_errors(estimate: Trajectory, truth: Trajectory, pairs: Int) -> tuple[Float, Float]:
-    """Metres (N,) and degrees (N,) by which the motions of pairs (N, 2) differ."""
+    """Errors of the motions of pairs (N, 2): metres (N,) and degrees (N,)."""
     if not len(pairs):
         return np.empty(0), np.empty(0)
-    began, ended = pairs[:, 0], pairs[:, 1]
+    first, last = pairs[:, 0], pairs[:, 1]
 
     def motion(trajectory: Trajectory) -> tuple[Float, Float]:
-        to_body = trajectory.rotations[began].transpose(0, 2, 1)
-        step = trajectory.positions[ended] - trajectory.positions[began]
-        return (to_body @ step[:, :, None])[:, :, 0], to_body @ trajectory.rotations[ended]
+        to_body = trajectory.rotations[first].transpose(0, 2, 1)
+        step = trajectory.positions[last] - trajectory.positions[first]
+        return (to_body @ step[:, :, None])[:, :, 0], to_body @ trajectory.rotations[last]
 
     (step, turn), (true_step, true_turn) = motion(estimate), motion(truth)
     return np.linalg.norm(step - true_step, axis=1), np.rad2deg(angle_between(true_turn, turn))

@@ -1,8 +1,8 @@
 """Calibration of an EuRoC/ASL folder: ``cam0/sensor.yaml``, ``cam1/sensor.yaml`` ..., ``imu0/sensor.yaml``.
 
-``T_BS`` is the pose of the sensor in the body's frame. Where the IMU's is not the identity, everything is
-moved into the IMU's frame, which is graphvio's body. TUM-VI's export has the same folders but may leave the
-calibration to ``dso/camchain.yaml`` and ``dso/imu_config.yaml`` next to ``mav0``.
+``T_BS`` is the pose of the sensor in the file's body frame. Where the IMU's is not the identity, all extrinsics are
+transformed to the IMU's frame, which is graphvio's body. TUM-VI exports have the same folders but may have the
+calibration in ``dso/camchain.yaml`` and ``dso/imu_config.yaml`` next to ``mav0``.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _CAMERA_KEYS = ("T_BS", "resolution", "intrinsics", "distortion_model", "distort
 
 
 def load(path: Path) -> Rig:
-    """Read the calibration of a folder that is ``mav0``, or holds it.
+    """Read the calibration in ``mav0`` or the folder that contains it.
 
     Cameras 0 and 1 form the first pair, 2 and 3 the next. Without a folder ``imu0`` the rig has no IMU.
 
     Raises:
-        RigError: if a file or value is missing or describes no usable rig.
+        RigError: if a file or value is missing, or they do not describe a usable rig.
     """
     root = sensors_folder(path)
     if root is None:
@@ -54,7 +54,7 @@ def load(path: Path) -> Rig:
 
 
 def sensors_folder(path: Path) -> Path | None:
-    """The folder with ``cam0``: the given one or its ``mav0``; None where neither is."""
+    """Find the folder with ``cam0``: ``path`` or its ``mav0``; None if neither is."""
     for folder in (path / "mav0", path):
         if camera_folders(folder):
             return folder
@@ -62,7 +62,7 @@ def sensors_folder(path: Path) -> Path | None:
 
 
 def camera_folders(root: Path) -> list[Path]:
-    """``cam0``, ``cam1`` ... by number."""
+    """List the folders ``cam0``, ``cam1`` ... by number."""
     if not root.is_dir():
         return []
     folders = [p for p in root.iterdir() if re.fullmatch(r"cam\d+", p.name) and p.is_dir()]
@@ -70,16 +70,12 @@ def camera_folders(root: Path) -> list[Path]:
 
 
 def _camera(name: str, section: Section, imu_T_body: Float) -> Camera:
-    if section.values.get("camera_model", "pinhole") != "pinhole":
-        raise RigError(
-            f"{section.where('camera_model')}: is {section.text('camera_model')!r}; graphvio knows pinhole, "
-            "with distortion_model radial-tangential or equidistant"
-        )
+    model = kalibr.model_of(section)
     with named(section.file):
         body_T_cam = checked_transform(section.matrix("T_BS"), section.where("T_BS"))
         return Camera(
             name=name,
-            model=kalibr.model_name(section, "distortion_model"),
+            model=model,
             size_px=section.size("resolution"),
             intrinsics=section.array("intrinsics", (4,)),
             distortion=section.array("distortion_coefficients"),
@@ -103,7 +99,7 @@ def _from_chain(chain: Path, names: list[str], has_imu: bool, name: str) -> Rig:
 
 def _sensor(folder: Path) -> Section:
     file = folder / "sensor.yaml"
-    if not file.is_file():  # every value is then missing, and the first that is asked for says so
+    if not file.is_file():  # the error then names the first value that is missing
         return Section({}, file)
     return read_yaml(file)
 

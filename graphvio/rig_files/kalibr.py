@@ -1,7 +1,7 @@
 """Kalibr's ``camchain-imucam.yaml`` with the ``imu.yaml`` next to it, and a camera-only ``camchain.yaml``.
 
-Kalibr writes ``T_cam_imu``, which maps points of the IMU's frame to the camera's, so ``body_T_cam`` is its
-inverse; and ``timeshift_cam_imu`` with ``t_imu = t_cam + timeshift``, graphvio's own sign.
+Kalibr's ``T_cam_imu`` maps points from the IMU's frame to the camera's, so ``body_T_cam`` is its inverse;
+``timeshift_cam_imu`` has graphvio's sign, ``t_imu = t_cam + timeshift``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from graphvio.geometry import se3_inverse
 from graphvio.rig import Camera, Imu, Rig, checked_transform
 from graphvio.rig_files.reading import NOISE_KEYS, Section, consecutive_pairs, named, read_yaml
 
-MODELS = {
+_MODELS = {
     "radtan": "radial-tangential",
     "radial-tangential": "radial-tangential",
     "plumb_bob": "radial-tangential",
@@ -25,31 +25,24 @@ MODELS = {
     "equidistant": "equidistant",
     "equi": "equidistant",
 }
-"""Name of a distortion model in others' files -> graphvio's."""
-IMU_KEYS = dict(
-    zip(
-        NOISE_KEYS,
-        (
-            "gyroscope_noise_density",
-            "gyroscope_random_walk",
-            "accelerometer_noise_density",
-            "accelerometer_random_walk",
-        ),
-        strict=True,
-    )
-)
-"""graphvio's name of a noise density -> Kalibr's and EuRoC's."""
-_MAX_SPREAD_S = 5e-3
+"""Distortion model in files of Kalibr, EuRoC and ROS -> graphvio's name."""
+IMU_KEYS = {
+    "gyro_noise_density": "gyroscope_noise_density",
+    "gyro_random_walk": "gyroscope_random_walk",
+    "accel_noise_density": "accelerometer_noise_density",
+    "accel_random_walk": "accelerometer_random_walk",
+}
+"""graphvio's name of a noise density -> Kalibr's and EuRoC's key."""
+_MAX_TIME_SHIFT_SPREAD_S = 5e-3
 
 
 def load(path: Path) -> Rig:
-    """Read a camera chain; with ``T_cam_imu`` in it, also the IMU's file from the same folder.
+    """Read a camera chain, and if it has ``T_cam_imu`` the IMU's file from the same folder.
 
-    Cameras 0 and 1 form the first pair, 2 and 3 the next. Without ``T_cam_imu`` the rig has no
-    IMU, and body is cam0.
+    Cameras 0 and 1 form the first pair, 2 and 3 the next. Without ``T_cam_imu`` the rig has no IMU, and body is cam0.
 
     Raises:
-        RigError: if a file cannot be read, lacks a value or describes no usable rig.
+        RigError: if a file cannot be read or lacks a value, or they do not describe a usable rig.
     """
     document = read_yaml(path)
     names = camera_names(document)
@@ -62,13 +55,13 @@ def load(path: Path) -> Rig:
 
 
 def camera_names(document: Section) -> list[str]:
-    """``cam0``, ``cam1`` ... of a chain, by number."""
+    """List the cameras ``cam0``, ``cam1`` ... of a chain by number."""
     names = [key for key in document.values if re.fullmatch(r"cam\d+", str(key))]
     return sorted(names, key=lambda name: int(name[3:]))
 
 
 def cameras_of(document: Section) -> list[Camera]:
-    """All cameras of a chain."""
+    """Read all cameras of a chain."""
     cameras: list[Camera] = []
     previous_T_body = np.eye(4)
     for index, name in enumerate(camera_names(document)):
@@ -77,7 +70,7 @@ def cameras_of(document: Section) -> list[Camera]:
         cameras.append(
             Camera(
                 name=name,
-                model=_model(section),
+                model=model_of(section),
                 size_px=section.size("resolution"),
                 intrinsics=section.array("intrinsics", (4,)),
                 distortion=_distortion(section),
@@ -89,10 +82,14 @@ def cameras_of(document: Section) -> list[Camera]:
 
 
 def imu_of(path: Path, time_offset_s: float) -> Imu:
-    """The IMU of Kalibr's ``imu.yaml``, flat or under ``imu0``.
+    """Read the IMU in Kalibr's ``imu.yaml``, flat or under ``imu0``.
+
+    Args:
+        path: of the file.
+        time_offset_s: from the camera chain.
 
     Raises:
-        RigError: if a noise value is missing, or the file sets body apart from the IMU.
+        RigError: if a noise value is missing, or body is not the IMU's frame.
     """
     section = read_yaml(path)
     if isinstance(section.values.get("imu0"), dict):
@@ -104,7 +101,7 @@ def imu_of(path: Path, time_offset_s: float) -> Imu:
 
 
 def time_offset_of(document: Section) -> float:
-    """Mean of the cameras' ``timeshift_cam_imu``: seconds to add to a camera's stamp; 0 where none is given.
+    """Compute the mean of the cameras' ``timeshift_cam_imu``, seconds; 0 where none is given.
 
     Raises:
         RigError: if the cameras disagree by more than 5 ms.
@@ -112,7 +109,7 @@ def time_offset_of(document: Section) -> float:
     sections = [document.section(name) for name in camera_names(document)]
     shifts = [section.number("timeshift_cam_imu", 0.0) for section in sections]
     spread = max(shifts, default=0.0) - min(shifts, default=0.0)
-    if spread > _MAX_SPREAD_S:
+    if spread > _MAX_TIME_SHIFT_SPREAD_S:
         raise RigError(
             f"{document.file}: timeshift_cam_imu differs by {1e3 * spread:.1f} ms between "
             "cameras; graphvio needs cameras that are triggered together: synchronise them or correct "
@@ -122,10 +119,10 @@ def time_offset_of(document: Section) -> float:
 
 
 def find_imu_file(camchain: Path) -> Path:
-    """The IMU's file next to a camera chain.
+    """Find the IMU's file next to a camera chain.
 
     Raises:
-        RigError: if there is none, or no telling which.
+        RigError: if there is none, or there are several candidates.
     """
     stem = camchain.name
     likely = [stem.replace("camchain-imucam", "imu"), stem.replace("camchain", "imu")]
@@ -143,33 +140,29 @@ def find_imu_file(camchain: Path) -> Path:
     )
 
 
+def model_of(section: Section) -> str:
+    """Read a camera's model as graphvio's name.
+
+    Raises:
+        RigError: if it is missing or not supported.
+    """
+    if section.values.get("camera_model", "pinhole") != "pinhole":
+        raise RigError(
+            f"{section.where('camera_model')}: is {section.text('camera_model')!r}; calibrate with pinhole and the "
+            "distortion model radial-tangential (radtan) or equidistant (equi)"
+        )
+    name = section.text("distortion_model")
+    if name not in _MODELS:
+        raise RigError(f"{section.where('distortion_model')}: unknown model {name!r}; use one of {', '.join(_MODELS)}")
+    return _MODELS[name]
+
+
 def _cam_T_body(section: Section, previous_T_body: Float, first: bool) -> Float:
     if section.values.get("T_cam_imu") is not None:
         return checked_transform(section.matrix("T_cam_imu"), section.where("T_cam_imu"))
     if first:
         return np.eye(4)
     return checked_transform(section.matrix("T_cn_cnm1"), section.where("T_cn_cnm1")) @ previous_T_body
-
-
-def _model(section: Section) -> str:
-    if section.values.get("camera_model", "pinhole") != "pinhole":
-        raise RigError(
-            f"{section.where('camera_model')}: is {section.text('camera_model')!r}; calibrate with "
-            "pinhole-radtan or pinhole-equi"
-        )
-    return model_name(section, "distortion_model")
-
-
-def model_name(section: Section, key: str) -> str:
-    """graphvio's name of the distortion model under a key.
-
-    Raises:
-        RigError: if it is missing or not known.
-    """
-    name = section.text(key)
-    if name not in MODELS:
-        raise RigError(f"{section.where(key)}: unknown model {name!r}; use one of {', '.join(MODELS)}")
-    return MODELS[name]
 
 
 def _distortion(section: Section) -> Float:

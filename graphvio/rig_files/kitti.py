@@ -1,8 +1,8 @@
-"""Calibration of KITTI: odometry's ``calib.txt`` (P0 to P3) and raw's ``calib_cam_to_cam.txt``.
+"""KITTI calibration: ``calib.txt`` (P0 to P3) of the odometry benchmark and ``calib_cam_to_cam.txt`` of raw drives.
 
 Both describe rectified images, ``P_i = K_i [1 | t_i]`` with ``X_cam_i = X_cam0 + t_i``. Body is the rectified
-grey left camera, which is also the frame of the benchmark's poses. The grey pair (0, 1) is used;
-where a recording has only the colour images, the pair (2, 3) is.
+grey left camera, which is also the frame of the benchmark's poses. The grey pair (0, 1) is used, or the colour pair
+(2, 3) where a recording has only that.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ _PAIRS = (("grey", 0, 1), ("colour", 2, 3))
 
 
 def load_odometry(file: Path) -> Rig:
-    """Read ``calib.txt``; the size of the images, which it lacks, comes from the image folders next to it.
+    """Read ``calib.txt``; the image size, which it lacks, is that of the images next to it.
 
     Raises:
-        RigError: if a projection or the images are missing, or they describe no usable rig.
+        RigError: if a projection or the images are missing, or they do not describe a usable rig.
     """
     folder = file.parent
     name, left, right = pair_of([p.name for p in folder.iterdir() if p.is_dir()] if folder.is_dir() else [], "image_{}")
     size = _png_size(folder / f"image_{left}")
     if size is None:
         raise RigError(
-            f"{file}: says nothing of the image size, and {folder / f'image_{left}'} holds no PNG to take it "
-            "from; put it next to the image folders, or write a rig.yaml"
+            f"{file}: has no image size, and {folder / f'image_{left}'} holds no PNG to take it from; put it next "
+            "to the image folders, or write a rig.yaml"
         )
     entries = _entries(file)
     with named(file):
@@ -47,10 +47,10 @@ def load_raw(file: Path, drive: Path | None = None) -> Rig:
 
     Args:
         file: the calibration.
-        drive: folder with ``image_00`` ..., which says whether it is grey; None takes the grey pair.
+        drive: folder with ``image_00`` ..., from which the pair is chosen; None takes the grey pair.
 
     Raises:
-        RigError: if a projection or size is missing, or they describe no usable rig.
+        RigError: if a projection or size is missing, or they do not describe a usable rig.
     """
     folders = [p.name for p in drive.iterdir() if p.is_dir()] if drive is not None else []
     name, left, right = pair_of(folders, "image_{:02d}")
@@ -65,7 +65,7 @@ def load_raw(file: Path, drive: Path | None = None) -> Rig:
 
 
 def pair_of(folders: list[str], pattern: str) -> tuple[str, int, int]:
-    """The pair to use, ``(name, left, right)``: the first whose two image folders exist, or the grey one."""
+    """Choose the pair ``(name, left, right)``: the first whose two image folders exist, or the grey one."""
     for pair in _PAIRS:
         if pattern.format(pair[1]) in folders and pattern.format(pair[2]) in folders:
             return pair
@@ -73,7 +73,7 @@ def pair_of(folders: list[str], pattern: str) -> tuple[str, int, int]:
 
 
 def raw_calibration_of(drive: Path) -> Path | None:
-    """``calib_cam_to_cam.txt`` in a drive's folder or in the folder of its day; None where neither has it."""
+    """Find ``calib_cam_to_cam.txt`` in a drive's folder or the folder of its day; None if neither has it."""
     drive = drive.resolve()
     for folder in (drive, drive.parent):
         if (folder / RAW_FILE).is_file():

@@ -1,4 +1,4 @@
-"""Finds the calibration in a file or folder, and the reader for its format."""
+"""Reads a rig from a calibration file or folder of any supported format."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from graphvio.rig import Rig
 from graphvio.rig_files import euroc, kalibr, kitti, native
 from graphvio.rig_files.reading import read_yaml
 
-_KNOWN = (
+_FORMATS = (
     "rig.yaml, Kalibr's camchain-imucam.yaml, an EuRoC/ASL folder (mav0), KITTI's calib.txt or calib_cam_to_cam.txt"
 )
 
 
 def load_rig(path: str | Path) -> Rig:
-    """Read a rig from a calibration file, or from the folder of a recording that carries one.
+    """Read a rig from a calibration file, or from the folder of a recording that holds one.
 
     Args:
         path: ``rig.yaml``, a Kalibr camera chain, a ``sensor.yaml`` of an EuRoC/ASL folder, KITTI's
-            ``calib.txt`` or ``calib_cam_to_cam.txt``; or a folder, in which a ``rig.yaml`` goes first.
+            ``calib.txt`` or ``calib_cam_to_cam.txt``; or a folder, in which ``rig.yaml`` takes precedence.
 
     Raises:
-        RigError: if there is no such file, it cannot be read, or it describes no usable rig.
+        RigError: if there is no such file, it cannot be read, or it does not describe a usable rig.
     """
     path = Path(path)
     try:
@@ -35,10 +35,10 @@ def _load(path: Path) -> Rig:
     if path.is_dir():
         rig = find_rig(path)
         if rig is None:
-            raise RigError(f"{path}: holds no calibration that graphvio knows; give one of: {_KNOWN}")
+            raise RigError(f"{path}: holds no calibration that graphvio knows; give one of: {_FORMATS}")
         return rig
     if not path.exists():
-        raise RigError(f"{path}: does not exist; give one of: {_KNOWN}")
+        raise RigError(f"{path}: does not exist; give one of: {_FORMATS}")
     if path.name == kitti.RAW_FILE:
         return kitti.load_raw(path)
     if path.suffix == ".txt":
@@ -46,7 +46,7 @@ def _load(path: Path) -> Rig:
     if path.name == "sensor.yaml":
         return euroc.load(path.parent.parent)
     if path.suffix not in (".yaml", ".yml"):
-        raise RigError(f"{path}: is no calibration file that graphvio knows; give one of: {_KNOWN}")
+        raise RigError(f"{path}: is no calibration file that graphvio knows; give one of: {_FORMATS}")
     document = read_yaml(path)
     if native.VERSION_KEY not in document.values and kalibr.camera_names(document):
         return kalibr.load(path)
@@ -54,10 +54,10 @@ def _load(path: Path) -> Rig:
 
 
 def find_rig(folder: Path) -> Rig | None:
-    """The rig that a recording's folder carries; None if it carries none.
+    """Read the rig in the folder of a recording; None if there is none.
 
     Raises:
-        RigError: if it carries one that is not usable.
+        RigError: if there is one that is not usable.
     """
     sensors = euroc.sensors_folder(folder)
     places = [folder] if sensors is None else [folder, sensors]

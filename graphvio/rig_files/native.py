@@ -26,13 +26,17 @@ def load(path: Path) -> Rig:
     """Read a ``rig.yaml``.
 
     Raises:
-        RigError: if it cannot be read, holds an unknown key or an impossible value, or lacks one.
+        RigError: if it cannot be read, lacks a value, or has an unknown key or an invalid value.
     """
     return _rig(read_yaml(path), path)
 
 
 def parse(text: str, path: Path) -> Rig:
-    """The rig in the text of a ``rig.yaml``, which came from a file that holds other things, too.
+    """Read a rig from the text of a ``rig.yaml`` that is embedded in another file.
+
+    Args:
+        text: of the ``rig.yaml``.
+        path: of the other file, for messages.
 
     Raises:
         RigError: as `load`.
@@ -73,7 +77,7 @@ def save_rig(rig: Rig, path: str | Path) -> None:
 
 
 def to_text(rig: Rig, folder: Path) -> str:
-    """The text of a ``rig.yaml`` in a folder, to which masks are relative where they lie in it."""
+    """Format a rig as ``rig.yaml`` for a folder; paths of masks inside the folder are relative to it."""
     lines = [
         "# A rig of stereo pairs. Metres, radians, seconds, pixels; body is the frame of the IMU.",
         f"{VERSION_KEY}: {VERSION}",
@@ -151,11 +155,11 @@ def _numbers(values: Iterable[float]) -> str:
 def _number(value: float) -> str:
     text = repr(float(value))  # the shortest text that reads back exactly
     if "e" in text and "." not in text:
-        text = text.replace("e", ".0e")  # YAML 1.1 reads 1e-05 as a text
+        text = text.replace("e", ".0e")  # YAML 1.1 reads 1e-05 as a string
     return text
 
 
 def _quoted(text: str) -> str:
-    """A YAML text in double quotes; what no editor would show is escaped."""
+    """Quote a YAML string; characters that are not printable are escaped."""
     shown = [c if c.isprintable() and c not in '"\\' else f"\\U{ord(c):08x}" for c in text]
     return f'"{"".join(shown)}"'

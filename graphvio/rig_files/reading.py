@@ -1,4 +1,4 @@
-"""Reading calibration files: YAML in which every value knows its file and key, so that errors say where."""
+"""YAML of calibration files as sections that include file and key in their errors."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _DEFAULTS = {f.name: f.default for f in fields(Imu)}
 
 @dataclass(frozen=True)
 class Section:
-    """A mapping inside a YAML file.
+    """A mapping in a YAML file.
 
     Attributes:
-        values: what the mapping holds.
-        file: the file.
-        key: the mapping's own key inside the file, empty at the top.
+        values: of the mapping.
+        file: that contains it.
+        key: of the mapping in the file, empty at the top level.
     """
 
     values: Mapping[str, Any]
@@ -36,11 +36,11 @@ class Section:
     key: str = ""
 
     def where(self, key: str) -> str:
-        """File and full key, for messages."""
+        """Format file and full key for messages."""
         return f"{self.file}: {self.key}.{key}" if self.key else f"{self.file}: {key}"
 
     def only(self, known: Iterable[str]) -> None:
-        """Refuse keys that are not known; the error names the nearest known one."""
+        """Raise for keys that are not in ``known``; the error names the most similar one that is."""
         known = list(known)
         for key in self.values:
             if key not in known:
@@ -50,39 +50,39 @@ class Section:
                 )
 
     def get(self, key: str) -> Any:
-        """A value that must be there."""
+        """Get a required value."""
         if self.values.get(key) is None:
             raise RigError(f"{self.where(key)} is missing; add it")
         return self.values[key]
 
     def section(self, key: str) -> Section:
-        """A mapping that must be there."""
+        """Get a required mapping."""
         return self.nested(self.get(key), key)
 
     def nested(self, value: object, key: str) -> Section:
-        """A value of this mapping, known under ``key``, as a mapping of its own."""
+        """Convert a value of this mapping to a section; ``key`` is its name in messages."""
         if not isinstance(value, dict):
             raise RigError(f"{self.where(key)}: is {_shown(value)}; it must be a mapping of keys to values")
         return Section(value, self.file, f"{self.key}.{key}" if self.key else key)
 
     def text(self, key: str) -> str:
-        """A text that must be there."""
+        """Get a required string."""
         value = self.get(key)
         if isinstance(value, dict | list):
             raise RigError(f"{self.where(key)}: is {_shown(value)}; it must be a text")
         return str(value)
 
     def number(self, key: str, default: float | None = None) -> float:
-        """A number; without a default it must be there."""
+        """Get a number, which is required if there is no default."""
         if default is not None and self.values.get(key) is None:
             return default
         return float(self.array(key, ()))
 
     def array(self, key: str, shape: tuple[int, ...] | None = None) -> Float:
-        """An array of finite numbers that must be there; ``shape`` None takes any one-dimensional one."""
+        """Get a required array of finite numbers; ``shape`` None takes any one-dimensional array."""
         value = self.get(key)
         try:
-            array = np.array(value, dtype=np.float64)  # also takes '1e-5', which YAML 1.1 reads as a text
+            array = np.array(value, dtype=np.float64)  # converts '1e-5', which YAML 1.1 reads as a string
         except (TypeError, ValueError):
             raise RigError(f"{self.where(key)}: is {_shown(value)}; it must hold numbers only") from None
         if array.ndim != 1 if shape is None else array.shape != shape:
@@ -93,14 +93,14 @@ class Section:
         return array
 
     def size(self, key: str) -> tuple[int, int]:
-        """An image size (width, height) in pixels that must be there."""
+        """Get a required image size (width, height), pixels."""
         width, height = self.array(key, (2,))
         if width != int(width) or height != int(height):
             raise RigError(f"{self.where(key)}: is {_shown(self.get(key))}; it must be two whole numbers")
         return int(width), int(height)
 
     def matrix(self, key: str) -> Float:
-        """A 4x4 matrix that must be there: four rows, 16 numbers by rows, or ``data`` of an OpenCV matrix."""
+        """Get a required (4, 4) matrix: four rows, 16 numbers by rows, or ``data`` of an OpenCV matrix."""
         value = self.get(key)
         if isinstance(value, dict):
             return self.section(key).matrix("data")
@@ -109,14 +109,14 @@ class Section:
         return self.array(key, (4, 4))
 
     def noise(self, rate_key: str, keys: Mapping[str, str]) -> dict[str, float]:
-        """Rate and noise of an IMU, by the names of `graphvio.rig.Imu`.
+        """Get rate and noise densities of an IMU by the names of `graphvio.rig.Imu`.
 
         Args:
             rate_key: key of the rate.
             keys: name in `graphvio.rig.Imu` -> key in this file, for all four densities.
 
         Raises:
-            RigError: if any is missing; the message offers the defaults, ready to be pasted.
+            RigError: if one is missing; the message has graphvio's defaults, ready to be pasted.
         """
         names = {"rate_hz": rate_key, **keys}
         missing = [name for name, key in names.items() if self.values.get(key) is None]
@@ -131,19 +131,19 @@ class Section:
 
 
 def read_yaml(path: Path) -> Section:
-    """The mapping in a YAML file, as written by people, Kalibr or OpenCV; an empty file is an empty mapping.
+    """Read a YAML file, also as Kalibr and OpenCV write it; an empty file is an empty mapping.
 
     Raises:
-        RigError: if the file cannot be read or holds no mapping.
+        RigError: if the file cannot be read or is no mapping.
     """
     return parse_yaml(read_text(path), path)
 
 
 def parse_yaml(text: str, path: Path) -> Section:
-    """The same of a text that is already read.
+    """Parse the text of a YAML file, see `read_yaml`.
 
     Raises:
-        RigError: if it holds no mapping.
+        RigError: if it is no mapping.
     """
     text = re.sub(r"^%.*$", "", text, flags=re.MULTILINE)  # OpenCV's `%YAML:1.0` is no valid directive
     text = text.replace("!!opencv-matrix", "")
@@ -162,7 +162,7 @@ def parse_yaml(text: str, path: Path) -> Section:
 
 
 def read_text(path: Path) -> str:
-    """Text of a calibration file.
+    """Read a text file.
 
     Raises:
         RigError: if it cannot be read as text.
@@ -177,7 +177,7 @@ def read_text(path: Path) -> str:
 
 @contextmanager
 def named(path: Path) -> Iterator[None]:
-    """Put the file's path in front of what a rig object says about itself."""
+    """Prefix errors of rig objects with the file's path."""
     try:
         yield
     except RigError as error:
@@ -187,10 +187,14 @@ def named(path: Path) -> Iterator[None]:
 
 
 def consecutive_pairs(cameras: list[Camera], path: Path) -> tuple[StereoPair, ...]:
-    """Pairs (0, 1), (2, 3) and so on, of cameras in the order of their numbers.
+    """Form pairs (0, 1), (2, 3) and so on.
+
+    Args:
+        cameras: in the order of their numbers.
+        path: of their file, for messages.
 
     Raises:
-        RigError: if there is no camera, or one is left over.
+        RigError: if there is no camera, or their number is odd.
     """
     if not cameras:
         raise RigError(f"{path}: describes no camera; give a rig.yaml, or a calibration of at least two cameras")
