@@ -138,7 +138,7 @@ def test_residuals_of_each_pair_are_curves_without_those_that_are_not_known(tmp_
         expected = {e.stamp_ns: getattr(e.pairs[0], figure) for e in shown}
         expected = {stamp: value for stamp, value in expected.items() if value is not None}
         assert scalars_of(tmp_path / "r.rrd", f"/residuals/front/{entity}") == expected
-    assert scalars_of(tmp_path / "r.rrd", "/points/front/offered") == {e.stamp_ns: 50.0 for e in shown}
+    assert scalars_of(tmp_path / "r.rrd", "/points/front/candidates") == {e.stamp_ns: 50.0 for e in shown}
     assert scalars_of(tmp_path / "r.rrd", "/points/front/inliers") == {e.stamp_ns: 40.0 for e in shown}
 
 

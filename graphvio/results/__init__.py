@@ -1,13 +1,13 @@
-"""The folder that a run leaves behind.
+"""The result folder of a run.
 
-| file | holds |
+| file | contents |
 |---|---|
 | ``trajectory.txt`` | TUM: pose of body in nav as emitted, one line per frameset that has one |
-| ``trajectory_smoothed.txt`` | the same with all later measurements taken into account |
-| ``covariance.csv`` | upper triangle (21) of the pose's covariance: ``[rotation, translation]``, frame body |
+| ``trajectory_smoothed.txt`` | the same poses as they left the smoother's window |
+| ``covariance.csv`` | upper triangle (21) of the pose's covariance, tangent ``[rotation, translation]`` in body |
 | ``imu_bias.csv`` | biases of gyro (rad/s) and accelerometer (m/s^2) |
-| ``pairs.csv`` | points, inliers and residuals (px) of each pair, one line per estimate and pair |
-| ``events.jsonl`` | gates, resets, losses and faults of the input, one JSON object a line |
+| ``pairs.csv`` | points, inliers and residuals (px), one line per estimate and pair |
+| ``events.jsonl`` | gates, resets, losses and faults of the input, one JSON object per line |
 | ``config.yaml``, ``rig.yaml`` | as used |
 | ``summary.json`` | see `Summary` |
 | ``trajectory.png`` | plan and side view |

@@ -1,4 +1,4 @@
-"""The figures of a run that ``summary.json`` holds."""
+"""The figures of a run in ``summary.json``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from graphvio.trajectory import Trajectory, travelled
 
 @dataclass(frozen=True)
 class Percentiles:
-    """Spread of a time, milliseconds."""
+    """Distribution of a processing time, milliseconds."""
 
     median: float
     p95: float
@@ -22,7 +22,7 @@ class Percentiles:
 
     @staticmethod
     def of(values_ms: Sequence[float]) -> Percentiles | None:
-        """Of any number of values; None of none."""
+        """Compute the percentiles; None if there are no values."""
         if not len(values_ms):
             return None
         return Percentiles(*(round(float(v), 4) for v in np.percentile(np.asarray(values_ms), [50.0, 95.0, 99.0])))
@@ -30,11 +30,11 @@ class Percentiles:
 
 @dataclass(frozen=True)
 class PairMedians:
-    """Medians over all reports on one pair, of those that have the figure; None where none has.
+    """Medians over the reports of one pair that have the figure; None where none has.
 
     Attributes:
-        inliers: points that the chosen motion explains.
-        rms_px: their rms reprojection error under it, pixels.
+        inliers: points that the selected motion explains.
+        rms_px: their rms reprojection error under that motion, pixels.
         own_rms_px: rms reprojection error of the pair's points under its own motion, pixels.
     """
 
@@ -44,39 +44,38 @@ class PairMedians:
 
     @staticmethod
     def of(figures: Mapping[str, Sequence[float]]) -> PairMedians:
-        """Of any number of values of each figure, by its name."""
+        """Compute the medians of the values of each figure, by its name."""
         return PairMedians(**{name: _median(values) for name, values in figures.items()})
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What ``summary.json`` holds.
+    """The contents of ``summary.json``.
 
     Attributes:
-        framesets: framesets read.
-        estimated: estimates with a pose.
-        completion: share of the framesets awaited (those after initialisation may begin) that have a pose.
-        duration_s: from the first to the last estimate, pose or not.
+        framesets: number of framesets read.
+        estimated: number of estimates with a pose.
+        completion: share of the framesets since the IMU's first sample that have a pose.
+        duration_s: from the first to the last estimate, with or without a pose.
         path_length_m: along the estimated positions, within epochs.
         wall_s: processing time of the whole run.
-        realtime_factor: ``duration_s / wall_s``; above 1 is faster than the sensors.
+        realtime_factor: ``duration_s / wall_s``; above 1 is faster than real time.
         stage_ms: stage -> time per frameset.
         frameset_ms: time per frameset of all stages, without decoding images.
         input_faults: kind -> count.
-        resets: times the estimation was started anew.
-        events: kind -> count, of everything in ``events.jsonl``.
-        warnings: what a person should mend before the next run, such as a rig file that the motions refute.
+        resets: number of times that the estimator was reinitialised.
+        events: kind -> count, of all events in ``events.jsonl``.
+        warnings: what to correct before the next run, such as a rig file that the motions contradict.
         status: status -> number of estimates.
-        pair_medians: name of each of the rig's pairs -> its medians.
-        pair_rejected: name of each of the rig's pairs -> test of tracking and stereo matching -> how many corners and
-            tracks it threw out.
-        epochs: for each epoch its number, first and last stamp in nanoseconds, and number of poses.
-        time_offset_s: between cameras and IMU as estimated at the end, or None where it was not.
+        pair_medians: name of the pair -> its medians.
+        pair_rejected: name of the pair -> test of tracking or stereo matching -> corners and tracks rejected by it.
+        epochs: of each epoch its number, first and last stamp in nanoseconds, and number of poses.
+        time_offset_s: last estimate of the offset between cameras and IMU, or None where it is not estimated.
         time_offset_sigma_s: its standard deviation, or None.
-        graphvio_version: that made the run.
+        graphvio_version: of the run.
         config_sha256: of ``config.yaml``.
-        evaluation: figures against truth, or None.
-        evaluation_error: why truth that was given could not be used, or None.
+        evaluation: figures against the truth, or None.
+        evaluation_error: why the truth could not be used, or None.
     """
 
     framesets: int
@@ -105,7 +104,7 @@ class Summary:
 
 
 def _median(values: Sequence[float]) -> float | None:
-    """None of no values, and where the median is not finite."""
+    """Median; None if there are no values or it is not finite."""
     if not len(values):
         return None
     median = float(np.median(np.asarray(values)))
@@ -113,13 +112,13 @@ def _median(values: Sequence[float]) -> float | None:
 
 
 def path_length(trajectory: Trajectory, epochs: Int) -> float:
-    """Metres along poses whose epoch numbers (N,) are given; the step into a new epoch is none."""
+    """Compute the path length in metres, without the steps between epochs, whose numbers are given (N,)."""
     parts = (trajectory.positions[epochs == epoch] for epoch in np.unique(epochs))
     return float(sum(travelled(part)[-1] for part in parts))
 
 
 def epoch_intervals(trajectory: Trajectory, epochs: Int) -> list[dict[str, int]]:
-    """Number, first and last stamp (nanoseconds) and number of poses of each epoch (N,)."""
+    """List number, first and last stamp (nanoseconds) and number of poses of each epoch, given per pose (N,)."""
     intervals = []
     for epoch in np.unique(epochs):
         stamps = trajectory.stamps_ns[epochs == epoch]

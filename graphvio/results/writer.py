@@ -1,8 +1,7 @@
-"""Writes a result folder while the run goes on.
+"""Writes a result folder during a run.
 
-All files but the summary, the smoothed trajectory and the picture grow line by line and are flushed at once,
-so that a run which is broken off leaves what it had. Equal input gives an equal ``trajectory.txt``, byte by
-byte.
+All files but the summary, the smoothed trajectory and the plot grow line by line and are flushed at once, so that an
+interrupted run leaves its results until then. Equal input gives an equal ``trajectory.txt``, byte by byte.
 """
 
 from __future__ import annotations
@@ -48,20 +47,20 @@ class ResultWriter:
     """Writes one result folder; a context manager that closes its files.
 
     Args:
-        folder: made if absent.
-        rig: written to ``rig.yaml``; the pairs that estimates report on are its pairs.
-        config_yaml: written to ``config.yaml`` as it is.
+        folder: created if absent.
+        rig: written to ``rig.yaml``; reports of pairs are by their indices in it.
+        config_yaml: contents of ``config.yaml``.
 
     Raises:
-        GraphvioError: if the folder holds something already, or cannot be written.
+        GraphvioError: if the folder is not empty or cannot be written.
     """
 
     @staticmethod
     def new_folder(base: Path, name: str) -> Path:
-        """Make ``base/name-1``, or the next number that is free; two runs at once never get the same.
+        """Create ``base/name-1``, or with the next free number; simultaneous runs get different folders.
 
         Raises:
-            GraphvioError: if it cannot be made.
+            GraphvioError: if it cannot be created.
         """
         try:
             base.mkdir(parents=True, exist_ok=True)
@@ -134,7 +133,7 @@ class ResultWriter:
             self.folder.rmdir()
 
     def close(self) -> None:
-        """Close the files; what was added stays."""
+        """Close the files."""
         for file in self._files.values():
             file.close()
 
@@ -142,7 +141,7 @@ class ResultWriter:
         """Append one estimate; stamps must increase.
 
         Raises:
-            GraphvioError: if the disk is full or the folder gone.
+            GraphvioError: if a file cannot be written.
         """
         stamp = int(estimate.stamp_ns)
         self._first_ns = stamp if self._first_ns is None else self._first_ns
@@ -170,7 +169,7 @@ class ResultWriter:
         """Append one line to ``events.jsonl``.
 
         Raises:
-            GraphvioError: if the disk is full or the folder gone.
+            GraphvioError: if the file cannot be written.
         """
         self._events[event.kind] += 1
         self._write("events.jsonl", json.dumps(asdict(event), ensure_ascii=False))
@@ -188,18 +187,18 @@ class ResultWriter:
         warnings: Sequence[str] = (),
         truth: Path | None = None,
     ) -> Summary:
-        """Write what is known only at the end: the smoothed trajectory, the summary and the picture.
+        """Write the smoothed trajectory, the summary and the plot.
 
         Args:
             wall_s: processing time of the whole run.
             frameset_ms: time per frameset, without decoding, milliseconds.
-            smoothed: (stamp_ns, nav_T_body (4, 4)) with everything that came later taken into account.
+            smoothed: stamps and poses ``nav_T_body`` (4, 4) as they left the smoother's window.
             input_faults: kind -> count.
-            framesets: framesets read.
-            awaited: framesets that could have had a pose: those after initialisation may begin.
-            resets: times the estimation was started anew.
-            warnings: what a person should mend before the next run.
-            truth: trajectory file to measure the run against; if that fails, the summary says why.
+            framesets: number of framesets read.
+            awaited: number of framesets that could have had a pose: those since the IMU's first sample.
+            resets: number of times that the estimator was reinitialised.
+            warnings: what to correct before the next run.
+            truth: trajectory file or session to evaluate against; if that fails, the summary has the reason.
 
         Raises:
             GraphvioError: if a file cannot be written.
@@ -268,7 +267,7 @@ class ResultWriter:
             raise _cannot_write(self.folder / name, error) from None
 
     def _write_at_once(self, name: str, text: str) -> None:
-        """Write a file that is either whole or absent."""
+        """Write a file that is either complete or absent."""
         unfinished = self.folder / f".{name}.tmp"
         try:
             unfinished.write_text(text, encoding="utf-8", newline="\n")
@@ -282,7 +281,7 @@ def _csv(stamp_ns: int, values: Iterable[float]) -> str:
 
 
 def _report_line(stamp_ns: int, name: str, report: PairReport) -> str:
-    """A line of ``pairs.csv``: quoted where the name asks for it, empty where the report has None."""
+    """A line of ``pairs.csv``; fields are empty where the report has None."""
     line = io.StringIO()
     rms, own_rms = (None if px is None else _number(px) for px in (report.rms_px, report.own_rms_px))
     csv.writer(line, lineterminator="").writerow(
@@ -302,7 +301,7 @@ def _cannot_write(where: Path, error: OSError) -> GraphvioError:
 def _evaluate_if_possible(
     trajectory: Trajectory, truth: Path | None
 ) -> tuple[Trajectory | None, Evaluation | None, str | None]:
-    """The truth and the figures, as far as they can be had, and why not otherwise."""
+    """Truth and evaluation, or None for each that failed, and the reason."""
     if truth is None:
         return None, None, None
     read = None

@@ -1,4 +1,4 @@
-"""How rerun's window is laid out, and the colours of what is in it. Needs the optional part ``viewer``."""
+"""Layout and colours of rerun's window."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STATUS_COLOURS = {
 
 
 def blueprint(rig: Rig) -> Any:
-    """World on the left; on the right the left camera of every pair, above the curves and the messages."""
+    """Lay out the world on the left, and left cameras, curves and events on the right."""
     cameras = [
         rrb.Spatial2DView(origin=f"world/rig/{pair.left.name}", name=f"{pair.name}: {pair.left.name}")
         for pair in rig.pairs

@@ -1,19 +1,19 @@
-"""What is logged to rerun, and under which names. Needs the optional part ``viewer``.
+"""Logs a run to rerun.
 
-| entity | holds |
+| entity | contents |
 |---|---|
 | ``world/rig`` | pose of body in nav |
 | ``world/rig/<camera>`` | pinhole; below it ``image`` and ``corners`` (left cameras) |
 | ``world/rig/uncertainty`` | ellipsoid of three standard deviations of the position |
-| ``world/trajectory/<epoch>/<n>`` | the n-th piece of the path, coloured by status |
+| ``world/trajectory/<epoch>/<n>`` | the n-th segment of the path, coloured by status |
 | ``rates/<axis>/<source>`` | angular rate of body by gyro, vision and fused, rad/s (figure 5 of the paper) |
 | ``biases/gyro``, ``biases/accel`` | rad/s, m/s^2 |
-| ``points/<pair>/offered``, ``inliers`` | number of points |
-| ``residuals/<pair>/joint``, ``own`` | rms reprojection error, px, under the chosen motion and the pair's own |
+| ``points/<pair>/candidates``, ``inliers`` | number of points |
+| ``residuals/<pair>/joint``, ``own`` | rms reprojection error, px, under the selected motion and the pair's own |
 | ``timing/<stage>`` | milliseconds |
 | ``events`` | changes of status, gates, resets, faults |
 
-The timeline ``time`` begins with the first stamp.
+The timeline ``time`` is relative to the first stamp.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from graphvio.trajectory import Trajectory
 from graphvio.viewer.layout import AXES, RATE_COLOURS, STATUS_COLOURS, TIMELINE, blueprint
 from graphvio.viewer.web import WebHost, WebOptions
 
-_PIECE_POSES = 100
+_MAX_SEGMENT_POSES = 100
 _SIGMAS = 3.0
 _JPEG_QUALITY = 80
 _CURVES_NS = 500_000_000
@@ -51,7 +51,7 @@ _FLUSH_S = 30.0
 _FRUSTUM_M = 0.25
 _INLIER, _OUTLIER = (60, 220, 90), (235, 60, 50)
 _PAIR_CURVES = {
-    "points/{}/offered": "points",
+    "points/{}/candidates": "points",
     "points/{}/inliers": "inliers",
     "residuals/{}/joint": "rms_px",
     "residuals/{}/own": "own_rms_px",
@@ -60,17 +60,17 @@ _XYZ_COLOURS = [(220, 70, 60), (60, 170, 75), (70, 110, 230)]
 
 
 class Recording:
-    """A stream to rerun's window, browsers, a file or several of these. All but construction belongs to one thread.
+    """A stream to rerun's window, browsers, a file or several of these; methods are called by one thread.
 
     Args:
-        rig: drawn once, and its cameras get images.
+        rig: cameras to be logged.
         spawn: open a window.
-        save: file to write.
-        web: serve browsers.
+        save: file to write, or None.
+        web: how to serve browsers, or None.
 
     Raises:
         GraphvioError: if browsers cannot be served.
-        OSError, RuntimeError: whatever rerun raises when the file or the window cannot be opened.
+        OSError, RuntimeError: by rerun, if the file or the window cannot be opened.
     """
 
     def __init__(self, rig: Rig, *, spawn: bool, save: Path | None, web: WebOptions | None = None) -> None:
@@ -92,18 +92,18 @@ class Recording:
         self._start_ns: int | None = None
         self._unsent: list[Estimate] = []
         self._status: Status | None = None
-        self._piece: list[tuple[int, Float, Status]] = []
-        self._piece_number = 0
+        self._segment: list[tuple[int, Float, Status]] = []
+        self._segment_number = 0
         self._epoch = 0
         self._log_static()
 
     def close(self) -> None:
-        """Log what is left, flush and end."""
+        """Log pending curves, flush and disconnect."""
         self._send_curves()
         try:
             self._stream.flush(timeout_sec=_FLUSH_S)
         except RuntimeError as error:
-            if self._is_saved and "gRPC" not in str(error):  # who looked on may have gone, which is no failure
+            if self._is_saved and "gRPC" not in str(error):  # a window or browser may have been closed
                 raise
         finally:
             self._stream.disconnect()
@@ -111,7 +111,7 @@ class Recording:
                 self._web.close()
 
     def add_estimates(self, estimates: Sequence[Estimate]) -> None:
-        """Poses, scalars and changes of status; a batch costs hardly more than one."""
+        """Log poses, scalars and changes of status."""
         if not estimates:
             return
         if self._start_ns is None:
@@ -129,12 +129,12 @@ class Recording:
                 self._status = estimate.status
 
     def add_event(self, event: Event) -> None:
-        """A message at the time of its data."""
+        """Log an event at its stamp."""
         self._at(event.stamp_ns)
         self._log_text(event.detail, event.kind, (200, 200, 200))
 
     def add_images(self, frameset: FrameSet, estimate: Estimate) -> None:
-        """Left images with the corners tracked in them, green where the motion explains them."""
+        """Log left images with their corners, inliers in green."""
         self._at(frameset.stamp_ns)
         for index, (left, _) in frameset.images.items():
             camera = f"world/rig/{self._rig.pairs[index].left.name}"
@@ -149,7 +149,7 @@ class Recording:
                 self._stream.log(f"{camera}/corners", corners)
 
     def add_path(self, name: str, trajectory: Trajectory, colour: tuple[int, int, int]) -> None:
-        """A whole other path, such as the smoothed one, seen at all times."""
+        """Log another trajectory, visible at all times."""
         strip = rr.LineStrips3D([trajectory.positions], colors=[colour], radii=rr.Radius.ui_points(1.0))
         self._stream.log(f"world/{name}", strip, static=True)
 
@@ -189,7 +189,7 @@ class Recording:
             self._send("world/rig/uncertainty", with_covariance, spheres)
 
     def _send_curves(self) -> None:
-        """Everything that is drawn over time: one message a curve for any number of estimates."""
+        """Log scalars over time, one message per curve."""
         estimates, self._unsent = self._unsent, []
         for source in RATE_COLOURS:
             for k, axis in enumerate(AXES):
@@ -204,7 +204,7 @@ class Recording:
                 self._send_scalars(entity.format(name), estimates, _reported(index, figure))
 
     def _send_scalars(self, entity: str, estimates: Sequence[Estimate], value: Callable[[Estimate], Any]) -> None:
-        """The values, numbers or vectors (3,), of those estimates that have one."""
+        """Log the values, numbers or vectors (3,), of the estimates that have one."""
         known = [(e, v) for e in estimates if (v := value(e)) is not None]
         if not known:
             return
@@ -219,29 +219,29 @@ class Recording:
         self._stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=since)], columns)
 
     def _extend_path(self, posed: Sequence[Estimate]) -> None:
-        """Log the path in pieces of bounded length, so that a long run costs no more per pose."""
+        """Log the path in segments of bounded length, so that the cost per pose does not grow."""
         for estimate in posed:
             if estimate.epoch != self._epoch:
-                self._log_piece()
-                self._piece, self._epoch, self._piece_number = [], estimate.epoch, 0
-            self._piece.append((estimate.stamp_ns, np.asarray(estimate.nav_T_body)[:3, 3], estimate.status))
-            if len(self._piece) > _PIECE_POSES:
-                self._log_piece()
-                self._piece, self._piece_number = self._piece[-1:], self._piece_number + 1
-        self._log_piece()
+                self._log_segment()
+                self._segment, self._epoch, self._segment_number = [], estimate.epoch, 0
+            self._segment.append((estimate.stamp_ns, np.asarray(estimate.nav_T_body)[:3, 3], estimate.status))
+            if len(self._segment) > _MAX_SEGMENT_POSES:
+                self._log_segment()
+                self._segment, self._segment_number = self._segment[-1:], self._segment_number + 1
+        self._log_segment()
 
-    def _log_piece(self) -> None:
-        """Log the piece that is growing, at the time of its last pose; again and again until it is full."""
+    def _log_segment(self) -> None:
+        """Log the newest segment again, at the time of its last pose."""
         strips: list[list[Float]] = []
         colours: list[tuple[int, int, int]] = []
-        for (_, before, _), (_, position, status) in zip(self._piece, self._piece[1:], strict=False):
+        for (_, before, _), (_, position, status) in zip(self._segment, self._segment[1:], strict=False):
             if not colours or colours[-1] != STATUS_COLOURS[status]:
                 strips.append([before])
                 colours.append(STATUS_COLOURS[status])
             strips[-1].append(position)
         if strips:
-            self._at(self._piece[-1][0])
-            entity = f"world/trajectory/{self._epoch}/{self._piece_number}"
+            self._at(self._segment[-1][0])
+            entity = f"world/trajectory/{self._epoch}/{self._segment_number}"
             self._stream.log(entity, rr.LineStrips3D(strips, colors=colours, radii=rr.Radius.ui_points(1.5)))
 
     def _log_text(self, text: str, kind: str, colour: tuple[int, int, int]) -> None:
@@ -254,7 +254,7 @@ class Recording:
 
 
 def ellipsoid(covariance: Float) -> tuple[Float, Float]:
-    """Half axes (3,) of three standard deviations, metres, and their frame: quaternion ``x y z w``."""
+    """Compute half axes (3,) of three standard deviations, metres, and their frame as quaternion ``x y z w``."""
     variances, axes = np.linalg.eigh(covariance)
     if np.linalg.det(axes) < 0.0:
         axes[:, 0] = -axes[:, 0]
@@ -262,15 +262,15 @@ def ellipsoid(covariance: Float) -> tuple[Float, Float]:
 
 
 def _executable() -> dict[str, str]:
-    """Where rerun's program is when it is installed beside Python, but that folder is not in PATH."""
-    beside = Path(sys.executable).with_name("rerun")
-    return {} if shutil.which("rerun") or not beside.is_file() else {"executable_path": str(beside)}
+    """Path of rerun's program where it is next to Python in a folder that is not in PATH."""
+    program = Path(sys.executable).with_name("rerun")
+    return {} if shutil.which("rerun") or not program.is_file() else {"executable_path": str(program)}
 
 
 def _wait_for_window() -> None:
-    """Until rerun answers, and still does after a second: without a usable display it ends at once."""
-    began = time.monotonic()
-    while (waited := time.monotonic() - began) < _WINDOW_S:
+    """Wait until rerun answers, and still does after a second: without a usable display it ends at once."""
+    start = time.monotonic()
+    while (waited := time.monotonic() - start) < _WINDOW_S:
         time.sleep(0.1)
         with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", _PORT), timeout=1.0):
             if waited > _WINDOW_SURE_S:

@@ -1,4 +1,4 @@
-"""Shows a result folder again, from the text files in it."""
+"""Shows a result folder in the viewer."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _UPPER = np.triu_indices(6)
 
 
 def replay(folder: Path, *, spawn: bool = False, save: Path | None = None) -> None:
-    """Show poses, covariances, biases, events and the smoothed path of a result folder.
+    """Show poses, covariances, biases, events and the smoothed trajectory of a result folder.
 
     Args:
-        folder: as `graphvio.results.ResultWriter` leaves it; what is missing is left out, but not the trajectory.
+        folder: of `graphvio.results.ResultWriter`; files other than the trajectory may be missing.
         spawn: open a window.
-        save: write a recording here.
+        save: file to save a recording to, or None.
 
     Raises:
-        GraphvioError: if the folder holds no results, a file is damaged, or there is nowhere to show it.
+        GraphvioError: if the folder holds no results, a file is damaged, or the viewer cannot be opened.
     """
     if not (folder / "trajectory.txt").is_file():
         raise GraphvioError(f"{folder}: holds no trajectory.txt; give a folder that  graphvio run  has written")
@@ -47,7 +47,7 @@ def replay(folder: Path, *, spawn: bool = False, save: Path | None = None) -> No
 
 
 def read_estimates(folder: Path) -> Iterator[Estimate]:
-    """What the text files know of each estimate with a pose; its status is not among it.
+    """Read the estimates that have a pose from the files of a result folder; their status is not saved.
 
     Raises:
         GraphvioError: if a file is damaged.
@@ -96,7 +96,7 @@ def _read_epochs(path: Path) -> list[dict[str, Any]]:
     try:
         return list(json.loads(path.read_text(encoding="utf-8"))["epochs"])
     except (OSError, ValueError, KeyError, TypeError):
-        return []  # a run that was broken off has no summary
+        return []  # an interrupted run has no summary
 
 
 def _symmetric(upper: Float) -> Float:

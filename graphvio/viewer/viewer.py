@@ -30,17 +30,17 @@ _ROUND_S = 0.03
 
 
 class Viewer:
-    """Shows a run in a window or in browsers, writes it to a file, or several of these; a context manager.
+    """Shows a run in a window, in browsers, or saves it to a file, or several of these; a context manager.
 
     Args:
-        rig: what is shown; its cameras are drawn where they are.
+        rig: cameras to be shown.
         spawn: open rerun's window and stream to it.
-        save: write a recording (``.rrd``) here; needs no display.
-        web: serve browsers at ``web.url``, until the viewer is closed; needs no display.
+        save: file (``.rrd``) to save a recording to; needs no display.
+        web: serve browsers at ``web.url`` until the viewer is closed; needs no display.
 
     Raises:
         MissingExtraError: if rerun is not installed.
-        GraphvioError: if there is no display to open a window on, the file cannot be written, or a port not be used.
+        GraphvioError: if there is no display for a window, the file cannot be written, or a port is not available.
     """
 
     def __init__(
@@ -67,21 +67,21 @@ class Viewer:
         try:
             self.close()
         except GraphvioError:
-            if value is None:  # else what went wrong first is what matters
+            if value is None:  # otherwise the first error matters more
                 raise
 
     @property
     def url(self) -> str | None:
-        """What to open in a browser, or None if browsers are not served."""
+        """Address for a browser, or None if none is served."""
         return None if self._web is None else self._web.url
 
     @property
     def dropped(self) -> int:
-        """Framesets whose images were left out so far because drawing was slower than the odometry."""
+        """Number of framesets whose images were left out because the odometry was faster."""
         return self._dropped
 
     def show(self, frameset: FrameSet | None, estimate: Estimate) -> None:
-        """Hand over an estimate, and the images it was made from if they are to be seen; returns at once."""
+        """Show an estimate, and the images of its frameset unless that is None; returns at once."""
         with self._changed:
             if self._closing or self._error is not None:
                 return
@@ -92,11 +92,11 @@ class Viewer:
             self._changed.notify()
 
     def show_event(self, event: Event) -> None:
-        """Hand over a message; returns at once."""
+        """Show an event; returns at once."""
         self._add_extra(lambda recording: recording.add_event(event))
 
     def show_path(self, name: str, path: Trajectory, colour: tuple[int, int, int] = (150, 150, 150)) -> None:
-        """Hand over a whole other path in nav, such as the smoothed one or truth; returns at once."""
+        """Show another trajectory in nav, such as the smoothed one or truth; returns at once."""
         self._add_extra(lambda recording: recording.add_path(name, path, colour))
 
     def _add_extra(self, extra: Callable[[Recording], None]) -> None:
@@ -107,10 +107,10 @@ class Viewer:
             self._changed.notify()
 
     def close(self) -> None:
-        """Draw what is still waiting, flush and end; once closed, nothing more is shown.
+        """Show what is pending, flush and end; later calls of other methods have no effect.
 
         Raises:
-            GraphvioError: if drawing had failed; the recording then ends there.
+            GraphvioError: if showing has failed; the recording then ends there.
         """
         with self._changed:
             self._closing = True
@@ -118,12 +118,12 @@ class Viewer:
         self._worker.join()
         error, self._error = self._error, None
         if error is not None:
-            raise GraphvioError(f"viewer: drawing failed ({_first_line(error)}); what was shown or saved is incomplete")
+            raise GraphvioError(f"viewer: rerun failed ({_first_line(error)}); what was shown or saved is incomplete")
 
     def _work(self, recording: Recording) -> None:
         try:
             try:
-                self._draw(recording)
+                self._log(recording)
             finally:
                 recording.close()
         except Exception as error:
@@ -132,14 +132,14 @@ class Viewer:
             self._extras.clear()
             self._frameset = None
 
-    def _draw(self, recording: Recording) -> None:
-        while self._draw_waiting(recording):
-            # Many small rounds would hold up the odometry; one carries many poses as cheaply as one pose.
+    def _log(self, recording: Recording) -> None:
+        while self._log_pending(recording):
+            # Frequent rounds would slow the odometry down; a batch costs as much as one estimate.
             with self._changed:
                 self._changed.wait_for(lambda: self._closing, _ROUND_S)
 
-    def _draw_waiting(self, recording: Recording) -> bool:
-        """Wait for work and do it; False when all is done and there will be no more."""
+    def _log_pending(self, recording: Recording) -> bool:
+        """Wait for pending data and log it; False when the viewer is closing and all is logged."""
         with self._changed:
             self._changed.wait_for(lambda: self._closing or self._estimates or self._extras)
             estimates, self._estimates = self._estimates, deque()
@@ -155,7 +155,7 @@ class Viewer:
 
 
 def check_display() -> None:
-    """Make sure that a window can be opened at all.
+    """Check that a window can be opened.
 
     Raises:
         GraphvioError: on Linux without an X or Wayland display.

@@ -1,6 +1,6 @@
-"""The view in a browser: rerun's web viewer and the server of its data, in a process of their own.
+"""Serves browsers: rerun's web viewer and data server as a separate process.
 
-rerun can serve from within a program, too, but then listens on all addresses (0.41), and has no password.
+Within a program rerun (0.41) would listen on all addresses, without a password.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from graphvio.errors import GraphvioError
 
 _HOST = "127.0.0.1"
 _START_S, _END_S = 20.0, 5.0
-# Ends the server when its input ends, which it also does when this process is killed.
+# Ends the server when its standard input is closed, which also happens when this process is killed.
 _SCRIPT = 'trap : TERM; "$@" & read -r _; kill -TERM 0; wait'
 
 
 @dataclass(frozen=True)
 class WebOptions:
-    """Where the view is served: on this machine only. From elsewhere both ports are reached by an SSH tunnel.
+    """Ports and memory of the server, which listens on this machine only; use an SSH tunnel for both ports elsewhere.
 
     Attributes:
-        port: of the page, which takes what it shows from the next one, ``data_port``.
-        memory_mb: kept for browsers that come later; beyond it the oldest is forgotten.
+        port: of the page; its data is on the next one, ``data_port``.
+        memory_mb: data kept for browsers that connect later; the oldest is dropped.
 
     Raises:
-        GraphvioError: if a value is not valid.
+        GraphvioError: if a value is out of range.
     """
 
     port: int = 9090
@@ -50,25 +50,25 @@ class WebOptions:
 
     @property
     def data_port(self) -> int:
-        """From which the page takes what it shows."""
+        """Port of the data."""
         return self.port + 1
 
     @property
     def data_url(self) -> str:
-        """Where data goes to, and is taken from."""
+        """Address of the data."""
         return f"rerun+http://{_HOST}:{self.data_port}/proxy"
 
     @property
     def url(self) -> str:
-        """What to open in a browser."""
+        """Address of the page."""
         return f"http://{_HOST}:{self.port}/?url={quote(self.data_url, safe='')}"
 
 
 class WebHost:
-    """The process that serves; ended by `close`, or with this one.
+    """The server process; ends by `close`, or with this process.
 
     Args:
-        options: where.
+        options: ports and memory.
 
     Raises:
         GraphvioError: if a port is taken, or rerun does not start.
@@ -87,7 +87,7 @@ class WebHost:
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for the odometry, which then ends this
+            start_new_session=True,  # Ctrl-C is for the odometry, which then closes the server
         )
         try:
             for port in (options.port, options.data_port):
@@ -97,7 +97,7 @@ class WebHost:
             raise
 
     def close(self) -> None:
-        """End the process; a second time does nothing."""
+        """End the process; idempotent."""
         if self._process.stdin is not None:
             self._process.stdin.close()
         try:
@@ -117,15 +117,15 @@ class WebHost:
 
 
 def _program() -> list[str]:
-    """rerun itself where it is found: its launcher would be gone before it when both are ended."""
+    """rerun's program rather than its Python launcher, which would end before it."""
     package = find_spec("rerun_cli")
-    beside = None if package is None or package.origin is None else Path(package.origin).with_name("rerun")
-    return [str(beside)] if beside is not None and beside.is_file() else [sys.executable, "-m", "rerun_cli"]
+    program = None if package is None or package.origin is None else Path(package.origin).with_name("rerun")
+    return [str(program)] if program is not None and program.is_file() else [sys.executable, "-m", "rerun_cli"]
 
 
 def _check_free(port: int) -> None:
     with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # one that has just been closed is free
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was just closed is free
         try:
             probe.bind((_HOST, port))
         except OSError as error:
