@@ -1,4 +1,4 @@
-"""``scripts/campaign live``: the live system in real time, with all that can go wrong with sensors and machine.
+"""``scripts/campaign live``: the live system in real time, with faults of sensors and machine.
 
 Each case runs the simulated room, walked to and fro, through the whole live system at the sensors' pace.
 """
@@ -32,12 +32,12 @@ from graphvio.warmup import warm_up
 
 _SCENE = "room"
 _HEAD = ("case", "framesets", "skipped", "least corners, %", "p50, ms", "p99, ms", "longest, ms", "epochs", "error, mm",
-         "what was told")  # fmt: skip
+         "events")  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _Case:
-    """Options of the simulated devices; ``stalls_s`` holds the output up for so long, once."""
+    """Options of the simulated devices; ``stalls_s`` blocks the output for so long, once."""
 
     name: str
     options: str = ""
@@ -101,40 +101,40 @@ def _run(case: _Case, folder: Path, seconds: float) -> list[str]:
     running = LiveOdometry(source, rig, config, [stall])
     listener = Listener(running, folder)
     running.start()
-    least = 1.0
+    min_share = 1.0
     while not running.wait(0.05):
-        least = min(least, float(running.status()["corner_share"] or 0.0))
+        min_share = min(min_share, float(running.status()["corner_share"] or 0.0))
     running.stop()
     listener.thread.join()
     figures = running.status()
-    told = {name.removeprefix("event_"): value for name, value in figures.items() if name.startswith("event_")}
+    events = {name.removeprefix("event_"): value for name, value in figures.items() if name.startswith("event_")}
     return [
         str(figures["framesets"]),
         str(int(figures["skipped_late"] or 0) + int(figures["skipped_no_room"] or 0)),
-        f"{100 * least:.0f}",
+        f"{100 * min_share:.0f}",
         *(f"{figures[name]:.1f}" for name in ("latency_p50_ms", "latency_p99_all_ms", "latency_max_ms")),
         str(listener.epochs),
         f"{listener.error_mm:.0f}",
-        ", ".join(f"{kind} {count}" for kind, count in told.items()) or "nothing",
+        ", ".join(f"{kind} {count}" for kind, count in events.items()) or "nothing",
     ]
 
 
 class _Stall(Output):
-    """Holds the output up, once."""
+    """Blocks the output once, at the hundredth result."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
         self._results = 0
 
     def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
-        """Sleep at the hundredth."""
+        """See `Output`."""
         self._results += 1
         if self._seconds and self._results == 100:
             time.sleep(self._seconds)
 
 
 def _killed(folder: Path, after_s: float) -> float:
-    """How much of a recording is lost, seconds, when the process is killed so long after its file appeared."""
+    """Seconds of a recording that are lost when the process is killed so long after its file appeared."""
     with tempfile.TemporaryDirectory() as made:
         out = Path(made) / "killed.mcap"
         command = [sys.executable, "-c", "from graphvio.cli import main; main()", "live"]
@@ -147,10 +147,10 @@ def _killed(folder: Path, after_s: float) -> float:
             if process.poll() is not None:
                 raise GraphvioError(f"graphvio live ended with exit code {process.returncode} before it recorded")
             time.sleep(0.01)
-        begun_s = time.monotonic()
+        begin_s = time.monotonic()
         time.sleep(after_s)
         os.kill(process.pid, signal.SIGKILL)
-        elapsed_s = time.monotonic() - begun_s
+        elapsed_s = time.monotonic() - begin_s
         process.wait()
         session = open_source(out)
         framesets = [measurement for measurement in session if not isinstance(measurement, ImuSample)]

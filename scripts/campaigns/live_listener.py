@@ -1,4 +1,4 @@
-"""Listens to a live run of a simulated scene that is walked to and fro, and holds it against the truth."""
+"""The errors and times of a live run on a simulated scene that is walked to and fro."""
 
 from __future__ import annotations
 
@@ -17,31 +17,26 @@ _STAGES = ("predict", "track", "motion", "quality", "replenish", "update")
 
 
 class Listener:
-    """A thread that listens until the run has ended.
+    """Takes estimates in a thread of its own until the run has ended.
 
     Args:
         running: not started yet.
         folder: of the recording, whose first frameset is the first estimate's.
 
     Attributes:
-        work_ms: that the odometry took for each frameset.
-        statuses: of each.
+        work_ms: processing time of each frameset.
         error_mm: of the newest position, from the first pose on.
-        longest_gap_s: between estimates.
-        epochs: until now.
-        thread: that listens.
+        epochs: so far.
+        thread: that takes the estimates.
     """
 
     def __init__(self, running: LiveOdometry, folder: Path) -> None:
         source = open_source(folder)
         assert source.truth is not None
         self.work_ms: list[float] = []
-        self.statuses: list[str] = []
         self.error_mm = 0.0
-        self.longest_gap_s = 0.0
         self.epochs = 0
         self._first_ns: int | None = None
-        self._last_ns: int | None = None
         self._start_ns, self._end_ns = source.start_ns, source.end_ns
         self._truth = load_trajectory(source.truth)
         self._nav_T_world: Float | None = None
@@ -52,10 +47,7 @@ class Listener:
     def _listen(self) -> None:
         while (estimate := self._estimates.get()) is not None:
             self._first_ns = estimate.stamp_ns if self._first_ns is None else self._first_ns
-            self.statuses.append(str(estimate.status))
-            if self._last_ns is not None:
-                self.longest_gap_s = max(self.longest_gap_s, 1e-9 * (estimate.stamp_ns - self._last_ns))
-            self._last_ns, self.epochs = estimate.stamp_ns, estimate.epoch + 1
+            self.epochs = estimate.epoch + 1
             if estimate.nav_T_body is None:
                 continue
             self.work_ms.append(sum(estimate.stage_ms.get(stage, 0.0) for stage in _STAGES))
@@ -66,7 +58,7 @@ class Listener:
             self.error_mm = 1e3 * float(np.linalg.norm(apart))
 
     def _true_pose(self, stamp_ns: int) -> Float:
-        """At the true pose's stamp nearest to this one's place in the walk to and fro."""
+        """The true pose nearest to a stamp's position in the walk to and fro."""
         length_ns = self._end_ns - self._start_ns
         assert self._first_ns is not None
         along_ns = (stamp_ns - self._first_ns) % (2 * length_ns)  # whatever clock the stamps are of

@@ -1,4 +1,4 @@
-"""All that can run beside a live odometry: it is recorded, offered by gRPC and ROS 2, and another process listens."""
+"""All services of a live odometry: recording, gRPC, ROS 2 and metrics, with a gRPC client in another process."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from graphvio.slam.service.options import ServiceOptions
 from graphvio.slam.service.server import GrpcServer
 
 _DOMAIN = 97
-_LISTENS = "from campaigns.live_services import listen; import sys; listen(sys.argv[1])"
+_CLIENT = "from campaigns.live_services import listen; import sys; listen(sys.argv[1])"
 _END_S = 60.0
 
 
 @dataclass(frozen=True)
-class Beside:
-    """What runs beside.
+class Services:
+    """The running services.
 
     Attributes:
-        recorder: of all, in a file that is removed at the end.
-        client: the process that listens.
+        recorder: of a session.
+        client: process that takes all keyframes by gRPC.
         publisher: on ROS 2.
     """
 
@@ -36,36 +36,36 @@ class Beside:
     publisher: Publisher
 
     @classmethod
-    def start(cls, running: LiveOdometry, path: Path, waits: bool, stack: ExitStack) -> Beside:
-        """Start all of it, until the stack ends; before the odometry is started."""
+    def start(cls, running: LiveOdometry, path: Path, waits: bool, stack: ExitStack) -> Services:
+        """Start all services, until the stack is closed; before the odometry is started."""
         recorder = SessionRecorder(path, running.rig, waits=waits)
         stack.callback(recorder.close)
         running.add_output(recorder)
         stack.callback(HealthServer(running.status).close)
         server = stack.enter_context(GrpcServer(running, ServiceOptions(port=0)))
         publisher = stack.enter_context(Publisher(running, _DOMAIN))
-        client = subprocess.Popen([sys.executable, "-c", _LISTENS, server.address], stdout=subprocess.PIPE, text=True)
+        client = subprocess.Popen([sys.executable, "-c", _CLIENT, server.address], stdout=subprocess.PIPE, text=True)
         stack.callback(client.kill)
         assert client.stdout is not None
-        client.stdout.readline()  # it listens
+        client.stdout.readline()  # it is connected
         return cls(recorder, client, publisher)
 
-    def told(self) -> str:
-        """What each has seen, after the end."""
+    def summary(self) -> str:
+        """Return how much each has received, after the end."""
         self.publisher.check()
-        heard, _ = self.client.communicate(timeout=_END_S)
+        received, _ = self.client.communicate(timeout=_END_S)
         self.recorder.close()
         recorded = self.recorder.status()
         return (
             f"Recorded: {recorded['recorded_framesets']} framesets, {recorded['framesets_not_recorded']} left out. "
-            f"The client by gRPC: {heard.strip()}."
+            f"The client by gRPC: {received.strip()}."
         )
 
 
 def listen(address: str) -> None:
-    """What the client does: keyframes with their images, all of them, until there are no more."""
+    """Take all keyframes with their images, in the client's process."""
     with Client(address) as client:
-        print("listens", flush=True)
+        print("connected", flush=True)
         ids = [keyframe.id for keyframe in client.keyframes(with_images=True)]
     missing = len(set(range(ids[0], ids[-1] + 1)) - set(ids)) if ids else 0
     print(f"{len(ids)} keyframes with their images, {missing} missing", flush=True)

@@ -1,7 +1,7 @@
-"""``scripts/campaign soak``: does the live system stay as it is, over thousands of framesets?
+"""``scripts/campaign soak``: do memory and speed of the live system stay constant over thousands of framesets?
 
 The whole live system, from the source to the listeners, on the simulated room that is walked to and fro. Memory is that
-of the process. With ``--beside``, it is recorded and offered to other programs meanwhile, and one takes all keyframes.
+of the process. With ``--services``, it is recorded and served by gRPC and ROS 2, and a client takes all keyframes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, machine, tell
 
 from campaigns.live_listener import Listener
-from campaigns.live_services import Beside
+from campaigns.live_services import Services
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.live.heap import share_heap
@@ -38,10 +38,10 @@ _Figures = Mapping[str, float | int | str | None]
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``soak``."""
     parser = add_command(subparsers, "soak", "memory, latency and losses of the live system over hours", __doc__)
-    parser.add_argument("--framesets", type=int, default=20_000, help="as many (default: 20000)")
+    parser.add_argument("--framesets", type=int, default=20_000, help="number of framesets (default: 20000)")
     parser.add_argument("--real-time", action="store_true", help="at the sensors' pace, not as fast as possible")
     parser.add_argument(
-        "--beside", action="store_true", help="record it, and offer it by gRPC and ROS 2 (25 GB of disk for 20000)"
+        "--services", action="store_true", help="record it, and serve it by gRPC and ROS 2 (25 GB of disk for 20000)"
     )
     add_report_options(parser)
     add_data_option(parser)
@@ -55,31 +55,31 @@ def main(args: argparse.Namespace) -> None:
     folder = simulated(args.data, _SCENE)
     report = Report()
     how = "at the sensors' pace" if args.real_time else "as fast as possible"
-    given = "".join(f" --{name}" for name in ("real-time", "beside") if vars(args)[name.replace("-", "_")])
+    given = "".join(f" --{name}" for name in ("real-time", "services") if vars(args)[name.replace("-", "_")])
     report.add(machine(), "", f"`--framesets {args.framesets}{given}`: {how}.")
     with tempfile.TemporaryDirectory() as made:
-        target = Path(made) / "soak.mcap" if args.beside else None
-        rows, figures, growth_mb, told_beside = _soak(folder, args.framesets, args.real_time, target)
+        target = Path(made) / "soak.mcap" if args.services else None
+        rows, figures, growth_mb, services_summary = _soak(folder, args.framesets, args.real_time, target)
     report.table(_HEAD, rows)
     lost = _lost(figures)
-    told = f"p50 {figures['latency_p50_ms']:.1f} ms (newest), p99 {figures['latency_p99_all_ms']:.1f} ms (all)"
+    latency = f"p50 {figures['latency_p50_ms']:.1f} ms (newest), p99 {figures['latency_p99_all_ms']:.1f} ms (all)"
     report.add(
-        f"Memory grew by {growth_mb:.1f} MB after {'three tenths' if args.beside else 'the first tenth'}. "
+        f"Memory grew by {growth_mb:.1f} MB after {'three tenths' if args.services else 'the first tenth'}. "
         f"Lost: {lost or 'nothing'}. "
-        + (f"Latency: {told}." if args.real_time else f"Work on a frameset: {_work_told(figures)}.")
+        + (f"Latency: {latency}." if args.real_time else f"Work on a frameset: {_work_summary(figures)}.")
     )
-    if told_beside:
-        report.add(told_beside)
+    if services_summary:
+        report.add(services_summary)
     if args.out is not None:
         report.save(args.out)
     if args.docs:
-        report.save_to_docs("soak-beside" if args.beside else "soak")
+        report.save_to_docs("soak-services" if args.services else "soak")
 
 
 def _soak(
     folder: Path, framesets: int, is_real_time: bool, target: Path | None
 ) -> tuple[list[list[str]], _Figures, float, str]:
-    """Rows by tenths, the figures at the end, by how much memory grew, and what ran beside: none without a target."""
+    """Rows by tenths, the figures at the end, the growth of memory (MB), and the services' summary if there are any."""
     share_heap()  # as the command line does
     config = Config()
     if target is not None:
@@ -91,7 +91,7 @@ def _soak(
     running = LiveOdometry(source, rig, config, wants_keyframes=target is not None)
     listener = Listener(running, folder)
     with ExitStack() as stack:
-        beside = None if target is None else Beside.start(running, target, not is_real_time, stack)
+        services = None if target is None else Services.start(running, target, not is_real_time, stack)
         running.start()
         begun_s, due = time.monotonic(), framesets / _PARTS
         rows: list[list[str]] = []
@@ -104,13 +104,13 @@ def _soak(
                 tell(f"{figures['estimates']} of {framesets}")
         running.stop()
         listener.thread.join()
-        told_beside = "" if beside is None else beside.told()
+        summary = "" if services is None else services.summary()
     figures = dict(running.status())
     figures |= {f"work_p{percent}_ms": float(np.percentile(listener.work_ms, percent)) for percent in (50, 99)}
     rows.append(_row(figures, listener.error_mm, time.monotonic() - begun_s))
     memories.append(float(figures["memory_mb"] or np.nan))
-    warm = 2 if beside is not None else 0  # keyframes are kept up to 256 MB, which takes a while to fill
-    return rows, figures, max(memories[warm:]) - memories[warm], told_beside
+    warm = 2 if services is not None else 0  # keyframes are kept up to 256 MB, which takes a while to fill
+    return rows, figures, max(memories[warm:]) - memories[warm], summary
 
 
 def _row(figures: _Figures, error_mm: float, elapsed_s: float) -> list[str]:
@@ -131,5 +131,5 @@ def _lost(figures: _Figures) -> dict[str, int]:
     return {name: int(value) for name, value in figures.items() if name.startswith(kinds) and value}
 
 
-def _work_told(figures: _Figures) -> str:
+def _work_summary(figures: _Figures) -> str:
     return f"p50 {figures['work_p50_ms']:.1f} ms, p99 {figures['work_p99_ms']:.1f} ms"
