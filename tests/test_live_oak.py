@@ -22,8 +22,7 @@ from graphvio.geometry import se3, se3_inverse, so3_exp
 from graphvio.live.devices import DeviceSource
 from graphvio.live.lens_fit import fit_rational
 from graphvio.live.sources import SourceSpec, kind_of
-from graphvio.live.sources.oak import list_devices, open_source
-from graphvio.live.sources.oak_device import StreamSettings
+from graphvio.live.sources.oak import StreamSettings, list_devices, open_source
 from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.rig import Rig
 
@@ -274,7 +273,7 @@ def test_images_of_rational_lenses_are_moved_unless_they_are_wanted_raw() -> Non
 
 def test_most_cameras_do_not_know_where_their_imu_is() -> None:
     plugs = Plugs(A=Queues(calibration(PLAIN, imu=False)))
-    with pytest.raises(RigError, match=r"where the IMU is.*places=guess.*--correct-imu"):
+    with pytest.raises(RigError, match=r"pose of the IMU.*places=guess.*--correct-imu"):
         begun("oak:A", plugs)
     source, rig, _ = begun("oak:A?imu=none", plugs)
     source.close()
@@ -380,7 +379,7 @@ def test_closing_does_not_wait_for_messages() -> None:
     [
         ("oak:Z", "Cannot find any device"),
         ("oak:A,B,C", "3 cameras, but the rig has 1 pairs"),
-        ("oak:A?iso=800", "counts with exposure_us="),
+        ("oak:A?iso=800", "iso= needs exposure_us="),
         ("oak:A?imu=second", "choose one of first, none"),
         ("oak:A?sync=hardware", "has no option 'sync'"),
     ],

@@ -113,7 +113,7 @@ class SoftwareBus:
 
     def __init__(self, *devices: Software) -> None:
         self.connected = {device.serial: device for device in devices}
-        self._watched: list[tuple[Any, Callable[[], None]]] = []
+        self._monitored: list[tuple[Any, Callable[[], None]]] = []
 
     def serials(self) -> list[str]:
         return list(self.connected)
@@ -121,12 +121,12 @@ class SoftwareBus:
     def find(self, serial: str) -> Any | None:
         return self.connected[serial].device if serial in self.connected else None
 
-    def watch(self, device: Any, on_removed: Callable[[], None]) -> None:
-        self._watched.append((device, on_removed))
+    def monitor(self, device: Any, on_removed: Callable[[], None]) -> None:
+        self._monitored.append((device, on_removed))
 
     def unplug(self, serial: str) -> None:
         gone = self.connected.pop(serial).device
-        for device, on_removed in self._watched:
+        for device, on_removed in self._monitored:
             if device is gone:
                 on_removed()
 
