@@ -130,8 +130,7 @@ def test_live_long_outage_of_all_starts_new_epoch(room_walk: Path) -> None:
 
 def test_live_drifting_clocks_and_late_readings_are_corrected(room_walk: Path) -> None:
     """With the times of arrival that a host would have noted, whatever this machine has to do meanwhile."""
-    from graphvio.live.sources.pacing import Pace
-    from graphvio.live.sources.replay import paced
+    from graphvio.live.sources.replay import Pace, paced
     from graphvio.live.sources.simulated_faults import DeviceFaults, with_faults
     from graphvio.trajectory_files import load_trajectory
 

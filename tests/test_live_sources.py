@@ -16,8 +16,7 @@ from graphvio import FrameSet, open_source
 from graphvio.errors import SourceError
 from graphvio.geometry import so3_exp
 from graphvio.live.sources import SourceSpec, open_live_source
-from graphvio.live.sources.pacing import Pace, speed_of
-from graphvio.live.sources.replay import paced
+from graphvio.live.sources.replay import Pace, paced, speed_of
 from graphvio.live.sources.simulated_faults import DeviceFaults, Outage, devices_of, with_faults
 from graphvio.live.sources.simulator import _leg
 from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
@@ -32,9 +31,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def resting(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Half a second of the room, at rest."""
-    out = tmp_path_factory.mktemp("simulated") / "resting"
+def stationary(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Half a second of the room, stationary."""
+    out = tmp_path_factory.mktemp("simulated") / "stationary"
     simulate("room", out, duration_s=0.5, seed=3)
     return out
 
@@ -49,7 +48,7 @@ def images_and_samples(readings: list[Reading]) -> tuple[list[CameraFrame], list
     return [r for r in readings if isinstance(r, CameraFrame)], [r for r in readings if isinstance(r, ImuReading)]
 
 
-def test_samples_before_the_first_image_are_not_waited_for(recording: Path) -> None:
+def test_replay_samples_before_first_image_come_at_once(recording: Path) -> None:
     """They begin a second before it."""
     source = open_live_source(f"replay:{recording}")
     source.open()
@@ -67,7 +66,7 @@ def test_samples_before_the_first_image_are_not_waited_for(recording: Path) -> N
 # ---------------------------------------------------------------- what is written
 
 
-def test_a_spec_is_taken_apart() -> None:
+def test_spec_is_parsed() -> None:
     spec = SourceSpec.parse("realsense:0123,4567?rate_hz=30&width=640")
     assert spec == SourceSpec("realsense", "0123,4567", {"rate_hz": "30", "width": "640"})
     assert SourceSpec.parse("simulator") == SourceSpec("simulator")
@@ -75,7 +74,7 @@ def test_a_spec_is_taken_apart() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("simulater", "there is no live source 'simulater'.*simulator"),
         ("walk.mcap", "there is no live source 'walk.mcap'.*replay"),
@@ -96,16 +95,16 @@ def test_a_spec_is_taken_apart() -> None:
         ("replay:nowhere?legs=2", "replay has no option 'legs'"),
     ],
 )
-def test_what_cannot_be_opened_is_told(text: str, told: str) -> None:
-    with pytest.raises(SourceError, match=told):
+def test_open_live_source_bad_spec_is_refused(text: str, message: str) -> None:
+    with pytest.raises(SourceError, match=message):
         open_live_source(text)
 
 
 @pytest.mark.parametrize(
-    ("option", "told"),
+    ("option", "message"),
     [
         ("unplug=left@1-2", "there is no device 'left'; there are front, back, imu"),
-        ("unplug=back@1", "a fault's value is no number"),
+        ("unplug=back@1", "a fault's value is not a number"),
         ("unplug=back@8-5", "for no time"),
         ("jitter_ms=nan", "jitter_ms is not from 0"),
         ("drift_ppm=nan", "drift_ppm not from"),
@@ -115,15 +114,15 @@ def test_what_cannot_be_opened_is_told(text: str, told: str) -> None:
         ("rate_hz=0&legs=1", "rate_hz is '0'"),
     ],
 )
-def test_what_the_simulated_devices_cannot_do_is_told(resting: Path, option: str, told: str) -> None:
-    with pytest.raises(SourceError, match=told):
-        open_live_source(f"simulator:room?recording={resting}&{option}").open()
+def test_simulator_bad_option_is_refused(stationary: Path, option: str, message: str) -> None:
+    with pytest.raises(SourceError, match=message):
+        open_live_source(f"simulator:room?recording={stationary}&{option}").open()
 
 
 # ---------------------------------------------------------------- replays
 
 
-def test_a_replay_gives_all_of_a_recording(recording: Path) -> None:
+def test_replay_yields_whole_recording(recording: Path) -> None:
     source = open_source(recording)
     expected = list(source)
     frames, samples = images_and_samples(all_of(f"replay:{recording}?speed=max"))
@@ -136,7 +135,7 @@ def test_a_replay_gives_all_of_a_recording(recording: Path) -> None:
     np.testing.assert_array_equal(frames[6].decode(), framesets[1].images[1][0])
 
 
-def test_faults_of_a_recording_are_told(recording: Path, tmp_path: Path) -> None:
+def test_replay_reports_faults_of_recording(recording: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken"
     broken.symlink_to(write_euroc(tmp_path / "walk", frames=4, pairs=1))
     next((broken / "mav0/cam1/data").glob("*.png")).write_bytes(b"no image")
@@ -149,7 +148,7 @@ def test_faults_of_a_recording_are_told(recording: Path, tmp_path: Path) -> None
     assert sum(health.counts.values()) == len(notices)
 
 
-def test_a_replay_keeps_the_recordings_pace(recording: Path) -> None:
+def test_replay_keeps_pace_of_recording(recording: Path) -> None:
     """Never faster, however busy the machine is: one second of images at five times the pace."""
     begun_s = time.monotonic()
     readings = all_of(f"replay:{recording}?speed=5")
@@ -161,7 +160,7 @@ def test_a_replay_keeps_the_recordings_pace(recording: Path) -> None:
     assert apart_ns > 0.8 * (frames[-1].stamp_ns - frames[0].stamp_ns) / 10
 
 
-def test_closing_wakes_a_replay_that_waits(recording: Path) -> None:
+def test_replay_close_ends_wait(recording: Path) -> None:
     source = open_live_source(f"replay:{recording}?speed=0.01")
     source.open()
     thread = threading.Thread(target=lambda: list(source.readings()), daemon=True)
@@ -172,9 +171,9 @@ def test_closing_wakes_a_replay_that_waits(recording: Path) -> None:
     assert not thread.is_alive()
 
 
-def test_a_pace_does_not_make_up_for_time_that_was_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pace_skips_lost_time(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [10_000_000_000]
-    monkeypatch.setattr("graphvio.live.sources.pacing.host_ns", lambda: now[0])
+    monkeypatch.setattr("graphvio.live.sources.replay.host_ns", lambda: now[0])
     pace = Pace(1.0)
     waits: list[float] = []
     monkeypatch.setattr(pace._stop, "wait", waits.append)
@@ -186,12 +185,12 @@ def test_a_pace_does_not_make_up_for_time_that_was_lost(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "101", "nan", "x"])
-def test_impossible_speeds(text: str) -> None:
+def test_speed_of_bad_value_is_refused(text: str) -> None:
     with pytest.raises(SourceError, match=r"speed is .*; write a number from 0\.01 to 100"):
         speed_of(SourceSpec("replay", "walk", {"speed": text}))
 
 
-def test_speeds() -> None:
+def test_speed_of_values() -> None:
     given = [{}, {"speed": "max"}, {"speed": "2.5"}]
     assert [speed_of(SourceSpec("replay", "walk", options)) for options in given] == [1.0, None, 2.5]
 
@@ -199,8 +198,8 @@ def test_speeds() -> None:
 # ---------------------------------------------------------------- the simulated rig, to and fro
 
 
-def test_there_and_back_is_the_same_way(room_walk: Path) -> None:
-    """Rotations that the gyro tells cancel, accelerations and images come in the other order."""
+def test_simulator_way_back_reverses_way_there(room_walk: Path) -> None:
+    """Rotations by the gyro cancel, accelerations and images come in the other order."""
     source = open_source(room_walk)
     track = make_simulator("room", seed=3).imu_track
     there, back = ([*_leg(source, track, leg)] for leg in (0, 1))
@@ -230,21 +229,21 @@ def test_there_and_back_is_the_same_way(room_walk: Path) -> None:
         farthest_rad = max(farthest_rad, float(np.arccos(np.clip((np.trace(begin_R_now) - 1) / 2, -1, 1))))
     left_rad = float(np.arccos(np.clip((np.trace(begin_R_now) - 1) / 2, -1, 1)))
     assert farthest_rad > 0.2
-    assert left_rad < 0.01  # at the turn, where this walk does not rest, the rate jumps
+    assert left_rad < 0.01  # at the turn, where this walk does not stop, the rate jumps
     for one_way, other_way in zip(samples(there)[:-1], samples(back)[::-1], strict=True):
         np.testing.assert_array_equal(one_way.linear_acceleration, other_way.linear_acceleration)
 
 
-def test_a_walk_that_ends_in_motion_is_not_walked_back(room_walk: Path) -> None:
+def test_simulator_walk_ending_in_motion_is_not_reversed(room_walk: Path) -> None:
     spec = f"simulator:room?recording={room_walk}&seed=3"
-    with pytest.raises(SourceError, match="does not end at rest, so that it cannot be walked back"):
+    with pytest.raises(SourceError, match="does not end stationary, so that it cannot be walked back"):
         open_live_source(spec).open()
     open_live_source(f"{spec}&legs=1").open()
     open_live_source(f"{spec}&duration_s=4").open()
 
 
-def test_it_goes_on_for_as_long_as_is_asked(resting: Path) -> None:
-    spec = f"simulator:room?recording={resting}&seed=3&speed=max"
+def test_simulator_lasts_legs_or_duration(stationary: Path) -> None:
+    spec = f"simulator:room?recording={stationary}&seed=3&speed=max"
     frames, samples = images_and_samples(all_of(f"{spec}&legs=3"))
     assert len(frames) == 4 * (10 + 9 + 9)
     assert np.ptp(np.diff([s.stamp_ns for s in samples])) <= 1
@@ -263,7 +262,7 @@ def test_it_goes_on_for_as_long_as_is_asked(resting: Path) -> None:
 # ---------------------------------------------------------------- faults
 
 
-def test_faults_are_read() -> None:
+def test_device_faults_are_parsed() -> None:
     faults = DeviceFaults.parse({"unplug": "back@5-8,imu@20-21.5", "jitter_ms": "2"}, ("front", "back", "imu"))
     assert faults == DeviceFaults(None, 2.0, (Outage("back", 5.0, 8.0), Outage("imu", 20.0, 21.5)))
 
@@ -274,12 +273,17 @@ def faulty(recording: Path, faults: DeviceFaults) -> Iterator[Reading]:
     return with_faults(readings, source.rig, faults, source.start_ns, seed=1)
 
 
-def test_an_unplugged_device_gives_nothing_and_is_told_once(recording: Path) -> None:
+def test_outage_drops_readings_and_is_reported_once(recording: Path) -> None:
     start_ns = open_source(recording).start_ns
     outages = (Outage("pair1", 0.2, 0.6), Outage("imu", 0.3, 0.4))
     readings = list(faulty(recording, DeviceFaults(outages=outages)))
-    told = [(r.kind, r.clock) for r in readings if isinstance(r, Notice)]
-    assert told == [("device_lost", "pair1"), ("device_lost", "imu"), ("device_back", "imu"), ("device_back", "pair1")]
+    notices = [(r.kind, r.clock) for r in readings if isinstance(r, Notice)]
+    assert notices == [
+        ("device_lost", "pair1"),
+        ("device_lost", "imu"),
+        ("device_back", "imu"),
+        ("device_back", "pair1"),
+    ]
     frames, samples = images_and_samples(readings)
     gone = {f.stamp_ns - start_ns for f in frames if f.camera == "cam0"} - {
         f.stamp_ns - start_ns for f in frames if f.camera == "cam2"
@@ -288,7 +292,7 @@ def test_an_unplugged_device_gives_nothing_and_is_told_once(recording: Path) -> 
     assert max(np.diff([s.stamp_ns for s in samples])) == 105_000_000
 
 
-def test_each_device_has_a_clock_of_its_own(recording: Path) -> None:
+def test_drift_gives_each_device_a_clock(recording: Path) -> None:
     source = open_source(recording)
     assert devices_of(source.rig) == ("pair0", "pair1", "imu")
     readings = list(faulty(recording, DeviceFaults(drift_ppm=100.0)))
@@ -303,7 +307,7 @@ def test_each_device_has_a_clock_of_its_own(recording: Path) -> None:
     assert {f.clock for f in frames if f.camera in ("cam2", "cam3")} == {"pair1"}
 
 
-def test_late_readings_keep_the_order_of_their_device_and_none_is_lost(recording: Path) -> None:
+def test_jitter_keeps_order_per_device_and_loses_none(recording: Path) -> None:
     expected_frames, expected_samples = images_and_samples(list(faulty(recording, DeviceFaults())))
     begun_ns = host_ns()
     frames, samples = images_and_samples(list(faulty(recording, DeviceFaults(jitter_ms=5.0))))

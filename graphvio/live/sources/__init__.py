@@ -1,4 +1,4 @@
-"""Live sources, one file each; each names the kind that it is, lists its devices and opens one."""
+"""Live sources: one module a kind, which lists its devices and opens a source."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class SourceSpec:
     """``KIND[:WHAT][?KEY=VALUE[&KEY=VALUE]]``, such as ``realsense:0123,4567?rate_hz=30``.
 
     Attributes:
-        kind: of source.
+        kind: of source, one of `KINDS`.
         what: device, devices separated by commas, path or name; may be empty.
-        options: the source's own.
+        options: of the source.
     """
 
     kind: str
@@ -31,10 +31,10 @@ class SourceSpec:
 
     @staticmethod
     def parse(text: str) -> SourceSpec:
-        """Take a text apart.
+        """Parse a text.
 
         Raises:
-            SourceError: if there is no such kind, or an option has no value.
+            SourceError: if there is no such kind, or an option has no value or two.
         """
         head, _, tail = text.partition("?")
         kind, _, what = head.partition(":")
@@ -54,17 +54,21 @@ class SourceSpec:
 
 
 class SourceKind(Protocol):
-    """What the module of each kind has."""
+    """Interface of the modules."""
 
     def list_devices(self) -> Sequence[DeviceInfo]:
-        """What is connected.
+        """List the connected devices.
 
         Raises:
             MissingExtraError: if the vendor's library is not installed.
         """
 
     def open_source(self, spec: SourceSpec, rig: Rig | None) -> LiveSource:
-        """The source; nothing is started before its `open`.
+        """Make a source; nothing is started before its `open`.
+
+        Args:
+            spec: of the source.
+            rig: or None for the rig of the source itself.
 
         Raises:
             SourceError: if an option is not known, or its value is not valid.
@@ -73,21 +77,21 @@ class SourceKind(Protocol):
 
 
 def kind_of(name: str) -> SourceKind:
-    """The module of a kind."""
+    """Import the module of a kind."""
     return cast(SourceKind, import_module(f"graphvio.live.sources.{name}"))
 
 
 def open_live_source(text: str, rig: Rig | None = None) -> LiveSource:
-    """A live source by what is written on the command line; see `SourceSpec` and `SourceKind.open_source`."""
+    """Make a live source by its text on the command line; see `SourceSpec` and `SourceKind.open_source`."""
     spec = SourceSpec.parse(text)
     return kind_of(spec.kind).open_source(spec, rig)
 
 
 def check_options(spec: SourceSpec, known: Sequence[str]) -> None:
-    """Refuse options that a kind does not have.
+    """Check that a kind has the options of a spec.
 
     Raises:
-        SourceError: if there is one; the message names the nearest that it has.
+        SourceError: if not; the message names the nearest option.
     """
     for key in spec.options:
         if key not in known:

@@ -1,15 +1,17 @@
-"""A recording as a live source: in real time, at a multiple, or as fast as it is taken."""
+"""Recordings as a live source: in real time, at a multiple of it, or as fast as readings are taken."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
-from graphvio.arrays import Image
+import numpy as np
+
 from graphvio.errors import SourceError
 from graphvio.live.source import DeviceInfo
 from graphvio.live.sources import SourceSpec, check_options
-from graphvio.live.sources.pacing import Pace, speed_of
 from graphvio.live.spec_options import number_of
 from graphvio.measurements.readings import CameraFrame, DeviceHealth, ImuReading, Notice, Reading, host_ns
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
@@ -18,21 +20,22 @@ from graphvio.sources import Source
 from graphvio.sources import open_source as open_recording
 
 _OPTIONS = ("speed", "from_s", "to_s")
+_MAX_DELAY_NS = 1_000_000_000
 
 
 def list_devices() -> Sequence[DeviceInfo]:
-    """There is always one: any recording."""
+    """See `SourceKind.list_devices`: always one, any recording."""
     return [
         DeviceInfo("replay:RECORDING", "a recording in real time; ?speed=2 is twice as fast, ?speed=max waits for none")
     ]
 
 
 def open_source(spec: SourceSpec, rig: Rig | None) -> Replay:
-    """A recording by its path.
+    """Open a recording by its path; see `SourceKind.open_source`.
 
     Raises:
         SourceError: if it cannot be read, or an option is not valid.
-        RigError: if no rig is given and the recording carries none.
+        RigError: if no rig is given and the recording has none.
     """
     check_options(spec, _OPTIONS)
     if not spec.what:
@@ -43,11 +46,11 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> Replay:
 
 
 class Replay:
-    """A recording (`graphvio.live.source.LiveSource`).
+    """A recording as a `LiveSource`.
 
     Args:
         recording: is read once.
-        speed: of its time, or None for as fast as it is taken.
+        speed: factor of the recording's time, or None for as fast as readings are taken.
     """
 
     def __init__(self, recording: Source, speed: float | None) -> None:
@@ -57,47 +60,82 @@ class Replay:
         self._pace = Pace(speed)
 
     def open(self) -> Rig:
-        """The rig of the recording."""
+        """Return the rig of the recording."""
         return self._recording.rig
 
     def readings(self) -> Iterator[Reading]:
-        """Samples and images, each when it is due."""
+        """Yield samples and images when they are due, and at the end the recording's faults."""
         yield from paced(self._recording, self._recording.rig, self._pace)
         for event in self._recording.faults.events:
             yield Notice(event.kind, event.detail, host_ns())
 
     def health(self) -> Sequence[DeviceHealth]:
-        """What was wrong with the recording until now."""
+        """Return the recording's faults so far."""
         return [DeviceHealth(self.name, True, "recording", dict(self._recording.faults.counts))]
 
     def close(self) -> None:
-        """Read no further."""
+        """Stop reading."""
         self._pace.stop()
 
 
+class Pace:
+    """Waits until measurements are due.
+
+    Args:
+        speed: factor of the recording's time; None does not wait.
+    """
+
+    def __init__(self, speed: float | None) -> None:
+        self._speed = speed
+        self._stop = threading.Event()
+        self._first: tuple[int, int] | None = None  # stamp, and when it was due
+
+    def wait_for(self, stamp_ns: int) -> bool:
+        """Wait until a stamp is due; returns False after `stop`."""
+        if self._speed is not None and not self._stop.is_set():
+            if self._first is None:
+                self._first = stamp_ns, host_ns()
+            due_ns = self._first[1] + round((stamp_ns - self._first[0]) / self._speed)
+            left_ns = due_ns - host_ns()
+            if left_ns < -_MAX_DELAY_NS:  # after a suspension or a slow reader: sensors do not make up for that
+                self._first = stamp_ns, host_ns()
+            elif left_ns > 0:
+                self._stop.wait(left_ns * 1e-9)
+        return not self._stop.is_set()
+
+    def stop(self) -> None:
+        """End the current wait and all later ones; from any thread."""
+        self._stop.set()
+
+
+def speed_of(spec: SourceSpec) -> float | None:
+    """Return the option ``speed``: a factor such as ``2``, 1 where it is not given, or None for ``max``.
+
+    Raises:
+        SourceError: if it is neither.
+    """
+    if spec.options.get("speed") == "max":
+        return None
+    return number_of(spec, "speed", 0.01, 100.0) or 1.0
+
+
 def paced(measurements: Iterable[Measurement], rig: Rig, pace: Pace) -> Iterator[Reading]:
-    """Measurements as readings of one clock, each when it is due; samples before the first frameset come at once."""
-    has_begun = False
+    """Yield measurements as readings of one clock when they are due, those before the first frameset at once.
+
+    Args:
+        measurements: of a recording.
+        rig: names the cameras.
+        pace: waits for the stamps, and ends the readings when it is stopped.
+    """
+    has_frameset = False
     for measurement in measurements:
-        has_begun = has_begun or isinstance(measurement, FrameSet)
-        if has_begun and not pace.wait_for(measurement.stamp_ns):
+        has_frameset = has_frameset or isinstance(measurement, FrameSet)
+        if has_frameset and not pace.wait_for(measurement.stamp_ns):
             return
-        now_ns = host_ns()
+        stamp_ns, now_ns = measurement.stamp_ns, host_ns()
         if isinstance(measurement, ImuSample):
-            yield ImuReading(
-                measurement.stamp_ns, measurement.angular_velocity, measurement.linear_acceleration, now_ns
-            )
+            yield ImuReading(stamp_ns, measurement.angular_velocity, measurement.linear_acceleration, now_ns)
             continue
         for j, images in sorted(measurement.images.items()):
             for camera, image in zip((rig.pairs[j].left, rig.pairs[j].right), images, strict=True):
-                yield CameraFrame(camera.name, measurement.stamp_ns, _Decoded(image), now_ns)
-
-
-class _Decoded:
-    """An image that a recording's own threads have decoded."""
-
-    def __init__(self, image: Image) -> None:
-        self._image = image
-
-    def __call__(self) -> Image:
-        return self._image
+                yield CameraFrame(camera.name, stamp_ns, partial(np.asarray, image), now_ns)

@@ -1,4 +1,4 @@
-"""What simulated devices do wrong: clocks of their own, late arrival, and being unplugged for a while."""
+"""Faults of simulated devices: drifting clocks, late arrivals and outages."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from itertools import count
 import numpy as np
 
 from graphvio.errors import SourceError
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.rig import Rig
 
 IMU = "imu"
 OPTIONS = ("drift_ppm", "jitter_ms", "unplug")
-_CLOCK_OFFSET_NS = 7_000_000_000_000  # by which each further device's clock is off
+_CLOCK_OFFSET_NS = 7_000_000_000_000  # between the clocks of consecutive devices
 
 
 @dataclass(frozen=True)
 class Outage:
-    """A device is unplugged from one second of the walk to another."""
+    """An interval of the walk, in seconds, in which a device is unplugged."""
 
     device: str
     from_s: float
@@ -30,13 +31,13 @@ class Outage:
 
 @dataclass(frozen=True)
 class DeviceFaults:
-    """How the devices of a rig fail: each pair is one, and the IMU is one.
+    """Faults of a rig's devices: each pair is one, and the IMU is one.
 
     Attributes:
-        drift_ppm: of the first device's clock; the others' are in between, by turns of the other sign. None gives all
-            one clock.
-        jitter_ms: mean of the exponential part of the time that a reading takes to the host.
-        outages: when which device is gone.
+        drift_ppm: of the first device's clock; those of the others are smaller, of alternating sign. None gives all
+            devices one clock.
+        jitter_ms: mean of the exponentially distributed delay of a reading on its way to the host.
+        outages: of the devices.
     """
 
     drift_ppm: float | None = None
@@ -45,7 +46,11 @@ class DeviceFaults:
 
     @staticmethod
     def parse(options: Mapping[str, str], rig_devices: tuple[str, ...]) -> DeviceFaults:
-        """From a source's options, such as ``drift_ppm=100``, ``jitter_ms=2`` and ``unplug=back@5-8,imu@20-21``.
+        """Parse options such as ``drift_ppm=100``, ``jitter_ms=2`` and ``unplug=back@5-8,imu@20-21``.
+
+        Args:
+            options: of a source.
+            rig_devices: names of the devices.
 
         Raises:
             SourceError: if a device is not there, or a value is not valid.
@@ -60,7 +65,7 @@ class DeviceFaults:
                 outages.append(Outage(device, float(begin), float(end)))
         except ValueError:
             raise SourceError(
-                "simulator: a fault's value is no number; write drift_ppm=100, jitter_ms=2, unplug=DEVICE@FROM-TO"
+                "simulator: a fault's value is not a number; write drift_ppm=100, jitter_ms=2, unplug=DEVICE@FROM-TO"
             ) from None
         for outage in outages:
             if outage.device not in rig_devices:
@@ -75,19 +80,19 @@ class DeviceFaults:
 
 
 def devices_of(rig: Rig) -> tuple[str, ...]:
-    """Names of the pairs and, if there is one, the IMU."""
+    """Return the names of the pairs and, if there is one, the IMU."""
     return (*(pair.name for pair in rig.pairs), *((IMU,) if rig.imu is not None else ()))
 
 
 def with_faults(
     readings: Iterable[Reading], rig: Rig, faults: DeviceFaults, start_ns: int, seed: int
 ) -> Iterator[Reading]:
-    """Readings as devices that fail would give them.
+    """Apply faults to readings.
 
     Args:
-        readings: of devices that do not, stamped by one clock.
-        rig: of them.
-        faults: what goes wrong.
+        readings: stamped by one clock.
+        rig: of the readings.
+        faults: to apply.
         start_ns: stamp from which outages count.
         seed: of the jitter.
     """
@@ -95,7 +100,7 @@ def with_faults(
     device_of = {camera.name: pair.name for pair in rig.pairs for camera in (pair.left, pair.right)}
     rng, number = np.random.default_rng(seed), count()
     late: list[tuple[int, int, Reading]] = []
-    last_ns = dict.fromkeys(devices, 0)  # a device's readings keep their order
+    last_ns = dict.fromkeys(devices, 0)  # readings of a device keep their order
     gone: frozenset[str] = frozenset()
     for reading in readings:
         if isinstance(reading, Notice):
@@ -105,7 +110,7 @@ def with_faults(
         now_s = (reading.stamp_ns - start_ns) * 1e-9
         absent = frozenset(each.device for each in faults.outages if each.from_s <= now_s < each.to_s)
         for name in sorted(absent ^ gone):
-            kind = "device_lost" if name in absent else "device_back"
+            kind = EventKind.DEVICE_LOST if name in absent else EventKind.DEVICE_BACK
             yield Notice(kind, f"{name} was {'un' * (name in absent)}plugged", host_ns(), name)
         gone = absent
         if device in gone:

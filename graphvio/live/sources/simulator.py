@@ -1,7 +1,7 @@
-"""The simulator as a live device: a walk that is rendered once, by a process of its own, and then walked to and fro.
+"""The simulator as a live source: a walk that is rendered once, by another process, and then walked there and back.
 
 On the way back time runs backwards: positions and attitudes are those of the way there, velocities and rates have the
-other sign, accelerations are the same. Where a walk begins and ends at rest, to and fro is one smooth motion.
+other sign, accelerations are the same. Where a walk begins and ends stationary, the whole motion is smooth.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from graphvio.errors import SourceError
 from graphvio.kernels import cache_root
 from graphvio.live.source import DeviceInfo
 from graphvio.live.sources import SourceSpec, check_options
-from graphvio.live.sources.pacing import Pace, speed_of
-from graphvio.live.sources.replay import paced
+from graphvio.live.sources.replay import Pace, paced, speed_of
 from graphvio.live.sources.simulated_faults import OPTIONS as FAULT_OPTIONS
 from graphvio.live.sources.simulated_faults import DeviceFaults, devices_of, with_faults
 from graphvio.live.spec_options import number_of, whole_number_of
@@ -40,16 +39,16 @@ if TYPE_CHECKING:
     from graphvio.simulation.imu import ImuTrack
 
 _OPTIONS = ("speed", "duration_s", "legs", "seed", "rate_hz", "recording", *FAULT_OPTIONS)
-_STILL_M_S = 1e-3
+_MAX_END_SPEED_M_S = 1e-3
 
 
 def list_devices() -> Sequence[DeviceInfo]:
-    """A device for each scene that ends at rest, so that it can be walked for ever."""
+    """See `SourceKind.list_devices`: scenes that end stationary, which can be walked without end."""
     return [DeviceInfo(f"simulator:{name}", f"simulated rig, scene {name}") for name in ("room", "loop")]
 
 
 def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
-    """A scene by its name, ``room`` if there is none.
+    """Make a source of a scene by its name, ``room`` by default; see `SourceKind.open_source`.
 
     Raises:
         SourceError: if there is no such scene, or an option is not valid.
@@ -61,7 +60,7 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
     speed = speed_of(spec)
     rate_hz = number_of(spec, "rate_hz", 0.1, 200.0)
     if "drift_ppm" in spec.options and speed != 1.0:
-        raise SourceError("simulator: clocks that drift are told from when readings arrive: drift_ppm needs speed=1")
+        raise SourceError("simulator: drifting clocks are estimated from arrival times: drift_ppm needs speed=1")
     recording = Path(spec.options["recording"]) if "recording" in spec.options else None
     return SimulatedRig(
         scene,
@@ -77,18 +76,18 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
 
 
 class SimulatedRig:
-    """A scene (`graphvio.live.source.LiveSource`).
+    """A scene as a `LiveSource`.
 
     Args:
         scene: its name.
-        rig: takes the place of the scene's own, such as one with fewer pairs, or None.
-        speed: of its time, or None for as fast as it is taken.
-        duration_s: when it ends; None goes on for ever.
-        legs: how often it is walked, there and back counting as two; None goes on for ever.
+        rig: replaces the scene's own, such as one with fewer pairs, or None.
+        speed: factor of the scene's time, or None for as fast as readings are taken.
+        duration_s: of the readings; None for no end.
+        legs: number of walks, there and back counting as two; None for no end.
         seed: of all noise.
         rate_hz: framesets per second.
-        recording: where it was rendered before, by `graphvio simulate` with the same scene, seed and rate; None renders
-            it, once, in graphvio's folder of the user's cache.
+        recording: folder of `graphvio simulate` with the same scene, seed and rate; None renders it once, into
+            graphvio's folder of the user's cache.
         faults: options of `DeviceFaults.parse`.
     """
 
@@ -121,10 +120,10 @@ class SimulatedRig:
         self._track: ImuTrack | None = None
 
     def open(self) -> Rig:
-        """Render the scene if it has not been, which takes minutes, and read it.
+        """Render the scene, which takes minutes, unless it is in the cache, and open the recording.
 
         Raises:
-            SourceError: if it cannot be rendered, does not end at rest and is to be walked back, or has no such fault.
+            SourceError: if it cannot be rendered or walked back, or a fault is not valid.
         """
         folder = self._folder if self._folder is not None else self._rendered()
         self._opened = open_recording(folder, self._rig)
@@ -133,18 +132,18 @@ class SimulatedRig:
         return self._opened.rig
 
     def readings(self) -> Iterator[Reading]:
-        """Samples and images, each when it is due."""
-        assert self._opened is not None, "it was opened"
+        """Yield samples and images when they are due."""
+        assert self._opened is not None, "open() comes first"
         with closing(self._measurements(self._opened)) as measurements:
             readings = paced(measurements, self._opened.rig, self._pace)
             yield from with_faults(readings, self._opened.rig, self._faults, self._opened.start_ns, self._seed)
 
     def health(self) -> Sequence[DeviceHealth]:
-        """It is always there."""
+        """Return that it is connected, as always."""
         return [DeviceHealth(self.name, True, "simulated")]
 
     def close(self) -> None:
-        """Walk no further."""
+        """End the walk."""
         self._pace.stop()
 
     def _measurements(self, recording: Source) -> Generator[Measurement, None, None]:
@@ -157,7 +156,7 @@ class SimulatedRig:
             leg += 1
 
     def _inertial(self, recording: Source) -> ImuTrack | None:
-        """The IMU with its biases, which a recording does not tell apart."""
+        """Simulate the IMU track with its biases, which a recording does not separate."""
         from graphvio.simulation.simulator import make_simulator
 
         if recording.rig.imu is None:
@@ -166,19 +165,21 @@ class SimulatedRig:
         first_ns = simulator.stamps_ns[0]
         ends_s = 1e-9 * np.array([recording.start_ns - first_ns, recording.end_ns - first_ns])
         ends = simulator.scene.motion.at(np.clip(ends_s, 0.0, simulator.scene.motion.duration_s)).velocity
-        if self._legs != 1 and np.abs(ends).max() > _STILL_M_S and not self._ends_early(recording):
+        if self._legs != 1 and np.abs(ends).max() > _MAX_END_SPEED_M_S and not self._ends_early(recording):
             raise SourceError(
-                f"simulator: the walk {recording.name} does not end at rest, so that it cannot be walked back: ?legs=1"
+                f"simulator: {recording.name} does not end stationary, so that it cannot be walked back: give legs=1"
             )
         if not first_ns <= recording.start_ns <= recording.end_ns <= simulator.stamps_ns[-1]:
-            raise SourceError(f"simulator: {recording.name} is no recording of {self._scene}, whose walk is shorter")
+            raise SourceError(
+                f"simulator: {recording.name} is longer than the walk of {self._scene}; give a recording of that scene"
+            )
         return simulator.imu_track
 
     def _ends_early(self, recording: Source) -> bool:
         return self._duration_s is not None and self._duration_s * 1e9 <= recording.end_ns - recording.start_ns
 
     def _rendered(self) -> Path:
-        """The folder of the rendered scene."""
+        """Return the folder of the rendered scene, after rendering it if need be."""
         root = cache_root().parent / "simulator"
         folder = root / f"{self._scene}-seed{self._seed}-{self._rate_hz:g}hz-{_digest()}"
         if folder.is_dir():
@@ -200,7 +201,7 @@ class SimulatedRig:
 
 
 def _leg(recording: Source, track: ImuTrack | None, leg: int) -> Iterator[Measurement]:
-    """One walk through, there if the leg is even, back if it is odd; what stands at the turn is not given twice."""
+    """Yield one walk, there if the leg is even, back if it is odd; measurements at the turn come once."""
     start_ns, end_ns = recording.start_ns, recording.end_ns
     shift_ns, is_back = leg * (end_ns - start_ns), bool(leg % 2)
     origin_ns = end_ns if is_back else start_ns
@@ -223,12 +224,12 @@ def _leg(recording: Source, track: ImuTrack | None, leg: int) -> Iterator[Measur
     stamps = recording.stamps_ns
     ordered = (stamps[::-1] if is_back else stamps)[1 if leg else 0 :].tolist()
     with closing(read_ahead(recording.frameset_at, ordered)) as framesets:
-        renewed = (FrameSet(restamped(frameset.stamp_ns), frameset.images) for frameset in framesets)
-        yield from merge(samples(), renewed)
+        restamped_framesets = (FrameSet(restamped(frameset.stamp_ns), frameset.images) for frameset in framesets)
+        yield from merge(samples(), restamped_framesets)
 
 
 def _digest() -> str:
-    """Of the simulator's own files: another simulator renders anew."""
+    """Return a digest of the simulator's files: a changed simulator renders again."""
     import graphvio.simulation
 
     files = sorted(Path(graphvio.simulation.__file__).parent.rglob("*.py"))
