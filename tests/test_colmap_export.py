@@ -190,7 +190,7 @@ def test_matches_of_a_refused_loop_closure_make_no_points(
     rows = np.column_stack([np.arange(100), np.arange(100)])
     database.add_matches(names[0], names[1], rows)
     closure = LoopClosure(places[0], places[-1], np.eye(4), np.eye(6), 100, ((0, 0),), False)
-    refused = replace(exported.optimization, loops=[JudgedLoop(closure, "far from what all others say", 1e3)])
+    refused = replace(exported.optimization, loops=[JudgedLoop(closure, "far from the solution", 1e3)])
     (model,) = export(refused, [exported.session], database, folder, Config())
     assert (names[0], names[1]) not in database.verified_pairs()
     np.testing.assert_array_equal(database.all_matches(names[0], names[1]), rows)

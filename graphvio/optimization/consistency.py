@@ -1,9 +1,9 @@
-"""Which loop closures to believe: those that agree with the odometry and with each other.
+"""Selection of loop closures that are consistent with the odometry and with each other.
 
-Fragments, which are the epochs of the sessions, are first joined by the transforms on which most closures between them
-agree. Closures are then weighed by graduated non-convexity (H. Yang, P. Antonante, V. Tzoumas, L. Carlone, RA-L 2020),
-in a graph that holds their ends only: the odometry between two ends is one factor, with the covariance that the full
-graph has for it.
+Fragments, the epochs of all sessions, are first joined by the transforms on which most closures between them agree.
+Outliers are then rejected by graduated non-convexity (H. Yang, P. Antonante, V. Tzoumas, L. Carlone, RA-L 2020) in a
+graph of the closures' end states only: the odometry between two of them is one factor with its covariance in the full
+graph.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from graphvio.backend.noise import isotropic
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.optimization.solver import Edge, Marginals
 
-_AGREE_M = 0.5
-_AGREE_RAD = 0.1
-_LEAST_VOTES = 3
-_STRONG_POINTS = 100  # of a closure that may vote: fewer may be one thing that two places have alike
+_MAX_DIFFERENCE_M = 0.5  # of closures that agree
+_MAX_DIFFERENCE_RAD = 0.1
+_MIN_VOTES = 3
+_MIN_POINTS = 100  # of a closure that votes: fewer may be of one object that two places have in common
 _FRAME_SIGMA = 1e-6
-_JOINED_SIGMAS = np.repeat([_AGREE_RAD, _AGREE_M], 3)  # of how fragments lie to each other before closures are weighed
+_JOINED_SIGMAS = np.repeat([_MAX_DIFFERENCE_RAD, _MAX_DIFFERENCE_M], 3)  # of the transforms by vote
 
 
 class KnownMotions(Protocol):
-    """Who knows the motion between any two states of a fragment; `Marginals` of a solution do."""
+    """Motions between any two states of a fragment with their covariances, such as `Marginals`."""
 
     def motion(self, first: int, second: int) -> tuple[Float, Float]:
-        """``first_T_second`` (4, 4) and its covariance (6, 6), in body at the second."""
+        """Return ``first_T_second`` (4, 4) and its covariance (6, 6), in body at the second."""
 
     def distance(self, edge: Edge) -> float:
-        """Squared Mahalanobis distance of a closure that it does not rest on, 6 degrees of freedom."""
+        """Return the squared Mahalanobis distance, 6 degrees of freedom, of an edge that is independent of these."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +46,8 @@ class Joined:
     """Fragments in common frames.
 
     Attributes:
-        frames: of each fragment, ``frame_T_nav`` (4, 4).
-        component: of each fragment, the fragment whose nav frame it is in.
+        frames: ``frame_T_nav`` (4, 4) of each fragment.
+        component: for each fragment, the fragment whose nav frame is its frame.
     """
 
     frames: list[Float]
@@ -55,13 +55,13 @@ class Joined:
 
 
 def join_fragments(fragments: Sequence[range], poses: Float, edges: Sequence[Edge], inliers: Sequence[int]) -> Joined:
-    """Bring fragments that closures tie into the frame of the first of them.
+    """Transform fragments that loop closures join into the frame of the first of them.
 
     Args:
-        fragments: states of each, which share a nav frame.
-        poses: (N, 4, 4) of all states, in their fragments' frames.
-        edges: closures, right and wrong ones.
-        inliers: points of each closure.
+        fragments: states of each.
+        poses: (N, 4, 4) of all states, in their fragments' nav frames.
+        edges: true and false loop closures.
+        inliers: points of each loop closure.
     """
     of = fragment_of(fragments)
     frames = [np.eye(4) for _ in fragments]
@@ -69,10 +69,10 @@ def join_fragments(fragments: Sequence[range], poses: Float, edges: Sequence[Edg
     between = [
         (int(of[edge.first]), int(of[edge.second]), edge)
         for edge, points in zip(edges, inliers, strict=True)
-        if of[edge.first] != of[edge.second] and points >= _STRONG_POINTS
+        if of[edge.first] != of[edge.second] and points >= _MIN_POINTS
     ]
     while True:
-        offers: dict[tuple[int, int], list[Float]] = {}
+        transforms_of: dict[tuple[int, int], list[Float]] = {}
         for one, other, edge in between:
             a, c = component[one], component[other]
             if a == c:
@@ -80,15 +80,15 @@ def join_fragments(fragments: Sequence[range], poses: Float, edges: Sequence[Edg
             c_T_second = frames[other] @ poses[edge.second]
             a_T_c = frames[one] @ poses[edge.first] @ edge.first_T_second @ se3_inverse(c_T_second)
             if a < c:
-                offers.setdefault((a, c), []).append(a_T_c)
+                transforms_of.setdefault((a, c), []).append(a_T_c)
             else:
-                offers.setdefault((c, a), []).append(se3_inverse(a_T_c))
+                transforms_of.setdefault((c, a), []).append(se3_inverse(a_T_c))
         best = max(
-            ((*_most_voted(transforms), pair) for pair, transforms in offers.items()),
+            ((*_most_voted(transforms), pair) for pair, transforms in transforms_of.items()),
             key=lambda each: (each[0], (-each[2][0], -each[2][1])),
             default=None,
         )
-        if best is None or best[0] < _LEAST_VOTES:
+        if best is None or best[0] < _MIN_VOTES:
             return Joined(frames, component)
         _, a_T_c, (a, c) = best
         for number in range(len(fragments)):
@@ -97,7 +97,7 @@ def join_fragments(fragments: Sequence[range], poses: Float, edges: Sequence[Edg
 
 
 def fragment_of(fragments: Sequence[range]) -> Int:
-    """Number (N,) of the fragment of each state."""
+    """Return the number of each state's fragment (N,)."""
     return np.repeat(np.arange(len(fragments)), [len(states) for states in fragments])
 
 
@@ -106,51 +106,51 @@ def consistent(
     joined: Joined,
     poses: Float,
     edges: Sequence[Edge],
-    alone: KnownMotions,
+    odometry: KnownMotions,
     probability: float,
 ) -> tuple[Bool, Float]:
-    """Which closures (L,) agree with the odometry and with each other.
+    """Select the loop closures that are consistent with the odometry and with each other.
 
-    Where many are wrong, a first solution with all of them lies far from the truth, and graduated non-convexity does
-    not always find back: what the odometry alone refutes is left out before.
+    If many are wrong, the initial solution with all of them is far from the truth, and graduated non-convexity does not
+    always converge: closures that contradict the odometry are therefore rejected first.
 
     Args:
         fragments: states of each.
-        joined: how they lie to each other; closures between those that are not joined are left out.
-        poses: (N, 4, 4) of all states, in the frames that are common now.
-        edges: L closures.
-        alone: of the solution without closures.
-        probability: a closure beyond this share of the chi-square distribution is refused.
+        joined: transforms of the fragments; closures between those that are not joined are rejected.
+        poses: (N, 4, 4) of all states, in the joined frames.
+        edges: L loop closures.
+        odometry: motions of the solution without loop closures.
+        probability: quantile of the chi-square distribution at which a closure is rejected.
 
     Returns:
-        Which agree, and their squared distances (L,) from what is known without any, 6 degrees of freedom: from the
-        odometry, or between fragments from how these are joined; NaN where they are not.
+        Whether each is consistent (L,), and its squared distance (L,), 6 degrees of freedom, from the odometry, or
+        between fragments from their joined transform; NaN where they are not joined.
     """
     of = fragment_of(fragments)
     component = np.array(joined.component)[of]
     limit = chi_square_quantile(probability, 6)
-    distances, asked = np.full(len(edges), np.nan), []
+    distances, candidates = np.full(len(edges), np.nan), []
     for k, edge in enumerate(edges):
         if of[edge.first] == of[edge.second]:
-            distances[k] = alone.distance(edge)
-            may_be_used = distances[k] <= limit
+            distances[k] = odometry.distance(edge)
+            is_candidate = distances[k] <= limit
         else:
-            may_be_used = component[edge.first] == component[edge.second]
-        if may_be_used:
-            asked.append(k)
-    ends = sorted({end for k in asked for end in (edges[k].first, edges[k].second)})
-    graph, values = _ends_only(ends, of, joined, poses, _odometry_between(alone, fragments, ends))
+            is_candidate = component[edge.first] == component[edge.second]
+        if is_candidate:
+            candidates.append(k)
+    ends = sorted({end for k in candidates for end in (edges[k].first, edges[k].second)})
+    graph, values = _ends_only(ends, of, joined, poses, _odometry_between(odometry, fragments, ends))
     kept = np.zeros(len(edges), dtype=bool)
-    across = [k for k in asked if of[edges[k].first] != of[edges[k].second]]
+    across = [k for k in candidates if of[edges[k].first] != of[edges[k].second]]
     if across:
         as_joined = Marginals(graph, values)
         for k in across:
             distances[k] = as_joined.distance(edges[k])
-    asked = [k for k in asked if distances[k] <= limit]
-    if not asked:
+    candidates = [k for k in candidates if distances[k] <= limit]
+    if not candidates:
         return kept, distances
     known = list(range(graph.size()))
-    for k in asked:
+    for k in candidates:
         graph.add(edges[k].factor())
     params = gtsam.GncLMParams()
     params.setKnownInliers(known)
@@ -158,15 +158,15 @@ def consistent(
     optimizer = gtsam.GncLMOptimizer(graph, values, params)
     optimizer.setInlierCostThresholdsAtProbability(probability)
     solution = optimizer.optimize()
-    for place, k in enumerate(asked, start=len(known)):
-        kept[k] = 2.0 * graph.at(place).error(solution) <= limit
+    for index, k in enumerate(candidates, start=len(known)):
+        kept[k] = 2.0 * graph.at(index).error(solution) <= limit
     return kept, distances
 
 
 def _ends_only(
     ends: Sequence[int], of: Int, joined: Joined, poses: Float, odometry: Sequence[Edge]
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """A graph of the states that are ends of closures; each fragment lies to its root as the votes have it, about."""
+    """Return a graph of the closures' end states, with each fragment's transform to its root as a weak prior."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     seen: set[int] = set()
     for end in ends:
@@ -181,28 +181,22 @@ def _ends_only(
     return graph, values
 
 
-def _odometry_between(marginals: KnownMotions, fragments: Sequence[range], ends: Sequence[int]) -> list[Edge]:
-    """The motion between the states of each fragment that are ends of closures, with its covariance.
-
-    Args:
-        marginals: of the solution without closures.
-        fragments: states of each.
-        ends: states, increasing.
-    """
-    made = []
+def _odometry_between(odometry: KnownMotions, fragments: Sequence[range], ends: Sequence[int]) -> list[Edge]:
+    """Return the odometry between successive end states of each fragment; ``ends`` increase."""
+    edges = []
     for states in fragments:
         inside = [end for end in ends if end in states]
         for first, second in pairwise(inside):
-            made.append(Edge(first, second, *marginals.motion(first, second)))
-    return made
+            edges.append(Edge(first, second, *odometry.motion(first, second)))
+    return edges
 
 
 def _most_voted(transforms: Sequence[Float]) -> tuple[int, Float]:
-    """The transform with which most others agree, and how many do, itself included."""
+    """Return how many transforms agree with the one that most agree with, itself included, and that one."""
     votes = []
     for one in transforms:
         errors = np.array([se3_log(se3_inverse(one) @ other) for other in transforms])
-        near = (np.linalg.norm(errors[:, :3], axis=1) < _AGREE_RAD) & (np.linalg.norm(errors[:, 3:], axis=1) < _AGREE_M)
-        votes.append(int(near.sum()))
+        angles, distances = np.linalg.norm(errors[:, :3], axis=1), np.linalg.norm(errors[:, 3:], axis=1)
+        votes.append(int(((angles < _MAX_DIFFERENCE_RAD) & (distances < _MAX_DIFFERENCE_M)).sum()))
     best = int(np.argmax(votes))
     return votes[best], transforms[best]

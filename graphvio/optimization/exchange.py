@@ -1,4 +1,4 @@
-"""The result as other tools read it: trajectory, covariances, and a pose graph in the g2o format."""
+"""The result in other formats: trajectory (TUM), covariances and frames (CSV), pose graph (g2o)."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _UPPER = np.triu_indices(6)
 
 
 def trajectory_text(session: OptimizedSession) -> str:
-    """All its poses in the TUM format, each in its frame."""
+    """Return all poses in the TUM format, each in its frame."""
     poses = zip(session.record.stamps_ns.tolist(), session.nav_T_body, strict=True)
     return "".join(f"{tum_line(stamp, pose)}\n" for stamp, pose in poses)
 
 
 def frames_text(session: OptimizedSession) -> str:
-    """Which of its poses share a frame: first and last stamp of each run of poses, and the frame's number."""
+    """Return first stamp, last stamp and frame of each run of poses in one frame, as CSV."""
     stamps, frame = session.record.stamps_ns, session.frame
     begins = np.concatenate([[0], np.flatnonzero(np.diff(frame)) + 1]).tolist()
     ends = [*(begin - 1 for begin in begins[1:]), len(frame) - 1]
@@ -38,7 +38,7 @@ def frames_text(session: OptimizedSession) -> str:
 
 
 def covariance_text(session: OptimizedSession) -> str:
-    """Upper triangles (21) of the states' covariances, tangent ``[rotation, translation]`` in body."""
+    """Return the upper triangles of the states' covariances, tangent ``[rotation, translation]`` in body, as CSV."""
     header = ",".join(["stamp_ns", *(f"{one}_{other}" for one, other in combinations_with_replacement(_TANGENT, 2))])
     lines = [header]
     for stamp, covariance in zip(session.nodes.stamps_ns.tolist(), session.covariance, strict=True):
@@ -47,45 +47,50 @@ def covariance_text(session: OptimizedSession) -> str:
 
 
 def write_g2o(optimization: Optimization, path: Path) -> None:
-    """A graph of the states' poses, for tools that know poses only.
+    """Write the states' poses as a pose graph, for tools without IMU factors.
 
-    Edges are the motions, each as the solution without closures has it, which the IMU has a part in, with its
-    covariance; where no motion leads to a state, one from the state before; and the closures as they are.
+    Its edges are the measured motions with their covariances, but with the relative poses of the solution without loop
+    closures, which the IMU contributes to; one from the previous state where no motion ends in a state; and the loop
+    closures.
+
+    Args:
+        optimization: to write.
+        path: of the file; it is whole or absent.
 
     Raises:
         OptimizationError: if the file cannot be written.
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    at = 0
+    count = 0
     for session in optimization.sessions:
         for pose in session.nav_T_body[session.nodes.rows]:
-            values.insert(at, gtsam.Pose3(pose))
-            at += 1
-    for edge in (*_measured(optimization), *optimization.edges):
+            values.insert(count, gtsam.Pose3(pose))
+            count += 1
+    for edge in (*_odometry_edges(optimization), *optimization.edges):
         noise = gtsam.noiseModel.Gaussian.Covariance(0.5 * (edge.covariance + edge.covariance.T), False)
         graph.add(gtsam.BetweenFactorPose3(edge.first, edge.second, gtsam.Pose3(edge.first_T_second), noise))
     unfinished = path.with_name(f".{path.name}.tmp")
     gtsam.writeG2o(graph, values, str(unfinished))
     try:
         if unfinished.read_bytes().count(b"EDGE") != graph.size():
-            raise OSError(ENOSPC, os.strerror(ENOSPC))  # gtsam does not tell
+            raise OSError(ENOSPC, os.strerror(ENOSPC))  # gtsam reports no error
         unfinished.replace(path)
     except OSError as error:
         raise OptimizationError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 
-def _measured(optimization: Optimization) -> Iterator[Edge]:
-    """What is measured without closures: motions, and what leads to states that none ends in."""
+def _odometry_edges(optimization: Optimization) -> Iterator[Edge]:
+    """Yield an edge for each measured motion, and one from the previous state to each state in which none ends."""
     marginals: Marginals | None = None
     poses, first = poses_of(optimization.alone, int(sum(len(each.nodes.rows) for each in optimization.sessions))), 0
     for session in optimization.sessions:
         nodes, motions = session.nodes, session.record.motions
-        tied = np.zeros(len(nodes.rows), dtype=bool)
+        has_motion = np.zeros(len(nodes.rows), dtype=bool)
         for k in nodes.motions.tolist():
             i, j = nodes.index_of_row(int(motions.reference[k])), nodes.index_of_row(int(motions.row[k]))
-            tied[j] = True
+            has_motion[j] = True
             yield Edge(first + i, first + j, se3_inverse(poses[first + i]) @ poses[first + j], motions.covariance[k])
-        for n in np.flatnonzero(~tied).tolist():
+        for n in np.flatnonzero(~has_motion).tolist():
             if n and nodes.epoch[n] == nodes.epoch[n - 1]:
                 marginals = marginals or Marginals(optimization.graph_alone, optimization.alone)
                 yield Edge(first + n - 1, first + n, *marginals.motion(first + n - 1, first + n))

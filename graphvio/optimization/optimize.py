@@ -1,9 +1,10 @@
-"""Sessions as one graph: solved, joined by loop closures, and solved again."""
+"""Optimisation of sessions as one graph: solved, joined by loop closures, and solved again."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -19,23 +20,23 @@ from graphvio.optimization.graph import Fragment, SessionGraph, moved, poses_of
 from graphvio.optimization.loops.closures import LoopClosure
 from graphvio.optimization.nodes import Nodes, choose_nodes, spread
 from graphvio.optimization.record import SessionRecord
-from graphvio.optimization.solver import Edge, Marginals, Residuals, residuals, solve
+from graphvio.optimization.solver import Edge, Marginals, Residuals, gtsam_errors, residuals, solve
 from graphvio.rig import Imu
 
 Progress = Callable[[str, int, float], None]
-"""Called with what is solved, the number of the iteration, and the cost."""
+"""Called with the name of the solution, the number of the iteration and the cost."""
 
 
 @dataclass(frozen=True, eq=False)
 class OptimizedSession:
-    """One of the sessions.
+    """The solution of one session.
 
     Attributes:
-        nodes: the states of its graph.
-        nav_T_body: (F, 4, 4) of all its framesets; nav is the frame of the fragment that ``frame`` tells.
-        covariance: (N, 6, 6) of the states' poses, tangent ``[rotation, translation]`` in body; of what their frame's
-            origin is told from.
-        frame: (F,) number of the frame of each frameset; 0 is the first session's first.
+        nodes: states of the graph.
+        nav_T_body: (F, 4, 4) of all framesets, in the frame that ``frame`` gives.
+        covariance: (N, 6, 6) of the states' poses relative to the origin of their frame, tangent
+            ``[rotation, translation]`` in body.
+        frame: (F,) number of each frameset's frame; 0 is that of the first session's first.
     """
 
     nodes: Nodes
@@ -45,19 +46,19 @@ class OptimizedSession:
 
     @property
     def record(self) -> SessionRecord:
-        """What the odometry made of it."""
+        """The session's record."""
         return self.nodes.record
 
 
 @dataclass(frozen=True, eq=False)
 class JudgedLoop:
-    """A loop closure, and what became of it.
+    """A loop closure and whether it is used.
 
     Attributes:
         closure: as it was found.
         refusal: why it is not used, or empty.
-        distance: squared Mahalanobis distance from the solution, 6 degrees of freedom; of one that is refused, the
-            solution's own uncertainty counts, too. NaN between parts that nothing joins.
+        distance: squared Mahalanobis distance from the solution, 6 degrees of freedom; of a refused one, with the
+            solution's covariance. NaN between parts that are not joined.
     """
 
     closure: LoopClosure
@@ -67,21 +68,21 @@ class JudgedLoop:
 
 @dataclass(frozen=True, eq=False)
 class Optimization:
-    """What became of the sessions.
+    """The solution of all sessions.
 
     Attributes:
-        sessions: in the order in which they were given.
-        loops: all closures that were offered.
-        fragments: the epochs of all sessions.
-        frames: number of the frame that each fragment is in.
-        before: kind of factor -> its residuals as the odometry left the states.
-        after: the same in the solution.
-        graph: with all that was used.
+        sessions: in the given order.
+        loops: all given loop closures.
+        fragments: epochs of all sessions.
+        frames: number of each fragment's frame.
+        before: kind of factor -> residuals of the odometry's states.
+        after: kind of factor -> residuals of the solution.
+        graph: with the loop closures that are used.
         values: the solution.
-        edges: closures that are used, as factors.
-        graph_alone: without closures, each fragment in a frame of its own.
-        alone: its solution.
-        corrections: of each session's rig file, or None where the calibration was not asked for.
+        edges: the loop closures that are used, as edges.
+        graph_alone: without loop closures, each fragment in its own frame.
+        alone: solution of ``graph_alone``.
+        corrections: of each session's rig file, or None where the calibration is not estimated.
     """
 
     sessions: Sequence[OptimizedSession]
@@ -99,51 +100,37 @@ class Optimization:
 
     @property
     def cost_before(self) -> float:
-        """Half the sum of all squared residuals as the odometry left the states, closures not counted."""
+        """Half the sum of all squared residuals of the odometry's states, without loop closures."""
         return _cost(self.before)
 
     @property
     def cost_after(self) -> float:
-        """The same in the solution."""
+        """Half the sum of all squared residuals of the solution, without loop closures."""
         return _cost(self.after)
 
 
+@gtsam_errors("the sessions' graph has no unique solution")
 def optimize(
     records: Sequence[SessionRecord],
     imus: Sequence[Imu | None],
     closures: Sequence[LoopClosure],
     config: Config,
-    on_progress: Progress | None = None,
+    on_progress: Progress = lambda *_: None,
     calibrates: bool = False,
 ) -> Optimization:
-    """The best trajectories that all measurements of the sessions hold together.
+    """Optimise the trajectories of sessions over all their measurements.
 
     Args:
-        records: S sessions as the odometry saw them.
+        records: what the odometry measured in S sessions.
         imus: of each session's rig, or None.
-        closures: places seen from others, right ones and wrong ones.
+        closures: true and false loop closures.
         config: of the back-end and of this stage.
-        on_progress: told how far it is.
-        calibrates: whether the places of the pairs, and the IMU's time offset, are unknowns with priors.
+        on_progress: called after each iteration.
+        calibrates: whether the extrinsics of the pairs and the IMU's time offset are estimated, with priors.
 
     Raises:
         OptimizationError: if the graph has no unique solution, or closures are of other sessions.
     """
-    try:
-        return _optimize(records, imus, closures, config, on_progress, calibrates)
-    except RuntimeError as error:  # of gtsam
-        why = " ".join(str(error).split())[:200]
-        raise OptimizationError(f"the sessions' graph has no unique solution ({why})") from None
-
-
-def _optimize(
-    records: Sequence[SessionRecord],
-    imus: Sequence[Imu | None],
-    closures: Sequence[LoopClosure],
-    config: Config,
-    on_progress: Progress | None,
-    calibrates: bool,
-) -> Optimization:
     settings = config.optimization
     interval_s = np.inf if calibrates else settings.keyframe_interval_s
     sessions = [choose_nodes(record, interval_s) for record in records]
@@ -151,28 +138,30 @@ def _optimize(
     fragments = whole.fragments
     graph_alone, kinds = whole.complete(range(len(fragments)))
     before = residuals(graph_alone, kinds, whole.values)
-    alone = solve(graph_alone, whole.values, _named(on_progress, "without loops"))
+    alone = solve(graph_alone, whole.values, partial(on_progress, "without loops"))
     edges = [_edge(closure, sessions, whole) for closure in closures]
     states = [each.states for each in fragments]
     poses = poses_of(alone, len(whole))
     joined = join_fragments(states, poses, edges, [closure.inliers for closure in closures])
     values = moved(alone, list(zip(states, joined.frames, strict=True)))
     poses = poses_of(values, len(whole))
-    known_alone = Marginals(graph_alone, alone)
-    believed, distances = consistent(states, joined, poses, edges, known_alone, settings.loop_probability)
+    is_used, distances = consistent(
+        states, joined, poses, edges, Marginals(graph_alone, alone), settings.loop_probability
+    )
     roots = sorted(set(joined.component))
     limit = chi_square_quantile(settings.loop_probability, 6)
     while True:
-        graph, kinds = whole.complete(roots, [edge for edge, is_used in zip(edges, believed, strict=True) if is_used])
-        values = solve(graph, values, _named(on_progress, "with loops"))
+        used = [edges[k] for k in np.flatnonzero(is_used)]
+        graph, kinds = whole.complete(roots, used)
+        values = solve(graph, values, partial(on_progress, "with loops"))
         marginals = Marginals(graph, values)
-        # Refused too soon are those that the odometry does not refute, and that the solution without them bears out.
-        doubted = np.flatnonzero(~believed & (distances <= limit))
-        distances[doubted] = [marginals.distance(edges[k]) for k in doubted.tolist()]
-        again = doubted[distances[doubted] <= limit]
+        # A refused closure that neither the odometry nor the solution without it contradicts is used after all.
+        refused = np.flatnonzero(~is_used & (distances <= limit))
+        distances[refused] = [marginals.distance(edges[k]) for k in refused.tolist()]
+        again = refused[distances[refused] <= limit]
         if not len(again):
             break
-        believed[again] = True
+        is_used[again] = True
     solution = poses_of(values, len(whole))
     covariances = np.array([marginals.pose(k) for k in range(len(whole))]).reshape(-1, 6, 6)
     frames = [roots.index(number) for number in joined.component]
@@ -182,8 +171,8 @@ def _optimize(
             for number, nodes in enumerate(sessions)
         ],
         loops=[
-            _judged(closure, edge, bool(is_used), float(distance), solution, limit)
-            for closure, edge, is_used, distance in zip(closures, edges, believed, distances, strict=True)
+            _judged(closure, edge, bool(kept), float(distance), solution, limit)
+            for closure, edge, kept, distance in zip(closures, edges, is_used, distances, strict=True)
         ],
         fragments=fragments,
         frames=frames,
@@ -191,7 +180,7 @@ def _optimize(
         after=residuals(graph, kinds, values),
         graph=graph,
         values=values,
-        edges=[edge for edge, is_used in zip(edges, believed, strict=True) if is_used],
+        edges=used,
         graph_alone=graph_alone,
         alone=alone,
         corrections=[
@@ -207,7 +196,7 @@ def _edge(closure: LoopClosure, sessions: Sequence[Nodes], whole: SessionGraph) 
     for place in (closure.reference, closure.current):
         stamps_ns = sessions[place.session].record.stamps_ns
         if place.row >= len(stamps_ns) or stamps_ns[place.row] != place.stamp_ns:
-            raise OptimizationError("the loop closures are of other sessions than those that are given")
+            raise OptimizationError("the loop closures belong to other sessions than the given ones")
     first, second = (
         int(whole.firsts[place.session]) + sessions[place.session].index_of_row(place.row)
         for place in (closure.reference, closure.current)
@@ -235,22 +224,16 @@ def _session(
 def _judged(
     closure: LoopClosure, edge: Edge, is_used: bool, distance: float, solution: Float, limit: float
 ) -> JudgedLoop:
-    """What became of a closure, whose squared distance is known if it is not used, but could have been."""
+    """Return a closure with its outcome; ``distance`` is that of a refused one, NaN if its fragments are not joined."""
     if is_used:
         error = se3_log(se3_inverse(se3_inverse(solution[edge.first]) @ solution[edge.second]) @ edge.first_T_second)
         return JudgedLoop(closure, "", float(error @ np.linalg.solve(edge.covariance, error)))
     if np.isnan(distance):
-        return JudgedLoop(closure, "too few closures agree on how its two parts lie to each other", distance)
-    sigmas, most = np.sqrt(distance), np.sqrt(limit)
-    why = f"{sigmas:.0f} standard deviations from what all others say, more than {most:.1f}"
-    return JudgedLoop(closure, why, distance)
+        return JudgedLoop(closure, "too few closures agree on the transform between its two parts", distance)
+    sigmas, max_sigmas = np.sqrt(distance), np.sqrt(limit)
+    refusal = f"{sigmas:.0f} standard deviations from the solution by all others, more than {max_sigmas:.1f}"
+    return JudgedLoop(closure, refusal, distance)
 
 
 def _cost(kinds: dict[str, Residuals]) -> float:
     return 0.5 * float(sum(each.distances.sum() for kind, each in kinds.items() if kind != "loop"))
-
-
-def _named(on_progress: Progress | None, name: str) -> Callable[[int, float], None] | None:
-    if on_progress is None:
-        return None
-    return lambda iteration, cost: on_progress(name, iteration, cost)

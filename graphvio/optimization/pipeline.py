@@ -1,4 +1,4 @@
-"""From recordings to one optimised map, stage by stage: odometry, features, loops, graph."""
+"""Optimisation of recordings, stage by stage: odometry, features, loop closures, graph, map."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from graphvio.optimization.optimize import Optimization, optimize
 from graphvio.optimization.record import Recorder, SessionRecord
 from graphvio.optimization.report.write import write_report
 from graphvio.optimization.workspace import Workspace, digest
-from graphvio.pipeline import Progress as RunProgress
 from graphvio.pipeline import RunListener, run
 from graphvio.results import ResultWriter
 from graphvio.rig import Rig
@@ -33,27 +32,15 @@ from graphvio.version import __version__
 DATABASE = "database.db"
 
 Progress = Callable[[str, float, float], None]
-"""Called with the stage, and how much of how much is done."""
+"""Called with the stage, how much of it is done, and how much there is."""
 
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """A recording with a name that no other of the same optimisation has."""
+    """A recording with a name that is unique in an optimisation."""
 
     name: str
     source: Source
-
-
-def named(sources: Sequence[Source]) -> list[Session]:
-    """Sessions by their sources' names; a number is added where several have the same."""
-    made: list[Session] = []
-    for source in sources:
-        name, number = source.name, 1
-        while name in {each.name for each in made}:
-            number += 1
-            name = f"{source.name}-{number}"
-        made.append(Session(name, source))
-    return made
 
 
 def optimize_sessions(
@@ -65,38 +52,50 @@ def optimize_sessions(
     calibrates: bool = False,
     on_progress: Progress | None = None,
 ) -> Optimization:
-    """Run the odometry on recordings, find loop closures within and between them, and optimise all as one.
+    """Run the odometry on recordings, find loop closures within and between them, and optimise all in one graph.
 
     Args:
         sources: one or several recordings.
-        out: folder of the results: new, or one in which an optimisation of the same was interrupted, which goes on.
+        out: folder of the results: new, or that of an interrupted optimisation of the same, which is continued.
         config: of all stages.
-        with_loops: whether loop closures are looked for, which needs the extra ``maps``.
-        calibrates: whether the places of the pairs, and the IMU's time offset, are unknowns of the graph, too.
-        on_progress: told how far it is.
+        with_loops: whether to find loop closures and write a map, which needs the extra ``maps``.
+        calibrates: whether the extrinsics of the pairs and the IMU's time offset are estimated as well.
+        on_progress: called with the progress of each stage.
 
     Raises:
-        GraphvioError: if a recording cannot be read, holds no pose, or the folder cannot be used.
+        GraphvioError: if a recording cannot be read or holds no pose, or the folder cannot be used.
     """
-    sessions = named(sources)
+    sessions = _sessions(sources)
     stages = Stages(sessions, Path(out), config, with_loops=with_loops, calibrates=calibrates, on_progress=on_progress)
     records = [stages.record(number) for number in range(len(sessions))]
     return stages.result(records, stages.closures(records) if with_loops else None)
 
 
+def _sessions(sources: Sequence[Source]) -> list[Session]:
+    """Name sessions after their sources; a number is appended to a name that occurs before."""
+    sessions: list[Session] = []
+    for source in sources:
+        name, number = source.name, 1
+        while name in {each.name for each in sessions}:
+            number += 1
+            name = f"{source.name}-{number}"
+        sessions.append(Session(name, source))
+    return sessions
+
+
 class Stages:
-    """The stages one by one, for who runs them elsewhere than one after the other.
+    """The stages of an optimisation, to be run one by one, possibly on different machines.
 
     Args:
         sessions: one or several.
-        out: folder of the results, as `optimize_sessions` takes it.
+        out: see `optimize_sessions`.
         config: of all stages.
-        with_loops: as `optimize_sessions` takes it.
-        calibrates: as `optimize_sessions` takes it.
-        on_progress: told how far it is.
+        with_loops: see `optimize_sessions`.
+        calibrates: see `optimize_sessions`.
+        on_progress: see `optimize_sessions`.
 
     Attributes:
-        inputs: what decides the results: name -> value.
+        inputs: name -> value of everything that determines the results.
 
     Raises:
         OptimizationError: if the folder cannot be used.
@@ -115,7 +114,7 @@ class Stages:
         self._sessions = sessions
         self._calibrates = calibrates
         self._config = config
-        self._on_progress = on_progress or _quiet
+        self._on_progress = on_progress or (lambda *_: None)
         self.inputs = {each.name: _identity(each.source) for each in sessions} | {
             "sessions": ", ".join(each.name for each in sessions),
             "config": config.sha256(),
@@ -126,18 +125,18 @@ class Stages:
         self._space = Workspace(out, self.inputs)
 
     def record(self, number: int) -> SessionRecord:
-        """What the odometry makes of a session; beside it the results of its run."""
+        """Run the odometry on a session, write its results, and return what it measured."""
         session = self._sessions[number]
         name, stage = f"{session.name}/record.npz", f"odometry of {session.name}"
         if not self._space.has_finished(stage):
             folder = self._space.folder / session.name / "odometry"
-            shutil.rmtree(folder, ignore_errors=True)  # of a run that was interrupted
+            shutil.rmtree(folder, ignore_errors=True)  # of an interrupted run
             recorder = Recorder(session.name)
-
-            def follow(progress: RunProgress) -> None:
-                self._on_progress(stage, progress.framesets, progress.total)
-
-            listener = RunListener(on_step=recorder.add, on_smoothed=recorder.add_smoothed, on_progress=follow)
+            listener = RunListener(
+                on_step=recorder.add,
+                on_smoothed=recorder.add_smoothed,
+                on_progress=lambda progress: self._on_progress(stage, progress.framesets, progress.total),
+            )
             with ResultWriter(folder, session.source.rig, self._config.to_yaml()) as writer:
                 run(session.source, self._config, writer, [listener])
             self._space.write(name, recorder.record().to_bytes())
@@ -145,7 +144,7 @@ class Stages:
         return SessionRecord.load(self._space.folder / name)
 
     def closures(self, records: Sequence[SessionRecord]) -> list[LoopClosure]:
-        """Loop closures within and between the sessions."""
+        """Find loop closures within and between the sessions."""
         inputs = [self.places(number, record) for number, record in enumerate(records)]
         missing = [each for each in inputs if not self._space.has_finished(_features_of(each.name))]
         if missing or not self._space.has_finished("loops"):
@@ -160,7 +159,7 @@ class Stages:
         return load_closures(self._space.folder / "loops.npz")
 
     def result(self, records: Sequence[SessionRecord], closures: Sequence[LoopClosure] | None) -> Optimization:
-        """The solution, with its files; where closures are None, none were looked for, and there is no map."""
+        """Optimise the sessions and write all results; without a map if closures are None."""
         imus = [each.source.rig.imu for each in self._sessions]
         found = optimize(
             records,
@@ -194,20 +193,17 @@ class Stages:
             replace(self.places(number, record), rig=rig)
             for number, (record, rig) in enumerate(zip(records, rigs, strict=True))
         ]
+
+        def on_progress(what: str, done: int, total: int) -> None:
+            self._on_progress(f"map: {what}", done, total)
+
         with FeatureDatabase(self._space.folder / DATABASE) as database:
             for each in inputs if self._calibrates else []:
                 database.move_cameras(each.name, each.rig)
-            export(
-                found,
-                inputs,
-                database,
-                self._space.folder / "colmap",
-                self._config,
-                lambda what, done, total: self._on_progress(f"map: {what}", done, total),
-            )
+            export(found, inputs, database, self._space.folder / "colmap", self._config, on_progress)
 
     def places(self, number: int, record: SessionRecord) -> SessionInput:
-        """A session with the places at which loop closures are looked for."""
+        """Return a session with the places among which loop closures are searched."""
         session, settings = self._sessions[number], self._config.optimization
         rows = choose_places(record, settings.place_distance_m, settings.place_angle_deg)
         places = [Place(number, row, int(record.stamps_ns[row])) for row in rows.tolist()]
@@ -228,24 +224,20 @@ class Stages:
 
 
 def _features_of(name: str) -> str:
-    """The stage's name."""
+    """Return the name of a stage."""
     return f"features of {name}"
 
 
 def _identity(source: Source) -> str:
-    """What tells a recording from others, as far as that shows without reading it."""
+    """Return a hash that identifies a recording without reading its measurements."""
     return digest(
         source.name, str(source.start_ns), str(source.end_ns), str(source.frameset_count), to_text(source.rig, Path())
     )
 
 
 def _truth(source: Source) -> Trajectory | None:
-    """The true trajectory of a recording that carries a usable one."""
+    """Return the true trajectory of a recording if it holds a usable one."""
     try:
         return None if source.truth is None else load_trajectory(source.truth)
     except TrajectoryError:
-        return None  # the odometry's own summary says why
-
-
-def _quiet(stage: str, done: float, total: float) -> None:
-    """Nobody wants to know."""
+        return None  # the odometry's summary states why

@@ -1,24 +1,24 @@
-"""The folder of an optimisation: what each stage has left, so that an interrupted run goes on where it was."""
+"""The results folder of an optimisation, in which an interrupted run is continued."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
 from graphvio.errors import OptimizationError
+from graphvio.reporting.files import replace_file
 
 _STATE = "stages.json"
 
 
 class Workspace:
-    """A folder of results that is made stage by stage.
+    """A folder of results that are written stage by stage.
 
     Args:
-        folder: made if absent; else one that an optimisation of the same input was writing.
-        inputs: what decides the result: name -> value.
+        folder: made if missing; otherwise that of an optimisation of the same inputs.
+        inputs: name -> value of everything that determines the results.
 
     Raises:
         OptimizationError: if the folder holds something else, or cannot be written.
@@ -32,49 +32,44 @@ class Workspace:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if state.is_file():
-                self._go_on(json.loads(state.read_text(encoding="utf-8")))
+                self._continue(json.loads(state.read_text(encoding="utf-8")))
             elif any(folder.iterdir()):
                 raise OptimizationError(
-                    f"{folder}: is not empty, and results are never overwritten; name another folder"
+                    f"{folder}: is not empty, and results are never overwritten; choose another folder"
                 )
             self._save()
         except OSError as error:
             raise _cannot_write(folder, error) from None
         except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
-            raise OptimizationError(f"{state}: is damaged; remove the folder, or name another one") from None
+            raise OptimizationError(f"{state}: is damaged; remove the folder or choose another one") from None
 
     def has_finished(self, stage: str) -> bool:
-        """Whether a stage was finished, now or by an earlier run, and its files are there."""
+        """Whether a stage was finished, in this run or an earlier one, and its files exist."""
         return stage in self._finished and all((self.folder / name).is_file() for name in self._finished[stage])
 
     def finish(self, stage: str, *files: str) -> None:
-        """Note that a stage is finished, and has left these files.
+        """Record that a stage is finished and has written these files.
 
         Raises:
-            OptimizationError: if it cannot be written.
+            OptimizationError: if the folder cannot be written.
         """
         self._finished[stage] = list(files)
         self._save()
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file that is either whole or absent.
+        """Write a file, which is whole or absent.
 
         Raises:
             OptimizationError: if it cannot be written.
         """
         path = self.folder / name
-        unfinished = path.with_name(f".{path.name}.tmp")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with unfinished.open("wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            unfinished.replace(path)
+            replace_file(path, data)
         except OSError as error:
             raise _cannot_write(path, error) from None
 
-    def _go_on(self, state: dict[str, object]) -> None:
+    def _continue(self, state: dict[str, object]) -> None:
         known = state["inputs"]
         assert isinstance(known, dict)
         differing = [name for name in sorted({*known, *self._inputs}) if known.get(name) != self._inputs.get(name)]
@@ -92,11 +87,11 @@ class Workspace:
 
 
 def digest(*parts: str) -> str:
-    """Of some texts."""
+    """Return a short hash of texts."""
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
 def _cannot_write(where: Path, error: OSError) -> OptimizationError:
     return OptimizationError(
-        f"{where}: cannot be written ({error.strerror or error}); choose another place for results"
+        f"{where}: cannot be written ({error.strerror or error}); choose another folder for results"
     )
