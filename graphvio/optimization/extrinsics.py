@@ -1,8 +1,8 @@
-"""The rig's calibration as unknowns of the full graph: where each pair is, and the IMU's time offset.
+"""The rig's calibration as variables of the graph: extrinsics of each pair, and the IMU's time offset.
 
-A pair whose true ``body_T_left`` is ``C`` times the rig file's reports a motion ``M`` of body as ``C^-1 M C``, see
-`graphvio.frontend.alignment`. Its images are taken ``d`` later on the IMU's clock than the rig file says, so that it
-sees body as ``x exp(d xi)``, with the twist ``xi`` of body there.
+A pair whose true ``body_T_left`` is ``C`` times the rig file's measures a motion ``M`` of body as ``C^-1 M C``, see
+`graphvio.frontend.alignment`. Its images are taken ``d`` later on the IMU's clock than by the rig file, so that it
+sees body at ``x exp(d xi)``, with the twist ``xi`` of body.
 """
 
 from __future__ import annotations
@@ -28,23 +28,24 @@ _OFFSET_SIGMA_S = 0.02
 
 
 def c(session: int, pair: int) -> int:
-    """A pair's correction: what its ``body_T_left`` is to be multiplied by from the left."""
+    """Return the key of a pair's correction, by which its ``body_T_left`` is multiplied from the left."""
     return int(gtsam.symbol("c", 256 * session + pair))
 
 
 def d(session: int) -> int:
-    """The correction of a session's time offset, seconds."""
+    """Return the key of the correction of a session's time offset, in seconds."""
     return int(gtsam.symbol("d", session))
 
 
 @dataclass(frozen=True, eq=False)
 class RigCorrection:
-    """What the measurements say of a session's rig file.
+    """Corrections of a session's rig file.
 
     Attributes:
-        pairs: pair -> what its ``body_T_left`` is to be multiplied by from the left (4, 4).
-        covariances: pair -> (6, 6) of it, tangent ``[rotation, translation]``; of the first pair without an IMU, zero.
-        offset_s: to be added to the IMU's time offset.
+        pairs: pair -> correction (4, 4), by which its ``body_T_left`` is multiplied from the left.
+        covariances: pair -> covariance (6, 6) of the correction, tangent ``[rotation, translation]``; zero for the
+            first pair without an IMU.
+        offset_s: added to the IMU's time offset.
         offset_sigma_s: its standard deviation, or None without an IMU.
     """
 
@@ -54,7 +55,7 @@ class RigCorrection:
     offset_sigma_s: float | None
 
     def corrected(self, rig: Rig) -> Rig:
-        """The rig with these corrections."""
+        """Return the rig with these corrections."""
         pairs = []
         for j, pair in enumerate(rig.pairs):
             correction = self.pairs.get(j, np.eye(4))
@@ -69,7 +70,7 @@ class RigCorrection:
 
 
 def unknowns(session: int, pairs: int, with_imu: bool) -> Iterator[tuple[int, Any, gtsam.NonlinearFactor]]:
-    """Variables with their first values and priors; without an IMU the first pair is where the rig file has it."""
+    """Yield key, initial value and prior of each variable; without an IMU the first pair's extrinsics are fixed."""
     for pair in range(pairs):
         sigmas = _FIRST_SIGMAS if pair == 0 else _OTHER_SIGMAS
         noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas if with_imu or pair else np.full(6, 1e-9))
@@ -82,22 +83,22 @@ def unknowns(session: int, pairs: int, with_imu: bool) -> Iterator[tuple[int, An
 def own_motion(
     session: int, pair: int, i: int, j: int, motion: RelativeMotion, twists: tuple[Float, Float] | None
 ) -> gtsam.NoiseModelFactor:
-    """What a pair alone says of the motion between two states.
+    """Return the factor of a motion between two states that a single pair measured.
 
     Args:
-        session: its number.
-        pair: its number in the rig.
+        session: number of the session.
+        pair: number of the pair.
         i: state that the motion is measured from.
         j: state in which it ends.
-        motion: as the rig file's place of the pair makes it.
-        twists: (6,) ``[rotation, translation]`` a second of body at both states; None without an IMU.
+        motion: of body, by the rig file's extrinsics.
+        twists: (6,) angular and linear velocity of body at both states; None without an IMU.
     """
     keys = [x(i), x(j), c(session, pair)] + ([] if twists is None else [d(session)])
     return gtsam.CustomFactor(gaussian(motion.covariance), keys, _error(motion.reference_T_current, twists))
 
 
 def correction_of(marginals: Marginals, values: gtsam.Values, session: int, pairs: int) -> RigCorrection:
-    """The solution's corrections, with covariances."""
+    """Return the corrections of a session by the solution."""
     has_offset = values.exists(d(session))
     return RigCorrection(
         {pair: values.atPose3(c(session, pair)).matrix() for pair in range(pairs)},
@@ -108,7 +109,7 @@ def correction_of(marginals: Marginals, values: gtsam.Values, session: int, pair
 
 
 def _error(measured: Float, twists: tuple[Float, Float] | None) -> Callable[..., Float]:
-    """Of ``measured^-1 C^-1 exp(-d xi_i) x_i^-1 x_j exp(d xi_j) C``, with derivatives on the right."""
+    """Return the error ``log(measured^-1 C^-1 exp(-d xi_i) x_i^-1 x_j exp(d xi_j) C)`` with its derivatives."""
     inverse = se3_inverse(measured)
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, derivatives: list[Float] | None) -> Float:

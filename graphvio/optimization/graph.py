@@ -1,4 +1,4 @@
-"""The full graph of one or several sessions: all motions, the preintegrated IMU, rests, and loop closures."""
+"""The graph of one or several sessions: motions, preintegrated IMU, zero-velocity updates and loop closures."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ _START_TILT_RAD = 0.2
 _START_SPEED_M_S = 10.0
 _START_GYRO_BIAS_RAD_S = 0.1
 _START_ACCEL_BIAS_M_S2 = 0.5
-_ORIGIN_SIGMA = 1e-4  # radians and metres: without an IMU, the first pose of an epoch is its frame
+_ORIGIN_SIGMA = 1e-4  # radians and metres: without an IMU, the first pose of an epoch defines its frame
 
 
 @dataclass(frozen=True, eq=False)
 class Fragment:
-    """An epoch of a session: its poses share a frame.
+    """An epoch of a session, whose poses share a frame.
 
     Attributes:
-        session: its number.
+        session: number of the session.
         epoch: of the session.
-        states: its states, numbered through all sessions.
-        start: state of the rig at the first of them.
-        with_imu: whether that has a velocity and biases.
+        states: numbered through all sessions.
+        start: the rig at the first state.
+        with_imu: whether the first state has a velocity and biases.
     """
 
     session: int
@@ -49,19 +49,19 @@ class Fragment:
 
 
 class SessionGraph:
-    """Factors and values of all sessions; states are numbered through, session after session.
+    """Factors and initial values of all sessions; states are numbered through, session after session.
 
     Args:
-        sessions: their states.
+        sessions: states of each.
         imus: of each session, or None.
         config: of the odometry's back-end.
-        calibrates: whether the places of the pairs, and the IMU's time offset, are unknowns; then each pair's own
-            motions over whole keyframes are the factors, as far as there are.
+        calibrates: whether extrinsics and the IMU's time offset are variables; the factors are then the motions of
+            single pairs over whole keyframes, where there are any.
 
     Attributes:
-        values: of all states, as the odometry left them.
+        values: of all states by the odometry.
         fragments: of all sessions, in order.
-        firsts: (S + 1,) the first state of each session, and their number.
+        firsts: (S + 1,) first state of each session, and the number of states.
     """
 
     def __init__(
@@ -87,25 +87,27 @@ class SessionGraph:
         return int(self.firsts[-1])
 
     def add(self, factor: gtsam.NonlinearFactor) -> None:
-        """Insert a factor of the kind at hand; `ReferenceViews` calls it, too."""
+        """Insert a factor of the current kind; also called by `ReferenceViews`."""
         self._kinds.setdefault(self._kind, []).append(self._graph.size())
         self._graph.add(factor)
 
     def complete(
         self, roots: Iterable[int], edges: Iterable[Edge] = ()
     ) -> tuple[gtsam.NonlinearFactorGraph, dict[str, list[int]]]:
-        """The graph with closures and with what defines its frames, and its factors by kind.
+        """Return the graph with loop closures and with priors that define its frames, and its factors by kind.
 
         Args:
-            roots: fragments whose first pose defines a frame; closures tie the others to one of these.
-            edges: closures.
+            roots: fragments whose first pose defines a frame; loop closures join the others to these.
+            edges: loop closures.
         """
         graph, kinds = gtsam.NonlinearFactorGraph(self._graph), dict(self._kinds)
         chosen = frozenset(roots)
-        starts = [
-            factor for number, each in enumerate(self.fragments) for factor in _starts(each, is_root=number in chosen)
+        priors = [
+            factor
+            for number, each in enumerate(self.fragments)
+            for factor in _initial_priors(each, is_root=number in chosen)
         ]
-        for kind, factors in (("start", starts), ("loop", [edge.factor() for edge in edges])):
+        for kind, factors in (("start", priors), ("loop", [edge.factor() for edge in edges])):
             if factors:
                 kinds[kind] = list(range(graph.size(), graph.size() + len(factors)))
             for factor in factors:
@@ -135,8 +137,8 @@ class SessionGraph:
     def _add_inertial(self, first: int, nodes: Nodes, imu: Imu | None) -> None:
         record, config, epoch = nodes.record, self._config, nodes.epoch
         params = None if imu is None else preintegration_params(imu, config.imu_noise_scale)
-        tied = np.zeros(len(nodes.rows), dtype=bool)
-        tied[np.searchsorted(nodes.rows, record.motions.row[nodes.motions])] = True
+        has_motion = np.zeros(len(nodes.rows), dtype=bool)
+        has_motion[np.searchsorted(nodes.rows, record.motions.row[nodes.motions])] = True
         for n in range(1, len(nodes.rows)):
             if epoch[n] != epoch[n - 1]:
                 continue
@@ -152,14 +154,14 @@ class SessionGraph:
             else:
                 self._kind = "walk"
                 if record.is_start[before + 1 : row + 1].any():
-                    for factor in _start_of_imu(k, record, row):
+                    for factor in _reinitialised(k, record, row):
                         self.add(factor)
                 elif record.with_imu[before] and record.with_imu[row] and imu is not None:
                     for factor in imu_without_samples(
                         k - 1, k, dt, config.motion_accel_sigma_m_s2, imu, config.imu_noise_scale
                     ):
                         self.add(factor)
-                if not tied[n]:  # nothing measured leads here: as the odometry has it, eq. (11)
+                if not has_motion[n]:  # constant velocity by the odometry, eq. (11)
                     motion = np.linalg.inv(record.smoothed[before]) @ record.smoothed[row]
                     accels = np.array([config.motion_angular_accel_sigma_rad_s2, config.motion_accel_sigma_m_s2])
                     self.add(constant_velocity(k - 1, k, motion, dt, dt, np.zeros(2), accels))
@@ -168,7 +170,7 @@ class SessionGraph:
                 self.add(zero_velocity(k))
 
     def _add_own_motions(self, session: int, first: int, nodes: Nodes) -> Int:
-        """Motions of single pairs, with the calibration as unknowns; rows (K,) of the framesets in which they end."""
+        """Add the motions of single pairs and the calibration; return the rows (K,) in which the motions end."""
         record = nodes.record
         own, with_imu = record.own, bool(record.with_imu.all())
         if not len(record.own_pair):
@@ -186,7 +188,7 @@ class SessionGraph:
         return own.row
 
     def _add_motions(self, first: int, nodes: Nodes, left_out: Int) -> None:
-        """All motions of the rig, but those that end in some framesets."""
+        """Add the motions of the rig except those that end in the rows ``left_out``."""
         record = nodes.record
         for number in nodes.motions[~np.isin(record.motions.row[nodes.motions], left_out)].tolist():
             motion = record.motions.at(number, record.stamps_ns)
@@ -201,24 +203,24 @@ class SessionGraph:
             )
 
 
-def _starts(fragment: Fragment, is_root: bool) -> Iterator[gtsam.NonlinearFactor]:
-    """What is known of a fragment's first state: it defines the frame; with an IMU, gravity tells the vertical."""
+def _initial_priors(fragment: Fragment, is_root: bool) -> Iterator[gtsam.NonlinearFactor]:
+    """Yield priors of a fragment's first state; its pose defines a frame if it is a root."""
     k, pose = fragment.states.start, fragment.start.nav_T_body
     if not fragment.with_imu:
         if is_root:
             yield gtsam.PriorFactorPose3(x(k), gtsam.Pose3(pose), isotropic(6, _ORIGIN_SIGMA))
         return
-    known = InitialUncertainty(
+    uncertainty = InitialUncertainty(
         origin_covariance(pose[:3, :3], _START_TILT_RAD), _START_SPEED_M_S, _START_GYRO_BIAS_RAD_S
     )
-    about_pose, *others = first_state(k, fragment.start, known, True)
+    pose_prior, *others = first_state(k, fragment.start, uncertainty, True)
     if is_root:
-        yield about_pose
+        yield pose_prior
     yield from others
 
 
-def _start_of_imu(k: int, record: SessionRecord, row: int) -> Iterator[gtsam.NonlinearFactor]:
-    """What is known of velocity and biases where the estimation began anew: next to nothing."""
+def _reinitialised(k: int, record: SessionRecord, row: int) -> Iterator[gtsam.NonlinearFactor]:
+    """Yield weak priors of velocity and biases at a reinitialisation."""
     if record.with_imu[row]:
         yield gtsam.PriorFactorVector(v(k), record.velocity_nav[row], isotropic(3, _START_SPEED_M_S))
         sigmas = np.repeat([_START_ACCEL_BIAS_M_S2, _START_GYRO_BIAS_RAD_S], 3)
@@ -227,12 +229,12 @@ def _start_of_imu(k: int, record: SessionRecord, row: int) -> Iterator[gtsam.Non
 
 
 def poses_of(values: gtsam.Values, count: int) -> Float:
-    """Poses (N, 4, 4) of the states."""
+    """Return the poses (N, 4, 4) of the first ``count`` states."""
     return np.array([values.atPose3(x(k)).matrix() for k in range(count)]).reshape(-1, 4, 4)
 
 
 def moved(values: gtsam.Values, frames: Sequence[tuple[range, Float]]) -> gtsam.Values:
-    """The same with ranges of states seen from other frames: ``other_T_nav`` (4, 4) of each."""
+    """Transform ranges of states to other frames by ``other_T_nav`` (4, 4) of each."""
     made = gtsam.Values(values)
     for states, other_T_nav in frames:
         frame, rotation = gtsam.Pose3(other_T_nav), other_T_nav[:3, :3]

@@ -1,4 +1,4 @@
-"""Which framesets become states of the graph, and which motions tie them."""
+"""The framesets that become states of a session's graph."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from graphvio.optimization.record import SessionRecord
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """The N states of one session's graph.
+    """The N states of a session's graph.
 
     Attributes:
         record: of the session.
-        rows: (N,) their framesets, increasing.
-        motions: (M,) those of the record's motions that begin and end at one of them.
+        rows: (N,) rows of their framesets, increasing.
+        motions: (M,) indices of the record's motions that begin and end at states.
     """
 
     record: SessionRecord
@@ -29,27 +29,27 @@ class Nodes:
 
     @property
     def stamps_ns(self) -> Int:
-        """(N,)."""
+        """(N,) stamps of the states."""
         return np.asarray(self.record.stamps_ns[self.rows])
 
     @property
     def epoch(self) -> Int:
-        """(N,)."""
+        """(N,) epochs of the states."""
         return np.asarray(self.record.epoch[self.rows])
 
     def index_of_row(self, row: int) -> int:
-        """The state of a frameset.
+        """Return the state of a frameset.
 
         Raises:
-            OptimizationError: if it is none.
+            OptimizationError: if the frameset is no state.
         """
         index = int(np.searchsorted(self.rows, row))
         if index == len(self.rows) or self.rows[index] != row:
-            raise OptimizationError(f"{self.record.name}: frameset {row} is no state of the graph, but tied to one")
+            raise OptimizationError(f"{self.record.name}: frameset {row} has a measurement but no state")
         return index
 
     def twist(self, n: int) -> Float:
-        """(6,) angular rate, rad/s, and velocity, m/s, of body in body at state ``n``, which the IMU covers."""
+        """Return angular rate (rad/s) and velocity (m/s) of body in body (6,) at state ``n``, which the IMU covers."""
         record, row = self.record, int(self.rows[n])
         inertial = record.inertial
         around = inertial.values[max(int(inertial.begins[row + 1]) - 1, 0) : int(inertial.begins[row + 1]) + 1]
@@ -57,7 +57,7 @@ class Nodes:
         return np.concatenate([rate, record.smoothed[row, :3, :3].T @ record.velocity_nav[row]])
 
     def interval(self, n: int) -> ImuInterval | None:
-        """The IMU from state ``n - 1`` to ``n``; None where it does not cover that."""
+        """Return the IMU interval from state ``n - 1`` to ``n``; None if the IMU does not cover it."""
         inertial, first, last = self.record.inertial, self.rows[n - 1] + 1, self.rows[n] + 1
         if not inertial.covers[first:last].all() or not self.record.with_imu[[first - 1, last - 1]].all():
             return None
@@ -67,12 +67,12 @@ class Nodes:
 
 
 def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
-    """The framesets that others are measured from, the first and last of each epoch, and others in between.
+    """Choose the framesets that motions refer to, the first and last of each epoch, and others in between.
 
     Args:
         record: of a session.
-        interval_s: between two states there is no more time than this, as far as there are framesets; what is measured
-            from one keyframe within a shorter time adds little.
+        interval_s: maximum time between states, if there are framesets; more of the motions that are measured from
+            one keyframe add little.
     """
     stamps, motions = record.stamps_ns, record.motions
     wanted = record.is_keyframe.copy()
@@ -81,7 +81,7 @@ def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
     wanted[ends] = wanted[ends + 1] = True
     wanted[0] = wanted[-1] = True
     wanted[record.own.reference] = wanted[record.own.row] = True
-    wanted[_last_of_each_reference(motions.reference, motions.row)] = True
+    wanted[_last_of_references(motions.reference, motions.row)] = True
     latest = stamps[0]
     seen = np.zeros(len(stamps), dtype=bool)
     seen[motions.row] = True
@@ -94,7 +94,8 @@ def choose_nodes(record: SessionRecord, interval_s: float) -> Nodes:
     return Nodes(record, np.flatnonzero(wanted), chosen)
 
 
-def _last_of_each_reference(reference: Int, row: Int) -> Int:
+def _last_of_references(reference: Int, row: Int) -> Int:
+    """Return the last row that is measured from each reference."""
     last: dict[int, int] = {}
     for k, r in zip(reference.tolist(), row.tolist(), strict=True):
         last[k] = max(last.get(k, r), r)
@@ -102,15 +103,15 @@ def _last_of_each_reference(reference: Int, row: Int) -> Int:
 
 
 def spread(nodes: Nodes, nav_T_body: Float) -> Float:
-    """Poses (F, 4, 4) of all framesets from those (N, 4, 4) of the states.
+    """Interpolate the poses (F, 4, 4) of all framesets from those (N, 4, 4) of the states.
 
-    Between two states the smoothed trajectory is kept, and what it differs by at the second is shared out by time.
+    The smoothed trajectory is kept between two states; its error at the second is distributed linearly in time.
     """
     record, rows = nodes.record, nodes.rows
-    made = np.empty_like(record.smoothed)
+    poses = np.empty_like(record.smoothed)
     stamps = record.stamps_ns
     for n, row in enumerate(rows):
-        made[row] = nav_T_body[n]
+        poses[row] = nav_T_body[n]
         if n + 1 == len(rows) or record.epoch[row] != record.epoch[rows[n + 1]]:
             continue
         after = rows[n + 1]
@@ -118,5 +119,5 @@ def spread(nodes: Nodes, nav_T_body: Float) -> Float:
         error = se3_log(se3_inverse(since @ record.smoothed[after]) @ se3_inverse(nav_T_body[n]) @ nav_T_body[n + 1])
         for k in range(row + 1, after):
             share = float(stamps[k] - stamps[row]) / float(stamps[after] - stamps[row])
-            made[k] = nav_T_body[n] @ since @ record.smoothed[k] @ se3_exp(share * error)
-    return made
+            poses[k] = nav_T_body[n] @ since @ record.smoothed[k] @ se3_exp(share * error)
+    return poses

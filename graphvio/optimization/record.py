@@ -1,4 +1,4 @@
-"""What the odometry measured in a session, as columns: kept on disk, and optimised as often as one likes."""
+"""The measurements of a session's odometry as columns, in memory and on disk."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from graphvio.odometry.step import Step
 
 
 class Inertial(NamedTuple):
-    """The IMU in N steps of constant rate and acceleration, by framesets.
+    """The IMU in N steps of constant angular velocity and specific force.
 
     Attributes:
         begins: (F + 1,) the steps from frameset i - 1 to i are rows ``begins[i]`` to ``begins[i + 1]``.
-        covers: (F,) whether they cover all of that time, and nothing speaks against them.
+        covers: (F,) whether they cover all of that time and can be trusted.
         steps_s: (N,) durations.
         values: (N, 6) angular velocity, rad/s, and specific force, m/s^2, in body.
     """
@@ -35,15 +35,15 @@ class Inertial(NamedTuple):
 
 
 class Motions(NamedTuple):
-    """M measured motions, in the order of the framesets in which they end.
+    """M measured motions, ordered by the framesets in which they end.
 
     Attributes:
         reference: (M,) row of the frameset that each is measured from.
-        row: (M,) row of the one in which it ends.
+        row: (M,) row of the frameset in which it ends.
         reference_T_current: (M, 4, 4) of body.
         covariance: (M, 6, 6) tangent ``[rotation, translation]`` in body at its end.
-        shared_covariance: (M, 6, 6) the part that all motions from one reference have in common, same tangent.
-        inliers: (M,) points that it explains.
+        shared_covariance: (M, 6, 6) its part that all motions from one reference share, same tangent.
+        inliers: (M,) number of points.
     """
 
     reference: Int
@@ -54,7 +54,7 @@ class Motions(NamedTuple):
     inliers: Int
 
     def at(self, k: int, stamps_ns: Int) -> RelativeMotion:
-        """One of them."""
+        """Return motion k."""
         return RelativeMotion(
             int(stamps_ns[self.reference[k]]),
             int(stamps_ns[self.row[k]]),
@@ -64,6 +64,8 @@ class Motions(NamedTuple):
             int(self.inliers[k]),
         )
 
+
+_COLUMNS = {"is_stationary": "at_rest"}  # fields that have another name in files
 
 NO_MOTIONS = Motions(
     np.zeros(0, dtype=np.int64),
@@ -77,26 +79,26 @@ NO_MOTIONS = Motions(
 
 @dataclass(frozen=True, eq=False)
 class SessionRecord:
-    """A session as the odometry saw it: F framesets that have a pose.
+    """Estimates and measurements of a session's odometry, for F framesets with a pose.
 
     Attributes:
         name: of the session.
         stamps_ns: (F,) increasing.
         epoch: (F,) poses of different epochs do not share a nav frame.
         online: (F, 4, 4) ``nav_T_body`` as emitted.
-        smoothed: (F, 4, 4) the same as the smoother left it.
+        smoothed: (F, 4, 4) ``nav_T_body`` as it left the smoother's window.
         covariance: (F, 6, 6) of ``online``, tangent ``[rotation, translation]`` in body.
         velocity_nav: (F, 3) m/s.
         gyro_bias: (F, 3) rad/s; zero without an IMU.
         accel_bias: (F, 3) m/s^2; zero without an IMU.
         is_stationary: (F,) whether images and IMU show no motion.
         is_keyframe: (F,) whether later motions are measured from it.
-        with_imu: (F,) whether the IMU takes part in the state.
-        is_start: (F,) whether the estimation began here, be it anew: velocity and biases before then tell nothing.
+        with_imu: (F,) whether the state has a velocity and biases.
+        is_start: (F,) whether the state was initialised or reinitialised here.
         motions: of the rig.
-        own: motions of body over whole keyframes that single pairs tell.
+        own: motions of body over whole keyframes, measured by single pairs.
         own_pair: the pair of each of these.
-        inertial: the IMU's samples.
+        inertial: IMU samples.
     """
 
     name: str
@@ -118,21 +120,21 @@ class SessionRecord:
     inertial: Inertial
 
     def to_bytes(self) -> bytes:
-        """As numpy's archive; equal records give equal bytes."""
+        """Return the record as a numpy archive; equal records give equal bytes."""
         columns: dict[str, Any] = {"name": np.array(self.name)}
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, tuple):
                 columns |= {f"{field.name}.{name}": part for name, part in value._asdict().items()}  # type: ignore[attr-defined]
             elif field.name != "name":
-                columns[field.name] = value
+                columns[_COLUMNS.get(field.name, field.name)] = value
         buffer = io.BytesIO()
         np.savez(buffer, **columns)
         return buffer.getvalue()
 
     @staticmethod
     def load(path: Path) -> SessionRecord:
-        """Read what `to_bytes` gave.
+        """Read a record that `to_bytes` made.
 
         Raises:
             OptimizationError: if it cannot be read.
@@ -144,9 +146,10 @@ class SessionRecord:
                 kind: cls(*(columns.pop(f"{kind}.{name}") for name in cls._fields))
                 for kind, cls in (("motions", Motions), ("own", Motions), ("inertial", Inertial))
             }
-            return SessionRecord(**(columns | groups | {"name": str(columns["name"])}))
+            renamed = {field: columns.pop(column) for field, column in _COLUMNS.items()}
+            return SessionRecord(**(columns | groups | renamed | {"name": str(columns["name"])}))
         except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-            raise OptimizationError(f"{path}: is no record of a session ({error}); remove it") from None
+            raise OptimizationError(f"{path}: is no record of a session ({error}); remove the file") from None
 
 
 class Recorder:
@@ -157,24 +160,24 @@ class Recorder:
         self._steps: list[_Row] = []
         self._motions: list[RelativeMotion] = []
         self._own: list[tuple[int, RelativeMotion]] = []
-        self._refused: list[RelativeMotion] = []  # since vision was last used
+        self._refused: list[RelativeMotion] = []  # since the last motion that was used
         self._references: set[int] = set()
-        self._since: list[tuple[Float, Float]] = []  # the IMU since the last step with a pose
+        self._since: list[tuple[Float, Float]] = []  # IMU since the last step with a pose
         self._is_covered = True
         self._smoothed: dict[int, Float] = {}
-        self._used_at = 0  # row of the last step that vision constrains
+        self._used_at = 0  # row of the last step whose motion was used
 
     def add(self, step: Step) -> None:
-        """Take a step."""
+        """Add a step."""
         estimate, motion = step.estimate, step.motion
-        self._collect_inertial(step)
+        self._add_inertial(step)
         self._references |= step.references
         if motion is not None and not step.used:
             self._refused.append(motion)
         if estimate.nav_T_body is None or estimate.covariance is None or estimate.status is Status.LOST:
             return
         if step.initialised and motion is not None and step.used and self._steps:
-            # Vision is believed against the prediction: so is what it said before, and the IMU since then is not.
+            # Vision overrules the prediction: use its refused motions as well, and not the IMU since then.
             self._motions += [each for each in self._refused if each is not motion]
             if estimate.epoch == self._steps[-1].estimate.epoch:
                 for row in self._steps[self._used_at + 1 :]:
@@ -199,18 +202,18 @@ class Recorder:
             self._used_at = len(self._steps) - 1
 
     def add_smoothed(self, poses: Iterable[tuple[int, Float]]) -> None:
-        """Take stamps and poses ``nav_T_body`` (4, 4) as the smoother left them."""
+        """Add stamps and poses ``nav_T_body`` (4, 4) that have left the smoother's window."""
         self._smoothed.update(poses)
 
     def record(self) -> SessionRecord:
-        """All that was taken.
+        """Return all that was added as a record.
 
         Raises:
             OptimizationError: if no frameset has a pose.
         """
         rows = self._steps
         if not rows:
-            raise OptimizationError(f"{self._name}: the odometry found no pose; graphvio run tells why")
+            raise OptimizationError(f"{self._name}: the odometry estimated no pose; graphvio run reports why")
         estimates = [row.estimate for row in rows]
         motions = sorted(self._motions, key=lambda each: (each.stamp_ns, each.reference_stamp_ns))
         stamps = np.array([each.stamp_ns for each in estimates], dtype=np.int64)
@@ -237,12 +240,13 @@ class Recorder:
             inertial=_joined_inertial(rows),
         )
 
-    def _collect_inertial(self, step: Step) -> None:
-        if step.interval is None:
-            self._is_covered = False
-            return
+    def _add_inertial(self, step: Step) -> None:
         interval = step.interval
-        self._since.append((interval.steps_s, np.hstack([interval.angular_velocity, interval.linear_acceleration])))
+        if interval is None:
+            self._is_covered = False
+        else:
+            values = np.hstack([interval.angular_velocity, interval.linear_acceleration])
+            self._since.append((interval.steps_s, values))
 
 
 @dataclass(eq=False)

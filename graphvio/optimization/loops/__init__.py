@@ -1,1 +1,1 @@
-"""Loop closure: places that are seen again, by any pair, and where the rig was then."""
+"""Loop closure: recognition of places by any pair, and the relative pose between the visits."""

@@ -16,16 +16,16 @@ from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.loops.resection import Resection
 
-_INDEPENDENT_POINTS = 10  # errors of lenses' calibrations are alike across much of an image: more points help no more
+_INDEPENDENT_POINTS = 10  # errors of a lens's calibration are correlated across the image
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where a session looked around.
+    """A keyframe whose images are searched for loop closures.
 
     Attributes:
-        session: its number.
-        row: of the session's record.
+        session: number of the session.
+        row: of the frameset in the session's record.
         stamp_ns: of the frameset.
     """
 
@@ -36,16 +36,16 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class LoopClosure:
-    """One place seen from another.
+    """The relative pose of two places that see the same points.
 
     Attributes:
         reference: the earlier place.
         current: the later one.
         reference_T_current: (4, 4) of body.
         covariance: (6, 6), tangent ``[rotation, translation]`` in body at the current place.
-        inliers: points that it rests on.
-        pairs: which pair's points which pair saw.
-        is_registered: whether it rests on patches, not on features alone.
+        inliers: number of points.
+        pairs: (pair at the reference, pair at the current place) that saw the same points.
+        is_registered: whether patches were registered, not only features matched.
     """
 
     reference: Place
@@ -58,7 +58,7 @@ class LoopClosure:
 
 
 def closure_of(earlier: Place, later: Place, found: Resection) -> LoopClosure:
-    """What a resection of the later place on the earlier one's points says, with a covariance that is honest."""
+    """Make a loop closure of a resection; its covariance allows for correlated errors of the points."""
     return LoopClosure(
         earlier,
         later,
@@ -71,7 +71,7 @@ def closure_of(earlier: Place, later: Place, found: Resection) -> LoopClosure:
 
 
 def closures_to_bytes(closures: Sequence[LoopClosure]) -> bytes:
-    """As numpy's archive; equal closures give equal bytes."""
+    """Return loop closures as a numpy archive; equal closures give equal bytes."""
     ends = [[(end.session, end.row, end.stamp_ns) for end in (each.reference, each.current)] for each in closures]
     crossings = [(k, a, b) for k, each in enumerate(closures) for a, b in each.pairs]
     columns: dict[str, Any] = {
@@ -88,7 +88,7 @@ def closures_to_bytes(closures: Sequence[LoopClosure]) -> bytes:
 
 
 def load_closures(path: Path) -> list[LoopClosure]:
-    """Read what `closures_to_bytes` gave.
+    """Read loop closures that `closures_to_bytes` made.
 
     Raises:
         OptimizationError: if it cannot be read.

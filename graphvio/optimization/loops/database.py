@@ -1,7 +1,7 @@
-"""A COLMAP database that holds what was seen at the places: cameras and rig, images, features, matches.
+"""A COLMAP database of places: cameras and rig, images, features and matches.
 
-COLMAP counts pixels from the corner of an image, and graphvio from the centre of its first pixel: half a pixel lies
-between them, which is added here and taken away again.
+The origin of pixel coordinates is the image's corner in COLMAP and the centre of its first pixel in graphvio: half a
+pixel is added when writing and subtracted when reading.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from graphvio.errors import MissingExtraError, OptimizationError
 from graphvio.rig import Camera, Rig
 
 CENTRE_PX = 0.5
-"""Where COLMAP has the centre of an image's first pixel."""
+"""COLMAP's coordinate of the centre of an image's first pixel."""
 
 
 def colmap() -> Any:
-    """The library pycolmap, which says nothing less than warnings.
+    """Import pycolmap, with logging from warnings on.
 
     Raises:
         MissingExtraError: if the extra ``maps`` is not installed.
@@ -37,12 +37,12 @@ def colmap() -> Any:
 
 
 def image_name(session: str, camera: str, stamp_ns: int) -> str:
-    """Of an image in a database and in a reconstruction, and its file below their folder of images."""
+    """Return the name of an image in databases and reconstructions, and of its file in their image folder."""
     return f"{session}/{camera}/{stamp_ns}.png"
 
 
 def colmap_camera(camera: Camera, number: int) -> Any:
-    """A camera of the rig as COLMAP has it."""
+    """Return a camera of the rig as a COLMAP camera."""
     fx, fy, cx, cy = (float(value) for value in camera.intrinsics)
     k1, k2, p1, p2, k3 = (float(value) for value in camera.distortion)
     centre = [cx + CENTRE_PX, cy + CENTRE_PX]
@@ -63,7 +63,7 @@ class FeatureDatabase:
     """The database of one or several sessions; a context manager that closes it.
 
     Args:
-        path: of the file, made if it is missing.
+        path: of the file, made if missing.
 
     Raises:
         OptimizationError: if it cannot be opened.
@@ -89,45 +89,44 @@ class FeatureDatabase:
 
     @property
     def names(self) -> frozenset[str]:
-        """Of all images."""
+        """Names of all images."""
         return frozenset(self._ids)
 
     @property
     def path(self) -> Path:
-        """Of the file."""
+        """Path of the file."""
         return self._path
 
     def frame_id(self, name: str) -> int:
-        """COLMAP's number of the frame that an image is part of."""
+        """Return COLMAP's number of an image's frame."""
         return int(self._file.read_image(self._ids[name]).frame_id)
 
     def transaction(self) -> AbstractContextManager[Any]:
-        """What is written inside is written as a whole or not at all."""
+        """Return a context manager whose writes succeed together or not at all."""
         return self._colmap.DatabaseTransaction(self._file)  # type: ignore[no-any-return]
 
     def rig_of(self, session: str, rig: Rig) -> tuple[int, dict[str, int]] | None:
-        """What `add_rig` gave for the rig that took a session's images, some of which may be of some of its cameras
-        only; None without images."""
+        """Return what `add_rig` returned for the rig of a session; None if the session has no images."""
         taken = next((number for name, number in self._ids.items() if name.rsplit("/", 2)[0] == session), None)
         if taken is None:
             return None
         sensor = self._colmap.sensor_t(self._colmap.SensorType.CAMERA, self._file.read_image(taken).camera_id)
         found = self._file.read_rig_with_sensor(sensor)
-        others = sorted(each.id for each in found.non_ref_sensors)  # as they were written
+        others = sorted(each.id for each in found.non_ref_sensors)  # in the order of writing
         names = [camera.name for camera in rig.cameras]
         return found.rig_id, dict(zip(names, [found.ref_sensor_id.id, *others], strict=True))
 
     def add_rig(self, rig: Rig) -> tuple[int, dict[str, int]]:
-        """Add a rig, whose first camera is the reference of COLMAP's.
+        """Add a rig, with its first camera as COLMAP's reference sensor.
 
         Returns:
-            The rig's number, and those of its cameras by name.
+            Number of the rig, and camera name -> number.
         """
         numbers = {camera.name: self._file.write_camera(colmap_camera(camera, 0)) for camera in rig.cameras}
         return self._file.write_rig(self._rig(rig, numbers)), numbers
 
     def move_cameras(self, session: str, rig: Rig) -> None:
-        """Put the cameras of a session, if it has images, where a rig has them."""
+        """Update the extrinsics of a session's cameras, if it has images, to those of a rig."""
         known = self.rig_of(session, rig)
         if known is not None:
             made = self._rig(rig, known[1])
@@ -146,7 +145,7 @@ class FeatureDatabase:
         return made
 
     def add_place(self, rig_id: int, images: Mapping[int, str]) -> None:
-        """Add the images of one instant: camera's number -> name."""
+        """Add the images of one instant, given as camera number -> name."""
         library = self._colmap
         frame = library.Frame(rig_id=rig_id)
         made = []
@@ -161,7 +160,7 @@ class FeatureDatabase:
             self._file.update_image(image)
 
     def add_features(self, name: str, pixels: Float, descriptors: AnyArray | None = None) -> None:
-        """Add features (K, 2) of an image and their descriptors (K, 128), uint8."""
+        """Add features (K, 2) of an image in pixels, and their descriptors (K, 128), uint8."""
         number = self._ids[name]
         self._file.write_keypoints(number, (pixels + CENTRE_PX).astype(np.float32).reshape(-1, 2))
         if descriptors is not None:
@@ -169,17 +168,21 @@ class FeatureDatabase:
             self._file.write_descriptors(number, self._colmap.FeatureDescriptors(kind, descriptors))
 
     def pixels(self, name: str) -> Float:
-        """Features (K, 2) of an image."""
+        """Return the features (K, 2) of an image in pixels."""
         return np.asarray(self._file.read_keypoints(self._ids[name])[:, :2], dtype=np.float64) - CENTRE_PX
 
     def descriptors(self, name: str) -> AnyArray:
-        """Descriptors (K, 128), uint8, of an image's features."""
+        """Return the descriptors (K, 128), uint8, of an image's features."""
         return np.asarray(self._file.read_descriptors(self._ids[name]).data, dtype=np.uint8).reshape(-1, 128)
 
     def add_matches(self, first: str, second: str, matches: Int, geometry: Any = None) -> None:
-        """Add which features (M, 2) of two images are one, and the two-view geometry that verifies them.
+        """Add matches of two images.
 
-        Without one, they are taken for verified, as a calibrated pair's are.
+        Args:
+            first: name of the first image.
+            second: name of the second image.
+            matches: (M, 2) features of the first and the second image.
+            geometry: two-view geometry that verifies matches; None if all are verified, as those of a stereo pair.
         """
         one, other = self._ids[first], self._ids[second]
         rows = np.ascontiguousarray(matches, dtype=np.uint32).reshape(-1, 2)
@@ -192,12 +195,12 @@ class FeatureDatabase:
         self._file.write_two_view_geometry(one, other, geometry)
 
     def matches(self, first: str, second: str) -> Int:
-        """Verified matches (M, 2) of two images."""
+        """Return the verified matches (M, 2) of two images."""
         found = self._file.read_two_view_geometry(self._ids[first], self._ids[second])
         return np.asarray(found.inlier_matches, dtype=np.int64).reshape(-1, 2)
 
     def all_matches(self, first: str, second: str) -> Int:
-        """Matches (M, 2) of two images, verified or not."""
+        """Return all matches (M, 2) of two images, verified or not."""
         found = self._file.read_matches(self._ids[first], self._ids[second])
         return np.asarray(found, dtype=np.int64).reshape(-1, 2)
 
@@ -206,14 +209,14 @@ class FeatureDatabase:
         return bool(self._file.exists_matches(self._ids[first], self._ids[second]))
 
     def verified_pairs(self) -> list[tuple[str, str]]:
-        """Names of the images between which there are verified matches."""
+        """Return the names of all pairs of images with verified matches."""
         names = {number: name for name, number in self._ids.items()}
         pairs, _ = self._file.read_two_view_geometry_num_inliers()
         found = [self._colmap.pair_id_to_image_pair(pair) for pair in pairs]
         return [(names[first], names[second]) for first, second in found]
 
     def verify(self, first: str, second: str, geometry: Any) -> None:
-        """Say anew which matches of two images are verified; None: none are, and all stay as unverified ones."""
+        """Replace the two-view geometry that verifies the matches of two images; with None, none are verified."""
         one, other = self._ids[first], self._ids[second]
         if self._file.exists_two_view_geometry(one, other):
             self._file.delete_two_view_geometry(one, other)
@@ -221,10 +224,10 @@ class FeatureDatabase:
             self._file.write_two_view_geometry(one, other, geometry)
 
     def model(self, rigs: Mapping[int, Float]) -> Any:
-        """A reconstruction without points, whose numbers are the database's.
+        """Return a reconstruction without points, with the database's numbers.
 
         Args:
-            rigs: frame's number -> (4, 4), from world to its rig's reference camera.
+            rigs: number of the frame -> (4, 4) reference camera from world.
         """
         file, made = self._file, self._colmap.Reconstruction()
         frames = [frame for frame in file.read_all_frames() if frame.frame_id in rigs]
@@ -248,6 +251,5 @@ class FeatureDatabase:
 
 
 def rigid(a_T_b: Float) -> Any:
-    """A transform (4, 4) as COLMAP has it."""
-    library = colmap()
-    return library.Rigid3d(np.ascontiguousarray(a_T_b[:3]))
+    """Return a transform (4, 4) as COLMAP's type."""
+    return colmap().Rigid3d(np.ascontiguousarray(a_T_b[:3]))

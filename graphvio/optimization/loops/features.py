@@ -1,4 +1,4 @@
-"""Features of the places, by COLMAP's SIFT on the CPU, and their depth by our own stereo matching."""
+"""SIFT features of places, by COLMAP on the CPU, and their depth by the odometry's stereo matching."""
 
 from __future__ import annotations
 
@@ -18,45 +18,19 @@ from graphvio.optimization.loops.places import PairObserver
 from graphvio.rig import Rig
 from graphvio.sources import Source
 
-_FIRST_OCTAVE = 0  # the image itself; twice its size, COLMAP's default, costs three times as much
-_AHEAD = 4  # places that are worked on at a time
-
-
-class Extractor:
-    """SIFT features of images, in any thread.
-
-    Args:
-        most: features of an image, the largest ones.
-    """
-
-    def __init__(self, most: int) -> None:
-        library = colmap()
-        self._options = library.FeatureExtractionOptions()
-        self._options.num_threads = 1
-        self._options.sift.max_num_features = most
-        self._options.sift.first_octave = _FIRST_OCTAVE
-        self._options.sift.max_num_orientations = 1
-        self._of_thread = threading.local()
-
-    def extract(self, image: Image) -> tuple[Float, AnyArray]:
-        """Pixels (K, 2) and descriptors (K, 128), uint8."""
-        library = colmap()
-        if not hasattr(self._of_thread, "made"):
-            self._of_thread.made = library.FeatureExtractor.create(self._options, library.Device.cpu)
-        keypoints, descriptors = self._of_thread.made.extract_from_uint8_array(np.ascontiguousarray(image))
-        pixels = np.asarray(library.keypoints_to_matrix(keypoints)[:, :2], dtype=np.float64) - CENTRE_PX
-        return pixels.reshape(-1, 2), np.asarray(descriptors.data, dtype=np.uint8).reshape(-1, 128)
+_FIRST_OCTAVE = 0  # full resolution; COLMAP's default of twice that takes three times as long
+_MAX_PENDING = 4  # places that are processed at a time
 
 
 @dataclass(frozen=True, eq=False)
 class PairFeatures:
-    """What one pair shows at a place.
+    """The features of one pair's images at a place.
 
     Attributes:
-        left: (K, 2) pixels in its left image.
-        descriptors: (K, 128) uint8 of them.
-        right: (M, 2) pixels in its right image, of those that are found there.
-        in_right: (M,) which of the K they are.
+        left: (K, 2) pixels in the left image.
+        descriptors: (K, 128) uint8, of the features in the left image.
+        right: (M, 2) pixels in the right image of those with a stereo match.
+        in_right: (M,) their indices among the K.
     """
 
     left: Float
@@ -66,12 +40,12 @@ class PairFeatures:
 
     @property
     def rows(self) -> Int:
-        """(M, 2) features of the left image and of the right one that are one."""
+        """Stereo matches (M, 2): features of the left and of the right image."""
         return np.column_stack([self.in_right, np.arange(len(self.in_right))])
 
 
 class PlaceObserver:
-    """Finds the features of a place's images, in any thread, and where they are in the right ones.
+    """Extracts the features of a place's images and matches them in stereo, in any thread.
 
     Args:
         rig: of the cameras.
@@ -81,29 +55,42 @@ class PlaceObserver:
     def __init__(self, rig: Rig, config: Config) -> None:
         self._rig = rig
         self._config = config
-        self._extractor = Extractor(config.optimization.features)
         self._of_thread = threading.local()
+        self._options = colmap().FeatureExtractionOptions()
+        self._options.num_threads = 1
+        self._options.sift.max_num_features = config.optimization.features
+        self._options.sift.first_octave = _FIRST_OCTAVE
+        self._options.sift.max_num_orientations = 1
 
     @property
     def pairs(self) -> Sequence[PairObserver]:
-        """Of each pair of the rig; those of the calling thread."""
+        """Observers of the rig's pairs, for the calling thread."""
         if not hasattr(self._of_thread, "pairs"):
             self._of_thread.pairs = [PairObserver(pair, self._config) for pair in self._rig.pairs]
         made: Sequence[PairObserver] = self._of_thread.pairs
         return made
 
     def look(self, frameset: FrameSet) -> dict[int, PairFeatures]:
-        """Pair -> what it shows."""
+        """Return pair index -> features of a frameset."""
         seen = {}
         for j, images in frameset.images.items():
             observer = self.pairs[j]
-            pixels, descriptors = self._extractor.extract(images[0])
+            pixels, descriptors = self._extract(images[0])
             usable = observer.usable(pixels)
             pixels, descriptors = pixels[usable], descriptors[usable]
             frame = observer.observe(frameset.stamp_ns, images, pixels)
             right, _ = observer.pair.right.project(np.column_stack([frame.right, np.ones(len(pixels))]))
             seen[j] = PairFeatures(pixels, descriptors, right[frame.has_depth], np.flatnonzero(frame.has_depth))
         return seen
+
+    def _extract(self, image: Image) -> tuple[Float, AnyArray]:
+        """Return pixels (K, 2) and descriptors (K, 128), uint8, of an image's features."""
+        library = colmap()
+        if not hasattr(self._of_thread, "extractor"):
+            self._of_thread.extractor = library.FeatureExtractor.create(self._options, library.Device.cpu)
+        keypoints, descriptors = self._of_thread.extractor.extract_from_uint8_array(np.ascontiguousarray(image))
+        pixels = np.asarray(library.keypoints_to_matrix(keypoints)[:, :2], dtype=np.float64) - CENTRE_PX
+        return pixels.reshape(-1, 2), np.asarray(descriptors.data, dtype=np.uint8).reshape(-1, 128)
 
 
 def extract_places(
@@ -115,18 +102,18 @@ def extract_places(
     config: Config,
     on_progress: Callable[[int], None] | None = None,
 ) -> None:
-    """Put the places of a session into the database: features of left images, and where they are in the right ones.
+    """Extract the features of a session's places into the database.
 
-    Places that are in the database already are left as they are, so that an interrupted run goes on.
+    Places that are in the database already are skipped, so that an interrupted run can be continued.
 
     Args:
         source: of the images.
-        rig: their cameras.
-        session: its name, unique in the database.
+        rig: of the cameras.
+        session: name of the session, unique in the database.
         stamps_ns: of the places.
         database: to write.
         config: of this stage and of the stereo matching.
-        on_progress: called with the number of places done.
+        on_progress: called with the number of finished places.
     """
     observer = PlaceObserver(rig, config)
 
@@ -138,7 +125,7 @@ def extract_places(
     with ThreadPoolExecutor(2, thread_name_prefix="graphvio-features") as pool:
         pending: list[Any] = []
         for at, stamp_ns in enumerate(missing):
-            while len(pending) < _AHEAD and at + len(pending) < len(missing):
+            while len(pending) < _MAX_PENDING and at + len(pending) < len(missing):
                 pending.append(pool.submit(look, missing[at + len(pending)]))
             store_place(database, rig, session, stamp_ns, pending.pop(0).result())
             done += 1
@@ -153,14 +140,14 @@ def _is_there(database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int) 
 def store_place(
     database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int, seen: Mapping[int, PairFeatures]
 ) -> None:
-    """Put a place into the database, as a whole: what its pairs show.
+    """Write the features of a place to the database, all or nothing.
 
     Args:
         database: to write.
-        rig: that looked around.
-        session: its name, unique in the database.
+        rig: of the cameras.
+        session: name of the session, unique in the database.
         stamp_ns: of the place.
-        seen: by pair.
+        seen: pair index -> features.
     """
     names = {
         camera.name: image_name(session, camera.name, stamp_ns)
@@ -180,15 +167,15 @@ def store_place(
 def merge_places(
     part: FeatureDatabase, whole: FeatureDatabase, session: str, rig: Rig, stamps_ns: Sequence[int]
 ) -> None:
-    """Copy places from one database into another.
+    """Copy places from one database to another.
 
-    Parts that are copied in the order of time give the rows that `extract_places` gives for all places at once.
+    Parts that are copied in the order of time give the same rows as `extract_places` for all places at once.
 
     Args:
-        part: holds some of the places.
+        part: to read.
         whole: to write.
         session: name of the session.
-        rig: its cameras.
+        rig: of the cameras.
         stamps_ns: of the places, in the order of time; those that the part does not hold are skipped.
     """
     for stamp_ns in stamps_ns:

@@ -1,4 +1,4 @@
-"""Features of two images that are one: matched by their descriptors, verified by the geometry of two views."""
+"""Matches of the features of two images by their descriptors, and their verification by two-view geometry."""
 
 from __future__ import annotations
 
@@ -12,28 +12,33 @@ from graphvio.optimization.loops.database import CENTRE_PX, colmap, colmap_camer
 from graphvio.rig import Camera
 
 _UNIT = 512.0**2  # COLMAP scales descriptors to this squared length
-_MOST_ANGLE = 0.7  # between descriptors of one feature, radians; COLMAP's
-_MOST_RATIO = 0.8  # of the best's angle to the second best's; COLMAP's
-_LEAST_LENGTH = 1e-12  # of the normal of a plane that there is not: two views from one point
+_MAX_ANGLE_RAD = 0.7  # between matching descriptors; COLMAP's
+_MAX_RATIO = 0.8  # of the best angle to the second best; COLMAP's
+_MIN_LENGTH = 1e-12  # of the normal of an epipolar plane; two views from one point have none
 
 
 def alike(first: AnyArray, second: AnyArray) -> Int:
-    """Rows (M, 2) of descriptors (K, 128) and (L, 128), uint8, that are each other's best and have no rival.
+    """Match descriptors that are each other's nearest and pass the ratio test, as COLMAP's matcher on the CPU does.
 
-    They are those that COLMAP's own matcher finds on the CPU, in a thirtieth of its time.
+    Args:
+        first: (K, 128) uint8.
+        second: (L, 128) uint8.
+
+    Returns:
+        Rows (M, 2) of the first and the second.
     """
     if not len(first) or not len(second):
         return np.zeros((0, 2), dtype=np.int64)
-    products = first.astype(np.float32) @ second.astype(np.float32).T  # whole numbers, and exact
-    there, is_clear = _best(products)
-    back, is_clear_back = _best(np.ascontiguousarray(products.T))
-    mutual = is_clear & is_clear_back[there] & (back[there] == np.arange(len(first)))
+    products = first.astype(np.float32) @ second.astype(np.float32).T  # of integers: exact
+    second_of, is_clear = _best(products)
+    first_of, is_clear_back = _best(np.ascontiguousarray(products.T))
+    mutual = is_clear & is_clear_back[second_of] & (first_of[second_of] == np.arange(len(first)))
     rows = np.flatnonzero(mutual)
-    return np.column_stack([rows, there[rows]])
+    return np.column_stack([rows, second_of[rows]])
 
 
 def _best(products: AnyArray) -> tuple[Int, Bool]:
-    """Column of the largest product of each row (K,), and whether it is near and clearly nearer than all others."""
+    """Return each row's column with the largest product (K,), and whether that passes both thresholds (K,)."""
     rows = np.arange(len(products))
     best = np.argmax(products, axis=1)
     largest = products[rows, best]
@@ -41,53 +46,59 @@ def _best(products: AnyArray) -> tuple[Int, Bool]:
     others[rows, best] = 0.0
     angle = np.arccos(np.minimum(largest / np.float32(_UNIT), 1.0))
     rival = np.arccos(np.minimum(others.max(axis=1) / np.float32(_UNIT), 1.0))
-    return best, (angle <= _MOST_ANGLE) & (angle < _MOST_RATIO * rival)
+    return best, (angle <= _MAX_ANGLE_RAD) & (angle < _MAX_RATIO * rival)
 
 
 def estimated_geometry(cameras: tuple[Camera, Camera], pixels: tuple[Float, Float], rows: Int) -> Any:
-    """COLMAP's two-view geometry that explains most matches (M, 2) of pixels (K, 2) and (L, 2)."""
+    """Estimate COLMAP's two-view geometry by RANSAC.
+
+    Args:
+        cameras: of the two images.
+        pixels: features (K, 2) and (L, 2).
+        rows: matches (M, 2).
+    """
     first, second = (colmap_camera(camera, 1) for camera in cameras)
     one, other = (each + CENTRE_PX for each in pixels)
     options = colmap().TwoViewGeometryOptions()
-    options.ransac.random_seed = 0  # else it depends on what the thread did before
+    options.ransac.random_seed = 0  # otherwise results depend on earlier calls of the thread
     return colmap().estimate_calibrated_two_view_geometry(first, one, second, other, rows.astype(np.uint32), options)
 
 
 def known_geometry(
-    cameras: tuple[Camera, Camera], second_T_first: Float, pixels: tuple[Float, Float], rows: Int, most_px: float
+    cameras: tuple[Camera, Camera], second_T_first: Float, pixels: tuple[Float, Float], rows: Int, max_error_px: float
 ) -> Any:
-    """COLMAP's two-view geometry of a known motion, and the matches that it explains.
+    """Return COLMAP's two-view geometry of a known motion, with the matches that agree with it.
 
     Args:
         cameras: of the two images.
         second_T_first: (4, 4).
         pixels: features (K, 2) and (L, 2).
-        rows: (M, 2) of features that look alike.
-        most_px: distance from the plane through the ray and both cameras, as an angle times the focal length.
+        rows: matches (M, 2).
+        max_error_px: maximum angle to the epipolar plane, times the focal length.
     """
     essential = skew(second_T_first[:3, 3]) @ second_T_first[:3, :3]
     first, has_first = _rays(cameras[0], pixels[0][rows[:, 0]])
     second, has_second = _rays(cameras[1], pixels[1][rows[:, 1]])
     fits = has_first & has_second
-    fits &= _off_plane(second, first @ essential.T) * cameras[1].focal_px <= most_px
-    fits &= _off_plane(first, second @ essential) * cameras[0].focal_px <= most_px
+    fits &= _off_plane(second, first @ essential.T) * cameras[1].focal_px <= max_error_px
+    fits &= _off_plane(first, second @ essential) * cameras[0].focal_px <= max_error_px
     library = colmap()
-    made = library.TwoViewGeometry()
-    made.config = library.TwoViewGeometryConfiguration.CALIBRATED
-    made.E = essential
-    made.cam2_from_cam1 = library.Rigid3d(np.ascontiguousarray(second_T_first[:3]))
-    made.inlier_matches = np.ascontiguousarray(rows[fits], dtype=np.uint32).reshape(-1, 2)
-    return made
+    geometry = library.TwoViewGeometry()
+    geometry.config = library.TwoViewGeometryConfiguration.CALIBRATED
+    geometry.E = essential
+    geometry.cam2_from_cam1 = library.Rigid3d(np.ascontiguousarray(second_T_first[:3]))
+    geometry.inlier_matches = np.ascontiguousarray(rows[fits], dtype=np.uint32).reshape(-1, 2)
+    return geometry
 
 
 def _rays(camera: Camera, pixels: Float) -> tuple[Float, Bool]:
-    """Unit vectors (M, 3), and whether there are any (M,)."""
+    """Return unit vectors (M, 3) of pixels (M, 2), and whether they exist (M,)."""
     rays, has_ray = camera.unproject(pixels)
     rows = np.column_stack([rays, np.ones(len(rays))])
     return rows / np.linalg.norm(rows, axis=1, keepdims=True), has_ray
 
 
 def _off_plane(rays: Float, normals: Float) -> Float:
-    """Angles (M,), radians, of unit vectors (M, 3) with planes of normals (M, 3)."""
-    length = np.maximum(np.linalg.norm(normals, axis=1), _LEAST_LENGTH)
+    """Return the angles (M,), in radians, between unit vectors (M, 3) and planes with normals (M, 3)."""
+    length = np.maximum(np.linalg.norm(normals, axis=1), _MIN_LENGTH)
     return np.asarray(np.arcsin(np.minimum(np.abs(np.sum(rays * normals, axis=1)) / length, 1.0)))

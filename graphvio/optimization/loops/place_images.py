@@ -1,4 +1,4 @@
-"""Images of places, as files that are named as in the database."""
+"""Image files of places, named as in the database."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.database import image_name
 from graphvio.rig import Rig
 
-_PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # the noise of images hardly shrinks any further
+_PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # higher levels hardly compress noise
 
 
 def write_image(path: Path, image: Image) -> None:
-    """Write a file that is either whole or absent.
+    """Write a PNG file, which is whole or absent.
 
     Raises:
         OSError: if it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.tmp")
+    unfinished = path.with_name(f".{path.name}.tmp")  # renamed without fsync: there are thousands
     _, encoded = cv2.imencode(".png", image, _PNG_OPTIONS)
     unfinished.write_bytes(encoded.tobytes())
     unfinished.replace(path)
 
 
 def write_place(folder: Path, rig: Rig, session: str, frameset: FrameSet) -> None:
-    """Write all images of a place.
+    """Write all images of a frameset.
 
     Raises:
         OSError: if one cannot be written.
@@ -41,7 +41,7 @@ def write_place(folder: Path, rig: Rig, session: str, frameset: FrameSet) -> Non
 
 
 def read_place(folder: Path, rig: Rig, session: str, stamp_ns: int) -> FrameSet:
-    """The images of a place, of those pairs whose both files are there and can be read."""
+    """Read the images of a place, of the pairs for which both files can be read."""
     images = {}
     for j, pair in enumerate(rig.pairs):
         both = [

@@ -1,4 +1,4 @@
-"""Places: the keyframes at which a session looks around, and what one stereo pair sees there."""
+"""Choice of places among the keyframes, and stereo matching of features at them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from graphvio.geometry import se3_inverse, so3_log
 from graphvio.optimization.record import SessionRecord
 from graphvio.rig import StereoPair
 
-_LEVELS = 2  # of the pyramid, as far as stereo matching needs it
+_LEVELS = 2  # of the pyramid, enough for stereo matching
 
 
 def choose_places(record: SessionRecord, distance_m: float, angle_deg: float) -> Int:
-    """Rows (P,) of the keyframes that are so far from the place before them, or turned by so much."""
+    """Choose keyframes at this distance or angle from the place before; returns their rows (P,)."""
     chosen: list[int] = []
     for row in np.flatnonzero(record.is_keyframe).tolist():
         if chosen and record.epoch[row] == record.epoch[chosen[-1]]:
@@ -31,7 +31,7 @@ def choose_places(record: SessionRecord, distance_m: float, angle_deg: float) ->
 
 
 class PairObserver:
-    """Finds out how deep features of one pair's left image are."""
+    """Finds the depth of features in one pair's left image by stereo matching."""
 
     def __init__(self, pair: StereoPair, config: Config) -> None:
         window_px = config.tracking.window_px
@@ -40,7 +40,7 @@ class PairObserver:
         self._matcher = StereoMatcher(pair, config, allowed_pixels(pair.right, window_px))
 
     def usable(self, pixels: Float) -> Bool:
-        """Which pixels (N, 2) of the left image are in it, and not masked."""
+        """Return which pixels (N, 2) are inside the left image and not masked."""
         inside, usable = usable_at(pixels, self._allowed, 0.0)
         return inside & usable
 
@@ -51,13 +51,13 @@ class PairObserver:
         pixels: Float,
         inverse_depths: Float | None = None,
     ) -> PairFrame:
-        """A frame whose tracks are these features.
+        """Return a frame whose tracks are these features.
 
         Args:
             stamp_ns: of the images.
             images: left and right.
             pixels: (N, 2) in the left one.
-            inverse_depths: (N,) expected, 1/m; NaN, or no array, where nothing is known.
+            inverse_depths: (N,) expected, 1/m; NaN or None where unknown.
         """
         left, right = (self._pyramid(image) for image in images)
         rays, has_ray = self.pair.left.unproject(pixels)

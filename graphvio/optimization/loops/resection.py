@@ -1,8 +1,8 @@
-"""Where the rig was at a place that it saw before: stereo 3D-2D resection across any pairs.
+"""Stereo 3D-2D resection between two places, across any pairs.
 
-Points that pair a triangulated at the reference are seen by pair b at the other place. Each such (a, b) is a pair of
-its own in the search and refinement of section 3.1, see `RigArrays.crossed`. Features that COLMAP finds lie where they
-are to half a pixel or so; where a pair sees again what it saw itself, its patches are then registered to a tenth.
+Points that pair a triangulated at the reference are seen by pair b at the current place. Each such (a, b) is treated as
+a pair of its own by the search and refinement of section 3.1, see `RigArrays.crossed`. SIFT features are accurate to
+about half a pixel; where a pair sees the same points at both places, their patches are then registered to a tenth.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.places import PairObserver
 from graphvio.rig import Rig
 
-_FEATURE_SIGMA_PX = 0.7  # of COLMAP's features in place of tracked corners
+_FEATURE_SIGMA_PX = 0.7  # of SIFT features instead of tracked corners
 _FEATURE_MAX_ERROR_PX = 4.0
-_ROUNDS = 2  # of registration: the first one's motion tells the second where to look
-_LEAST_REGISTERED = 30
+_ROUNDS = 2  # of registration, the second predicted from the motion of the first
+_MIN_REGISTERED = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +39,9 @@ class Resection:
     Attributes:
         cur_T_ref: (4, 4) of body.
         covariance: (6, 6), tangent ``[rotation, translation]`` in body at the current place.
-        inliers: points that it explains.
-        pairs: which pair's points which pair saw.
-        is_registered: whether it rests on patches, not on features alone.
+        inliers: number of points.
+        pairs: (pair at the reference, pair at the current place) that saw the same points.
+        is_registered: whether patches were registered, not only features matched.
     """
 
     cur_T_ref: Float
@@ -59,15 +59,18 @@ def resect_features(
     config: Config,
     seed: Sequence[int],
 ) -> Resection | None:
-    """The motion that matched features tell, or None where they tell none.
+    """Estimate the motion between two places from matched features.
 
     Args:
         rig: of the pairs.
-        reference: pair -> its features with their depth.
-        current: the same at the other place.
-        matches: (a, b) -> rows (M, 2) of a's features at the reference and b's at the other place.
+        reference: pair index -> its features with depth at the reference.
+        current: pair index -> its features with depth at the current place.
+        matches: (a, b) -> matches (M, 2) of a's features at the reference and b's at the current place.
         config: of the motion.
-        seed: of the random triples.
+        seed: of RANSAC.
+
+    Returns:
+        The motion, or None if the matches do not support one.
     """
     crossings = sorted(matches)
     observations = _observations(reference, current, [(pair, matches[pair]) for pair in crossings])
@@ -81,20 +84,22 @@ def resect_features(
     return _resection(refined, crossings, observations.pair, is_registered=False)
 
 
-def register_again(
+def register_patches(
     observers: Sequence[PairObserver], found: Resection, reference: Mapping[int, PairFrame],
     images: tuple[FrameSet, FrameSet], config: Config, seed: Sequence[int],
 ) -> Resection:  # fmt: skip
-    """The same motion by the patches of those pairs that see again what they saw themselves; as it was where these
-    are few.
+    """Refine a motion by registering the patches of pairs that see the same points at both places.
 
     Args:
         observers: of the rig's pairs.
-        found: by features.
-        reference: pair -> its features with their depth.
-        images: of the reference and of the other place.
+        found: motion by features.
+        reference: pair index -> its features with depth at the reference.
+        images: of the reference and of the current place.
         config: of the motion.
-        seed: of the random triples.
+        seed: of RANSAC.
+
+    Returns:
+        The refined motion, or the given one if too few patches can be registered.
     """
     then, now = images
     pairs = sorted({a for a, b in found.pairs if a == b and a in then.images and a in now.images})
@@ -110,10 +115,10 @@ def register_again(
         seen = {j: _registered(observers[j], patches[j], known[j], now, j, best.cur_T_ref) for j in pairs}
         correspondences = correspond(known, seen)
         observations = correspondences.observations
-        if len(observations.pair) < _LEAST_REGISTERED:
+        if len(observations.pair) < _MIN_REGISTERED:
             return best
         refined = joint_motion(rig, observations, best.cur_T_ref, config.motion, np.random.default_rng(list(seed)))
-        if refined.inlier.sum() < _LEAST_REGISTERED or not is_supported(refined.inlier, config.motion):
+        if refined.inlier.sum() < _MIN_REGISTERED or not is_supported(refined.inlier, config.motion):
             return best
         best = _resection(refined, [(j, j) for j in range(len(observers))], observations.pair, is_registered=True)
     return best
@@ -122,7 +127,7 @@ def register_again(
 def _registered(
     observer: PairObserver, patches: KeyframePatches, known: PairFrame, now: FrameSet, j: int, cur_T_ref: Float
 ) -> PairFrame:
-    """The reference's patches in pair j's images of the other place."""
+    """Register the reference's patches in pair j's images of the current place."""
     camera, images = observer.pair.left, now.images[j]
     left_T_left = camera.cam_T_body @ cur_T_ref @ camera.body_T_cam
     depth = np.where(known.has_depth, np.maximum(known.points[:, 2], 0.0), 0.0)
@@ -141,7 +146,7 @@ def _observations(
     current: Mapping[int, PairFrame],
     matches: Sequence[tuple[tuple[int, int], Int]],
 ) -> Observations:
-    """Matched features whose depth is known at the reference, sorted by the crossing that they are from."""
+    """Return matched features with depth at the reference, ordered by the pairs that saw them."""
     parts = []
     for number, ((a, b), rows) in enumerate(matches):
         then, now = reference[a], current[b]

@@ -1,4 +1,4 @@
-"""Which places look alike: a vocabulary of the session's own descriptors, and one vector for each image.
+"""Retrieval of similar places: a vocabulary of the sessions' own descriptors, and a VLAD vector for each image.
 
 H. Jegou, M. Douze, C. Schmid, P. Perez, *Aggregating local descriptors into a compact image representation*, CVPR 2010
 (VLAD), with the normalisations of R. Arandjelovic, A. Zisserman, *All about VLAD*, CVPR 2013.
@@ -15,26 +15,26 @@ import numpy as np
 from graphvio.arrays import AnyArray, Int
 
 _WORDS = 64
-_SAMPLE = 40_000  # descriptors that the vocabulary is made from
+_SAMPLE = 40_000  # of descriptors for the vocabulary
 _ITERATIONS = 15
-_FULL = 512.0  # length of COLMAP's descriptors
+_LENGTH = 512.0  # of COLMAP's descriptors
 
 
-def vocabulary(descriptors: Sequence[AnyArray], seed: int, most: int = _WORDS) -> AnyArray:
-    """Words (W, 128) that describe the descriptors (K, 128) of images best, by k-means.
+def vocabulary(descriptors: Sequence[AnyArray], seed: int, max_words: int = _WORDS) -> AnyArray:
+    """Cluster descriptors to words (W, 128) by k-means.
 
     Args:
-        descriptors: uint8, of N images.
-        seed: of the choice of descriptors and of the first words.
-        most: words.
+        descriptors: (K, 128) uint8, of each of N images.
+        seed: of the sample and of the initial words.
+        max_words: number of words, if there are as many descriptors.
     """
     rng = np.random.default_rng(seed)
     each = max(1, _SAMPLE // max(1, len(descriptors)))
     chosen = [rows[rng.choice(len(rows), min(each, len(rows)), replace=False)] for rows in descriptors if len(rows)]
     if not chosen:
         return np.zeros((0, 128), dtype=np.float32)
-    sample = np.concatenate(chosen).astype(np.float32) / np.float32(_FULL)
-    words = min(most, len(sample))
+    sample = np.concatenate(chosen).astype(np.float32) / np.float32(_LENGTH)
+    words = min(max_words, len(sample))
     cv2.setRNGSeed(seed)
     stop = (cv2.TERM_CRITERIA_MAX_ITER, _ITERATIONS, 0.0)
     _, _, centres = cv2.kmeans(sample, words, None, stop, 1, cv2.KMEANS_PP_CENTERS)  # type: ignore[call-overload]
@@ -42,10 +42,10 @@ def vocabulary(descriptors: Sequence[AnyArray], seed: int, most: int = _WORDS) -
 
 
 def describe(descriptors: AnyArray, words: AnyArray) -> AnyArray:
-    """An image's vector (W * 128,), of length one, or zero for an image without features."""
+    """Return an image's VLAD vector (W * 128,), of length one, or zero for an image without features."""
     made = np.zeros_like(words)
     if len(descriptors) and len(words):
-        rows = descriptors.astype(np.float32) / np.float32(_FULL)
+        rows = descriptors.astype(np.float32) / np.float32(_LENGTH)
         nearest = np.argmax(rows @ words.T - 0.5 * (words**2).sum(axis=1), axis=1)
         for word in range(len(words)):
             residual = (rows[nearest == word] - words[word]).sum(axis=0)
@@ -58,50 +58,50 @@ def describe(descriptors: AnyArray, words: AnyArray) -> AnyArray:
 
 
 def most_similar(
-    own: AnyArray, vectors: AnyArray, starts: Int, may: Callable[[int], bool], most: int
+    own: AnyArray, vectors: AnyArray, firsts: Int, may: Callable[[int], bool], count: int
 ) -> list[tuple[float, int]]:
-    """The P known places that a place is most alike, by those of their images that are.
+    """Find the places that are most similar to a place, by their most similar images.
 
     Args:
-        own: (K, D) of the place's images, of length one.
-        vectors: (N, D) of the known places' images, place by place.
-        starts: (P,) first row of each of them.
-        may: whether it may be compared with one of these.
-        most: places.
+        own: (K, D) vectors of the place's images.
+        vectors: (N, D) vectors of the images of P known places, place by place.
+        firsts: (P,) first row of each known place.
+        may: whether a known place may be returned, given its index.
+        count: maximum number of places.
 
     Returns:
-        Similarity and number, 0 to P - 1, the most similar first.
+        Similarity and index of known places, the most similar first.
     """
-    by_place = np.maximum.reduceat(np.max(own @ vectors.T, axis=0), starts)
+    by_place = np.maximum.reduceat(np.max(own @ vectors.T, axis=0), firsts)
     found: list[tuple[float, int]] = []
     for k in np.argsort(-by_place, kind="stable").tolist():
-        if len(found) == most:
+        if len(found) == count:
             break
         if may(k):
             found.append((float(by_place[k]), k))
     return found
 
 
-def candidates(vectors: AnyArray, place: Int, may: Callable[[int, int], bool], most: int) -> list[tuple[int, int]]:
-    """For each place its most similar ones among those before it: places are as alike as their images most alike.
+def candidates(vectors: AnyArray, place: Int, may: Callable[[int, int], bool], count: int) -> list[tuple[int, int]]:
+    """Find the most similar earlier places of each place.
 
     Args:
         vectors: (N, D) of images, of length one.
         place: (N,) number of each image's place, in order.
         may: whether an earlier and a later place may be compared.
-        most: candidates of a place.
+        count: maximum number of candidates of a place.
 
     Returns:
         Pairs (earlier, later) of places, the most similar first.
     """
     found: list[tuple[float, int, int]] = []
-    numbers, starts = np.unique(place, return_index=True)
-    ends = np.append(starts[1:], len(place))
-    for at in range(1, len(numbers)):  # a row at a time: all of them would not fit for hours of images
+    numbers, firsts = np.unique(place, return_index=True)
+    ends = np.append(firsts[1:], len(place))
+    for at in range(1, len(numbers)):  # one place at a time, as the matrix of all similarities may not fit in memory
         later = int(numbers[at])
         allowed = partial(lambda later, k: may(int(numbers[k]), later), later)
-        own, before = vectors[starts[at] : ends[at]], vectors[: starts[at]]
-        for similarity, earlier in most_similar(own, before, starts[:at], allowed, most):
+        own, before = vectors[firsts[at] : ends[at]], vectors[: firsts[at]]
+        for similarity, earlier in most_similar(own, before, firsts[:at], allowed, count):
             found.append((similarity, int(numbers[earlier]), later))
     found.sort(key=lambda each: (-each[0], each[1], each[2]))
     return [(earlier, later) for _, earlier, later in found]

@@ -1,4 +1,4 @@
-"""Loop closures among the places of one or several sessions: retrieved, matched, verified, resected."""
+"""Search for loop closures among the places of sessions: retrieval, matching, verification, resection."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from graphvio.sources import Source
 
 @dataclass(frozen=True, eq=False)
 class SessionInput:
-    """What the search takes of a session.
+    """A session to search.
 
     Attributes:
-        name: of it, unique.
+        name: of the session, unique.
         source: of its images.
-        rig: their cameras.
+        rig: of the cameras.
         places: in the order of time.
     """
 
@@ -44,13 +44,13 @@ def find_loops(
     config: Config,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> list[LoopClosure]:
-    """Loop closures between places that are far apart in time, or of different sessions.
+    """Find loop closures between places that are far apart in time or of different sessions.
 
     Args:
         sessions: whose places are in the database.
         database: of features; verified matches are added to it.
         config: of the search and the motion.
-        on_progress: called with the candidates that were tried, and how many there are.
+        on_progress: called with the number of finished candidates and of all.
     """
     places = [place for session in sessions for place in session.places]
     images = _described(sessions, places, database, config.motion.seed)
@@ -62,22 +62,22 @@ def find_loops(
         one, other = places[earlier], places[later]
         return one.session != other.session or abs(other.stamp_ns - one.stamp_ns) > apart_ns
 
-    offered = candidates(images.vectors, images.place, may, config.optimization.loop_candidates)
+    tried = candidates(images.vectors, images.place, may, config.optimization.loop_candidates)
     verifier = _Verifier(sessions, places, images, database, config)
     found: list[LoopClosure] = []
     with ThreadPoolExecutor(2, thread_name_prefix="graphvio-loops") as pool:
-        for done, closure in enumerate(pool.map(verifier.verify, offered), start=1):
+        for done, closure in enumerate(pool.map(verifier.verify, tried), start=1):
             if closure is not None:
                 found.append(closure)
             if on_progress is not None:
-                on_progress(done, len(offered))
+                on_progress(done, len(tried))
     verifier.store()
     return found
 
 
 @dataclass(frozen=True, eq=False)
 class _Images:
-    """N left images of the places: number of the place (N,), pair (N,), name, and what they look like (N, D)."""
+    """N left images: number of the place (N,), pair (N,), names, and VLAD vectors (N, D)."""
 
     place: Int
     pair: Int
@@ -89,7 +89,7 @@ class _Images:
 
 
 class _Descriptors(Sequence[AnyArray]):
-    """Those of some images, read when they are asked for: all of an hour would not fit."""
+    """Descriptors of images, read on access, as those of an hour may not fit in memory."""
 
     def __init__(self, database: FeatureDatabase, names: Sequence[str]) -> None:
         self._database = database
@@ -126,7 +126,7 @@ def _described(
 
 
 class _Verifier:
-    """Tries candidates, from any thread."""
+    """Verifies candidates, from any thread."""
 
     def __init__(
         self,
@@ -146,7 +146,7 @@ class _Verifier:
         self._verified: list[tuple[str, str, Int, Any]] = []
 
     def verify(self, candidate: tuple[int, int]) -> LoopClosure | None:
-        """The loop closure of an earlier and a later place, or None."""
+        """Return the loop closure of an earlier and a later place, or None."""
         earlier, later = (self._places[number] for number in candidate)
         then, now = self._view(earlier), self._view(later)
         seed = [self._config.motion.seed, *candidate]
@@ -160,7 +160,7 @@ class _Verifier:
         return None if found is None else closure_of(earlier, later, found)
 
     def store(self) -> None:
-        """Put the verified matches into the database, in an order that does not depend on threads."""
+        """Write the verified matches to the database, in an order that does not depend on threads."""
         for first, second, rows, geometry in sorted(self._verified, key=lambda each: each[:2]):
             if not self._database.has_matches(first, second):
                 self._database.add_matches(first, second, rows, geometry)

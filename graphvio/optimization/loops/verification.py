@@ -1,4 +1,4 @@
-"""Whether two places are one, and how they lie to each other: matches, two-view geometry, resection, patches."""
+"""Verification of a loop-closure candidate: matches, two-view geometry, resection, registration of patches."""
 
 from __future__ import annotations
 
@@ -17,40 +17,40 @@ from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.features import PairFeatures
 from graphvio.optimization.loops.matching import alike, estimated_geometry
 from graphvio.optimization.loops.places import PairObserver
-from graphvio.optimization.loops.resection import Resection, register_again, resect_features
+from graphvio.optimization.loops.resection import Resection, register_patches, resect_features
 from graphvio.rig import Rig, StereoPair
 
-_LEAST_MATCHES = 20
-_MOST_CROSSINGS = 2  # pairs of images of a candidate that are matched
+_MIN_MATCHES = 20
+_MAX_CROSSINGS = 2  # pairs of images of a candidate that are matched
 
 
 class View(Protocol):
-    """A place as verification looks at it, wherever its features are kept."""
+    """A place whose features may be in memory or in a database."""
 
     @property
     def rig(self) -> Rig:
-        """That looked around."""
+        """Rig that took the images."""
 
     def features(self, j: int) -> tuple[Float, AnyArray]:
-        """Pixels (K, 2) and descriptors (K, 128), uint8, of pair j's left image."""
+        """Return pixels (K, 2) and descriptors (K, 128), uint8, of pair j's left image."""
 
     def frame(self, j: int) -> PairFrame:
-        """The same features, triangulated."""
+        """Return the same features with their depth."""
 
     def frameset(self) -> FrameSet:
-        """The place's images, of those pairs whose images there still are."""
+        """Return the place's images, of the pairs whose images still exist."""
 
 
 class StoredView:
     """A place in a database.
 
     Args:
-        rig: that looked around.
-        session: its name in the database.
+        rig: that took the images.
+        session: name of the session in the database.
         stamp_ns: of the place.
         database: of features.
-        lock: held while it is read.
-        frameset_at: reads the images again.
+        lock: held while the database is read.
+        frameset_at: reads the images.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class StoredView:
         return self._rig
 
     def name(self, j: int) -> str:
-        """Of pair j's left image in the database."""
+        """Return the name of pair j's left image in the database."""
         return image_name(self._session, self._rig.pairs[j].left.name, self._stamp_ns)
 
     def features(self, j: int) -> tuple[Float, AnyArray]:
@@ -94,12 +94,12 @@ class StoredView:
 
 
 class FreshView:
-    """A place that is looked at now, in memory.
+    """A place in memory.
 
     Args:
-        rig: that looks around.
+        rig: that took the images.
         frameset: of the place.
-        seen: what its pairs show.
+        seen: pair index -> features.
     """
 
     def __init__(self, rig: Rig, frameset: FrameSet, seen: Mapping[int, PairFeatures]) -> None:
@@ -127,17 +127,17 @@ class FreshView:
 
 
 def crossings(pairs: Int, vectors: AnyArray, other_pairs: Int, other_vectors: AnyArray) -> list[tuple[int, int]]:
-    """Pairs (a, b) of the images of two places that are most alike, the most similar first.
+    """Return the pairs (a, b) whose images of two places are most similar, the most similar first.
 
     Args:
         pairs: (P,) of the earlier place's images.
-        vectors: (P, D) that describe them.
+        vectors: (P, D) their VLAD vectors.
         other_pairs: (Q,) of the later place's images.
-        other_vectors: (Q, D).
+        other_vectors: (Q, D) their VLAD vectors.
     """
     similar = vectors @ other_vectors.T
     ranked = sorted((-float(similar[i, k]), i, k) for i in range(len(pairs)) for k in range(len(other_pairs)))[
-        :_MOST_CROSSINGS
+        :_MAX_CROSSINGS
     ]
     return [(int(pairs[i]), int(other_pairs[k])) for _, i, k in ranked]
 
@@ -146,25 +146,27 @@ def verified(
     earlier: View, later: View, tried: Sequence[tuple[int, int]], observers: Sequence[PairObserver] | None,
     config: Config, seed: Sequence[int], on_matched: Callable[[int, int, Int, Any], None] | None = None,
 ) -> Resection | None:  # fmt: skip
-    """The motion between two places by what they have in common, or None where that is too little.
+    """Estimate the motion between two places that may be the same.
 
     Args:
-        earlier: whose points are used.
-        later: that sees them again.
-        tried: `crossings`.
-        observers: of the rig's pairs, to register patches; None where the two rigs are not the same.
+        earlier: place whose points are used.
+        later: place that may see them.
+        tried: pairs of images to match, see `crossings`.
+        observers: of the rig's pairs, to register patches; None if the rigs differ.
         config: of the search and the motion.
-        seed: of the random triples.
-        on_matched: called with (a, b), rows (M, 2) of features that look alike, and the two-view geometry that
-            verifies them.
+        seed: of RANSAC.
+        on_matched: called with a, b, their matches (M, 2), and the two-view geometry that verifies them.
+
+    Returns:
+        The motion, or None if the places have too little in common.
     """
     matches = {}
     for a, b in tried:
         rows, geometry = _matched(earlier, later, a, b)
-        if len(rows) < _LEAST_MATCHES:
-            break  # the others are less alike
+        if len(rows) < _MIN_MATCHES:
+            break  # the others are less similar
         inliers = np.asarray(geometry.inlier_matches, dtype=np.int64).reshape(-1, 2)
-        if len(inliers) < _LEAST_MATCHES:
+        if len(inliers) < _MIN_MATCHES:
             break
         if on_matched is not None:
             on_matched(a, b, rows, geometry)
@@ -178,22 +180,22 @@ def verified(
         return None
     if observers is not None:
         framesets = (earlier.frameset(), later.frameset())
-        found = register_again(observers, found, reference, framesets, config, seed)
+        found = register_patches(observers, found, reference, framesets, config, seed)
     return found
 
 
 def _matched(earlier: View, later: View, a: int, b: int) -> tuple[Int, Any]:
-    """Rows (M, 2) of features that are one by their descriptors, and COLMAP's geometry; None where they are few."""
+    """Return matches (M, 2) by descriptors, and COLMAP's two-view geometry, or None if they are few."""
     (first, first_descriptors), (second, second_descriptors) = earlier.features(a), later.features(b)
     rows = alike(first_descriptors, second_descriptors)
-    if len(rows) < _LEAST_MATCHES:
+    if len(rows) < _MIN_MATCHES:
         return rows, None
     cameras = (earlier.rig.pairs[a].left, later.rig.pairs[b].left)
     return rows, estimated_geometry(cameras, (first, second), rows)
 
 
 def frame_of(pair: StereoPair, stamp_ns: int, pixels: Float, in_right: Float, rows: Int) -> PairFrame:
-    """Features (K, 2) of a left image, of which those that rows (M, 2) match to the right one's have a depth."""
+    """Return a frame of features (K, 2) of a left image, with depth where rows (M, 2) match the right one's."""
     n = len(pixels)
     left, has_ray = pair.left.unproject(pixels)
     right = np.zeros((n, 2))
