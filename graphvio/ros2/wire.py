@@ -146,17 +146,17 @@ def _make_type(type_name: str, bases: tuple[Any, ...]) -> Any:
 def _field(kind: Any) -> Any:
     """Convert the type of a field from rosbags' to cyclonedds' description."""
     from cyclonedds.idl import types
-    from rosbags.interfaces import Nodetype
 
+    kinds = cdr.node_types()
     node, what = kind
-    if node == Nodetype.NAME:
+    if node == kinds.NAME:
         return idl_struct(what)
-    if node == Nodetype.BASE:
+    if node == kinds.BASE:
         name, bound = what
         if name == "string":
             return types.bounded_str[bound] if bound else str
         return bool if name == "bool" else getattr(types, "uint8" if name == "byte" else name)
     of, count = what
-    if node == Nodetype.ARRAY:
+    if node == kinds.ARRAY:
         return types.array[_field(of), count]
     return types.sequence[_field(of), count] if count else types.sequence[_field(of)]

@@ -31,6 +31,13 @@ def types() -> Any:
     return typestore("ROS2_HUMBLE")
 
 
+def node_types() -> Any:
+    """Return rosbags' kinds of fields: ``BASE``, ``NAME``, ``ARRAY`` and ``SEQUENCE``."""
+    from rosbags.interfaces import Nodetype
+
+    return Nodetype
+
+
 def make(type_name: str, **fields: Any) -> Any:
     """A message of a type such as ``sensor_msgs/msg/Image``."""
     return types().types[type_name](**fields)

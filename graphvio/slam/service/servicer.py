@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-import graphvio
 from graphvio.errors import GraphvioError, ServiceError
 from graphvio.measurements.estimate import Estimate, Prediction
 from graphvio.queues import BoundedQueue, Broadcast
@@ -19,6 +18,7 @@ from graphvio.slam.service import convert
 from graphvio.slam.service.arrays import checked_covariance, checked_pose, floats, packed
 from graphvio.slam.service.libraries import grpc, messages, stubs
 from graphvio.slam.service.streams import RUN_KEY, Stream, StreamLimit
+from graphvio.version import __version__
 
 _LOOK_S = 0.25  # how soon a stream sees that its client is gone or the server stops
 _WAITING = {messages.RATE_FRAME: 2, messages.RATE_IMU: 16}
@@ -48,7 +48,7 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
         """What is served; as with all below, the proto tells what is asked and answered."""
         log = self._served.keyframe_log
         return messages.Info(
-            version=graphvio.__version__,
+            version=__version__,
             rig_yaml=self._rig_text,
             run_id=self._run_id,
             epoch=newest_epoch(self._served),
