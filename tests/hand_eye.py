@@ -38,7 +38,7 @@ def synthetic_pairs(
     turns: tuple[float, float, float] = (0.1, 0.1, 0.1),
     steps: tuple[float, float, float] = (0.05, 0.05, 0.05),
 ) -> SyntheticPairs:
-    """Random motions, of which both cameras see their part.
+    """Random motions of a rig, as both of its cameras measure them.
 
     Args:
         count: number of pose pairs.
@@ -91,7 +91,7 @@ def straight(time_s: float) -> Float:
 
 
 def motions(walk: Walk, to_camera: Float, rng: np.random.Generator, moved: Float | None = None) -> CameraMotions:
-    """What a camera on the walk tells of itself from frame to frame.
+    """Motions that a camera on the walk measures from frame to frame.
 
     Args:
         walk: poses of the first camera at times.
@@ -100,13 +100,13 @@ def motions(walk: Walk, to_camera: Float, rng: np.random.Generator, moved: Float
         moved: pose in the first camera from the middle of the walk on, if it was knocked.
     """
     stamps = [k * PERIOD_NS for k in range(FRAMES)]
-    told = []
+    measured = []
     for k in range(1, FRAMES):
         place = to_camera if moved is None or k < FRAMES // 2 else moved
         one, other = (walk(stamps[i] * 1e-9) @ place for i in (k - 1, k))
-        measured = np.linalg.inv(one) @ other @ se3_exp(SIGMAS * rng.standard_normal(6))
-        told.append(RelativeMotion(stamps[k - 1], stamps[k], measured, np.diag(SIGMAS**2), np.zeros((6, 6)), 200))
-    return CameraMotions(stamps, told, np.eye(4))
+        motion = np.linalg.inv(one) @ other @ se3_exp(SIGMAS * rng.standard_normal(6))
+        measured.append(RelativeMotion(stamps[k - 1], stamps[k], motion, np.diag(SIGMAS**2), np.zeros((6, 6)), 200))
+    return CameraMotions(stamps, measured, np.eye(4))
 
 
 def by_dual_quaternions(pairs: PosePairs) -> Float:

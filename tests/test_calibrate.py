@@ -51,7 +51,7 @@ def is_plausible(found: Calibration, rig: Rig) -> bool:
     return sigmas_from(found, rig.left2_T_left1()) ** 2 < float(chi2.isf(1e-4, 6))
 
 
-def test_pairs_are_found_within_what_is_told(walk: Path, found: Calibration) -> None:
+def test_calibrate_pairs_errors_are_within_covariance(walk: Path, found: Calibration) -> None:
     rig = load_rig(walk / "rig.yaml")
     assert is_plausible(found, rig)
     sigmas = np.sqrt(np.diag(found.covariance))
@@ -67,7 +67,7 @@ def test_pairs_are_found_within_what_is_told(walk: Path, found: Calibration) -> 
     assert not found.warnings
 
 
-def test_where_the_rig_file_has_the_pairs_does_not_matter(walk: Path, found: Calibration) -> None:
+def test_calibrate_pairs_wrong_rig_gives_same_result(walk: Path, found: Calibration) -> None:
     rig = load_rig(walk / "rig.yaml")
     other = calibrate_pairs(open_source(walk, with_wrong_place(rig, 3.0, 0.05)))
     np.testing.assert_allclose(other.left2_T_left1, found.left2_T_left1, atol=1e-7)  # but for rounding
@@ -79,7 +79,7 @@ def test_where_the_rig_file_has_the_pairs_does_not_matter(walk: Path, found: Cal
     assert any("from where it is relative to front" in sentence for sentence in other.warnings)
 
 
-def test_pairs_in_each_others_place_are_told(walk: Path) -> None:
+def test_compare_rig_swapped_pairs_warns(walk: Path) -> None:
     rig = load_rig(walk / "rig.yaml")
     places = [pair.left.body_T_cam for pair in rig.pairs]
     moved = []
@@ -95,16 +95,16 @@ def test_pairs_in_each_others_place_are_told(walk: Path) -> None:
     assert any("changed places" in sentence for sentence in swapped.warnings)
 
 
-def test_the_command_puts_a_wrong_rig_right(walk: Path, tmp_path: Path) -> None:
+def test_command_wrong_rig_is_corrected(walk: Path, tmp_path: Path) -> None:
     rig = load_rig(walk / "rig.yaml")
     wrong, out, report = tmp_path / "wrong.yaml", tmp_path / "right.yaml", tmp_path / "report"
     save_rig(with_wrong_place(rig, 3.0, 0.05), wrong)
     ran = command("run", walk, "--rig", wrong, "--out", tmp_path / "results")
     assert ran.exit_code == 0
     size = r"pair back is ([\d.]+) \(\+- ([\d.]+)\) deg and ([\d.]+) \(\+- ([\d.]+)\) cm from where the rig file has it"
-    told = re.search(size, ran.stderr)
-    assert told is not None, ran.stderr
-    degrees, degrees_sigma, cm, cm_sigma = map(float, told.groups())
+    match = re.search(size, ran.stderr)
+    assert match is not None, ran.stderr
+    degrees, degrees_sigma, cm, cm_sigma = map(float, match.groups())
     assert abs(degrees - 3.0) < 4.0 * degrees_sigma < 1.0
     assert abs(cm - 5.3) < 4.0 * cm_sigma < 4.0
     done = command("calibrate", walk, "--rig", wrong, "--out", out, "--report", report)
@@ -134,20 +134,18 @@ def test_the_command_puts_a_wrong_rig_right(walk: Path, tmp_path: Path) -> None:
     [
         (planar, ["rotation only about the axis y (down)", "offset along y (down) cannot be found; tilt the rig"], 3),
         (on_the_spot, ["rotation only about the axis y (down)", "turn the rig about another axis"], 3),
-        (straight, ["without rotation nothing tells where the cameras are", "turn it about two axes"], 1),
+        (straight, ["without rotation the poses of the cameras cannot be found", "turn the rig about two axes"], 1),
     ],
     ids=["planar", "on the spot", "straight"],
 )
-def test_motions_that_do_not_tell_all_are_diagnosed(
-    course: Course, words: list[str], code: int, tmp_path: Path
-) -> None:
+def test_command_insufficient_motion_is_diagnosed(course: Course, words: list[str], code: int, tmp_path: Path) -> None:
     source = recorded(tmp_path / "walk", 4.0, course)
     done = command("calibrate", source, "--out", tmp_path / "out.yaml", "--guide")
     for each in words:
         assert each in " ".join(done.output.split()) or each in str(done.exception), done.output
     assert done.exit_code == code
     assert not (tmp_path / "out.yaml").exists()
-    assert "the rig has back" not in done.output  # what the motions tell is as the rig has it
+    assert "the rig has back" not in done.output  # in the directions that the motions determine
     if code == 3:
         assert "unknown" in done.stdout
         numbers = yaml.safe_load((tmp_path / "out.calibration.yaml").read_text())
@@ -158,14 +156,14 @@ def test_motions_that_do_not_tell_all_are_diagnosed(
         assert numbers["rig_before"][0]["off"] is False
 
 
-def test_pairs_that_are_not_triggered_together(tmp_path: Path) -> None:
+def test_calibrate_pairs_trigger_offset_stays_consistent(tmp_path: Path) -> None:
     source = recorded(tmp_path / "walk", SECONDS, trigger_offset_ms=17.0)
     found = calibrate_pairs(source)
     assert is_plausible(found, load_rig(source / "rig.yaml"))
     assert np.sqrt(np.diag(found.covariance))[3:].max() < 6e-3
 
 
-def test_a_wrong_rotation_and_offset_of_the_imu_are_put_right(walk: Path) -> None:
+def test_calibrated_rig_wrong_imu_is_corrected(walk: Path) -> None:
     rig = load_rig(walk / "rig.yaml")
     assert rig.imu is not None
     turned = np.eye(4)
@@ -191,13 +189,13 @@ def test_a_wrong_rotation_and_offset_of_the_imu_are_put_right(walk: Path) -> Non
     assert kept.imu == wrong.imu
 
 
-def test_a_rig_that_is_right_keeps_its_imu(walk: Path, found: Calibration) -> None:
+def test_calibrated_rig_right_imu_is_kept(walk: Path, found: Calibration) -> None:
     rig, corrected = load_rig(walk / "rig.yaml"), found.calibrated_rig(correct_imu=True)
     np.testing.assert_allclose(corrected.pairs[0].left.body_T_cam, rig.pairs[0].left.body_T_cam, atol=1e-15)
     assert corrected.imu == rig.imu
 
 
-def test_a_recording_may_be_ended_early(walk: Path) -> None:
+def test_calibrate_pairs_callback_ends_recording(walk: Path) -> None:
     counts: list[int] = []
 
     def enough(number: int, _: SeparateMotions) -> bool:
@@ -209,30 +207,30 @@ def test_a_recording_may_be_ended_early(walk: Path) -> None:
     assert len(found.pair.frames) < 60
 
 
-def test_the_guide_leads_to_enough(walk: Path) -> None:
+def test_guide_more_motion_improves_advice(walk: Path) -> None:
     advice = guided(walk)
     assert not advice[0].is_enough
     assert "turn the rig about two axes" in advice[0].text
-    assert not advice[-1].is_enough  # as well known as is asked for, but from six seconds only
+    assert not advice[-1].is_enough  # accurate enough, but from six seconds only
     assert advice[-1].text.startswith("go on like this")
     assert replace(advice[-1], motions=ENOUGH_MOTIONS).text.startswith("enough")
     sigmas = [each.translation_sigma_m for each in advice]
     assert sigmas[-1] < sigmas[len(sigmas) // 2] < sigmas[2]
 
 
-def test_the_answer_is_the_same_each_time(walk: Path, found: Calibration) -> None:
+def test_calibrate_pairs_repeated_gives_same_bits(walk: Path, found: Calibration) -> None:
     again = calibrate_pairs(walk)
     np.testing.assert_array_equal(again.left2_T_left1, found.left2_T_left1)
     np.testing.assert_array_equal(again.covariance, found.covariance)
 
 
-def test_one_pair_has_nothing_to_be_related_to(walk: Path) -> None:
+def test_calibrate_pairs_one_pair_raises(walk: Path) -> None:
     rig = load_rig(walk / "rig.yaml").with_pairs([0])
     with pytest.raises(CalibrationError, match="has one stereo pair"):
         calibrate_pairs(open_source(walk, rig))
 
 
-def test_a_pair_that_sees_nothing_is_named(walk: Path) -> None:
+def test_calibrate_pairs_crossed_left_right_names_pair(walk: Path) -> None:
     """Left and right of the second pair are exchanged: nothing is found where it should be."""
     rig = load_rig(walk / "rig.yaml")
     back = rig.pairs[1]
@@ -243,7 +241,7 @@ def test_a_pair_that_sees_nothing_is_named(walk: Path) -> None:
         calibrate_pairs(open_source(walk, replace(rig, pairs=(rig.pairs[0], crossed))))
 
 
-def test_images_of_each_others_pairs_are_told(walk: Path) -> None:
+def test_calibrate_pairs_crossed_pairs_raises(walk: Path) -> None:
     """The rig file has the names of the cameras the other way round."""
     front, back = load_rig(walk / "rig.yaml").pairs
     names = [[each.left.name, each.right.name] for each in (back, front)]
@@ -256,20 +254,20 @@ def test_images_of_each_others_pairs_are_told(walk: Path) -> None:
         calibrate_pairs(open_source(walk, rig))
 
 
-def test_sigmas_are_those_of_the_numbers_beside_them(found: Calibration) -> None:
-    """Poses are drawn from the covariance, and their offsets and rotation vectors scatter as is shown."""
+def test_pose_summary_sigmas_match_sampled_poses(found: Calibration) -> None:
+    """Offsets and rotation vectors of poses sampled from the covariance scatter as the summary says."""
     rng, root = np.random.default_rng(0), np.linalg.cholesky(found.covariance)
     offsets, turns = [], []
     for _ in range(3000):
-        drawn = found.left2_T_left1 @ se3_exp(root @ rng.standard_normal(6))
-        offsets.append(drawn[:3, 3])
-        turns.append(so3_log(np.ascontiguousarray(drawn[:3, :3])))
-    shown = found.pose_summary(1)
-    np.testing.assert_allclose(np.std(offsets, axis=0), shown.offset_sigmas_m, rtol=0.08)
-    np.testing.assert_allclose(np.std(turns, axis=0), shown.turn_sigmas_rad, rtol=0.08)
-    np.testing.assert_allclose(shown.offset_m, found.left2_T_left1[:3, 3])
-    assert shown.offset_known.all()
-    assert shown.turn_known.all()
+        sampled = found.left2_T_left1 @ se3_exp(root @ rng.standard_normal(6))
+        offsets.append(sampled[:3, 3])
+        turns.append(so3_log(np.ascontiguousarray(sampled[:3, :3])))
+    summary = found.pose_summary(1)
+    np.testing.assert_allclose(np.std(offsets, axis=0), summary.offset_sigmas_m, rtol=0.08)
+    np.testing.assert_allclose(np.std(turns, axis=0), summary.turn_sigmas_rad, rtol=0.08)
+    np.testing.assert_allclose(summary.offset_m, found.left2_T_left1[:3, 3])
+    assert summary.offset_known.all()
+    assert summary.turn_known.all()
 
 
 @pytest.mark.parametrize(
@@ -283,7 +281,7 @@ def test_sigmas_are_those_of_the_numbers_beside_them(found: Calibration) -> None
         (["--pairs", "0,7"], "there is no pair 7"),
     ],
 )
-def test_mistakes_on_the_command_line(walk: Path, arguments: list[str], words: str) -> None:
+def test_command_invalid_options_are_refused(walk: Path, arguments: list[str], words: str) -> None:
     done = command("calibrate", walk, *arguments)
     assert done.exit_code != 0
     assert words in str(done.exception)
@@ -293,18 +291,18 @@ def test_mistakes_on_the_command_line(walk: Path, arguments: list[str], words: s
 def guided(walk: Path) -> list[Advice]:
     source = open_source(walk)
     guide = Guide([pair.name for pair in source.rig.pairs])
-    told = []
+    advice = []
 
     def follow(number: int, separate: SeparateMotions) -> bool:
         if number % 10 == 0:
-            told.append(guide.advise(separate.motions()))
+            advice.append(guide.advise(separate.motions()))
         return False
 
     calibrate_pairs(source, config=Config(), on_frameset=follow)
-    return told
+    return advice
 
 
-def test_a_place_that_is_right_has_no_size_in_sigmas(found: Calibration) -> None:
+def test_sigmas_from_same_pose_are_zero(found: Calibration) -> None:
     assert sigmas_from(found, found.left2_T_left1) < 1e-6
     moved = found.left2_T_left1 @ se3_exp(np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0]))
     assert sigmas_from(found, moved) > 20.0

@@ -15,7 +15,7 @@ START_NS = 1_491_495_696_920_000_000
 
 
 def pose(time_s: float) -> Float:
-    """A rig that is turned about at changing speeds."""
+    """Pose of a rig that turns at changing speeds."""
     waves = [np.sin(0.9 * time_s), np.sin(1.3 * time_s + 0.4), np.sin(0.55 * time_s**1.2), 0.5 * np.sin(0.7 * time_s)]
     return se3_exp(np.array([0.5 * waves[0], 0.6 * waves[1], 0.9 * waves[2], waves[3], 0.3 * time_s, 0.2 * waves[1]]))
 
@@ -23,7 +23,7 @@ def pose(time_s: float) -> Float:
 def trajectories(
     rng: np.random.Generator, first_s: tuple[float, float], second_s: tuple[float, float], noise_rad: float = 1e-3
 ) -> tuple[Trajectory, Trajectory]:
-    """What both cameras tell, each with its clock, from and to some seconds of the walk."""
+    """Trajectories of both cameras, each on its own clock, over some seconds of the walk."""
     made = []
     for (begin_s, end_s), period_s, to_camera, clock_ns in (
         (first_s, 0.031, np.eye(4), START_NS),
@@ -37,27 +37,27 @@ def trajectories(
 
 
 @pytest.mark.parametrize(("second_s"), [(0.0, 40.0), (5.0, 30.0), (25.0, 60.0)])
-def test_the_offset_is_found(second_s: tuple[float, float]) -> None:
+def test_find_offset_partial_overlap_is_accurate(second_s: tuple[float, float]) -> None:
     one, other = trajectories(np.random.default_rng(0), (0.0, 40.0), second_s)
     found = find_offset(one, other)
     assert abs(found.offset_ns - OFFSET_NS) < 3_000_000
     assert found.correlation > 0.95
 
 
-def test_trajectories_that_do_not_overlap_are_refused() -> None:
+def test_find_offset_no_overlap_raises() -> None:
     one, other = trajectories(np.random.default_rng(1), (0.0, 20.0), (70.0, 90.0))
     with pytest.raises(CalibrationError, match="overlap in time"):
         find_offset(one, other)
 
 
-def test_a_short_trajectory_is_refused() -> None:
+def test_find_offset_short_trajectory_raises() -> None:
     one, other = trajectories(np.random.default_rng(2), (0.0, 20.0), (3.0, 6.0))
     with pytest.raises(CalibrationError, match=r"second trajectory is 2\.\d s long"):
         find_offset(one, other)
 
 
-def test_even_turning_is_refused() -> None:
-    """To and fro at one frequency, any number of periods fits."""
+def test_find_offset_periodic_rotation_raises() -> None:
+    """At one frequency, a shift by any number of periods fits."""
     times = np.arange(0.0, 40.0, 0.03)
     poses = np.array([se3_exp(np.array([0.0, 0.5 * np.sin(2.0 * time), 0.0, 0.0, 0.0, 0.0])) for time in times])
     even = Trajectory(START_NS + np.round(times * 1e9).astype(np.int64), poses)

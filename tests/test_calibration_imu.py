@@ -17,15 +17,15 @@ RATE_HZ = 200.0
 
 
 def gyro(walk: Walk, offset_s: float, rng: np.random.Generator, noise: float) -> tuple[Int, Float]:
-    """What a gyro on the walk's body reads, on a clock that is later by an offset."""
+    """Stamps and readings of a gyro on the walk, on a clock that is ahead by an offset."""
     times = np.arange(-1.0, FRAMES * PERIOD_NS * 1e-9 + 1.0, 1.0 / RATE_HZ)
     h = 1e-4
     rates = []
     for time in times:
         back, ahead = walk(float(time - h))[:3, :3], walk(float(time + h))[:3, :3]
         rates.append(BODY_R_LEFT @ so3_log(np.ascontiguousarray(back.T @ ahead)) / (2.0 * h))
-    told = np.array(rates) + BIAS + noise * np.sqrt(RATE_HZ) * rng.standard_normal((len(times), 3))
-    return ((times + offset_s) * 1e9).astype(np.int64) + 10**12, told
+    measured = np.array(rates) + BIAS + noise * np.sqrt(RATE_HZ) * rng.standard_normal((len(times), 3))
+    return ((times + offset_s) * 1e9).astype(np.int64) + 10**12, measured
 
 
 def found(
@@ -47,7 +47,7 @@ def found(
     return align(segments, 0, stamps, rates, imu, rig_R_left)
 
 
-def test_rotation_offset_and_bias_are_found() -> None:
+def test_align_walk_finds_rotation_offset_bias() -> None:
     for seed in range(2):
         each = found(seed=seed)
         off = so3_log(np.ascontiguousarray(each.body_R_left @ BODY_R_LEFT.T))
@@ -61,13 +61,13 @@ def test_rotation_offset_and_bias_are_found() -> None:
         assert each.is_late  # the rig says 0
 
 
-def test_a_rig_that_is_right_is_left_in_peace() -> None:
+def test_align_right_rig_has_no_warnings() -> None:
     each = found(rig_offset_s=0.012)
     assert each.warnings("front") == []
 
 
 @pytest.mark.parametrize("degrees", [2.0, 90.0])
-def test_a_wrong_rotation_is_told_with_its_size(degrees: float) -> None:
+def test_align_wrong_rotation_warns_with_size(degrees: float) -> None:
     wrong = so3_exp(np.deg2rad(degrees) * np.array([0.6, 0.0, 0.8])) @ BODY_R_LEFT
     each = found(rig_R_left=wrong)
     assert each.is_turned
@@ -77,12 +77,12 @@ def test_a_wrong_rotation_is_told_with_its_size(degrees: float) -> None:
     assert "front is turned by" in each.warnings("front")[0]
 
 
-def test_without_turning_nothing_is_told() -> None:
+def test_align_without_rotation_raises() -> None:
     with pytest.raises(CalibrationError, match="one axis only, or hardly at all"):
         found(straight)
 
 
-def test_gyro_and_camera_must_overlap() -> None:
+def test_align_no_overlap_raises() -> None:
     rng = np.random.default_rng(1)
     camera = motions(turning, np.eye(4), rng)
     segments = all_segments(camera.stamps_ns.tolist(), [camera.between, camera.between])

@@ -35,7 +35,7 @@ def both(pairs: PosePairs) -> tuple[paper_method.PaperSolution, graph.GraphSolut
 @given(
     tangent=st.lists(st.floats(-2.5, 2.5), min_size=6, max_size=6), seed=st.integers(0, 2**31), count=st.integers(6, 60)
 )
-def test_without_noise_all_methods_are_exact(tangent: list[float], seed: int, count: int) -> None:
+def test_all_methods_without_noise_are_exact(tangent: list[float], seed: int, count: int) -> None:
     true = se3_exp(np.array(tangent))
     pairs = synthetic_pairs(count, np.random.default_rng(seed), left2_T_left1=true).pairs
     paper, found = both(pairs)
@@ -46,7 +46,7 @@ def test_without_noise_all_methods_are_exact(tangent: list[float], seed: int, co
     assert found.inlier.all()
 
 
-def test_equation_5_holds_in_the_order_that_the_eigenvector_takes() -> None:
+def test_rotation_satisfies_equation_5() -> None:
     """With all axes turned about, so that no order of the products but the right one fits."""
     parts = PoseParts.of(synthetic_pairs(20, np.random.default_rng(1)).pairs)
     R, eigenvalues = paper_method.rotation(parts.R_1, parts.R_2)
@@ -55,14 +55,14 @@ def test_equation_5_holds_in_the_order_that_the_eigenvector_takes() -> None:
     assert eigenvalues[0] < 1e-12 < 1e-3 < eigenvalues[1]
 
 
-def test_signs_of_quaternions_do_not_matter() -> None:
+def test_calibrate_large_turns_ignore_quaternion_signs() -> None:
     """Turns of more than a half, whose quaternions change their sign."""
     pairs = synthetic_pairs(30, np.random.default_rng(2), turns=(1.2, 1.2, 1.2)).pairs
     assert np.linalg.norm(pairs.rotations_rad, axis=1).max() > 2.5
     assert np.abs(error_of(paper_method.calibrate(pairs).left2_T_left1)).max() < 1e-9
 
 
-def test_the_alignment_error_is_where_both_motions_put_the_second_camera() -> None:
+def test_alignment_errors_are_distances_of_second_camera() -> None:
     pairs = synthetic_pairs(10, np.random.default_rng(3), ANGLE, STEP_M).pairs
     R = LEFT2_T_LEFT1[:3, :3]
     t = -R.T @ LEFT2_T_LEFT1[:3, 3]
@@ -72,7 +72,7 @@ def test_the_alignment_error_is_where_both_motions_put_the_second_camera() -> No
     np.testing.assert_allclose(paper_method.alignment_errors(PoseParts.of(pairs), R, t), expected, atol=1e-12)
 
 
-def test_the_papers_jacobian_is_the_derivative() -> None:
+def test_jacobians_match_numerical_derivatives() -> None:
     parts = PoseParts.of(synthetic_pairs(10, np.random.default_rng(4), ANGLE, STEP_M).pairs)
     R, t, h = LEFT2_T_LEFT1[:3, :3], np.array([0.1, -0.2, 0.3]), 1e-6
     numeric = []
@@ -85,7 +85,7 @@ def test_the_papers_jacobian_is_the_derivative() -> None:
     np.testing.assert_allclose(paper_method.jacobians(parts, R), np.stack(numeric, axis=2), atol=1e-8)
 
 
-def test_the_graphs_jacobian_is_the_derivative() -> None:
+def test_whitened_matches_numerical_derivatives() -> None:
     pairs, h = synthetic_pairs(5, np.random.default_rng(5), ANGLE, STEP_M).pairs, 1e-6
     flat = replace(pairs, covariance_1=1e-12 * pairs.covariance_1)  # else the whitener changes, too
     _, jacobians = whitened(flat, LEFT2_T_LEFT1)
@@ -98,7 +98,7 @@ def test_the_graphs_jacobian_is_the_derivative() -> None:
 
 
 @pytest.mark.parametrize("outlier_share", [0.0, 0.3, 0.6])
-def test_errors_are_within_what_is_told(outlier_share: float) -> None:
+def test_both_methods_errors_are_within_covariance(outlier_share: float) -> None:
     runs = 24
     squares, differences, kept, missed = [], [], 0, 0
     for seed in range(runs):
@@ -116,7 +116,7 @@ def test_errors_are_within_what_is_told(outlier_share: float) -> None:
     assert missed <= 0.005 * runs * 150
 
 
-def test_a_good_start_serves_where_most_motions_are_wild() -> None:
+def test_solve_good_start_finds_few_inliers() -> None:
     """Slow turns and little noise: outliers are so far off that a solution for all motions leads nowhere."""
     for seed in range(8):
         made = synthetic_pairs(300, np.random.default_rng([seed, 2]), 2e-4, 4e-4, 0.6, turns=(0.05, 0.1, 0.05))
@@ -126,7 +126,7 @@ def test_a_good_start_serves_where_most_motions_are_wild() -> None:
         assert found.inlier.sum() > 0.95 * np.sum(~made.outlier)
 
 
-def test_methods_that_differ_by_more_than_they_may_are_told() -> None:
+def test_compare_wrong_solution_disagrees() -> None:
     pairs = synthetic_pairs(100, np.random.default_rng(6), ANGLE, STEP_M).pairs
     paper, found = both(pairs)
     assert compare(pairs, paper, found).agrees
@@ -134,32 +134,32 @@ def test_methods_that_differ_by_more_than_they_may_are_told() -> None:
     assert not compare(pairs, wrong, found).agrees
 
 
-def test_the_same_seed_gives_the_same_bits() -> None:
+def test_both_methods_same_seed_give_same_bits() -> None:
     pairs = synthetic_pairs(80, np.random.default_rng(7), ANGLE, STEP_M, 0.4).pairs
     one, other = both(pairs), both(pairs)
     assert np.array_equal(one[0].left2_T_left1, other[0].left2_T_left1)
     assert np.array_equal(one[1].left2_T_left1, other[1].left2_T_left1)
 
 
-def test_too_few_pose_pairs_are_refused() -> None:
+def test_calibrate_too_few_pose_pairs_raises() -> None:
     pairs = synthetic_pairs(2, np.random.default_rng(8)).pairs
     with pytest.raises(CalibrationError, match="needs 3 pose pairs and has 2"):
         paper_method.calibrate(pairs)
 
 
-def test_motions_without_rotation_are_refused() -> None:
+def test_calibrate_without_rotation_raises() -> None:
     pairs = synthetic_pairs(50, np.random.default_rng(9), turns=(0.0, 0.0, 0.0)).pairs
     with pytest.raises(CalibrationError, match="without rotation"):
         paper_method.calibrate(pairs)
 
 
-def test_motions_that_have_nothing_in_common_are_refused() -> None:
+def test_both_methods_unrelated_motions_raise() -> None:
     made = synthetic_pairs(60, np.random.default_rng(10), ANGLE, STEP_M, outlier_share=1.0)
     with pytest.raises(CalibrationError, match="one rig"):
         both(made.pairs)
 
 
-def test_values_that_are_not_finite_are_refused() -> None:
+def test_pose_pairs_not_finite_raises() -> None:
     pairs = synthetic_pairs(5, np.random.default_rng(11)).pairs
     broken = pairs.motion_2.copy()
     broken[3, 0, 3] = np.nan

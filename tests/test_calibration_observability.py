@@ -1,4 +1,4 @@
-"""What a recording's motions can tell of the cameras' relative pose, and the words for what they cannot."""
+"""Observability of the cameras' relative pose, and the sentences on what is missing."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def observed(turns: Three, steps: Three, noise: float) -> Observability:
 
 @pytest.mark.parametrize("noise", [2e-3, 1e-5])
 @pytest.mark.parametrize("turns", [ALL, (0.1, 0.1, 0.0), (0.01, 0.1, 0.01)])
-def test_turning_about_two_axes_is_enough(turns: Three, noise: float) -> None:
+def test_observe_rotation_about_two_axes_is_complete(turns: Three, noise: float) -> None:
     found = observed(turns, SOME, noise)
     assert found.is_complete
     assert found.missing == ()
@@ -36,7 +36,7 @@ def test_turning_about_two_axes_is_enough(turns: Three, noise: float) -> None:
 
 
 @pytest.mark.parametrize("noise", [2e-3, 1e-5])
-def test_planar_motion_leaves_the_offset_along_its_axis(noise: float) -> None:
+def test_observe_planar_motion_leaves_offset_along_axis(noise: float) -> None:
     found = observed((0.0, 0.1, 0.0), (0.05, 0.0, 0.05), noise)
     assert len(found.undetermined) == 1
     np.testing.assert_allclose(np.abs(found.undetermined[0]), [0, 0, 0, 0, 1, 0], atol=0.02)
@@ -66,9 +66,11 @@ def test_planar_motion_leaves_the_offset_along_its_axis(noise: float) -> None:
         (NONE, (0.05, 0.0, 0.0), 4, ["hardly turned", "angle between the cameras about x (right)"]),
         (NONE, NONE, 6, ["hardly moved"]),
     ],
-    ids=["on the spot", "without turning", "straight", "at rest"],
+    ids=["on the spot", "without turning", "straight", "standstill"],
 )
-def test_what_is_missing_is_told(turns: Three, steps: Three, undetermined: int, words: list[str], noise: float) -> None:
+def test_observe_insufficient_motion_names_missing(
+    turns: Three, steps: Three, undetermined: int, words: list[str], noise: float
+) -> None:
     found = observed(turns, steps, noise)
     assert len(found.undetermined) == undetermined
     for expected, sentence in zip(words, found.missing, strict=True):
@@ -76,11 +78,11 @@ def test_what_is_missing_is_told(turns: Three, steps: Three, undetermined: int, 
 
 
 @pytest.mark.parametrize("noise", [2e-3, 1e-5])
-def test_directions_of_motion_tell_the_rotation_where_nothing_turns(noise: float) -> None:
+def test_observe_translation_only_determines_rotation(noise: float) -> None:
     assert np.sqrt(np.diag(observed(NONE, SOME, noise).covariance))[:3].max() < 0.02
 
 
-def test_an_axis_that_is_none_of_the_cameras_is_told_by_its_numbers() -> None:
+def test_observe_oblique_axis_is_named_by_coordinates() -> None:
     axis = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5)])
     pairs = synthetic_pairs(300, np.random.default_rng(1), turns=NONE, steps=NONE).pairs
     angles = 0.1 * np.random.default_rng(2).standard_normal(300)
@@ -92,8 +94,8 @@ def test_an_axis_that_is_none_of_the_cameras_is_told_by_its_numbers() -> None:
     assert "[0.00, 0.71, 0.71]" in observe(turned, LEFT2_T_LEFT1).missing[0].replace("-0.00", "0.00")
 
 
-def test_where_all_is_determined_the_covariance_is_the_graphs() -> None:
+def test_observe_complete_covariance_matches_graph() -> None:
     pairs = synthetic_pairs(200, np.random.default_rng(3), 1e-3, 2e-3).pairs
     found = graph.solve(pairs, paper_method.calibrate(pairs).left2_T_left1)
-    told = observe(pairs, found.left2_T_left1).covariance
-    np.testing.assert_allclose(told, found.covariance, rtol=0.02, atol=1e-2 * np.abs(found.covariance).max())
+    covariance = observe(pairs, found.left2_T_left1).covariance
+    np.testing.assert_allclose(covariance, found.covariance, rtol=0.02, atol=1e-2 * np.abs(found.covariance).max())

@@ -1,4 +1,4 @@
-"""Two pairs calibrated from what each tells of its own motion."""
+"""Calibration of two pairs from the motion that each measures."""
 
 from itertools import pairwise
 
@@ -24,7 +24,7 @@ def calibrated(walk: Walk, seed: int) -> PairCalibration:
     return calibrate_pair(segments(walk, seed))
 
 
-def test_errors_are_within_what_is_told() -> None:
+def test_calibrate_pair_errors_are_within_covariance() -> None:
     runs = 10
     found = [calibrated(turning, seed) for seed in range(runs)]
     low, high = band(runs)
@@ -39,16 +39,16 @@ def test_errors_are_within_what_is_told() -> None:
         assert each.alignment_errors_m.mean() < 5e-3
 
 
-def test_checks_that_a_sound_recording_passes() -> None:
+def test_calibrate_pair_sound_recording_passes_checks() -> None:
     found = calibrated(turning, 3)
     assert found.warnings == ()
     assert found.halves is not None
     assert found.halves.agree
     own, crossed = found.halves.own_m, found.halves.crossed_m
     assert max(crossed) < 1.3 * max(own)
-    told, resampled = (np.sqrt(np.diag(each)) for each in (found.covariance, found.resampled_covariance))
-    assert np.all(resampled < 2.0 * told)
-    assert np.all(resampled > 0.3 * told)
+    sigmas, resampled = (np.sqrt(np.diag(each)) for each in (found.covariance, found.resampled_covariance))
+    assert np.all(resampled < 2.0 * sigmas)
+    assert np.all(resampled > 0.3 * sigmas)
     sizes = [np.trace(grown.covariance) for grown in found.growth]
     assert len(sizes) > 3
     assert all(later < earlier for earlier, later in pairwise(sizes))
@@ -56,7 +56,7 @@ def test_checks_that_a_sound_recording_passes() -> None:
 
 
 @pytest.mark.parametrize("wrong_by", [0.02, -0.03])
-def test_a_wrong_baseline_is_found_and_put_right(wrong_by: float) -> None:
+def test_calibrate_pair_wrong_baseline_is_corrected(wrong_by: float) -> None:
     made = segments(turning, 5)
     made.motions[:, 1, :3, 3] *= 1.0 + wrong_by
     found = calibrate_pair(made)
@@ -65,14 +65,14 @@ def test_a_wrong_baseline_is_found_and_put_right(wrong_by: float) -> None:
     assert abs(found.scale.log_ratio - np.log1p(wrong_by)) < 4.0 * found.scale.sigma
     assert found.scale.sigma < 0.005
     assert found.distance(LEFT2_T_LEFT1) < 22.5
-    as_it_is = calibrate_pair(made, scale_mode="fixed")
-    assert not as_it_is.scale_estimated
-    assert as_it_is.scale.is_wrong
-    assert as_it_is.distance(LEFT2_T_LEFT1) > found.distance(LEFT2_T_LEFT1)
+    fixed = calibrate_pair(made, scale_mode="fixed")
+    assert not fixed.scale_estimated
+    assert fixed.scale.is_wrong
+    assert fixed.distance(LEFT2_T_LEFT1) > found.distance(LEFT2_T_LEFT1)
 
 
-def test_errors_that_last_make_the_covariance_larger() -> None:
-    """One camera's scale wanders in time: what no single motion's covariance can tell."""
+def test_calibrate_pair_correlated_errors_enlarge_covariance() -> None:
+    """One camera's scale wanders in time: the covariance of a single motion cannot show that."""
     made = segments(turning, 6)
     wandering = 1.0 + 0.06 * np.sin(made.start_ns * 1e-9)
     made.motions[:, 1, :3, 3] *= wandering[:, None]
@@ -82,7 +82,7 @@ def test_errors_that_last_make_the_covariance_larger() -> None:
     assert np.trace(found.covariance[3:, 3:]) > 1.4 * np.trace(sound.covariance[3:, 3:])
 
 
-def test_planar_motion_gives_a_partial_answer_that_says_so() -> None:
+def test_calibrate_pair_planar_motion_is_partial() -> None:
     found = calibrated(planar, 0)
     assert not found.observability.is_complete
     assert any("offset along y (down) cannot be found" in sentence for sentence in found.warnings)
@@ -90,16 +90,16 @@ def test_planar_motion_gives_a_partial_answer_that_says_so() -> None:
     assert np.linalg.norm(off[:3]) < 5e-3
     assert np.linalg.norm(off[[3, 5]]) < 0.01
     sigmas = np.sqrt(np.diag(found.covariance))
-    assert sigmas[4] > 1.0  # nothing is claimed of the height
+    assert sigmas[4] > 1.0  # the height is not determined
     assert sigmas[[3, 5]].max() < 0.02
 
 
-def test_moving_without_turning_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="turn it about two axes"):
+def test_calibrate_pair_without_rotation_raises() -> None:
+    with pytest.raises(CalibrationError, match="turn the rig about two axes"):
         calibrated(straight, 0)
 
 
-def test_a_camera_that_was_knocked_is_told() -> None:
+def test_calibrate_pair_moved_camera_halves_inliers() -> None:
     """Half of the motions fit one place, half another."""
     moved = se3_inverse(se3_exp(np.array([0.0, 0.2, 0.1, 0.1, 0.0, 0.1])) @ LEFT2_T_LEFT1)
     found = calibrate_pair(segments(turning, 1, moved))
@@ -109,7 +109,7 @@ def test_a_camera_that_was_knocked_is_told() -> None:
     assert max(found.inlier[early].mean(), found.inlier[~early].mean()) > 0.9
 
 
-def test_without_common_instants_there_is_nothing_to_calibrate_from() -> None:
+def test_calibrate_pair_no_common_instants_raises() -> None:
     rng = np.random.default_rng(2)
     one = motions(turning, np.eye(4), rng)
     with pytest.raises(CalibrationError, match="needs 3 pose pairs and has 0"):

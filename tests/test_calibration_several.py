@@ -1,4 +1,4 @@
-"""More than two cameras at once."""
+"""Calibration of more than two cameras at once."""
 
 from itertools import combinations
 
@@ -41,7 +41,7 @@ def error(places: Places) -> Float:
     return np.concatenate([se3_log(se3_inverse(places.left_T_left1[j]) @ TRUTH[j]) for j in (1, 2)])
 
 
-def test_errors_of_all_are_within_what_is_told_and_no_larger_than_two_at_a_time() -> None:
+def test_place_all_errors_are_within_covariance_and_no_larger_than_pairwise() -> None:
     runs = 8
     squares, ratios = [], []
     distances: list[float] = []
@@ -63,7 +63,7 @@ def test_errors_of_all_are_within_what_is_told_and_no_larger_than_two_at_a_time(
     assert max(distances) < chi2.isf(1e-3, 6)
 
 
-def test_places_close_every_loop_exactly() -> None:
+def test_place_all_closes_loops_exactly() -> None:
     places = placed(segments(1))
     around = np.eye(4)
     for i, j in ((0, 1), (1, 2), (2, 0)):
@@ -71,21 +71,21 @@ def test_places_close_every_loop_exactly() -> None:
     np.testing.assert_allclose(around, np.eye(4), atol=1e-12)
 
 
-def test_covariance_between_two_is_that_of_the_pose_between_them() -> None:
+def test_covariance_between_matches_sampled_poses() -> None:
     places = placed(segments(2))
     root = np.linalg.cholesky(places.covariance)
     rng = np.random.default_rng(0)
     between = LEFT3_T_LEFT1 @ se3_inverse(LEFT2_T_LEFT1)
-    drawn = []
+    errors = []
     for _ in range(2000):
         change = root @ rng.standard_normal(12)
         one, other = (TRUTH[j] @ se3_exp(np.ascontiguousarray(change[6 * j - 6 : 6 * j])) for j in (1, 2))
-        drawn.append(se3_log(se3_inverse(between) @ other @ se3_inverse(one)))
-    told, seen = places.covariance_between(1, 2), np.cov(np.array(drawn).T)
-    np.testing.assert_allclose(np.diag(seen), np.diag(told), rtol=0.15)
+        errors.append(se3_log(se3_inverse(between) @ other @ se3_inverse(one)))
+    covariance, sampled = places.covariance_between(1, 2), np.cov(np.array(errors).T)
+    np.testing.assert_allclose(np.diag(sampled), np.diag(covariance), rtol=0.15)
 
 
-def test_a_camera_that_is_blind_at_times_is_placed_all_the_same() -> None:
+def test_place_all_camera_blind_at_times_is_consistent() -> None:
     made = segments(3)
     made.known[made.start_ns > np.median(made.start_ns), 2] = False
     made.motions[~made.known] = np.nan
@@ -97,7 +97,7 @@ def test_a_camera_that_is_blind_at_times_is_placed_all_the_same() -> None:
     assert np.all(sigmas[9:] > sigmas[3:6])
 
 
-def test_a_wrong_scale_of_one_camera_is_taken_out_of_all() -> None:
+def test_place_all_wrong_scale_is_corrected() -> None:
     made = segments(4)
     made.motions[:, 1, :3, 3] *= 1.02
     places = placed(made)
@@ -108,7 +108,7 @@ def test_a_wrong_scale_of_one_camera_is_taken_out_of_all() -> None:
     assert places.loops[0].statistic < chi2.isf(1e-4, 6)
 
 
-def test_planar_motion_leaves_the_heights_of_all_open() -> None:
+def test_place_all_planar_motion_leaves_heights_open() -> None:
     places = placed(segments(5, planar))
     for one, other in combinations(range(3), 2):
         assert not places.pairwise[one, other].observability.is_complete
@@ -118,7 +118,7 @@ def test_planar_motion_leaves_the_heights_of_all_open() -> None:
     assert sigmas[[3, 5, 9, 11]].max() < 0.03
 
 
-def test_a_camera_that_is_not_on_the_rig_is_named() -> None:
+def test_pairwise_unrelated_camera_is_named() -> None:
     made = segments(6)
     made.motions[:, 2] = made.motions[::-1, 2].copy()
     with pytest.raises(CalibrationError, match="front and side: "):

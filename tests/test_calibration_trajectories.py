@@ -1,4 +1,4 @@
-"""Cameras related by trajectories on clocks of their own."""
+"""Calibration of cameras from trajectories on clocks of their own."""
 
 from dataclasses import replace
 from functools import cache
@@ -41,7 +41,7 @@ def trajectory(
     begin_s: float = 0.0,
     end_s: float = SECONDS,
 ) -> Trajectory:
-    """What an odometry tells of a camera at a place on the rig."""
+    """Trajectory that an odometry measures for a camera at a pose on the rig."""
     rng = np.random.default_rng(seed)
     times = np.arange(begin_s, end_s, 1.0 / rate_hz) + 1e-3 * rng.random()
     poses = []
@@ -70,7 +70,7 @@ def check(found: Calibration) -> None:
     assert sigmas[3:].max() < 7e-3
 
 
-def test_offset_of_clocks_and_place_are_found_together() -> None:
+def test_calibrate_trajectories_finds_offset_and_pose() -> None:
     found = calibrate_trajectories([first(), second(offset_s=OFFSET_S)])
     check(found)
     assert found.clocks is not None
@@ -81,7 +81,7 @@ def test_offset_of_clocks_and_place_are_found_together() -> None:
     assert found.warnings == ()
 
 
-def test_drift_between_clocks_is_told_and_corrected() -> None:
+def test_calibrate_trajectories_drift_is_corrected() -> None:
     drift = 4e-4
     found = calibrate_trajectories([first(), second(offset_s=OFFSET_S, drift=drift)])
     check(found)
@@ -92,13 +92,13 @@ def test_drift_between_clocks_is_told_and_corrected() -> None:
     assert any("drift apart by" in sentence for sentence in found.warnings)
 
 
-def test_one_clock_needs_no_offset() -> None:
+def test_calibrate_trajectories_same_clock_has_no_relation() -> None:
     found = calibrate_trajectories([first(), second()], same_clock=True)
     check(found)
     assert found.clocks is None
 
 
-def test_an_odometry_that_measures_too_long_is_found() -> None:
+def test_calibrate_trajectories_wrong_scale_is_found() -> None:
     found = calibrate_trajectories([first(), second(offset_s=OFFSET_S, scale=1.04)], ["left", "right"])
     check(found)
     assert found.pair.scale_estimated
@@ -106,7 +106,7 @@ def test_an_odometry_that_measures_too_long_is_found() -> None:
     assert any("right measures lengths" in sentence and "longer than left" in sentence for sentence in found.warnings)
 
 
-def test_jumps_of_an_odometry_are_outliers() -> None:
+def test_calibrate_trajectories_jumps_are_outliers() -> None:
     jumping = second(offset_s=OFFSET_S)
     poses = jumping.nav_T_body.copy()
     for k in range(200, len(poses), 300):
@@ -116,24 +116,24 @@ def test_jumps_of_an_odometry_are_outliers() -> None:
     assert 0.8 < found.inliers.mean() < 1.0
 
 
-def test_the_answer_is_the_same_each_time() -> None:
+def test_calibrate_trajectories_repeated_gives_same_bits() -> None:
     one, other = (calibrate_trajectories([first(), second(offset_s=OFFSET_S)]) for _ in range(2))
     np.testing.assert_array_equal(one.left2_T_left1, other.left2_T_left1)
     np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
-def test_clocks_that_are_said_to_be_one_but_are_not() -> None:
+def test_calibrate_trajectories_wrong_same_clock_raises() -> None:
     with pytest.raises(CalibrationError, match="do not overlap in time; if each has a clock of its own"):
         calibrate_trajectories([first(), second(offset_s=OFFSET_S)], same_clock=True)
 
 
-def test_one_trajectory_is_too_few() -> None:
+def test_calibrate_trajectories_one_trajectory_raises() -> None:
     with pytest.raises(CalibrationError, match="takes two or more"):
         calibrate_trajectories([first()])
 
 
-def test_clocks_and_place_are_within_what_is_told() -> None:
-    """Several runs: what is told of offset, drift and place is what they scatter by."""
+def test_calibrate_trajectories_errors_are_within_sigmas() -> None:
+    """Over several runs, offset, drift and pose scatter by their sigmas."""
     offsets, drifts, squares = [], [], []
     for seed in range(8):
         one = trajectory(100 + seed, 33.0, np.eye(4))
@@ -153,29 +153,29 @@ def test_clocks_and_place_are_within_what_is_told() -> None:
     assert np.mean(squares) > 0.3 * band(8)[0]
 
 
-def test_the_same_trajectory_twice_is_refused() -> None:
+def test_calibrate_trajectories_same_trajectory_raises() -> None:
     with pytest.raises(CalibrationError, match="are the same trajectory"):
         calibrate_trajectories([first(), first()])
 
 
-def test_names_must_differ() -> None:
+def test_calibrate_trajectories_equal_names_raises() -> None:
     with pytest.raises(CalibrationError, match="as many different names"):
         calibrate_trajectories([first(), second()], ["a", "a"])
 
 
-def test_trajectories_of_different_walks_are_refused() -> None:
+def test_calibrate_trajectories_different_walks_raises() -> None:
     elsewhere = replace(second(), nav_T_body=np.array([se3_inverse(pose) for pose in second().nav_T_body[::-1]]))
     with pytest.raises(CalibrationError, match="camera 0 and camera 1: "):
         calibrate_trajectories([first(), elsewhere])
 
 
-def test_a_relation_of_clocks_maps_stamps() -> None:
+def test_clock_relation_maps_stamps() -> None:
     relation = ClockRelation(offset_ns=5, drift=1e-3, at_ns=1_000_000)
     np.testing.assert_array_equal(relation.of(np.array([1_000_000, 2_000_000])), [1_000_005, 2_001_005])
 
 
 @pytest.mark.skipif(not (REAL_DATA / "tango_triplet").is_dir(), reason="shared/data/tango_triplet is not here")
-def test_three_real_devices_close_their_loop() -> None:
+def test_calibrate_trajectories_real_devices_close_loop() -> None:
     files: list[Path] = sorted((REAL_DATA / "tango_triplet").glob("*.csv"))
     found = calibrate_trajectories([load_trajectory(file) for file in files], [file.stem[:6] for file in files])
     (loop,) = found.places.loops

@@ -34,7 +34,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return paths
 
 
-def test_three_cameras_in_one_command(files: list[Path], tmp_path: Path) -> None:
+def test_command_three_cameras_writes_report(files: list[Path], tmp_path: Path) -> None:
     out, report = tmp_path / "numbers.yaml", tmp_path / "report"
     done = command(*files, "--out", out, "--report", report)
     assert done.exit_code == 0, done.output
@@ -58,7 +58,7 @@ def test_three_cameras_in_one_command(files: list[Path], tmp_path: Path) -> None
     assert len(list(report.glob("*.png"))) == 12
 
 
-def test_a_file_that_holds_nan_is_named_with_its_line(files: list[Path], tmp_path: Path) -> None:
+def test_command_nan_in_file_names_line(files: list[Path], tmp_path: Path) -> None:
     lines = files[0].read_text().splitlines()
     lines[99] = lines[99].replace(lines[99].split()[2], "nan")
     broken = tmp_path / "broken.txt"
@@ -68,7 +68,7 @@ def test_a_file_that_holds_nan_is_named_with_its_line(files: list[Path], tmp_pat
     assert "broken.txt, line 100: holds NaN or infinity" in str(done.exception)
 
 
-def test_too_short_a_piece_is_refused(files: list[Path], tmp_path: Path) -> None:
+def test_command_short_trajectory_is_refused(files: list[Path], tmp_path: Path) -> None:
     piece = tmp_path / "piece.txt"
     save_trajectory(load_trajectory(files[0]).select(slice(0, 100)), piece)
     done = command(piece, files[1])
@@ -76,12 +76,12 @@ def test_too_short_a_piece_is_refused(files: list[Path], tmp_path: Path) -> None
     assert done.exit_code != 0
 
 
-def test_a_place_that_cannot_be_written_is_told(files: list[Path], tmp_path: Path) -> None:
+def test_command_unwritable_output_is_refused(files: list[Path], tmp_path: Path) -> None:
     done = command(files[0], files[1], "--out", tmp_path / "missing" / "numbers.yaml")
     assert "name a file in a folder that exists" in str(done.exception)
 
 
-def test_what_is_read_is_never_overwritten(files: list[Path], tmp_path: Path) -> None:
+def test_command_output_over_input_is_refused(files: list[Path], tmp_path: Path) -> None:
     copy = tmp_path / "front.yaml"
     copy.write_bytes(files[0].read_bytes())
     done = command(copy, files[1], "--out", copy)

@@ -21,11 +21,11 @@ from graphvio.errors import CalibrationError
 from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3, skew, so3_exp
 
 _TRIPLES = 500
-_LIKELY = 10  # of the best triples, which are refined before one is chosen
+_CANDIDATES = 10  # best triples, which are refined before one is chosen
 _LIMIT = float(chi2.isf(1e-3, 3))
-_TRIPLE_LIMIT = 9.0 * _LIMIT  # a solution from three pose pairs is off by itself
+_TRIPLE_LIMIT = 9.0 * _LIMIT  # a solution from three pose pairs has errors of its own
 _MIN_TURN, _MAX_TURN = np.deg2rad([0.2, 170.0])  # of a pose pair in a triple: both signs of q fit a half turn
-_MIN_TURNED = 3.0  # rms of the turning about an axis over the noise of a rotation
+_MIN_TURNED = 3.0  # rms rotation about an axis over the noise of a rotation
 _ROUNDS = 5
 _ITERATIONS = 50
 _FIRST_DAMPING, _STIFFER, _LOOSER = 1e-6, 10.0, 0.1
@@ -43,22 +43,22 @@ class PoseParts(NamedTuple):
 
     @staticmethod
     def of(pairs: PosePairs) -> PoseParts:
-        """Of N pose pairs."""
+        """Return the parts of N pose pairs."""
         P_1, P_2 = inverses(pairs.motion_1), inverses(pairs.motion_2)
         return PoseParts(P_1[:, :3, :3], P_1[:, :3, 3], P_2[:, :3, :3], P_2[:, :3, 3])
 
     def select(self, rows: Bool | Int) -> PoseParts:
-        """Some of them."""
+        """Return some of them, by mask or indices."""
         return PoseParts(*(part[rows] for part in self))
 
 
 @dataclass(frozen=True, eq=False)
 class PaperSolution:
-    """What the paper's method finds.
+    """The result of the paper's method.
 
     Attributes:
         left2_T_left1: (4, 4), the paper's P_12.
-        inlier: (N,) pose pairs that it was refined on.
+        inlier: (N,) pose pairs that the refinement used.
         errors_m: (N, 3) alignment errors, eq. (7), of all pose pairs.
     """
 
@@ -68,7 +68,7 @@ class PaperSolution:
 
 
 def calibrate(pairs: PosePairs, seed: int = 0) -> PaperSolution:
-    """RANSAC, then Levenberg-Marquardt on the inliers.
+    """Calibrate by RANSAC, then Levenberg-Marquardt on the inliers.
 
     Args:
         pairs: N pose pairs.
@@ -79,21 +79,25 @@ def calibrate(pairs: PosePairs, seed: int = 0) -> PaperSolution:
     """
     if len(pairs) < MIN_PAIRS:
         raise CalibrationError(f"calibration needs {MIN_PAIRS} pose pairs and has {len(pairs)}; record for longer")
-    weighed = _Weighed(pairs)
-    best = _best_triples(weighed, np.random.default_rng(seed))
-    _, R, t = min((_refined_on_inliers(weighed, R, t) for R, t in best), key=lambda found: found[0])
-    parts, inlier = weighed.parts, weighed.distances(R, t) < _LIMIT
+    weighted = _Weighted(pairs)
+    best = _best_triples(weighted, np.random.default_rng(seed))
+    _, R, t = min((_refined_on_inliers(weighted, R, t) for R, t in best), key=lambda found: found[0])
+    parts, inlier = weighted.parts, weighted.distances(R, t) < _LIMIT
     if inlier.sum() < MIN_PAIRS:
         raise CalibrationError(
             f"the best relative pose of the cameras explains {inlier.sum()} of {len(pairs)} motions; are they on one "
             "rig, and are their clocks the same?"
         )
-    R, t = refine(parts.select(inlier), R, t, weighed.noise_rad)
+    R, t = refine(parts.select(inlier), R, t, weighted.noise_rad)
     return PaperSolution(se3(R, -R @ t), inlier, alignment_errors(parts, R, t))
 
 
 def rotation(R_1: Float, R_2: Float) -> tuple[Float, Float]:
-    """R(q) from rotations (N, 3, 3), eq. (8) and (9).
+    """Find R(q) as an eigenvector, eq. (8) and (9).
+
+    Args:
+        R_1: (N, 3, 3) of the first camera.
+        R_2: (N, 3, 3) of the second camera.
 
     Returns:
         R(q) (3, 3), and the eigenvalues (4,) of ``C^T C`` in ascending order; the second is zero where the rotations do
@@ -104,12 +108,12 @@ def rotation(R_1: Float, R_2: Float) -> tuple[Float, Float]:
 
 
 def translation(R: Float, parts: PoseParts, noise_rad: float = 0.0) -> Float:
-    """T (3,) by least squares, eq. (10); the shortest where several serve as well.
+    """Find T (3,) by least squares, eq. (10); the shortest one where it is not unique.
 
     Args:
         R: (3, 3).
         parts: of N pose pairs.
-        noise_rad: of a rotation; an axis that the rig was turned about by no more counts as one that it was not.
+        noise_rad: standard deviation of a rotation; axes with no more rotation than this explains are left out.
     """
     A = (np.eye(3) - parts.R_2).reshape(-1, 3)
     b = (parts.T_2 - parts.T_1 @ R.T).ravel()  # eq. (10) has A T plus R T_1 - T_2: the paper's b lacks a sign
@@ -119,15 +123,18 @@ def translation(R: Float, parts: PoseParts, noise_rad: float = 0.0) -> Float:
 
 
 def alignment_errors(parts: PoseParts, R: Float, t: Float) -> Float:
-    """Eq. (7), (N, 3) metres: how far apart the two cameras' motions put the second camera's centre, in the frame of
-    the first camera at the start; ``t = -R^T T`` is that centre in the first camera's frame."""
+    """Compute alignment errors (N, 3), eq. (7), metres.
+
+    Each is the distance between the second camera's centres by both cameras' motions, in the frame of the first camera
+    at the start; ``t = -R^T T`` is that centre in the first camera's frame.
+    """
     by_2 = np.einsum("ji,nkj,nk->ni", R, parts.R_2, parts.T_2)
     by_1 = np.einsum("nji,nj->ni", parts.R_1, t - parts.T_1)
     return np.asarray(by_2 + by_1 - t)
 
 
 def jacobians(parts: PoseParts, R: Float) -> Float:
-    """Derivatives (N, 3, 6) of the alignment errors by ``[dt, dq]``; dq is half a rotation vector, from the left."""
+    """Differentiate the alignment errors: (N, 3, 6) by ``[dt, dq]``; dq is half a rotation vector, from the left."""
     made = np.empty((len(parts.R_1), 3, 6))
     made[:, :, :3] = np.swapaxes(parts.R_1, 1, 2) - np.eye(3)
     moved = np.einsum("nji,nj->ni", parts.R_2, parts.T_2)
@@ -136,8 +143,10 @@ def jacobians(parts: PoseParts, R: Float) -> Float:
 
 
 def refine(parts: PoseParts, R: Float, t: Float, noise_rad: float = 0.0) -> tuple[Float, Float]:
-    """Levenberg-Marquardt on the sum of squared alignment errors, from R (3, 3) and t (3,); what nothing tells of t
-    stays as it is, see `translation`."""
+    """Minimise the sum of squared alignment errors by Levenberg-Marquardt, from R (3, 3) and t (3,).
+
+    Components of t that the rotations do not determine stay as they are, see `translation`.
+    """
     damping, turned = _FIRST_DAMPING, _turned_axes(parts, noise_rad)
     errors = alignment_errors(parts, R, t)
     cost = float(np.sum(errors**2))
@@ -162,18 +171,18 @@ def refine(parts: PoseParts, R: Float, t: Float, noise_rad: float = 0.0) -> tupl
 
 
 def _turned_axes(parts: PoseParts, noise_rad: float) -> Float:
-    """Orthonormal directions (3, K), in left1, in which t makes a difference."""
+    """Orthonormal directions (3, K), in left1, in which the rotations determine t."""
     _, sizes, right = np.linalg.svd((np.swapaxes(parts.R_1, 1, 2) - np.eye(3)).reshape(-1, 3), full_matrices=False)
     return np.asarray(right[sizes > _min_singular_value(sizes, len(parts.R_1), noise_rad)].T)
 
 
 def _min_singular_value(sizes: Float, count: int, noise_rad: float) -> float:
-    """The singular value of N rotations, less the identity, that noise does not explain."""
+    """Smallest singular value of N rotations, less the identity, that noise does not explain."""
     return max(_MIN_TURNED * noise_rad * float(np.sqrt(count)), _TINY * float(sizes[0]))
 
 
-class _Weighed:
-    """Pose pairs whose alignment errors are weighed by what the motions' covariances make of them."""
+class _Weighted:
+    """Pose pairs whose alignment errors are weighted by the motions' covariances."""
 
     def __init__(self, pairs: PosePairs) -> None:
         self.parts = PoseParts.of(pairs)
@@ -192,41 +201,41 @@ class _Weighed:
         return np.asarray(np.einsum("ni,ni->n", errors, np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]))
 
 
-def _best_triples(weighed: _Weighed, rng: np.random.Generator) -> list[tuple[Float, Float]]:
-    """Rotations and t of the triples that explain most, the best first."""
-    parts, turns = weighed.parts, weighed.turns
+def _best_triples(weighted: _Weighted, rng: np.random.Generator) -> list[tuple[Float, Float]]:
+    """Rotations and t of the triples with the lowest cost, the best first."""
+    parts, turns = weighted.parts, weighted.turns
     normals = _normal_matrices(parts.R_1, parts.R_2)
     fit = np.flatnonzero((turns > _MIN_TURN) & (turns < _MAX_TURN))
     if len(fit) < MIN_PAIRS:
         raise CalibrationError(
             f"{len(fit)} of {len(turns)} motions turn by more than {np.rad2deg(_MIN_TURN):g} degrees, and {MIN_PAIRS} "
-            "are needed: without rotation nothing tells where the cameras are on the rig; turn it about two axes"
+            "are needed: without rotation the poses of the cameras cannot be found; turn the rig about two axes"
         )
     triples = rng.permuted(np.broadcast_to(fit, (_TRIPLES, len(fit))), axis=1)[:, :MIN_PAIRS]
     _, vectors = np.linalg.eigh(normals[triples].sum(axis=1))
     scored = []
     for triple, q in zip(triples, vectors[:, :, 0], strict=True):
         R = rotation_from_quat_wxyz(np.ascontiguousarray(q))
-        t = -R.T @ translation(R, parts.select(triple), weighed.noise_rad)
-        cost = np.minimum(weighed.distances(R, t), _TRIPLE_LIMIT).sum()
+        t = -R.T @ translation(R, parts.select(triple), weighted.noise_rad)
+        cost = np.minimum(weighted.distances(R, t), _TRIPLE_LIMIT).sum()
         scored.append((float(cost), R, t))
     scored.sort(key=lambda each: each[0])
-    return [(R, t) for _, R, t in scored[:_LIKELY]]
+    return [(R, t) for _, R, t in scored[:_CANDIDATES]]
 
 
-def _refined_on_inliers(weighed: _Weighed, R: Float, t: Float) -> tuple[float, Float, Float]:
-    """Inliers and solution in turns, until the inliers stay the same; with the cost that solutions are chosen by."""
+def _refined_on_inliers(weighted: _Weighted, R: Float, t: Float) -> tuple[float, Float, Float]:
+    """Alternate between inliers and solution until the inliers stay the same; the first value is the final cost."""
     before = None
     for number in range(_ROUNDS):
-        inlier = weighed.distances(R, t) < (_TRIPLE_LIMIT if number == 0 else _LIMIT)
+        inlier = weighted.distances(R, t) < (_TRIPLE_LIMIT if number == 0 else _LIMIT)
         if inlier.sum() < MIN_PAIRS or (before is not None and np.array_equal(inlier, before)):
             break
-        chosen, before = weighed.parts.select(inlier), inlier
+        chosen, before = weighted.parts.select(inlier), inlier
         if number == 0:
             R, _ = rotation(chosen.R_1, chosen.R_2)
-            t = -R.T @ translation(R, chosen, weighed.noise_rad)
-        R, t = refine(chosen, R, t, weighed.noise_rad)
-    return float(np.minimum(weighed.distances(R, t), _LIMIT).sum()), R, t
+            t = -R.T @ translation(R, chosen, weighted.noise_rad)
+        R, t = refine(chosen, R, t, weighted.noise_rad)
+    return float(np.minimum(weighted.distances(R, t), _LIMIT).sum()), R, t
 
 
 def _normal_matrices(R_1: Float, R_2: Float) -> Float:

@@ -1,7 +1,7 @@
 """``scripts/campaign calibration``: how well P_12 is found, and what it is information_gains to the odometry.
 
-Three parts. Drawn errors: 200 runs at each of several noise levels and shares of outliers, judged against what the
-covariance tells. Images: two minutes of the scene ``calibration``, of which more and more framesets are used. Odometry:
+Three parts. Synthetic errors: 200 runs at each of several noise levels and shares of outliers, compared with the
+covariance. Images: two minutes of the scene ``calibration``, of which more and more framesets are used. Odometry:
 every scene with the true rig, with the one that was found from images, and with one that is 3 degrees and 5 cm wrong.
 """
 
@@ -46,7 +46,7 @@ _ODOMETRY_HEAD = ("recording", "IMU", "true rig", "found rig", "found / true", "
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``calibration``."""
     parser = add_command(subparsers, "calibration", "how well P_12 is found from motion", __doc__)
-    parser.add_argument("--runs", type=int, default=200, help="runs of each case with drawn errors (default: 200)")
+    parser.add_argument("--runs", type=int, default=200, help="runs of each case with synthetic errors (default: 200)")
     parser.add_argument("--scenes", nargs="*", default=list(SCENE_NAMES), metavar="NAME", help="default: all")
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side (default: 2)")
     add_data_option(parser)
@@ -59,13 +59,13 @@ def main(args: argparse.Namespace) -> None:
     if args.runs < 1 or args.jobs < 1:
         raise GraphvioError("--runs and --jobs want 1 or more")
     report = Report()
-    report.add(machine(), "", f"`--runs {args.runs}`.", "", "#### Drawn errors")
+    report.add(machine(), "", f"`--runs {args.runs}`.", "", "#### Synthetic errors")
     low, high = chi2.ppf([0.025, 0.975], 6 * args.runs) / args.runs
     report.add(
         f"{PAIRS} pose pairs a run, along the walk of the scene `calibration`; root mean square errors. NEES of 6 has "
         f"its 95 % band at {low:.2f} to {high:.2f}.",
     )
-    report.table(_HEAD, _drawn(args.runs, args.jobs))
+    report.table(_HEAD, _synthetic(args.runs, args.jobs))
     recording = simulated(args.data, "calibration", _SECONDS)
     source = open_source(recording)
     whole, rows = _growth(recording)
@@ -86,7 +86,7 @@ def main(args: argparse.Namespace) -> None:
         report.save_to_docs("calibration")
 
 
-def _drawn(runs: int, jobs: int) -> list[list[str]]:
+def _synthetic(runs: int, jobs: int) -> list[list[str]]:
     rows = []
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         for rotation_rad, translation_m in _NOISES:
@@ -103,7 +103,7 @@ def _judged(runs: list[Run]) -> list[str]:
         return float(np.sqrt(np.mean(np.square(values))))
 
     outliers = sum(each.outliers for each in runs)
-    honest = len(runs) * PAIRS - outliers
+    inliers = len(runs) * PAIRS - outliers
     return [
         f"{np.rad2deg(rms([each.rotation_rad for each in runs])):.4f}",
         f"{1e3 * rms([each.translation_m for each in runs]):.3f}",
@@ -111,7 +111,7 @@ def _judged(runs: list[Run]) -> list[str]:
         f"{1e3 * rms([each.paper_translation_m for each in runs]):.3f}",
         f"{np.mean([each.square for each in runs]):.2f}",
         f"{100 * sum(each.outliers_kept for each in runs) / outliers:.2f}" if outliers else "-",
-        f"{100 * sum(each.inliers_lost for each in runs) / honest:.2f}",
+        f"{100 * sum(each.inliers_lost for each in runs) / inliers:.2f}",
         f"{100 * np.mean([each.agrees for each in runs]):.1f}",
     ]
 
@@ -154,9 +154,9 @@ def _odometry(data: Path, scenes: list[str], found: Calibration) -> list[list[st
         recording = simulated(data, scene)
         true = open_source(recording).rig
         rigs = [true, found.calibrated_rig(), with_moved_pair(true, 1, _WRONG_DEG, _WRONG_M)]
-        for without, rest in ((True, [rig.without_imu() for rig in rigs]), (False, rigs)):
+        for without, used in ((True, [rig.without_imu() for rig in rigs]), (False, rigs)):
             tell(f"{scene}, {'cameras alone' if without else 'with the IMU'}")
-            outcomes = [run(recording, rig, Config()) for rig in rest]
+            outcomes = [run(recording, rig, Config()) for rig in used]
             errors = np.array([1e3 * outcome.epoch_ate_m for outcome in outcomes])
             totals[int(without)] += errors
             rows.append(_odometry_row(scene, "no" if without else "yes", errors))

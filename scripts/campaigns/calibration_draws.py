@@ -1,4 +1,4 @@
-"""Pose pairs with drawn errors, on the walk of the scene ``calibration``, and what both methods make of them."""
+"""Pose pairs with synthetic errors, on the walk of the scene ``calibration``, solved by both methods."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class Run(NamedTuple):
         paper_translation_m: the same.
         square: squared Mahalanobis distance of the graph's result from the truth.
         outliers_kept: outliers that count as inliers.
-        outliers: that were drawn.
-        inliers_lost: honest pose pairs that count as outliers.
+        outliers: number of sampled outliers.
+        inliers_lost: other pose pairs that count as outliers.
         agrees: whether the two methods were found to agree.
     """
 
@@ -46,7 +46,7 @@ class Run(NamedTuple):
 
 
 def one_run(seed: int, rotation_rad: float, translation_m: float, outlier_share: float) -> Run:
-    """Draw, solve by both methods, and judge.
+    """Sample pose pairs, solve by both methods, and compare with the truth.
 
     Args:
         seed: of errors and outliers, and of the method's random triples.
