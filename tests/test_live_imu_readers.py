@@ -17,8 +17,7 @@ from recordings import small_rig
 
 from graphvio.errors import SourceError
 from graphvio.live.devices import Counts, Device, DeviceSource
-from graphvio.live.imu_readers.iio_imu import IioImu
-from graphvio.live.imu_readers.iio_scan import ScanElement, ScanFormat, mount_matrix
+from graphvio.live.imu_readers.iio_imu import IioImu, ScanElement, ScanFormat, mount_matrix
 from graphvio.live.imu_readers.serial_imu import ImuLines, SerialImu
 from graphvio.measurements.readings import ImuReading, Notice, Reading, host_ns
 
@@ -216,7 +215,7 @@ def test_scans_are_laid_out_as_the_kernel_does() -> None:
 def test_mount_matrices() -> None:
     np.testing.assert_array_equal(mount_matrix("0, 1, 0; -1, 0, 0; 0, 0, 1\n") @ [1, 2, 3], [2, -1, 3])
     for text in ("1, 0; 0, 1", "1, 0, 0; 0, 1, 0; 0, 0, -1", "a", "0, 0, 0; 0, 0, 0; 0, 0, 0"):
-        with pytest.raises(SourceError, match="no rotation"):
+        with pytest.raises(SourceError, match="not a rotation"):
             mount_matrix(text)
 
 

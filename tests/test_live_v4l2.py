@@ -17,8 +17,15 @@ from graphvio.arrays import AnyArray, Image
 from graphvio.errors import RigError, SourceError
 from graphvio.live.source import LiveSource
 from graphvio.live.sources import SourceSpec, kind_of
-from graphvio.live.sources.v4l2 import list_devices, open_source
-from graphvio.live.sources.v4l2_capture import CaptureSettings, GreyImage, OpenCapture, open_v4l2, set_up
+from graphvio.live.sources.v4l2 import (
+    CaptureSettings,
+    GreyImage,
+    OpenCapture,
+    list_devices,
+    open_source,
+    open_v4l2,
+    set_up,
+)
 from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
 
 SIZE_PX = (64, 48)

@@ -1,1 +1,1 @@
-"""Inertial sensors that are no part of a camera."""
+"""IMUs that are not part of a camera."""

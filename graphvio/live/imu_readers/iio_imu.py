@@ -1,44 +1,51 @@
-"""An IMU that the kernel reads: Linux' Industrial I/O, its files in sysfs and the buffer of its character device."""
+"""IMUs of Linux' Industrial I/O (IIO), by their files in sysfs and the buffers of their character devices."""
 
 from __future__ import annotations
 
 import os
+import re
 import select
 import threading
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from graphvio.arrays import Float
+from graphvio.arrays import AnyArray, Float, Int
 from graphvio.errors import SourceError
 from graphvio.live.device_clock import host_ns_of_monotonic, realtime_to_host_ns
 from graphvio.live.devices import Counts, DeviceLostError, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
-from graphvio.live.imu_readers.iio_scan import ScanElement, ScanFormat, mount_matrix
 from graphvio.measurements.readings import ImuReading, host_ns
 
 _SYSFS = Path("/sys/bus/iio/devices")
 _DEV = Path("/dev")
 _KINDS = ("anglvel", "accel")
 _AXES = "xyz"
+_TYPE = re.compile(r"(le|be):([su])(\d+)/(\d+)(?:X(\d+))?>>(\d+)")
 _BUFFER_SCANS = 128
 _SCANS_A_READ = 64
 _POLL_S = 0.1
-_SILENCE_NS = 3_000_000_000
+_MAX_SILENCE_NS = 3_000_000_000
 
 
 class IioImu:
-    """A `Device` that reads gyro and accelerometer of one IIO device, or of two whose samples are merged.
+    """Gyro and accelerometer of one IIO device, or of two whose samples are merged, as a `Device`.
 
-    Stamps are the kernel's, by the host's clock. Mount matrices are applied, so that body is what they map to.
+    Stamps are the kernel's, on the host's clock. Mount matrices are applied: they map to body.
+
+    Args:
+        names: of the devices, as in their files ``name``, or ``iio:deviceN``.
+        rate_hz: to set, or None to leave the rate.
+        sysfs: folder of all devices.
+        dev: folder of the character devices.
     """
 
     clock = None
 
     def __init__(self, names: list[str], rate_hz: float | None = None, sysfs: Path = _SYSFS, dev: Path = _DEV) -> None:
-        # Names as in the devices' files `name`, or iio:deviceN.
         self.name = f"iio:{'+'.join(names)}"
         self._names, self._rate_hz, self._sysfs, self._dev = names, rate_hz, sysfs, dev
         self._buffers: list[_Buffer] = []
@@ -75,7 +82,7 @@ class IioImu:
             for buffer in ready:
                 if buffer.read_into(self._merging, arrival_ns):
                     newest_ns = arrival_ns
-            if arrival_ns - newest_ns > _SILENCE_NS:
+            if arrival_ns - newest_ns > _MAX_SILENCE_NS:
                 raise DeviceLostError("no sample for 3 s; check its trigger")
 
     def stop(self) -> None:
@@ -94,16 +101,16 @@ class IioImu:
 
 
 class _Buffer:
-    """The buffer of one IIO device, with the channels of an IMU that it has."""
+    """The buffer of one IIO device, with its inertial channels."""
 
     def __init__(self, folder: Path, dev: Path, rate_hz: float | None) -> None:
         self._folder = folder
         self._path = dev / folder.name
         self._scan = folder / "scan_elements"
         self._fd = -1
-        self._rest = b""
+        self._partial = b""
         self.kinds = [kind for kind in _KINDS if (self._scan / f"in_{kind}_x_en").exists()]
-        self._write("buffer/enable", "0")  # channels cannot be chosen while it runs
+        self._write("buffer/enable", "0")  # channels cannot be selected while it runs
         self._set_rate(rate_hz)
         self._is_monotonic = self._set_clock()
         wanted = [f"in_{kind}_{axis}" for kind in self.kinds for axis in _AXES] + ["in_timestamp"]
@@ -115,7 +122,7 @@ class _Buffer:
         self._body_R_sensor = {kind: self._mount(kind) for kind in self.kinds}
 
     def fileno(self) -> int:
-        """For `select`."""
+        """Return the file descriptor, for `select`."""
         return self._fd
 
     def enable(self) -> None:
@@ -135,7 +142,7 @@ class _Buffer:
             self._write("buffer/enable", "0")
 
     def read_into(self, merging: AccelOntoGyro, arrival_ns: int) -> int:
-        """Hand on the scans that wait; returns how many there were."""
+        """Pass on the scans in the buffer; returns their number."""
         size = self._format.dtype.itemsize
         try:
             data = os.read(self._fd, _SCANS_A_READ * size)
@@ -143,9 +150,9 @@ class _Buffer:
             return 0
         if not data:
             raise DeviceLostError(f"{self._path} has ended")
-        data = self._rest + data
+        data = self._partial + data
         whole = len(data) // size * size
-        self._rest = data[whole:]
+        self._partial = data[whole:]
         scans = np.frombuffer(data[:whole], self._format.dtype)
         vectors = {kind: self._vectors(scans, kind) for kind in self.kinds}
         to_host_ns = host_ns_of_monotonic(0) if self._is_monotonic else realtime_to_host_ns()
@@ -177,7 +184,7 @@ class _Buffer:
         return scales
 
     def _per_axis(self, kind: str, what: str, default: float | None) -> Float:
-        """A value for each axis (3,): the axis' own file, the file of all three, or the default."""
+        """Read a value for each axis (3,): from the axis' own file or the common one, or the default."""
         values = []
         for axis in _AXES:
             texts = [self._read(f"in_{kind}_{axis}_{what}"), self._read(f"in_{kind}_{what}")]
@@ -205,7 +212,7 @@ class _Buffer:
             self._write(name, f"{rate_hz:g}")
 
     def _set_clock(self) -> bool:
-        """Whether stamps are by ``CLOCK_MONOTONIC``; else they are by the kernel's default, ``CLOCK_REALTIME``."""
+        """Select ``CLOCK_MONOTONIC``; returns False if stamps stay on the kernel's default, ``CLOCK_REALTIME``."""
         name = "current_timestamp_clock"
         if not (self._folder / name).exists():
             return False
@@ -216,7 +223,7 @@ class _Buffer:
         number = self._folder.name.removeprefix("iio:device")
         for file in sorted(self._folder.parent.glob("trigger*/name")):
             trigger = file.read_text().strip()
-            if trigger.endswith(f"-dev{number}"):  # the driver's own, raised when a sample is ready
+            if trigger.endswith(f"-dev{number}"):  # the driver's own data-ready trigger
                 return trigger
         raise SourceError(
             f"{self._folder}: has no trigger; write the name of one to {self._folder / 'trigger/current_trigger'}"
@@ -233,7 +240,7 @@ class _Buffer:
 
 
 def _find(sysfs: Path, name: str) -> Path:
-    """The folder of a device, by its name or number."""
+    """Find the folder of a device by its name or number."""
     known = {}
     for folder in sorted(sysfs.glob("iio:device*")):
         known[folder.name] = folder
@@ -242,3 +249,93 @@ def _find(sysfs: Path, name: str) -> Path:
     if name not in known:
         raise SourceError(f"there is no IIO device {name!r} in {sysfs}; there are {', '.join(known) or 'none'}")
     return known[name]
+
+
+@dataclass(frozen=True)
+class ScanElement:
+    """One channel of a scan; in sysfs ``[be|le]:[s|u]BITS/STORAGE[XREPEAT]>>SHIFT``.
+
+    Attributes:
+        name: such as ``in_anglvel_x``.
+        index: its order in the scan.
+        is_signed: two's complement.
+        bits: number of valid bits.
+        storage_bytes: its size, to a multiple of which it is aligned.
+        shift: to the right, before the valid bits are taken.
+        is_big_endian: byte order.
+    """
+
+    name: str
+    index: int
+    is_signed: bool
+    bits: int
+    storage_bytes: int
+    shift: int
+    is_big_endian: bool
+
+    @staticmethod
+    def parse(name: str, index: str, kind: str) -> ScanElement:
+        """Parse the contents of ``NAME_index`` and ``NAME_type``.
+
+        Raises:
+            SourceError: if they are malformed, or of a kind that no IMU has.
+        """
+        found = _TYPE.fullmatch(kind.strip())
+        if found is None or not index.strip().isdigit():
+            raise SourceError(f"IIO channel {name}: type {kind.strip()!r} or index {index.strip()!r} is not understood")
+        bits, storage, shift = int(found[3]), int(found[4]), int(found[6])
+        if storage not in (8, 16, 32, 64) or found[5] not in (None, "1") or not 0 < bits <= storage - shift:
+            raise SourceError(f"IIO channel {name}: type {kind.strip()!r} is none that an IMU has")
+        return ScanElement(name, int(index), found[2] == "s", bits, storage // 8, shift, found[1] == "be")
+
+    def values(self, stored: AnyArray) -> Int:
+        """Convert stored words (N,), unsigned and of the width of the storage, to numbers (N,)."""
+        words = stored.astype(np.uint64) >> np.uint64(self.shift)
+        unused = np.uint64(64 - self.bits)
+        words = words << unused
+        return (words.view(np.int64) >> np.int64(unused)) if self.is_signed else (words >> unused).view(np.int64)
+
+
+class ScanFormat:
+    """Layout of the enabled elements in a scan: each is aligned to its own size.
+
+    Args:
+        elements: enabled.
+
+    Attributes:
+        dtype: of a whole scan, with a field for each element.
+    """
+
+    def __init__(self, elements: list[ScanElement]) -> None:
+        self._elements = {element.name: element for element in elements}
+        offsets, formats, end = [], [], 0
+        ordered = sorted(elements, key=lambda element: element.index)
+        for element in ordered:
+            size = element.storage_bytes
+            offsets.append(-(-end // size) * size)
+            formats.append(f"{'>' if element.is_big_endian else '<'}u{size}")
+            end = offsets[-1] + size
+        alignment = max(element.storage_bytes for element in elements)
+        names = [element.name for element in ordered]
+        self.dtype: np.dtype[np.void] = np.dtype(
+            {"names": names, "formats": formats, "offsets": offsets, "itemsize": -(-end // alignment) * alignment}
+        )
+
+    def channel(self, scans: AnyArray, name: str) -> Int:
+        """Return the raw numbers (N,) of a channel in N scans of `dtype`."""
+        return self._elements[name].values(scans[name])
+
+
+def mount_matrix(text: str) -> Float:
+    """Parse ``body_R_sensor`` (3, 3) from a mount matrix in sysfs, ``a, b, c; d, e, f; g, h, i``.
+
+    Raises:
+        SourceError: if it is not a rotation.
+    """
+    try:
+        matrix = np.array([[float(value) for value in row.split(",")] for row in text.strip().split(";")])
+    except ValueError:
+        matrix = np.zeros((0, 0))
+    if matrix.shape != (3, 3) or np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-3 or np.linalg.det(matrix) < 0:
+        raise SourceError(f"IIO mount matrix {text.strip()!r} is not a rotation; correct it in the device tree")
+    return matrix

@@ -1,4 +1,4 @@
-"""An IMU behind a serial port, as lines of text: a microcontroller's few lines of code are enough to speak it.
+"""IMUs on a serial port, whose lines of text take a few lines of a microcontroller's code.
 
     stamp_us,gx,gy,gz,ax,ay,az[,temperature][*HH]
 
@@ -21,22 +21,23 @@ import numpy as np
 from graphvio.errors import MissingExtraError, SourceError
 from graphvio.live.device_clock import MicrosecondCounter
 from graphvio.live.devices import Counts, DeviceLostError, HandOver
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.readings import ImuReading, Notice, host_ns
 
 _POLL_S = 0.05
-_SILENCE_NS = 3_000_000_000
-_LONGEST_LINE = 256
-_LARGEST_RATE = 100.0  # rad/s; a digit that was lost or doubled makes most values larger than any IMU's range
-_LARGEST_ACCELERATION = 1000.0  # m/s^2
+_MAX_SILENCE_NS = 3_000_000_000
+_MAX_LINE = 256
+_MAX_RATE = 100.0  # rad/s; most values with a lost or doubled digit exceed the range of any IMU
+_MAX_ACCELERATION = 1000.0  # m/s^2
 _BACKWARDS_NS = 1_000_000_000
 _LINE = re.compile(rb"([-+0-9.eE, ]+)(?:\*([0-9A-Fa-f]{2}))?\r?")
 
 
 class ImuLines:
-    """Samples from the bytes of a serial port, however they are cut; what is no sample is counted.
+    """Parser of the bytes of a serial port; lines that are not samples are counted.
 
     Args:
-        clock: its name.
+        clock: name of the microcontroller's clock.
         counts: of ``bad_line``, ``bad_checksum`` and ``clock_restarted``.
     """
 
@@ -45,18 +46,18 @@ class ImuLines:
         self._clock = clock
         self._counter = MicrosecondCounter()
         self._newest_ns: int | None = None
-        self._rest = b""
+        self._partial = b""
         self._is_in_step = False
         self._has_checksums = False
 
     def take(self, data: bytes, arrival_ns: int) -> list[ImuReading | Notice]:
-        """What the lines say that end in these bytes; the first of all is left out, as it may be half a line."""
-        *lines, self._rest = (self._rest + data).split(b"\n")
+        """Parse the lines that end in these bytes; the very first is left out, as it may be incomplete."""
+        *lines, self._partial = (self._partial + data).split(b"\n")
         if lines and not self._is_in_step:
             self._is_in_step = True
             del lines[0]
-        if len(self._rest) > _LONGEST_LINE:
-            self._rest = b""
+        if len(self._partial) > _MAX_LINE:
+            self._partial = b""
             self._counts.add("bad_line", self._is_in_step)
             self._is_in_step = False
         found: list[ImuReading | Notice] = []
@@ -66,7 +67,7 @@ class ImuLines:
 
     def _take_line(self, line: bytes, arrival_ns: int, found: list[ImuReading | Notice]) -> None:
         matched = _LINE.fullmatch(line)
-        if matched is None or len(line) > _LONGEST_LINE:
+        if matched is None or len(line) > _MAX_LINE:
             self._counts.add("bad_line")
             return
         if matched[2] is None:
@@ -84,8 +85,8 @@ class ImuLines:
             self._counts.add("bad_line")
             return
         rate, acceleration = values[:3], values[3:6]
-        too_large = np.abs(rate).max(initial=0.0) > _LARGEST_RATE
-        too_large |= np.abs(acceleration).max(initial=0.0) > _LARGEST_ACCELERATION
+        too_large = np.abs(rate).max(initial=0.0) > _MAX_RATE
+        too_large |= np.abs(acceleration).max(initial=0.0) > _MAX_ACCELERATION
         if len(values) not in (6, 7) or stamp_us < 0 or too_large or not np.isfinite(values).all():
             self._counts.add("bad_line")
             return
@@ -94,22 +95,26 @@ class ImuLines:
             self._counts.add("clock_restarted")
             self._counter = MicrosecondCounter()
             stamp_ns = self._counter.stamp_ns(stamp_us)
-            detail = f"{self._clock}: its clock went back to {stamp_us} us; it has begun anew"
-            found.append(Notice("clock_restarted", detail, arrival_ns, self._clock))
+            detail = f"{self._clock}: its clock went back to {stamp_us} us; it has restarted"
+            found.append(Notice(EventKind.CLOCK_RESTARTED, detail, arrival_ns, self._clock))
         self._newest_ns = stamp_ns
         temperature_c = float(values[6]) if len(values) == 7 else None
         found.append(ImuReading(stamp_ns, rate, acceleration, arrival_ns, self._clock, temperature_c))
 
 
 class SerialImu:
-    """A `Device` that reads such lines from a port, by pyserial."""
+    """An IMU on a serial port as a `Device`, by pyserial.
+
+    Args:
+        path: of the port.
+        baud: rate of the port.
+        open_port: opens it by path and baud; None for pyserial.
+
+    Raises:
+        MissingExtraError: if pyserial is not installed.
+    """
 
     def __init__(self, path: str, baud: int, open_port: Callable[[str, int], Any] | None = None) -> None:
-        """See module.
-
-        Raises:
-            MissingExtraError: if pyserial is not installed.
-        """
         self.name = f"serial:{path}"
         self.clock = self.name
         self._path, self._baud = path, baud
@@ -140,7 +145,7 @@ class SerialImu:
                 hand_over(reading)
             if found:
                 newest_ns = arrival_ns
-            elif arrival_ns - newest_ns > _SILENCE_NS:
+            elif arrival_ns - newest_ns > _MAX_SILENCE_NS:
                 raise DeviceLostError("no sample for 3 s; check the rate of the port (baud=...) and the lines' format")
 
     def stop(self) -> None:
@@ -166,7 +171,7 @@ def _pyserial() -> Callable[[str, int], Any]:
 
     def open_port(path: str, baud: int) -> Any:
         port = serial.Serial(path, baud, timeout=_POLL_S, exclusive=True)
-        port.reset_input_buffer()  # what waited has no arrival that is worth anything
+        port.reset_input_buffer()  # arrival times of buffered data are meaningless
         return port
 
     return open_port
