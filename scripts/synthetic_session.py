@@ -56,12 +56,12 @@ def make_session(
         duration_s: of the walk.
         seed: of all noise; walks of different seeds go the same way.
         imu: whose noise is simulated.
-        loops: closures in all.
-        false_share: of them that are false: anywhere, and off by metres.
-        session: number that the closures' places have.
-        corrections: of each pair, what its place in the rig file must be multiplied by from the left (4, 4); single
-            pairs' motions are sampled for these.
-        offset_s: how much later on the IMU's clock the images are taken than the rig file says.
+        loops: number of closures.
+        false_share: share of them that are false: between any places, and off by metres.
+        session: number of the session in the closures' places.
+        corrections: (4, 4) for each pair, by which its extrinsics in the rig file are multiplied from the left; motions
+            of single pairs are sampled for these.
+        offset_s: added to the rig file's time offset.
     """
     rng = np.random.default_rng([seed, 7])
     rate = round(imu.rate_hz)
@@ -101,14 +101,14 @@ def make_session(
 
 
 def closure_between(one: SyntheticSession, other: SyntheticSession, row: int, seed: int) -> LoopClosure:
-    """A true closure between two sessions, 0 and 1, at about the same place of the lap."""
+    """Return a true closure between two sessions, 0 and 1, at the same row."""
     rng = np.random.default_rng([seed, row])
     motion = se3_inverse(one.truth.nav_T_body[row]) @ other.truth.nav_T_body[row]
     return _closure(one.record, row, other.record, row, motion, rng, (0, 1))
 
 
 def _course(times_s: Float) -> Float:
-    """``[x, y, z, yaw, pitch, roll]`` (N, 6): around a long round, with the bob of steps."""
+    """Return ``[x, y, z, yaw, pitch, roll]`` (N, 6) along an ellipse, with the motion of steps."""
     phase = 2.0 * np.pi * times_s / _LAP_S
     step = 2.0 * np.pi * 1.9 * times_s
     heading = np.unwrap(np.arctan2(_HALF_WIDTH_M * np.cos(phase), -_HALF_LENGTH_M * np.sin(phase)))
@@ -125,7 +125,7 @@ def _course(times_s: Float) -> Float:
 
 
 def _motions(truth: Float, rng: np.random.Generator) -> Motions:
-    """Each frameset's motion from the keyframe before it."""
+    """Sample each frameset's motion from the keyframe before it."""
     count = len(truth)
     row = np.arange(1, count)
     reference = (row - 1) // _KEYFRAME_FRAMES * _KEYFRAME_FRAMES
@@ -149,7 +149,7 @@ def _motions(truth: Float, rng: np.random.Generator) -> Motions:
 
 
 def _own_motions(truth: Float, corrections: Sequence[Float], rng: np.random.Generator) -> tuple[Motions, Int]:
-    """What each pair alone says of the motion over each keyframe, and the pair."""
+    """Sample each pair's motion over each keyframe; returns the motions and their pairs."""
     ends = np.arange(_KEYFRAME_FRAMES, len(truth), _KEYFRAME_FRAMES)
     row = np.repeat(ends, len(corrections))
     pair = np.tile(np.arange(len(corrections)), len(ends))
@@ -160,7 +160,7 @@ def _own_motions(truth: Float, corrections: Sequence[Float], rng: np.random.Gene
         for k, j in zip(row.tolist(), pair.tolist(), strict=True)
     ]  # fmt: skip
     covariance = np.tile(np.diag(sigmas**2), (len(row), 1, 1))
-    made = Motions(
+    motions = Motions(
         row - _KEYFRAME_FRAMES,
         row,
         np.array(poses).reshape(-1, 4, 4),
@@ -168,7 +168,7 @@ def _own_motions(truth: Float, corrections: Sequence[Float], rng: np.random.Gene
         np.zeros((len(row), 6, 6)),
         np.full(len(row), 100),
     )
-    return made, pair
+    return motions, pair
 
 
 def _integrated(first: Float, motions: Motions, count: int) -> Float:
@@ -180,7 +180,7 @@ def _integrated(first: Float, motions: Motions, count: int) -> Float:
 
 
 def _inertial(track: ImuTrack, rows: Int) -> Inertial:
-    """Steps from sample to sample, with the mean of both ends."""
+    """Return steps from sample to sample, with the mean of both ends."""
     values = np.hstack([track.angular_velocity, track.linear_acceleration])
     means = 0.5 * (values[:-1] + values[1:])
     begins = np.concatenate([[0], rows]).astype(np.int64)

@@ -1,4 +1,4 @@
-"""The optimised session as COLMAP reads it: rigs, frames, poses and points, against ours and the true surfaces."""
+"""The COLMAP export: rigs, frames, poses and points, compared with graphvio's and the true surfaces."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def read(exported: Exported) -> Any:
     return pycolmap.Reconstruction(exported.models[0].folder)
 
 
-def test_rig_frames_and_images_are_those_of_the_database(exported: Exported) -> None:
+def test_export_rig_frames_and_images_are_the_database_s(exported: Exported) -> None:
     model, rig = read(exported), exported.session.rig
     assert model.num_rigs() == 1
     assert model.num_reg_frames() == len(exported.session.places)
@@ -97,8 +97,8 @@ def test_rig_frames_and_images_are_those_of_the_database(exported: Exported) -> 
     database.close()
 
 
-def test_cameras_are_ours(exported: Exported) -> None:
-    """COLMAP counts pixels from the image's corner, half a pixel before ours."""
+def test_export_cameras_are_the_rig_s(exported: Exported) -> None:
+    """COLMAP's origin is the image's corner, half a pixel off."""
     model = read(exported)
     for number, camera in zip(sorted(model.cameras), exported.session.rig.cameras, strict=True):
         kept = model.camera(number)
@@ -108,7 +108,7 @@ def test_cameras_are_ours(exported: Exported) -> None:
         np.testing.assert_array_equal(kept.params[4:], camera.distortion[:4])
 
 
-def test_poses_are_ours(exported: Exported) -> None:
+def test_export_poses_are_the_optimisation_s(exported: Exported) -> None:
     cameras = {camera.name: camera for camera in exported.session.rig.cameras}
     for image in read(exported).images.values():
         _, camera, file = image.name.split("/")
@@ -116,11 +116,11 @@ def test_poses_are_ours(exported: Exported) -> None:
         np.testing.assert_allclose(image.cam_from_world().matrix(), expected[:3], rtol=0.0, atol=1e-9)
 
 
-def test_points_are_seen_by_many_images_within_a_pixel(exported: Exported) -> None:
-    (told,), model = exported.models, read(exported)
-    assert told.reprojection_error_px < 0.5
-    assert told.mean_track_length > 3.0
-    assert (told.points, told.observations) == (model.num_points3D(), model.compute_num_observations())
+def test_export_points_have_many_observations_within_a_pixel(exported: Exported) -> None:
+    (described,), model = exported.models, read(exported)
+    assert described.reprojection_error_px < 0.5
+    assert described.mean_track_length > 3.0
+    assert (described.points, described.observations) == (model.num_points3D(), model.compute_num_observations())
     errors = []
     for image in model.images.values():
         camera = exported.session.rig.cameras[sorted(model.cameras).index(image.camera_id)]
@@ -129,11 +129,11 @@ def test_points_are_seen_by_many_images_within_a_pixel(exported: Exported) -> No
         cam_T_world = image.cam_from_world().matrix()
         pixels, _ = camera.project(points @ cam_T_world[:, :3].T + cam_T_world[:, 3])
         errors += np.linalg.norm(pixels + 0.5 - [each.xy for each in seen], axis=1).tolist()
-    assert len(errors) == told.observations
-    assert np.mean(errors) == pytest.approx(told.reprojection_error_px, rel=1e-6)
+    assert len(errors) == described.observations
+    assert np.mean(errors) == pytest.approx(described.reprojection_error_px, rel=1e-6)
 
 
-def test_points_lie_on_the_true_surfaces(exported: Exported) -> None:
+def test_export_points_lie_on_true_surfaces(exported: Exported) -> None:
     simulator = walk_simulator(SECONDS)
     row_of = {int(stamp): row for row, stamp in enumerate(simulator.stamps_ns)}
     model = read(exported)
@@ -152,7 +152,7 @@ def test_points_lie_on_the_true_surfaces(exported: Exported) -> None:
     assert np.mean(np.abs(errors) > 0.1) < 0.03
 
 
-def test_images_are_lossless(exported: Exported) -> None:
+def test_export_images_are_lossless(exported: Exported) -> None:
     place, pair = exported.session.places[-1], exported.session.rig.pairs[1]
     images = exported.session.source.frameset_at(place.stamp_ns).images[1]
     for camera, image in zip((pair.left, pair.right), images, strict=True):
@@ -161,7 +161,7 @@ def test_images_are_lossless(exported: Exported) -> None:
     assert all((exported.folder / "images" / image.name).exists() for image in read(exported).images.values())
 
 
-def test_descriptors_are_matched_as_by_colmap(exported: Exported) -> None:
+def test_alike_matches_as_colmap(exported: Exported) -> None:
     first, second = (image_name(NAME, "cam0", place.stamp_ns) for place in exported.session.places[:2])
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
@@ -181,9 +181,7 @@ def test_descriptors_are_matched_as_by_colmap(exported: Exported) -> None:
     assert alike(np.zeros((0, 128), np.uint8), np.asarray(descriptors[0].data)).shape == (0, 2)
 
 
-def test_matches_of_a_refused_loop_closure_make_no_points(
-    exported: Exported, again: tuple[FeatureDatabase, Path]
-) -> None:
+def test_export_refused_loop_closure_makes_no_points(exported: Exported, again: tuple[FeatureDatabase, Path]) -> None:
     database, folder = again
     places = exported.session.places
     names = [image_name(NAME, "cam0", place.stamp_ns) for place in (places[0], places[-1])]
@@ -197,10 +195,10 @@ def test_matches_of_a_refused_loop_closure_make_no_points(
     assert (model.points, model.observations) == (exported.models[0].points, exported.models[0].observations)
 
 
-def test_of_a_used_loop_closure_only_matches_that_fit_the_poses_are_verified(
+def test_export_used_loop_closure_verifies_matches_by_poses(
     exported: Exported, again: tuple[FeatureDatabase, Path]
 ) -> None:
-    """The matches of two neighbours, as if a search had found them, and as many that are wrong."""
+    """The matches of two neighbours, and as many wrong ones."""
     database, folder = again
     places = exported.session.places[:2]
     names = [image_name(NAME, "cam0", place.stamp_ns) for place in (places[0], places[1])]
@@ -217,9 +215,7 @@ def test_of_a_used_loop_closure_only_matches_that_fit_the_poses_are_verified(
     assert len(database.matches(names[0], others)) < 0.2 * len(wrong)
 
 
-def test_each_frame_is_a_model_and_the_largest_comes_first(
-    exported: Exported, again: tuple[FeatureDatabase, Path]
-) -> None:
+def test_export_frames_are_models_the_largest_first(exported: Exported, again: tuple[FeatureDatabase, Path]) -> None:
     database, folder = again
     (folder / "sparse" / "7").mkdir(parents=True)
     session = exported.optimization.sessions[0]
@@ -234,7 +230,7 @@ def test_each_frame_is_a_model_and_the_largest_comes_first(
     assert min(first.num_points3D(), second.num_points3D()) > 0
 
 
-def test_a_database_without_the_places_is_told(exported: Exported, tmp_path: Path) -> None:
+def test_export_database_without_places_raises(exported: Exported, tmp_path: Path) -> None:
     path = tmp_path / "empty.db"
     with FeatureDatabase(path) as database, pytest.raises(OptimizationError, match=r"empty\.db: holds no image"):
         export(exported.optimization, [exported.session], database, tmp_path, Config())

@@ -1,4 +1,4 @@
-"""Places seen again: resection across pairs, retrieval, masks."""
+"""Loop closures: resection across pairs, retrieval, masks."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def frame(pair: StereoPair, points: Float, stamp_ns: int, rng: np.random.Generat
 def scene(
     rng: np.random.Generator, crossing: tuple[int, int], count: int
 ) -> tuple[Float, dict[int, PairFrame], dict[int, PairFrame], Int]:
-    """A motion after which pair b looks where pair a looked; what both see, and the rows that are one (M, 2)."""
+    """A motion after which pair b sees what pair a saw, the frames of both, and their matches (M, 2)."""
     a, b = (RIG.pairs[j] for j in crossing)
     shake = se3(so3_exp(rng.normal(0.0, 0.05, 3)), rng.normal(0.0, 0.2, 3))
     cur_T_ref = b.left.body_T_cam @ shake @ a.left.cam_T_body
@@ -60,8 +60,8 @@ def scene(
 
 
 @pytest.mark.parametrize("crossing", [(0, 0), (1, 1), (0, 1), (1, 0)])
-def test_any_pair_finds_where_another_was(crossing: tuple[int, int]) -> None:
-    """Also with two matches in five wrong; the error is within its covariance."""
+def test_resect_features_across_pairs_is_consistent(crossing: tuple[int, int]) -> None:
+    """With two matches in five wrong, the error is within its covariance."""
     rng = np.random.default_rng([7, *crossing])
     squares = []
     for _ in range(8):
@@ -78,8 +78,8 @@ def test_any_pair_finds_where_another_was(crossing: tuple[int, int]) -> None:
     assert np.mean(squares) < 15.0
 
 
-def test_both_pairs_count_in_one_motion() -> None:
-    """The front sees what the back saw and the other way round: one motion from both."""
+def test_resect_features_uses_both_pairs() -> None:
+    """The front pair sees what the back pair saw, and vice versa."""
     rng = np.random.default_rng(3)
     half_turn = RIG.pairs[1].left.body_T_cam @ RIG.pairs[0].left.cam_T_body
     points = rng.uniform(-6.0, 6.0, (4000, 3))
@@ -101,7 +101,7 @@ def test_both_pairs_count_in_one_motion() -> None:
     assert np.linalg.norm(se3_log(se3_inverse(half_turn) @ found.cur_T_ref)[3:]) < 0.01
 
 
-def test_matches_that_have_no_motion_in_common_give_none() -> None:
+def test_resect_features_wrong_matches_give_none() -> None:
     rng = np.random.default_rng(11)
     _, then, now, rows = scene(rng, (0, 1), 200)
     rows[:, 1] = rng.permutation(rows[:, 1])
@@ -109,7 +109,7 @@ def test_matches_that_have_no_motion_in_common_give_none() -> None:
     assert resect_features(RIG, then, now, {(0, 1): rows[:5]}, CONFIG, [1]) is None
 
 
-def test_an_image_is_most_like_another_of_the_same_place() -> None:
+def test_candidates_are_images_of_the_same_place() -> None:
     """Half of the features of a place are new each time."""
     rng = np.random.default_rng(5)
     places = [rng.gamma(0.5, 40.0, (300, 128)) for _ in range(12)]
@@ -123,13 +123,13 @@ def test_an_image_is_most_like_another_of_the_same_place() -> None:
     words = vocabulary(images, 0)
     assert np.array_equal(words, vocabulary(images, 0))
     vectors = np.array([describe(image, words) for image in images])
-    offered = candidates(vectors, np.arange(24), lambda earlier, later: True, 1)
-    best = {later: earlier for earlier, later in offered}
+    found = candidates(vectors, np.arange(24), lambda earlier, later: True, 1)
+    best = {later: earlier for earlier, later in found}
     assert [best[later] for later in range(12, 24)] == list(range(12))
     assert not describe(images[0][:0], words).any()
 
 
-def test_only_allowed_places_are_offered_the_most_alike_first() -> None:
+def test_candidates_are_allowed_and_ordered_by_similarity() -> None:
     """Of five images, the last two are of one place, which looks like the first by one of them."""
     vectors = np.array([[1.0, 0.0], [0.9, 0.4359], [0.2, 0.9798], [0.1, 0.995], [0.8, 0.6]], dtype=np.float32)
     place = np.array([0, 1, 2, 3, 3])
@@ -141,7 +141,7 @@ def test_only_allowed_places_are_offered_the_most_alike_first() -> None:
     assert candidates(vectors, place, may, 1) == [(1, 3), (0, 2)]
 
 
-def test_what_a_mask_hides_is_no_feature(tmp_path: Path) -> None:
+def test_usable_masked_pixels_are_not(tmp_path: Path) -> None:
     pair = RIG.pairs[0]
     width, height = pair.left.size_px
     mask = np.full((height, width), 255, dtype=np.uint8)

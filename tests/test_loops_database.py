@@ -1,4 +1,4 @@
-"""COLMAP's database of places: which camera is which, whatever was seen first."""
+"""COLMAP's database of places, if some pairs are missing at the first."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def shown(seed: int) -> PairFeatures:
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_one_pair_may_be_alone_at_the_first_place(tmp_path: Path, first: int) -> None:
+def test_store_place_first_place_of_one_pair(tmp_path: Path, first: int) -> None:
     rig = small_rig(2)
     with FeatureDatabase(tmp_path / "features.db") as database:
         for session in ("before", "walk"):  # another session's cameras have numbers of their own

@@ -50,8 +50,8 @@ def optimized(session: SyntheticSession, closures: list[LoopClosure]) -> Optimiz
     return optimize([session.record], [IMU], closures, CONFIG)
 
 
-def test_false_closures_do_not_bend_the_trajectory(walk: SyntheticSession) -> None:
-    """With 30 % false closures the result is within a tenth of that of the right ones alone."""
+def test_optimize_false_closures_are_refused(walk: SyntheticSession) -> None:
+    """With 30 % false closures the error is within a tenth of that with the true ones alone."""
     right = walk.closures[: -walk.false]
     clean, mixed, alone = optimized(walk, right), optimized(walk, walk.closures), optimized(walk, [])
     assert ate_m(clean.sessions[0].nav_T_body, walk) < 0.5 * ate_m(alone.sessions[0].nav_T_body, walk)
@@ -63,8 +63,8 @@ def test_false_closures_do_not_bend_the_trajectory(walk: SyntheticSession) -> No
     assert 0.1 < mixed.after["loop"].per_dimension < 1.2  # of the IMU's noise three times as much is expected
 
 
-def test_false_closures_that_agree_with_each_other_are_refused(walk: SyntheticSession) -> None:
-    """As many wrong ones as right ones, all off by the same two metres, as where a pattern repeats."""
+def test_optimize_false_closures_in_agreement_are_refused(walk: SyntheticSession) -> None:
+    """As many false closures as true ones, all off by the same two metres, as of a repeated pattern."""
     right = walk.closures[: -walk.false]
     shift = np.eye(4)
     shift[:3, 3] = 2.0, 0.0, 0.0
@@ -73,7 +73,7 @@ def test_false_closures_that_agree_with_each_other_are_refused(walk: SyntheticSe
     assert [bool(loop.refusal) for loop in found.loops] == [False] * len(right) + [True] * len(wrong)
 
 
-def test_what_is_told_of_the_uncertainty_is_true() -> None:
+def test_marginals_motion_is_consistent() -> None:
     """NEES of the last pose seen from the first, over 40 walks with the IMU's noise as it is: 95 % band of its mean."""
     config = replace(CONFIG, smoother=replace(SmootherConfig(), imu_noise_scale=1.0))
     squares = []
@@ -88,8 +88,8 @@ def test_what_is_told_of_the_uncertainty_is_true() -> None:
     assert 4.95 < np.mean(squares) < 7.1
 
 
-def test_sessions_of_one_place_come_into_one_frame() -> None:
-    """Two walks, each in a frame of its own, are one after a few closures between them; one closure is not believed."""
+def test_optimize_sessions_with_closures_share_frame() -> None:
+    """Two walks in different frames are joined by three closures between them, but not by one."""
     one, other = make_session(100.0, 1, IMU, 10), make_session(100.0, 2, IMU, 10, session=1)
     turned = se3_exp(np.array([0.0, 0.0, 2.0, 5.0, -3.0, 0.4]))
     elsewhere = replace(
@@ -111,8 +111,8 @@ def test_sessions_of_one_place_come_into_one_frame() -> None:
     assert apart_m.max() < 0.1
 
 
-def test_things_that_two_buildings_have_alike_do_not_join_them() -> None:
-    """Ten closures that agree, each on few points, as on one poster, are not believed; with a hundred each they are."""
+def test_optimize_closures_of_few_points_do_not_join_sessions() -> None:
+    """Ten closures that agree do not join sessions with 60 points each, as of one poster, but do with 100."""
     one, other = make_session(40.0, 1, IMU, 0), make_session(40.0, 2, IMU, 0, session=1)
     between = [closure_between(one, other, row, 5) for row in range(100, 300, 20)]
     few = [replace(each, inliers=60) for each in between]
@@ -120,7 +120,7 @@ def test_things_that_two_buildings_have_alike_do_not_join_them() -> None:
     assert optimize([one.record, other.record], [IMU, IMU], between, CONFIG).frames == [0, 0]
 
 
-def test_closures_of_other_sessions_are_refused(walk: SyntheticSession) -> None:
+def test_optimize_closures_of_other_sessions_raise(walk: SyntheticSession) -> None:
     other = make_session(40.0, 2, IMU, 0)
     with pytest.raises(OptimizationError, match="belong to other sessions"):
         optimize([other.record], [IMU], walk.closures, CONFIG)
@@ -132,7 +132,7 @@ def chosen(motions: Motions, which: Bool) -> Motions:
 
 
 def broken(session: SyntheticSession, row: int) -> SessionRecord:
-    """The same walk with a new epoch from a row on, whose first pose is a wrong guess."""
+    """The same walk with a new epoch from a row on, in another frame."""
     record, moved = session.record, se3_exp(np.array([0.0, 0.0, 0.5, 3.0, 1.0, 0.0]))
     kept = (record.motions.reference >= row) | (record.motions.row < row)
     poses = record.smoothed.copy()
@@ -145,7 +145,7 @@ def broken(session: SyntheticSession, row: int) -> SessionRecord:
     return replace(record, online=poses, smoothed=poses, velocity_nav=velocity, epoch=epoch, motions=motions)
 
 
-def test_a_break_is_bridged_by_closures_and_stays_declared_without(walk: SyntheticSession) -> None:
+def test_optimize_epochs_are_joined_by_closures_only(walk: SyntheticSession) -> None:
     record = broken(walk, 3000)
     found = optimize([record], [IMU], walk.closures, CONFIG)
     assert found.frames == [0, 0]
@@ -155,15 +155,15 @@ def test_a_break_is_bridged_by_closures_and_stays_declared_without(walk: Synthet
     assert np.array_equal(alone.sessions[0].frame, record.epoch)
 
 
-def test_without_an_imu_motions_alone_are_solved(walk: SyntheticSession) -> None:
+def test_optimize_without_imu_uses_motions(walk: SyntheticSession) -> None:
     record = replace(walk.record, with_imu=np.zeros(len(walk.record.stamps_ns), dtype=bool))
     found = optimize([record], [None], walk.closures, CONFIG)
     assert "imu" not in found.after
     assert ate_m(found.sessions[0].nav_T_body, walk) < 0.3 * ate_m(record.online, walk)
 
 
-def test_a_part_without_any_measurement_is_held_by_constant_velocity(walk: SyntheticSession) -> None:
-    """Neither motions nor IMU for half a second: the graph still has one solution."""
+def test_optimize_gap_has_constant_velocity(walk: SyntheticSession) -> None:
+    """The graph has a unique solution with neither motions nor IMU for half a second."""
     record = walk.record
     blind = (record.motions.row > 1000) & (record.motions.reference < 1010)
     covers = record.inertial.covers.copy()
@@ -175,7 +175,7 @@ def test_a_part_without_any_measurement_is_held_by_constant_velocity(walk: Synth
     assert "walk" in found.after
 
 
-def test_poses_between_states_keep_the_smoothed_motion(walk: SyntheticSession) -> None:
+def test_spread_keeps_smoothed_motion(walk: SyntheticSession) -> None:
     nodes = choose_nodes(walk.record, 1.0)
     exact = spread(nodes, walk.record.smoothed[nodes.rows])
     np.testing.assert_allclose(exact, walk.record.smoothed, atol=1e-9)
@@ -184,8 +184,8 @@ def test_poses_between_states_keep_the_smoothed_motion(walk: SyntheticSession) -
     np.testing.assert_allclose(elsewhere, moved @ walk.record.smoothed, atol=1e-9)
 
 
-def test_the_calibration_is_found_with_the_trajectory() -> None:
-    """A pair off by 0.5 degrees and 3 mm, another by 2 degrees and 4 cm, images 6 ms late: found within sigmas."""
+def test_optimize_calibrates_extrinsics_and_time_offset() -> None:
+    """Corrections of 0.5 degrees and 3 mm, 2 degrees and 4 cm, and 6 ms are estimated consistently."""
     true = [
         se3_exp(np.array([0.005, -0.006, 0.004, 0.002, -0.001, 0.002])),
         se3_exp(np.array([-0.02, 0.03, 0.01, 0.03, 0.02, -0.02])),
@@ -206,7 +206,7 @@ def test_the_calibration_is_found_with_the_trajectory() -> None:
     )
 
 
-def test_derivatives_of_a_single_pairs_motion() -> None:
+def test_own_motion_derivatives_are_numerical_ones() -> None:
     rng = np.random.default_rng(3)
     twists = rng.standard_normal((2, 6))
     motion = RelativeMotion(0, 1, se3_exp(0.5 * rng.standard_normal(6)), np.eye(6), np.zeros((6, 6)), 10)
@@ -228,7 +228,7 @@ def test_derivatives_of_a_single_pairs_motion() -> None:
     np.testing.assert_allclose(found, np.array(columns).T, atol=1e-6)
 
 
-def test_records_and_closures_are_kept_to_the_bit(walk: SyntheticSession, tmp_path: Path) -> None:
+def test_record_and_closures_files_are_lossless(walk: SyntheticSession, tmp_path: Path) -> None:
     record, closures = tmp_path / "record.npz", tmp_path / "loops.npz"
     record.write_bytes(walk.record.to_bytes())
     closures.write_bytes(closures_to_bytes(walk.closures))
@@ -242,10 +242,8 @@ def test_records_and_closures_are_kept_to_the_bit(walk: SyntheticSession, tmp_pa
         SessionRecord.load(record)
 
 
-def test_other_tools_find_the_same_optimum_in_the_pose_graph(walk: SyntheticSession, tmp_path: Path) -> None:
-    """What g2o holds has its optimum about where the full graph has it: what the IMU says of states that are not
-    neighbours is lost.
-    """
+def test_write_g2o_optimum_is_that_of_full_graph(walk: SyntheticSession, tmp_path: Path) -> None:
+    """The pose graph's optimum is near that of the full graph, which has correlations by the IMU in addition."""
     found = optimized(walk, walk.closures)
     write_g2o(found, tmp_path / "graph.g2o")
     graph, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
@@ -266,8 +264,8 @@ def test_other_tools_find_the_same_optimum_in_the_pose_graph(walk: SyntheticSess
     assert found.values.exists(x(0))
 
 
-def test_an_imu_that_is_found_wrong_does_not_bend_the_trajectory(room_walk: Path) -> None:
-    """From 2.5 s on its biases are others: vision is refused for a second, and then believed, also in what it said."""
+def test_optimize_wrong_imu_is_not_used(room_walk: Path) -> None:
+    """Its biases jump at 2.5 s: vision is gated for a second, and then used, also for that second."""
     source = open_source(room_walk)
     recorder = Recorder("walk")
     odometry = Odometry(source.rig, CONFIG)

@@ -327,9 +327,9 @@ def test_write_report_contradicting_loops_are_a_doubt(one: Optimization, tmp_pat
 def test_write_report_incomplete_session_is_a_doubt(
     one: Optimization, tmp_path: Path, completion: float, is_doubtful: bool
 ) -> None:
-    beside = tmp_path / "ring<1>" / "odometry"
-    beside.mkdir(parents=True)
-    (beside / "summary.json").write_text(json.dumps({"completion": completion}))
+    odometry = tmp_path / "ring<1>" / "odometry"
+    odometry.mkdir(parents=True)
+    (odometry / "summary.json").write_text(json.dumps({"completion": completion}))
     html = write_report(replace(one, loops=one.loops[:1]), tmp_path, [None]).read_text(encoding="utf-8")
     assert ("Only 89 % of the framesets" in html) == is_doubtful
     assert ("Read before use" in html) == is_doubtful

@@ -1,4 +1,4 @@
-"""``graphvio optimize`` on rendered images: its files, what an interrupted run does, several sessions, real data."""
+"""``graphvio optimize`` on rendered images: files, interruption, several sessions, real data."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ ALWAYS_EQUAL = ("trajectory_optimized.txt", "covariance.csv", "graph.g2o", "loop
 
 
 def to_and_fro(t: Float) -> Float:
-    """Every four seconds at the same place, looking the same way."""
+    """A motion that returns to the same pose every four seconds."""
     swing, zero = 0.5 * np.pi * t, np.zeros_like(t)
     return np.column_stack(
         [0.7 * np.sin(swing), 0.5 * np.cos(swing), 1.45 + zero, 0.3 * np.sin(swing), zero, 0.05 * np.cos(2.0 * swing)]
@@ -58,7 +58,7 @@ def settings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def done(walk: Path, settings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The results of a run that nothing interrupted."""
+    """The results of an uninterrupted run."""
     out = tmp_path_factory.mktemp("results") / "walk"
     finished = command(walk, "--config", settings, "--out", out)
     assert finished.exit_code == 0, finished.output
@@ -69,7 +69,7 @@ def command(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["optimize", *map(str, arguments)], env={"COLUMNS": "160"})
 
 
-def test_the_result_is_better_than_online(done: Path) -> None:
+def test_optimize_rendered_walk_improves_on_online(done: Path) -> None:
     summary = json.loads((done / "summary.json").read_text())
     (session,) = summary["sessions"]
     errors = {name: each["position_m"] for name, each in session["ate_rmse"].items()}
@@ -83,7 +83,7 @@ def test_the_result_is_better_than_online(done: Path) -> None:
     assert len(trajectory) == session["framesets"]
 
 
-def test_a_killed_run_goes_on_and_ends_the_same(walk: Path, settings: Path, done: Path, tmp_path: Path) -> None:
+def test_optimize_killed_run_continues_to_equal_results(walk: Path, settings: Path, done: Path, tmp_path: Path) -> None:
     out = tmp_path / "walk"
     line = [sys.executable, "-c", "from graphvio.cli import main; main()", "optimize", walk, "--config", settings]
     line += ["--out", out]
@@ -102,7 +102,9 @@ def test_a_killed_run_goes_on_and_ends_the_same(walk: Path, settings: Path, done
         assert (out / name).read_bytes() == (done / name).read_bytes(), name
 
 
-def test_a_folder_of_something_else_is_left_alone(walk: Path, settings: Path, done: Path, tmp_path: Path) -> None:
+def test_optimize_foreign_folder_is_refused_and_unchanged(
+    walk: Path, settings: Path, done: Path, tmp_path: Path
+) -> None:
     before = {path: path.read_bytes() for path in done.rglob("*.txt")}
     refused = command(walk, "--out", done)
     assert isinstance(refused.exception, OptimizationError)
@@ -114,7 +116,7 @@ def test_a_folder_of_something_else_is_left_alone(walk: Path, settings: Path, do
     assert "is not empty" in str(refused.exception)
 
 
-def test_files_that_are_gone_are_made_again(done: Path, walk: Path, settings: Path, tmp_path: Path) -> None:
+def test_optimize_missing_files_are_written_again(done: Path, walk: Path, settings: Path, tmp_path: Path) -> None:
     out = tmp_path / "walk"
     shutil.copytree(done, out)
     for name in ("database.db", "walk/record.npz", "graph.g2o"):
@@ -125,7 +127,7 @@ def test_files_that_are_gone_are_made_again(done: Path, walk: Path, settings: Pa
         assert (out / name).read_bytes() == (done / name).read_bytes(), name
 
 
-def test_the_calibration_is_refined_and_used_for_the_map(walk: Path, settings: Path, tmp_path: Path) -> None:
+def test_optimize_refined_calibration_is_used_for_map(walk: Path, settings: Path, tmp_path: Path) -> None:
     rig = open_source(walk).rig
     save_rig(with_wrong_place(rig, 1.0, 0.03), tmp_path / "wrong.yaml")
     out = tmp_path / "walk"
@@ -143,8 +145,8 @@ def test_the_calibration_is_refined_and_used_for_the_map(walk: Path, settings: P
     np.testing.assert_allclose(other.matrix(), expected[:3], atol=1e-6)
 
 
-def test_two_sessions_come_into_one_frame(walk: Path, tmp_path: Path) -> None:
-    """Two pieces of one recording, which overlap by a second, as if they were two visits."""
+def test_optimize_sessions_overlapping_recordings_share_frame(walk: Path, tmp_path: Path) -> None:
+    """Two parts of one recording that overlap by a second."""
     sources = [open_source(walk, from_s=0.0, to_s=4.0), open_source(walk, from_s=3.0)]
     found = optimize_sessions(sources, tmp_path / "both", Config.from_yaml(SETTINGS))
     assert found.frames == [0, 0]
@@ -158,7 +160,7 @@ def test_two_sessions_come_into_one_frame(walk: Path, tmp_path: Path) -> None:
         assert (tmp_path / "both" / name / "trajectory_optimized.txt").exists()
 
 
-def test_without_loops_nothing_of_maps_is_needed(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_optimize_without_loops_needs_no_extra(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     assert command(walk, "--to", "3", "--no-loops", "--out", tmp_path / "walk").exit_code == 0
     assert not (tmp_path / "walk" / "database.db").exists()
@@ -169,7 +171,7 @@ def test_without_loops_nothing_of_maps_is_needed(walk: Path, tmp_path: Path, mon
 
 
 @pytest.mark.skipif(not CLIP.is_dir(), reason="shared/data/euroc_mh01_clip is absent")
-def test_a_real_recording_becomes_better(tmp_path: Path) -> None:
+def test_optimize_real_recording_improves_on_online(tmp_path: Path) -> None:
     done = command(CLIP, "--out", tmp_path / "clip")
     assert done.exit_code == 0, done.output
     (session,) = json.loads((tmp_path / "clip" / "summary.json").read_text())["sessions"]

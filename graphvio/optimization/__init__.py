@@ -1,1 +1,1 @@
-"""Sessions as a whole: the best trajectory that all of their measurements hold."""
+"""Optimisation of recorded sessions: one graph of all measurements, with loop closures within and between sessions."""

@@ -1,6 +1,6 @@
-"""The optimised sessions as COLMAP reconstructions: rigs, frames, images and points, the poses as they are.
+"""Export of optimised sessions as COLMAP reconstructions: rigs, frames, images, and points triangulated at fixed poses.
 
-What COLMAP calls the world is the nav frame of the optimisation, in metres, z up where there is an IMU.
+COLMAP's world is the nav frame of the optimisation: metres, z up if there is an IMU.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from graphvio.optimization.loops.search import SessionInput
 from graphvio.optimization.optimize import Optimization
 
 Progress = Callable[[str, int, int], None]
-"""Called with what is done, how many of it are, and how many there are."""
+"""Called with the kind of item, the number of finished ones and of all."""
 
 _THREADS = 2
 
@@ -37,12 +38,12 @@ class ColmapModel:
     """A reconstruction on disk.
 
     Attributes:
-        folder: of its files.
-        frame: number of the optimisation's frame that is its world.
-        places: framesets, which are COLMAP's frames.
-        images: of them.
-        points: triangulated.
-        observations: of all points.
+        folder: of the files.
+        frame: number of the optimisation's frame that is COLMAP's world.
+        places: number of framesets, COLMAP's frames.
+        images: number of images.
+        points: number of triangulated points.
+        observations: number over all points.
         reprojection_error_px: mean over the observations; NaN without any.
     """
 
@@ -56,7 +57,7 @@ class ColmapModel:
 
     @property
     def mean_track_length(self) -> float:
-        """Images that see a point; NaN without points."""
+        """Mean number of images that see a point; NaN without points."""
         return self.observations / self.points if self.points else float("nan")
 
 
@@ -66,27 +67,27 @@ def export(
     database: FeatureDatabase,
     folder: Path,
     config: Config,
-    on_progress: Progress | None = None,
+    on_progress: Progress = lambda *_: None,
 ) -> list[ColmapModel]:
-    """Write ``images/SESSION/CAMERA/STAMP.png``, and ``sparse/0``, ``sparse/1`` ... with the points that they show.
+    """Write the images as ``images/SESSION/CAMERA/STAMP.png``, and models as ``sparse/0``, ``sparse/1`` ...
 
-    Each frame of the optimisation becomes a model of its own, that of most places the first, as unconnected models
-    are with COLMAP. Models of an earlier export are removed.
+    Each frame of the optimisation becomes a model, as COLMAP does for unconnected ones; that with most places comes
+    first. Models of an earlier export are removed.
 
     Args:
         optimization: of the sessions, in the same order.
         sessions: whose places are in the database.
-        database: of features; neighbouring places are matched in it, and its matches verified by the optimised poses.
-        folder: to write to; made if it is missing.
-        config: its seed is used.
-        on_progress: told how far it is.
+        database: of features; neighbouring places are matched, and matches verified by the optimised poses.
+        folder: to write to, made if missing.
+        config: gives the seed.
+        on_progress: called after each item.
 
     Returns:
         The models, in the order of their folders.
 
     Raises:
         OptimizationError: if none of the places is in the database, or a file cannot be written.
-        SourceError: if an image cannot be read again.
+        SourceError: if an image cannot be read.
         MissingExtraError: if the extra ``maps`` is not installed.
     """
     groups = _by_frame(optimization, sessions, database)
@@ -95,8 +96,8 @@ def export(
             f"{database.path}: holds no image of the sessions' places; extract their features first"
         )
     try:
-        _write_images(sessions, database, folder / "images", _named(on_progress, "images"))
-        verify_matches(optimization, sessions, database, _named(on_progress, "matches"))
+        _write_images(sessions, database, folder / "images", partial(on_progress, "images"))
+        verify_matches(optimization, sessions, database, partial(on_progress, "matches"))
         for old in (folder / "sparse").glob("*"):
             if re.fullmatch(r"\d+", old.name):
                 shutil.rmtree(old)
@@ -106,14 +107,14 @@ def export(
             target.mkdir(parents=True)
             model = _triangulated(_posed(optimization, sessions, places, database), database, folder, target, config)
             models.append(_described(model, target, frame))
-            _tell(on_progress, "models", number + 1, len(groups))
+            on_progress("models", number + 1, len(groups))
     except OSError as error:
         raise OptimizationError(f"{folder}: cannot be written ({error}); is the disk full?") from None
     return models
 
 
 def _names(session: SessionInput, place: Place, database: FeatureDatabase) -> list[str]:
-    """Of the images of a place that the database holds."""
+    """Return the names of a place's images that are in the database."""
     names = [image_name(session.name, camera.name, place.stamp_ns) for camera in session.rig.cameras]
     return [name for name in names if name in database.names]
 
@@ -121,7 +122,7 @@ def _names(session: SessionInput, place: Place, database: FeatureDatabase) -> li
 def _by_frame(
     optimization: Optimization, sessions: Sequence[SessionInput], database: FeatureDatabase
 ) -> list[tuple[int, list[Place]]]:
-    """Places of each frame, that of most places first."""
+    """Group places by frame, the frame with most places first."""
     groups: dict[int, list[Place]] = {}
     for optimized, session in zip(optimization.sessions, sessions, strict=True):
         for place in session.places:
@@ -133,8 +134,8 @@ def _by_frame(
 def _write_images(
     sessions: Sequence[SessionInput], database: FeatureDatabase, folder: Path, on_progress: Callable[[int, int], None]
 ) -> None:
-    """Write the images of all places that are not there yet."""
-    asked = [(session, place) for session in sessions for place in session.places]
+    """Write the images of all places whose files are missing."""
+    places = [(session, place) for session in sessions for place in session.places]
 
     def write(of: tuple[SessionInput, Place]) -> None:
         session, place = of
@@ -149,14 +150,14 @@ def _write_images(
                     write_image(folder / name, image)
 
     with ThreadPoolExecutor(_THREADS, thread_name_prefix="graphvio-images") as pool:
-        for done, _ in enumerate(pool.map(write, asked), start=1):
-            on_progress(done, len(asked))
+        for done, _ in enumerate(pool.map(write, places), start=1):
+            on_progress(done, len(places))
 
 
 def _posed(
     optimization: Optimization, sessions: Sequence[SessionInput], places: Sequence[Place], database: FeatureDatabase
 ) -> Any:
-    """The reconstruction of places of one frame, without points."""
+    """Return a reconstruction of the places of a frame, without points."""
     rigs: dict[int, Float] = {}
     for place in places:
         session = sessions[place.session]
@@ -167,24 +168,24 @@ def _posed(
 
 
 def _triangulated(model: Any, database: FeatureDatabase, folder: Path, target: Path, config: Config) -> Any:
-    """The reconstruction with the points of the database's verified matches; neither poses nor cameras change."""
+    """Triangulate the database's verified matches, with poses and cameras held fixed."""
     library = colmap()
     options = library.IncrementalPipelineOptions()
-    options.num_threads = 1  # with more, points depend on which of them is first
+    options.num_threads = 1  # with more, points depend on their timing
     options.random_seed = config.motion.seed
     options.image_names = sorted(image.name for image in model.images.values())
     options.load_all_images = True
     options.ba_refine_sensor_from_rig = False
     options.constant_rigs = set(model.rigs)
     options.constant_cameras = set(model.cameras)
-    options.triangulation.ignore_two_view_tracks = False  # a stereo pair is calibrated: two views are as good as more
+    options.triangulation.ignore_two_view_tracks = False  # two views of a calibrated stereo pair suffice
     try:
-        made = library.triangulate_points(model, database.path, folder / "images", target, True, options)
-        made.update_point_3d_errors()
-        made.write(target)
+        triangulated = library.triangulate_points(model, database.path, folder / "images", target, True, options)
+        triangulated.update_point_3d_errors()
+        triangulated.write(target)
     except (RuntimeError, ValueError) as error:
         raise OptimizationError(f"{target}: COLMAP cannot triangulate the places' features ({error})") from None
-    return made
+    return triangulated
 
 
 def _described(model: Any, folder: Path, frame: int) -> ColmapModel:
@@ -195,12 +196,3 @@ def _described(model: Any, folder: Path, frame: int) -> ColmapModel:
     return ColmapModel(
         folder, frame, model.num_frames(), model.num_images(), len(points), int(lengths.sum()), mean
     )  # fmt: skip
-
-
-def _tell(on_progress: Progress | None, what: str, done: int, count: int) -> None:
-    if on_progress is not None:
-        on_progress(what, done, count)
-
-
-def _named(on_progress: Progress | None, what: str) -> Callable[[int, int], None]:
-    return lambda done, count: _tell(on_progress, what, done, count)

@@ -1,8 +1,8 @@
-"""Which features of different places are one: the database's verified matches under the optimised poses.
+"""Verification of the matches between places by the optimised poses, for COLMAP's triangulation.
 
-Verified are matches of neighbours in time and of the loop closures that are used, as far as they lie on the epipolar
-planes of the optimised poses. All other matches stay in the database as what they are, features that look alike, and
-are not verified: COLMAP makes no points of those.
+Verified are matches of places that are neighbours in time and of the loop closures that are used, if they agree with
+the epipolar geometry of the optimised poses. All others stay in the database unverified, and COLMAP does not
+triangulate them.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from graphvio.optimization.optimize import Optimization
 from graphvio.rig import Camera
 
 _NEIGHBOURS = 2  # places after each that it is matched with
-_EPIPOLAR_PX = 4.0  # COLMAP's own limit for two views
-_LEAST_MATCHES = 15  # of two images: COLMAP makes no use of fewer
+_EPIPOLAR_PX = 4.0  # COLMAP's limit for two views
+_MIN_MATCHES = 15  # of two images; COLMAP ignores fewer
 
 
 @dataclass(frozen=True, eq=False)
 class _ImagePair:
-    """Left images of two places."""
+    """The left images of two places."""
 
     names: tuple[str, str]
     cameras: tuple[Camera, Camera]
@@ -39,15 +39,15 @@ def verify_matches(
     optimization: Optimization,
     sessions: Sequence[SessionInput],
     database: FeatureDatabase,
-    on_progress: Callable[[int, int], None] | None = None,
+    on_progress: Callable[[int, int], None] = lambda *_: None,
 ) -> None:
-    """Match neighbouring places, and say anew which matches between places the optimised poses verify.
+    """Match neighbouring places, and verify all matches between places by the optimised poses.
 
     Args:
         optimization: of the sessions, in the same order.
         sessions: whose places are in the database.
         database: to write; images that were matched before are not matched again.
-        on_progress: called with the pairs of images done, and how many there are.
+        on_progress: called with the number of finished pairs of images and of all.
     """
     pairs = {each.names: each for each in _neighbours(optimization, sessions, database)}
     pairs |= {each.names: each for each in _loops(optimization, sessions, database)}
@@ -61,12 +61,11 @@ def verify_matches(
         for first, second in database.verified_pairs():
             if first in lefts and second in lefts:
                 database.verify(first, second, None)
-    asked = sorted(pairs.values(), key=lambda each: each.names)
-    for done, pair in enumerate(asked, start=1):
+    listed = sorted(pairs.values(), key=lambda each: each.names)
+    for done, pair in enumerate(listed, start=1):
         with database.transaction():
             _verify(pair, database)
-        if on_progress is not None:
-            on_progress(done, len(asked))
+        on_progress(done, len(listed))
 
 
 def _verify(pair: _ImagePair, database: FeatureDatabase) -> None:
@@ -75,7 +74,7 @@ def _verify(pair: _ImagePair, database: FeatureDatabase) -> None:
         database.add_matches(first, second, alike(database.descriptors(first), database.descriptors(second)))
     pixels, rows = (database.pixels(first), database.pixels(second)), database.all_matches(first, second)
     geometry = known_geometry(pair.cameras, pair.second_T_first, pixels, rows, _EPIPOLAR_PX)
-    database.verify(first, second, geometry if len(geometry.inlier_matches) >= _LEAST_MATCHES else None)
+    database.verify(first, second, geometry if len(geometry.inlier_matches) >= _MIN_MATCHES else None)
 
 
 def _neighbours(
@@ -96,7 +95,7 @@ def _neighbours(
 def _loops(
     optimization: Optimization, sessions: Sequence[SessionInput], database: FeatureDatabase
 ) -> Iterator[_ImagePair]:
-    """The images that the search matched at the places of the closures that are used."""
+    """Yield the images that the search matched, of the loop closures that are used."""
     for loop in optimization.loops:
         if loop.refusal:
             continue

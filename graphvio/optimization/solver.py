@@ -89,7 +89,7 @@ def residuals(
 
 
 def solve(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, on_progress: Callable[[int, float], None] | None = None
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, on_progress: Callable[[int, float], None] = lambda *_: None
 ) -> gtsam.Values:
     """Minimise the cost by Levenberg-Marquardt until it converges.
 
@@ -109,8 +109,7 @@ def solve(
         for iteration in range(1, _MAX_ITERATIONS + 1):
             optimizer.iterate()
             before, cost = cost, optimizer.error()
-            if on_progress is not None:
-                on_progress(iteration, cost)
+            on_progress(iteration, cost)
             if before - cost <= _CONVERGED * max(before, 1e-9):
                 break
     if not np.isfinite(cost):

@@ -1,7 +1,7 @@
-"""``scripts/benchmark optimize``: sessions that are optimised as a whole.
+"""``scripts/benchmark optimize``: optimisation of whole sessions.
 
-Drawn sessions without images tell how time and memory grow with the length, and what false loop closures do. Recordings
-tell what the optimisation gains, which pairs close loops, and how well places are found again.
+Synthetic sessions without images show how time and memory grow with the length, and the effect of false loop closures.
+Recordings show the gain in accuracy, which pairs close loops, and how well places are recognised.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def add_parser(subparsers: Subparsers) -> None:
                         help=f"simulated recordings (default: {' '.join(_SCENES)})")  # fmt: skip
     parser.add_argument("--clip", type=Path, default=CLIP, metavar="DIR",
                         help="a real recording with truth, left out if it is not there (default: "
-                        "shared/data/euroc_mh01_clip beside the project)")  # fmt: skip
+                        "shared/data/euroc_mh01_clip next to the project)")  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="DIR", help="write a report of each part to this folder")
     parser.add_argument("--docs", action="store_true", help="put the reports into docs/benchmarks.md")
     add_data_option(parser)
@@ -92,7 +92,7 @@ def _recorded(report: Report, args: argparse.Namespace) -> None:
 
 
 def _by_pairs(recording: Path, both: Optimized, space: Path) -> dict[str, Optimized]:
-    """Each pair alone, and all of them as they were run already."""
+    """Optimise with each pair alone, and add the run with all of them."""
     pairs = open_source(recording).rig.pairs
     tell(f"the {AIMED_AT} with each pair alone")
     runs = {

@@ -1,4 +1,4 @@
-"""Recordings that are optimised as a whole: each once, with the time of every stage."""
+"""Accuracy and time by stage of optimised recordings."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Optimized:
 
     @property
     def across(self) -> Bool:
-        """Which closures (L,) rest on points of one pair that another saw."""
+        """Which closures (L,) are between different pairs."""
         return np.array([any(a != b for a, b in loop.closure.pairs) for loop in self.found.loops], dtype=bool)
 
     def ate_m(self, poses: Float) -> float:
@@ -120,7 +120,7 @@ def optimized(folder: Path, name: str, out: Path, pairs: tuple[int, ...] | None 
     if pairs is not None:
         source = open_source(folder, source.rig.with_pairs(pairs))
     if source.truth is None:
-        raise GraphvioError(f"{folder}: holds no true trajectory; accuracy cannot be told without")
+        raise GraphvioError(f"{folder}: holds no true trajectory, which the accuracy needs")
     config = Config()
     warm_up(source.rig, config)
     spent = dict.fromkeys(STAGES, 0.0)
@@ -208,8 +208,8 @@ def add_pairs(report: Report, runs: dict[str, Optimized]) -> None:
     """Table of one recording by its pairs; ``runs`` has their names."""
     report.add(
         "#### Pairs of the loop",
-        "The loop with each pair alone and with both. *Across pairs* are closures that rest on points of one pair "
-        "which the other saw, as where a way is walked back. ATE in cm.",
+        "The loop with each pair alone and with both. *Across pairs* are closures by points of one pair which the "
+        "other saw, as where a way is walked back. ATE in cm.",
     )
     rows = []
     for name, run in runs.items():

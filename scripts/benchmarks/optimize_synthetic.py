@@ -1,4 +1,4 @@
-"""Sessions without images: how long they may be, and how many closures may be false."""
+"""Synthetic sessions without images: time and memory by length, and accuracy by the share of false closures."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LOOPS_AN_HOUR, FALSE_SHARE = 200, 0.3
 _BLOCK = 15  # variables of a state: pose, velocity, biases
 _WALK_S, _RIGHT = 315.0, 42
 _FALSE = (0, 5, 18, 42, 63)
-"""Beside the right ones they are 0, 10, 30, 50 and 60 % of all closures."""
+"""With the true ones, these are 0, 10, 30, 50 and 60 % of all closures."""
 _AIMED_AT = 18
 _ANYWHERE = 0.0
 _SHIFTS_M = (_ANYWHERE, 2.0, 0.1)
@@ -70,7 +70,7 @@ def add_hour(report: Report, minutes: Sequence[float]) -> None:
         "`optimize()` by the clock, which other load lengthens; *processor* what it took of all cores. *Reference* is "
         f"what the processor takes for a chain of as many states, blocks of {_BLOCK} variables, factored and solved in "
         "plain numpy before and after it in the same process: where *ratio*, processor over reference, stays as it is, "
-        "the work is linear in the length. *Memory* is the most that the process held, the drawing of the session "
+        "the work is linear in the length. *Memory* is the most that the process held, sampling the session "
         "included.",
     )
     report.table(
@@ -102,7 +102,7 @@ def _hour(minutes: float) -> _Hour:
     imu = Imu()
     session = make_session(60.0 * minutes, 1, imu, round(LOOPS_AN_HOUR * minutes / 60.0), FALSE_SHARE)
     warm = make_session(5.0, 1, imu, 0)
-    optimize([warm.record], [imu], [], Config())  # what is compiled or imported at first use is not counted
+    optimize([warm.record], [imu], [], Config())  # compiles and imports
     states = round(5.0 * 60.0 * minutes)
     reference_s = _reference_s(states)
     start, start_processor = perf_counter(), process_time()
@@ -170,7 +170,7 @@ def add_false_closures(report: Report, seeds: int, jobs: int) -> None:
         for case, result in zip(cases, pool.map(_judged, cases), strict=True):
             results[case] = result
             if case.seed == seeds:
-                tell(f"  {_kind(case.shift_m)}, {case.false} false beside {_RIGHT} right ones: done")
+                tell(f"  {_kind(case.shift_m)}, {case.false} false and {_RIGHT} true ones: done")
     rows, aims = [], []
     for shift_m, false in [(_ANYWHERE, 0), *product(_SHIFTS_M, _FALSE[1:])]:
         found = [results[_Case(each.seed, shift_m, false)] for each in clean]
@@ -194,7 +194,7 @@ def add_false_closures(report: Report, seeds: int, jobs: int) -> None:
         f"A walk of {_WALK_S:g} s with {_RIGHT} right closures and more and more false ones, {seeds} seeds. "
         "*Anywhere*: between any two places and off by metres. *All alike*: of places that are seen again, all off by "
         "the same transform along the way, as where a pattern repeats: "
-        f"{_SHIFTS_M[1]:g} m is more than the odometry can be off by here, {_SHIFTS_M[2]:g} m is not. The ATE is told "
+        f"{_SHIFTS_M[1]:g} m is more than the odometry can be off by here, {_SHIFTS_M[2]:g} m is not. The ATE is given "
         f"as its ratio to that of the right ones alone (in the median {100 * after:.1f} cm, online "
         f"{100 * online:.0f} cm); closures are counted over all seeds.",
     )

@@ -100,7 +100,7 @@ def extract_places(
     stamps_ns: Sequence[int],
     database: FeatureDatabase,
     config: Config,
-    on_progress: Callable[[int], None] | None = None,
+    on_progress: Callable[[int], None] = lambda _: None,
 ) -> None:
     """Extract the features of a session's places into the database.
 
@@ -129,8 +129,7 @@ def extract_places(
                 pending.append(pool.submit(look, missing[at + len(pending)]))
             store_place(database, rig, session, stamp_ns, pending.pop(0).result())
             done += 1
-            if on_progress is not None:
-                on_progress(done)
+            on_progress(done)
 
 
 def _is_there(database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int) -> bool:

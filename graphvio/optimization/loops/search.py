@@ -42,7 +42,7 @@ def find_loops(
     sessions: Sequence[SessionInput],
     database: FeatureDatabase,
     config: Config,
-    on_progress: Callable[[int, int], None] | None = None,
+    on_progress: Callable[[int, int], None] = lambda *_: None,
 ) -> list[LoopClosure]:
     """Find loop closures between places that are far apart in time or of different sessions.
 
@@ -69,8 +69,7 @@ def find_loops(
         for done, closure in enumerate(pool.map(verifier.verify, tried), start=1):
             if closure is not None:
                 found.append(closure)
-            if on_progress is not None:
-                on_progress(done, len(tried))
+            on_progress(done, len(tried))
     verifier.store()
     return found
 
