@@ -92,7 +92,7 @@ def test_a_checksum_that_is_zero_is_none(session: Path, tmp_path: Path) -> None:
 def test_a_damaged_rig_is_refused_unless_another_is_given(session: Path, tmp_path: Path) -> None:
     at = session.read_bytes().index(b"intrinsics")
     path = changed(session, tmp_path / "walk.mcap", at + 14)
-    with pytest.raises(SessionError, match="the rig in it is damaged; copy the file anew, or give a rig"):
+    with pytest.raises(SessionError, match="the rig in it is damaged"):
         open_source(path)
     source = open_source(path, open_source(session).rig)
     assert len(list(source)) == len(list(open_source(session)))

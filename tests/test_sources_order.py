@@ -17,8 +17,9 @@ from graphvio.image_decoding import damage_of
 from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.rig import Rig
 from graphvio.sources.faults import FaultLog
+from graphvio.sources.index import ImageFiles, Index
 from graphvio.sources.matching import TOLERANCE_NS, group_pairs, match_sides
-from graphvio.sources.recording import ImageFiles, Index, Recording
+from graphvio.sources.recording import Recording
 from graphvio.sources.sequencer import COVER_NS, merge
 from graphvio.sources.tables import ImuTable, clean_stamps, decimal_ns, parse_stamp, read_imu_csv
 
@@ -66,7 +67,7 @@ def test_merge_reads_no_further_than_it_must() -> None:
 def test_clean_stamps_keeps_the_most(values: list[int]) -> None:
     stamps = np.array(values, dtype=np.int64)
     faults = FaultLog("any")
-    kept = clean_stamps(stamps, "x", Path("x.csv"), faults)
+    kept = clean_stamps(stamps, "imu", Path("x.csv"), faults)
     chosen = stamps[kept]
     assert (np.diff(chosen) > 0).all()
     assert sum(faults.counts.values()) == len(values) - len(chosen)
@@ -77,7 +78,7 @@ def test_clean_stamps_keeps_the_most(values: list[int]) -> None:
 
 
 def test_of_equal_stamps_the_first_is_kept() -> None:
-    kept = clean_stamps(np.array([1, 2, 2, 2, 3]), "x", Path("x.csv"), FaultLog("any"))
+    kept = clean_stamps(np.array([1, 2, 2, 2, 3]), "imu", Path("x.csv"), FaultLog("any"))
     assert kept.tolist() == [True, True, False, False, True]
 
 

@@ -1,4 +1,4 @@
-"""Images in ROS messages, as grey ones."""
+"""Converts the images in ROS messages to grey."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from graphvio.arrays import Image
 from graphvio.image_decoding import ImageError, decode_grey
+from graphvio.measurements.events import EventKind
 
 _TO_GREY = {
     "bgr8": cv2.COLOR_BGR2GRAY,
@@ -25,11 +26,11 @@ _GREY, _GREY_16 = ("mono8", "8UC1"), ("mono16", "16UC1")
 
 
 def grey(message: Any, where: str) -> Image:
-    """The image (height, width) uint8 of a ``sensor_msgs/Image`` or ``CompressedImage``.
+    """Convert a ``sensor_msgs/Image`` or ``CompressedImage`` to grey (height, width) uint8.
 
     Args:
         message: as decoded.
-        where: it is from, for what is told of a fault.
+        where: the message is from, for errors.
 
     Raises:
         ImageError: if it is damaged, or its encoding is not known.
@@ -39,7 +40,7 @@ def grey(message: Any, where: str) -> Image:
     height, width, step, encoding = message.height, message.width, message.step, message.encoding
     rows = np.asarray(message.data, dtype=np.uint8)
     if step * height > len(rows) or not height or not width:
-        raise ImageError("image_undecodable", f"{where} is cut short")
+        raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} is cut short")
     rows = rows[: step * height].reshape(height, step)
     if encoding in _GREY_16:
         order = ">u2" if message.is_bigendian else "<u2"
@@ -47,7 +48,7 @@ def grey(message: Any, where: str) -> Image:
     if encoding in _GREY:
         return rows[:, :width].copy()  # a view of the message could not be written to, nor compiled kernels take it
     if encoding not in _TO_GREY:
-        raise ImageError("image_undecodable", f"{where} is encoded as {encoding}, which is not known")
+        raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} is encoded as {encoding}, which is not known")
     channels = _CHANNELS.get(encoding, 1)
     pixels = np.ascontiguousarray(rows[:, : channels * width])
     shaped = pixels.reshape(height, width, channels) if channels > 1 else pixels

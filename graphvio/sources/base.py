@@ -1,4 +1,4 @@
-"""What every source offers, whatever the format of the recording."""
+"""The interface of all sources, whatever the format of the recording."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class Source(Protocol):
 
     @property
     def rig(self) -> Rig:
-        """The rig that the measurements refer to; its IMU is None where the recording has none."""
+        """Rig of the measurements; its IMU is None if the recording has no samples."""
 
     @property
     def faults(self) -> FaultLog:
-        """What was wrong with the recording: complete once the iteration has ended."""
+        """Faults of the recording; complete once an iteration has ended, and counted again by the next one."""
 
     @property
     def frameset_count(self) -> int:
-        """How many framesets it yields at most."""
+        """Number of framesets, of which those without usable images are not yielded."""
 
     @property
     def stamps_ns(self) -> Int:
@@ -45,23 +45,23 @@ class Source(Protocol):
 
     @property
     def truth(self) -> Path | None:
-        """Where `load_trajectory` finds the true trajectory, if the recording carries one: a file, or a session."""
+        """File, session or bag from which `load_trajectory` reads the true trajectory, or None."""
 
     @property
     def decode_ms(self) -> Sequence[float]:
         """Time that the decoding of each frameset took in its thread, milliseconds."""
 
     def frameset_at(self, stamp_ns: int) -> FrameSet:
-        """One frameset, out of order: the images of it that are usable; from any thread.
+        """Return the usable images of one frameset, out of order; from any thread.
 
         Raises:
-            SourceError: if there is none of this stamp.
+            SourceError: if there is no frameset with this stamp.
         """
 
     def __iter__(self) -> Iterator[Measurement]:
-        """IMU samples and framesets: the sample that covers a frameset's instant comes before it.
+        """Yield IMU samples and framesets; the sample that covers a frameset's instant comes before it.
 
         Raises:
             SourceError: at the end, if not one frameset could be read.
-            RigError: if the first image of a camera has another size than the rig says.
+            RigError: if the first image of a camera does not have the rig's size.
         """

@@ -1,4 +1,4 @@
-"""EuRoC/ASL folders with any number of cameras, and TUM-VI's export in the same layout."""
+"""Reads EuRoC/ASL folders with any number of cameras, and TUM-VI's export in the same layout."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from graphvio.errors import SourceError
+from graphvio.measurements.events import EventKind
 from graphvio.rig import Rig
 from graphvio.rig_files.euroc import camera_folders, sensors_folder
 from graphvio.sources.faults import FaultLog
-from graphvio.sources.recording import ImageFiles, Index, Track
+from graphvio.sources.index import ImageFiles, Index
 from graphvio.sources.tables import read_frame_csv, read_imu_csv
 
 LAYOUT = "EuRoC/ASL and TUM-VI: mav0/cam0/data.csv, mav0/cam0/data/*.png, mav0/imu0/data.csv"
@@ -18,12 +19,17 @@ _TRUTHS = ("state_groundtruth_estimate0", "mocap0")
 
 
 def matches(path: Path) -> bool:
-    """Whether a folder has this layout."""
+    """Return whether a folder has this layout."""
     return sensors_folder(path) is not None
 
 
 def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
     """Index the cameras of a rig, and the IMU if it has one.
+
+    Args:
+        path: folder of the recording, or its ``mav0``.
+        rig: whose cameras are looked for.
+        faults: to count in.
 
     Raises:
         SourceError: if a camera of the rig has no folder or no images here.
@@ -31,15 +37,15 @@ def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
     root = sensors_folder(path)
     if root is None:
         raise SourceError(f"{path}: holds no cam0, cam1, ...; give an EuRoC/ASL recording")
-    tracks = {camera.name: _track(root, camera.name, faults) for camera in rig.cameras}
+    images = {camera.name: _images(root, camera.name, faults) for camera in rig.cameras}
     imu_csv = root / "imu0" / "data.csv"
     imu = read_imu_csv(imu_csv, faults) if rig.imu is not None and imu_csv.is_file() else None
     truths = [root / name / "data.csv" for name in _TRUTHS]
     truth = next((file for file in truths if file.is_file()), None)
-    return Index(faults.name, tracks, imu, truth)
+    return Index(faults.name, images, imu, truth)
 
 
-def _track(root: Path, camera: str, faults: FaultLog) -> Track:
+def _images(root: Path, camera: str, faults: FaultLog) -> ImageFiles:
     folder = root / camera
     if not folder.is_dir():
         has = ", ".join(p.name for p in camera_folders(root))
@@ -52,7 +58,7 @@ def _track(root: Path, camera: str, faults: FaultLog) -> Track:
         files = sorted((p for p in images.glob("*.png") if p.stem.isdecimal()), key=lambda p: int(p.stem))
         stamps = np.array([int(p.stem) for p in files], dtype=np.int64)
         names = [p.name for p in files]
-        faults.add("csv_missing", 0, f"{csv} does not exist; stamps are taken from the names of the images")
+        faults.add(EventKind.CSV_MISSING, 0, f"{csv} does not exist; stamps are taken from the names of the images")
     if not names:
         raise SourceError(f"{folder}: lists no image in data.csv, and holds none in data/ that is named by its stamp")
     return ImageFiles(images, stamps, names)

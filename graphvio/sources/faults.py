@@ -1,11 +1,11 @@
-"""Faults of a recording: counted by kind, and told once with the place where each kind was met first."""
+"""Faults of a recording: counted by kind, and logged once per kind."""
 
 from __future__ import annotations
 
 import logging
 from collections import Counter
 
-from graphvio.measurements.events import Event
+from graphvio.measurements.events import Event, EventKind
 
 _log = logging.getLogger(__name__)
 
@@ -13,20 +13,29 @@ _log = logging.getLogger(__name__)
 class FaultLog:
     """Counts faults by kind, and keeps and logs the first of each kind.
 
+    Args:
+        name: of the recording; begins each logged line.
+
     Attributes:
-        counts: kind -> how often it was met.
-        events: the first fault of each kind, in the order in which the kinds were met.
+        counts: kind -> how many there were.
+        events: the first fault of each kind, in the order in which they came.
     """
 
     def __init__(self, name: str) -> None:
-        """An empty log; ``name`` of the recording begins each logged line."""
         self.name = name
         self.counts: dict[str, int] = {}
         self.events: list[Event] = []
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
 
-    def add(self, kind: str, stamp_ns: int, detail: str, times: int = 1) -> None:
-        """Count a fault that was met ``times`` times, first at ``stamp_ns``; the kind's first is logged."""
+    def add(self, kind: EventKind, stamp_ns: int, detail: str, times: int = 1) -> None:
+        """Count a fault.
+
+        Args:
+            kind: of the fault.
+            stamp_ns: when it came first.
+            detail: where it came first, one line.
+            times: how many there are; nothing is counted if there is none.
+        """
         if times <= 0:
             return
         first = kind not in self.counts
@@ -34,12 +43,12 @@ class FaultLog:
         if not first:
             return
         self.events.append(Event(stamp_ns, kind, detail))
-        if kind not in self._told:  # a second pass over the recording tells nothing new
-            self._told.add(kind)
-            _log.warning("%s: %s: %s (further ones are only counted)", self.name, kind, detail)
+        if kind not in self._logged:  # not again when the recording is read a second time
+            self._logged.add(kind)
+            _log.warning("%s: %s: %s (later ones are only counted)", self.name, kind, detail)
 
     def mark(self) -> tuple[Counter[str], list[Event]]:
-        """What is known now, to return to with `rewind`."""
+        """Return the present counts and events, for `rewind`."""
         return Counter(self.counts), list(self.events)
 
     def rewind(self, marked: tuple[Counter[str], list[Event]]) -> None:

@@ -1,7 +1,7 @@
-"""A synchronised, rectified drive of KITTI's raw data: ``image_00/data/*.png``, ``image_00/timestamps.txt``.
+"""Reads synchronised, rectified drives of KITTI's raw data: ``image_00/data/*.png``, ``image_00/timestamps.txt``.
 
-In a synchronised drive the i-th images of all cameras belong together though their stamps differ a little, so
-both cameras of a pair take the stamps of the left one.
+The i-th images of all cameras of such a drive belong together though their stamps differ a little, so both cameras of a
+pair take the stamps of the left one.
 """
 
 from __future__ import annotations
@@ -9,54 +9,46 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
-
 from graphvio.errors import SourceError
 from graphvio.rig import Rig
 from graphvio.sources.faults import FaultLog
-from graphvio.sources.recording import ImageFiles, Index
-from graphvio.sources.tables import clean_stamps, decimal_ns, read_lines
+from graphvio.sources.index import ImageFiles, Index
+from graphvio.sources.tables import decimal_ns, read_times
 
 LAYOUT = "KITTI raw: image_00/data/*.png, image_00/timestamps.txt (and 01, or 02 and 03)"
 
 
 def matches(path: Path) -> bool:
-    """Whether a folder has this layout."""
+    """Return whether a folder has this layout."""
     return any((path / f"image_{i:02d}" / "data").is_dir() for i in (0, 2))
 
 
 def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
     """Index the cameras of a rig.
 
+    Args:
+        path: folder of the drive.
+        rig: whose cameras are looked for.
+        faults: to count in.
+
     Raises:
         SourceError: if the stamps or the images of a camera of the rig are missing.
     """
-    tracks = {}
+    images = {}
     for pair in rig.pairs:
-        file = path / pair.left.name / "timestamps.txt"
-        rows, stamps = [], []
-        for row, line in enumerate(read_lines(file)):
-            stamp = utc_ns(line)
-            if stamp is not None:
-                rows.append(row)
-                stamps.append(stamp)
-            elif line.strip():
-                detail = f"{file}: line {row + 1} is no date and time; it is dropped"
-                faults.add("frame_garbage", stamps[-1] if stamps else 0, detail)
-        stamps_ns = np.array(stamps, dtype=np.int64)
-        kept = clean_stamps(stamps_ns, "frame", file, faults)
-        names = [f"{row:010d}.png" for row, keep in zip(rows, kept, strict=True) if keep]
+        stamps_ns, rows = read_times(path / pair.left.name / "timestamps.txt", _utc_ns, faults)
+        names = [f"{row:010d}.png" for row in rows]
         for camera in (pair.left, pair.right):
             folder = path / camera.name / "data"
             if not folder.is_dir():
                 raise SourceError(
                     f"{folder}: is missing, and the rig names {camera.name}; give KITTI's own calibration"
                 )
-            tracks[camera.name] = ImageFiles(folder, stamps_ns[kept], names)
-    return Index(faults.name, tracks)
+            images[camera.name] = ImageFiles(folder, stamps_ns, names)
+    return Index(faults.name, images)
 
 
-def utc_ns(text: str) -> int | None:
+def _utc_ns(text: str) -> int | None:
     """Nanoseconds since 1970, exactly, of ``2011-09-26 13:02:25.951199337``; None if it is no time."""
     whole, _, fraction = text.strip().partition(".")
     try:

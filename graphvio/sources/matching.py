@@ -1,7 +1,7 @@
-"""Which images belong together: left to right of a pair, and pairs to one frameset, by their stamps.
+"""Matches images by their stamps: left to right of a pair, and pairs to framesets.
 
-What is not of one instant is never joined: pairs that are triggered at other times, or at other rates, make
-framesets of their own.
+Images of different instants are never joined: pairs that are triggered at other times or rates make framesets of their
+own.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 from graphvio.arrays import Int
 
 TOLERANCE_NS = 2_000_000
-"""Images whose stamps differ by no more than this are of the same instant, unless `open_source` is told otherwise."""
+"""Images whose stamps differ by no more than this are of one instant, unless `open_source` gets another value."""
 
 Rows = NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
 class PairIndex:
-    """Images of one pair.
+    """Left and right images of one pair that belong together.
 
     Attributes:
         stamps_ns: (N,) of the left images, increasing.
-        rows: (N, 2) rows of the left and the right image in their cameras' tables.
+        rows: (N, 2) rows of the left and the right image in their cameras' indexes.
         left_alone: (L,) stamps of left images without a right one.
         right_alone: (R,) stamps of right images without a left one.
     """
@@ -49,13 +49,15 @@ class FramesetIndex:
     stamps_ns: Int
     rows: Rows
 
-    def slice(self, first: int, last: int) -> FramesetIndex:
-        """Framesets ``first`` to ``last - 1``."""
-        return FramesetIndex(self.stamps_ns[first:last], self.rows[first:last])
-
 
 def match_sides(left_ns: Int, right_ns: Int, tolerance_ns: int = TOLERANCE_NS) -> PairIndex:
-    """Match left (N,) and right (M,) images of a pair by stamp; both increase. The left stamp counts."""
+    """Match left and right images of a pair by stamp.
+
+    Args:
+        left_ns: (N,) stamps of the left images, increasing.
+        right_ns: (M,) stamps of the right images, increasing.
+        tolerance_ns: largest difference of stamps of one instant.
+    """
     if np.array_equal(left_ns, right_ns):
         rows = np.repeat(np.arange(len(left_ns), dtype=np.int32)[:, None], 2, axis=1)
         nothing = np.zeros(0, dtype=np.int64)
@@ -85,8 +87,12 @@ def match_sides(left_ns: Int, right_ns: Int, tolerance_ns: int = TOLERANCE_NS) -
 def group_pairs(pairs: Sequence[PairIndex], tolerance_ns: int = TOLERANCE_NS) -> FramesetIndex:
     """Join pairs of the same instant to framesets.
 
-    A frameset bears the stamp of the first of its pairs; or of the earliest, where another frameset follows so
-    closely that it would otherwise lie within the tolerance of this one.
+    A frameset has the stamp of the first of its pairs; or of the earliest, if the next frameset would otherwise be
+    within the tolerance of this one.
+
+    Args:
+        pairs: images of each pair, at least one pair.
+        tolerance_ns: largest difference of stamps of one instant.
     """
     count = len(pairs)
     first = pairs[0].stamps_ns
@@ -96,11 +102,11 @@ def group_pairs(pairs: Sequence[PairIndex], tolerance_ns: int = TOLERANCE_NS) ->
         (stamp, number, row) for number, pair in enumerate(pairs) for row, stamp in enumerate(pair.stamps_ns.tolist())
     )
     groups: list[dict[int, tuple[int, int]]] = []  # pair -> (stamp, row)
-    begun_ns = 0
+    begin_ns = 0
     for stamp, number, row in entries:
-        if not groups or stamp - begun_ns > tolerance_ns or number in groups[-1]:
+        if not groups or stamp - begin_ns > tolerance_ns or number in groups[-1]:
             groups.append({})
-            begun_ns = stamp
+            begin_ns = stamp
         groups[-1][number] = (stamp, row)
     earliest = np.array([min(group.values())[0] for group in groups], dtype=np.int64)
     stamps = np.array([group[min(group)][0] for group in groups], dtype=np.int64)

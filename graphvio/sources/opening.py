@@ -5,25 +5,39 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
+from typing import Protocol
 
 from graphvio.errors import RigError, SourceError
 from graphvio.rig import Rig
 from graphvio.rig_files import find_rig
-from graphvio.sessions.store import open_store
+from graphvio.sessions.store import is_store, open_store
 from graphvio.sources import euroc, kitti_odometry, kitti_raw, session
 from graphvio.sources.base import Source
 from graphvio.sources.faults import FaultLog
+from graphvio.sources.index import Index
 from graphvio.sources.matching import TOLERANCE_NS
 from graphvio.sources.recording import Recording
 
-_FORMATS: tuple[ModuleType, ...] = (euroc, kitti_odometry, kitti_raw)
 _MAX_TOLERANCE_MS = 10.0
 
 
+class _Layout(Protocol):
+    """A module that reads folders of one layout."""
+
+    LAYOUT: str
+
+    def matches(self, path: Path) -> bool: ...
+
+    def read_index(self, path: Path, rig: Rig, faults: FaultLog) -> Index: ...
+
+
+_LAYOUTS: tuple[_Layout, ...] = (euroc, kitti_odometry, kitti_raw)
+_KNOWN = "; ".join(layout.LAYOUT for layout in _LAYOUTS)
+
+
 def is_recording(path: Path) -> bool:
-    """Whether a path is of a known layout, so that `open_source` would try to read it."""
-    return session.matches(path) or (path.is_dir() and any(known.matches(path) for known in _FORMATS))
+    """Return whether a path has a known layout, so that `open_source` would try to read it."""
+    return is_store(path) or (path.is_dir() and any(layout.matches(path) for layout in _LAYOUTS))
 
 
 def open_source(
@@ -42,65 +56,56 @@ def open_source(
         rig: decides which pairs are read, and whether the IMU is; None takes the recording's own.
         from_s: where to begin, seconds after the recording's first frameset.
         to_s: where to end (inclusive), on the same scale.
-        tolerance_ms: images whose stamps differ by no more are of one instant. Left and right images further apart
-            are no pair, and pairs further apart make framesets of their own.
-        topics: name of a camera, or ``imu`` -> topic, for sessions and bags whose topics' names do not tell.
+        tolerance_ms: images whose stamps differ by no more are of one instant. Left and right images farther apart
+            are no pair, and pairs farther apart make framesets of their own.
+        topics: name of a camera, or ``imu`` -> topic, for sessions and bags whose topics have other names.
 
     Raises:
         SourceError: if the folder cannot be read, has no known layout, or holds nothing in the given time.
-        RigError: if no rig is given and the recording carries none that is usable.
+        RigError: if no rig is given and the recording has none that is usable.
+        SessionError: if a session or bag cannot be read.
+        MissingExtraError: if it is a session or bag, and the extra ``sessions`` is not installed.
     """
     for name, value in (("from_s", from_s), ("to_s", to_s)):
         if value is not None and not math.isfinite(value):
             raise SourceError(f"{name} is {value}; give seconds after the first frameset")
     if not 0.0 <= tolerance_ms <= _MAX_TOLERANCE_MS:
         raise SourceError(
-            f"tolerance_ms is {tolerance_ms}; give 0 to {_MAX_TOLERANCE_MS:g}: what is triggered together"
+            f"tolerance_ms is {tolerance_ms}; give 0 to {_MAX_TOLERANCE_MS:g}: images that are triggered together"
         )
+    path = Path(path)
     try:
-        return _open(Path(path), rig, from_s, to_s, round(1e6 * tolerance_ms), topics or {})
+        index, rig, faults = _read_index(path, rig, topics or {})
+        return Recording(index, rig, faults, from_s, to_s, round(1e6 * tolerance_ms))
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
 
 
-def _open(
-    path: Path,
-    rig: Rig | None,
-    from_s: float | None,
-    to_s: float | None,
-    tolerance_ns: int,
-    topics: Mapping[str, str],
-) -> Recording:
+def _read_index(path: Path, rig: Rig | None, topics: Mapping[str, str]) -> tuple[Index, Rig, FaultLog]:
     if not path.exists():
         raise SourceError(f"{path}: does not exist; give the folder of a recording")
     resolved = path.resolve()
-    faults = FaultLog(resolved.parent.name if resolved.name == "mav0" else _name_of(resolved))
-    if session.matches(path):
+    resolved = resolved.parent if resolved.name == "mav0" else resolved
+    faults = FaultLog(resolved.name if resolved.is_dir() else resolved.stem)
+    if is_store(path):
         store = open_store(path)
         rig = _required(rig if rig is not None else session.rig_in(store), path)
-        index = session.read_index(store, rig, faults, topics)
-    else:
-        layout = _layout_of(path)
-        if topics:
-            raise SourceError(f"{path}: has no topics to be mapped; that is for sessions and bags")
-        rig = _required(rig if rig is not None else find_rig(path), path)
-        index = layout.read_index(path, rig, faults)
-    return Recording(index, rig, faults, from_s, to_s, tolerance_ns)
+        return session.read_index(store, rig, faults, topics), rig, faults
+    layout = _layout_of(path)
+    if topics:
+        raise SourceError(f"{path}: has no topics to be mapped; that is for sessions and bags")
+    rig = _required(rig if rig is not None else find_rig(path), path)
+    return layout.read_index(path, rig, faults), rig, faults
 
 
-def _name_of(path: Path) -> str:
-    return path.name if path.is_dir() else path.stem
-
-
-def _layout_of(path: Path) -> ModuleType:
-    """The module that reads a folder."""
+def _layout_of(path: Path) -> _Layout:
     if not path.is_dir():
-        raise SourceError(f"{path}: is no recording that graphvio knows; {session.LAYOUT}, or a folder ({_known()})")
+        raise SourceError(f"{path}: is no recording that graphvio knows; {session.LAYOUT}, or a folder ({_KNOWN})")
     if next(path.iterdir(), None) is None:
-        raise SourceError(f"{path}: is empty; looked for {_known()}")
-    layout = next((known for known in _FORMATS if known.matches(path)), None)
+        raise SourceError(f"{path}: is empty; looked for {_KNOWN}")
+    layout = next((known for known in _LAYOUTS if known.matches(path)), None)
     if layout is None:
-        raise SourceError(f"{path}: has none of the known layouts; looked for {_known()}")
+        raise SourceError(f"{path}: has none of the known layouts; looked for {_KNOWN}")
     return layout
 
 
@@ -108,7 +113,3 @@ def _required(rig: Rig | None, path: Path) -> Rig:
     if rig is None:
         raise RigError(f"{path}: carries no calibration; write a rig.yaml into it, or give a rig of your own")
     return rig
-
-
-def _known() -> str:
-    return "; ".join(known.LAYOUT for known in _FORMATS)

@@ -1,4 +1,4 @@
-"""Work done ahead of its use in threads: bounded, in order, and ended with its consumer."""
+"""Prepares results ahead of their use in threads: bounded, in order, and ended with the consumer."""
 
 from __future__ import annotations
 
@@ -15,10 +15,16 @@ R = TypeVar("R")
 def read_ahead(
     work: Callable[[T], R], items: Iterable[T], depth: int = 8, threads: int = 2
 ) -> Generator[R, None, None]:
-    """``map(work, items)``, where up to ``depth`` results are prepared ahead in ``threads`` threads.
+    """Yield ``map(work, items)``, with results prepared ahead in threads.
 
-    An exception of ``work`` is raised where its result is due. The threads end when the iterator is
-    exhausted, closed or collected.
+    An exception of ``work`` is raised where its result is due. The threads end when the iterator is exhausted, closed
+    or collected.
+
+    Args:
+        work: called in the threads.
+        items: its arguments.
+        depth: how many results are prepared ahead at most.
+        threads: how many threads prepare them.
     """
     waiting: deque[Future[R]] = deque()
     pool = ThreadPoolExecutor(threads, thread_name_prefix="graphvio-read")

@@ -1,21 +1,23 @@
-"""Tables of stamped rows: tolerant reading, and cleaning of stamps. Stamps never pass through a float."""
+"""Reads tables of stamped rows tolerantly, and cleans their stamps, which are never converted to floats."""
 
 from __future__ import annotations
 
 import warnings
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.errors import SourceError
+from graphvio.measurements.events import EventKind
 from graphvio.sources.faults import FaultLog
 
-_MAX_STAMP_NS = 2**62  # the year 2116; far enough from the end of int64 to add offsets to
+_MAX_STAMP_NS = 2**62  # the year 2116; offsets can be added without an overflow of int64
 _HOUR_NS = 3_600_000_000_000
 _MAX_OUTLIERS = 2
 
@@ -32,13 +34,14 @@ class ImuTable:
     stamps_ns: Int
     values: Float
 
-    def slice(self, first: int, last: int) -> ImuTable:
-        """Rows ``first`` to ``last - 1``."""
-        return ImuTable(self.stamps_ns[first:last], self.values[first:last])
-
 
 def read_imu_csv(path: Path, faults: FaultLog) -> ImuTable:
-    """Read EuRoC's ``imu0/data.csv``; rows that are no samples, repeated or out of order are dropped."""
+    """Read EuRoC's ``imu0/data.csv``.
+
+    Args:
+        path: of the file.
+        faults: counts the rows that are dropped: no samples, repeated or out of order.
+    """
     table = _read_fast(path)
     if table is None:
         table = _read_tolerant(path, faults)
@@ -46,7 +49,7 @@ def read_imu_csv(path: Path, faults: FaultLog) -> ImuTable:
     if not finite.all():
         bad = int(np.argmin(finite))
         faults.add(
-            "imu_garbage",
+            EventKind.IMU_GARBAGE,
             int(table.stamps_ns[bad]),
             f"{path}: the row of stamp {table.stamps_ns[bad]} holds NaN, infinity or an impossible stamp",
             int(np.sum(~finite)),
@@ -57,13 +60,21 @@ def read_imu_csv(path: Path, faults: FaultLog) -> ImuTable:
 
 
 def read_frame_csv(path: Path, faults: FaultLog) -> tuple[Int, list[str]]:
-    """Read EuRoC's ``cam0/data.csv``: stamps (N,), increasing, and file names."""
+    """Read EuRoC's ``cam0/data.csv``.
+
+    Args:
+        path: of the file.
+        faults: counts the rows that are dropped.
+
+    Returns:
+        Stamps (N,), increasing, and names of the images.
+    """
     stamps: list[int] = []
     names: list[str] = []
     for number, cells in _rows(path):
         stamp = parse_stamp(cells[0])
         if stamp is None:
-            _count_garbage("frame_garbage", path, number, stamps, faults)
+            _count_garbage(EventKind.FRAME_GARBAGE, path, number, stamps, faults)
             continue
         stamps.append(stamp)
         names.append(cells[1] if len(cells) > 1 and cells[1] else f"{stamp}.png")
@@ -72,8 +83,36 @@ def read_frame_csv(path: Path, faults: FaultLog) -> tuple[Int, list[str]]:
     return all_stamps[kept], [name for name, keep in zip(names, kept, strict=True) if keep]
 
 
+def read_times(path: Path, parse: Callable[[str], int | None], faults: FaultLog) -> tuple[Int, list[int]]:
+    """Read a file with the time of a frame in each line.
+
+    Args:
+        path: of the file.
+        parse: returns the nanoseconds of a line, or None if it is no time.
+        faults: counts the lines that are dropped.
+
+    Returns:
+        Stamps (N,), increasing, and their lines, from 0.
+
+    Raises:
+        SourceError: if the file cannot be read.
+    """
+    lines: list[int] = []
+    stamps: list[int] = []
+    for number, line in enumerate(read_lines(path)):
+        stamp = parse(line)
+        if stamp is not None:
+            lines.append(number)
+            stamps.append(stamp)
+        elif line.strip():
+            _count_garbage(EventKind.FRAME_GARBAGE, path, number + 1, stamps, faults)
+    stamps_ns = np.array(stamps, dtype=np.int64)
+    kept = clean_stamps(stamps_ns, "frame", path, faults)
+    return stamps_ns[kept], [line for line, keep in zip(lines, kept, strict=True) if keep]
+
+
 def parse_stamp(text: str) -> int | None:
-    """Whole nanoseconds, exactly, also of ``1.4e18``; None if the text is no stamp."""
+    """Return whole nanoseconds, exactly, also of ``1.4e18``; None if the text is no stamp."""
     try:
         stamp = int(text)
     except ValueError:
@@ -82,7 +121,7 @@ def parse_stamp(text: str) -> int | None:
 
 
 def decimal_ns(text: str, unit_ns: int) -> int | None:
-    """Whole nanoseconds of a decimal number in units of ``unit_ns``; None if the text is no such number."""
+    """Return whole nanoseconds of a decimal number in units of ``unit_ns``; None if the text is no such number."""
     try:
         value = Decimal(text.strip()) * unit_ns
     except InvalidOperation:
@@ -92,13 +131,21 @@ def decimal_ns(text: str, unit_ns: int) -> int | None:
     return int(value.to_integral_value())
 
 
-def clean_stamps(stamps_ns: Int, what: str, path: Path, faults: FaultLog) -> Bool:
-    """Which rows (N,) to keep so that stamps increase and the fewest rows are dropped.
+def clean_stamps(stamps_ns: Int, sensor: Literal["imu", "frame"], path: Path, faults: FaultLog) -> Bool:
+    """Return which rows to keep so that stamps increase and the fewest rows are dropped.
 
-    The longest increasing subsequence is kept. So one stamp far in the future costs one row, not all that
-    follow it; of equal stamps the first is kept. Then go one or two rows that lie hours from all others, such
-    as the stamp 0 of a driver that has no time yet. Dropped rows are counted as ``{what}_duplicate``,
-    ``{what}_backward`` and ``{what}_outlier``.
+    The longest increasing subsequence is kept. So one stamp far in the future costs one row, not all that follow it; of
+    equal stamps the first is kept. Of these, one or two rows that lie hours from all others are dropped, such as the
+    stamp 0 of a driver that has no time yet.
+
+    Args:
+        stamps_ns: (N,) in the order of the file.
+        sensor: whose rows they are.
+        path: of the file, for messages.
+        faults: counts the dropped rows as duplicate, backward or outlier.
+
+    Returns:
+        (N,) true for rows to keep.
     """
     increasing = np.ones(len(stamps_ns), dtype=np.bool_)
     if (np.diff(stamps_ns) <= 0).any():
@@ -108,15 +155,15 @@ def clean_stamps(stamps_ns: Int, what: str, path: Path, faults: FaultLog) -> Boo
     kept[increasing] = ~_far_from_all(stamps_ns[increasing])
     dropped = ~increasing
     duplicate = dropped & np.isin(stamps_ns, stamps_ns[increasing])
-    for kind, rows, says in (
+    for kind, rows, reason in (
         ("duplicate", duplicate, "repeats an earlier row's; the first is kept"),
         ("backward", dropped & ~duplicate, "is out of order; the row is dropped"),
         ("outlier", increasing & ~kept, "lies hours from all others; the row is dropped"),
     ):
         if rows.any():
             row = int(np.argmax(rows))
-            detail = f"{path}: stamp {stamps_ns[row]} of data row {row + 1} {says}"
-            faults.add(f"{what}_{kind}", int(stamps_ns[row]), detail, int(np.sum(rows)))
+            detail = f"{path}: stamp {stamps_ns[row]} of data row {row + 1} {reason}"
+            faults.add(EventKind(f"{sensor}_{kind}"), int(stamps_ns[row]), detail, int(np.sum(rows)))
     return kept
 
 
@@ -157,7 +204,7 @@ def _read_fast(path: Path) -> ImuTable | None:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # numpy only warns when it cuts a stamp that is written as a float
             table = np.loadtxt(path, dtype=row, delimiter=",", comments="#", ndmin=1, encoding="utf-8")
-    except (ValueError, OverflowError, OSError, Warning):  # the tolerant reader says where
+    except (ValueError, OverflowError, OSError, Warning):  # the tolerant reader finds the row
         return None
     return ImuTable(np.ascontiguousarray(table["stamp"]), np.ascontiguousarray(table["values"]))
 
@@ -172,7 +219,7 @@ def _read_tolerant(path: Path, faults: FaultLog) -> ImuTable:
         except ValueError:
             sample = []
         if stamp is None or len(sample) != 6:
-            _count_garbage("imu_garbage", path, number, stamps, faults)
+            _count_garbage(EventKind.IMU_GARBAGE, path, number, stamps, faults)
             continue
         stamps.append(stamp)
         values.append(sample)
@@ -193,7 +240,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Lines of a text file with any line ends; bytes that are no text become garbage in their line only.
+    """Read the lines of a text file with any line ends; bytes that are no text spoil only their line.
 
     Raises:
         SourceError: if the file cannot be read.
@@ -212,5 +259,5 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _count_garbage(kind: str, path: Path, number: int, stamps: list[int], faults: FaultLog) -> None:
+def _count_garbage(kind: EventKind, path: Path, number: int, stamps: list[int], faults: FaultLog) -> None:
     faults.add(kind, stamps[-1] if stamps else 0, f"{path}: line {number} is no row of this table; it is dropped")
