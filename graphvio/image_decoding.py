@@ -24,7 +24,7 @@ class ImageError(Exception):
         detail: one line with the file.
     """
 
-    def __init__(self, kind: str, detail: str) -> None:
+    def __init__(self, kind: EventKind, detail: str) -> None:
         super().__init__(detail)
         self.kind = kind
         self.detail = detail
