@@ -62,6 +62,11 @@ def synthetic_messages(
     return Messages(stamps_ns, arrivals_ns, true_ns)
 
 
+def drift_ppm(clock: ClockMap) -> float:
+    """Estimated rate of the host's clock relative to the device's, less 1."""
+    return 1e6 * clock._envelope.line.drift
+
+
 @dataclass(frozen=True)
 class ClockErrors:
     """Errors of mapped stamps in the second after some time, over many runs.
@@ -93,7 +98,7 @@ def clock_errors(conditions: Conditions, after_s: Sequence[float], runs: int, se
         ):
             at = clock.map(stamp, arrival)
             mapped[k] = np.nan if at is None else 1e-3 * (at - truth)
-            found[k] = clock.drift_ppm
+            found[k] = drift_ppm(clock)
         for errors, drift, begin_s in zip(errors_us, drifts, after_s, strict=True):
             first, last = (round(s * conditions.rate_hz) for s in (begin_s, begin_s + 1.0))
             errors.append(mapped[first:last])

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 import synthetic  # noqa: F401  (hypothesis' settings)
-from device_messages import Conditions, Messages, clock_errors, synthetic_messages
+from device_messages import Conditions, Messages, clock_errors, drift_ppm, synthetic_messages
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -43,7 +43,7 @@ def feed(messages: Messages) -> Run:
         if at is not None:
             run.mapped.append(at)
             run.kept.append(k)
-    run.drift_ppm = clock.drift_ppm
+    run.drift_ppm = drift_ppm(clock)
     return run
 
 

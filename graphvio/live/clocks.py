@@ -55,11 +55,6 @@ class ClockMap:
         self._suspicion: _Suspicion | None = None
         self._may_have_restarted = False
 
-    @property
-    def drift_ppm(self) -> float:
-        """Rate of the host's clock relative to the device's, less 1; 0 in the first three seconds."""
-        return 1e6 * self._envelope.line.drift
-
     def expect_restart(self) -> None:
         """Map the clock again at once if the next stamp says so, as the device was away."""
         self._may_have_restarted = True

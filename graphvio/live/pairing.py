@@ -93,11 +93,6 @@ class FramesetAssembler:
             self._abandon(camera, list(camera.waiting))
         return framesets
 
-    @property
-    def waiting(self) -> int:
-        """Number of images that are held."""
-        return sum(len(camera.waiting) for camera in self._cameras()) + sum(2 * len(p.matched) for p in self._pairs)
-
     def _set_time(self, arrival_ns: int) -> None:
         if self._now_ns is None:
             for camera in self._cameras():

@@ -6,6 +6,7 @@ import shutil
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from graphvio.live.outputs import Output
 from graphvio.measurements.estimate import Estimate
@@ -16,9 +17,12 @@ from graphvio.rig import Rig
 from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
 
+_FRAMESETS = "framesets"  # a lane
 _WAITING = 20_000  # samples, poses and events: a minute of them
 _WAITING_FRAMESETS = 120  # a disk may pause for seconds
 _READ_AHEAD = 2  # framesets, where the source waits
+
+_Write = tuple[Callable[[Any], None], Any]  # a function of the writer, and what it is to write
 
 
 class SessionRecorder(Output):
@@ -46,47 +50,42 @@ class SessionRecorder(Output):
         self._writer = SessionWriter(path, rig, image_format)
         when_full = WhenFull.WAIT if waits else WhenFull.DROP_NEWEST
         framesets = Limit(_READ_AHEAD if waits else _WAITING_FRAMESETS, when_full)
-        self._waiting: BoundedQueue[Callable[[], None]] = BoundedQueue(_WAITING, when_full, framesets=framesets)
+        self._queue: BoundedQueue[_Write] = BoundedQueue(_WAITING, when_full, framesets=framesets)
         self._framesets = 0
         self._failed_framesets = 0
         self._failed_messages = 0
         self.failure: Exception | None = None
-        self._thread = threading.Thread(target=self._write, name="graphvio-record", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="graphvio-record", daemon=True)
         self._thread.start()
 
     def add_measurement(self, measurement: Measurement) -> None:
         """See `Output`."""
-        if isinstance(measurement, FrameSet):
-            self._waiting.put(lambda: self._write_frameset(measurement), "framesets")
-        else:
-            self._put(lambda: self._writer.add(measurement))
+        lane = _FRAMESETS if isinstance(measurement, FrameSet) else ""
+        self._queue.put((self._writer.add, measurement), lane)
 
     def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
         """See `Output`."""
-        self._put(lambda: self._writer.add_estimate(estimate))
+        self._queue.put((self._writer.add_estimate, estimate))
 
     def add_event(self, event: Event) -> None:
         """See `Output`."""
-        self._put(lambda: self._writer.add_event(event))
+        self._queue.put((self._writer.add_event, event))
 
     def status(self) -> Mapping[str, float | int | str | None]:
         """See `Output`."""
         return {
             "recorded_framesets": self._framesets,
             "recorded_poses": self._writer.poses,
-            "framesets_not_recorded": self._waiting.dropped("framesets") + self._failed_framesets,
-            "messages_not_recorded": self._waiting.dropped() + self._failed_messages,
+            "framesets_not_recorded": self._queue.dropped(_FRAMESETS) + self._failed_framesets,
+            "messages_not_recorded": self._queue.dropped() + self._failed_messages,
             "recording_stopped": self._writer.stopped or (str(self.failure) if self.failure else ""),
             "disk_free_gb": self._free_gb(),
         }
 
     def close(self) -> None:
         """Write all that waits, and finish the file."""
-        self._waiting.close()
+        self._queue.close()
         self._thread.join()
-
-    def _put(self, write: Callable[[], None]) -> None:
-        self._waiting.put(lambda: self._write_message(write))
 
     def _free_gb(self) -> float | None:
         try:
@@ -94,23 +93,20 @@ class SessionRecorder(Output):
         except OSError:  # the disk was taken away
             return None
 
-    def _write_frameset(self, frameset: FrameSet) -> None:
-        is_written = self._is_written(lambda: self._writer.add(frameset))
-        self._framesets += is_written
-        self._failed_framesets += not is_written
+    def _run(self) -> None:
+        with self._writer:
+            while (item := self._queue.get()) is not None:
+                is_written = self._is_written(*item)
+                if isinstance(item[1], FrameSet):
+                    self._framesets += is_written
+                    self._failed_framesets += not is_written
+                else:
+                    self._failed_messages += not is_written
 
-    def _write_message(self, write: Callable[[], None]) -> None:
-        self._failed_messages += not self._is_written(write)
-
-    def _is_written(self, write: Callable[[], None]) -> bool:
+    def _is_written(self, write: Callable[[Any], None], message: Any) -> bool:
         try:
-            write()
+            write(message)
         except Exception as error:  # a message that cannot be written is no reason to stop the others
             self.failure = error
             return False
         return self._writer.stopped is None
-
-    def _write(self) -> None:
-        with self._writer:
-            while (write := self._waiting.get()) is not None:
-                write()
