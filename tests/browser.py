@@ -1,4 +1,4 @@
-"""A headless Chromium, driven by its DevTools protocol over pipes, and ports for what it looks at."""
+"""A headless Chromium, driven by the DevTools protocol over pipes, and free ports for a web view."""
 
 import base64
 import json
@@ -19,7 +19,7 @@ _ANSWER_S = 60.0
 
 
 def free_options() -> WebOptions:
-    """Two ports next to each other that nobody listens on."""
+    """Options with two free consecutive ports."""
     while True:
         with socket.socket() as one, socket.socket() as other, suppress(OSError):
             one.bind(("127.0.0.1", 0))
@@ -76,18 +76,18 @@ class Browser:
         os.close(self._from)
 
     def open(self, url: str) -> None:
-        """Go there, and wait until the page is loaded."""
+        """Navigate to an address and wait until the page is loaded."""
         self._is_loaded = False
         self.ask("Page.navigate", {"url": url})
         while not self._is_loaded:
             self._read()
 
     def screenshot(self) -> bytes:
-        """The page as PNG."""
+        """Take a screenshot as PNG."""
         return base64.b64decode(self.ask("Page.captureScreenshot", {"format": "png"})["data"])
 
     def value(self, expression: str) -> Any:
-        """Of JavaScript in the page."""
+        """Evaluate JavaScript in the page."""
         return self.ask("Runtime.evaluate", {"expression": expression, "returnByValue": True})["result"].get("value")
 
     def ask(self, method: str, parameters: dict[str, Any] | None = None) -> Any:

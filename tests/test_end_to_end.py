@@ -1,4 +1,4 @@
-"""The main job, on simulated and on real recordings, through the command line."""
+"""``graphvio run`` on simulated and real recordings."""
 
 import json
 import os
@@ -19,9 +19,8 @@ from graphvio.trajectory_files import load_trajectory
 
 pytestmark = pytest.mark.heavy
 
-
 CLIP = REAL_DATA / "euroc_mh01_clip"
-needs_clip = pytest.mark.skipif(not CLIP.is_dir(), reason=f"the real recording {CLIP.name} is not beside the project")
+needs_clip = pytest.mark.skipif(not CLIP.is_dir(), reason=f"the real recording {CLIP.name} is not next to the project")
 
 
 def run(source: Path, out: Path, *options: object, command: Callable[..., Ran] = graphvio) -> dict[str, Any]:
@@ -58,14 +57,16 @@ def change_lines(path: Path, change: Any) -> None:
 
 
 @needs_clip
-@pytest.mark.parametrize(("options", "most_m"), [((), 0.0055), (("--no-imu",), 0.006)], ids=["imu", "no-imu"])
-def test_real_clip_from_a_moving_start(tmp_path: Path, options: tuple[str, ...], most_m: float) -> None:
+@pytest.mark.parametrize(("options", "max_ate_m"), [((), 0.0055), (("--no-imu",), 0.006)], ids=["imu", "no-imu"])
+def test_run_real_clip_started_in_motion_is_accurate(
+    tmp_path: Path, options: tuple[str, ...], max_ate_m: float
+) -> None:
     summary = run(CLIP, tmp_path / "out", *options)
     assert summary["framesets"] == summary["estimated"] == 340
     assert summary["completion"] == 1.0
     assert summary["input_faults"] == {"frame_gap": 1}
     assert summary["resets"] == 0
-    assert summary["evaluation"]["ate_position_m"]["rmse"] < most_m
+    assert summary["evaluation"]["ate_position_m"]["rmse"] < max_ate_m
     if not options:
         assert_gravity_and_gyro_bias_are_found(tmp_path / "out")
 
@@ -89,7 +90,7 @@ def assert_gravity_and_gyro_bias_are_found(out: Path) -> None:
 # ---------------------------------------------------------------- simulated data
 
 
-def test_results_are_complete_accurate_and_repeatable(room_walk: Path, tmp_path: Path) -> None:
+def test_run_is_complete_accurate_and_repeatable(room_walk: Path, tmp_path: Path) -> None:
     summary = run(room_walk, tmp_path / "a")
     run(room_walk, tmp_path / "b", command=graphvio_alone)
     for name in ("trajectory.txt", "pairs.csv"):
@@ -112,29 +113,29 @@ def test_results_are_complete_accurate_and_repeatable(room_walk: Path, tmp_path:
 
 
 @pytest.mark.parametrize("pair", [0, 1])
-def test_one_pair_alone(room_walk: Path, tmp_path: Path, pair: int) -> None:
+def test_run_with_one_pair_is_accurate(room_walk: Path, tmp_path: Path, pair: int) -> None:
     summary = run(room_walk, tmp_path / "out", "--pairs", pair)
     assert summary["completion"] == 1.0
     (medians,) = summary["pair_medians"].values()
     assert medians["rms_px"] < 1.0
-    assert medians["own_rms_px"] is None  # there is no other motion
+    assert medians["own_rms_px"] is None  # there is no motion of other pairs
     assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.03
 
 
-def test_without_imu_and_with_the_papers_baseline(room_walk: Path, tmp_path: Path) -> None:
+def test_run_without_imu_with_paper_profile_is_accurate(room_walk: Path, tmp_path: Path) -> None:
     summary = run(room_walk, tmp_path / "out", "--no-imu", "--config", "paper")
     assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.03
     assert (tmp_path / "out/imu_bias.csv").read_text().count("\n") == 1  # the header alone
 
 
-def test_from_and_to(room_walk: Path, tmp_path: Path) -> None:
+def test_run_from_to_uses_interval(room_walk: Path, tmp_path: Path) -> None:
     summary = run(room_walk, tmp_path / "out", "--from", 2, "--to", 4)
     assert summary["framesets"] == 41
     assert summary["completion"] == 1.0
     assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.03
 
 
-def test_a_broken_image_costs_only_its_pair_at_that_instant(room_walk: Path, tmp_path: Path) -> None:
+def test_run_with_damaged_image_leaves_out_its_pair(room_walk: Path, tmp_path: Path) -> None:
     broken = copy_of(room_walk, tmp_path / "broken")
     image = sorted((broken / "mav0/cam1/data").iterdir())[50]
     whole = image.read_bytes()
@@ -148,7 +149,7 @@ def test_a_broken_image_costs_only_its_pair_at_that_instant(room_walk: Path, tmp
     assert image.name in next(e["detail"] for e in events if e["kind"] == "image_undecodable")
 
 
-def test_an_imu_gap_of_two_seconds_is_bridged_by_vision(room_walk: Path, tmp_path: Path) -> None:
+def test_run_with_imu_gap_keeps_tracking(room_walk: Path, tmp_path: Path) -> None:
     gap = copy_of(room_walk, tmp_path / "gap")
     change_lines(gap / "mav0/imu0/data.csv", lambda lines: lines[:400] + lines[800:])
     summary = run(gap, tmp_path / "out")
@@ -158,7 +159,7 @@ def test_an_imu_gap_of_two_seconds_is_bridged_by_vision(room_walk: Path, tmp_pat
     assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.02
 
 
-def test_stamps_that_go_backwards_are_left_out(room_walk: Path, tmp_path: Path) -> None:
+def test_run_with_backward_stamps_leaves_them_out(room_walk: Path, tmp_path: Path) -> None:
     def swap(lines: list[str]) -> list[str]:
         return [*lines[:40], lines[41], lines[40], *lines[42:]]
 
@@ -174,7 +175,7 @@ def test_stamps_that_go_backwards_are_left_out(room_walk: Path, tmp_path: Path) 
     assert (np.diff(stamps) > 0).all()
 
 
-def test_blind_framesets_end_with_exit_code_3(room_walk: Path, tmp_path: Path) -> None:
+def test_run_with_grey_images_exits_with_3(room_walk: Path, tmp_path: Path) -> None:
     blind = copy_of(room_walk, tmp_path / "blind")
     for cam in range(4):
         for image in sorted((blind / f"mav0/cam{cam}/data").iterdir())[40:]:
@@ -194,7 +195,7 @@ def _grey_png() -> bytes:
     return cv2.imencode(".png", np.full((480, 640), 128, dtype=np.uint8))[1].tobytes()
 
 
-def test_a_truth_that_cannot_be_read_costs_only_the_figures(room_walk: Path, tmp_path: Path) -> None:
+def test_run_with_unreadable_truth_has_no_evaluation(room_walk: Path, tmp_path: Path) -> None:
     spoilt = copy_of(room_walk, tmp_path / "spoilt")
     truth = spoilt / "mav0/state_groundtruth_estimate0/data.csv"
     truth.write_text(truth.read_text() + "no,pose,at,all\n")
@@ -243,7 +244,7 @@ def write_as_kitti(recording: Path, sequence: Path, frames: int) -> None:
     truth.write_text("".join(" ".join(map(str, pose[:3].ravel())) + "\n" for pose in poses))
 
 
-def test_kitti_odometry_with_poses(room_walk: Path, tmp_path: Path) -> None:
+def test_run_kitti_sequence_is_accurate(room_walk: Path, tmp_path: Path) -> None:
     sequence = tmp_path / "sequences/07"
     write_as_kitti(room_walk, sequence, frames=80)
     summary = run(sequence, tmp_path / "out")
@@ -252,12 +253,12 @@ def test_kitti_odometry_with_poses(room_walk: Path, tmp_path: Path) -> None:
     assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.02
 
 
-def test_a_viewer_recording_inside_the_results(room_walk: Path, tmp_path: Path) -> None:
+def test_run_saves_viewer_recording_in_results(room_walk: Path, tmp_path: Path) -> None:
     run(room_walk, tmp_path / "out", "--to", 0.5, "--save-rrd", tmp_path / "out/run.rrd")
     assert (tmp_path / "out/run.rrd").stat().st_size > 10_000
 
 
-def test_a_run_that_cannot_begin_leaves_no_folder(room_walk: Path, tmp_path: Path) -> None:
+def test_run_that_cannot_start_leaves_no_folder(room_walk: Path, tmp_path: Path) -> None:
     other = copy_of(room_walk, tmp_path / "other")
     (other / "rig.yaml").write_text((other / "rig.yaml").read_text().replace("[640, 480]", "[752, 480]"))
     assert "image is 640x480, the rig says 752x480" in refused(graphvio("run", other, "--out", tmp_path / "out"))
@@ -267,7 +268,7 @@ def test_a_run_that_cannot_begin_leaves_no_folder(room_walk: Path, tmp_path: Pat
 # ---------------------------------------------------------------- mistakes
 
 
-def test_unreadable_and_empty_folders(tmp_path: Path) -> None:
+def test_run_unusable_source_exits_with_2(tmp_path: Path) -> None:
     assert "does not exist" in refused(graphvio("run", tmp_path / "nowhere"))
     (tmp_path / "file").write_text("no folder")
     assert "is no recording that graphvio knows" in refused(graphvio("run", tmp_path / "file"))
@@ -278,7 +279,7 @@ def test_unreadable_and_empty_folders(tmp_path: Path) -> None:
     assert "known layouts" in refused(graphvio("run", tmp_path / "other"))
 
 
-def test_mistakes_in_the_options(room_walk: Path, tmp_path: Path) -> None:
+def test_run_invalid_options_exit_with_2(room_walk: Path, tmp_path: Path) -> None:
     (tmp_path / "typo.yaml").write_text("motion: {cauchy_scale: 2.0}")
     assert "did you mean 'cauchy_scale_px'" in refused(graphvio("run", room_walk, "--config", tmp_path / "typo.yaml"))
     assert "no pair 7" in refused(graphvio("run", room_walk, "--pairs", "0,7"))
@@ -288,7 +289,7 @@ def test_mistakes_in_the_options(room_walk: Path, tmp_path: Path) -> None:
     assert "not empty" in refused(graphvio("run", room_walk, "--out", tmp_path / "full", "--to", 0.2))
 
 
-def test_mistakes_of_usage_are_one_line_too(tmp_path: Path) -> None:
+def test_usage_errors_are_one_line(tmp_path: Path) -> None:
     assert "Missing argument" in refused(graphvio("run"))
     assert "--from" in refused(graphvio("run", tmp_path, "--from", "soon"))
     assert "No such option" in refused(graphvio("run", tmp_path, "--nope"))
@@ -296,13 +297,13 @@ def test_mistakes_of_usage_are_one_line_too(tmp_path: Path) -> None:
     assert graphvio("--help").returncode == 0
 
 
-def test_verbose_shows_the_traceback(tmp_path: Path) -> None:
+def test_run_verbose_shows_traceback(tmp_path: Path) -> None:
     done = graphvio("run", tmp_path / "nowhere", "--verbose")
     assert done.returncode != 0
     assert "Traceback" in done.stderr
 
 
-def test_default_folders_are_numbered(room_walk: Path, tmp_path: Path) -> None:
+def test_run_without_out_numbers_folders(room_walk: Path, tmp_path: Path) -> None:
     for number in (1, 2):
         done = graphvio("run", room_walk, "--to", 0.5, folder=tmp_path)
         assert done.returncode == 0, done.stderr

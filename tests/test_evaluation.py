@@ -79,7 +79,7 @@ def test_rpe_agrees_with_evo(pair: tuple[Evaluation, Any, Any], name: str, delta
         agrees(stats, rpe)
 
 
-def test_equal_trajectories_have_no_error_in_whatever_frame() -> None:
+def test_evaluate_equal_trajectories_in_other_frame_has_no_error() -> None:
     figures = evaluate(walk().transformed(ELSEWHERE), walk())
     assert figures.ate_position_m.max < 1e-9
     assert figures.ate_rotation_deg.max < 1e-6
@@ -90,7 +90,7 @@ def test_equal_trajectories_have_no_error_in_whatever_frame() -> None:
     assert figures.associated == figures.estimates == 1600
 
 
-def test_umeyama_finds_the_transform_and_never_a_mirror() -> None:
+def test_umeyama_finds_transform_and_no_reflection() -> None:
     points = np.random.default_rng(1).normal(size=(50, 3))
     found = umeyama_se3(points, points @ ELSEWHERE[:3, :3].T + ELSEWHERE[:3, 3])
     np.testing.assert_allclose(found, ELSEWHERE, atol=1e-12)
@@ -103,7 +103,7 @@ def straight(count: int, per_pose_m: Float) -> Trajectory:
     return Trajectory(np.arange(count) * 50_000_000, poses)
 
 
-def test_drift_of_a_wrong_scale_is_the_error_at_the_end_by_path() -> None:
+def test_drift_of_wrong_scale_is_error_at_end_by_path() -> None:
     truth = straight(2001, np.array([0.05, 0.0, 0.0]))
     figures = evaluate(straight(2001, np.array([0.051, 0.0, 0.0])), truth)
     assert figures.path_length_m == pytest.approx(100.0)
@@ -114,7 +114,7 @@ def test_drift_of_a_wrong_scale_is_the_error_at_the_end_by_path() -> None:
     assert figures.ate_rotation_deg.max < 1e-6  # although positions on a line leave the roll undefined
 
 
-def test_loop_closure_error_in_metres_and_percent() -> None:
+def test_loop_closure_error_is_in_metres_and_percent() -> None:
     truth = walk(turns=1.0)
     poses = truth.nav_T_body.copy()
     poses[:, :3, 3] += np.linspace(0.0, 1.0, len(poses))[:, None] * [0.3, 0.0, 0.4]
@@ -124,7 +124,7 @@ def test_loop_closure_error_in_metres_and_percent() -> None:
     assert figures.loop_closure.error_percent == pytest.approx(50.0 / figures.path_length_m, rel=1e-3)
 
 
-def test_at_rest_there_is_no_percentage() -> None:
+def test_evaluate_at_standstill_has_no_percentage() -> None:
     figures = evaluate(straight(100, np.zeros(3)).transformed(ELSEWHERE), straight(100, np.zeros(3)))
     assert figures.ate_percent is None
     assert figures.drift_percent is None
@@ -133,7 +133,7 @@ def test_at_rest_there_is_no_percentage() -> None:
     assert list(figures.rpe) == ["1 s"]
 
 
-def test_truth_is_interpolated_and_its_gaps_left_out() -> None:
+def test_evaluate_interpolates_truth_and_leaves_out_gaps() -> None:
     truth, estimate = walk(), walk()
     late = Trajectory(estimate.stamps_ns[:-1] + 25_000_000, 0.5 * (estimate.nav_T_body[:-1] + estimate.nav_T_body[1:]))
     kept = np.ones(len(truth), dtype=bool)
@@ -144,7 +144,7 @@ def test_truth_is_interpolated_and_its_gaps_left_out() -> None:
 
 
 @pytest.mark.parametrize("shift_s", [0, 4000])
-def test_too_little_in_common_is_explained(shift_s: int) -> None:
+def test_evaluate_too_few_associated_raises(shift_s: int) -> None:
     truth = walk(100)
     few = Trajectory(truth.stamps_ns + shift_s * 10**9, truth.nav_T_body).select(slice(0, 2 if shift_s == 0 else 50))
     with pytest.raises(TrajectoryError, match="at least 3 are needed") as caught:
@@ -152,7 +152,7 @@ def test_too_little_in_common_is_explained(shift_s: int) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_figures_are_plain_values() -> None:
+def test_as_dict_is_valid_json() -> None:
     import json
 
     figures = json.loads(json.dumps(evaluate(walk(drift_m=0.01), walk()).as_dict(), allow_nan=False))

@@ -39,7 +39,7 @@ def pose(k: int) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def reports(k: int) -> dict[int, PairReport]:
-    """Both pairs, the rear one first; that has no images at every third frameset, and never a motion of its own."""
+    """Both pairs, the rear one first: without images in every third frameset, and without a motion of its own."""
     nothing = np.zeros((0, 2)), np.zeros(0, dtype=bool)
     front = PairReport(
         50, k, *nothing, rms_px=0.2 + 0.01 * k if k else None, own_inliers=k + 1, own_rms_px=0.1 + 0.003 * k,
@@ -102,7 +102,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_folder_holds_what_was_promised(folder: Path) -> None:
+def test_writer_writes_all_files(folder: Path) -> None:
     assert sorted(file.name for file in folder.iterdir()) == [
         "config.yaml",
         "covariance.csv",
@@ -119,7 +119,7 @@ def test_folder_holds_what_was_promised(folder: Path) -> None:
     assert load_rig(folder / "rig.yaml").pairs[0].baseline_m == pytest.approx(0.1)
 
 
-def test_trajectory_has_one_line_for_each_pose(folder: Path) -> None:
+def test_trajectory_has_one_line_per_pose(folder: Path) -> None:
     lines = (folder / "trajectory.txt").read_text().splitlines()
     assert len(lines) == COUNT - len(LOST)
     assert lines[1].startswith("1403636579.813555584 0.100000000 ")
@@ -128,7 +128,7 @@ def test_trajectory_has_one_line_for_each_pose(folder: Path) -> None:
     assert len(load_trajectory(folder / "trajectory_smoothed.txt")) == 2
 
 
-def test_covariance_is_the_upper_triangle_row_by_row(folder: Path) -> None:
+def test_covariance_is_upper_triangle_by_rows(folder: Path) -> None:
     lines = (folder / "covariance.csv").read_text().splitlines()
     header = lines[0].split(",")
     assert len(header) == 22
@@ -139,7 +139,7 @@ def test_covariance_is_the_upper_triangle_row_by_row(folder: Path) -> None:
     assert len(lines) == 1 + COUNT - len(LOST)
 
 
-def test_biases_and_events(folder: Path) -> None:
+def test_biases_and_events_are_written(folder: Path) -> None:
     bias = np.loadtxt(folder / "imu_bias.csv", delimiter=",", skiprows=1)
     assert bias.shape == (COUNT, 7)
     np.testing.assert_allclose(bias[0, 1:], [0.001, 0.002, 0.003, 0.1, 0.2, 0.3])
@@ -152,7 +152,7 @@ def test_biases_and_events(folder: Path) -> None:
     assert len(events) == 2
 
 
-def test_pairs_have_a_line_for_each_report_with_a_pose_or_without(folder: Path) -> None:
+def test_pairs_have_one_line_per_report_with_or_without_pose(folder: Path) -> None:
     text = (folder / "pairs.csv").read_text()
     header, *rows = csv.reader(text.splitlines())
     assert header == ["stamp_ns", "pair", "points", "inliers", "rms_px", "own_inliers", "own_rms_px"]
@@ -164,14 +164,14 @@ def test_pairs_have_a_line_for_each_report_with_a_pose_or_without(folder: Path) 
     ]
     assert [(int(row[0]), row[1]) for row in rows] == [(stamp, name) for stamp, name, _ in expected]
     for row, (_, _, report) in zip(rows, expected, strict=True):
-        told = [report.points, report.inliers, report.rms_px, report.own_inliers, report.own_rms_px]
-        assert [float(field) if field else None for field in row[2:]] == pytest.approx(told, abs=1e-9)
+        expected_fields = [report.points, report.inliers, report.rms_px, report.own_inliers, report.own_rms_px]
+        assert [float(field) if field else None for field in row[2:]] == pytest.approx(expected_fields, abs=1e-9)
     lines = text.splitlines()
     assert lines[1] == f"{START_NS},front,50,0,,1,1.000000000e-01"
     assert lines[3] == f'{START_NS + STEP_NS},"rear, low",7,0,,,'
 
 
-def test_pair_medians(folder: Path) -> None:
+def test_pair_medians_ignore_missing_values(folder: Path) -> None:
     medians = json.loads((folder / "summary.json").read_text())["pair_medians"]
     assert medians == {
         "front": {"inliers": 29.5, "rms_px": 0.5, "own_rms_px": 0.1885},
@@ -179,12 +179,12 @@ def test_pair_medians(folder: Path) -> None:
     }
 
 
-def test_what_each_test_threw_out_is_counted(folder: Path) -> None:
+def test_pair_rejected_counts_by_test(folder: Path) -> None:
     rejected = json.loads((folder / "summary.json").read_text())["pair_rejected"]
     assert rejected == {"front": {"epipolar": COUNT, "search": COUNT * (COUNT - 1) // 2}, "rear, low": {}}
 
 
-def test_a_residual_that_is_not_finite_spoils_no_summary(tmp_path: Path) -> None:
+def test_summary_with_infinite_residual_has_null(tmp_path: Path) -> None:
     behind = PairReport(1, 1, np.zeros((1, 2)), np.ones(1, dtype=bool), rms_px=np.inf)
     with ResultWriter(tmp_path / "behind", some_rig(), "") as writer:
         writer.add(Estimate(START_NS, Status.LOST, None, None, pairs={0: behind}))
@@ -193,7 +193,7 @@ def test_a_residual_that_is_not_finite_spoils_no_summary(tmp_path: Path) -> None
     assert json.loads((tmp_path / "behind" / "summary.json").read_text())["pair_medians"]["front"]["rms_px"] is None
 
 
-def test_summary(folder: Path) -> None:
+def test_summary_has_figures_of_run(folder: Path) -> None:
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["framesets"] == COUNT
     assert summary["estimated"] == COUNT - len(LOST)
@@ -211,14 +211,14 @@ def test_summary(folder: Path) -> None:
     assert summary["evaluation"]["ate_position_m"]["rmse"] < 1e-9
 
 
-def test_path_does_not_count_the_jump_into_a_new_epoch(folder: Path) -> None:
+def test_path_length_leaves_out_step_between_epochs(folder: Path) -> None:
     positions = np.array([pose(k)[:3, 3] for k in range(COUNT)])
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     expected = steps.sum() - steps[LOST.start - 1 : LOST.stop].sum()
     assert json.loads((folder / "summary.json").read_text())["path_length_m"] == pytest.approx(expected)
 
 
-def test_equal_input_gives_equal_bytes(folder: Path, tmp_path: Path) -> None:
+def test_writer_with_equal_input_writes_equal_bytes(folder: Path, tmp_path: Path) -> None:
     write_all(tmp_path / "again")
     for name in (
         "trajectory.txt", "trajectory_smoothed.txt", "covariance.csv", "imu_bias.csv", "pairs.csv", "events.jsonl",
@@ -226,7 +226,7 @@ def test_equal_input_gives_equal_bytes(folder: Path, tmp_path: Path) -> None:
         assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes(), name
 
 
-def test_folders_are_numbered_and_never_overwritten(folder: Path, tmp_path: Path) -> None:
+def test_new_folder_is_numbered_and_never_overwritten(folder: Path, tmp_path: Path) -> None:
     assert [ResultWriter.new_folder(tmp_path / "r", "walk").name for _ in range(3)] == ["walk-1", "walk-2", "walk-3"]
     before = (folder / "trajectory.txt").read_bytes()
     with pytest.raises(GraphvioError, match="is not empty"):
@@ -234,7 +234,7 @@ def test_folders_are_numbered_and_never_overwritten(folder: Path, tmp_path: Path
     assert (folder / "trajectory.txt").read_bytes() == before
 
 
-def test_a_run_that_breaks_off_leaves_what_it_had(tmp_path: Path) -> None:
+def test_writer_of_interrupted_run_leaves_lines(tmp_path: Path) -> None:
     writer = ResultWriter(tmp_path / "broken", some_rig(), "")
     for estimate in estimates()[:7]:
         writer.add(estimate)
@@ -243,7 +243,7 @@ def test_a_run_that_breaks_off_leaves_what_it_had(tmp_path: Path) -> None:
     assert not (tmp_path / "broken" / "summary.json").exists()
 
 
-def test_without_a_single_pose_there_is_still_a_summary(tmp_path: Path) -> None:
+def test_finish_without_pose_writes_summary(tmp_path: Path) -> None:
     truth = Trajectory(START_NS + STEP_NS * np.arange(COUNT), np.array([pose(k) for k in range(COUNT)]))
     with ResultWriter(tmp_path / "none", some_rig(), "") as writer:
         summary = finish(writer, truth, framesets=0)
@@ -257,7 +257,7 @@ def test_without_a_single_pose_there_is_still_a_summary(tmp_path: Path) -> None:
     assert (tmp_path / "none" / "trajectory.png").stat().st_size > 0
 
 
-def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+def test_writer_with_unusable_folder_raises(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(GraphvioError, match="cannot be written"):
         ResultWriter(tmp_path / "file" / "x", some_rig(), "")

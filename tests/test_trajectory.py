@@ -16,7 +16,7 @@ def some_trajectory(count: int = 20) -> Trajectory:
     return Trajectory(START_NS + 50_000_001 * np.arange(count), np.array(poses))
 
 
-def test_what_is_written_is_read_to_the_nanosecond(tmp_path: Path) -> None:
+def test_save_then_load_returns_equal_stamps_and_poses(tmp_path: Path) -> None:
     written = some_trajectory()
     save_trajectory(written, tmp_path / "t.txt")
     read = load_trajectory(tmp_path / "t.txt")
@@ -35,17 +35,17 @@ def test_what_is_written_is_read_to_the_nanosecond(tmp_path: Path) -> None:
         ("7", 7_000_000_000),
     ],
 )
-def test_seconds_are_converted_exactly(text: str, stamp: int) -> None:
+def test_stamp_ns_from_seconds_is_exact(text: str, stamp: int) -> None:
     assert stamp_ns_from_seconds(text) == stamp
 
 
 @pytest.mark.parametrize("text", ["nan", "inf", "x", "", "1e99", "1e999999999"])
-def test_no_time(text: str) -> None:
+def test_stamp_ns_from_seconds_invalid_text_raises(text: str) -> None:
     with pytest.raises(ValueError, match="is no time"):
         stamp_ns_from_seconds(text)
 
 
-def test_line_has_nine_decimals_positive_scalar_part_and_no_negative_zero() -> None:
+def test_tum_line_has_nine_decimals_positive_scalar_part_and_no_negative_zero() -> None:
     turned = so3_exp(np.array([0.0, 0.0, 1.5 * np.pi]))  # w < 0 if taken as it comes
     line = tum_line(-5, se3(turned, np.array([-1e-12, 1.0, -2.0])))
     assert line.split()[:4] == ["-0.000000005", "0.000000000", "1.000000000", "-2.000000000"]
@@ -53,7 +53,7 @@ def test_line_has_nine_decimals_positive_scalar_part_and_no_negative_zero() -> N
     np.testing.assert_allclose([float(v) for v in line.split()[6:]], [-np.sqrt(0.5), np.sqrt(0.5)], atol=1e-9)
 
 
-def test_euroc_has_the_scalar_part_first(tmp_path: Path) -> None:
+def test_load_euroc_reads_scalar_part_first(tmp_path: Path) -> None:
     file = tmp_path / "data.csv"
     file.write_text(
         "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v\n"
@@ -65,7 +65,7 @@ def test_euroc_has_the_scalar_part_first(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.positions[0], [1, 2, 3])
 
 
-def test_commas_with_stamps_in_seconds_are_tum(tmp_path: Path) -> None:
+def test_load_commas_with_decimal_stamps_is_tum(tmp_path: Path) -> None:
     file = tmp_path / "device.csv"
     file.write_text("12.5, 1, 2, 3, 0, 0, 0.6, 0.8\n12.5, 1, 2, 3, 0, 0, 0.6, 0.8\n12.53, 1, 2, 4, 0, 0, 0, 1\n")
     read = load_trajectory(file)
@@ -73,7 +73,7 @@ def test_commas_with_stamps_in_seconds_are_tum(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.rotations[0] @ [1, 0, 0], [0.28, 0.96, 0.0], atol=1e-12)
 
 
-def test_header_without_comment_sign_is_skipped(tmp_path: Path) -> None:
+def test_load_header_without_comment_sign_is_skipped(tmp_path: Path) -> None:
     file = tmp_path / "t.csv"
     file.write_text("stamp_ns,x,y,z,qw,qx,qy,qz\n5,1,2,3,1,0,0,0\n")
     assert load_trajectory(file).stamps_ns.tolist() == [5]
@@ -95,7 +95,7 @@ def test_header_without_comment_sign_is_skipped(tmp_path: Path) -> None:
         ("99999999999999999999,0,0,0,1,0,0,0\n", "is no time"),
     ],
 )
-def test_unusable_files_are_refused_with_the_place(tmp_path: Path, text: str, message: str) -> None:
+def test_load_invalid_line_raises_with_its_number(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / "bad.txt"
     file.write_text(text)
     with pytest.raises(TrajectoryError, match=message) as caught:
@@ -104,7 +104,7 @@ def test_unusable_files_are_refused_with_the_place(tmp_path: Path, text: str, me
     assert "\n" not in str(caught.value)
 
 
-def test_missing_and_binary_files_are_refused(tmp_path: Path) -> None:
+def test_load_or_save_unusable_path_raises(tmp_path: Path) -> None:
     (tmp_path / "binary").write_bytes(bytes(range(128, 256)))
     with pytest.raises(TrajectoryError, match="not a text file"):
         load_trajectory(tmp_path / "binary")
@@ -114,7 +114,7 @@ def test_missing_and_binary_files_are_refused(tmp_path: Path) -> None:
         save_trajectory(some_trajectory(), tmp_path / "no" / "folder.txt")
 
 
-def test_poses_that_are_none_are_refused() -> None:
+def test_trajectory_invalid_values_raise() -> None:
     good = some_trajectory(3)
     bad = good.nav_T_body.copy()
     bad[1, 0, 3] = np.inf
@@ -126,7 +126,7 @@ def test_poses_that_are_none_are_refused() -> None:
         Trajectory(good.stamps_ns[::-1], good.nav_T_body)
 
 
-def test_interpolation_is_linear_in_position_and_slerp_in_rotation() -> None:
+def test_at_interpolates_linearly_and_by_slerp() -> None:
     poses = np.array(
         [se3(so3_exp(np.array([0.0, 0.0, a])), np.array([x, 0.0, 0.0])) for a, x in ((0.0, 0.0), (1.0, 4.0))]
     )
@@ -136,19 +136,19 @@ def test_interpolation_is_linear_in_position_and_slerp_in_rotation() -> None:
     np.testing.assert_allclose(between.rotations[1], so3_exp(np.array([0.0, 0.0, 0.25])), atol=1e-12)
 
 
-def test_gaps_are_not_bridged_but_equal_stamps_always_count() -> None:
+def test_at_leaves_out_gaps_but_not_equal_stamps() -> None:
     trajectory = Trajectory(np.array([0, 10, 2_000_000_000]), some_trajectory(3).nav_T_body)
     _, known = trajectory.at(np.array([5, 10, 1_000_000_000, 2_000_000_000]), max_gap_s=0.1)
     assert known.tolist() == [True, True, False, True]
 
 
-def test_interpolation_in_one_pose_or_none() -> None:
+def test_at_with_one_pose_or_none() -> None:
     one = some_trajectory(1)
     assert one.at(np.array([START_NS - 1, START_NS, START_NS + 1]), 1.0)[1].tolist() == [False, True, False]
     assert one.select(slice(0, 0)).at(np.array([START_NS]), 1.0)[1].tolist() == [False]
 
 
-def test_distances_and_frames() -> None:
+def test_distances_duration_and_transformed() -> None:
     trajectory = some_trajectory(3)
     np.testing.assert_allclose(trajectory.distances, [0.0, 1.5, 3.0])
     other_T_nav = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([1.0, 0.0, 0.0]))

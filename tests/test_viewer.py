@@ -92,7 +92,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def test_recording_can_be_loaded_and_holds_every_entity(recording: Path) -> None:
+def test_recording_has_every_entity(recording: Path) -> None:
     printed("verify", str(recording))
     entities = rows_of(recording)
     for entity in (
@@ -116,7 +116,7 @@ def test_recording_can_be_loaded_and_holds_every_entity(recording: Path) -> None
         assert entities.get(entity, 0) > 0, entity
 
 
-def test_no_pose_is_dropped_though_images_are(recording: Path) -> None:
+def test_viewer_that_is_slow_drops_images_but_no_pose(recording: Path) -> None:
     entities = rows_of(recording)
     assert entities["/world/rig"] == 245  # all but those lost
     assert entities["/world/rig/uncertainty"] == 245
@@ -125,7 +125,7 @@ def test_no_pose_is_dropped_though_images_are(recording: Path) -> None:
     assert entities["/events"] == 4  # tracking, lost, tracking, and the event
 
 
-def test_residuals_of_each_pair_are_curves_without_those_that_are_not_known(tmp_path: Path) -> None:
+def test_residuals_of_each_pair_are_logged_where_available(tmp_path: Path) -> None:
     shown = []
     for k in range(30):
         joint_px, own_px = 0.3 + 0.01 * k if k else None, 0.1 + 0.02 * k if k % 2 else None
@@ -142,7 +142,7 @@ def test_residuals_of_each_pair_are_curves_without_those_that_are_not_known(tmp_
     assert scalars_of(tmp_path / "r.rrd", "/points/front/inliers") == {e.stamp_ns: 40.0 for e in shown}
 
 
-def test_handing_over_is_cheap_and_drawing_never_holds_it_up(tmp_path: Path, monkeypatch: Any) -> None:
+def test_show_returns_at_once_while_logging_is_slow(tmp_path: Path, monkeypatch: Any) -> None:
     from graphvio.viewer.recording import Recording
 
     monkeypatch.setattr(Recording, "add_images", lambda *_: time.sleep(0.2))
@@ -159,7 +159,7 @@ def test_handing_over_is_cheap_and_drawing_never_holds_it_up(tmp_path: Path, mon
     assert rows_of(tmp_path / "slow.rrd")["/timing/track"] == 100
 
 
-def test_a_failure_of_drawing_is_told_at_the_end_only(tmp_path: Path, monkeypatch: Any) -> None:
+def test_close_after_failure_of_logging_raises(tmp_path: Path, monkeypatch: Any) -> None:
     from graphvio.viewer.recording import Recording
 
     def fail(*_: object) -> None:
@@ -176,7 +176,7 @@ def test_a_failure_of_drawing_is_told_at_the_end_only(tmp_path: Path, monkeypatc
     assert not [t for t in threading.enumerate() if t.name == "viewer"]
 
 
-def test_an_error_of_the_run_is_not_hidden_by_one_of_drawing(tmp_path: Path, monkeypatch: Any) -> None:
+def test_exit_after_error_of_run_and_of_logging_raises_that_of_run(tmp_path: Path, monkeypatch: Any) -> None:
     from graphvio.viewer.recording import Recording
 
     def fail(*_: object) -> None:
@@ -202,7 +202,7 @@ def test_ellipsoid_has_the_axes_of_the_covariance() -> None:
     )
 
 
-def test_without_a_display_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_viewer_without_display_raises_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
@@ -211,7 +211,7 @@ def test_without_a_display_there_is_one_line(monkeypatch: pytest.MonkeyPatch) ->
     assert "\n" not in str(caught.value)
 
 
-def test_without_rerun_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_viewer_without_rerun_raises_with_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name in [name for name in sys.modules if name.split(".")[0] == "rerun"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.delitem(sys.modules, "graphvio.viewer.recording", raising=False)
@@ -227,14 +227,14 @@ def test_without_rerun_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch, tmp_
         Viewer(some_rig(), save=tmp_path / "x.rrd")
 
 
-def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
+def test_viewer_with_unusable_path_raises(tmp_path: Path) -> None:
     with pytest.raises(GraphvioError, match="cannot be written"):
         Viewer(some_rig(), save=tmp_path / "no" / "x.rrd")
     with pytest.raises(GraphvioError, match="cannot be opened"):
         Viewer(some_rig(), save=tmp_path)
 
 
-def test_results_can_be_shown_again_from_their_files(tmp_path: Path) -> None:
+def test_replay_shows_result_folder(tmp_path: Path) -> None:
     from graphvio.results import ResultWriter
     from graphvio.viewer.replay import read_estimates, replay
 
@@ -273,7 +273,9 @@ def test_results_can_be_shown_again_from_their_files(tmp_path: Path) -> None:
         replay(tmp_path, save=tmp_path / "again.rrd")
 
 
-def test_view_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_view_command_exit_codes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     from graphvio.cli import main
 
     def code_of(*arguments: str) -> int:

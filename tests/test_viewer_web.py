@@ -1,4 +1,4 @@
-"""The view in a browser: what listens where, and what a real browser shows of it."""
+"""The view in a browser: ports and processes of the server, and the page in a real browser."""
 
 import os
 import signal
@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def listening_hosts(port: int) -> set[str]:
-    """Addresses, in hexadecimal as Linux tells them, at which something listens."""
+    """Addresses in hexadecimal, as in /proc/net, at which a process listens."""
     hosts = set()
     for table in ("tcp", "tcp6"):
         for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
@@ -55,7 +55,7 @@ def served() -> Iterator[WebOptions]:
         yield options
 
 
-def test_page_and_data_are_served_on_the_loopback_only(served: WebOptions) -> None:
+def test_web_view_listens_on_loopback_only(served: WebOptions) -> None:
     with urllib.request.urlopen(served.url, timeout=10.0) as page:
         assert page.status == 200
         assert b"<canvas" in page.read()
@@ -64,7 +64,7 @@ def test_page_and_data_are_served_on_the_loopback_only(served: WebOptions) -> No
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium")
-def test_a_browser_shows_the_path(served: WebOptions, tmp_path: Path) -> None:
+def test_web_view_in_browser_shows_path(served: WebOptions, tmp_path: Path) -> None:
     with Browser(tmp_path, (800, 600)) as browser:
         browser.open(served.url)
         shown: AnyArray = np.zeros((0, 0, 3), dtype=np.uint8)
@@ -76,13 +76,13 @@ def test_a_browser_shows_the_path(served: WebOptions, tmp_path: Path) -> None:
             world = shown[60:540, :470]  # the left part of the page
             return bool((np.abs(world.astype(int) - colour).max(axis=2) < 12).sum() > 30)
 
-        # A processor draws what a graphics card would: seconds a picture.
+        # Rendered by the processor, a frame takes seconds.
         until(has_path, "the path is not on the page", 180.0)
         assert browser.value("document.querySelectorAll('canvas').length") == 1
         assert len(np.unique(shown.reshape(-1, 3), axis=0)) > 100
 
 
-def test_closing_ends_what_served_and_the_ports_can_be_used_again() -> None:
+def test_close_frees_both_ports() -> None:
     options = free_options()
     for _ in range(2):
         with Viewer(some_rig(), web=options) as viewer:
@@ -91,7 +91,7 @@ def test_closing_ends_what_served_and_the_ports_can_be_used_again() -> None:
         assert not listening_hosts(options.data_port)
 
 
-def test_a_killed_odometry_leaves_nothing_that_serves() -> None:
+def test_web_host_of_killed_process_ends() -> None:
     options = free_options()
     code = f"""
 import time
@@ -109,7 +109,7 @@ time.sleep(60)
     until(lambda: not listening_hosts(options.port) and not listening_hosts(options.data_port), "it is still served")
 
 
-def test_a_viewer_goes_on_when_what_serves_is_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_viewer_after_end_of_web_host_still_saves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hosts = []
 
     class Host(WebHost):
@@ -126,7 +126,7 @@ def test_a_viewer_goes_on_when_what_serves_is_gone(tmp_path: Path, monkeypatch: 
     assert rows_of(tmp_path / "run.rrd")["/world/rig"] == 20
 
 
-def test_ports_that_are_taken_or_none() -> None:
+def test_web_options_with_unusable_values_raise() -> None:
     options = free_options()
     with socket.socket() as other:
         other.bind(("127.0.0.1", options.data_port))
