@@ -1,4 +1,4 @@
-"""Monte Carlo truth for the covariance of a motion: real geometry of the simulator's scenes, noise that is drawn.
+"""Monte Carlo campaigns on the covariance of a motion: geometry of the simulator's scenes, random noise.
 
 No images are made. Rays of random pixels of the rig's left cameras, at poses of a scene's walk, end on the scene's
 surfaces; the points are projected through the real lenses, and every image point gets noise of its own in pixels.
@@ -30,10 +30,10 @@ from graphvio.simulation.motion import Motion
 from graphvio.simulation.raycast import TILE_PX, first_hits, ray_coefficients, tile_lists
 
 RATE_HZ = 20.0
-_NEAREST_M = 0.3
+_MIN_DEPTH_M = 0.3
 _MARGIN_PX = 2.0
 _TRIES = 40
-_START_SIGMA = np.repeat([0.003, 0.01], 3)  # of the prediction that a search starts from: rad, metres
+_PREDICTION_SIGMA = np.repeat([0.003, 0.01], 3)  # of the initial motion: rad, metres
 
 Choice = Callable[[Float, Float], Bool]
 """Takes pixels (N, 2) in the left image and points (N, 3) in its camera's frame; says which take part (N,)."""
@@ -41,7 +41,7 @@ Choice = Callable[[Float, Float], Bool]
 
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """A scene's surfaces that stand still, (Q, 3, 3) as `ray_coefficients` takes them, and the walk through it."""
+    """The static surfaces of a scene, (Q, 3, 3) as `ray_coefficients` takes them, and the walk through it."""
 
     corners: Float
     motion: Motion
@@ -56,7 +56,7 @@ def walk_through(scene: str) -> Walk:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What frames are drawn under.
+    """Conditions under which frames are sampled.
 
     Attributes:
         scene: name of the simulator's scene.
@@ -74,7 +74,7 @@ class Conditions:
     per_pair: tuple[int, ...] = (150, 150)
     noise_px: float = 0.3
     depth_scale: float = 1.0
-    min_depth_m: float = _NEAREST_M
+    min_depth_m: float = _MIN_DEPTH_M
     outlier_share: float = 0.0
     outlier_px: float = 5.0
     has_right: bool = True
@@ -149,15 +149,15 @@ def arrays_of_walks() -> RigArrays:
     return RigArrays.of(rig_of_walks())
 
 
-def draw_poses(walk: Walk, frames: int, rng: np.random.Generator) -> Float:
+def sample_poses(walk: Walk, frames: int, rng: np.random.Generator) -> Float:
     """Poses ``world_T_body`` (frames + 1, 4, 4) of successive framesets from a random time of the walk on."""
     interval = frames / RATE_HZ
     start = rng.uniform(1.5, walk.motion.duration_s - interval - 2.0)
     return walk.motion.at(start + np.arange(frames + 1) / RATE_HZ).world_T_body
 
 
-def draw_tracks(walk: Walk, poses: Sequence[Float], conditions: Conditions, rng: np.random.Generator) -> Tracks:
-    """True points that every camera of a pair sees from each of some poses; rays start at the first of them."""
+def sample_tracks(walk: Walk, poses: Sequence[Float], conditions: Conditions, rng: np.random.Generator) -> Tracks:
+    """True points that every camera of a pair sees from each of some poses; rays begin at the first of them."""
     pairs, points = [], []
     for j, (pair, wanted) in enumerate(zip(rig_of_walks().pairs, conditions.per_pair, strict=True)):
         found = np.zeros((0, 3))
@@ -201,7 +201,7 @@ def _moved(a_T_b: Float, points: Float) -> Float:
 
 
 def see(tracks: Tracks, world_T_body: Float, conditions: Conditions, rng: np.random.Generator) -> Seen:
-    """Both images of every track with fresh noise, which is drawn in pixels and passes back through the lens."""
+    """Both images of every track with new noise, which is sampled in pixels and passes back through the lens."""
     views = []
     for side in range(2):
         view = np.empty((len(tracks.pair), 2))
@@ -215,7 +215,7 @@ def see(tracks: Tracks, world_T_body: Float, conditions: Conditions, rng: np.ran
     return Seen(*views)
 
 
-def draw_outliers(tracks: Tracks, conditions: Conditions, rng: np.random.Generator) -> Bool:
+def sample_outliers(tracks: Tracks, conditions: Conditions, rng: np.random.Generator) -> Bool:
     """Which tracks (N,) are wrong."""
     return np.asarray(rng.random(len(tracks.pair)) < conditions.outlier_share)
 
@@ -235,7 +235,7 @@ def led_astray(tracks: Tracks, seen: Seen, wrong: Bool, conditions: Conditions, 
 
 
 def observe(tracks: Tracks, reference: Seen, current: Seen, has_right: bool = True) -> Observations:
-    """What the front-end makes of tracks that are seen at two instants."""
+    """Observations of tracks that are seen at two instants."""
     n = len(tracks.pair)
     points, covariances = np.zeros((n, 3)), np.zeros((n, 3, 3))
     focal = arrays_of_walks().focal_px
@@ -253,7 +253,7 @@ def observe(tracks: Tracks, reference: Seen, current: Seen, has_right: bool = Tr
 
 def solve(observations: Observations, true_cur_T_ref: Float, config: MotionConfig, rng: np.random.Generator) -> Refined:
     """The joint motion, from a prediction that is a little off."""
-    off = se3_exp(_START_SIGMA * rng.standard_normal(6))
+    off = se3_exp(_PREDICTION_SIGMA * rng.standard_normal(6))
     return joint_motion(arrays_of_walks(), observations, np.ascontiguousarray(off @ true_cur_T_ref), config, rng)
 
 
@@ -262,13 +262,13 @@ def motion_between(world_T_ref: Float, world_T_cur: Float) -> Float:
     return np.ascontiguousarray(se3_inverse(world_T_cur) @ world_T_ref)
 
 
-def draw_frame(conditions: Conditions, rng: np.random.Generator) -> tuple[Float, Observations]:
+def sample_frame(conditions: Conditions, rng: np.random.Generator) -> tuple[Float, Observations]:
     """A true motion ``cur_T_ref`` over one to five framesets of the walk, and what is observed of it."""
     walk = walk_through(conditions.scene)
-    poses = draw_poses(walk, int(rng.integers(1, 6)), rng)
-    tracks = draw_tracks(walk, (poses[0], poses[-1]), conditions, rng)
+    poses = sample_poses(walk, int(rng.integers(1, 6)), rng)
+    tracks = sample_tracks(walk, (poses[0], poses[-1]), conditions, rng)
     reference = see(tracks, poses[0], conditions, rng)
-    wrong = draw_outliers(tracks, conditions, rng)
+    wrong = sample_outliers(tracks, conditions, rng)
     current = led_astray(tracks, see(tracks, poses[-1], conditions, rng), wrong, conditions, rng)
     return motion_between(poses[0], poses[-1]), observe(tracks, reference, current, conditions.has_right)
 
@@ -278,7 +278,7 @@ def run_campaign(conditions: Conditions, config: MotionConfig, frames: int, seed
     campaign = Campaign()
     for number in range(frames):
         rng = np.random.default_rng([seed, number])
-        truth, observations = draw_frame(conditions, rng)
+        truth, observations = sample_frame(conditions, rng)
         campaign.add(truth, solve(observations, truth, config, rng))
     return campaign
 
@@ -288,12 +288,12 @@ def run_campaign(conditions: Conditions, config: MotionConfig, frames: int, seed
 
 @dataclass(frozen=True, eq=False)
 class SharedErrors:
-    """Errors of two motions from one reference, over many draws of all noise with the same true points and poses.
+    """Errors of two motions from one reference, over many samples of all noise with the same true points and poses.
 
     Attributes:
         first: (M, 6) errors of the first motion, in the body frame at the reference.
         second: (M, 6) of the second.
-        refined: the first motion of each draw.
+        refined: the first motion of each sample.
         true_cur_T_ref: of the first motion.
     """
 
@@ -319,21 +319,21 @@ def at_reference(cur_T_ref: Float, covariance: Float) -> Float:
     return np.asarray(adjoint @ covariance @ adjoint.T)
 
 
-def draw_shared(
-    conditions: Conditions, config: MotionConfig, frames: tuple[int, int], draws: int, seed: int
+def sample_shared(
+    conditions: Conditions, config: MotionConfig, frames: tuple[int, int], samples: int, seed: int
 ) -> SharedErrors:
     """Motions from one reference to two frames after it; the reference's noise and which tracks go wrong are shared."""
     rng = np.random.default_rng(seed)
     walk = walk_through(conditions.scene)
-    all_poses = draw_poses(walk, max(frames), rng)
+    all_poses = sample_poses(walk, max(frames), rng)
     poses = [all_poses[0], *(all_poses[k] for k in frames)]
-    tracks = draw_tracks(walk, poses, conditions, rng)
+    tracks = sample_tracks(walk, poses, conditions, rng)
     truths = [motion_between(poses[0], pose) for pose in poses[1:]]
     errors: list[list[Float]] = [[], []]
     refined: list[Refined] = []
-    for _ in range(draws):
+    for _ in range(samples):
         reference = see(tracks, poses[0], conditions, rng)
-        wrong = draw_outliers(tracks, conditions, rng)
+        wrong = sample_outliers(tracks, conditions, rng)
         for k, truth in enumerate(truths):
             current = led_astray(tracks, see(tracks, poses[k + 1], conditions, rng), wrong, conditions, rng)
             motion = solve(observe(tracks, reference, current), truth, config, rng)
@@ -348,7 +348,7 @@ _ANY_MOTION = SmootherConfig(lag_s=10.0, motion_accel_sigma_m_s2=1e3, motion_ang
 
 
 def run_smoothed(
-    conditions: Conditions, config: MotionConfig, chains: int, seed: int, *, renewed: bool, split: bool = True
+    conditions: Conditions, config: MotionConfig, chains: int, seed: int, *, new_tracks: bool, split: bool = True
 ) -> Campaign:
     """Poses composed by the smoother, vision alone, from the motions of every frameset since its keyframe.
 
@@ -356,24 +356,24 @@ def run_smoothed(
         conditions: without outliers.
         config: of the motions.
         chains: how many poses.
-        seed: of all that is drawn.
-        renewed: each keyframe has tracks and views of its own; else the same tracks go on through all keyframes, and
+        seed: of all random values.
+        new_tracks: each keyframe has tracks and views of its own; else the same tracks go on through all keyframes, and
             the noise of a keyframe's images is in the motion to it and in the ones from it.
-        split: whether the smoother is told what motions from one keyframe share.
+        split: whether the smoother gets the covariance that motions from one keyframe share.
     """
     campaign = Campaign()
     walk, last = walk_through(conditions.scene), FIRST + FRAMES
     stamps_ns = [round(k * 1e9 / RATE_HZ) for k in range(last + 1)]
     for number in range(chains):
         rng = np.random.default_rng([seed, number])
-        poses = list(draw_poses(walk, last, rng))
+        poses = list(sample_poses(walk, last, rng))
         smoother = Smoother(_ANY_MOTION, None)
         start = RigState(poses[0], np.zeros(3), np.zeros(3), np.zeros(3))
         smoother.initialise(0, start, InitialUncertainty(1e-8 * np.eye(6), 1.0, 1.0))
         for key in range(0, last, KEYFRAME):
             to = min(key + KEYFRAME, last)
-            if renewed or key == 0:
-                tracks = draw_tracks(walk, poses[key : to + 1] if renewed else poses, conditions, rng)
+            if new_tracks or key == 0:
+                tracks = sample_tracks(walk, poses[key : to + 1] if new_tracks else poses, conditions, rng)
                 current = see(tracks, poses[key], conditions, rng)
             reference = current
             for k in range(key + 1, to + 1):

@@ -9,11 +9,11 @@ from monte_carlo import (
     arrays_of_walks,
     at_reference,
     band,
-    draw_frame,
-    draw_shared,
     error_of,
     run_campaign,
     run_smoothed,
+    sample_frame,
+    sample_shared,
     solve,
 )
 
@@ -48,7 +48,7 @@ def flattened(seen: Observations, truth: Float) -> Observations:
 
 
 def test_covariance_is_of_the_current_body_frame() -> None:
-    truth, seen = draw_frame(replace(FAR, noise_px=0.0), np.random.default_rng(1))
+    truth, seen = sample_frame(replace(FAR, noise_px=0.0), np.random.default_rng(1))
     refined = refine(arrays_of_walks(), seen, truth, CONFIG)
     np.testing.assert_allclose(refined.cur_T_ref, truth, atol=1e-6)
     step = np.array([1e-3, -2e-3, 3e-3, 1e-2, 2e-2, -1e-2])
@@ -117,7 +117,7 @@ def test_covariance_of_far_points_is_large_in_translation_only() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_refine_of_too_few_points_gives_a_large_covariance(count: int) -> None:
-    truth, seen = draw_frame(Conditions(per_pair=(count, 0)), np.random.default_rng(2))
+    truth, seen = sample_frame(Conditions(per_pair=(count, 0)), np.random.default_rng(2))
     for has_right in (True, False):
         part = seen._replace(has_right=np.full(count, has_right))
         refined = solve(part, truth, CONFIG, np.random.default_rng(3))
@@ -129,7 +129,7 @@ def test_refine_of_too_few_points_gives_a_large_covariance(count: int) -> None:
 
 
 def test_refine_of_points_in_one_plane_constrains_all_directions() -> None:
-    truth, seen = draw_frame(Conditions(per_pair=(100, 0)), np.random.default_rng(4))
+    truth, seen = sample_frame(Conditions(per_pair=(100, 0)), np.random.default_rng(4))
     flat = flattened(seen, truth)
     refined = solve(flat, truth, CONFIG, np.random.default_rng(5))
     np.testing.assert_allclose(refined.cur_T_ref, truth, atol=1e-6)
@@ -139,7 +139,7 @@ def test_refine_of_points_in_one_plane_constrains_all_directions() -> None:
 # ------------------------------------------------------------------ motions from one reference, and chains
 
 
-SHARED_DRAWS = 600
+SHARED_SAMPLES = 600
 
 
 @pytest.mark.parametrize(
@@ -153,14 +153,14 @@ SHARED_DRAWS = 600
 )
 def test_shared_covariance_is_that_between_motions_of_one_reference(conditions: Conditions) -> None:
     """Two currents at one place: their errors have in common what comes from the reference's points."""
-    drawn = draw_shared(conditions, CONFIG, (3, 3), SHARED_DRAWS, seed=16)
+    sampled = sample_shared(conditions, CONFIG, (3, 3), SHARED_SAMPLES, seed=16)
     shared, total = (
-        at_reference(drawn.true_cur_T_ref, np.mean([getattr(r, name) for r in drawn.refined], axis=0))
+        at_reference(sampled.true_cur_T_ref, np.mean([getattr(r, name) for r in sampled.refined], axis=0))
         for name in ("shared_covariance", "covariance")
     )
     white = np.linalg.inv(np.linalg.cholesky(total))
-    found, stated = (white @ c @ white.T for c in (drawn.cross_covariance(), shared))
-    # an element of a covariance of unit variables, from 600 draws, is known to 0.04
+    found, stated = (white @ c @ white.T for c in (sampled.cross_covariance(), shared))
+    # an element of a covariance of unit variables, from 600 samples, is known to 0.04
     assert np.abs(found - stated).max() < 0.2
     assert np.trace(found) == pytest.approx(np.trace(stated), rel=0.15)
     assert np.linalg.eigvalsh(total - shared).min() > 0.0
@@ -174,12 +174,12 @@ def test_pose_over_twenty_frames_is_consistent(conditions: Conditions) -> None:
     """From between two keyframes, through three, to between two others; each keyframe has tracks of its own."""
     some = replace(conditions, per_pair=(40, 40))
     low, high = band(CHAINS)
-    assert low < run_smoothed(some, CONFIG, CHAINS, seed=17, renewed=True).nees().mean() < high
+    assert low < run_smoothed(some, CONFIG, CHAINS, seed=17, new_tracks=True).nees().mean() < high
 
 
 def test_pose_without_shared_covariance_is_overconfident() -> None:
     some = replace(RICH, per_pair=(40, 40))
-    unaware = run_smoothed(some, CONFIG, CHAINS, seed=17, renewed=True, split=False)
+    unaware = run_smoothed(some, CONFIG, CHAINS, seed=17, new_tracks=True, split=False)
     assert unaware.nees().mean() < band(CHAINS)[0] - 0.3
 
 
@@ -189,4 +189,4 @@ def test_pose_of_tracks_through_keyframes_is_conservative(conditions: Conditions
     by less than a factor of 1.8 in sigma."""
     some = replace(conditions, per_pair=(40, 40))
     _, high = band(CHAINS)
-    assert 6.0 / 1.8**2 < run_smoothed(some, CONFIG, CHAINS, seed=18, renewed=False).nees().mean() < high
+    assert 6.0 / 1.8**2 < run_smoothed(some, CONFIG, CHAINS, seed=18, new_tracks=False).nees().mean() < high
