@@ -55,14 +55,7 @@ def distort(model: int, distortion: Float, x: float, y: float) -> tuple[float, f
     slope_theta = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
     scale = theta_d / r
     dscale = (slope_theta / (1.0 + r2) - scale) / r2  # (d scale / d r) / r
-    return (
-        x * scale,
-        y * scale,
-        scale + x * x * dscale,
-        x * y * dscale,
-        x * y * dscale,
-        scale + y * y * dscale,
-    )
+    return (x * scale, y * scale, scale + x * x * dscale, x * y * dscale, x * y * dscale, scale + y * y * dscale)
 
 
 @kernel

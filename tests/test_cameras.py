@@ -6,14 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from graphvio.arrays import Float
-from graphvio.cameras import (
-    EQUIDISTANT,
-    RADIAL_TANGENTIAL,
-    distort,
-    project_points,
-    undistort,
-    unproject_pixels,
-)
+from graphvio.cameras import EQUIDISTANT, RADIAL_TANGENTIAL, distort, project_points, undistort, unproject_pixels
 
 INTRINSICS = np.array([410.0, 405.0, 322.0, 237.0])
 LENSES = {

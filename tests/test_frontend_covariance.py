@@ -144,11 +144,7 @@ SHARED_SAMPLES = 600
 
 @pytest.mark.parametrize(
     "conditions",
-    [
-        Conditions(per_pair=(60, 60)),
-        replace(FAR, per_pair=(60, 60)),
-        Conditions(per_pair=(60, 60), outlier_share=0.3),
-    ],
+    [Conditions(per_pair=(60, 60)), replace(FAR, per_pair=(60, 60)), Conditions(per_pair=(60, 60), outlier_share=0.3)],
     ids=["rich", "far", "outliers"],
 )
 def test_shared_covariance_is_that_between_motions_of_one_reference(conditions: Conditions) -> None:

@@ -44,13 +44,7 @@ def thinned(pixels: Float, found: Bool, cell_px: int, most: int) -> Bool:
 
 @kernel
 def find_corners(
-    image: Image,
-    allowed: Bool,
-    tracked: Float,
-    occupying: Bool,
-    cell_px: int,
-    border_px: int,
-    min_response: float,
+    image: Image, allowed: Bool, tracked: Float, occupying: Bool, cell_px: int, border_px: int, min_response: float
 ) -> Float:
     """Find the strongest Harris corner of each cell that no track occupies, to sub-pixel precision.
 

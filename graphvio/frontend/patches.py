@@ -140,11 +140,7 @@ def prepare(bordered: Patch, inside: Patch, patch: Patch, gx: Patch, gy: Patch) 
         flat[k] -= weights[k] * mean
         flat_x[k] -= weights[k] * mean_x
         flat_y[k] -= weights[k] * mean_y
-    return (
-        float(xx - area * mean_x * mean_x),
-        float(xy - area * mean_x * mean_y),
-        float(yy - area * mean_y * mean_y),
-    )
+    return (float(xx - area * mean_x * mean_x), float(xy - area * mean_x * mean_y), float(yy - area * mean_y * mean_y))
 
 
 @fast_kernel

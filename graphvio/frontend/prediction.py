@@ -163,8 +163,4 @@ def _project(
     if not z > 1e-6 or not x * x + y * y < (limit * z) ** 2:
         return 0.0, 0.0, False
     xd, yd, a, b, c, d = distort(model, distortion, x / z, y / z)
-    return (
-        intrinsics[0] * xd + intrinsics[2],
-        intrinsics[1] * yd + intrinsics[3],
-        a * d - b * c > 0.0 and a > 0.0,
-    )
+    return (intrinsics[0] * xd + intrinsics[2], intrinsics[1] * yd + intrinsics[3], a * d - b * c > 0.0 and a > 0.0)

@@ -13,11 +13,7 @@ from graphvio.frontend.refinement import Refined, explained, refine
 
 
 def joint_motion(
-    rig: RigArrays,
-    observations: Observations,
-    predicted: Float,
-    config: MotionConfig,
-    rng: np.random.Generator,
+    rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
 ) -> Refined:
     """Estimate one motion from all pairs: hypotheses scored on every pair, the best one refined (section 3.1).
 
@@ -32,11 +28,7 @@ def joint_motion(
 
 
 def best_pair_motion(
-    rig: RigArrays,
-    observations: Observations,
-    predicted: Float,
-    config: MotionConfig,
-    rng: np.random.Generator,
+    rig: RigArrays, observations: Observations, predicted: Float, config: MotionConfig, rng: np.random.Generator
 ) -> Refined:
     """Estimate a motion from each pair alone, and choose the one of least global cost, eq. (4).
 
