@@ -150,7 +150,7 @@ def test_the_gate_has_the_measurements_degrees_of_freedom() -> None:
         spread = nominal.by_error @ running.covariance @ nominal.by_error.T + nominal.covariance
         root = np.linalg.cholesky(spread)
         drawn = [replace(nominal, innovation=root @ rng.standard_normal(len(root))) for _ in range(4000)]
-        refused = np.mean([not running.test(each, 0.95).accepted for each in drawn])
+        refused = np.mean([not running.gate(each, 0.95).accepted for each in drawn])
         assert abs(refused - 0.05) < 0.012  # 3.5 sigma of 4000 draws
 
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from paper_graph import PaperGraph
 from recordings import REAL_DATA
 from synthetic import random_covariance
 
 from graphvio.arrays import Float
 from graphvio.backend.ekf.filter import ExtendedKalmanFilter
-from graphvio.backend.ekf.graph import PaperGraph
 from graphvio.backend.ekf.measurements import Measurement, VisualRates, accelerometer, gyro, stacked, vision
 from graphvio.backend.ekf.process import noise_sigmas, propagated
 from graphvio.backend.ekf.state import FilterState
@@ -61,7 +61,7 @@ class Comparison:
             running.predict(DT, SIGMAS)
             graph.predict(DT, SIGMAS)
             offered = step.expectations()
-            passed = [each for each in offered if running.test(each(running.state), PROBABILITY).accepted]
+            passed = [each for each in offered if running.gate(each(running.state), PROBABILITY).accepted]
             self.refused += len(offered) - len(passed)
             if passed:
                 running.update(stacked([each(running.state) for each in passed]))
@@ -149,7 +149,7 @@ def test_a_longer_lag_and_more_iterations_come_nearer_to_the_batch() -> None:
     running, offered = ExtendedKalmanFilter(start, START), []
     for step in steps:  # what passes the filter's gates is given to all
         running.predict(DT, SIGMAS)
-        passed = [each for each in step.expectations() if running.test(each(running.state), PROBABILITY).accepted]
+        passed = [each for each in step.expectations() if running.gate(each(running.state), PROBABILITY).accepted]
         running.update(stacked([each(running.state) for each in passed]))
         offered.append(passed)
     ends = []

@@ -1,7 +1,8 @@
 """The back-end: relative poses and IMU samples in, the rig's state with covariance out (section 5 of the paper).
 
-`inertial` buffers the IMU and `preintegration` sums it up, `propagation` predicts at its rate, `initialisation` finds
-the first attitude, `starts` says what the smoother starts from, at first and after breaks, `gating` tests vision
-against the prediction, `window` is the fixed-lag factor graph, and `smoother` joins them to the estimator that the
-odometry uses.
+`estimator` says what a state estimator does; `smoother_estimator` and `ekf.estimator` are the two that there are.
+`gating` tests innovations. `smoother` is the fixed-lag smoother over the factor graph of `window`, with the factors of
+`factors`, `preintegration` and `reference_views`; `initial_state` is what it is initialised with, and `initialisation`
+finds the first attitude. `inertial` buffers the IMU, `propagation` predicts at its rate, and `time_offset`
+estimates its offset.
 """

@@ -1,4 +1,4 @@
-"""IMU samples by time, and what they are between framesets."""
+"""A buffer of IMU samples, which checks them and returns them as intervals."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.kernels import kernel, put
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.sensors import ImuSample
 
@@ -15,22 +16,26 @@ GRAVITY_M_S2 = 9.81
 _MAX_RATE = 100.0  # rad/s and m/s^2: beyond what any inertial sensor for this use can read
 _MAX_FORCE = 1000.0
 NO_SAMPLES = (np.empty(0, dtype=np.int64), np.empty((0, 6)))
-"""What `ImuBuffer.since` returns where it knows nothing."""
-_STUCK_NS = 250_000_000  # for so long no living axis repeats one value while others change
-_HISTORY = 100  # samples over which it is counted how often an axis repeats its value
-_SELDOM = 0.02  # an axis that has changed in a smaller share of the samples has no noise: nothing is known of it
-_LIVELIEST = 0.95  # share of the samples in which an axis changes that is believed at most
-_LIVING = 0.8  # share of the samples in which another axis of the sensor must go on changing
-_FROZEN = 5  # times that all axes repeat their values; some drivers tell each sample twice
-_LIVELY = 0.5  # share of the samples in which each of them must have changed before
-_UNLIKELY = np.log(1e-9)  # chance that a living axis repeats its value so often
-_MOVING = np.repeat([0.2, 1.0], 3)  # rad/s and m/s^2, by so much
+"""No stamps (0,) and no values (0, 6)."""
+_STUCK_NS = 250_000_000  # no working axis repeats one value for so long while others change
+_HISTORY = 100  # samples over which an axis's repetitions are averaged
+_MIN_CHANGE = 0.02  # an axis that changes in a smaller share of the samples has no noise to go by
+_MAX_CHANGE = 0.95  # share of the samples in which an axis changes that is assumed at most
+_MIN_OTHERS_CHANGE = 0.8  # share of the samples in which another axis of the sensor must go on changing
+_MAX_FROZEN = 5  # times that all axes may repeat their values; some drivers deliver each sample twice
+_MIN_LIVE_CHANGE = 0.5  # share of the samples in which each of them must have changed before
+_MIN_LOG_CHANCE = np.log(1e-9)  # of a working axis that repeats its value so often
+_MIN_MOTION = np.repeat([0.2, 1.0], 3)  # rad/s and m/s^2
 _KEPT_NS = 60_000_000_000  # framesets do not come later than this after their samples
 _ROOM = 1024  # samples that the buffer has room for at first
 
 
 class ImuBuffer:
-    """Samples in time order; what cannot be used is named and left out."""
+    """IMU samples in time order; unusable ones are named and left out.
+
+    Args:
+        max_gap_ms: Longer intervals between samples are gaps.
+    """
 
     def __init__(self, max_gap_ms: float) -> None:
         self._stamps = np.empty(_ROOM, dtype=np.int64)
@@ -50,16 +55,16 @@ class ImuBuffer:
         return int(self._stamps[self._end - 1]) if self._end > self._first else None
 
     def add(self, sample: ImuSample) -> str:
-        """Take a sample; the name of its fault if it cannot be used, or an empty string."""
+        """Take a sample, and return the kind of its fault if it is unusable, or an empty string."""
         if not (np.isfinite(sample.angular_velocity).all() and np.isfinite(sample.linear_acceleration).all()):
-            return "imu_not_finite"
+            return EventKind.IMU_NOT_FINITE
         if np.abs(sample.angular_velocity).max() > _MAX_RATE or np.abs(sample.linear_acceleration).max() > _MAX_FORCE:
-            return "imu_out_of_range"
+            return EventKind.IMU_OUT_OF_RANGE
         newest_ns = self.newest_ns
         if newest_ns is not None and sample.stamp_ns <= newest_ns:
-            return "imu_duplicate_stamp" if sample.stamp_ns == newest_ns else "imu_backward_stamp"
+            return EventKind.IMU_DUPLICATE_STAMP if sample.stamp_ns == newest_ns else EventKind.IMU_BACKWARD_STAMP
         if self._stuck.shows(sample):
-            return "imu_stuck"
+            return EventKind.IMU_STUCK
         if self._end == len(self._stamps):
             self._make_room()
         self._stamps[self._end] = sample.stamp_ns
@@ -73,7 +78,7 @@ class ImuBuffer:
         return self._end > self._first and bool(self._stamps[self._end - 1] >= stamp_ns)
 
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
-        """The IMU between two instants, interpolated at both ends, or None where a gap makes it unknown."""
+        """Return the IMU between two instants, interpolated at both ends, or None where there is a gap."""
         first = self._find(start_ns, "right") - 1
         last = self._find(end_ns, "left")
         if first < self._first or last >= self._end or end_ns <= start_ns:
@@ -85,10 +90,10 @@ class ImuBuffer:
         return ImuInterval(steps_s, means[:, :3], means[:, 3:])
 
     def segment(self, start_ns: int, end_ns: int) -> tuple[ImuInterval, int] | None:
-        """The longest gapless piece of the IMU that ends at the newest sample within two instants.
+        """Return the longest gapless segment that ends at the newest sample between two instants.
 
         Returns:
-            The interval and the stamp at which it starts, or None where there are not two samples.
+            The interval and its first stamp, or None where there are not two samples.
         """
         stamps = self._stamps[self._find(start_ns, "left") : self._find(end_ns, "right")]
         gaps = np.flatnonzero(np.diff(stamps) > self._max_gap_ns)
@@ -97,7 +102,7 @@ class ImuBuffer:
         return None if interval is None else (interval, int(stamps[0]))
 
     def since(self, stamp_ns: int) -> tuple[Int, Float]:
-        """The IMU at an instant and its samples after it.
+        """Return the IMU at an instant, interpolated, and its samples after it.
 
         Returns:
             Stamps (N,) and values (N, 6), angular velocity and specific force; none where the instant is in a gap.
@@ -114,16 +119,16 @@ class ImuBuffer:
         return stamps, np.vstack([at, self._values[end : self._end]])
 
     def discard_before(self, stamp_ns: int) -> None:
-        """Forget samples that no later interval can need."""
+        """Forget samples that no later interval needs."""
         self._first = max(self._find(stamp_ns, "right") - 1, self._first)
 
     def _find(self, stamp_ns: int, side: Literal["left", "right"]) -> int:
         return self._first + int(np.searchsorted(self._stamps[self._first : self._end], stamp_ns, side))
 
     def _make_room(self) -> None:
-        """Move the samples to the front, of twice the room if they fill half of it.
+        """Move the samples to the front of an array that is twice as large if they fill half of it.
 
-        Those of long ago are dropped: an IMU without framesets must not fill the memory.
+        Samples of more than a minute ago are dropped: an IMU without framesets must not fill the memory.
         """
         self.discard_before(int(self._stamps[self._end - 1]) - _KEPT_NS)
         kept = slice(self._first, self._end)
@@ -135,11 +140,11 @@ class ImuBuffer:
 
 
 class _StuckAxes:
-    """Finds axes that repeat one value while others live, as at the end of their range.
+    """Detection of axes that repeat one value while others change, as at the end of their range.
 
-    An axis that used to change with every sample, as noise makes it, is found within some samples, if another axis of
-    the same sensor goes on changing; so is an IMU that repeats all of them. One that used to repeat its values is found
-    once others have moved for a while.
+    An axis that used to change with every sample, as noise makes it, is found within some samples if another axis of
+    the same sensor goes on changing; so is an IMU that repeats all of them. An axis that used to repeat its values is
+    found once others have moved for a while.
     """
 
     def __init__(self) -> None:
@@ -155,15 +160,15 @@ class _StuckAxes:
         now = np.concatenate([sample.angular_velocity, sample.linear_acceleration])
         stopped = _note_stops(now, self._before, self._change, self._repeats)
         since_ns = _note_repeats(
-            sample.stamp_ns, now, self._before, self._low, self._high, self._since_ns, self._change > _SELDOM
+            sample.stamp_ns, now, self._before, self._low, self._high, self._since_ns, self._change > _MIN_CHANGE
         )
         return stopped or sample.stamp_ns - since_ns >= _STUCK_NS
 
 
 @kernel
 def _note_stops(now: Float, before: Float, change: Float, repeats: Float) -> bool:
-    """Go on by a sample (6,), and tell whether some axis repeats its value against all likelihood."""
-    stopped, all_repeat = False, change.min() > _LIVELY
+    """Add a sample (6,), and return whether some axis repeats its value beyond what noise allows."""
+    stopped, all_repeat = False, change.min() > _MIN_LIVE_CHANGE
     for axis in range(6):
         if now[axis] != before[axis]:
             change[axis] *= (1.0 - 1.0 / _HISTORY) ** repeats[axis, axis]
@@ -177,10 +182,10 @@ def _note_stops(now: Float, before: Float, change: Float, repeats: Float) -> boo
         count, first = repeats[axis, axis], 3 * (axis // 3)
         others_live = False
         for other in range(first, first + 3):
-            others_live |= other != axis and repeats[axis, other] > _LIVING * count
-        chance = count * np.log(1.0 - min(change[axis], _LIVELIEST))
-        stopped |= others_live and chance < _UNLIKELY
-        all_repeat &= count >= _FROZEN
+            others_live |= other != axis and repeats[axis, other] > _MIN_OTHERS_CHANGE * count
+        chance = count * np.log(1.0 - min(change[axis], _MAX_CHANGE))
+        stopped |= others_live and chance < _MIN_LOG_CHANCE
+        all_repeat &= count >= _MAX_FROZEN
     return stopped or all_repeat
 
 
@@ -188,7 +193,7 @@ def _note_stops(now: Float, before: Float, change: Float, repeats: Float) -> boo
 def _note_repeats(
     stamp_ns: int, now: Float, before: Float, low: Float, high: Float, since_ns: Int, has_lived: Bool
 ) -> int:
-    """Go on by a sample (6,), and tell since when some axis has repeated its value though others moved."""
+    """Add a sample (6,), and return since when some axis has repeated its value though others moved."""
     for axis in range(6):
         if now[axis] != before[axis]:
             low[axis], high[axis] = now, now
@@ -196,7 +201,7 @@ def _note_repeats(
         for other in range(6):
             low[axis, other] = min(low[axis, other], now[other])
             high[axis, other] = max(high[axis, other], now[other])
-            moved |= high[axis, other] - low[axis, other] > _MOVING[other]
+            moved |= high[axis, other] - low[axis, other] > _MIN_MOTION[other]
         if not (moved and has_lived[axis]):
             since_ns[axis] = stamp_ns
     put(before, now)
@@ -205,7 +210,7 @@ def _note_repeats(
 
 @kernel
 def _steps(stamps_ns: Int, values: Float, end_ns: int) -> tuple[Float, Float]:
-    """Durations (N - 1,) and mean values (N - 1, 6) between samples (N,), cut off at 0 and at an end."""
+    """Return durations (N - 1,) and mean values (N - 1, 6) between samples (N,), clipped to 0 and an end."""
     n = len(stamps_ns)
     steps_s, means = np.empty(n - 1), np.empty((n - 1, 6))
     for i in range(n - 1):

@@ -1,4 +1,4 @@
-"""What a solved window says of some of its variables together."""
+"""The marginal distribution of some variables of a solved window."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Marginal:
     """The joint distribution of some variables: their step x from the present values has ``R x = d``.
 
     Attributes:
-        columns: where each variable stands.
+        columns: Columns of each variable.
         square_root: R (N, N), upper triangle; ``R^T R`` is the information.
         right_side: d (N,), zero where the present values are the solution.
     """
@@ -31,9 +31,9 @@ class Marginal:
     right_side: Float
 
     def covariance(self, keys: Sequence[int]) -> Float | None:
-        """Covariance of some of the variables, in the order given, or None if it is not bounded.
+        """Return the covariance of some of the variables, in the order given, or None if it is not bounded.
 
-        R is inverted, not its square: states far less certain than the poses relative to them do no harm.
+        R is inverted instead of the information, for its better condition.
         """
         inverse = self._inverse
         if inverse is None:
@@ -42,16 +42,16 @@ class Marginal:
         return np.asarray(rows @ rows.T)
 
     def step(self) -> Float | None:
-        """x (N,), or None if there is none."""
+        """Return x (N,), or None if R is singular."""
         solution, failed = lapack.dtrtrs(self.square_root, self.right_side)
         return None if failed else np.asarray(solution)
 
     def at_solution(self) -> Marginal:
-        """The same once the step has been taken."""
+        """Return the distribution after the step has been taken."""
         return Marginal(self.columns, self.square_root, np.zeros(len(self.right_side)))
 
     def of_last(self, keys: Sequence[int]) -> Marginal:
-        """The marginal of the last variables."""
+        """Return the marginal distribution of the last variables."""
         start = self.columns[keys[0]].start
         columns = {key: slice(self.columns[key].start - start, self.columns[key].stop - start) for key in keys}
         return Marginal(columns, self.square_root[start:, start:], self.right_side[start:])
@@ -62,12 +62,12 @@ class Marginal:
         """Return the joint distribution with more factors and their variables.
 
         Args:
-            factors: linearised at the present values.
-            last: variables that shall stand last.
-            dims: of all variables.
+            factors: Linearised at the present values.
+            last: Variables that are ordered last.
+            dims: Dimensions of all variables.
 
         Returns:
-            None where something of it is not constrained.
+            None where some variable is not constrained.
         """
         new = frozenset(key for factor in factors for key in list(factor.keys())) - self.columns.keys()
         keys = [key for key in (*self.columns, *sorted(new)) if key not in last]
@@ -108,7 +108,7 @@ def marginal_of_last(
     Args:
         solution: of the linearised window.
         last: variables.
-        dims: of all variables.
+        dims: Dimensions of all variables.
     """
     conditionals = [root.conditional() for root in solution.roots()]
     ends = [list(takewhile(frozenset(last).__contains__, reversed(list(each.keys())))) for each in conditionals]

@@ -1,4 +1,4 @@
-"""Noise models of gtsam's factors, and what errors that motions share leave to each of them."""
+"""Noise models of gtsam's factors, and the part of a motion's covariance that no other motion shares."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _MIN_OWN_SHARE = 0.001  # of each direction of a motion's covariance: keeps it p
 
 
 def gaussian(covariance: Float) -> gtsam.noiseModel.Gaussian:
-    """A noise of a full covariance (N, N).
+    """Return a noise model of a full covariance (N, N).
 
     By default gtsam takes a matrix whose elements off the diagonal are below 1e-9 for a diagonal one: correlations of
     rotations known to 0.03 mrad and of translations known to 0.03 mm would be lost.
@@ -22,7 +22,7 @@ def gaussian(covariance: Float) -> gtsam.noiseModel.Gaussian:
 
 
 def robust(noise: gtsam.noiseModel.Gaussian, probability: float) -> gtsam.noiseModel.Base:
-    """The noise with Huber's kernel: errors outside this share of the chi-square distribution count linearly."""
+    """Return the noise with Huber's kernel, linear beyond this quantile of the chi-square distribution."""
     if probability == 1.0:
         return noise
     distance = np.sqrt(chi_square_quantile(probability, noise.dim()))
@@ -30,15 +30,15 @@ def robust(noise: gtsam.noiseModel.Gaussian, probability: float) -> gtsam.noiseM
 
 
 def isotropic(dimension: int, sigma: float) -> gtsam.noiseModel.Isotropic:
-    """A noise of one standard deviation in all of so many directions."""
+    """Return a noise model with one standard deviation in all directions."""
     return gtsam.noiseModel.Isotropic.Sigma(dimension, sigma)
 
 
 @kernel
 def own_covariance(covariance: Float, shared: Float) -> Float:
-    """What a motion's covariance (6, 6) has beyond the part that it shares with others, which was told before.
+    """Return what a motion's covariance (6, 6) has beyond the part (6, 6) that it shares with other motions.
 
-    The points' errors come to a little more as the rig moves on. Some of it is always the motion's own.
+    The shared part may exceed the covariance a little as the rig moves on: a minimum is always the motion's own.
     """
     root = np.linalg.cholesky(covariance)
     white = np.linalg.solve(root, np.linalg.solve(root, shared).T)

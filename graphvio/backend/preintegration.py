@@ -35,7 +35,7 @@ def preintegrate(
 ) -> gtsam.PreintegratedCombinedMeasurements:
     """Preintegrate an interval, linearised at a bias.
 
-    A step's mean force belongs to its middle, and gtsam takes it to be in the frame at the step's start: it is turned
+    A step's mean force is that of its middle, while gtsam takes it in the frame at the step's beginning: it is turned
     there by half of the step's rotation.
     """
     measurements = gtsam.PreintegratedCombinedMeasurements(params, bias)
@@ -48,7 +48,7 @@ def preintegrate(
 
 @kernel
 def _at_start(steps_s: Float, rates: Float, forces: Float, bias: Float) -> Float:
-    """Mean forces (N, 3) of steps, in the frames at the steps' starts; bias (6,) of accelerometer and gyro."""
+    """Return the mean forces (N, 3) in the frames at the steps' beginnings; bias (6,) of accelerometer and gyro."""
     turned = np.empty_like(forces)
     for i in range(len(steps_s)):
         start_R_middle = so3_exp(0.5 * steps_s[i] * (rates[i] - bias[3:]))

@@ -1,7 +1,6 @@
-"""Poses between framesets and beyond the newest one: the newest state, carried on by each sample of the IMU.
+"""Prediction of poses between framesets and beyond the newest one, from the newest state and the IMU since then.
 
-They cost some microseconds each. One thread may ask for them while another works on a frameset: what is known is
-replaced as a whole, and only grows at its end.
+One thread may predict while another processes a frameset: the path is replaced as a whole, and only grows at its end.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ from graphvio.geometry import se3_compose, se3_exp, so3_exp
 from graphvio.kernels import kernel, put
 from graphvio.measurements.estimate import Prediction
 
-_LONGEST_BLIND_NS = 5_000_000_000  # without a frameset
+_MAX_BLIND_NS = 5_000_000_000  # without a frameset
 
 
 class Propagator:
-    """What is predicted from the newest state, see `graphvio.odometry.Odometry.predict`.
+    """Predicts from the newest state, see `graphvio.odometry.Odometry.predict`.
 
     Args:
-        longest_ms: how far it goes beyond the newest sample, or without samples beyond the newest frameset.
-        max_gap_ms: between samples; it does not go on across longer ones.
+        longest_ms: Longest prediction beyond the newest sample, or without samples beyond the newest frameset.
+        max_gap_ms: Longest gap between samples that a prediction crosses.
     """
 
     def __init__(self, longest_ms: float, max_gap_ms: float) -> None:
@@ -34,19 +33,19 @@ class Propagator:
         self._path: _Path | None = None
 
     def forget(self) -> None:
-        """There is no state that anything could be predicted from."""
+        """Forget the state: nothing is predicted until `restart`."""
         self._path = None
 
     def restart(self, stamp_ns: int, state: RigState, epoch: int, rate: Float, stamps: Int, values: Float) -> None:
-        """Begin at a new state.
+        """Predict from a new state.
 
         Args:
-            stamp_ns: of the state.
-            state: of the rig.
-            epoch: of the state.
-            rate: (3,) rad/s of body. Without samples, it and the velocity in body go on as they are.
-            stamps: (N,) of the IMU's samples on the framesets' clock; the first is the state's, or there are none.
-            values: (N, 6) of these: angular velocity and specific force.
+            stamp_ns: Stamp of the state.
+            state: The rig at that instant.
+            epoch: Epoch of the state.
+            rate: (3,) rad/s of body. Without samples, it and the velocity in body are taken to be constant.
+            stamps: (N,) of the IMU samples on the framesets' clock; the first is the state's, or there are none.
+            values: (N, 6) of the samples: angular velocity and specific force.
         """
         path = _Path(stamp_ns, state, epoch, rate, values[0] if len(values) else None)
         for stamp, sample in zip(stamps[1:].tolist(), values[1:], strict=True):
@@ -56,27 +55,26 @@ class Propagator:
         self._path = path
 
     def add(self, stamp_ns: int, sample: Float) -> Prediction | None:
-        """Go on by a sample (6,) of the IMU, and tell what is predicted at its instant."""
+        """Add an IMU sample (6,), and return the prediction at its instant, or None."""
         path = self._path
         if path is None or not path.samples or stamp_ns <= path.stamps[-1]:
             return None
-        if stamp_ns - path.stamps[-1] > self._max_gap_ns or stamp_ns - path.stamps[0] > _LONGEST_BLIND_NS:
+        if stamp_ns - path.stamps[-1] > self._max_gap_ns or stamp_ns - path.stamps[0] > _MAX_BLIND_NS:
             self._path = None  # what happened in a gap is not known, nor where an IMU alone would be by now
             return None
         path.add(stamp_ns, sample)
         return path.predict(stamp_ns, self._longest_ns)
 
     def predict(self, stamp_ns: int) -> Prediction | None:
-        """What is predicted at an instant, or None where nothing is."""
+        """Return the prediction at an instant, or None where there is none."""
         path = self._path
         return None if path is None else path.predict(stamp_ns, self._longest_ns)
 
 
 class _Path:
-    """A state, and what the IMU's samples since then make of it.
+    """A state and its propagation by the IMU samples since then; without an IMU there are no samples.
 
-    Poses, velocities and samples stand beside the stamps, which are appended last: all that belongs to a stamp is
-    there. Without an IMU there are no samples.
+    Stamps are appended last, so that a reader in another thread finds all that belongs to a stamp.
     """
 
     def __init__(self, stamp_ns: int, state: RigState, epoch: int, rate: Float, sample: Float | None) -> None:
@@ -88,7 +86,7 @@ class _Path:
         self._twist = np.concatenate([rate, state.nav_T_body[:3, :3].T @ state.velocity_nav])
 
     def add(self, stamp_ns: int, sample: Float) -> None:
-        """Go on by a sample (6,)."""
+        """Add a sample (6,)."""
         pose, velocity = self._after(-1, stamp_ns - self.stamps[-1], 0.5 * (self.samples[-1] + sample))
         self.poses.append(pose)
         self.velocities.append(velocity)
@@ -96,10 +94,10 @@ class _Path:
         self.stamps.append(stamp_ns)
 
     def predict(self, stamp_ns: int, longest_ns: int) -> Prediction | None:
-        """What is known or predicted at an instant, at most so long after the newest sample, or None."""
+        """Return the state at an instant, at most ``longest_ns`` after the newest sample, or None."""
         i = bisect_right(self.stamps, stamp_ns) - 1
         if i < 0:
-            return None  # that is past: there is an estimate
+            return None  # an estimate is newer
         is_newest = i == len(self.stamps) - 1
         after_ns = stamp_ns - self.stamps[i]
         if is_newest and after_ns > longest_ns:
@@ -122,7 +120,7 @@ class _Path:
 def advanced(
     nav_T_body: Float, velocity_nav: Float, mean: Float, bias: Float, duration_s: float
 ) -> tuple[Float, Float]:
-    """Pose (4, 4) and velocity (3,) after a step with a mean rate and specific force (6,), less the biases (6,).
+    """Return pose (4, 4) and velocity (3,) after a step with a mean rate and specific force (6,) and biases (6,).
 
     The mean force is that of the step's middle, and so is the attitude that turns it.
     """

@@ -1,4 +1,4 @@
-"""References as vision sees them: what all motions from one reference have in common."""
+"""Reference states as vision sees them, with the error that all motions from one reference share."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from graphvio.measurements.motion import RelativeMotion
 
 
 class Holder(Protocol):
-    """What holds factors and values: a window, or the graph of a whole session."""
+    """A container of factors and values: a window, or the graph of a whole session."""
 
     values: gtsam.Values
 
@@ -24,10 +24,10 @@ class Holder(Protocol):
 
 
 class ReferenceViews:
-    """The states that motions are measured from, each as vision sees it.
+    """Nuisance variables for the errors that motions from one reference share.
 
-    All motions from one reference share the error of its triangulated points. The reference as seen differs from the
-    reference's pose by that error, so that it is one unknown for all of them.
+    All motions from one reference share the error of its triangulated points. The pose of the reference as vision sees
+    it differs from its true pose by that error, and is one unknown for all of these motions.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class ReferenceViews:
         self._own: tuple[RelativeMotion, Float] | None = None  # of the motion asked for last
 
     def add(self, k: int, motion: RelativeMotion, window: Holder) -> None:
-        """Give a motion's reference, state k, an unknown of its own, if it needs one and has none."""
+        """Insert the nuisance variable of a motion's reference, state k, if it needs one and has none."""
         if k in self._shared or not motion.shared_covariance.any():
             return
         adjoint = se3_adjoint(motion.reference_T_current)  # takes the tangent from the current instant there
@@ -44,11 +44,11 @@ class ReferenceViews:
         window.add(gtsam.BetweenFactorPose3(x(k), r(k), gtsam.Pose3(), gaussian(self._shared[k])))
 
     def keys(self, k: int) -> list[int]:
-        """The pose of state k, and its view if it has one."""
+        """Return the keys of the pose of state k, and of its nuisance variable if it has one."""
         return [x(k), r(k)] if k in self._shared else [x(k)]
 
     def seen(self, k: int, motion: RelativeMotion) -> tuple[int, Float]:
-        """The variable that a motion from state k is measured from, and the motion's covariance (6, 6) from there."""
+        """Return the key that a motion from state k is measured from, and the motion's covariance (6, 6) from there."""
         if k not in self._shared or not motion.shared_covariance.any():
             return x(k), motion.covariance
         if self._own is None or self._own[0] is not motion:  # it is asked for by the test, and again to insert it
@@ -57,5 +57,5 @@ class ReferenceViews:
         return r(k), self._own[1]
 
     def forget(self, k: int) -> None:
-        """State k has left the window."""
+        """Forget state k, which has left the window."""
         self._shared.pop(k, None)

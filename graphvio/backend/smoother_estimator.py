@@ -120,7 +120,7 @@ class SmootherEstimator:
         if self._smoother is not None:
             self.epoch += 1
             self._report(
-                stamp_ns, EventKind.IMU_CAME, f"the IMU has come: epoch {self.epoch} starts with gravity pointing down"
+                stamp_ns, EventKind.IMU_CAME, f"the IMU has come: epoch {self.epoch} begins with gravity pointing down"
             )
             position = self.state().nav_T_body[:3, 3]
             self._final += self._smoother.all_poses()
@@ -262,7 +262,7 @@ class SmootherEstimator:
         self.epoch += 1
         gap_s = (stamp_ns - last_ns) * 1e-9
         self._report(
-            stamp_ns, EventKind.TIME_JUMP, f"{gap_s:.1f} s without data: epoch {self.epoch} starts at the last pose"
+            stamp_ns, EventKind.TIME_JUMP, f"{gap_s:.1f} s without data: epoch {self.epoch} begins at the last pose"
         )
 
     def _reinitialise_after_lost(self, motion: RelativeMotion) -> None:
@@ -276,7 +276,7 @@ class SmootherEstimator:
         self._report(
             motion.stamp_ns,
             EventKind.NEW_EPOCH,
-            f"vision is back: epoch {self.epoch} starts at the predicted pose",
+            f"vision is back: epoch {self.epoch} begins at the predicted pose",
         )
 
     def _reinitialise_from_vision(self, motion: RelativeMotion, why: str) -> None:

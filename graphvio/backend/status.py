@@ -30,7 +30,7 @@ class StatusMonitor:
         self.is_lost = False
         self._max_sigma_m = max_sigma_m
         self._report = report
-        self._initialising_since_ns: int | None = None  # None once the first motions have told what was missing
+        self._initialising_since_ns: int | None = None  # None once the first motions have determined what was missing
         self._was_complete = False  # whether nothing was missing at the estimate before
         self._is_reported = False  # that initialisation takes long
 

@@ -1,6 +1,6 @@
-"""The time offset between cameras and IMU, from rotations by vision and by the gyro.
+"""Estimation of the time offset between cameras and IMU from rotations by vision and by the gyro.
 
-A rotation that vision measures between two framesets is the gyro's, taken a little earlier or later. Over such an
+A rotation that vision measures between two framesets is the gyro's at instants a little earlier or later. Over such an
 interval the two differ by the offset times the difference of the angular rates at its ends, and by the gyro's bias.
 """
 
@@ -23,7 +23,7 @@ from graphvio.rig import Imu
 _START_SIGMA_S = 0.01
 _START_BIAS_SIGMA_RAD_S = 0.1
 _WALK_S = 5e-5  # by which the offset may change in a second
-_INTERVAL_NS = 250_000_000  # shorter ones tell less, and longer ones' samples may be gone
+_INTERVAL_NS = 250_000_000  # shorter ones have less information, and longer ones' samples may be gone
 _ANGULAR_ACCEL_RAD_S2 = 10.0
 _USABLE_SIGMA_S = 2e-3
 _GATE_PROBABILITY = 0.999
@@ -31,11 +31,11 @@ _GATE_PROBABILITY = 0.999
 
 @dataclass(frozen=True)
 class OffsetEstimate:
-    """How far the offset in use is believed to be off.
+    """Estimated error of the offset in use.
 
     Attributes:
-        error_s: add it to the offset in use.
-        sigma_s: its standard deviation.
+        error_s: Add it to the offset in use.
+        sigma_s: Standard deviation of the error.
     """
 
     error_s: float
@@ -51,9 +51,9 @@ class TimeOffsetFilter:
     """A Kalman filter over the offset's error, seconds, and the gyro's bias, rad/s.
 
     Args:
-        imu: its noise densities.
-        noise_scale: factor on them.
-        imu_between: the IMU between two framesets' stamps by the offset in use, or None where it is not known.
+        imu: Noise densities of the IMU.
+        noise_scale: Factor on these.
+        imu_between: Returns the IMU between two framesets' stamps by the offset in use, or None.
     """
 
     def __init__(self, imu: Imu, noise_scale: float, imu_between: Callable[[int, int], ImuInterval | None]) -> None:
@@ -63,27 +63,29 @@ class TimeOffsetFilter:
         self._mean = np.zeros(4)
         self._covariance = np.diag([_START_SIGMA_S, *3 * [_START_BIAS_SIGMA_RAD_S]]) ** 2
         # Reference -> the motion that ends where an interval begins; None is the reference itself.
-        self._starts: dict[int, RelativeMotion | None] = {}
+        self._beginnings: dict[int, RelativeMotion | None] = {}
         self._newest_ns: int | None = None
 
     @property
     def estimate(self) -> OffsetEstimate:
-        """What is known of the offset now."""
+        """Estimate of the offset's error."""
         return OffsetEstimate(float(self._mean[0]), float(np.sqrt(self._covariance[0, 0])))
 
     def update(self, motion: RelativeMotion) -> None:
-        """Take a motion by vision, once a frameset."""
+        """Take the relative motion of a frameset."""
         reference_ns = motion.reference_stamp_ns
-        start = self._starts.get(reference_ns)
+        start = self._beginnings.get(reference_ns)
         start_ns = reference_ns if start is None else start.stamp_ns
-        if reference_ns not in self._starts:
-            self._starts = {ns: begun for ns, begun in self._starts.items() if ns > reference_ns - 4 * _INTERVAL_NS}
-            self._starts[reference_ns] = None
+        if reference_ns not in self._beginnings:
+            self._beginnings = {
+                ns: begun for ns, begun in self._beginnings.items() if ns > reference_ns - 4 * _INTERVAL_NS
+            }
+            self._beginnings[reference_ns] = None
         if motion.stamp_ns - start_ns < _INTERVAL_NS:
             return
-        self._starts[reference_ns] = motion
+        self._beginnings[reference_ns] = motion
         self._walk(motion.stamp_ns)
-        for error_s in (float(self._mean[0]), 0.0):  # where it is believed to be, if the samples there have come
+        for error_s in (float(self._mean[0]), 0.0):  # at the estimated offset, if the samples there have come
             shift_ns = round(error_s * 1e9)
             interval = self._imu_between(start_ns + shift_ns, motion.stamp_ns + shift_ns)
             if interval is not None:
@@ -91,7 +93,7 @@ class TimeOffsetFilter:
                 return
 
     def corrected(self) -> float:
-        """The offset's error, seconds, which the caller takes into use: from here on it is believed to be none."""
+        """Return the offset's error, seconds, which the caller corrects: it is zero from then on."""
         error_s = float(self._mean[0])
         self._mean[0] = 0.0
         return error_s
@@ -103,7 +105,7 @@ class TimeOffsetFilter:
         self._newest_ns = stamp_ns
 
     def _measure(self, start_R_end: Float, covariance: Float, interval: ImuInterval, error_s: float) -> None:
-        """A rotation (3, 3) by vision, its covariance (3, 3) in the frame at its end, the IMU for some error."""
+        """Update by a rotation (3, 3) of vision, its covariance (3, 3) in the frame at its end, and the IMU."""
         by_gyro, by_bias = integrated_rates(interval.steps_s, interval.angular_velocity - self._mean[1:])
         residual = so3_log(np.ascontiguousarray(by_gyro.T @ start_R_end))
         rates = interval.angular_velocity[[0, -1]] - self._mean[1:]
@@ -118,16 +120,16 @@ class TimeOffsetFilter:
             return
         gain = np.linalg.solve(spread, jacobian @ self._covariance).T
         self._mean = self._mean + gain @ innovation
-        rest = np.eye(4) - gain @ jacobian
-        self._covariance = rest @ self._covariance @ rest.T + gain @ covariance @ gain.T
+        remaining = np.eye(4) - gain @ jacobian
+        self._covariance = remaining @ self._covariance @ remaining.T + gain @ covariance @ gain.T
 
 
 def _rotation_between(start: RelativeMotion | None, end: RelativeMotion) -> tuple[Float, Float]:
-    """The rotation (3, 3) from one motion's end to another's, and its covariance (3, 3) there.
+    """Return the rotation (3, 3) from one motion's end to another's, and its covariance (3, 3) there.
 
     Args:
-        start: from the same reference; None is the reference itself.
-        end: the later one.
+        start: Motion from the same reference; None is the reference itself.
+        end: The later motion.
     """
     if start is None:
         return end.reference_T_current[:3, :3], end.covariance[:3, :3]
@@ -137,13 +139,13 @@ def _rotation_between(start: RelativeMotion | None, end: RelativeMotion) -> tupl
 
 
 def _own_rotation_covariance(motion: RelativeMotion) -> Float:
-    """Covariance (3, 3) without the part that all motions from one reference share."""
+    """Return the covariance (3, 3) without the part that all motions from one reference share."""
     return np.asarray(own_covariance(motion.covariance, motion.shared_covariance)[:3, :3])
 
 
 @kernel
 def integrated_rates(steps_s: Float, rates: Float) -> tuple[Float, Float]:
-    """The rotation (3, 3) by steps of constant rate (N, 3), and its derivative (3, 3) by a bias of the rates.
+    """Return the rotation (3, 3) over steps of constant rate (N, 3), and its derivative (3, 3) by their bias.
 
     The derivative is that of the rotation's tangent in the frame at the end.
     """

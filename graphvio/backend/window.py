@@ -15,7 +15,7 @@ from graphvio.backend.marginal import Marginal, marginal_of_last
 from graphvio.errors import GraphvioError
 
 _MAX_ITERATIONS = 4
-_CONVERGED = 1e-2  # radians, metres...: what a further step would still change is of the order of its square
+_CONVERGED = 1e-2  # radians, metres...: another step would change the square of this
 
 
 class WindowError(GraphvioError):
@@ -23,15 +23,15 @@ class WindowError(GraphvioError):
 
 
 SOLVER_ERRORS = (WindowError, RuntimeError, np.linalg.LinAlgError)
-"""What a window, gtsam and numpy raise where equations have no solution."""
+"""Raised by a window, gtsam and numpy where equations have no solution."""
 
 
 class Window:
     """Nonlinear factors and the present values of their variables.
 
     Args:
-        min_iterations: in each optimisation; robust kernels need two, as the first weighs new factors by how far the
-            start is off.
+        min_iterations: Of each optimisation; robust kernels need two, as the first weighs new factors by their
+            initial error.
     """
 
     def __init__(self, min_iterations: int = 1) -> None:
@@ -51,11 +51,11 @@ class Window:
         self._unknown.append(self._insert(factor))
 
     def optimize(self, followed: Sequence[int] = ()) -> None:
-        """Gauss-Newton from the present values.
+        """Optimise by Gauss-Newton from the present values.
 
         Args:
-            followed: variables whose covariance will be asked for, and to which new factors will be tied: those
-                covariances are then found without solving the whole window again.
+            followed: Variables whose covariance will be needed, and to which new factors will be tied: it is then
+                found without solving the whole window again.
 
         Raises:
             WindowError: if some variable is not constrained, or the solution is not finite; the values stay as
@@ -80,11 +80,12 @@ class Window:
             raise
 
     def advance(self, followed: Sequence[int]) -> bool:
-        """Let the newest factors correct what the last solution followed and the variables since then, all others
-        staying as they are: a step of a filter, whose prior is the window's exact marginal.
+        """Update only the variables that the last solution followed, and those inserted since then.
+
+        It is a step of a filter whose prior is the window's exact marginal; all other variables keep their values.
 
         Args:
-            followed: the same as for `optimize`, some of these variables, for the next time.
+            followed: As for `optimize`, some of these variables, for the next time.
 
         Returns:
             Whether that was possible. Where it was not, or the step is too long for a linear one, nothing has changed.
@@ -103,7 +104,7 @@ class Window:
         return True
 
     def joint_covariance(self, keys: Sequence[int]) -> Float:
-        """Covariance of some variables together, in the order given.
+        """Return the joint covariance of some variables, in the order given.
 
         Raises:
             WindowError: if some variable is not constrained.
@@ -121,7 +122,7 @@ class Window:
         return covariance
 
     def marginalise(self, keys: Iterable[int]) -> None:
-        """Replace variables and their factors by the linear factor that says the same of the others.
+        """Marginalise variables: replace them and their factors by a linear factor on the other variables.
 
         Raises:
             WindowError: if one of them is not constrained.
@@ -141,7 +142,7 @@ class Window:
         except RuntimeError as error:
             raise WindowError(f"a state cannot be marginalised: {_one_line(error)}") from None
         if self._unknown or (self._marginal is not None and self._marginal.columns.keys() & leaving):
-            self._take(None)  # else it still tells the covariances of those that stay
+            self._take(None)  # else it still has the covariances of those that stay
         for slot in slots:
             self._graph.remove(slot)
             del self._involved[slot]
@@ -155,7 +156,7 @@ class Window:
         self._known_keys -= leaving
 
     def _insert(self, factor: gtsam.NonlinearFactor) -> int:
-        """Put a factor into a free slot of the graph, and tell which."""
+        """Put a factor into a free slot of the graph, and return the slot."""
         if self._free:
             slot = self._free.pop()
             self._graph.replace(slot, factor)
@@ -166,7 +167,7 @@ class Window:
         return slot
 
     def _solve(self, last: Sequence[int]) -> gtsam.GaussianBayesTree:
-        """The window eliminated at its present values, some variables last; their marginal is kept."""
+        """Eliminate the window at its present values, some variables last, and keep their marginal."""
         if len(self._graph.keyVector()) < self.values.size():
             loose = set(self.values.keys()).difference(*self._involved.values())
             raise WindowError(f"no factor constrains variable {_named([min(loose)])}")
@@ -181,8 +182,10 @@ class Window:
         return solution
 
     def _eliminated(self, graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.GaussianBayesTree:
-        """Cholesky takes half of the time. It refuses where its digits do not suffice, as with biases that hardly walk;
-        QR does it then, and from then on."""
+        """Eliminate by Cholesky, or by QR from the first time on that Cholesky's precision does not suffice.
+
+        Cholesky takes half of the time, but fails where biases hardly walk.
+        """
         if self._cholesky_suffices:
             try:
                 return graph.eliminateMultifrontal(ordering)
@@ -191,8 +194,10 @@ class Window:
         return graph.eliminateMultifrontal(ordering, gtsam.EliminateQR)
 
     def _extended_marginal(self, last: Sequence[int] = ()) -> Marginal | None:
-        """The marginal with the newest factors and their variables, some of which stand last, or None if that cannot be
-        told from it."""
+        """Return the marginal with the newest factors and their variables, some of them last.
+
+        None if they are tied to variables that it does not have.
+        """
         if self._marginal is None:
             return None
         followed = self._marginal.columns.keys()
@@ -203,12 +208,12 @@ class Window:
         return self._marginal.extended(linear, last, self._known_dims(followed | touched))
 
     def _take(self, marginal: Marginal | None) -> None:
-        """Keep a marginal that knows of all factors."""
+        """Keep a marginal that includes all factors."""
         self._known_keys |= frozenset().union(*(self._involved[slot] for slot in self._unknown))
         self._marginal, self._unknown = marginal, []
 
     def _known_dims(self, keys: Iterable[int]) -> dict[int, int]:
-        """Dimensions, of these variables among others."""
+        """Return the dimensions of these variables and others."""
         if not all(map(self._dims.__contains__, keys)):
             self._dims = self.values.dims()
         return self._dims

@@ -12,16 +12,16 @@ from graphvio.measurements.motion import PairReport, Quality
 
 
 class Status(StrEnum):
-    """What an estimate rests on."""
+    """What an estimate is based on."""
 
     INITIALISING = "initialising"
-    """Vision moves the pose; gravity, velocity or biases are not yet known well."""
+    """Vision constrains the pose; attitude, velocity or biases are not known well yet."""
     TRACKING = "tracking"
     """Vision constrains this frameset."""
     COASTING = "coasting"
-    """Vision failed or was rejected; the pose is predicted and its covariance grows."""
+    """Vision failed or was gated; the pose is predicted and its covariance grows."""
     LOST = "lost"
-    """There is no honest pose; the next one starts a new epoch."""
+    """The position is too uncertain to be reported; the next pose begins a new epoch."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,30 +29,29 @@ class Estimate:
     """The state of the rig at a frameset's time, as known when that frameset arrived (causal).
 
     Attributes:
-        stamp_ns: the frameset's stamp.
-        status: what the pose rests on.
-        nav_T_body: (4, 4) pose, or None when there is nothing honest to say.
+        stamp_ns: Stamp of the frameset.
+        status: What the pose is based on.
+        nav_T_body: (4, 4) pose, or None while initialising without a state and while lost.
         covariance: (6, 6) of the pose, tangent ``[rotation, translation]`` in frame body, or None with the pose.
-        epoch: counts declared breaks; poses of different epochs do not share a nav frame.
+        epoch: Number of declared breaks; poses of different epochs do not share a nav frame.
         velocity_nav: (3,) m/s in nav, or None when not estimated.
         gyro_bias: (3,) rad/s, or None without an IMU.
         accel_bias: (3,) m/s^2, or None without an IMU.
         velocity_covariance: (3, 3) of ``velocity_nav``, in nav, or None where it is not estimated.
         gyro_bias_covariance: (3, 3), or None where the bias is not estimated.
         accel_bias_covariance: (3, 3), or None where the bias is not estimated.
-        time_offset_s: how much later than the framesets' the IMU's stamp of an instant is, as estimated, or None where
-            that is not estimated.
-        time_offset_sigma_s: its standard deviation, or None.
-        innovations: what was measured against what was expected, with the test's outcome: ``vision``, and ``rest``
-            where the rig stood still; with the paper's filter ``vision``, ``gyro`` and ``accelerometer``.
-        rates: angular rate of body (3,) rad/s by ``gyro``, ``vision`` and ``fused``, as far as known.
-        vision: how far the motion that vision measured can be trusted.
-        vision_reason: why that is not ``good``, or empty.
-        vision_sigmas: how well the geometry conditions that motion: its standard deviations in the directions that are
-            known least, of the rotation (radians) and the translation (metres); None without a motion.
-        is_stationary: images, and the IMU if there is one, show no motion.
-        pairs: pair index -> what it contributed.
-        stage_ms: processing time by stage, milliseconds: ``predict``; ``track``, with all pairs side by side; its parts
+        time_offset_s: The IMU's stamp less the framesets' stamp of the same instant, as estimated, or None.
+        time_offset_sigma_s: Standard deviation of the time offset, or None.
+        innovations: Outcomes of the innovation tests by name: ``vision``, and ``zero_velocity`` at a standstill; with
+            the paper's filter ``vision``, ``gyro`` and ``accelerometer``.
+        rates: Angular rate of body (3,) rad/s by ``gyro``, ``vision`` and ``fused``, as far as known.
+        vision: How far the motion that vision measured can be trusted.
+        vision_reason: Why that is not ``good``, or empty.
+        vision_sigmas: Standard deviations of that motion in the directions that are known least, of the rotation
+            (radians) and the translation (metres); None without a motion.
+        is_stationary: Whether images, and the IMU if there is one, show a standstill.
+        pairs: Pair index -> report of the pair.
+        stage_ms: Processing time by stage, milliseconds: ``predict``; ``track``, with all pairs side by side; its parts
             ``pyramid``, ``register``, ``flow`` and ``stereo``, each of the pair that took longest; then ``motion``,
             ``quality``, ``replenish`` (next to nothing unless the reference changes) and ``update``. A stage that was
             not reached is absent.
@@ -83,14 +82,14 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """The rig between framesets, or beyond the newest one, from the newest estimate and the IMU since then.
+    """The predicted rig between framesets or beyond the newest one.
 
     Attributes:
-        stamp_ns: on the framesets' clock.
+        stamp_ns: On the framesets' clock.
         nav_T_body: (4, 4) pose.
         velocity_nav: (3,) m/s in nav.
         angular_velocity: (3,) rad/s in body, without the gyro's bias.
-        epoch: of the estimate that it goes on from.
+        epoch: Epoch of the estimate that it is predicted from.
     """
 
     stamp_ns: int

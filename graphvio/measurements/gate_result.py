@@ -6,19 +6,19 @@ from dataclasses import dataclass
 
 from graphvio.arrays import Float
 
-_UNCLEAR = (0.5, 2.0)  # statistic over threshold
+_UNCLEAR_RATIO = (0.5, 2.0)  # statistic over threshold
 
 
 @dataclass(frozen=True, eq=False)
 class GateResult:
-    """Outcome of a gate.
+    """Outcome of an innovation test.
 
     Attributes:
-        accepted: whether the measurement may be used.
-        statistic: squared Mahalanobis distance of the innovation.
-        threshold: the largest that is accepted.
-        innovation: (M,) what was measured, less what was expected.
-        covariance: (M, M) of it.
+        accepted: Whether the measurement passed.
+        statistic: Squared Mahalanobis distance of the innovation.
+        threshold: Largest statistic that passes.
+        innovation: (M,) measurement less its prediction.
+        covariance: (M, M) of the innovation.
     """
 
     accepted: bool
@@ -29,5 +29,5 @@ class GateResult:
 
     @property
     def is_clear(self) -> bool:
-        """Whether the outcome is not a matter of a small difference."""
-        return not _UNCLEAR[0] < self.statistic / self.threshold < _UNCLEAR[1]
+        """Whether the statistic is far from the threshold."""
+        return not _UNCLEAR_RATIO[0] < self.statistic / self.threshold < _UNCLEAR_RATIO[1]

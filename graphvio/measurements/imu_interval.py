@@ -1,4 +1,4 @@
-"""The IMU between two instants."""
+"""The IMU samples between two instants."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class ImuInterval:
     """The IMU between two instants, as steps of constant rate and acceleration.
 
     Attributes:
-        steps_s: (N,) durations.
+        steps_s: (N,) durations of the steps.
         angular_velocity: (N, 3) rad/s, body.
         linear_acceleration: (N, 3) m/s^2 specific force, body.
     """

@@ -1,4 +1,4 @@
-"""What the front-end says of a frameset: a measured motion, how far it can be trusted, and why."""
+"""Relative motions, and the front-end's result for a frameset."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class Quality(StrEnum):
     """How far a measured motion can be trusted."""
 
     GOOD = "good"
-    """Its covariance says all there is to say."""
+    """Its covariance is consistent."""
     WEAK = "weak"
-    """Pairs contradict each other, points are few, or a direction is hardly constrained; its covariance says so."""
+    """Pairs contradict each other, points are few, or a direction is hardly constrained; its covariance is enlarged."""
     FAILED = "failed"
     """There is no motion."""
 
@@ -27,17 +27,16 @@ class PairReport:
     """What one stereo pair contributed to a frameset.
 
     Attributes:
-        points: points offered to the estimation.
-        inliers: points that the chosen motion explains.
+        points: Points that take part in the estimation.
+        inliers: Points that the chosen motion explains.
         pixels: (N, 2) left-image pixels of the tracked corners, for display.
-        is_inlier: (N,) whether each of them is explained.
+        is_inlier: (N,) whether each of them is an inlier.
         ages: (N,) number of earlier frames that saw each of them.
-        rejected: test of tracking or stereo matching -> how many corners it threw out.
-        rms_px: rms reprojection error of these under the chosen motion, per direction and without the share of the
+        rejected: Check of tracking or stereo matching -> number of corners that failed it.
+        rms_px: RMS reprojection error of these under the chosen motion, per direction and without the share of the
             points' own uncertainty; None where there are none.
-        own_inliers: points that the pair's own motion explains, or None where there is but one pair or too few points.
-        own_rms_px: their rms error under it, or None; much less than ``rms_px`` tells of a transfer between pairs that
-            is wrong.
+        own_inliers: Points that the pair's own motion explains, or None where there is but one pair or too few points.
+        own_rms_px: Their RMS error under it, or None; much less than ``rms_px`` is a sign of wrong extrinsics.
     """
 
     points: int
@@ -56,12 +55,12 @@ class RelativeMotion:
     """A measured motion of the rig.
 
     Attributes:
-        reference_stamp_ns: the earlier instant.
-        stamp_ns: the later one.
+        reference_stamp_ns: Stamp of the earlier frameset.
+        stamp_ns: Stamp of the later frameset.
         reference_T_current: (4, 4) of body: the motion that a between factor takes.
         covariance: (6, 6), tangent ``[rotation, translation]`` in the body frame of the later instant.
         shared_covariance: (6, 6) the part of it that all motions from this reference have in common, same tangent.
-        inliers: number of points that it explains.
+        inliers: Number of points that it explains.
     """
 
     reference_stamp_ns: int
@@ -73,7 +72,7 @@ class RelativeMotion:
 
     @property
     def duration_s(self) -> float:
-        """Time between the two instants."""
+        """Time between the two framesets."""
         return (self.stamp_ns - self.reference_stamp_ns) * 1e-9
 
     @property
@@ -87,18 +86,18 @@ class RelativeMotion:
 
 @dataclass(frozen=True, eq=False)
 class VisualResult:
-    """What the front-end made of one frameset.
+    """The front-end's result for one frameset.
 
     Attributes:
-        motion: the measured motion, or None.
-        quality: how far the motion can be trusted.
-        reason: why it is not good, or empty.
-        alternatives: where pairs contradict each other, what each side says with its own covariance: one is right.
-        own: at the end of a keyframe, pair -> its own motion of body, as the rig file's place of the pair makes it.
-        is_stationary: the images have shown no motion for a while.
-        frozen: pairs that were left out because a camera of theirs repeats an image.
-        pairs: pair index -> report.
-        stage_ms: time by stage, milliseconds: ``track``, with all pairs side by side; its parts ``pyramid``,
+        motion: The measured motion, or None.
+        quality: How far the motion can be trusted.
+        reason: Why it is not good, or empty.
+        pairs: Pair index -> report of the pair.
+        alternatives: Motion hypotheses with their own covariances, where pairs contradict each other.
+        own: At the end of a keyframe, pair index -> its own motion of body by the rig's extrinsics.
+        is_stationary: Whether the images have shown no motion for a while.
+        frozen: Pairs that were left out because a camera of theirs repeats an image.
+        stage_ms: Processing time by stage, milliseconds: ``track``, with all pairs side by side; its parts ``pyramid``,
             ``register``, ``flow`` and ``stereo``, each of the pair that took longest; then ``motion``, ``quality``, and
             ``replenish``, which is next to nothing unless the reference changes.
     """

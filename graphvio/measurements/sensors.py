@@ -25,7 +25,7 @@ class ImuSample:
     Attributes:
         stamp_ns: IMU clock, nanoseconds.
         angular_velocity: (3,) rad/s, frame body.
-        linear_acceleration: (3,) m/s^2, frame body: specific force, so at rest it points up with 9.81.
+        linear_acceleration: (3,) m/s^2, frame body: specific force, so at a standstill it points up with 9.81.
     """
 
     stamp_ns: int
@@ -52,7 +52,7 @@ Measurement = ImuSample | FrameSet
 
 
 def checked_measurement(measurement: Measurement) -> Measurement:
-    """The measurement with its stamp as an int and its vectors as float64 arrays.
+    """Return the measurement with its stamp as an int and its vectors as float64 arrays.
 
     Raises:
         MeasurementError: if its type, stamp, vectors or pairs are not valid.

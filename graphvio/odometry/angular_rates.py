@@ -9,7 +9,7 @@ from graphvio.measurements.motion import RelativeMotion
 
 
 class AngularRates:
-    """Turns successive measured motions, which may share a reference, into rates over the newest interval."""
+    """Converts successive motions, which may share a reference, into rates over the newest interval."""
 
     def __init__(self) -> None:
         self._before: RelativeMotion | None = None
@@ -17,7 +17,7 @@ class AngularRates:
     def update(
         self, motion: RelativeMotion | None, interval: ImuInterval | None, gyro_bias: Float, fused: Float | None
     ) -> dict[str, Float]:
-        """Rates (3,) rad/s in body by ``gyro``, ``vision`` and ``fused``, as far as known.
+        """Return rates (3,) rad/s in body by ``gyro``, ``vision`` and ``fused``, as far as known.
 
         Args:
             motion: measured motion that ends in the newest frameset, or None.

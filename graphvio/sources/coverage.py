@@ -68,7 +68,7 @@ def count_imu_faults(stamps_ns: Int, begin_ns: int, end_ns: int, faults: FaultLo
     period = int(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0
     if stamps_ns[0] > begin_ns + period:
         detail = f"the first sample comes {_ms(int(stamps_ns[0]) - begin_ns)} after the first frameset"
-        faults.add(EventKind.IMU_STARTS_LATE, int(stamps_ns[0]), detail)
+        faults.add(EventKind.IMU_BEGINS_LATE, int(stamps_ns[0]), detail)
     if stamps_ns[-1] < end_ns - period:
         detail = f"the last sample comes {_ms(end_ns - int(stamps_ns[-1]))} before the last frameset"
         faults.add(EventKind.IMU_STOPS_EARLY, int(stamps_ns[-1]), detail)

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from paper_graph import PaperGraph
 
 from campaigns.walks import FRAMES_HZ, Walk, buffer_of
 from graphvio.arrays import Float
 from graphvio.backend.ekf.filter import ExtendedKalmanFilter
-from graphvio.backend.ekf.graph import PaperGraph
 from graphvio.backend.ekf.measurements import Measurement, VisualRates, accelerometer, gyro, stacked, vision
 from graphvio.backend.ekf.process import noise_sigmas
 from graphvio.backend.ekf.state import FilterState

@@ -126,7 +126,7 @@ class FilterEstimator:
         if self._filter is not None:
             self.epoch += 1
             self._report(
-                stamp_ns, EventKind.IMU_CAME, f"the IMU has come: epoch {self.epoch} starts with gravity pointing down"
+                stamp_ns, EventKind.IMU_CAME, f"the IMU has come: epoch {self.epoch} begins with gravity pointing down"
             )
             position = self.state().nav_T_body[:3, 3]
         elif self._rig.imu is not None and imu is None:
@@ -216,11 +216,11 @@ class FilterEstimator:
             if self._status.is_lost:
                 self.epoch += 1
                 self._report(
-                    stamp_ns, EventKind.NEW_EPOCH, f"vision is back: epoch {self.epoch} starts at the predicted pose"
+                    stamp_ns, EventKind.NEW_EPOCH, f"vision is back: epoch {self.epoch} begins at the predicted pose"
                 )
             self._status.is_lost, self._tracked_ns, self._before_outage = False, stamp_ns, position
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(position - self._before_outage)[-1], 0.0)))
-        # Motion does not tell this filter more of its attitude: an initialisation is over with the first motion.
+        # Motion does not make this filter's attitude better known: an initialisation is over with the first motion.
         return StateUpdate(self._status.status(stamp_ns, is_constrained, sigma, self.has_imu, lambda: ""))
 
     @property
@@ -262,14 +262,14 @@ class FilterEstimator:
         state, config = self._running.state, self._config.filter
         accel = float(np.linalg.norm(rates.values[:3] - state.velocity_body)) / motion.duration_s
         sigma = np.sqrt(np.linalg.eigvalsh(self._running.covariance[VELOCITY, VELOCITY])[-1])
-        is_known = sigma / motion.duration_s < config.max_accel_m_s2  # the velocity, well enough to tell
+        is_known = sigma / motion.duration_s < config.max_accel_m_s2  # the velocity, well enough to decide
         if is_known and accel > config.max_accel_m_s2:
             self._report(motion.stamp_ns, EventKind.VISION_GATED, f"asks for an acceleration of {accel:.0f} m/s^2")
             return False
         return self._passes(vision(state, rates))
 
     def _passes(self, measurement: Measurement) -> bool:
-        gate_result = self._running.test(measurement, self._config.filter.gate_probability)
+        gate_result = self._running.gate(measurement, self._config.filter.gate_probability)
         self.gate_results[measurement.name] = gate_result
         if not gate_result.accepted:
             self._report(
@@ -283,7 +283,7 @@ class FilterEstimator:
         """Begin an epoch at the last pose, after a gap that nothing bridges."""
         self.epoch += 1
         self._report(
-            stamp_ns, EventKind.TIME_JUMP, f"{gap_s:.1f} s without data: epoch {self.epoch} starts at the last pose"
+            stamp_ns, EventKind.TIME_JUMP, f"{gap_s:.1f} s without data: epoch {self.epoch} begins at the last pose"
         )
         self._reset_velocities()
         self._running.covariance[POSITION, POSITION] += AFTER_JUMP[3:, 3:]

@@ -16,10 +16,10 @@ from graphvio.measurements.gate_result import GateResult
 
 @dataclass
 class ExtendedKalmanFilter:
-    """State and covariance.
+    """The paper's filter: a state and its covariance.
 
     Attributes:
-        state: the estimate.
+        state: The estimate.
         covariance: (15, 15) of its error, see `FilterState.plus`.
     """
 
@@ -27,18 +27,18 @@ class ExtendedKalmanFilter:
     covariance: Float
 
     def predict(self, dt: float, sigmas: Float) -> None:
-        """Go on by a time step in seconds with a process noise of standard deviations (9,)."""
+        """Predict over a time step in seconds with a process noise of standard deviations (9,), eq. (11) and (12)."""
         by_error, by_noise = jacobians(self.state, dt)
         noise = by_noise * sigmas
         self.covariance = by_error @ self.covariance @ by_error.T + noise @ noise.T
         self.state = propagated(self.state, dt)
 
-    def test(self, measurement: Measurement, probability: float) -> GateResult:
-        """Chi-square test of an innovation."""
+    def gate(self, measurement: Measurement, probability: float) -> GateResult:
+        """Test the innovation of a measurement."""
         return gate_innovation(measurement.innovation, self._spread(measurement), probability)
 
     def update(self, measurement: Measurement) -> None:
-        """Kalman update, in Joseph's form."""
+        """Update by a measurement, in Joseph's form."""
         by_error = measurement.by_error
         gain = np.linalg.solve(self._spread(measurement), by_error @ self.covariance).T
         kept = np.eye(ERRORS) - gain @ by_error
@@ -47,18 +47,21 @@ class ExtendedKalmanFilter:
         self.state = self.state.plus(gain @ measurement.innovation)
 
     def reset_position(self, sigma_m: float) -> Float:
-        """Forget what is not known of the position but through the other states, of which it keeps the correlation.
+        """Reset the position's covariance up to its correlation with the other states.
+
+        Args:
+            sigma_m: Standard deviation that remains.
 
         Returns:
-            What was forgotten, a covariance (3, 3) in nav.
+            The covariance (3, 3) in nav that was removed.
         """
-        rest = slice(POSITION.stop, ERRORS)
-        cross = self.covariance[POSITION, rest]
-        through_rest = cross @ np.linalg.pinv(self.covariance[rest, rest], hermitian=True) @ cross.T
-        forgotten = self.covariance[POSITION, POSITION] - through_rest
-        self.covariance[POSITION, POSITION] = through_rest + sigma_m**2 * np.eye(3)
+        others = slice(POSITION.stop, ERRORS)
+        cross = self.covariance[POSITION, others]
+        through_others = cross @ np.linalg.pinv(self.covariance[others, others], hermitian=True) @ cross.T
+        forgotten = self.covariance[POSITION, POSITION] - through_others
+        self.covariance[POSITION, POSITION] = through_others + sigma_m**2 * np.eye(3)
         return forgotten
 
     def _spread(self, measurement: Measurement) -> Float:
-        """Covariance (M, M) of the innovation."""
+        """Return the covariance (M, M) of the innovation."""
         return measurement.by_error @ self.covariance @ measurement.by_error.T + measurement.covariance

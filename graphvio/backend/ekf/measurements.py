@@ -1,4 +1,4 @@
-"""What the filter measures (eq. 13): rates from vision, gyro, and the accelerometer as gravity."""
+"""Measurements of the filter (eq. 13): rates by vision and gyro, and the accelerometer as gravity."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from graphvio.geometry import skew, so3_log, so3_right_jacobian_inverse
 from graphvio.measurements.motion import RelativeMotion
 
 GRAVITY = np.array([0.0, 0.0, GRAVITY_M_S2])
-"""Specific force at rest, nav."""
+"""Specific force at a standstill, in nav."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,8 +22,8 @@ class Measurement:
     """A measurement at a state.
 
     Attributes:
-        name: what it can be counted by.
-        innovation: (M,) measured minus expected.
+        name: Name of the sensor.
+        innovation: (M,) measured minus expected value.
         by_error: (M, 15) derivative of what is expected by the state's error.
         covariance: (M, M) of the noise.
     """
@@ -48,7 +48,7 @@ class VisualRates:
 
     @staticmethod
     def of(motion: RelativeMotion) -> VisualRates:
-        """A measured motion over its time step: ``-R^T T`` and the rotation vector (section 5)."""
+        """Divide a measured motion by its time step: ``-R^T T`` and the rotation vector (section 5)."""
         dt = motion.duration_s
         rotation = np.ascontiguousarray(motion.reference_T_current[:3, :3])
         turn = so3_log(rotation)
@@ -60,7 +60,7 @@ class VisualRates:
 
 
 def stacked(measurements: Sequence[Measurement]) -> Measurement:
-    """Several measurements of one state, independent of each other, as one."""
+    """Stack several independent measurements of one state."""
     sizes = [len(measurement.innovation) for measurement in measurements]
     covariance = np.zeros((sum(sizes), sum(sizes)))
     start = 0
@@ -76,7 +76,7 @@ def stacked(measurements: Sequence[Measurement]) -> Measurement:
 
 
 def vision(state: FilterState, rates: VisualRates) -> Measurement:
-    """``v^vo = v + n`` and ``omega^vo = omega + n``, which are correlated with each other."""
+    """Measure ``v^vo = v + n`` and ``omega^vo = omega + n``, which are correlated with each other."""
     by_error = np.zeros((6, ERRORS))
     by_error[0:3, VELOCITY] = by_error[3:6, RATE] = np.eye(3)
     expected = np.concatenate([state.velocity_body, state.rate_body])
@@ -84,14 +84,14 @@ def vision(state: FilterState, rates: VisualRates) -> Measurement:
 
 
 def gyro(state: FilterState, rate: Float, sigma_rad_s: float) -> Measurement:
-    """``omega^imu = omega + b + n``."""
+    """Measure ``omega^imu = omega + b + n``."""
     by_error = np.zeros((3, ERRORS))
     by_error[:, RATE] = by_error[:, GYRO_BIAS] = np.eye(3)
     return Measurement("gyro", rate - state.rate_body - state.gyro_bias, by_error, sigma_rad_s**2 * np.eye(3))
 
 
 def accelerometer(state: FilterState, force: Float, sigma_m_s2: float) -> Measurement:
-    """``a^imu = R(q) g + n``: what the rig's own acceleration adds is noise."""
+    """Measure ``a^imu = R(q) g + n``, where the rig's own acceleration is part of the noise."""
     expected = state.nav_R_body.T @ GRAVITY
     by_error = np.zeros((3, ERRORS))
     by_error[:, ATTITUDE] = skew(expected)

@@ -1,4 +1,4 @@
-"""The filter's process: constant velocity, constant angular velocity (eq. 11, 12)."""
+"""The process model of the filter: constant velocity, constant angular velocity (eq. 11, 12)."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ NOISES = 9
 
 
 def noise_sigmas(dt: float, accel_sigma_m_s2: float, angular_accel_sigma_rad_s2: float, gyro_bias_walk: float) -> Float:
-    """Standard deviations (9,) of the process noise over a time step in seconds.
+    """Return the standard deviations (9,) of the process noise over a time step.
 
     Args:
-        dt: the step.
-        accel_sigma_m_s2: of the unknown acceleration, constant within a step.
-        angular_accel_sigma_rad_s2: likewise.
-        gyro_bias_walk: rad/s per root of a second.
+        dt: Time step, seconds.
+        accel_sigma_m_s2: Of the unknown acceleration, constant within a step.
+        angular_accel_sigma_rad_s2: Of the unknown angular acceleration.
+        gyro_bias_walk: Rad/s per root of a second.
     """
     return np.repeat([accel_sigma_m_s2 * dt, angular_accel_sigma_rad_s2 * dt, gyro_bias_walk * np.sqrt(dt)], 3)
 
 
 def propagated(state: FilterState, dt: float) -> FilterState:
-    """The state after a time step in seconds, without noise (eq. 11)."""
+    """Return the state after a time step in seconds, without noise (eq. 11)."""
     return FilterState(
         state.position + state.nav_R_body @ state.velocity_body * dt,
         state.nav_R_body @ so3_exp(state.rate_body * dt),
@@ -36,9 +36,9 @@ def propagated(state: FilterState, dt: float) -> FilterState:
 
 
 def jacobians(state: FilterState, dt: float) -> tuple[Float, Float]:
-    """Derivatives of the next state's error by this one's (15, 15), and by the noise (15, 9).
+    """Return the derivatives of the next state's error by this one's (15, 15), and by the noise (15, 9).
 
-    The same ``n_v`` and ``n_omega`` change the velocities and, through eq. (12), what is moved during the step.
+    The same ``n_v`` and ``n_omega`` change the velocities and, through eq. (12), the motion during the step.
     """
     by_error, by_noise = np.eye(ERRORS), np.zeros((ERRORS, NOISES))
     turned = so3_right_jacobian(state.rate_body * dt) * dt

@@ -10,7 +10,7 @@ from graphvio.arrays import Float
 from graphvio.geometry import se3, so3_exp, so3_log
 
 POSITION, ATTITUDE, VELOCITY, RATE, GYRO_BIAS = (slice(k, k + 3) for k in range(0, 15, 3))
-"""Where each part of the error stands."""
+"""Parts of the error."""
 ERRORS = 15
 
 
@@ -38,7 +38,7 @@ class FilterState:
         return se3(self.nav_R_body, self.position)
 
     def plus(self, error: Float) -> FilterState:
-        """The state whose error (15,) with respect to this one is given; attitude's is a rotation vector in body."""
+        """Return the state with an error (15,) with respect to this one; attitude's is a rotation vector in body."""
         return FilterState(
             self.position + error[POSITION],
             self.nav_R_body @ so3_exp(np.ascontiguousarray(error[ATTITUDE])),
@@ -48,7 +48,7 @@ class FilterState:
         )
 
     def minus(self, other: FilterState) -> Float:
-        """The error (15,) of this state with respect to another: the inverse of `plus`."""
+        """Return the error (15,) of this state with respect to another: the inverse of `plus`."""
         return np.concatenate(
             [
                 self.position - other.position,

@@ -1,10 +1,10 @@
-"""The filter's model in a factor graph: with a lag of one step and one Gauss-Newton iteration it is the filter.
+"""The paper's filter as a factor graph: with a lag of one step and one Gauss-Newton iteration the two are equal.
 
-A state is three variables: position, attitude, and the rest together. The process, eq. (11) and (12), is one factor
+A state is three variables: position, attitude, and all others together. The process, eq. (11) and (12), is one factor
 between consecutive states. The noise that changes the velocities is the noise of what is moved: position and attitude
 follow from the velocities without any noise of their own, so six of the factor's rows are constraints.
 
-No odometry runs on it: it shows what the filter is, and what a longer lag and more iterations would gain.
+It shows what a longer lag and more iterations would gain; the odometry does not use it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from graphvio.geometry import skew, so3_exp, so3_log, so3_right_jacobian, so3_ri
 Expectation = Callable[[FilterState], Measurement]
 """What a measurement makes of a state."""
 
-_PARTS = (slice(0, 3), slice(3, 6), slice(6, ERRORS))  # of the error: position, attitude, the rest
+_PARTS = (slice(0, 3), slice(3, 6), slice(6, ERRORS))  # of the error: position, attitude, all others
 
 
 class PaperGraph:
@@ -95,10 +95,10 @@ class PaperGraph:
                 involved.push_back(linear.at(i))
             else:
                 staying.append(factor)
-        _, rest = involved.eliminatePartialMultifrontal(gtsam.Ordering(leaving), gtsam.EliminateQR)
-        for i in range(rest.size()):
-            if rest.at(i) is not None and len(rest.at(i).keys()):
-                staying.append(gtsam.LinearContainerFactor(rest.at(i), at))
+        _, remaining = involved.eliminatePartialMultifrontal(gtsam.Ordering(leaving), gtsam.EliminateQR)
+        for i in range(remaining.size()):
+            if remaining.at(i) is not None and len(remaining.at(i).keys()):
+                staying.append(gtsam.LinearContainerFactor(remaining.at(i), at))
         for key in leaving:
             self._values.erase(key)
         self._factors = staying
@@ -126,8 +126,8 @@ def _keys(k: int) -> list[int]:
 
 def _state(values: gtsam.Values, keys: Sequence[int]) -> FilterState:
     x, q, u = keys
-    rest = values.atVector(u)
-    return FilterState(values.atVector(x), values.atRot3(q).matrix(), rest[0:3], rest[3:6], rest[6:9])
+    velocities = values.atVector(u)
+    return FilterState(values.atVector(x), values.atRot3(q).matrix(), velocities[0:3], velocities[3:6], velocities[6:9])
 
 
 def _prior(keys: Sequence[int], state: FilterState, covariance: Float) -> gtsam.CustomFactor:
@@ -175,7 +175,7 @@ def _process(before: Sequence[int], after: Sequence[int], dt: float, sigmas: Flo
             for i, part in enumerate(_PARTS):
                 jacobians[i] = np.asfortranarray(by_then[:, part])
                 jacobians[i + 3] = np.asfortranarray(by_now[:, part])
-        rest = now.minus(then)[6:]
-        return np.concatenate([moved - now.velocity_body * dt, off, rest])
+        change = now.minus(then)[6:]
+        return np.concatenate([moved - now.velocity_body * dt, off, change])
 
     return gtsam.CustomFactor(noise, [*before, *after], _error)
