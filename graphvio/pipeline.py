@@ -61,7 +61,7 @@ class RunListener:
     """Callbacks that follow a run, in the thread of the run.
 
     Attributes:
-        on_step: takes what went into an estimate, see `graphvio.odometry.Odometry`.
+        on_step: takes each step of the odometry, see `graphvio.odometry.Odometry.subscribe`.
         on_estimate: takes each estimate, after its frameset, or None where that is no longer in memory.
         on_event: takes each event of the odometry.
         on_smoothed: takes stamps and poses ``nav_T_body`` (4, 4) that have left the smoother's window.

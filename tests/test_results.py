@@ -10,7 +10,7 @@ import pytest
 from graphvio.errors import GraphvioError
 from graphvio.geometry import se3, so3_exp
 from graphvio.measurements.estimate import Estimate, Status
-from graphvio.measurements.events import Event
+from graphvio.measurements.events import Event, EventKind
 from graphvio.measurements.motion import PairReport
 from graphvio.results import PairMedians, ResultWriter, Summary
 from graphvio.rig import Camera, Imu, Rig, StereoPair
@@ -89,8 +89,8 @@ def write_all(folder: Path, truth: Trajectory | None = None) -> Summary:
     with ResultWriter(folder, some_rig(), "profile: balanced\n") as writer:
         for estimate in estimates():
             writer.add(estimate)
-        writer.add_event(Event(START_NS, "vision_gated", "front: 3 of 40 points, «far off»"))
-        writer.add_event(Event(START_NS + 1, "reset", "lost"))
+        writer.add_event(Event(START_NS, EventKind.VISION_GATED, "front: 3 of 40 points, «far off»"))
+        writer.add_event(Event(START_NS + 1, EventKind.NEW_EPOCH, "lost"))
         return finish(writer, truth)
 
 
@@ -203,7 +203,7 @@ def test_summary_has_figures_of_run(folder: Path) -> None:
     assert summary["stage_ms"]["track"] == {"median": 29.5, "p95": 56.05, "p99": 58.41}
     assert summary["frameset_ms"]["median"] == 2.0
     assert summary["input_faults"] == {"imu_gap": 2}
-    assert summary["events"] == {"vision_gated": 1, "reset": 1}
+    assert summary["events"] == {"vision_gated": 1, "new_epoch": 1}
     assert summary["status"] == {"tracking": 45, "coasting": 10, "lost": 5}
     assert [epoch["poses"] for epoch in summary["epochs"]] == [30, 25]
     assert summary["graphvio_version"] == __version__

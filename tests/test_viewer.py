@@ -13,7 +13,7 @@ import pytest
 from graphvio.errors import GraphvioError, MissingExtraError
 from graphvio.geometry import se3, so3_exp
 from graphvio.measurements.estimate import Estimate, Status
-from graphvio.measurements.events import Event
+from graphvio.measurements.events import Event, EventKind
 from graphvio.measurements.motion import PairReport
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Camera, Imu, Rig, StereoPair
@@ -87,7 +87,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Viewer(some_rig(), save=file) as viewer:
         for k in range(250):
             viewer.show(frameset(k), estimate(k))
-        viewer.show_event(Event(START_NS, "vision_gated", "front"))
+        viewer.show_event(Event(START_NS, EventKind.VISION_GATED, "front"))
         viewer.show_path("smoothed", Trajectory(np.arange(3), np.array([np.eye(4)] * 3)))
     return file
 
@@ -243,7 +243,7 @@ def test_replay_shows_result_folder(tmp_path: Path) -> None:
     with ResultWriter(folder, some_rig(), "") as writer:
         for each in shown:
             writer.add(each)
-        writer.add_event(Event(START_NS, "vision_gated", "front"))
+        writer.add_event(Event(START_NS, EventKind.VISION_GATED, "front"))
         smoothed = [(e.stamp_ns, e.nav_T_body) for e in shown if e.nav_T_body is not None]
         writer.finish(
             wall_s=1.0,

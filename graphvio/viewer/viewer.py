@@ -12,7 +12,6 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 from graphvio.errors import GraphvioError, MissingExtraError
@@ -61,13 +60,11 @@ class Viewer:
     def __enter__(self) -> Viewer:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             self.close()
         except GraphvioError:
-            if value is None:  # otherwise the first error matters more
+            if kind is None:  # otherwise the first error matters more
                 raise
 
     @property
