@@ -79,7 +79,7 @@ def write_image(path: Path, image: np.ndarray[tuple[int, ...], np.dtype[np.uint8
 def write_euroc(path: Path, pairs: int = 2, frames: int = 10, imu: bool = True, rig: Rig | None = None) -> Path:
     """Write an EuRoC/ASL recording with a ``sensor.yaml`` per sensor; returns its path.
 
-    Frames come every 50 ms from `START_NS`; the IMU, at 200 Hz and at rest, from 1 s before to 0.1 s after.
+    Frames come every 50 ms from `START_NS`; the IMU, at 200 Hz and stationary, from 1 s before to 0.1 s after.
     """
     rig = rig or small_rig(pairs, imu)
     root = path / "mav0"
@@ -99,7 +99,7 @@ def write_euroc(path: Path, pairs: int = 2, frames: int = 10, imu: bool = True, 
 
 
 def imu_row(stamp: int) -> str:
-    """A row of ``imu0/data.csv`` at rest."""
+    """A row of ``imu0/data.csv`` of a stationary IMU."""
     return f"{stamp},0.01,-0.02,0.03,0.1,0.2,9.81"
 
 

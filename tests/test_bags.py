@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2, and others' MCAP files, written by a library that is not ours."""
+"""Bags of ROS 1 and ROS 2, and MCAP files, written by the library rosbags."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def messages(recording: Path, folder: Path) -> list[Message]:
-    """All that a session of the recording holds, recorded a little after it was measured."""
+    """All messages of a session of the recording, recorded a little after they were measured."""
     file = open_store(written(recording, folder / "session.mcap"))
     found = [
         (topic.name, topic.type_name, logged_ns + LATE_NS, file.read(place))
@@ -67,7 +67,7 @@ def ros1_bag(messages: list[Message], path: Path) -> Path:
     types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 
     def old(message: Any) -> Any:
-        """A message as ROS 1 has it."""
+        """The ROS 1 message."""
         if isinstance(message, list):
             return [old(each) for each in message]
         name = getattr(message, "__msgtype__", None)
@@ -98,7 +98,7 @@ def bag(kind: str, messages: list[Message], folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["ros1", "db3", "mcap", "mcap file"])
-def test_a_bag_yields_what_was_recorded(kind: str, recording: Path, tmp_path: Path) -> None:
+def test_bag_yields_the_recorded_measurements(kind: str, recording: Path, tmp_path: Path) -> None:
     original = open_source(recording)
     path = bag(kind, messages(recording, tmp_path), tmp_path)
     source = open_source(path, original.rig)
@@ -109,7 +109,7 @@ def test_a_bag_yields_what_was_recorded(kind: str, recording: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize("kind", ["ros1", "db3"])
-def test_a_bag_tells_its_own_rig(kind: str, recording: Path, tmp_path: Path) -> None:
+def test_bag_has_the_rig_of_its_messages(kind: str, recording: Path, tmp_path: Path) -> None:
     expected = open_source(recording).rig
     source = open_source(bag(kind, messages(recording, tmp_path), tmp_path))
     assert [pair.name for pair in source.rig.pairs] == ["pair0", "pair1"]
@@ -121,7 +121,7 @@ def test_a_bag_tells_its_own_rig(kind: str, recording: Path, tmp_path: Path) -> 
     assert len([measurement for measurement in source if isinstance(measurement, FrameSet)]) == 6
 
 
-def test_a_baseline_may_be_told_by_the_projection(recording: Path, tmp_path: Path) -> None:
+def test_bag_without_right_transform_takes_the_baseline_of_the_projection(recording: Path, tmp_path: Path) -> None:
     """As drivers of stereo cameras do: both cameras in one frame, and the baseline in ``camera_info``."""
 
     def change(message: Message) -> Message | None:
@@ -144,11 +144,11 @@ def test_a_baseline_may_be_told_by_the_projection(recording: Path, tmp_path: Pat
     np.testing.assert_allclose(pair.left.body_T_cam, np.eye(4))
 
 
-def test_topics_of_any_name_may_be_mapped(recording: Path, tmp_path: Path) -> None:
+def test_topics_of_other_names_are_mapped(recording: Path, tmp_path: Path) -> None:
     def renamed(message: Message) -> Message:
-        topic, *rest = message
+        topic, *others = message
         names = {"/pair0/left/image_raw": "/a", "/pair0/right/image_raw": "/b", "/imu": "/c"}
-        return (names.get(topic, topic), *rest)  # type: ignore[return-value]
+        return (names.get(topic, topic), *others)  # type: ignore[return-value]
 
     path = bag("db3", [renamed(message) for message in messages(recording, tmp_path)], tmp_path)
     rig = open_source(recording).rig.with_pairs([0])
@@ -168,7 +168,7 @@ def test_topics_of_any_name_may_be_mapped(recording: Path, tmp_path: Path) -> No
     assert "give NAME=TOPIC separated by commas" in str(done.exception)
 
 
-def test_what_a_bag_does_not_tell_is_asked_for(recording: Path, tmp_path: Path) -> None:
+def test_bag_without_transforms_or_calibration_is_refused(recording: Path, tmp_path: Path) -> None:
     made = messages(recording, tmp_path)
     (tmp_path / "one").mkdir()
     (tmp_path / "two").mkdir()
@@ -180,12 +180,12 @@ def test_what_a_bag_does_not_tell_is_asked_for(recording: Path, tmp_path: Path) 
         open_source(bag("db3", without_infos, tmp_path / "two"))
 
 
-def test_latency_is_told(recording: Path, tmp_path: Path) -> None:
+def test_describe_gives_the_latency(recording: Path, tmp_path: Path) -> None:
     found = describe(bag("mcap file", messages(recording, tmp_path), tmp_path))
     assert {topic.name: topic.latency_ms for topic in found.topics}["/imu"] == pytest.approx(3.0)
 
 
-def test_a_bag_that_is_damaged_is_refused(recording: Path, tmp_path: Path) -> None:
+def test_damaged_bag_is_refused(recording: Path, tmp_path: Path) -> None:
     path = bag("ros1", messages(recording, tmp_path), tmp_path)
     path.write_bytes(path.read_bytes()[:5000])
     with pytest.raises(SessionError, match="cannot be read as a bag"):

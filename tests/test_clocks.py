@@ -1,4 +1,4 @@
-"""What is told of a session's clocks: stamps that go back or jump, latency and its drift, synchronisation."""
+"""Description of a session's clocks: backward stamps, jumps, latency and its drift, synchronisation."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def stamps(seconds: float) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     return 1_700_000_000_000_000_000 + np.arange(int(20 * seconds), dtype=np.int64) * PERIOD_NS
 
 
-def test_a_drift_is_found_under_late_messages() -> None:
+def test_drift_is_found_despite_late_messages() -> None:
     """0.3 ms a minute, where a tenth of the messages is up to 20 ms late."""
     header = stamps(120.0)
     rng = np.random.default_rng(0)
@@ -41,13 +41,13 @@ def test_a_drift_is_found_under_late_messages() -> None:
     assert (found.backward, found.jumps) == (0, 0)
 
 
-def test_a_short_recording_tells_no_drift() -> None:
+def test_short_recording_has_no_drift() -> None:
     header = stamps(5.0)
     assert compare_clocks(header, header + 1_000_000).drift_ms_per_minute is None
     assert compare_clocks(stamps(60.0), stamps(60.0)).drift_ms_per_minute is None
 
 
-def test_stamps_that_go_back_or_jump_are_counted() -> None:
+def test_backward_stamps_and_jumps_are_counted() -> None:
     logged = stamps(20.0)
     header = logged.copy()
     header[100] = header[99]
@@ -58,7 +58,7 @@ def test_stamps_that_go_back_or_jump_are_counted() -> None:
     assert found.jumps == 2
 
 
-def test_topics_are_compared_by_their_nearest_stamps() -> None:
+def test_compare_topics_uses_the_nearest_stamps() -> None:
     left = stamps(10.0)
     right = np.delete(left + 400_000, [5, 6])
     right[50] += 3_000_000
@@ -72,7 +72,7 @@ def test_topics_are_compared_by_their_nearest_stamps() -> None:
 
 
 @pytest.mark.parametrize("kind", ["ros1", "db3", "mcap file"])
-def test_bags_are_described(kind: str, tmp_path: Path) -> None:
+def test_describe_compares_clocks_and_cameras_of_bags(kind: str, tmp_path: Path) -> None:
     """Right images of the first pair are 0.5 ms late."""
 
     def shifted(message: tuple[str, str, int, bytes]) -> tuple[str, str, int, bytes]:
@@ -105,7 +105,7 @@ def test_bags_are_described(kind: str, tmp_path: Path) -> None:
     assert "pair0 left to pair0 right: 6 of 6 images, the second 0.500 ms later (median), 0.500 ms" in done.stdout
 
 
-def test_what_is_no_session_is_told_so(tmp_path: Path) -> None:
+def test_describe_of_no_session_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SessionError, match=r"is no session or bag; give NAME\.mcap, NAME\.bag or the folder"):
         describe(write_euroc(tmp_path / "walk", frames=2))
     with pytest.raises(SessionError, match="does not exist"):

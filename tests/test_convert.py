@@ -1,4 +1,4 @@
-"""Recordings from format to format: nothing is lost on the way, the rig and the truth with it."""
+"""Conversion of recordings between formats: measurements, rig and truth are preserved."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def equal(one: Path, other: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["mcap", "rosbag1", "rosbag2", "euroc"])
-def test_nothing_is_lost_there_and_back(kind: str, recording: Path, tmp_path: Path) -> None:
+def test_conversion_there_and_back_is_lossless(kind: str, recording: Path, tmp_path: Path) -> None:
     there = converted(recording, out_of(kind, tmp_path))
     equal(recording, there)
     (tmp_path / "back").mkdir()
@@ -116,14 +116,14 @@ def test_nothing_is_lost_there_and_back(kind: str, recording: Path, tmp_path: Pa
     ).read_text().splitlines()[1:]
 
 
-def test_from_bag_to_bag_with_images_as_png(recording: Path, tmp_path: Path) -> None:
+def test_conversion_from_bag_to_bag_with_png_is_lossless(recording: Path, tmp_path: Path) -> None:
     first = converted(recording, tmp_path / "a.bag", "--png")
     second = converted(first, tmp_path / "rosbag2", "--png")
     assert second.is_dir()
     equal(recording, converted(second, tmp_path / "b.mcap"))
 
 
-def test_the_folder_tells_its_rig_to_others_too(recording: Path, tmp_path: Path) -> None:
+def test_euroc_sensor_files_hold_the_rig(recording: Path, tmp_path: Path) -> None:
     """By the files of each sensor, without graphvio's own."""
     back = converted(recording, tmp_path / "euroc")
     (back / "rig.yaml").unlink()
@@ -136,7 +136,7 @@ def test_the_folder_tells_its_rig_to_others_too(recording: Path, tmp_path: Path)
     assert found.imu.gyro_noise_density == 1.23456789e-4
 
 
-def test_a_piece_has_the_truth_of_the_piece(recording: Path, tmp_path: Path) -> None:
+def test_converted_piece_has_the_truth_of_its_time(recording: Path, tmp_path: Path) -> None:
     piece = converted(recording, tmp_path / "piece.mcap", "--from", "0.1", "--to", "0.2")
     stamps = load_trajectory(piece).stamps_ns
     source = open_source(piece)
@@ -144,7 +144,7 @@ def test_a_piece_has_the_truth_of_the_piece(recording: Path, tmp_path: Path) -> 
     assert source.end_ns <= stamps[-1] <= source.end_ns + 10_000_000
 
 
-def test_a_session_that_was_cut_is_converted_as_far_as_it_goes(recording: Path, tmp_path: Path) -> None:
+def test_cut_session_is_converted_as_far_as_it_goes(recording: Path, tmp_path: Path) -> None:
     source, cut = open_source(recording), tmp_path / "cut.mcap"
     with SessionWriter(cut, source.rig) as writer:
         assert isinstance(writer._storage, McapStorage)
@@ -156,11 +156,11 @@ def test_a_session_that_was_cut_is_converted_as_far_as_it_goes(recording: Path, 
     assert 0 < len([measurement for measurement in open_source(bag) if isinstance(measurement, FrameSet)]) < FRAMES
     described = describe(bag)
     (log,) = (topic for topic in described.topics if topic.name == "/rosout")
-    assert log.messages >= 1  # that it was cut, which has no time of its own
+    assert log.messages >= 1  # the event session_cut, which has no time of its own
     assert described.duration_s < 2.0
 
 
-def test_others_read_the_truth_and_latched_topics(recording: Path, tmp_path: Path) -> None:
+def test_bags_have_truth_and_latched_topics(recording: Path, tmp_path: Path) -> None:
     from rosbags.highlevel import AnyReader
 
     for path in (converted(recording, tmp_path / "walk.bag"), converted(recording, tmp_path / "rosbag2")):
@@ -172,7 +172,7 @@ def test_others_read_the_truth_and_latched_topics(recording: Path, tmp_path: Pat
             assert "1" in str(getattr(transforms.ext, "latching", transforms.ext))
 
 
-def test_cameras_of_other_names_are_renamed_for_the_layout(tmp_path: Path) -> None:
+def test_cameras_are_renamed_for_the_euroc_layout(tmp_path: Path) -> None:
     drive = write_kitti_odometry(tmp_path / "07")
     done = CliRunner().invoke(app, ["convert", str(drive), "--format", "euroc", "--out", str(tmp_path / "euroc")])
     assert done.exit_code == 0, done.output
@@ -196,14 +196,12 @@ def expected(room_walk: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", ["mcap", "rosbag1", "rosbag2", "euroc"])
-def test_the_odometry_makes_the_same_of_all_formats(
-    kind: str, room_walk: Path, expected: list[str], tmp_path: Path
-) -> None:
+def test_odometry_is_equal_on_all_formats(kind: str, room_walk: Path, expected: list[str], tmp_path: Path) -> None:
     assert len(expected) > 10
     assert trajectory(converted(room_walk, out_of(kind, tmp_path), "--to", str(PIECE_S))) == expected
 
 
-def test_a_run_is_measured_against_the_truth_in_a_session(room_walk: Path, tmp_path: Path) -> None:
+def test_run_is_evaluated_with_the_truth_in_a_session(room_walk: Path, tmp_path: Path) -> None:
     session = converted(room_walk, tmp_path / "room.mcap", "--to", str(PIECE_S))
     figures = []
     for path, options in ((room_walk, ["--to", str(PIECE_S)]), (session, [])):
@@ -218,27 +216,27 @@ def test_a_run_is_measured_against_the_truth_in_a_session(room_walk: Path, tmp_p
     ("name", "asked", "expected"),
     [("a.mcap", None, "mcap"), ("a.bag", None, "rosbag1"), ("a", "rosbag2", "rosbag2"), ("a.d", "euroc", "euroc")],
 )
-def test_the_format_goes_by_the_name(name: str, asked: str | None, expected: str) -> None:
+def test_format_goes_by_the_name(name: str, asked: str | None, expected: str) -> None:
     assert format_of(Path(name), asked) == expected
 
 
 @pytest.mark.parametrize(
     ("name", "asked", "words"),
     [
-        ("a", None, "tells no format; name a file .mcap or .bag, or give --format rosbag2 or --format euroc"),
+        ("a", None, "shows no format; name a file .mcap or .bag, or give --format rosbag2 or --format euroc"),
         ("a.mcap", "avi", "give one of mcap, rosbag1, rosbag2, euroc"),
         ("a.bag", "mcap", "is not how mcap is named; name it .mcap"),
         ("a", "rosbag1", "is not how rosbag1 is named; name it .bag"),
         ("a.bag", "rosbag2", "is not how rosbag2 is named; name a folder without that ending"),
     ],
 )
-def test_a_name_that_does_not_fit_is_refused(name: str, asked: str | None, words: str) -> None:
+def test_format_with_another_name_is_refused(name: str, asked: str | None, words: str) -> None:
     with pytest.raises(SessionError, match=words):
         format_of(Path(name), asked)
 
 
 @pytest.mark.parametrize("kind", ["mcap", "rosbag1", "rosbag2", "euroc"])
-def test_nothing_is_overwritten(kind: str, recording: Path, tmp_path: Path) -> None:
+def test_convert_overwrites_nothing(kind: str, recording: Path, tmp_path: Path) -> None:
     out = converted(recording, out_of(kind, tmp_path), "--to", "0.1")
     before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
     given = ["--format", kind] if out.suffix == "" else []
@@ -250,7 +248,7 @@ def test_nothing_is_overwritten(kind: str, recording: Path, tmp_path: Path) -> N
     assert "cannot be written" in str(nowhere.exception)
 
 
-def test_a_full_disk_ends_with_its_own_exit_code(recording: Path, tmp_path: Path) -> None:
+def test_convert_on_a_full_disk_exits_with_3(recording: Path, tmp_path: Path) -> None:
     """A limit on the size of files is as good as a full disk."""
     code = f"""
 import resource, signal
@@ -273,12 +271,12 @@ for limit, arguments in ((60_000, ["/x.mcap"]), (60_000, ["/x.bag"]), (60_000, [
         assert f"what was written until then {can}" in line
 
 
-def test_only_mcap_is_recorded(recording: Path, tmp_path: Path) -> None:
+def test_record_of_a_bag_is_refused(recording: Path, tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["record", str(recording), "--out", str(tmp_path / "a.bag")])
     assert "name it .mcap" in str(done.exception)
 
 
-def test_a_truth_that_is_missing_or_bad_is_told(recording: Path, tmp_path: Path) -> None:
+def test_missing_or_invalid_truth_is_reported(recording: Path, tmp_path: Path) -> None:
     plain = write_euroc(tmp_path / "plain", frames=2)
     session = converted(plain, tmp_path / "plain.mcap")
     assert open_source(session).truth is None
@@ -292,8 +290,8 @@ def test_a_truth_that_is_missing_or_bad_is_told(recording: Path, tmp_path: Path)
     assert "the true trajectory is left out" in done.stderr
 
 
-def test_a_bag_is_read_at_any_place(recording: Path, tmp_path: Path) -> None:
-    """In any order, and for as long a bag as may be: the library alone would go through all that comes before."""
+def test_bag_messages_are_read_in_any_order(recording: Path, tmp_path: Path) -> None:
+    """The library alone would read all messages before the wanted one."""
     for path in (converted(recording, tmp_path / "walk.bag"), converted(recording, tmp_path / "rosbag2")):
         bag = open_store(path)
         places = bag.topics["/imu"].places
@@ -316,7 +314,7 @@ def trajectory_of(source: Path, out: Path, *options: str) -> bytes:
 
 
 @pytest.mark.parametrize("name", ["recorded.mcap", "clip.bag", "clip"])
-def test_a_real_recording_gives_the_same_from_all_formats(
+def test_real_recording_gives_equal_results_from_all_formats(
     name: str, trajectory_of_the_clip: bytes, tmp_path: Path
 ) -> None:
     """From the MCAP file that ``record`` makes while the odometry runs, and from bags of ROS 1 and ROS 2."""

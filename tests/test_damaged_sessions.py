@@ -1,4 +1,4 @@
-"""Sessions whose bytes were changed on the way: all that is lost is told, and what is left is used."""
+"""Damaged sessions: losses are counted, and all other measurements are read."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def session(recording: Path) -> Path:
-    """With many chunks, some of images and samples."""
+    """A session with many chunks, some with images and samples."""
     path = recording.parent / "walk.mcap"
     source = open_source(recording)
     with SessionWriter(path, source.rig) as writer:
@@ -40,7 +40,7 @@ def session(recording: Path) -> Path:
 
 
 def chunks(path: Path) -> list[int]:
-    """Where each begins."""
+    """Bytes at which chunks begin."""
     file = open_store(path)
     return sorted({place.chunk for topic in file.topics.values() for place in topic.places})
 
@@ -57,8 +57,8 @@ def places_of(path: Path, topic: str, chunk: int) -> list[int]:
 
 
 @pytest.mark.parametrize("which", [0, 6, -1])
-def test_a_chunk_whose_bytes_changed_is_left_out_and_counted(session: Path, tmp_path: Path, which: int) -> None:
-    """Of the first one the channels are lost, too, but for those that the summary has."""
+def test_damaged_chunk_is_left_out_and_counted(session: Path, tmp_path: Path, which: int) -> None:
+    """Without the first chunk, channels are known from the summary only."""
     chunk = chunks(session)[which]
     length = int.from_bytes(session.read_bytes()[chunk + 1 : chunk + 9], "little")
     path = changed(session, tmp_path / "walk.mcap", chunk + 9 + length - 5)
@@ -79,7 +79,7 @@ def test_a_chunk_whose_bytes_changed_is_left_out_and_counted(session: Path, tmp_
         same(one, other)
 
 
-def test_a_checksum_that_is_zero_is_none(session: Path, tmp_path: Path) -> None:
+def test_zero_checksum_is_not_verified(session: Path, tmp_path: Path) -> None:
     data = bytearray(session.read_bytes())
     for chunk in chunks(session):
         data[chunk + 9 + 24 : chunk + 9 + 28] = bytes(4)
@@ -89,7 +89,7 @@ def test_a_checksum_that_is_zero_is_none(session: Path, tmp_path: Path) -> None:
     assert not source.faults.counts
 
 
-def test_a_damaged_rig_is_refused_unless_another_is_given(session: Path, tmp_path: Path) -> None:
+def test_damaged_rig_is_refused_unless_another_is_given(session: Path, tmp_path: Path) -> None:
     at = session.read_bytes().index(b"intrinsics")
     path = changed(session, tmp_path / "walk.mcap", at + 14)
     with pytest.raises(SessionError, match="the rig in it is damaged"):
@@ -99,7 +99,7 @@ def test_a_damaged_rig_is_refused_unless_another_is_given(session: Path, tmp_pat
     assert source.faults.counts == {"session_damaged": 1}
 
 
-def test_a_stamp_of_the_index_that_is_not_the_messages_is_found(session: Path, tmp_path: Path) -> None:
+def test_wrong_stamp_in_the_index_is_detected(session: Path, tmp_path: Path) -> None:
     file = open_store(session)
     place = file.topics["/pair0/left/image_raw"].places[3]
     entry = place.logged_ns.to_bytes(8, "little") + place.offset.to_bytes(8, "little")
@@ -109,18 +109,18 @@ def test_a_stamp_of_the_index_that_is_not_the_messages_is_found(session: Path, t
     assert source.faults.counts["image_undecodable"] == 1
 
 
-def test_the_odometry_goes_on(session: Path, tmp_path: Path) -> None:
-    """What a chunk with images is to the odometry, an image that is damaged is in a folder."""
+def test_record_of_a_damaged_session_goes_on(session: Path, tmp_path: Path) -> None:
+    """A damaged chunk with images is to the odometry like damaged images in a folder."""
     chunk = open_store(session).topics["/pair0/left/image_raw"].places[4].chunk
     path = changed(session, tmp_path / "walk.mcap", chunk + 200)
     done = CliRunner().invoke(app, ["record", str(path), "--out", str(tmp_path / "again.mcap")])
     assert done.exit_code == 0, done.output
     assert "/rosout" in open_store(tmp_path / "again.mcap").topics
-    told = CliRunner().invoke(app, ["info", str(path)])
-    assert told.exit_code == 0, told.output
+    info = CliRunner().invoke(app, ["info", str(path)])
+    assert info.exit_code == 0, info.output
 
 
-def test_no_change_of_bytes_gives_more_than_a_refusal(session: Path, tmp_path: Path) -> None:
+def test_random_damage_raises_only_graphvio_errors(session: Path, tmp_path: Path) -> None:
     """Sixty files with one to three bytes changed, some of them cut, with checksums and without, by half."""
     whole = session.read_bytes()
     without = bytearray(whole)

@@ -1,4 +1,4 @@
-"""Which topics make a rig, where a recording has several of one camera."""
+"""Topics that make a rig, also if a recording has several of one camera."""
 
 from __future__ import annotations
 
@@ -43,18 +43,18 @@ def of_one_camera(*kinds: str) -> list[str]:
         (["image_rect"], "image_rect"),
     ],
 )
-def test_of_several_topics_of_a_camera_one_is_taken(kinds: list[str], taken: str) -> None:
+def test_stereo_topics_uses_one_of_several_topics_of_a_camera(kinds: list[str], taken: str) -> None:
     expected = {"camera": (f"/camera/infra1/{taken}", f"/camera/infra2/{taken}")}
     assert stereo_topics(of_one_camera(*kinds)) == expected
     assert stereo_topics(of_one_camera(*kinds)[::-1]) == expected
 
 
-def test_both_cameras_have_what_is_taken() -> None:
+def test_stereo_topics_uses_topics_that_both_cameras_have() -> None:
     names = ["/rig/left/image_raw", "/rig/left/image_raw/compressed", "/rig/right/image_raw/compressed"]
     assert stereo_topics(names) == {"rig": ("/rig/left/image_raw/compressed", "/rig/right/image_raw/compressed")}
 
 
-def test_pairs_have_names_of_their_own() -> None:
+def test_stereo_topics_gives_pairs_distinct_names() -> None:
     names = [f"/rig/{side}/image_raw" for side in ("left", "right", "infra1", "infra2")]
     assert set(stereo_topics(names)) == {"rig-left", "rig-infra1"}
     names = [f"/rig/image_cam{number}" for number in range(4)]
@@ -77,7 +77,7 @@ def with_compressed(made: list[Message]) -> list[Message]:
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap file"])
-def test_raw_images_are_read_once_where_packed_ones_are_there_too(kind: str, recording: Path, tmp_path: Path) -> None:
+def test_raw_images_are_preferred_to_compressed_ones(kind: str, recording: Path, tmp_path: Path) -> None:
     made = [message for message in messages(recording, tmp_path) if message[0] != "/graphvio/rig"]
     path = bag(kind, with_compressed(made), tmp_path)
     source = open_source(path)
@@ -90,7 +90,7 @@ def test_raw_images_are_read_once_where_packed_ones_are_there_too(kind: str, rec
     assert [each.first for each in describe(path).synchronisation] == ["pair0 left"]
 
 
-def test_of_several_imus_the_first_is_taken_and_it_is_said(
+def test_first_of_several_imus_is_used_and_reported(
     recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     made = messages(recording, tmp_path)

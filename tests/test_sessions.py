@@ -1,4 +1,4 @@
-"""Sessions on disk: what is written is read back, also after a crash, and by others' readers."""
+"""Sessions on disk: what is written is read back, also after a crash, and by other libraries."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def same(one: Measurement, other: Measurement) -> None:
 
 
 @pytest.mark.parametrize("image_format", ["raw", "png"])
-def test_a_session_yields_what_was_recorded_to_the_bit(
+def test_session_yields_the_recorded_measurements_exactly(
     recording: Path, tmp_path: Path, image_format: ImageFormat
 ) -> None:
     session = open_source(written(recording, tmp_path / "walk.mcap", image_format))
@@ -80,7 +80,7 @@ def test_a_session_yields_what_was_recorded_to_the_bit(
     assert not session.faults.counts
 
 
-def test_others_read_it(recording: Path, tmp_path: Path) -> None:
+def test_session_is_read_by_mcap_and_rosbags(recording: Path, tmp_path: Path) -> None:
     from mcap.reader import make_reader
     from rosbags.typesys import Stores, get_typestore
 
@@ -102,7 +102,7 @@ def test_others_read_it(recording: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.3, 0.4, 0.5])
-def test_a_file_that_was_cut_is_read_as_far_as_it_goes(recording: Path, tmp_path: Path, share: float) -> None:
+def test_cut_session_is_read_as_far_as_it_goes(recording: Path, tmp_path: Path, share: float) -> None:
     source = open_source(recording)
     path = tmp_path / "walk.mcap"
     with SessionWriter(path, source.rig) as writer:
@@ -147,7 +147,7 @@ with SessionWriter(Path({path!r}), rig) as writer:
 """
 
 
-def test_killed_recordings_lose_the_last_second_at_most(tmp_path: Path) -> None:
+def test_killed_recordings_lose_at_most_the_last_second(tmp_path: Path) -> None:
     """Ten of them, at moments of all kinds."""
     moments_s = np.sort(np.random.default_rng(0).uniform(0.8, 3.0, 10))
     recorders = []
@@ -178,7 +178,7 @@ def check_killed(path: Path, last_ns: int) -> None:
         assert frameset.images[0][0][0, 0] == frameset.stamp_ns // 10**6 % 256
 
 
-def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> None:
+def test_full_disk_stops_only_the_recording(tmp_path: Path) -> None:
     """A limit on the size of files is as good as a full disk."""
     code = f"""
 import resource, signal, sys
@@ -208,7 +208,7 @@ print(writer.stopped)
     assert 10 < len(framesets) < 60
 
 
-def test_what_a_session_holds_is_told(recording: Path, tmp_path: Path) -> None:
+def test_info_describes_a_session(recording: Path, tmp_path: Path) -> None:
     path = written(recording, tmp_path / "walk.mcap")
     found = describe(path)
     assert found.is_whole
@@ -224,7 +224,7 @@ def test_what_a_session_holds_is_told(recording: Path, tmp_path: Path) -> None:
     assert "pairs pair0, pair1, with IMU" in done.stdout
 
 
-def test_the_command_converts_a_piece(recording: Path, tmp_path: Path) -> None:
+def test_convert_of_a_piece_writes_its_framesets(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "piece.mcap"
     done = CliRunner().invoke(app, ["convert", str(recording), "--out", str(out), "--to", "0.2"])
     assert done.exit_code == 0, done.output
@@ -234,7 +234,7 @@ def test_the_command_converts_a_piece(recording: Path, tmp_path: Path) -> None:
     assert "never overwritten" in str(again.exception)
 
 
-def test_recording_keeps_what_the_odometry_made_of_it(recording: Path, tmp_path: Path) -> None:
+def test_record_writes_images_and_events(recording: Path, tmp_path: Path) -> None:
     """Images of noise give no pose, which is an event."""
     out = tmp_path / "recorded.mcap"
     done = CliRunner().invoke(app, ["record", str(recording), "--out", str(out)])
@@ -245,7 +245,7 @@ def test_recording_keeps_what_the_odometry_made_of_it(recording: Path, tmp_path:
     assert "/rosout" in file.topics
 
 
-def test_an_estimate_as_odometry_has_the_axes_of_ros() -> None:
+def test_odometry_message_has_the_axes_of_ros() -> None:
     """Translation before rotation, about the axes of the parent frame; the twist is in the child's."""
     R = so3_exp(np.array([0.0, 0.0, 0.5 * np.pi]))
     covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])  # rotation, translation in body
@@ -269,7 +269,7 @@ def test_an_estimate_as_odometry_has_the_axes_of_ros() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["mono8", "mono16", "bgr8", "rgb8", "bayer_rggb8"])
-def test_images_of_all_encodings_become_grey(encoding: str) -> None:
+def test_grey_of_all_encodings(encoding: str) -> None:
     grey_level, width, height = 90, 6, 4
     channels = 3 if encoding in ("bgr8", "rgb8") else 1
     pixels = np.full((height, width, channels), grey_level, np.uint16 if encoding == "mono16" else np.uint8)
@@ -287,14 +287,14 @@ def test_images_of_all_encodings_become_grey(encoding: str) -> None:
 @pytest.mark.parametrize(
     ("field", "value", "words"), [("encoding", "yuv422", "yuv422, which is not known"), ("height", 9, "cut short")]
 )
-def test_images_that_cannot_be_used_are_faults(field: str, value: object, words: str) -> None:
+def test_grey_of_invalid_images_raises(field: str, value: object, words: str) -> None:
     fields = {"height": 4, "width": 6, "encoding": "mono8", "is_bigendian": 0, "step": 6} | {field: value}
     message = cdr.make(IMAGE, header=header(0, "cam"), data=np.zeros(24, np.uint8), **fields)
     with pytest.raises(ImageError, match=words):
         grey(message, "here")
 
 
-def test_what_is_no_session_is_refused(recording: Path, tmp_path: Path) -> None:
+def test_open_source_of_no_session_is_refused(recording: Path, tmp_path: Path) -> None:
     (tmp_path / "noise.mcap").write_bytes(b"noise")
     with pytest.raises(SessionError, match="is no MCAP file"):
         open_source(tmp_path / "noise.mcap")

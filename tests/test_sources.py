@@ -56,7 +56,7 @@ def image_file(walk: Path, camera: int, frame: int) -> Path:
 
 
 @pytest.mark.parametrize("inner", [False, True])
-def test_euroc_whole(walk: Path, inner: bool) -> None:
+def test_euroc_yields_all_images_and_samples(walk: Path, inner: bool) -> None:
     source = open_source(walk / "mav0" if inner else str(walk))
     assert (source.name, source.frameset_count) == ("walk", 10)
     assert (source.start_ns, source.end_ns) == (START_NS, START_NS + 9 * FRAME_PERIOD_NS)
@@ -78,7 +78,7 @@ def test_euroc_whole(walk: Path, inner: bool) -> None:
     assert min(source.decode_ms) > 0
 
 
-def test_the_sample_that_covers_a_frameset_comes_first(walk: Path) -> None:
+def test_covering_sample_comes_before_its_frameset(walk: Path) -> None:
     latest = 0
     for measurement in open_source(walk):
         if isinstance(measurement, FrameSet):
@@ -87,7 +87,7 @@ def test_the_sample_that_covers_a_frameset_comes_first(walk: Path) -> None:
             latest = measurement.stamp_ns
 
 
-def test_rig_decides_what_is_read(walk: Path) -> None:
+def test_rig_selects_pairs_and_imu(walk: Path) -> None:
     rig = small_rig(2)
     only_second = open_source(walk, rig.with_pairs([1]).without_imu())
     assert samples(only_second) == []
@@ -96,7 +96,7 @@ def test_rig_decides_what_is_read(walk: Path) -> None:
     np.testing.assert_array_equal(first.images[0][1], noise_image(300))
 
 
-def test_truth_is_found(walk: Path) -> None:
+def test_euroc_truth_is_found(walk: Path) -> None:
     write_rows(walk / "mav0" / "mocap0" / "data.csv", ["#"])
     assert open_source(walk).truth == walk / "mav0" / "mocap0" / "data.csv"
     write_rows(walk / "mav0" / "state_groundtruth_estimate0" / "data.csv", ["#"])
@@ -107,7 +107,9 @@ def test_truth_is_found(walk: Path) -> None:
     ("from_s", "to_s", "frames"),
     [(0.1, None, range(2, 10)), (None, 0.2, range(5)), (0.07, 0.21, range(2, 5))],
 )
-def test_from_to(walk: Path, from_s: float | None, to_s: float | None, frames: range) -> None:
+def test_from_to_cuts_framesets_and_samples(
+    walk: Path, from_s: float | None, to_s: float | None, frames: range
+) -> None:
     source = open_source(walk, from_s=from_s, to_s=to_s)
     assert [s.stamp_ns for s in framesets(source)] == [START_NS + i * FRAME_PERIOD_NS for i in frames]
     assert source.frameset_count == len(frames)
@@ -118,7 +120,7 @@ def test_from_to(walk: Path, from_s: float | None, to_s: float | None, frames: r
     assert source.faults.counts == {}
 
 
-def test_imu_lead_is_bounded(tmp_path: Path) -> None:
+def test_imu_samples_begin_at_most_5_s_before_the_first_frameset(tmp_path: Path) -> None:
     write_euroc(tmp_path, pairs=1, frames=3)
     write_imu(tmp_path / "mav0", list(range(START_NS - 8 * S, START_NS + S, IMU_PERIOD_NS)))
     assert samples(open_source(tmp_path))[0].stamp_ns == START_NS - 5 * S
@@ -133,12 +135,14 @@ def test_imu_lead_is_bounded(tmp_path: Path) -> None:
         (None, float("inf"), "to_s is inf"),
     ],
 )
-def test_from_to_outside(walk: Path, from_s: float | None, to_s: float | None, message: str) -> None:
+def test_from_to_without_framesets_is_refused(
+    walk: Path, from_s: float | None, to_s: float | None, message: str
+) -> None:
     with pytest.raises(SourceError, match=message):
         open_source(walk, from_s=from_s, to_s=to_s)
 
 
-def test_wrong_paths(tmp_path: Path) -> None:
+def test_open_source_of_no_recording_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="does not exist"):
         open_source(tmp_path / "none")
     with pytest.raises(SourceError, match="cannot be read"):
@@ -154,14 +158,14 @@ def test_wrong_paths(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_no_calibration(tmp_path: Path) -> None:
+def test_open_source_without_calibration_is_refused(tmp_path: Path) -> None:
     write_kitti_odometry(tmp_path)
     (tmp_path / "calib.txt").unlink()
     with pytest.raises(RigError, match=r"carries no calibration; write a rig\.yaml"):
         open_source(tmp_path)
 
 
-def test_camera_of_the_rig_is_not_in_the_recording(tmp_path: Path) -> None:
+def test_open_source_without_a_camera_of_the_rig_is_refused(tmp_path: Path) -> None:
     write_euroc(tmp_path, pairs=1)
     with pytest.raises(SourceError, match="no camera cam2, which the rig names; it has cam0, cam1"):
         open_source(tmp_path, small_rig(2))
@@ -393,7 +397,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], dict[str, int], int, int]] = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_fault(walk: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_fault_is_counted_and_logged_once(walk: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
     damage, counts, frames, imu = FAULTS[name]
     damage(walk)
     with caplog.at_level(logging.WARNING, logger="graphvio"):
@@ -409,12 +413,12 @@ def test_fault(walk: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
     assert set(stamps) <= set(frame_stamps(10))
 
 
-def test_a_broken_image_takes_only_its_pair(walk: Path) -> None:
+def test_missing_image_removes_only_its_pair(walk: Path) -> None:
     image_file(walk, 2, 4).unlink()
     assert [list(s.images) for s in framesets(open_source(walk))] == [[0, 1]] * 4 + [[0]] + [[0, 1]] * 5
 
 
-def test_iterating_again_yields_and_counts_the_same(walk: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_second_iteration_yields_and_counts_the_same(walk: Path, caplog: pytest.LogCaptureFixture) -> None:
     image_file(walk, 2, 4).unlink()
     csv_edit("imu0", drop(slice(220, 250)))(walk)
     source = open_source(walk)
@@ -427,7 +431,7 @@ def test_iterating_again_yields_and_counts_the_same(walk: Path, caplog: pytest.L
     assert len(caplog.records) == 2
 
 
-def test_places_of_faults(walk: Path) -> None:
+def test_events_of_faults_have_their_places(walk: Path) -> None:
     csv_edit("imu0", drop(slice(221, 251)))(walk)
     image_file(walk, 1, 3).unlink()
     source = open_source(walk)
@@ -439,7 +443,7 @@ def test_places_of_faults(walk: Path) -> None:
     assert str(image_file(walk, 1, 3)) in image.detail
 
 
-def test_frameset_in_an_imu_gap_does_not_wait(walk: Path) -> None:
+def test_frameset_in_an_imu_gap_does_not_wait_for_samples(walk: Path) -> None:
     csv_edit("imu0", drop(slice(221, 271)))(walk)  # 250 ms from 100 ms after the first frameset
     order = [
         type(measurement).__name__[0]
@@ -449,7 +453,7 @@ def test_frameset_in_an_imu_gap_does_not_wait(walk: Path) -> None:
     assert "".join(order).startswith("IF" + "FFF")
 
 
-def test_image_size_that_the_rig_does_not_have(tmp_path: Path) -> None:
+def test_first_image_of_another_size_is_refused(tmp_path: Path) -> None:
     write_euroc(tmp_path, pairs=1, frames=2)
     for i in range(2):
         write_image(image_file(tmp_path, 1, i), noise_image(0, (32, 40)))
@@ -457,7 +461,7 @@ def test_image_size_that_the_rig_does_not_have(tmp_path: Path) -> None:
         list(open_source(tmp_path))
 
 
-def test_nothing_left(tmp_path: Path) -> None:
+def test_recording_without_a_readable_frameset_is_refused(tmp_path: Path) -> None:
     write_euroc(tmp_path, pairs=1, frames=3)
     for i in range(3):
         image_file(tmp_path, 1, i).unlink()
@@ -473,7 +477,7 @@ def test_nothing_left(tmp_path: Path) -> None:
         open_source(tmp_path)
 
 
-def test_pairs_that_are_not_triggered_together(walk: Path) -> None:
+def test_staggered_pairs_make_framesets_of_their_own(walk: Path) -> None:
     for camera in ("cam2", "cam3"):
         rows = [f"{s + 20_000_000},{s}.png" for s in frame_stamps(10)]
         write_rows(walk / "mav0" / camera / "data.csv", rows)
@@ -483,7 +487,7 @@ def test_pairs_that_are_not_triggered_together(walk: Path) -> None:
     assert source.faults.counts == {}
 
 
-def test_stamps_within_tolerance_belong_together(walk: Path) -> None:
+def test_stamps_within_tolerance_are_joined(walk: Path) -> None:
     for number, camera in enumerate(CAMERAS):
         rows = [f"{s - 500_000 * number},{s}.png" for s in frame_stamps(10)]
         write_rows(walk / "mav0" / camera / "data.csv", rows)
@@ -492,7 +496,7 @@ def test_stamps_within_tolerance_belong_together(walk: Path) -> None:
     assert source.faults.counts == {}
 
 
-def test_time_offset_moves_the_frames(tmp_path: Path) -> None:
+def test_time_offset_moves_the_covering_sample(tmp_path: Path) -> None:
     write_euroc(tmp_path, pairs=1)
     rig_file = tmp_path / "rig.yaml"
     save_rig(small_rig(1), rig_file)
@@ -506,7 +510,7 @@ def test_time_offset_moves_the_frames(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["16 bit", "colour", "colour with alpha"])
-def test_pixel_formats(tmp_path: Path, kind: str) -> None:
+def test_pixel_formats_become_grey(tmp_path: Path, kind: str) -> None:
     write_euroc(tmp_path, pairs=1, frames=1)
     grey = noise_image(7)
     images: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.uint8 | np.uint16]]] = {
@@ -521,7 +525,7 @@ def test_pixel_formats(tmp_path: Path, kind: str) -> None:
     np.testing.assert_array_equal(got, grey)
 
 
-def test_kitti_odometry(tmp_path: Path) -> None:
+def test_kitti_odometry_yields_framesets_and_truth(tmp_path: Path) -> None:
     path = write_kitti_odometry(tmp_path / "dataset" / "sequences" / "07")
     write_rows(tmp_path / "dataset" / "poses" / "07.txt", ["1 0 0 0 0 1 0 0 0 0 1 0"])
     (path / "image_1" / "000002.png").unlink()
@@ -534,7 +538,7 @@ def test_kitti_odometry(tmp_path: Path) -> None:
     assert source.faults.counts == {"image_missing": 1, "frameset_empty": 1}
 
 
-def test_kitti_odometry_times(tmp_path: Path) -> None:
+def test_kitti_odometry_with_invalid_times_keeps_rows_and_images(tmp_path: Path) -> None:
     write_kitti_odometry(tmp_path)
     write_rows(tmp_path / "times.txt", ["0", "1.036224e-01", "?", "3.0e-01", "3.0e-01", "5e-01", ""], "\r\n")
     source = open_source(tmp_path)
@@ -548,7 +552,7 @@ def test_kitti_odometry_times(tmp_path: Path) -> None:
         open_source(tmp_path)
 
 
-def test_kitti_raw(tmp_path: Path) -> None:
+def test_kitti_raw_yields_framesets(tmp_path: Path) -> None:
     source = open_source(write_kitti_raw(tmp_path / "2011_09_26"))
     assert source.name == "2011_09_26_drive_0001_sync"
     begin = 1_317_042_145_000_000_007
@@ -574,7 +578,7 @@ def first_frameset(measurements: Iterator[object]) -> None:
 
 
 @pytest.mark.parametrize("how", ["exhausted", "closed", "collected", "broken out of", "raised"])
-def test_threads_end(walk: Path, how: str) -> None:
+def test_reading_threads_end(walk: Path, how: str) -> None:
     source = open_source(walk)
     measurements = iter(source)
     first_frameset(measurements)
@@ -626,7 +630,7 @@ def test_read_ahead_works_while_its_consumer_does() -> None:
     assert time.perf_counter() - begun < 9 * 0.02 + 0.15
 
 
-def test_errors_in_threads_surface() -> None:
+def test_read_ahead_raises_errors_in_order() -> None:
     def work(item: int) -> int:
         if item == 3:
             raise RuntimeError("in a thread")
@@ -640,7 +644,7 @@ def test_errors_in_threads_surface() -> None:
 
 
 @pytest.mark.skipif(not (REAL_DATA / "euroc_mh01_clip").is_dir(), reason="the real EuRoC clip is not here")
-def test_real_euroc_clip() -> None:
+def test_real_euroc_clip_is_read_whole() -> None:
     root = REAL_DATA / "euroc_mh01_clip"
     source = open_source(root)
     measurements = list(source)

@@ -32,7 +32,7 @@ def imu_at(stamps: list[int]) -> list[ImuSample]:
 
 
 @given(imu=increasing, frames=increasing, offset_ns=st.integers(-300 * MS, 300 * MS))
-def test_merge(imu: list[int], frames: list[int], offset_ns: int) -> None:
+def test_merge_puts_covering_samples_before_framesets(imu: list[int], frames: list[int], offset_ns: int) -> None:
     measurements = list(merge(imu_at(imu), [FrameSet(stamp, {}) for stamp in frames], offset_ns))
     assert [e.stamp_ns for e in measurements if isinstance(e, ImuSample)] == imu  # nothing lost, nothing moved
     assert [e.stamp_ns for e in measurements if isinstance(e, FrameSet)] == frames
@@ -49,7 +49,7 @@ def test_merge(imu: list[int], frames: list[int], offset_ns: int) -> None:
         assert all(stamp <= instant + COVER_NS for stamp in seen)
 
 
-def test_merge_reads_no_further_than_it_must() -> None:
+def test_merge_reads_one_sample_ahead() -> None:
     taken: list[int] = []
 
     def samples() -> Iterator[ImuSample]:
@@ -64,7 +64,7 @@ def test_merge_reads_no_further_than_it_must() -> None:
 
 
 @given(st.lists(st.integers(0, 30), max_size=40))
-def test_clean_stamps_keeps_the_most(values: list[int]) -> None:
+def test_clean_stamps_drops_the_fewest_rows(values: list[int]) -> None:
     stamps = np.array(values, dtype=np.int64)
     faults = FaultLog("any")
     kept = clean_stamps(stamps, "imu", Path("x.csv"), faults)
@@ -77,7 +77,7 @@ def test_clean_stamps_keeps_the_most(values: list[int]) -> None:
     assert len(chosen) == max(longest, default=0)
 
 
-def test_of_equal_stamps_the_first_is_kept() -> None:
+def test_clean_stamps_keeps_the_first_of_equal_ones() -> None:
     kept = clean_stamps(np.array([1, 2, 2, 2, 3]), "imu", Path("x.csv"), FaultLog("any"))
     assert kept.tolist() == [True, True, False, False, True]
 
@@ -88,7 +88,9 @@ def test_of_equal_stamps_the_first_is_kept() -> None:
     lost_left=st.sets(st.integers(0, 29)),
     lost_right=st.sets(st.integers(0, 29)),
 )
-def test_match_sides(steps: list[int], jitter: list[int], lost_left: set[int], lost_right: set[int]) -> None:
+def test_match_sides_finds_all_common_images(
+    steps: list[int], jitter: list[int], lost_left: set[int], lost_right: set[int]
+) -> None:
     truth = np.cumsum(steps) * MS
     left = [i for i in range(len(steps)) if i not in lost_left]
     right = [i for i in range(len(steps)) if i not in lost_right]
@@ -108,7 +110,7 @@ def test_match_sides(steps: list[int], jitter: list[int], lost_left: set[int], l
     lost=st.lists(st.sets(st.integers(0, 29)), min_size=3, max_size=3),
     delay_ns=st.lists(st.integers(0, TOLERANCE_NS), min_size=3, max_size=3),
 )
-def test_group_pairs(steps: list[int], lost: list[set[int]], delay_ns: list[int]) -> None:
+def test_group_pairs_joins_all_instants(steps: list[int], lost: list[set[int]], delay_ns: list[int]) -> None:
     truth = np.cumsum(steps) * MS
     present = [[i for i in range(len(steps)) if i not in gone] for gone in lost]
     pairs = [match_sides(truth[i] + delay, truth[i] + delay) for i, delay in zip(present, delay_ns, strict=True)]
@@ -122,7 +124,7 @@ def test_group_pairs(steps: list[int], lost: list[set[int]], delay_ns: list[int]
         assert index.stamps_ns[at] == truth[instant] + delay_ns[having[0]]
 
 
-def test_decimal_stamps_are_exact() -> None:
+def test_parse_stamp_is_exact() -> None:
     assert parse_stamp("1403636580838555649") == 1403636580838555649
     assert parse_stamp("1403636580838555649.0") == 1403636580838555649
     assert decimal_ns("1403636580.838555649", 10**9) == 1403636580838555649
@@ -157,7 +159,7 @@ def test_damage_of_any_bytes_never_raises(data: bytes) -> None:
     damage_of(b"\xff\xd8" + data)
 
 
-def test_memory_does_not_grow_with_length(tmp_path: Path) -> None:
+def test_recording_memory_does_not_grow_with_length(tmp_path: Path) -> None:
     size_px = (320, 240)
     file = tmp_path / "image.png"
     write_image(file, noise_image(0, size_px))

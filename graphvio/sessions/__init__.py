@@ -1,1 +1,1 @@
-"""Sessions on disk: MCAP files with ROS 2 messages; and bags."""
+"""Sessions on disk: MCAP files with ROS 2 messages, bags of ROS 1 and ROS 2, and the EuRoC/ASL layout."""

@@ -52,7 +52,7 @@ class BagFile:
             raise SessionError(f"{path}: cannot be read as a bag ({str(error) or type(error).__name__})") from None
 
     def read(self, place: Place) -> bytes:
-        """A message as CDR.
+        """Return a message as CDR.
 
         Raises:
             SessionError: if it cannot be read any more.
@@ -61,15 +61,15 @@ class BagFile:
         with self._lock:
             data = next((raw for _, _, raw in self._found(connection, place)), None)
         if data is None:
-            raise SessionError(f"{self.path}: has a message of {connection.topic} no more that was there")
+            raise SessionError(f"{self.path}: a message of {connection.topic} is missing now; open the bag again")
         return self._as_cdr(connection, data)
 
     def _found(self, connection: Any, place: Place) -> Any:
-        """Messages of a connection, of which the first is the one at a place: by row in ROS 1, by time in ROS 2."""
+        """Messages of a connection, the first of them the one at a place: by row in ROS 1, by time in ROS 2."""
         if self._reader.is2:
             return self._reader.messages([connection], start=place.offset, stop=place.offset + 1)
         rows = self._indexes[place.chunk]
-        # Asked for one of many, the library goes through all that come before; so it is given the index of one.
+        # The library would read all messages before the wanted one; so it gets an index of that one only.
         connection.owner.indexes[connection.id] = rows[place.offset : place.offset + 1]
         return self._reader.messages([connection])
 
@@ -90,7 +90,7 @@ class BagFile:
             row = rows[number]
             rows[number] += 1
             if self._reader.is2 and topic.logged_ns and topic.logged_ns[-1] == logged_ns:
-                continue  # it could not be told from the one before
+                continue  # it could not be distinguished from the one before
             topic.logged_ns.append(logged_ns)
             topic.places.append(Place(number, logged_ns if self._reader.is2 else row))
             if connection.msgtype in STAMPED:

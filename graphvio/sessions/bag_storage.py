@@ -15,24 +15,24 @@ _ROS2_VERSION: Final = 8  # of metadata.yaml; the newest whose QoS profiles olde
 
 
 class _Bag:
-    """What bags of ROS 1 and ROS 2 have in common."""
+    """Common part of bags of ROS 1 and ROS 2."""
 
     has_attachments = False
     is_readable_when_cut = False
 
     def attach(self, name: str, text: str) -> None:
-        """Bags have no attachments."""
+        """Raise an error: bags have no attachments."""
         raise NotImplementedError
 
 
 class Ros1Storage(_Bag):
-    """A ROS 1 bag; without its end, which has the index, it cannot be read.
+    """A ROS 1 bag; it cannot be read without the index at its end.
 
     Args:
         path: of the file, which must not exist.
 
     Raises:
-        SessionError: if the file exists or cannot be made.
+        SessionError: if the file exists or cannot be created.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
 
@@ -52,7 +52,7 @@ class Ros1Storage(_Bag):
             raise not_writable_error(path, error) from None
 
     def write(self, topic: str, stamp_ns: int, message: Any, is_latched: bool) -> None:
-        """Store a ROS 2 message as ROS 1 has it."""
+        """Store a ROS 2 message as the ROS 1 message: see `Storage`."""
         if topic not in self._connections:
             name = ros1.type_name(message.__msgtype__)
             latching = 1 if is_latched else None
@@ -67,18 +67,18 @@ class Ros1Storage(_Bag):
         self._writer.close()
 
     def close(self) -> None:
-        """Close the file, if it was not finished."""
+        """Close the file if it was not finished."""
         self._writer.abort()
 
 
 class Ros2Storage(_Bag):
-    """A ROS 2 bag: a folder with an SQLite file, whose messages are there once it is finished.
+    """A ROS 2 bag: a folder with an SQLite file, which holds its messages once it is finished.
 
     Args:
         path: of the folder, which must not exist.
 
     Raises:
-        SessionError: if the folder exists or cannot be made.
+        SessionError: if the folder exists or cannot be created.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
 
@@ -98,7 +98,7 @@ class Ros2Storage(_Bag):
             raise not_writable_error(path, _as_os_error(error)) from None
 
     def write(self, topic: str, stamp_ns: int, message: Any, is_latched: bool) -> None:
-        """Store a message."""
+        """Store a message: see `Storage`."""
         try:
             if topic not in self._connections:
                 self._connections[topic] = self._writer.add_connection(
@@ -119,7 +119,7 @@ class Ros2Storage(_Bag):
             raise _as_os_error(error) from None
 
     def close(self) -> None:
-        """Close the file, if it was not finished."""
+        """Close the file if it was not finished."""
         try:
             self._writer.abort()
         except sqlite3.Error as error:
@@ -131,7 +131,7 @@ def _as_os_error(error: OSError | sqlite3.Error) -> OSError:
 
 
 def _latched() -> Any:
-    """The quality of service that ROS 2 has for what ROS 1 called latched."""
+    """The quality of service of ROS 2 that corresponds to a latched topic of ROS 1."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     forever = QosTime(9223372036, 854775807)  # as ROS writes it

@@ -9,7 +9,10 @@ from graphvio.errors import MissingExtraError, SessionError
 
 
 def typestore(name: str) -> Any:
-    """The types of a ROS distribution, by the name that rosbags has for it.
+    """Return the types of a ROS distribution.
+
+    Args:
+        name: of the distribution, as in rosbags' ``Stores``.
 
     Raises:
         MissingExtraError: if the extra ``sessions`` is not installed.
@@ -23,7 +26,7 @@ def typestore(name: str) -> Any:
 
 @cache
 def types() -> Any:
-    """The types of ROS 2 (Humble).
+    """Return the types of ROS 2 (Humble).
 
     Raises:
         MissingExtraError: if the extra ``sessions`` is not installed.
@@ -39,22 +42,22 @@ def node_types() -> Any:
 
 
 def make(type_name: str, **fields: Any) -> Any:
-    """A message of a type such as ``sensor_msgs/msg/Image``."""
+    """Create a message of a type such as ``sensor_msgs/msg/Image``."""
     return types().types[type_name](**fields)
 
 
 def encode(message: Any) -> bytes:
-    """A message as CDR."""
+    """Encode a message as CDR."""
     return bytes(types().serialize_cdr(message, message.__msgtype__))
 
 
 def decode(data: bytes, type_name: str, where: object = "a message") -> Any:
-    """A message from CDR; arrays are views of the data.
+    """Decode a message from CDR; its arrays are views of the data.
 
     Args:
-        data: of the message.
-        type_name: of it.
-        where: it is from, for what is told of damage.
+        data: CDR of the message.
+        type_name: such as ``sensor_msgs/msg/Image``.
+        where: the message is from, for errors.
 
     Raises:
         SessionError: if it is damaged.
@@ -62,24 +65,24 @@ def decode(data: bytes, type_name: str, where: object = "a message") -> Any:
     known = types()
     try:
         return known.deserialize_cdr(data, type_name)
-    except Exception as error:  # the library has errors of many types for bytes that are none of its own
+    except Exception as error:  # the library raises errors of many types for damaged bytes
         why = str(error) or type(error).__name__
-        raise SessionError(f"{where}: holds a damaged {type_name} ({why}); copy the file anew") from None
+        raise SessionError(f"{where}: holds a damaged {type_name} ({why}); copy the file again") from None
 
 
 def definition(type_name: str) -> bytes:
-    """The text of a type and of all that it holds, as MCAP's ``ros2msg`` schemas have it."""
+    """Return the text of a type and of the types of its fields, as in MCAP's ``ros2msg`` schemas."""
     text, _ = types().generate_msgdef(type_name, ros_version=2)
     return str(text).encode()
 
 
 def stamp_ns(data: bytes) -> int:
-    """The stamp of a message that begins with a header, without decoding the rest.
+    """Return the stamp of a message that begins with a header, without decoding the other fields.
 
     Raises:
         SessionError: if the message is too short to have one.
     """
     if len(data) < 12:
-        raise SessionError(f"a message of {len(data)} bytes has no header; copy the file anew")
+        raise SessionError(f"a message of {len(data)} bytes has no header; copy the file again")
     order: Any = "little" if data[1] & 1 else "big"
     return int.from_bytes(data[4:8], order, signed=True) * 1_000_000_000 + int.from_bytes(data[8:12], order)

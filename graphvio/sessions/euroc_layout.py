@@ -1,4 +1,4 @@
-"""The texts and images of a recording in the EuRoC/ASL layout, as the simulator and ``graphvio convert`` write them."""
+"""Rows, texts and images of the EuRoC/ASL layout, as the simulator and ``graphvio convert`` write them."""
 
 from __future__ import annotations
 
@@ -25,38 +25,42 @@ STATE_HEADER = (
     "b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]"
 )
 
-_PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # noise hardly shrinks any further
+_PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # noise hardly compresses any better
 
 
 def write_image(path: Path, image: Image) -> None:
-    """Write an image (height, width) uint8 as PNG.
+    """Write an image as PNG.
+
+    Args:
+        path: of the file.
+        image: (height, width) uint8.
 
     Raises:
         OSError: if it cannot be written.
     """
-    is_packed, png = cv2.imencode(".png", image, _PNG_OPTIONS)
-    if not is_packed:
-        raise OSError(errno.EINVAL, "the image cannot be packed", str(path))
+    is_encoded, png = cv2.imencode(".png", image, _PNG_OPTIONS)
+    if not is_encoded:
+        raise OSError(errno.EINVAL, "the image cannot be encoded", str(path))
     path.write_bytes(png.tobytes())
 
 
 def frame_row(stamp_ns: int) -> str:
-    """A row of a camera's ``data.csv``."""
+    """Return a row of a camera's ``data.csv``."""
     return f"{stamp_ns},{stamp_ns}.png"
 
 
 def rounded_row(stamp_ns: int, values: Iterable[float]) -> str:
-    """A row of a table with twelve significant digits."""
+    """Return a row of a table with twelve significant digits."""
     return f"{stamp_ns}," + ",".join(f"{value:.12g}" for value in values)
 
 
 def exact_row(stamp_ns: int, values: Iterable[float]) -> str:
-    """A row of a table whose values read back to the last digit."""
+    """Return a row of a table whose values read back to the last digit."""
     return f"{stamp_ns}," + ",".join(repr(float(value)) for value in values)
 
 
 def camera_yaml(camera: Camera, rate_hz: float, comment: str) -> str:
-    """A camera's ``sensor.yaml``."""
+    """Return a camera's ``sensor.yaml``."""
     coefficients = camera.distortion if camera.distortion[4] != 0.0 else camera.distortion[:4]
     return (
         f"sensor_type: camera\ncomment: {comment}\n{_matrix_yaml(camera.body_T_cam)}"
@@ -69,7 +73,7 @@ def camera_yaml(camera: Camera, rate_hz: float, comment: str) -> str:
 
 
 def imu_yaml(imu: Imu, comment: str) -> str:
-    """The IMU's ``sensor.yaml``."""
+    """Return the IMU's ``sensor.yaml``."""
     return (
         f"sensor_type: imu\ncomment: {comment}\n{_matrix_yaml(np.eye(4))}rate_hz: {imu.rate_hz:g}\n"
         f"gyroscope_noise_density: {imu.gyro_noise_density:.12g}\n"
@@ -80,7 +84,7 @@ def imu_yaml(imu: Imu, comment: str) -> str:
 
 
 def truth_yaml(comment: str) -> str:
-    """The truth's ``sensor.yaml``: poses of body."""
+    """Return the truth's ``sensor.yaml``: poses of body."""
     return f"sensor_type: visual-inertial\ncomment: {comment}\n{_matrix_yaml(np.eye(4))}"
 
 

@@ -1,4 +1,4 @@
-"""Writes a recording in the EuRoC/ASL layout, with graphvio's ``rig.yaml`` beside ``mav0``."""
+"""Writes a recording in the EuRoC/ASL layout, with graphvio's ``rig.yaml`` next to ``mav0``."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ _COMMENT = "converted by graphvio"
 
 
 class EurocWriter:
-    """Writes sensors' measurements as a folder; values of the IMU and poses read back to the last digit.
+    """Writes measurements as a folder; values of the IMU and poses read back to the last digit.
 
-    Images bear the stamps of their framesets. When the disk is full writing stops, as with `SessionWriter`.
+    Images have the stamps of their framesets. When the disk is full writing stops, as with `SessionWriter`.
 
     Args:
         path: of the folder, which must not exist, or be empty.
         rig: of the framesets.
 
     Attributes:
-        stopped: why nothing is written any more, or None.
-        rig: as written: cameras are called ``cam0``, ``cam1`` and so on in the layout, and are renamed if they are not.
+        stopped: why writing stopped, or None.
+        rig: as written: its cameras are renamed to ``cam0``, ``cam1`` and so on if they have other names.
 
     Raises:
-        SessionError: if the folder is not empty or cannot be made.
+        SessionError: if the folder is not empty or cannot be created.
     """
 
     def __init__(self, path: Path, rig: Rig) -> None:
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             raise exists_error(path)
         self.path = path
-        self.rig = _named_as_the_layout(rig)
+        self.rig = _renamed(rig)
         self.stopped: str | None = None
         self._mav0 = path / "mav0"
         self._stamps: dict[str, list[int]] = {camera.name: [] for camera in self.rig.cameras}
@@ -77,7 +77,7 @@ class EurocWriter:
             self._stop(error)
 
     def add_true_pose(self, stamp_ns: int, world_T_body: Float) -> None:
-        """Write a pose (4, 4) of the true trajectory."""
+        """Write a pose ``world_T_body`` (4, 4) of the true trajectory."""
         try:
             if self.stopped is None:
                 quat_wxyz = quat_wxyz_from_rotation(np.ascontiguousarray(world_T_body[:3, :3]))
@@ -86,7 +86,7 @@ class EurocWriter:
             self._stop(error)
 
     def add_event(self, event: Event) -> None:
-        """The layout has no place for events."""
+        """Ignore the event: the layout has no place for it."""
 
     def close(self) -> None:
         """Finish the folder; a second time does nothing."""
@@ -147,7 +147,7 @@ class EurocWriter:
         _log.error("%s", self.stopped)
 
 
-def _named_as_the_layout(rig: Rig) -> Rig:
+def _renamed(rig: Rig) -> Rig:
     if all(re.fullmatch(r"cam\d+", camera.name) for camera in rig.cameras):
         return rig
     pairs = tuple(
@@ -158,5 +158,5 @@ def _named_as_the_layout(rig: Rig) -> Rig:
 
 
 def _rate_hz(stamps_ns: list[int]) -> float:
-    """By the median interval; 0 where there is none."""
+    """Rate by the median interval; 0 if there is none."""
     return 1e9 / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0

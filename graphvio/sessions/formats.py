@@ -1,4 +1,4 @@
-"""The formats that recordings are converted to."""
+"""The formats to which recordings are converted."""
 
 from __future__ import annotations
 
@@ -25,70 +25,70 @@ _STORAGES: dict[str, Callable[[Path], Storage]] = {"mcap": McapStorage, "rosbag1
 
 
 class RecordingWriter(Protocol):
-    """Takes what a source yields.
+    """Writes the measurements of a source.
 
     Attributes:
-        stopped: why nothing is written any more, or None.
+        stopped: why writing stopped, or None.
     """
 
     stopped: str | None
 
     @property
     def rig(self) -> Rig:
-        """As written."""
+        """Rig as written."""
 
     def __enter__(self) -> Self:
-        """Itself."""
+        """Return the writer."""
 
     def __exit__(self, *_: object) -> None:
-        """Finish what is written."""
+        """Finish the file or folder."""
 
     def add(self, measurement: Measurement) -> None:
         """Write an IMU sample or a frameset."""
 
     def add_true_pose(self, stamp_ns: int, world_T_body: Float) -> None:
-        """Write a pose (4, 4) of the true trajectory."""
+        """Write a pose ``world_T_body`` (4, 4) of the true trajectory."""
 
     def add_event(self, event: Event) -> None:
-        """Write an event, where the format has a place for it."""
+        """Write an event if the format has a place for it."""
 
 
 def format_of(path: Path, asked: str | None) -> str:
-    """The format, one of `FORMATS`, of what is written at a path.
+    """Return the format, one of `FORMATS`, in which a path is written.
 
     Args:
         path: a file ``NAME.mcap`` or ``NAME.bag``, or a folder.
         asked: the format, or None to go by the name.
 
     Raises:
-        SessionError: if the name does not tell it, or tells another.
+        SessionError: if the name does not show the format, or contradicts it.
     """
     if asked is not None and asked not in FORMATS:
         raise SessionError(f"--format {asked}: is not known; give one of {', '.join(FORMATS)}")
-    told = _BY_SUFFIX.get(path.suffix)
-    if asked is None and told is None:
+    named = _BY_SUFFIX.get(path.suffix)
+    if asked is None and named is None:
         raise SessionError(
-            f"{path}: its name tells no format; name a file .mcap or .bag, or give --format rosbag2 or --format euroc "
+            f"{path}: its name shows no format; name a file .mcap or .bag, or give --format rosbag2 or --format euroc "
             "for a folder"
         )
     suffix = next((suffix for suffix, known in _BY_SUFFIX.items() if known == asked), None)
-    if asked is not None and asked != told and (told is not None or suffix is not None):
+    if asked is not None and asked != named and (named is not None or suffix is not None):
         wanted = f"it {suffix}" if suffix is not None else "a folder without that ending"
         raise SessionError(f"{path}: is not how {asked} is named; name {wanted}, or give another --format")
-    return asked or told or ""
+    return asked or named or ""
 
 
 def open_writer(path: Path, rig: Rig, file_format: str, image_format: ImageFormat = "raw") -> RecordingWriter:
-    """A writer of a format.
+    """Create a file or folder of a format.
 
     Args:
         path: of the file or folder, which must not exist.
         rig: of the framesets.
         file_format: one of `FORMATS`.
-        image_format: of images in sessions and bags; the EuRoC layout has PNG in any case.
+        image_format: of images in sessions and bags; the EuRoC layout always has PNG.
 
     Raises:
-        SessionError: if the target exists or cannot be made.
+        SessionError: if the target exists or cannot be created.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
     if file_format == "euroc":

@@ -1,4 +1,4 @@
-"""Writes MCAP files of which a crash loses the last second at most."""
+"""Writes MCAP files that lose at most the last second in a crash."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from graphvio.version import __version__
 LIBRARY = "graphvio"
 
 _CHUNK_BYTES = 4 * 1024 * 1024
-_FLUSH_S = 0.5  # two flushes a second, so that a second is lost at most
+_FLUSH_S = 0.5  # so that at most a second is lost
 _ENCODING, _SCHEMA_ENCODING, _PROFILE = "cdr", "ros2msg", "ros2"
 
 
@@ -27,7 +27,7 @@ class McapStorage:
         path: of the file, which must not exist.
 
     Raises:
-        SessionError: if the file exists or cannot be made.
+        SessionError: if the file exists or cannot be created.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
 
@@ -46,19 +46,19 @@ class McapStorage:
         except OSError as error:
             raise not_writable_error(path, error) from None
         self._mcap = writer(self._file)
-        self._mcap.start(_PROFILE, f"{LIBRARY} {__version__}")  # into a buffer: the disk is not asked yet
+        self._mcap.start(_PROFILE, f"{LIBRARY} {__version__}")  # buffered: nothing is written to the disk yet
         self._last_flush_s = time.monotonic()
         self._closing = threading.Event()
         self._syncing = threading.Thread(target=self._sync, name="graphvio-session", daemon=True)
         self._syncing.start()
 
     def attach(self, name: str, text: str) -> None:
-        """Store a text before all messages."""
+        """Store a text before all messages: see `Storage`."""
         self._mcap.add_attachment(0, 0, name, "application/yaml", text.encode())
         self._file.flush()
 
     def write(self, topic: str, stamp_ns: int, message: Any, is_latched: bool) -> None:
-        """Store a message; twice a second, all that came so far goes to the disk."""
+        """Store a message: see `Storage`. All messages so far are flushed to the file twice a second."""
         if topic not in self._channels:
             name = message.__msgtype__
             if name not in self._schemas:
@@ -83,7 +83,7 @@ class McapStorage:
         self._file.close()
 
     def _sync(self) -> None:
-        """Has what was flushed on the disk, for when the power fails."""
+        """Sync the file with the disk, as a flush does not survive a power failure."""
         while not self._closing.wait(_FLUSH_S):
             try:
                 os.fsync(self._file.fileno())

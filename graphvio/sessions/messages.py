@@ -1,4 +1,4 @@
-"""What graphvio has, as ROS 2 messages, and back."""
+"""Converts measurements, rigs and estimates to ROS 2 messages and back."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ LOG, TEXT = "rcl_interfaces/msg/Log", "std_msgs/msg/String"
 STAMPED = (IMAGE, COMPRESSED, IMU, CAMERA_INFO, ODOMETRY, POSE)
 """Types that begin with a header."""
 ODOM, BODY = "odom", "base_link"
-"""REP 105's names of nav and body."""
+"""Names of the frames nav and body, by REP 105."""
 WORLD = "world"
-"""Frame of the truth."""
+"""Frame of the true trajectory."""
 
 _NS_PER_S = 1_000_000_000
 _STAMP_END_S = 2**31
-_UNKNOWN = -1.0  # in the first element of a covariance: no such quantity
+_UNKNOWN = -1.0  # in the first element of a covariance: the quantity is not measured
 _DISTORTIONS = {"radial-tangential": ("plumb_bob", 5), "equidistant": ("equidistant", 4)}
 _WARN = 30
 
 
 def header(stamp_ns: int, frame: str) -> Any:
-    """A ``std_msgs/Header``."""
+    """Return a ``std_msgs/Header``."""
     return make("std_msgs/msg/Header", stamp=_time(stamp_ns), frame_id=frame)
 
 
 def image(stamp_ns: int, frame: str, pixels: Image) -> Any:
-    """A grey image (height, width)."""
+    """Return the message of a grey image (height, width) uint8."""
     height, width = pixels.shape
     return make(
         IMAGE,
@@ -54,14 +54,14 @@ def image(stamp_ns: int, frame: str, pixels: Image) -> Any:
 
 
 def compressed_image(stamp_ns: int, frame: str, png: bytes) -> Any:
-    """An image in a PNG."""
+    """Return the message of an image in a PNG."""
     return make(
         COMPRESSED, header=header(stamp_ns, frame), format="mono8; png compressed", data=np.frombuffer(png, np.uint8)
     )
 
 
 def imu(sample: ImuSample) -> Any:
-    """A sample, with no orientation."""
+    """Return the message of a sample, without orientation."""
     unknown = np.zeros(9)
     unknown[0] = _UNKNOWN
     return make(
@@ -77,7 +77,7 @@ def imu(sample: ImuSample) -> Any:
 
 
 def imu_sample(message: Any) -> ImuSample:
-    """The sample of a message."""
+    """Return the sample in a message."""
     rates, forces = message.angular_velocity, message.linear_acceleration
     return ImuSample(
         stamp_of(message.header),
@@ -87,7 +87,7 @@ def imu_sample(message: Any) -> ImuSample:
 
 
 def camera_info(stamp_ns: int, camera: Camera) -> Any:
-    """Intrinsics and distortion."""
+    """Return the ``CameraInfo`` of a camera: intrinsics and distortion."""
     fx, fy, cx, cy = camera.intrinsics
     model, count = _DISTORTIONS[camera.model]
     return make(
@@ -107,7 +107,7 @@ def camera_info(stamp_ns: int, camera: Camera) -> Any:
 
 
 def static_transforms(stamp_ns: int, rig: Rig) -> Any:
-    """``body_T_cam`` of all cameras."""
+    """Return the transforms ``body_T_cam`` of all cameras."""
     return make(
         TRANSFORMS,
         transforms=[transform(stamp_ns, BODY, camera.name, camera.body_T_cam) for camera in rig.cameras],
@@ -115,7 +115,7 @@ def static_transforms(stamp_ns: int, rig: Rig) -> Any:
 
 
 def transform(stamp_ns: int, parent: str, child: str, parent_T_child: Float) -> Any:
-    """A ``geometry_msgs/TransformStamped``."""
+    """Return a ``geometry_msgs/TransformStamped``."""
     return make(
         "geometry_msgs/msg/TransformStamped",
         header=header(stamp_ns, parent),
@@ -129,10 +129,11 @@ def transform(stamp_ns: int, parent: str, child: str, parent_T_child: Float) -> 
 
 
 def odometry(estimate: Estimate) -> Any:
-    """An estimate that has a pose; ROS orders covariances ``[translation, rotation]``, the pose's in the fixed axes.
+    """Return the message of an estimate that has a pose.
 
-    Rates are those of the newest interval, by all that is known, else by gyro, else by vision. What is not estimated,
-    as the covariance of rates, is NaN.
+    ROS orders covariances ``[translation, rotation]``, that of the pose in the fixed axes. Angular rates are those of
+    the newest interval: fused, or else of the gyro, or else of vision. Values that are not estimated, such as the
+    covariance of the rates, are NaN.
     """
     assert estimate.nav_T_body is not None
     assert estimate.covariance is not None
@@ -157,7 +158,12 @@ def odometry(estimate: Estimate) -> Any:
 
 
 def pose_with_covariance(a_T_body: Float, covariance: Float) -> Any:
-    """A ``geometry_msgs/PoseWithCovariance`` of a covariance (6, 6), tangent ``[rotation, translation]`` in body."""
+    """Return a ``geometry_msgs/PoseWithCovariance``.
+
+    Args:
+        a_T_body: (4, 4).
+        covariance: (6, 6), tangent ``[rotation, translation]`` in body.
+    """
     turned = _fixed_axes(a_T_body)
     return make(
         "geometry_msgs/msg/PoseWithCovariance",
@@ -167,35 +173,35 @@ def pose_with_covariance(a_T_body: Float, covariance: Float) -> Any:
 
 
 def covariance_of(message: Any) -> Float:
-    """The covariance (6, 6), tangent ``[rotation, translation]`` in body, of a message that has one with its pose."""
+    """Return the covariance (6, 6) in a message with pose, tangent ``[rotation, translation]`` in body."""
     turned = _fixed_axes(pose_of(message))
     return np.asarray(turned.T @ np.asarray(message.pose.covariance, dtype=np.float64).reshape(6, 6) @ turned)
 
 
 def pose_stamped(stamp_ns: int, frame: str, frame_T_body: Float) -> Any:
-    """A ``geometry_msgs/PoseStamped``."""
+    """Return a ``geometry_msgs/PoseStamped``."""
     return make(POSE, header=header(stamp_ns, frame), pose=_pose(frame_T_body))
 
 
 def true_pose(stamp_ns: int, world_T_body: Float) -> Any:
-    """A pose (4, 4) of the true trajectory."""
+    """Return the message of a pose (4, 4) of the true trajectory."""
     return pose_stamped(stamp_ns, WORLD, world_T_body)
 
 
 def pose_of(message: Any) -> Float:
-    """The pose (4, 4) in a ``PoseStamped``, a ``PoseWithCovarianceStamped`` or an ``Odometry``."""
+    """Return the pose (4, 4) in a ``PoseStamped``, a ``PoseWithCovarianceStamped`` or an ``Odometry``."""
     pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
     q, t = pose.orientation, pose.position
     return se3(rotation_from_quat_wxyz(np.array([q.w, q.x, q.y, q.z])), np.array([t.x, t.y, t.z]))
 
 
 def text(content: str) -> Any:
-    """A text."""
+    """Return the message of a text."""
     return make(TEXT, data=content)
 
 
 def log(event: Event) -> Any:
-    """An event as a line of ``/rosout``."""
+    """Return an event as a line of ``/rosout``."""
     return make(
         LOG,
         stamp=_time(event.stamp_ns),
@@ -209,15 +215,15 @@ def log(event: Event) -> Any:
 
 
 def stamp_of(message_header: Any) -> int:
-    """Nanoseconds of a header's stamp."""
+    """Return the nanoseconds of a header's stamp."""
     return int(message_header.stamp.sec) * _NS_PER_S + int(message_header.stamp.nanosec)
 
 
 def _time(stamp_ns: int) -> Any:
-    seconds, rest = divmod(stamp_ns, _NS_PER_S)
+    seconds, nanoseconds = divmod(stamp_ns, _NS_PER_S)
     if not 0 <= seconds < _STAMP_END_S:
-        raise SessionError(f"stamp {stamp_ns} ns is no time that ROS messages hold: they hold 1970 to 2038")
-    return make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+        raise SessionError(f"stamp {stamp_ns} ns is not within 1970 to 2038, which ROS messages can hold")
+    return make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
 
 
 def _fixed_axes(a_T_body: Float) -> Float:

@@ -1,4 +1,4 @@
-"""The rig that a recording's own messages tell: intrinsics by ``camera_info``, places by ``tf_static``."""
+"""Makes a rig of the messages of a recording: intrinsics of ``camera_info``, extrinsics of ``tf_static``."""
 
 from __future__ import annotations
 
@@ -21,16 +21,20 @@ _WORDS = tuple(side for sides in _SIDES for side in sides)
 
 
 def rig_of_topics(messages: MessageReader, name: str) -> Rig | None:
-    """The rig of all stereo pairs whose images, calibrations and places are there; None if there is none.
+    """Make the rig of all stereo pairs that have images, ``camera_info`` and extrinsics; None if there is none.
 
     A pair's topics differ in one part of their name only: ``left`` and ``right``, ``infra1`` and ``infra2``. Of several
-    topics with one camera's images one is taken, and of several with samples of an IMU the first by name. Where
-    transforms do not tell the right camera's place, its ``camera_info`` does, by the projection's fourth column. Body
-    is the IMU's frame, or the first left camera's.
+    topics with one camera's images one is used (see `preference`), and of several with samples of an IMU the first by
+    name. Without a transform to the right camera, the fourth column of its projection gives the baseline. Body is the
+    frame of the IMU, or of the first left camera.
+
+    Args:
+        messages: to read from.
+        name: of the rig.
 
     Raises:
-        RigError: if what is told makes no rig.
-        SessionError: if it is damaged.
+        RigError: if transforms are missing, or a camera is of an unknown kind.
+        SessionError: if a message is damaged.
     """
     images = [each.name for each in of_type(messages.topics, IMAGE, COMPRESSED)]
     transforms = _transforms(messages)
@@ -70,10 +74,13 @@ def rig_of_topics(messages: MessageReader, name: str) -> Rig | None:
 
 
 def stereo_topics(images: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Name of each pair -> topics of its left and right camera, among topics with images.
+    """Return name of each pair -> topics of its left and right camera.
 
-    Their names differ in one part only. Where a camera has several, raw and compressed or raw and rectified, one is
-    taken: see `preference`.
+    Their names differ in one part only. Of several topics of a camera, such as raw and compressed or raw and rectified,
+    one is used: see `preference`.
+
+    Args:
+        images: names of topics with images.
     """
     names = sorted(images)
     made: dict[tuple[str, str], tuple[str, str]] = {}
@@ -93,20 +100,20 @@ def stereo_topics(images: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def _without_side(camera: str) -> str:
-    """A pair's name: what the name of its left camera has besides the side."""
+    """A pair's name: that of its left camera without the side."""
     parts = [part for part in camera.split("/") if part]
-    rest = [part for part in parts if not any(side in part for side in _WORDS)]
-    return "-".join(rest) or "-".join(parts)
+    others = [part for part in parts if not any(side in part for side in _WORDS)]
+    return "-".join(others) or "-".join(parts)
 
 
 def info_topics(image_topic: str) -> list[str]:
-    """Where the calibration of a topic with images may be, the nearest first."""
+    """Return the possible topics of the calibration of a topic with images, the nearest first."""
     parts = image_topic.split("/")
     return ["/".join([*parts[:depth], "camera_info"]) for depth in range(len(parts) - 1, 0, -1)]
 
 
 def _info(messages: MessageReader, image_topic: str) -> Any:
-    """The calibration beside a topic with images."""
+    """The calibration of a topic with images, or None."""
     for name in info_topics(image_topic):
         topic = messages.topics.get(name)
         if topic is not None and topic.type_name == CAMERA_INFO and topic.places:
@@ -115,11 +122,11 @@ def _info(messages: MessageReader, image_topic: str) -> Any:
 
 
 def _first(messages: MessageReader, topic: Topic) -> Any:
-    """The first message of a topic that is not damaged."""
+    """The first undamaged message of a topic."""
     for place in topic.places[:-1]:
         try:
             return cdr.decode(messages.read(place), topic.type_name, messages.path)
-        except SessionError:  # all say the same
+        except SessionError:  # the others say the same
             continue
     return cdr.decode(messages.read(topic.places[-1]), topic.type_name, messages.path)
 
@@ -146,7 +153,7 @@ def _frame(info: Any, topic: str) -> str:
 
 
 def _transforms(messages: MessageReader) -> dict[tuple[str, str], Float]:
-    """All static transforms, as `transforms_in` has them."""
+    """All static transforms: see `transforms_in`."""
     made: dict[tuple[str, str], Float] = {}
     for topic in messages.topics.values():
         if topic.type_name != TRANSFORMS or not topic.name.endswith("tf_static"):
@@ -157,7 +164,7 @@ def _transforms(messages: MessageReader) -> dict[tuple[str, str], Float]:
 
 
 def transforms_in(message: Any) -> dict[tuple[str, str], Float]:
-    """(parent, child) -> ``parent_T_child`` (4, 4) of a ``TFMessage``, both ways."""
+    """Return (parent, child) -> ``parent_T_child`` (4, 4) of a ``TFMessage``, and the inverses."""
     made: dict[tuple[str, str], Float] = {}
     for each in message.transforms:
         q, t = each.transform.rotation, each.transform.translation
@@ -168,7 +175,13 @@ def transforms_in(message: Any) -> dict[tuple[str, str], Float]:
 
 
 def path_between(transforms: dict[tuple[str, str], Float], start: str, end: str) -> Float | None:
-    """``start_T_end`` along transforms, or None."""
+    """Return ``start_T_end`` (4, 4) along transforms, or None if no path leads there.
+
+    Args:
+        transforms: (parent, child) -> ``parent_T_child``, as of `transforms_in`.
+        start: frame.
+        end: frame.
+    """
     start, end = start.lstrip("/"), end.lstrip("/")
     reached = {start: np.eye(4)}
     waiting = [start]

@@ -1,4 +1,4 @@
-"""Messages as ROS 1 has them, from and to those of ROS 2: headers have a sequence number, and some names differ."""
+"""Converts messages of ROS 1 from and to those of ROS 2: headers have a sequence number, and some names differ."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _OLD_LEVELS = {10: 1, 20: 2, 30: 4, 40: 8, 50: 16}
 
 @cache
 def types() -> Any:
-    """The types of ROS 1 (Noetic), and that of ``tf_static``.
+    """Return the types of ROS 1 (Noetic), with that of ``tf_static``.
 
     Raises:
         MissingExtraError: if the extra ``sessions`` is not installed.
@@ -27,12 +27,12 @@ def types() -> Any:
 
 
 def type_name(name: str) -> str:
-    """The type that stands for one of ROS 2."""
+    """Return the type of ROS 1 that corresponds to one of ROS 2."""
     return _OLD_LOG if name == LOG else name
 
 
 def modern(message: Any) -> Any:
-    """A ROS 1 message as ROS 2 has it; names of fields are lower case there."""
+    """Convert a ROS 1 message to that of ROS 2, whose fields have lower-case names."""
     if isinstance(message, list):
         return [modern(each) for each in message]
     name = getattr(message, "__msgtype__", None)
@@ -45,10 +45,10 @@ def modern(message: Any) -> Any:
 
 
 def encode(message: Any, number: int) -> bytes:
-    """A ROS 2 message as ROS 1 has it, serialised.
+    """Serialise a ROS 2 message as that of ROS 1.
 
     Args:
-        message: one of those that graphvio writes.
+        message: of a type that graphvio writes.
         number: of the message in its topic, for the headers.
     """
     old = _old_log(message, number) if message.__msgtype__ == LOG else _old(message, number)
@@ -56,7 +56,7 @@ def encode(message: Any, number: int) -> bytes:
 
 
 def stamp_ns(data: bytes) -> int:
-    """The stamp of a message that begins with a header, without decoding the rest."""
+    """Return the stamp of a message that begins with a header, without decoding the other fields."""
     return int.from_bytes(data[4:8], "little") * 1_000_000_000 + int.from_bytes(data[8:12], "little")
 
 

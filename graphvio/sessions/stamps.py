@@ -1,4 +1,4 @@
-"""Stamps of messages: those of their headers, and how the clock that gave them compares with the recorder's."""
+"""Stamps of messages' headers, and comparison of their clock with the recorder's."""
 
 from __future__ import annotations
 
@@ -15,23 +15,22 @@ from graphvio.sessions.store import Store
 from graphvio.sessions.topics import Place, Topic
 
 _BLOCKS = 10
-_FEWEST = 5 * _BLOCKS
-_SHORTEST_NS = 10_000_000_000
+_MIN_MESSAGES = 5 * _BLOCKS
+_MIN_DURATION_NS = 10_000_000_000
 _JUMP_NS = 1_000_000_000
 _NS_PER_MS, _NS_PER_MINUTE = 1e6, 60e9
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Stamps of one topic's headers against the times at which the messages were recorded.
+    """Comparison of the stamps of one topic's headers with the times of recording.
 
     Attributes:
         backward: messages whose stamp is not after that of the message before.
-        jumps: messages whose stamp is a second or more off what the recorder's clock says since the message before.
-        latency_ms: median of when messages were recorded after their stamps.
-        drift_ms_per_minute: by how much that grows, or None where the recording is too short to tell, or where both
-            are the same.
-        drift_sigma: its standard deviation, or None.
+        jumps: messages whose stamp advanced a second or more differently from the recorder's clock.
+        latency_ms: median time from stamp to recording.
+        drift_ms_per_minute: growth of the latency; None if the recording is too short, or both clocks are the same.
+        drift_sigma: standard deviation of the drift, or None.
     """
 
     backward: int
@@ -43,12 +42,12 @@ class Clock:
 
 @dataclass(frozen=True)
 class Offset:
-    """Stamps of one topic against those of another.
+    """Comparison of the stamps of two topics.
 
     Attributes:
-        matched: messages for which the other has one that is nearer than half the interval of messages.
-        median_ms: of how much later the other's are.
-        largest_ms: difference, without its sign.
+        matched: messages of the first that have one of the second within half their interval.
+        median_ms: median of the second's stamp less the first's.
+        largest_ms: largest absolute difference.
     """
 
     matched: int
@@ -57,16 +56,16 @@ class Offset:
 
 
 def header_stamps(store: Store, topic: Topic) -> Int:
-    """Stamps (N,) of the headers of a topic's messages, in the order of the file.
+    """Return the stamps (N,) of the headers of a topic's messages, in the order of the file.
 
-    graphvio's own sessions are logged by them, and bags have been read for them; other files are read here. A message
-    that is damaged has the time at which it was recorded.
+    graphvio's own sessions are logged by these stamps, and bags were read when they were opened; other files are read
+    here. A damaged message gets the time of its recording.
     """
     return all_header_stamps(store, [topic])[topic.name]
 
 
 def all_header_stamps(store: Store, topics: Iterable[Topic]) -> dict[str, Int]:
-    """Name of a topic -> its `header_stamps`; messages are read in the order of the file, so each chunk but once."""
+    """Return name of a topic -> its `header_stamps`, reading the file in order so that each chunk is unpacked once."""
     found: dict[str, Int] = {}
     waiting: list[tuple[Place, str, int]] = []
     for topic in topics:
@@ -80,13 +79,18 @@ def all_header_stamps(store: Store, topics: Iterable[Topic]) -> dict[str, Int]:
     for place, name, row in sorted(waiting):
         try:
             found[name][row] = cdr.stamp_ns(store.read(place))
-        except SessionError:  # told by who reads it
+        except SessionError:  # counted by those who read the message itself
             continue
     return found
 
 
 def compare_clocks(header_ns: Int, logged_ns: Int) -> Clock:
-    """Compare stamps (N,) with the times (N,) at which they were recorded, both in the order of recording; N > 0."""
+    """Compare stamps with the times of recording.
+
+    Args:
+        header_ns: (N,) stamps in the order of recording, N > 0.
+        logged_ns: (N,) times of recording.
+    """
     late_ns = logged_ns - header_ns
     drift, sigma = _drift(header_ns, late_ns)
     return Clock(
@@ -99,7 +103,7 @@ def compare_clocks(header_ns: Int, logged_ns: Int) -> Clock:
 
 
 def compare_topics(first_ns: Int, second_ns: Int) -> Offset | None:
-    """Compare stamps (N,) with the nearest ones (M,) of another topic; None where too few belong together."""
+    """Compare stamps (N,) with the nearest ones (M,) of another topic; None if too few belong together."""
     first, second = np.unique(first_ns), np.unique(second_ns)
     if len(first) < 2 or len(second) < 2:
         return None
@@ -113,8 +117,8 @@ def compare_topics(first_ns: Int, second_ns: Int) -> Offset | None:
 
 
 def _drift(header_ns: Int, late_ns: Int) -> tuple[float | None, float | None]:
-    """Slope of the lateness and its standard deviation, milliseconds a minute, by a line through medians of blocks."""
-    if len(header_ns) < _FEWEST or header_ns.max() - header_ns.min() < _SHORTEST_NS or not late_ns.any():
+    """Slope of the latency and its standard deviation, ms per minute, by a line through medians of blocks."""
+    if len(header_ns) < _MIN_MESSAGES or header_ns.max() - header_ns.min() < _MIN_DURATION_NS or not late_ns.any():
         return None, None
     blocks = np.array_split(np.argsort(header_ns, kind="stable"), _BLOCKS)
     minutes = np.array([np.median(header_ns[block] - header_ns.min()) for block in blocks]) / _NS_PER_MINUTE

@@ -1,4 +1,4 @@
-"""Where a session's messages go: one file format each, all alike to the writer."""
+"""The interface of the file formats to which a session is written."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from graphvio.errors import SessionError
 
 
 class Storage(Protocol):
-    """A file, or folder, that takes messages by topic.
+    """A file or folder to which messages are written by topic.
 
     Attributes:
-        path: of it.
-        has_attachments: whether it takes texts besides messages.
-        is_readable_when_cut: whether what was written can be read where the writing was not finished.
+        path: of the file or folder.
+        has_attachments: whether it can hold texts in addition to messages.
+        is_readable_when_cut: whether it can be read if its writing was not finished.
     """
 
     path: Path
@@ -22,28 +22,34 @@ class Storage(Protocol):
     is_readable_when_cut: bool
 
     def attach(self, name: str, text: str) -> None:
-        """Store a text before all messages, where there `has_attachments`.
+        """Store a text before all messages, if it `has_attachments`.
 
         Raises:
             OSError: if it cannot be written.
         """
 
     def write(self, topic: str, stamp_ns: int, message: Any, is_latched: bool) -> None:
-        """Store a ROS 2 message; of a latched topic, subscribers that come late still get the last one.
+        """Store a ROS 2 message.
+
+        Args:
+            topic: of the message.
+            stamp_ns: time of recording.
+            message: of rosbags' types.
+            is_latched: whether late subscribers to the topic still get its last message.
 
         Raises:
             OSError: if it cannot be written.
         """
 
     def finish(self) -> None:
-        """Write what stands at the end.
+        """Write the end of the file.
 
         Raises:
             OSError: if it cannot be written.
         """
 
     def close(self) -> None:
-        """Let go of the file, finished or not.
+        """Close the file, finished or not.
 
         Raises:
             OSError: if the last bytes cannot be written.
@@ -51,10 +57,10 @@ class Storage(Protocol):
 
 
 def exists_error(path: Path) -> SessionError:
-    """That a session would be overwritten."""
+    """Return the error that a session would be overwritten."""
     return SessionError(f"{path}: exists, and sessions are never overwritten; name another file")
 
 
 def not_writable_error(path: Path, error: OSError) -> SessionError:
-    """That a session cannot be begun."""
+    """Return the error that a session cannot be created."""
     return SessionError(f"{path}: cannot be written ({error.strerror}); choose another place")

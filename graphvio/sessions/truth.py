@@ -1,4 +1,4 @@
-"""The true trajectory that a session or bag carries."""
+"""Reads the true trajectory in a session or bag."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _log = logging.getLogger(__name__)
 
 
 def truth_topic(topics: Mapping[str, Topic]) -> Topic | None:
-    """The topic with the truth, or None."""
+    """Return the topic with the true trajectory, or None."""
     topic = topics.get(TRUTH_TOPIC)
     return topic if topic is not None and topic.type_name in (POSE, ODOMETRY) and topic.places else None
 
 
 def read_truth(path: Path) -> tuple[Int, Float]:
-    """Stamps (N,), increasing, and poses (N, 4, 4) of the true trajectory in a session or bag.
+    """Return stamps (N,), increasing, and poses ``world_T_body`` (N, 4, 4) of the true trajectory.
 
     Raises:
         TrajectoryError: if it holds none.
@@ -47,6 +47,6 @@ def read_truth(path: Path) -> tuple[Int, Float]:
     if damaged:
         _log.warning("%s: %d true poses are left out; the first: %s", path, len(damaged), damaged[0])
     if not poses:
-        raise TrajectoryError(f"{path}: not one pose on {TRUTH_TOPIC} can be read; copy the file anew")
+        raise TrajectoryError(f"{path}: not one pose on {TRUTH_TOPIC} can be read; copy the file again")
     stamps = sorted(poses)
     return np.array(stamps, dtype=np.int64), np.array([poses[stamp] for stamp in stamps])

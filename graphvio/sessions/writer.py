@@ -1,10 +1,12 @@
-"""Records a session: sensors' measurements, and what the odometry made of them, as messages."""
+"""Records a session: measurements, estimates and events as messages."""
 
 from __future__ import annotations
 
 import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
+
+import cv2
 
 from graphvio.arrays import Float, Image
 from graphvio.measurements.estimate import Estimate
@@ -35,24 +37,24 @@ _log = logging.getLogger(__name__)
 
 
 class SessionWriter:
-    """Writes sensors' measurements, and what the odometry made of them.
+    """Writes measurements, estimates, the true trajectory and events.
 
-    When the disk is full or the file cannot be written any more, recording stops, which is logged and told by
-    `stopped`; the caller goes on.
+    When the disk is full or the file cannot be written any more, recording stops; this is logged, `stopped` says why,
+    and later calls do nothing.
 
     Args:
         path: of the file or folder, which must not exist.
-        rig: of the framesets; written into the file, so that it needs no other.
-        image_format: images as they are, or as PNG, which is smaller and slower.
-        storage: makes what is written at the path: MCAP, of which a crash loses the last second at most, or a bag.
+        rig: of the framesets; is written into the file.
+        image_format: raw, or PNG, which is smaller and slower.
+        storage: creates the file or folder: MCAP, which loses at most the last second in a crash, or a bag.
 
     Attributes:
         rig: of the framesets.
-        stopped: why nothing is recorded any more, or None.
-        poses: that were recorded.
+        stopped: why recording stopped, or None.
+        poses: number of estimates that were recorded.
 
     Raises:
-        SessionError: if the file exists or cannot be made, or from any method if a stamp is no time that messages hold.
+        SessionError: if the file exists or cannot be created, or from any method if messages cannot hold a stamp.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
 
@@ -93,17 +95,17 @@ class SessionWriter:
             self._guarded(lambda: self._add(IMU_TOPIC, measurement.stamp_ns, messages.imu(measurement)))
 
     def add_estimate(self, estimate: Estimate) -> None:
-        """Record an estimate, if it has a pose."""
+        """Record an estimate if it has a pose."""
         if estimate.nav_T_body is not None and self.stopped is None:
             self._guarded(lambda: self._add(ODOMETRY_TOPIC, estimate.stamp_ns, messages.odometry(estimate)))
             self.poses += 1
 
     def add_true_pose(self, stamp_ns: int, world_T_body: Float) -> None:
-        """Record a pose (4, 4) of the true trajectory."""
+        """Record a pose ``world_T_body`` (4, 4) of the true trajectory."""
         self._guarded(lambda: self._add(TRUTH_TOPIC, stamp_ns, messages.true_pose(stamp_ns, world_T_body)))
 
     def add_event(self, event: Event) -> None:
-        """Record an event; one without a time of the recording, at the recording's nearest end."""
+        """Record an event; if it is not within the recording's time, at the nearer end of that."""
         if self._first_ns is not None:
             stamp_ns = min(max(event.stamp_ns, self._first_ns), self._last_ns)
             event = Event(stamp_ns, event.kind, event.detail)
@@ -143,8 +145,6 @@ class SessionWriter:
     def _image(self, stamp_ns: int, frame: str, pixels: Image) -> Any:
         if self._format == "raw":
             return messages.image(stamp_ns, frame, pixels)
-        import cv2
-
         _, png = cv2.imencode(".png", pixels)
         return messages.compressed_image(stamp_ns, frame, png.tobytes())
 
@@ -159,10 +159,10 @@ class SessionWriter:
                 self._stop(error)
 
     def _stop(self, error: OSError) -> None:
-        rest = (
+        remainder = (
             "what was written until then can be read"
             if self._storage.is_readable_when_cut
             else "what was written until then cannot be read: remove it, make room and begin again"
         )
-        self.stopped = f"{self.path}: recording stopped ({error.strerror}); {rest}"
+        self.stopped = f"{self.path}: recording stopped ({error.strerror}); {remainder}"
         _log.error("%s", self.stopped)

@@ -1,4 +1,4 @@
-"""What a session or bag holds, how regular it is, and how far its clocks are to be trusted."""
+"""Describes a session or bag: its topics, how regular their messages are, and how its clocks compare."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from graphvio.sessions.topics import Topic
 from graphvio.sources.session import rig_in
 
 _GAP_PERIODS = 1.5
-_FEWEST = 3
+_MIN_MESSAGES = 3
 _NS_PER_MS, _NS_PER_S = 1e6, 1e9
 
 
 @dataclass(frozen=True)
 class TopicDescription:
-    """Messages of one topic; None where there are too few to tell.
+    """Messages of one topic; values are None if there are too few messages.
 
     Attributes:
         name: of the topic.
         type_name: of its messages.
         messages: how many.
-        rate_hz: by the median interval of when they were recorded.
-        jitter_ms: standard deviation of the intervals, but for gaps.
-        gaps: intervals longer than one and a half median ones.
-        longest_ms: interval.
-        clock: stamps of the headers against the times of recording; None also where messages have no header.
+        rate_hz: by the median interval of the times of recording.
+        jitter_ms: standard deviation of the intervals without gaps.
+        gaps: number of intervals longer than one and a half median ones.
+        longest_ms: longest interval.
+        clock: stamps of the headers and times of recording compared; None also for messages without header.
     """
 
     name: str
@@ -47,19 +47,19 @@ class TopicDescription:
 
     @property
     def latency_ms(self) -> float | None:
-        """Median of when messages were recorded after their headers' stamps."""
+        """Median time from the headers' stamps to recording."""
         return None if self.clock is None else self.clock.latency_ms
 
 
 @dataclass(frozen=True)
 class Synchronisation:
-    """Stamps of one camera's images against another's.
+    """Comparison of the stamps of two cameras' images.
 
     Attributes:
-        first: what is compared, such as ``pair0 left``.
-        second: with what.
-        offset: of the second's stamps, or None where none belong together.
-        images: of the first.
+        first: camera, such as ``pair0 left``.
+        second: camera.
+        offset: of the second's stamps to the first's, or None if none belong together.
+        images: number of the first's.
     """
 
     first: str
@@ -70,20 +70,20 @@ class Synchronisation:
 
 @dataclass(frozen=True)
 class Description:
-    """A session or bag.
+    """Description of a session or bag.
 
     Attributes:
-        path: of it.
-        size_bytes: of it.
+        path: of the file or folder.
+        size_bytes: of the file or folder.
         duration_s: from the first to the last message.
         library: that wrote it, or empty.
         is_whole: whether its writing was finished.
-        damaged: chunks and other records that are damaged, of those that were read for this; of graphvio's own
-            sessions, that is no chunk but the first.
-        rig: one line on the rig in it, or on why that is not usable; empty where there is none.
+        damaged: number of damaged chunks and other records among those that were read; of the chunks of graphvio's own
+            sessions that is the first only.
+        rig: one line about the rig in it, or why that is not usable; empty if there is none.
         topics: by name.
-        synchronisation: left against right of each pair, then the first pair against each other one, as far as the
-            topics' names tell which images are of a pair.
+        synchronisation: left and right of each pair, then the first pair and each other one, of the pairs that
+            topics' names show.
     """
 
     path: Path
@@ -101,7 +101,7 @@ def describe(path: Path) -> Description:
     """Describe a session or bag.
 
     Raises:
-        SessionError: if it is none, or cannot be read.
+        SessionError: if it is no session or bag, or cannot be read.
         MissingExtraError: if the extra ``sessions`` is not installed.
     """
     if not path.exists():
@@ -145,7 +145,7 @@ def _rig(store: Store) -> str:
 def _topic(topic: Topic, header_ns: Int | None) -> TopicDescription:
     logged_ns = topic.logged_stamps_ns
     stamps, count = np.sort(logged_ns), len(logged_ns)
-    if count < _FEWEST or stamps[0] == stamps[-1]:
+    if count < _MIN_MESSAGES or stamps[0] == stamps[-1]:
         return TopicDescription(topic.name, topic.type_name, count)
     steps = np.diff(stamps).astype(np.float64)
     median = float(np.median(steps))
@@ -163,7 +163,6 @@ def _topic(topic: Topic, header_ns: Int | None) -> TopicDescription:
 
 
 def _synchronisation(stamps: dict[str, Int]) -> tuple[Synchronisation, ...]:
-    """Of topics with images, by their stamps (N,)."""
     pairs = stereo_topics(stamps)
     wanted = [(f"{name} left", f"{name} right", left, right) for name, (left, right) in pairs.items()]
     first, *others = pairs or [""]
