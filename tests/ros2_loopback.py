@@ -1,4 +1,4 @@
-"""A domain on the loopback for two processes, and others' side of it, written with cyclonedds' own messages."""
+"""A domain on the loopback for two processes, and the other process, with cyclonedds' own messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ URI = (
     "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo' multicast='true'/></Interfaces></General>"
     "<Discovery><LeaseDuration>1s</LeaseDuration></Discovery></Domain></CycloneDDS>"
 )
-"""The loopback only; who vanishes without a word is missed after a second."""
+"""The loopback only; participants that vanish are lost after a second."""
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 50_000_000
 IMU_PERIOD_NS = 5_000_000
@@ -57,17 +57,17 @@ class Other:
         """Have a step done.
 
         Returns:
-            What it says when it is done.
+            Its answer when it is done.
         """
-        self.say(line)
-        return self.hear()
+        self.send(line)
+        return self.read()
 
-    def say(self, line: str) -> None:
+    def send(self, line: str) -> None:
         assert self.process.stdin is not None
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
 
-    def hear(self) -> str:
+    def read(self) -> str:
         assert self.process.stdout is not None
         return self.process.stdout.readline().strip()
 
@@ -89,7 +89,7 @@ def foreign(message: Any) -> Any:
 
 
 class Participant:
-    """Writes and reads by what cyclonedds itself makes of the types; nothing but their names is graphvio's."""
+    """Writes and reads by cyclonedds' own types; only their names are graphvio's."""
 
     def __init__(self, domain: int) -> None:
         from cyclonedds.domain import DomainParticipant
@@ -190,7 +190,7 @@ def robot(domain: int) -> None:
 
 
 def slam(domain: int) -> None:
-    """Hears the odometry, and corrects it; a line is a command, as JSON."""
+    """Read the odometry's topics, and send corrections; a line is a command, as JSON."""
     here = Participant(domain)
     kinds = {
         "/graphvio/odometry": "nav_msgs/msg/Odometry",

@@ -34,7 +34,7 @@ def imu_readings(found: list[ImuReading | Notice]) -> list[ImuReading]:
 
 
 @pytest.mark.parametrize("cut", [1, 7, 1000])
-def test_lines_become_samples_however_they_are_cut(cut: int) -> None:
+def test_imu_lines_any_chunks_give_samples(cut: int) -> None:
     counts = Counts()
     lines = ImuLines("mcu", counts)
     data = b"5,1.0,2.0\n" + line(1000) + line(6000, temperature=",31.5").replace(b"\n", b"\r\n") + line(11000)[:9]
@@ -66,7 +66,7 @@ def test_lines_become_samples_however_they_are_cut(cut: int) -> None:
         b"1,0,0,,0,0,0\n",
     ],
 )
-def test_what_is_no_sample_is_counted_and_passed_over(garbage: bytes) -> None:
+def test_imu_lines_bad_line_is_counted(garbage: bytes) -> None:
     counts = Counts()
     lines = ImuLines("mcu", counts)
     found = imu_readings(lines.take(b"\n" + line(1000) + garbage + line(2000), 0))
@@ -74,7 +74,7 @@ def test_what_is_no_sample_is_counted_and_passed_over(garbage: bytes) -> None:
     assert counts.totals() == {"bad_line": 1}
 
 
-def test_a_stream_without_line_ends_is_not_kept() -> None:
+def test_imu_lines_without_line_ends_are_dropped() -> None:
     counts = Counts()
     lines = ImuLines("mcu", counts)
     lines.take(b"\n", 0)
@@ -84,7 +84,7 @@ def test_a_stream_without_line_ends_is_not_kept() -> None:
     assert imu_readings(lines.take(b"00\n" + line(3000), 0))[0].stamp_ns == 3_000_000
 
 
-def test_checksums_are_optional_but_once_there_are_needed() -> None:
+def test_imu_lines_checksum_is_required_after_first() -> None:
     counts = Counts()
     lines = ImuLines("mcu", counts)
     sound, damaged = line(1000, checksum=True), line(2000, checksum=True).replace(b"9.81", b"8.81")
@@ -93,7 +93,7 @@ def test_checksums_are_optional_but_once_there_are_needed() -> None:
     assert counts.totals() == {"bad_checksum": 2}
 
 
-def test_a_counter_that_wraps_goes_on_and_one_that_begins_anew_is_told() -> None:
+def test_imu_lines_counter_wrap_and_restart() -> None:
     counts = Counts()
     lines = ImuLines("mcu", counts)
     found = lines.take(b"\n" + line((1 << 32) - 1000) + line(1000) + line(5_000_000) + line(70), 9)
@@ -126,7 +126,7 @@ def started(imu: Device) -> tuple[DeviceSource, Iterator[Reading]]:
     return source, source.readings()
 
 
-def test_a_serial_port_is_read(terminal: tuple[int, str]) -> None:
+def test_serial_imu_reads_port(terminal: tuple[int, str]) -> None:
     controller, path = terminal
     before_ns = host_ns()
     source, readings = started(SerialImu(path, BAUD))
@@ -147,7 +147,7 @@ def test_a_serial_port_is_read(terminal: tuple[int, str]) -> None:
     source.close()
 
 
-def test_a_serial_port_that_is_pulled_out_and_put_back(tmp_path: Path) -> None:
+def test_serial_imu_unplugged_port_reconnects(tmp_path: Path) -> None:
     path = tmp_path / "ttyACM0"  # what udev would make of the device
     controller, port = os.openpty()
     tty.setraw(port)
@@ -176,7 +176,7 @@ def test_a_serial_port_that_is_pulled_out_and_put_back(tmp_path: Path) -> None:
     os.close(controller)
 
 
-def test_a_port_that_is_not_there_is_refused(tmp_path: Path) -> None:
+def test_serial_imu_missing_port_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="cannot be opened as a serial port"):
         SerialImu(str(tmp_path / "ttyACM9"), BAUD).start(lambda reading: None)
 
@@ -191,19 +191,19 @@ def test_a_port_that_is_not_there_is_refused(tmp_path: Path) -> None:
         ("le:s24/32>>8", [0x800000FF, 0x7FFFFF00, 0x100], [-(1 << 23), (1 << 23) - 1, 1]),
     ],
 )
-def test_types_of_channels(kind: str, stored: list[int], values: list[int]) -> None:
+def test_scan_element_values(kind: str, stored: list[int], values: list[int]) -> None:
     element = ScanElement.parse("in_accel_x", "0\n", kind)
     raw = np.array(stored, np.uint64).astype(f"<u{element.storage_bytes}")
     assert element.values(raw).tolist() == values
 
 
 @pytest.mark.parametrize("kind", ["le:s16/16", "xe:s16/16>>0", "le:s16/16X3>>0", "le:s40/40>>0", "le:s16/16>>4"])
-def test_types_that_no_imu_has_are_refused(kind: str) -> None:
+def test_scan_element_bad_type_is_refused(kind: str) -> None:
     with pytest.raises(SourceError, match="in_accel_x"):
         ScanElement.parse("in_accel_x", "0", kind)
 
 
-def test_scans_are_laid_out_as_the_kernel_does() -> None:
+def test_scan_format_matches_kernel_layout() -> None:
     kinds = {"in_accel_x": "le:s16/16>>0", "in_accel_y": "be:s32/32>>0", "in_timestamp": "le:s64/64>>0"}
     made = ScanFormat([ScanElement.parse(name, str(k), kind) for k, (name, kind) in enumerate(kinds.items())])
     assert made.dtype.itemsize == 16  # 2, 2 of padding, 4, 8
@@ -212,7 +212,7 @@ def test_scans_are_laid_out_as_the_kernel_does() -> None:
     assert [made.channel(scans, name)[0] for name in kinds] == [-7, -70_000, 10**18]
 
 
-def test_mount_matrices() -> None:
+def test_mount_matrix_is_rotation() -> None:
     np.testing.assert_array_equal(mount_matrix("0, 1, 0; -1, 0, 0; 0, 0, 1\n") @ [1, 2, 3], [2, -1, 3])
     for text in ("1, 0; 0, 1", "1, 0, 0; 0, 1, 0; 0, 0, -1", "a", "0, 0, 0; 0, 0, 0; 0, 0, 0"):
         with pytest.raises(SourceError, match="not a rotation"):
@@ -267,7 +267,7 @@ class Tree:
         return IioImu(names, rate_hz, self.folder.parent, self.device.parent)
 
 
-def test_the_kernels_imu_is_read(tmp_path: Path) -> None:
+def test_iio_imu_reads_device(tmp_path: Path) -> None:
     tree = Tree(tmp_path, 0, "bmi088", ("anglvel", "accel"))
     tree.write("in_mount_matrix", "0, 1, 0; -1, 0, 0; 0, 0, 1")
     tree.write("in_accel_x_offset", "10")
@@ -298,7 +298,7 @@ def test_the_kernels_imu_is_read(tmp_path: Path) -> None:
     assert tree.read("buffer/enable") == "0"
 
 
-def test_gyro_and_accelerometer_that_are_two_devices(tmp_path: Path) -> None:
+def test_iio_imu_merges_two_devices(tmp_path: Path) -> None:
     gyro = Tree(tmp_path, 0, "gyro_3d", ("anglvel",), clock=False)
     accel = Tree(tmp_path, 1, "accel_3d", ("accel",), clock=False)
     holders = [os.open(tree.device, os.O_RDWR | os.O_NONBLOCK) for tree in (gyro, accel)]
@@ -315,7 +315,7 @@ def test_gyro_and_accelerometer_that_are_two_devices(tmp_path: Path) -> None:
         os.close(holder)
 
 
-def test_what_is_no_usable_imu_is_refused(tmp_path: Path) -> None:
+def test_iio_imu_unusable_device_is_refused(tmp_path: Path) -> None:
     tree = Tree(tmp_path, 0, "gyro_3d", ("anglvel",))
 
     def refusal(imu: IioImu) -> str:
@@ -334,7 +334,7 @@ def test_what_is_no_usable_imu_is_refused(tmp_path: Path) -> None:
     assert "there is no IIO device" in refusal(IioImu(["a"], None, tmp_path / "none", tmp_path))
 
 
-def test_the_drivers_own_trigger_is_taken(tmp_path: Path) -> None:
+def test_iio_imu_uses_own_trigger(tmp_path: Path) -> None:
     tree = Tree(tmp_path, 3, "mpu6050", ("anglvel", "accel"))
     tree.write("trigger/current_trigger", "")
     (tree.folder.parent / "trigger0").mkdir()

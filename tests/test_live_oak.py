@@ -132,7 +132,7 @@ def smooth(seed: int) -> Image:
     return np.asarray(cv2.GaussianBlur(noise, (0, 0), 3.0), np.uint8)
 
 
-def test_images_and_imu_of_one_camera() -> None:
+def test_source_yields_images_and_imu() -> None:
     camera = Queues(calibration(PLAIN))
     source, rig, readings = begun("oak:A", Plugs(A=camera))
     left, right = smooth(1), smooth(2)
@@ -165,7 +165,7 @@ def test_images_and_imu_of_one_camera() -> None:
     assert rig.imu is not None
 
 
-def test_stamps_are_of_the_middle_of_the_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_image_stamp_is_middle_of_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
     stamp_of = dai.ImgFrame.getTimestampDevice
 
@@ -183,7 +183,7 @@ def test_stamps_are_of_the_middle_of_the_exposure(monkeypatch: pytest.MonkeyPatc
     assert asked == [dai.CameraExposureOffset.MIDDLE]  # messages made on the host have no exposure to see it by
 
 
-def test_the_factorys_calibration_becomes_a_rig() -> None:
+def test_factory_rig_matches_calibration() -> None:
     source, rig, _ = begun("oak:A?imu_hz=400", Plugs(A=Queues(calibration(PLAIN))))
     source.close()
     (pair,) = rig.pairs
@@ -196,7 +196,7 @@ def test_the_factorys_calibration_becomes_a_rig() -> None:
     assert rig.imu.rate_hz == 400.0
 
 
-def test_fisheyes() -> None:
+def test_factory_rig_fisheye_lens() -> None:
     coefficients = [0.05, -0.01, 0.002, -0.0005]
     handler = calibration(coefficients + [0.0] * 10, "Fisheye")
     source, rig, _ = begun("oak:A", Plugs(A=Queues(handler)))
@@ -210,7 +210,7 @@ def test_fisheyes() -> None:
 
 
 @pytest.mark.parametrize(("coefficients", "focal_px"), [(NARROW, 401.0), (WIDE, 285.0)])
-def test_rational_lenses_are_fitted_and_images_moved_by_the_rest(coefficients: list[float], focal_px: float) -> None:
+def test_fit_rational_corrected_image_matches_fitted_lens(coefficients: list[float], focal_px: float) -> None:
     intrinsics = np.array([focal_px, focal_px + 0.5, 322.75, 193.25])
     lens = fit_rational(intrinsics, np.array(coefficients), SIZE_PX, "here")
     assert 0.05 < lens.error_px < 4.0
@@ -240,7 +240,7 @@ def centre(image: Image) -> Float:
     return np.asarray(np.array([(weights * x).sum(), (weights * y).sum()]) / weights.sum())
 
 
-def test_lenses_of_few_coefficients_are_taken_as_they_are() -> None:
+def test_fit_rational_few_coefficients_are_exact() -> None:
     image = smooth(0)
     for coefficients in (PLAIN, PLAIN[:5], PLAIN[:4]):
         lens = fit_rational(INTRINSICS, np.array(coefficients), SIZE_PX, "here")
@@ -250,7 +250,7 @@ def test_lenses_of_few_coefficients_are_taken_as_they_are() -> None:
         fit_rational(INTRINSICS / 2, np.array([-60.0, 900.0, 0.3, 0.2, 100.0, -59.0, 800.0, 90.0]), SIZE_PX, "here")
 
 
-def test_images_of_rational_lenses_are_moved_unless_they_are_wanted_raw() -> None:
+def test_source_corrects_rational_lens_unless_raw() -> None:
     camera, image = Queues(calibration(NARROW)), smooth(1)
     source, rig, readings = begun("oak:A", Plugs(A=camera))
     camera.image(0, image, timedelta(seconds=1))
@@ -271,7 +271,7 @@ def test_images_of_rational_lenses_are_moved_unless_they_are_wanted_raw() -> Non
         begun("oak:A?lens=raw", Plugs(A=camera))
 
 
-def test_most_cameras_do_not_know_where_their_imu_is() -> None:
+def test_factory_rig_without_imu_pose_needs_guess() -> None:
     plugs = Plugs(A=Queues(calibration(PLAIN, imu=False)))
     with pytest.raises(RigError, match=r"pose of the IMU.*places=guess.*--correct-imu"):
         begun("oak:A", plugs)
@@ -285,7 +285,7 @@ def test_most_cameras_do_not_know_where_their_imu_is() -> None:
     np.testing.assert_array_equal(rig.pairs[0].left.body_T_cam, np.eye(4))
 
 
-def test_cameras_without_calibration_need_a_rig() -> None:
+def test_source_without_calibration_needs_rig() -> None:
     camera = Queues(dai.CalibrationHandler())
     with pytest.raises(RigError, match="calibration is incomplete"):
         begun("oak:A", Plugs(A=camera))
@@ -300,7 +300,7 @@ def test_cameras_without_calibration_need_a_rig() -> None:
 
 
 @pytest.mark.parametrize("way", ["closed queues", "dead pipeline"])
-def test_a_camera_that_is_unplugged_comes_back(way: str) -> None:
+def test_source_unplugged_camera_reconnects(way: str) -> None:
     camera = Queues(calibration(PLAIN))
     plugs = Plugs(A=camera)
     source, _, readings = begun("oak:A", plugs)
@@ -330,7 +330,7 @@ def test_a_camera_that_is_unplugged_comes_back(way: str) -> None:
     assert again.closed == 1
 
 
-def test_two_cameras() -> None:
+def test_source_two_cameras_guess_or_rig() -> None:
     front, back = Queues(calibration(PLAIN)), Queues(calibration(PLAIN, imu=False), imu=False)
     plugs = Plugs(A=front, B=back)
     with pytest.raises(RigError, match=r"oak:A,B\?places=guess"):
@@ -352,7 +352,7 @@ def test_two_cameras() -> None:
     np.testing.assert_allclose(se3_inverse(rig.pairs[1].left.cam_T_body), rig.pairs[1].left.body_T_cam, atol=1e-12)
 
 
-def test_messages_that_cannot_be_used_are_counted() -> None:
+def test_source_bad_message_is_counted() -> None:
     camera = Queues(calibration(PLAIN))
     source, _, readings = begun("oak:A", Plugs(A=camera))
     assert camera.imu is not None
@@ -363,7 +363,7 @@ def test_messages_that_cannot_be_used_are_counted() -> None:
     source.close()
 
 
-def test_closing_does_not_wait_for_messages() -> None:
+def test_source_close_ends_readings() -> None:
     camera = Queues(calibration(PLAIN))
     source, _, readings = begun("oak:A", Plugs(A=camera))
     reader = threading.Thread(target=lambda: list(readings))
@@ -384,19 +384,19 @@ def test_closing_does_not_wait_for_messages() -> None:
         ("oak:A?sync=hardware", "has no option 'sync'"),
     ],
 )
-def test_what_cannot_be_done_is_refused(spec: str, words: str) -> None:
+def test_open_source_bad_spec_is_refused(spec: str, words: str) -> None:
     with pytest.raises(SourceError, match=words):
         begun(spec, Plugs(A=Queues(calibration(PLAIN))), small_rig(1))
 
 
-def test_rigs_of_another_size_are_refused() -> None:
+def test_source_rig_of_other_size_is_refused() -> None:
     rig = small_rig(1)
     larger = replace(rig.pairs[0], right=replace(rig.pairs[0].right, size_px=(640, 480)))
     with pytest.raises(RigError, match="images are 64x48, but the rig has cam1 with 640x480"):
         begun("oak:A", Plugs(A=Queues(calibration(PLAIN))), replace(rig, pairs=(larger,)))
 
 
-def test_devices_are_listed_without_any() -> None:
+def test_list_devices_without_camera_is_empty() -> None:
     assert list_devices() == []
     assert kind_of("oak").list_devices() == []
     with pytest.raises(SourceError, match="no camera is connected"):
@@ -406,7 +406,7 @@ def test_devices_are_listed_without_any() -> None:
         source.open()
 
 
-def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "depthai", None)
     with pytest.raises(MissingExtraError, match=r"graphvio\[oak\]"):
         list_devices()

@@ -141,7 +141,7 @@ def begun(spec: str, bus: SoftwareBus, rig: Rig | None = None) -> tuple[DeviceSo
 SPEC = "realsense:0123?size=64x48"
 
 
-def test_images_and_imu_of_one_camera() -> None:
+def test_source_yields_images_and_imu() -> None:
     camera = Software("0123")
     source, rig, readings = begun(SPEC, SoftwareBus(camera))
     left, right = noise_image(1, SIZE_PX), noise_image(2, SIZE_PX)
@@ -178,7 +178,7 @@ def test_images_and_imu_of_one_camera() -> None:
     assert rig.imu is not None
 
 
-def test_the_factorys_calibration_becomes_a_rig() -> None:
+def test_factory_rig_matches_calibration() -> None:
     source, rig, _ = begun(SPEC, SoftwareBus(Software("0123", coefficients=(0.1, -0.2, 0.003, 0.004, 0.05))))
     source.close()
     (pair,) = rig.pairs
@@ -191,7 +191,7 @@ def test_the_factorys_calibration_becomes_a_rig() -> None:
     assert rig.imu.rate_hz == 200.0
 
 
-def test_projection_by_the_rig_is_librealsenses() -> None:
+def test_factory_rig_projects_like_librealsense() -> None:
     coefficients = (0.1, -0.2, 0.003, 0.004, 0.05)
     for model in (rs.distortion.brown_conrady, rs.distortion.kannala_brandt4):
         camera = Software("0123", model, coefficients)
@@ -203,7 +203,7 @@ def test_projection_by_the_rig_is_librealsenses() -> None:
             np.testing.assert_allclose(pixels[0], rs.rs2_project_point_to_pixel(lens, list(point)), atol=1e-3)
 
 
-def test_lenses_that_graphvio_has_not() -> None:
+def test_factory_rig_unknown_lens_is_refused() -> None:
     model = rs.distortion.inverse_brown_conrady
     source, rig, _ = begun(SPEC, SoftwareBus(Software("0123", model)))  # without coefficients it is none
     source.close()
@@ -214,7 +214,7 @@ def test_lenses_that_graphvio_has_not() -> None:
     source.close()
 
 
-def test_a_camera_without_imu() -> None:
+def test_source_camera_without_imu() -> None:
     bus = SoftwareBus(Software("0123", imu=False))
     with pytest.raises(SourceError, match="no streams of a gyro at 200 Hz"):
         begun(SPEC, bus)
@@ -224,7 +224,7 @@ def test_a_camera_without_imu() -> None:
     np.testing.assert_array_equal(rig.pairs[0].left.body_T_cam, np.eye(4))
 
 
-def test_a_camera_that_is_unplugged_comes_back() -> None:
+def test_source_unplugged_camera_reconnects() -> None:
     camera = Software("0123")
     bus = SoftwareBus(camera)
     source, _, readings = begun(SPEC, bus)
@@ -252,7 +252,7 @@ def test_a_camera_that_is_unplugged_comes_back() -> None:
     source.close()
 
 
-def test_two_cameras_need_a_rig_or_a_guess() -> None:
+def test_source_two_cameras_need_rig_or_guess() -> None:
     front, back = Software("0123"), Software("4567")
     bus = SoftwareBus(front, back)
     spec = "realsense:0123,4567?size=64x48"
@@ -276,7 +276,7 @@ def named(rig: Rig, prefix: str) -> Rig:
     return replace(rig, pairs=tuple(renamed(pair) for pair in rig.pairs))
 
 
-def test_two_cameras_with_a_rig() -> None:
+def test_source_two_cameras_with_rig() -> None:
     front, back = Software("0123"), Software("4567")
     rig = named(small_rig(2), "my-")
     spec = "realsense:0123,4567?sync=hardware&exposure_us=4000&gain=30"
@@ -298,7 +298,7 @@ def test_two_cameras_with_a_rig() -> None:
     assert without.imu is None
 
 
-def test_stamps_of_the_host_are_told() -> None:
+def test_source_host_stamps_are_reported() -> None:
     camera = Software("0123")
     source, _, readings = begun(SPEC, SoftwareBus(camera))
     camera.image(0, noise_image(0, SIZE_PX), 1e3 * time.time(), domain=rs.timestamp_domain.system_time)
@@ -310,7 +310,7 @@ def test_stamps_of_the_host_are_told() -> None:
     source.close()
 
 
-def test_closing_while_frames_come() -> None:
+def test_source_close_while_frames_arrive() -> None:
     camera = Software("0123")
     source, _, readings = begun(SPEC, SoftwareBus(camera))
     stop = threading.Event()
@@ -327,12 +327,12 @@ def test_closing_while_frames_come() -> None:
         next(readings)
     closing = threading.Thread(target=source.close)
     closing.start()
-    rest = list(readings)
+    remaining = list(readings)
     closing.join(10.0)
     stop.set()
     feeding.join(10.0)
     assert not closing.is_alive()
-    assert len(rest) < 1000
+    assert len(remaining) < 1000
     assert not source.health()[0].connected
 
 
@@ -347,12 +347,12 @@ def test_closing_while_frames_come() -> None:
         ("realsense:0123?fps=x", "fps"),
     ],
 )
-def test_what_cannot_be_done_is_refused(spec: str, words: str) -> None:
+def test_open_source_bad_spec_is_refused(spec: str, words: str) -> None:
     with pytest.raises(SourceError, match=words):
         begun(spec, SoftwareBus(Software("0123"), Software("4567")))
 
 
-def test_rigs_that_do_not_fit_are_refused() -> None:
+def test_source_rig_mismatch_is_refused() -> None:
     bus = SoftwareBus(Software("0123"))
     with pytest.raises(SourceError, match="1 cameras, but the rig has 2 pairs"):
         begun("realsense:", bus, small_rig(2))
@@ -364,12 +364,12 @@ def test_rigs_that_do_not_fit_are_refused() -> None:
         begun("realsense:", SoftwareBus())
 
 
-def test_devices_are_listed_without_any() -> None:
+def test_list_devices_without_camera_is_empty() -> None:
     assert list_devices() == []
     assert kind_of("realsense").list_devices() == []
 
 
-def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(MissingExtraError, match=r"graphvio\[realsense\]"):
         list_devices()

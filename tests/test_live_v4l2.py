@@ -87,7 +87,7 @@ def frames_of(readings: Iterator[Reading], count: int) -> list[CameraFrame]:
     return found
 
 
-def test_images_side_by_side(tmp_path: Path) -> None:
+def test_source_splits_side_by_side_images(tmp_path: Path) -> None:
     path = write_video(tmp_path / "wide.avi", 128)
     clock_ns = time.monotonic_ns()
     before_ns = host_ns()
@@ -114,7 +114,7 @@ def test_images_side_by_side(tmp_path: Path) -> None:
     source.close()
 
 
-def test_the_right_image_may_come_first(tmp_path: Path) -> None:
+def test_source_right_left_layout_swaps_cameras(tmp_path: Path) -> None:
     path = write_video(tmp_path / "wide.avi", 128)
     source, readings = begun(f"v4l2:{path}?layout=right_left", files(time.monotonic_ns()))
     frames = frames_of(readings, 2)
@@ -123,7 +123,7 @@ def test_the_right_image_may_come_first(tmp_path: Path) -> None:
     source.close()
 
 
-def test_a_device_for_each_camera_of_two_pairs(tmp_path: Path) -> None:
+def test_source_separate_layout_reads_one_device_per_camera(tmp_path: Path) -> None:
     paths = [str(write_video(tmp_path / f"{k}.avi", 64)) for k in range(4)]
     source, readings = begun(f"v4l2:{','.join(paths)}", files(time.monotonic_ns()), pairs=2)
     frames = frames_of(readings, 16)
@@ -133,7 +133,7 @@ def test_a_device_for_each_camera_of_two_pairs(tmp_path: Path) -> None:
     source.close()
 
 
-def test_two_pairs_side_by_side_each(tmp_path: Path) -> None:
+def test_source_two_devices_side_by_side_give_four_cameras(tmp_path: Path) -> None:
     paths = [str(write_video(tmp_path / f"{k}.avi", 128)) for k in range(2)]
     source, readings = begun(f"v4l2:{','.join(paths)}?layout=side_by_side", files(time.monotonic_ns()), pairs=2)
     assert {frame.camera for frame in frames_of(readings, 16)} == {"cam0", "cam1", "cam2", "cam3"}
@@ -141,7 +141,7 @@ def test_two_pairs_side_by_side_each(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("clock", ["realtime", "none"])
-def test_stamps_of_other_clocks(tmp_path: Path, clock: str) -> None:
+def test_stamp_of_realtime_or_no_clock(tmp_path: Path, clock: str) -> None:
     path = write_video(tmp_path / "wide.avi", 128)
     before_ns = host_ns()
     source, readings = begun(f"v4l2:{path}", files(time.time_ns() if clock == "realtime" else 0))
@@ -155,7 +155,7 @@ def test_stamps_of_other_clocks(tmp_path: Path, clock: str) -> None:
     source.close()
 
 
-def test_an_imu_on_a_serial_port_comes_with_the_images(tmp_path: Path) -> None:
+def test_source_reads_serial_imu(tmp_path: Path) -> None:
     path = write_video(tmp_path / "wide.avi", 128)
     controller, port = os.openpty()
     tty.setraw(port)
@@ -171,7 +171,7 @@ def test_an_imu_on_a_serial_port_comes_with_the_images(tmp_path: Path) -> None:
     os.close(controller)
 
 
-def test_the_rig_that_is_used(tmp_path: Path) -> None:
+def test_source_rig_and_imu_must_agree(tmp_path: Path) -> None:
     path = write_video(tmp_path / "wide.avi", 128)
     source = open_source(SourceSpec.parse(f"v4l2:{path}"), small_rig(1), files(0))
     assert source.open().imu is None  # none is asked for
@@ -201,12 +201,12 @@ def test_the_rig_that_is_used(tmp_path: Path) -> None:
         ("v4l2:a?imu=iio:a+b+c", SourceError, "write imu=serial"),
     ],
 )
-def test_what_does_not_fit_is_refused(spec: str, error: type[Exception], words: str) -> None:
+def test_open_source_bad_spec_is_refused(spec: str, error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         open_source(SourceSpec.parse(spec), small_rig(1))
 
 
-def test_damaged_jpegs_are_damaged() -> None:
+def test_grey_image_damaged_jpeg_is_refused() -> None:
     is_made, jpeg = cv2.imencode(".jpg", picture(0, 64))
     assert is_made
     everything = (slice(None), slice(None))
@@ -226,7 +226,7 @@ def test_damaged_jpegs_are_damaged() -> None:
 
 
 @pytest.mark.parametrize("pixel_format", ["YUYV", "UYVY", "GREY"])
-def test_formats_that_are_not_compressed(pixel_format: str) -> None:
+def test_grey_image_uncompressed_formats(pixel_format: str) -> None:
     grey = noise_image(0, SIZE_PX)
     raw: AnyArray = grey
     if pixel_format != "GREY":
@@ -259,7 +259,7 @@ class Properties:
         return self.values.get(propId, 0.0) if refused is None else refused
 
 
-def test_what_is_asked_of_the_driver() -> None:
+def test_set_up_sets_properties() -> None:
     manual = Properties({})
     set_up(manual, "/dev/video0", CaptureSettings((1280, 480), 60.0, "YUYV", 5040.0, 3.0))
     assert manual.order.index(cv2.CAP_PROP_FOURCC) < manual.order.index(cv2.CAP_PROP_FRAME_WIDTH)
@@ -284,12 +284,12 @@ def test_what_is_asked_of_the_driver() -> None:
         ({cv2.CAP_PROP_GAIN: None}, "does not let its gain be set"),
     ],
 )
-def test_what_the_driver_does_not_do_is_told(refused: dict[int, float | None], words: str) -> None:
+def test_set_up_refused_property_is_reported(refused: dict[int, float | None], words: str) -> None:
     with pytest.raises(SourceError, match=words):
         set_up(Properties(refused), "/dev/video0", CaptureSettings((1280, 480), 30.0, "MJPG", 5000.0, 3.0))
 
 
-def test_what_is_no_camera_is_refused(tmp_path: Path) -> None:
+def test_open_v4l2_without_camera_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="is not there"):
         open_v4l2(str(tmp_path / "video0"), CaptureSettings(SIZE_PX))
     (tmp_path / "video0").write_bytes(b"")
@@ -297,7 +297,7 @@ def test_what_is_no_camera_is_refused(tmp_path: Path) -> None:
         open_v4l2(str(tmp_path / "video0"), CaptureSettings(SIZE_PX))
 
 
-def test_cameras_are_listed_with_the_node_that_has_images(tmp_path: Path) -> None:
+def test_list_devices_lists_image_nodes(tmp_path: Path) -> None:
     nodes, by_id = tmp_path / "nodes", tmp_path / "by-id"
     by_id.mkdir()
     for node, name, index in (("video10", "Other", 0), ("video2", "Stereo", 0), ("video3", "Stereo", 1)):

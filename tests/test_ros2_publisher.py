@@ -98,7 +98,7 @@ class System:
         self.running = Running()
         self.publisher = Publisher(self.running, domain, body="imu_link")
         self.other = Other("slam", domain)
-        assert self.other.hear() == "True"
+        assert self.other.read() == "True"
         self._taken: dict[str, list[Any]] = {}
 
     def all_of(self, topic: str) -> list[Any]:
@@ -111,12 +111,16 @@ class System:
         command = {"stamp_ns": stamp_ns, "frame": frame, "map_T_body": map_T_body.tolist()}
         self.other.do(json.dumps({**command, "covariance": covariance.reshape(-1).tolist()}))
 
-    def tells(self, name: str, level: int, said: str) -> dict[str, str]:
-        """Waits until something is told to be in a state; returns its values."""
+    def wait_for_diagnosis(self, name: str, level: int, message: str) -> dict[str, str]:
+        """Wait until the diagnostics have a status of this level and message; returns its values."""
 
         def found() -> list[dict[str, Any]]:
-            told = [each for array in self.all_of("/diagnostics") for each in array["status"] if each["name"] == name]
-            return [each for each in told if each["level"] == level and said in each["message"]]
+            statuses = [each for array in self.all_of("/diagnostics") for each in array["status"]]
+            return [
+                each
+                for each in statuses
+                if each["name"] == name and each["level"] == level and message in each["message"]
+            ]
 
         assert until(lambda: bool(found()))
         return {each["key"]: each["value"] for each in found()[-1]["values"]}
@@ -147,28 +151,28 @@ def pose_in(message: dict[str, Any], rotation: str, translation: str) -> Float:
     return se3(rotation_from_quat_wxyz(np.array([q["w"], q["x"], q["y"], q["z"]])), np.array([t["x"], t["y"], t["z"]]))
 
 
-def test_poses_transforms_and_path_are_published(system: System) -> None:
+def test_publisher_sends_poses_transforms_and_path(system: System) -> None:
     made = [estimate(number) for number in range(10)]
     for each in made:
         system.running.estimates.publish(each)
     assert until(lambda: len(system.all_of(ODOMETRY)) == 10 and len(system.all_of("/tf")) == 10)
-    for told, moved, each in zip(system.all_of(ODOMETRY), system.all_of("/tf"), made, strict=True):
+    for message, moved, each in zip(system.all_of(ODOMETRY), system.all_of("/tf"), made, strict=True):
         assert each.nav_T_body is not None
         assert each.covariance is not None
         assert each.velocity_nav is not None
-        assert (stamp_of(told["header"]), told["header"]["frame_id"]) == (each.stamp_ns, "odom")
-        assert told["child_frame_id"] == "imu_link"
-        np.testing.assert_allclose(pose_in(told["pose"]["pose"], "orientation", "position"), each.nav_T_body)
-        covariance = np.array(told["pose"]["covariance"]).reshape(6, 6)
+        assert (stamp_of(message["header"]), message["header"]["frame_id"]) == (each.stamp_ns, "odom")
+        assert message["child_frame_id"] == "imu_link"
+        np.testing.assert_allclose(pose_in(message["pose"]["pose"], "orientation", "position"), each.nav_T_body)
+        covariance = np.array(message["pose"]["covariance"]).reshape(6, 6)
         R = each.nav_T_body[:3, :3]
         np.testing.assert_allclose(covariance[:3, :3], R @ each.covariance[3:, 3:] @ R.T, atol=1e-12)
         np.testing.assert_allclose(covariance[3:, :3], R @ each.covariance[:3, 3:] @ R.T, atol=1e-12)
-        linear = told["twist"]["twist"]["linear"]
+        linear = message["twist"]["twist"]["linear"]
         np.testing.assert_allclose([linear["x"], linear["y"], linear["z"]], R.T @ each.velocity_nav)
-        angular = told["twist"]["twist"]["angular"]
+        angular = message["twist"]["twist"]["angular"]
         expected = each.rates.get("fused", np.full(3, np.nan))
         np.testing.assert_array_equal([angular["x"], angular["y"], angular["z"]], expected)
-        assert np.isnan(np.array(told["twist"]["covariance"]).reshape(6, 6)[3:]).all()
+        assert np.isnan(np.array(message["twist"]["covariance"]).reshape(6, 6)[3:]).all()
         (link,) = moved["transforms"]
         assert (link["header"]["frame_id"], link["child_frame_id"]) == ("odom", "imu_link")
         assert stamp_of(link["header"]) == each.stamp_ns
@@ -180,26 +184,26 @@ def test_poses_transforms_and_path_are_published(system: System) -> None:
     assert until(lambda: len(system.all_of(PATH)[-1]["poses"]) == 1)
 
 
-def test_the_cameras_places_are_told_to_those_who_come_late(system: System) -> None:
+def test_publisher_latches_camera_poses(system: System) -> None:
     assert until(lambda: len(system.all_of("/tf_static")) == 1)
-    (told,) = system.all_of("/tf_static")
-    for link, camera in zip(told["transforms"], system.running.rig.cameras, strict=True):
+    (message,) = system.all_of("/tf_static")
+    for link, camera in zip(message["transforms"], system.running.rig.cameras, strict=True):
         assert (link["header"]["frame_id"], link["child_frame_id"]) == ("imu_link", camera.name.lstrip("/"))
         np.testing.assert_allclose(pose_in(link["transform"], "rotation", "translation"), camera.body_T_cam, atol=1e-12)
 
 
-def test_diagnostics_tell_how_it_runs(system: System) -> None:
+def test_publisher_diagnostics_report_status(system: System) -> None:
     for status, level in ((Status.TRACKING, 0), (Status.COASTING, 1), (Status.LOST, 2)):
         system.running.estimates.publish(estimate(1, status=status))
-        values = system.tells("graphvio: odometry", level, str(status))
+        values = system.wait_for_diagnosis("graphvio: odometry", level, str(status))
         assert values == {"rate_hz": "19.875", "framesets": "7", "state": "tracking"}
     system.running.estimates.publish(replace(estimate(1), stamp_ns=-1))
-    system.tells("graphvio: publisher", 1, "no time that ROS messages hold")
+    system.wait_for_diagnosis("graphvio: publisher", 1, "no time that ROS messages hold")
     system.running.estimates.close()
-    system.tells("graphvio: odometry", 3, "the odometry has ended")
+    system.wait_for_diagnosis("graphvio: odometry", 3, "the odometry has ended")
 
 
-def test_keyframes_go_out_and_their_corrections_come_in(system: System) -> None:
+def test_publisher_sends_keyframes_and_applies_corrections(system: System) -> None:
     keyframes = [keyframe(number) for number in range(4)]
     for each in keyframes:
         system.running.keyframe_log.add(each)
@@ -238,14 +242,14 @@ def test_keyframes_go_out_and_their_corrections_come_in(system: System) -> None:
         (stamp_ns, as_ros, "odom", "a correction in frame 'odom'"),
         (stamp_ns, np.zeros((6, 6)), "map", "not positive definite"),
     ]
-    for count, (when_ns, told, frame, why) in enumerate(refused, 1):
-        system.correct(when_ns, map_T_body, told, frame)
-        values = system.tells("graphvio: corrections", 1, why)
+    for count, (when_ns, wrong, frame, why) in enumerate(refused, 1):
+        system.correct(when_ns, map_T_body, wrong, frame)
+        values = system.wait_for_diagnosis("graphvio: corrections", 1, why)
         assert values == {"accepted": "1", "refused": str(count)}
     assert [number for number, _, _ in system.running.corrections] == [2, 0]
 
 
-def test_a_thread_that_ends_before_its_time_is_told_of(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_publisher_check_reports_failed_thread(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
     system.publisher.check()
 
     def broken() -> dict[str, float]:
@@ -253,17 +257,17 @@ def test_a_thread_that_ends_before_its_time_is_told_of(system: System, monkeypat
 
     monkeypatch.setattr(system.running, "status", broken)
 
-    def is_told() -> bool:
+    def is_reported() -> bool:
         try:
             system.publisher.check()
         except ServiceError as error:
             return "thread of poses has failed" in str(error) and "no figures" in str(error)
         return False
 
-    assert until(is_told)
+    assert until(is_reported)
 
 
-def test_a_path_covers_the_whole_way_in_a_bounded_number_of_poses() -> None:
+def test_thinned_path_is_bounded_and_uniform() -> None:
     path = ThinnedPath(8)
     for number in range(1000):
         path.add(number)

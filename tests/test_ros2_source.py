@@ -1,4 +1,4 @@
-"""A ROS 2 system in another process, heard over the loopback."""
+"""A ROS 2 system in another process, received over the loopback."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def on_the_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def robot_on(domain: int) -> Other:
     other = Other("robot", domain)
-    assert other.hear() == "ready"
+    assert other.read() == "ready"
     return other
 
 
@@ -61,19 +61,19 @@ class Listening:
 
     def __init__(self, source: LiveSource) -> None:
         self.source = source
-        self.heard: list[Reading] = []
+        self.received: list[Reading] = []
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
     def _run(self) -> None:
         for reading in self.source.readings():
-            self.heard.append(reading)
+            self.received.append(reading)
 
     def count(self, kind: type[Reading]) -> int:
-        return sum(isinstance(each, kind) for each in self.heard)
+        return sum(isinstance(each, kind) for each in self.received)
 
     def notices(self) -> list[str]:
-        return [each.kind for each in self.heard if isinstance(each, Notice)]
+        return [each.kind for each in self.received if isinstance(each, Notice)]
 
     def end(self) -> None:
         self.source.close()
@@ -85,7 +85,7 @@ class Listening:
 def check_frames(listening: Listening, cameras: list[str], first: int) -> None:
     """All images of all cameras are there, with their stamps and pixels, whatever their encoding."""
     for k, camera in enumerate(cameras):
-        frames = [each for each in listening.heard if isinstance(each, CameraFrame) and each.camera == camera]
+        frames = [each for each in listening.received if isinstance(each, CameraFrame) and each.camera == camera]
         assert [each.stamp_ns for each in frames] == [
             START_NS + number * PERIOD_NS for number in range(first, first + FRAMESETS)
         ]
@@ -94,7 +94,7 @@ def check_frames(listening: Listening, cameras: list[str], first: int) -> None:
             assert frame.clock is None
 
 
-def test_all_that_is_published_comes(domain: int, robot: Other) -> None:
+def test_source_yields_all_published(domain: int, robot: Other) -> None:
     rig = small_rig()
     source = open_live_source(f"ros2:?domain={domain}", rig)
     assert source.open() is rig
@@ -104,14 +104,14 @@ def test_all_that_is_published_comes(domain: int, robot: Other) -> None:
         assert robot.do(str(number)) == "sent"
     assert until(lambda: listening.count(CameraFrame) == 4 * FRAMESETS and listening.count(ImuReading) == 50)
     check_frames(listening, [camera.name for camera in rig.cameras], 0)
-    samples = [each for each in listening.heard if isinstance(each, ImuReading)]
+    samples = [each for each in listening.received if isinstance(each, ImuReading)]
     assert [each.stamp_ns for each in samples] == [START_NS + k * 5_000_000 for k in range(50)]
     np.testing.assert_array_equal(samples[-1].angular_velocity, [0.1, 0.2, FRAMESETS - 1])
     assert all(each.connected and each.counts["lost"] == 0 for each in source.health())
     listening.end()
 
 
-def test_the_rig_is_told_by_camera_info_and_transforms(domain: int, robot: Other) -> None:
+def test_source_receives_rig(domain: int, robot: Other) -> None:
     source = open_live_source(f"ros2:?domain={domain}")
     rigs = []
     opening = threading.Thread(target=lambda: rigs.append(source.open()))
@@ -132,25 +132,26 @@ def test_the_rig_is_told_by_camera_info_and_transforms(domain: int, robot: Other
         assert robot.do(str(number)) == "sent"
     assert until(
         lambda: (
-            sum(each.stamp_ns > START_NS for each in listening.heard if isinstance(each, CameraFrame)) == 4 * FRAMESETS
+            sum(each.stamp_ns > START_NS for each in listening.received if isinstance(each, CameraFrame))
+            == 4 * FRAMESETS
         )
     )
     listening.end()
 
 
-def test_samples_are_turned_into_body(domain: int, robot: Other) -> None:
+def test_source_rotates_samples_into_body(domain: int, robot: Other) -> None:
     source = open_live_source(f"ros2:?domain={domain}&body=base_link", small_rig())
     source.open()
     listening = Listening(source)
     assert robot.do("await /imu") == "True"
     assert robot.do("3") == "sent"
     assert until(lambda: listening.count(ImuReading) == 10)
-    reading = next(each for each in listening.heard if isinstance(each, ImuReading))
+    reading = next(each for each in listening.received if isinstance(each, ImuReading))
     np.testing.assert_allclose(reading.angular_velocity, [-0.2, 0.1, 3.0], atol=1e-12)
     listening.end()
 
 
-def test_lost_samples_may_be_asked_for_again(domain: int, robot: Other) -> None:
+def test_source_reliable_yields_images(domain: int, robot: Other) -> None:
     rig = small_rig().with_pairs([1]).without_imu()
     source = open_live_source(f"ros2:?domain={domain}&reliable=1", rig)
     source.open()
@@ -161,14 +162,14 @@ def test_lost_samples_may_be_asked_for_again(domain: int, robot: Other) -> None:
     listening.end()
 
 
-def test_a_network_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open_missing_network_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CYCLONEDDS_URI", URI.replace("'lo'", "'nosuch0'"))
     source = open_live_source(f"ros2:?domain={free_domain()}", small_rig())
     with pytest.raises(SourceError, match=r"DDS domain \d+: cannot be joined .*CYCLONEDDS_URI"):
         source.open()
 
 
-def test_what_is_late_or_damaged_is_told(domain: int, robot: Other) -> None:
+def test_source_late_and_damaged_are_reported(domain: int, robot: Other) -> None:
     source = open_live_source(f"ros2:?domain={domain}", small_rig().with_pairs([0]))
     source.open()
     listening = Listening(source)
@@ -179,13 +180,13 @@ def test_what_is_late_or_damaged_is_told(domain: int, robot: Other) -> None:
     assert until(lambda: [each.counts.get("late", 0) for each in source.health()] == [10, 1, 1])
     assert robot.do("cut") == "sent"
     assert until(lambda: listening.count(CameraFrame) == 7)
-    cut = [each for each in listening.heard if isinstance(each, CameraFrame)][-1]
+    cut = [each for each in listening.received if isinstance(each, CameraFrame)][-1]
     with pytest.raises(SourceError, match=r"/pair0/left/image_raw: an image cannot be decoded .*cut short"):
         cut.decode()
     listening.end()
 
 
-def test_a_publisher_that_vanishes_is_told_and_read_on_when_it_is_back() -> None:
+def test_source_lost_publisher_is_reported_and_read_again() -> None:
     domain = free_domain()
     robot = robot_on(domain)
     rig = small_rig().without_imu().with_pairs([0])
@@ -208,7 +209,7 @@ def test_a_publisher_that_vanishes_is_told_and_read_on_when_it_is_back() -> None
         listening.end()
 
 
-def test_what_is_published_is_listed(domain: int, robot: Other, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_list_devices_lists_domain(domain: int, robot: Other, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
     (device,) = list_devices()
     assert device.spec == f"ros2:?domain={domain}"
@@ -216,7 +217,7 @@ def test_what_is_published_is_listed(domain: int, robot: Other, monkeypatch: pyt
     assert "IMU: /imu" in device.description
 
 
-def test_publishers_may_start_later() -> None:
+def test_open_waits_for_publishers() -> None:
     domain = free_domain()
     source = open_live_source(f"ros2:?domain={domain}&wait_s=60", small_rig())
     opened = threading.Event()
@@ -242,7 +243,7 @@ def rig_of_other_names() -> Rig:
     return Rig((replace(pair, name="other", left=replace(pair.left, name="north")),))
 
 
-def test_topics_that_are_not_published_are_named(domain: int, robot: Other) -> None:
+def test_open_missing_topics_are_named(domain: int, robot: Other) -> None:
     rig = small_rig()
     absent = open_live_source(f"ros2:?domain={domain}&cam0=/front/image_raw&wait_s=1.5", rig)
     with pytest.raises(SourceError, match=r"nobody publishes /front/image_raw; topics on domain .* are .*/imu"):
@@ -262,7 +263,7 @@ def test_topics_that_are_not_published_are_named(domain: int, robot: Other) -> N
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("ros2:imu", "topics are named by options"),
         ("ros2:?cam9=/a", "no option 'cam9'"),
@@ -272,19 +273,19 @@ def test_topics_that_are_not_published_are_named(domain: int, robot: Other) -> N
         ("ros2:?wait_s=soon", "write a number from 0"),
     ],
 )
-def test_options_that_are_none_are_refused(text: str, told: str) -> None:
-    with pytest.raises(SourceError, match=told):
+def test_open_source_bad_option_is_refused(text: str, message: str) -> None:
+    with pytest.raises(SourceError, match=message):
         open_live_source(text, small_rig())
 
 
-def test_options_must_suit_the_rig() -> None:
+def test_open_source_options_must_match_rig() -> None:
     with pytest.raises(SourceError, match="small has no IMU"):
         open_live_source("ros2:?imu=/imu", small_rig().without_imu())
     with pytest.raises(SourceError, match="body is an option for a rig file"):
         open_live_source("ros2:?body=base_link")
 
 
-def test_the_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cyclonedds", None)
     for act in (lambda: open_live_source("ros2:", small_rig()), list_devices):
         with pytest.raises(MissingExtraError, match=r"cyclonedds: install it with .*graphvio\[ros2\]"):

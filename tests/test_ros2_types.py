@@ -1,4 +1,4 @@
-"""Types on the wire: two libraries must make the same bytes of a message, and the same message of the bytes."""
+"""Types on the wire: two libraries must encode a message to the same bytes, and decode these to the same message."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ TYPES = [
 WORDS = ["", "a", "odom", "base_link", "Köln"]
 
 
-def drawn(rng: np.random.Generator, type_name: str, length: int) -> Any:
-    """A message with values by chance; texts of all lengths put what follows at all alignments."""
+def random_message(rng: np.random.Generator, type_name: str, length: int) -> Any:
+    """A message of random values; strings of all lengths put the following fields at all alignments."""
 
     def value(kind: Any) -> Any:
         node, what = kind
         if node == Nodetype.NAME:
-            return drawn(rng, what, length)
+            return random_message(rng, what, length)
         if node == Nodetype.BASE:
             name = what[0]
             if name == "string":
@@ -84,19 +84,19 @@ def same(one: Any, other: Any) -> None:
 
 @pytest.mark.parametrize("length", [0, 1, 3])
 @pytest.mark.parametrize("type_name", TYPES)
-def test_both_libraries_agree(type_name: str, length: int) -> None:
+def test_types_agree_between_libraries(type_name: str, length: int) -> None:
     rng = np.random.default_rng(length)
     for _ in range(10):
-        message = drawn(rng, type_name, length)
+        message = random_message(rng, type_name, length)
         data = cdr.encode(message)
-        told = idl_struct(type_name).deserialize(data)
-        same(message, told)
-        made = told.serialize(use_version_2=False)
-        assert made == data
-        same(cdr.decode(made, type_name), told)
+        decoded = idl_struct(type_name).deserialize(data)
+        same(message, decoded)
+        encoded = decoded.serialize(use_version_2=False)
+        assert encoded == data
+        same(cdr.decode(encoded, type_name), decoded)
 
 
-def test_names_are_those_of_ros() -> None:
+def test_names_match_ros() -> None:
     assert dds_type_name("sensor_msgs/msg/Image") == "sensor_msgs::msg::dds_::Image_"
     assert ros_type_name("sensor_msgs::msg::dds_::Image_") == "sensor_msgs/msg/Image"
     assert ros_type_name("DDS::Chatter") is None
@@ -110,21 +110,21 @@ def test_names_are_those_of_ros() -> None:
     ("profile", "is_reliable", "is_latched"),
     [(SENSOR_DATA, False, False), (DEFAULT, True, False), (TF, True, False), (TF_STATIC, True, True)],
 )
-def test_endpoints_offer_what_those_of_ros_do(profile: Profile, is_reliable: bool, is_latched: bool) -> None:
+def test_profile_matches_ros(profile: Profile, is_reliable: bool, is_latched: bool) -> None:
     from cyclonedds.qos import Policy
 
-    offered = profile.dds("sensor_msgs/msg/Imu")
-    assert (offered[Policy.Reliability] == Policy.Reliability.BestEffort) != is_reliable
+    qos = profile.dds("sensor_msgs/msg/Imu")
+    assert (qos[Policy.Reliability] == Policy.Reliability.BestEffort) != is_reliable
     durability = Policy.Durability.TransientLocal if is_latched else Policy.Durability.Volatile
-    assert offered[Policy.Durability] == durability
-    assert offered[Policy.History] == Policy.History.KeepLast(profile.depth)
-    assert Policy.Partition not in offered
-    assert offered[Policy.Userdata].data == (  # of sensor_msgs/msg/Imu in ROS 2 Jazzy
+    assert qos[Policy.Durability] == durability
+    assert qos[Policy.History] == Policy.History.KeepLast(profile.depth)
+    assert Policy.Partition not in qos
+    assert qos[Policy.Userdata].data == (  # of sensor_msgs/msg/Imu in ROS 2 Jazzy
         b"typehash=RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b;"
     )
 
 
-def test_the_domain_is_that_of_ros(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_domain_of_matches_ros(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", "17")
     assert domain_of(None) == 17
     assert domain_of("3") == 3

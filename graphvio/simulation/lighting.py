@@ -96,7 +96,7 @@ def irradiance(points: Float, normals: Float, lamps: Float, blockers: Float) -> 
 
 @kernel
 def _blocks(rectangle: Float, start: Float, x: float, y: float, z: float) -> bool:
-    """Whether the segment from start along (x, y, z) passes through a rectangle (origin, edge_u, edge_v)."""
+    """Return whether the segment from start along (x, y, z) passes through a rectangle (origin, edge_u, edge_v)."""
     ux, uy, uz = rectangle[1, 0], rectangle[1, 1], rectangle[1, 2]
     vx, vy, vz = rectangle[2, 0], rectangle[2, 1], rectangle[2, 2]
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx

@@ -17,7 +17,7 @@ _START_S = 1.5  # time to come to full motion
 
 
 def build_room(duration_s: float, stationary_s: float) -> Scene:
-    """A furnished room of 10 x 8 x 3 metres: two rounds about the table, which end where they began."""
+    """Build a furnished room of 10 x 8 x 3 metres: two rounds about the table, which end where they began."""
     world = World(ambient=0.42)
     outline = [(-5.0, -4.0), (-5.0, 4.0), (5.0, 4.0), (5.0, -4.0)]
     world.outline(outline, 0.0, _HEIGHT_M, ("brick", "plaster", "plaster", "concrete"))
@@ -63,7 +63,7 @@ def _furnish(world: World) -> None:
 
 
 def build_calibration(duration_s: float, stationary_s: float) -> Scene:
-    """A slow circle in a small room; the rig is turned by up to 30 degrees in pitch and roll, and all around in yaw."""
+    """Build a slow circle in a small room, turned by up to 30 degrees in pitch and roll, and all around in yaw."""
     world = World(ambient=0.42)
     h = _CALIBRATION_HALF_M
     outline = [(-h, -h), (-h, h), (h, h), (h, -h)]
