@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable
 
 from graphvio.config.stages import OptimizationConfig
 from graphvio.errors import MapError
 from graphvio.mapping.places import Anchored, NewPlace, PlaceChooser
+from graphvio.queues import BoundedQueue, WhenFull
 from graphvio.slam.interface import FrontEnd
 
-_MOST_WAITING = 8  # places, with their images
+_MAX_WAITING = 8  # places, with their images
 
 
 class Intake:
@@ -29,12 +29,11 @@ class Intake:
         self._front_end = front_end
         self._share = share
         self._chooser = PlaceChooser(settings.place_distance_m, settings.place_angle_deg)
-        self._changed = threading.Condition()
-        self._waiting: deque[NewPlace] = deque()
+        self._lock = threading.Lock()
+        self._waiting: BoundedQueue[NewPlace] = BoundedQueue(_MAX_WAITING, WhenFull.DROP_NEWEST)
         self._keyframes: list[Anchored] = []
         self._skipped = 0
         self._lost = 0
-        self._is_over = False
         self._failure: BaseException | None = None
 
     @property
@@ -55,7 +54,7 @@ class Intake:
     @property
     def keyframes(self) -> list[Anchored]:
         """All that belong to a place, so far."""
-        with self._changed:
+        with self._lock:
             return list(self._keyframes)
 
     def start(self) -> None:
@@ -64,10 +63,7 @@ class Intake:
 
     def stop(self) -> None:
         """Read no more; places that wait are dropped."""
-        with self._changed:
-            self._is_over = True
-            self._waiting.clear()
-            self._changed.notify_all()
+        self._waiting.abandon()
 
     def next(self) -> NewPlace | None:
         """The next place, waited for; None when there will be none.
@@ -76,13 +72,10 @@ class Intake:
             GraphvioError: whatever the front-end raised, after all places that came before it; MapError, if its
                 keyframes carry no images.
         """
-        with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._is_over)
-            if self._waiting:
-                return self._waiting.popleft()
-            if self._failure is not None:
-                raise self._failure
-            return None
+        place = self._waiting.get()
+        if place is None and self._failure is not None:
+            raise self._failure
+        return place
 
     def _read(self) -> None:
         try:
@@ -90,25 +83,22 @@ class Intake:
         except BaseException as error:
             self._failure = error
         finally:
-            with self._changed:
-                self._is_over = True
-                self._changed.notify_all()
+            self._waiting.close()
 
     def _follow(self) -> None:
         expected: int | None = None
         for keyframe in self._front_end.keyframes():
             if expected is None and not keyframe.images:
                 raise MapError("the keyframes carry no images, and places are recognised by them: ask for images")
-            with self._changed:
-                if self._is_over:
+            with self._lock:
+                if self._waiting.is_closed:
                     return
                 self._lost += max(keyframe.id - (keyframe.id if expected is None else expected), 0)
                 expected = keyframe.id + 1
-                place, is_one = self._chooser.add(keyframe, self._share(), len(self._waiting) < _MOST_WAITING)
+                place, is_one = self._chooser.add(keyframe, self._share(), len(self._waiting) < _MAX_WAITING)
                 anchored = self._chooser.anchored()
                 if anchored is not None:
                     self._keyframes.append(anchored)
                 if place is not None:
-                    self._waiting.append(place)
-                    self._changed.notify_all()
+                    self._waiting.put(place)
                 self._skipped += is_one and place is None
