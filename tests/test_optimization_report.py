@@ -24,7 +24,7 @@ from graphvio.geometry import se3, se3_exp, se3_inverse, so3_exp
 from graphvio.optimization.extrinsics import RigCorrection
 from graphvio.optimization.loops.closures import LoopClosure, Place
 from graphvio.optimization.optimize import JudgedLoop, Optimization, optimize
-from graphvio.optimization.record import NO_MOTIONS, Inertial, Motions, SessionRecord
+from graphvio.optimization.record import Inertial, Motions, SessionRecord
 from graphvio.optimization.report.calibration import calibrations
 from graphvio.optimization.report.page import length, plain
 from graphvio.optimization.report.write import write_report
@@ -48,16 +48,20 @@ def session(name: str, seed: int, breaks: tuple[int, ...] = ()) -> SessionRecord
     """What an odometry without IMU would record on the circle, with drift; a new epoch begins at each break."""
     rng, true = np.random.default_rng(seed), circle()
     epoch = np.searchsorted(np.array(breaks, dtype=np.int64), np.arange(POSES), side="right")
-    poses, motions, rows = [np.eye(4)], [], []
+    poses, relative, rows = [np.eye(4)], [], []
     for k in range(1, POSES):
         motion = se3_inverse(true[k - 1]) @ true[k] @ se3_exp(SIGMAS * rng.standard_normal(6))
         if epoch[k] == epoch[k - 1]:
-            motions.append(motion)
+            relative.append(motion)
             rows.append(k)
         poses.append(poses[-1] @ motion if epoch[k] == epoch[k - 1] else np.eye(4))
     ends, count = np.array(rows, dtype=np.int64), len(rows)
     covariance, zero = np.diag(SIGMAS**2), np.zeros((POSES, 3))
     no, nothing = np.zeros(POSES, dtype=bool), np.zeros((count, 6, 6))
+    motions = Motions(
+        ends - 1, ends, np.array(relative), np.repeat(covariance[None], count, 0), nothing, np.full(count, 100)
+    )
+    none: list[Any] = [column[:0] for column in motions]
     return SessionRecord(
         name=name,
         stamps_ns=STEP_NS * np.arange(1, POSES + 1, dtype=np.int64),
@@ -72,10 +76,8 @@ def session(name: str, seed: int, breaks: tuple[int, ...] = ()) -> SessionRecord
         is_keyframe=~no,
         with_imu=no,
         is_start=no,
-        motions=Motions(
-            ends - 1, ends, np.array(motions), np.repeat(covariance[None], count, 0), nothing, np.full(count, 100)
-        ),
-        own=NO_MOTIONS,
+        motions=motions,
+        own=Motions(*none),
         own_pair=np.zeros(0, dtype=np.int64),
         inertial=Inertial(np.zeros(POSES + 1, dtype=np.int64), no, np.zeros(0), np.zeros((0, 6))),
     )

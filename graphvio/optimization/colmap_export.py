@@ -55,11 +55,6 @@ class ColmapModel:
     observations: int
     reprojection_error_px: float
 
-    @property
-    def mean_track_length(self) -> float:
-        """Mean number of images that see a point; NaN without points."""
-        return self.observations / self.points if self.points else float("nan")
-
 
 def export(
     optimization: Optimization,

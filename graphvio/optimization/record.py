@@ -67,15 +67,6 @@ class Motions(NamedTuple):
 
 _COLUMNS = {"is_stationary": "at_rest"}  # fields that have another name in files
 
-NO_MOTIONS = Motions(
-    np.zeros(0, dtype=np.int64),
-    np.zeros(0, dtype=np.int64),
-    np.zeros((0, 4, 4)),
-    np.zeros((0, 6, 6)),
-    np.zeros((0, 6, 6)),
-    np.zeros(0, dtype=np.int64),
-)
-
 
 @dataclass(frozen=True, eq=False)
 class SessionRecord:
