@@ -31,7 +31,6 @@ class Advice:
         motions: number of its motions.
         rotation_sigma_deg: largest over all directions; infinite without a solution.
         translation_sigma_m: largest over all directions; infinite without a solution.
-        turning_deg_s: (3,) rms angular velocity about the principal axes, in descending order.
         missing: a sentence on what to do; empty if only more of the same is needed.
     """
 
@@ -39,7 +38,6 @@ class Advice:
     motions: int
     rotation_sigma_deg: float
     translation_sigma_m: float
-    turning_deg_s: tuple[float, float, float]
     missing: str
 
     @property
@@ -102,7 +100,7 @@ class Guide:
 
     def _advice(self, j: int) -> Advice:
         segments = self._segments[j]
-        nothing = Advice(self._names[j], len(segments), np.inf, np.inf, (0.0, 0.0, 0.0), _INITIAL_ADVICE)
+        nothing = Advice(self._names[j], len(segments), np.inf, np.inf, _INITIAL_ADVICE)
         if len(segments) < MIN_PAIRS:
             return nothing
         start_ns, end_ns, *arrays = (np.array(column) for column in zip(*segments, strict=True))
@@ -119,10 +117,8 @@ class Guide:
         covariance = found.covariance + systematic_covariance(found.left2_T_left1, SEEN_FROM)
         blocks = np.stack([covariance[:3, :3], covariance[3:, 3:]])
         rotation, translation = np.sqrt(np.linalg.eigvalsh(blocks)[:, -1])
-        seconds = float(np.mean(pairs.end_ns - pairs.start_ns)) * 1e-9
-        turning = tuple((np.rad2deg(observability.turning_rad) / seconds).tolist())
         missing = "; ".join(observability.missing)
-        return Advice(self._names[j], len(segments), float(np.rad2deg(rotation)), float(translation), turning, missing)
+        return Advice(self._names[j], len(segments), float(np.rad2deg(rotation)), float(translation), missing)
 
 
 def _length(metres: float) -> str:

@@ -35,12 +35,10 @@ class JointSolution:
     Attributes:
         left_T_left1: (J, 4, 4) pose of the first left camera in each; the first is the identity.
         covariance: (6 (J - 1), 6 (J - 1)) of the others, tangents ``[rotation, translation]`` in left1.
-        used: (N, J) motions that agree with the others.
     """
 
     left_T_left1: Float
     covariance: Float
-    used: Bool
 
     def between(self, one: int, other: int) -> Float:
         """Return ``left_other_T_left_one`` (4, 4)."""
@@ -81,7 +79,7 @@ def solve(segments: Segments, start: Float, held: Sequence[Float]) -> JointSolut
             left_T_left1[j] = values.atPose3(_place(j)).matrix()
     joint = gtsam.Marginals(graph, values).jointMarginalCovariance(gtsam.KeyVector([_place(j) for j in cameras]))
     covariance = np.block([[joint.at(_place(i), _place(j)) for j in cameras] for i in cameras])
-    return JointSolution(left_T_left1, covariance, used)
+    return JointSolution(left_T_left1, covariance)
 
 
 def _place(camera: int) -> int:

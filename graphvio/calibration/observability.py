@@ -32,15 +32,13 @@ class Observability:
     Attributes:
         translation_singular_values: (3,) of the problem of the translation, eq. (6), as rms rotation, rad, in
             descending order; two of them must be well above the noise.
-        turning_axes: (3, 3) rows: principal axes of the rotation, in left1.
-        turning_rad: (3,) rms rotation about these, the singular values of the problem of the rotation, eq. (5).
+        turning_rad: (3,) rms rotation about principal axes, singular values of the problem of the rotation, eq. (5).
         undetermined: (K, 6) orthonormal directions, tangent in left1, that the motions do not determine.
         covariance: (6, 6) of ``left2_T_left1``, tangent in left1; very large along undetermined directions.
         missing: a sentence on each undetermined part and what to do about it; empty if everything is determined.
     """
 
     translation_singular_values: Float
-    turning_axes: Float
     turning_rad: Float
     undetermined: Float
     covariance: Float
@@ -71,7 +69,6 @@ def observe(pairs: PosePairs, left2_T_left1: Float) -> Observability:
     lever = np.concatenate([np.eye(3) - motion[:3, :3] for motion in pairs.motion_2])
     return Observability(
         translation_singular_values=np.linalg.svd(lever / np.sqrt(len(pairs)), compute_uv=False),
-        turning_axes=axes,
         turning_rad=turning_rad,
         undetermined=undetermined,
         covariance=scale @ covariance @ scale,

@@ -59,12 +59,10 @@ class PaperSolution:
     Attributes:
         left2_T_left1: (4, 4), the paper's P_12.
         inlier: (N,) pose pairs that the refinement used.
-        errors_m: (N, 3) alignment errors, eq. (7), of all pose pairs.
     """
 
     left2_T_left1: Float
     inlier: Bool
-    errors_m: Float
 
 
 def calibrate(pairs: PosePairs, seed: int = 0) -> PaperSolution:
@@ -89,7 +87,7 @@ def calibrate(pairs: PosePairs, seed: int = 0) -> PaperSolution:
             "rig, and are their clocks the same?"
         )
     R, t = refine(parts.select(inlier), R, t, weighted.noise_rad)
-    return PaperSolution(se3(R, -R @ t), inlier, alignment_errors(parts, R, t))
+    return PaperSolution(se3(R, -R @ t), inlier)
 
 
 def rotation(R_1: Float, R_2: Float) -> tuple[Float, Float]:

@@ -61,16 +61,6 @@ class Places:
     distances: Mapping[tuple[int, int], float]
     warnings: tuple[str, ...]
 
-    def covariance_between(self, one: int, other: int) -> Float:
-        """Compute the covariance (6, 6) of ``left_other_T_left_one``, tangent in the camera ``one``."""
-        # X_ij = X_j X_i^-1: changes d_j of X_j and d_i of X_i, in left1, make Ad(X_i) (d_j - d_i).
-        apart = np.zeros((6, len(self.covariance)))
-        for camera, sign in ((other, 1.0), (one, -1.0)):
-            if camera:
-                apart[:, 6 * (camera - 1) : 6 * camera] += sign * np.eye(6)
-        apart = se3_adjoint(np.ascontiguousarray(self.left_T_left1[one])) @ apart
-        return np.asarray(apart @ self.covariance @ apart.T)
-
 
 def pairwise(
     names: Sequence[str], calibrate: Callable[[int, int, ScaleMode], PairCalibration], scale_mode: ScaleMode
@@ -153,7 +143,11 @@ def place_all(
                 f"{names[i]} and {names[j]}: all cameras together put them {size_in_words(apart[i, j])} from where "
                 f"these two alone do, more than the noise explains (chi-square {distance:.0f} of 6)"
             )
-    loops = tuple(_loop(found, three) for three in combinations(range(count), 3) if _closed(found, three))
+    loops = tuple(
+        _loop(found, three)
+        for three in combinations(range(count), 3)
+        if all(two in found for two in combinations(three, 2))
+    )
     return Places(solution.left_T_left1, covariance, found, loops, distances, tuple(warnings))
 
 
@@ -202,10 +196,6 @@ def _in_first_lengths(found: Mapping[tuple[int, int], PairCalibration], one: int
     if one and found[0, one].scale_estimated:
         place[:3, 3] *= np.exp(-found[0, one].scale.log_ratio)
     return place
-
-
-def _closed(found: Mapping[tuple[int, int], PairCalibration], three: tuple[int, ...]) -> bool:
-    return all(two in found for two in combinations(three, 2))
 
 
 def _loop(found: Mapping[tuple[int, int], PairCalibration], three: tuple[int, int, int]) -> Loop:

@@ -1,4 +1,4 @@
-"""What the pictures of reports have in common; only matplotlib's objects are used, and pyplot is left alone."""
+"""Figures of reports: style, axes and PNG. Only matplotlib's objects are used, not the global state of pyplot."""
 
 from __future__ import annotations
 
@@ -14,14 +14,19 @@ GRID: dict[str, Any] = {"color": "#e2e2e2", "linewidth": 0.6}
 
 
 def empty_figure(width_in: float, height_in: float) -> Figure:
-    """A white figure without axes."""
+    """Create a white figure without axes."""
     figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 
 
 def add_axes(figure: Figure, place: tuple[float, float, float, float]) -> Any:
-    """Axes with a grid behind the data; left, bottom, width and height in shares of the figure."""
+    """Add axes with a grid behind the data.
+
+    Args:
+        figure: to add them to.
+        place: left, bottom, width and height as fractions of the figure.
+    """
     axes = figure.add_axes(place)
     axes.grid(**GRID)
     axes.set_axisbelow(True)
@@ -29,13 +34,13 @@ def add_axes(figure: Figure, place: tuple[float, float, float, float]) -> Any:
 
 
 def single(width_in: float, height_in: float) -> tuple[Figure, Any]:
-    """A figure with one pair of axes."""
+    """Create a figure with one pair of axes."""
     figure = empty_figure(width_in, height_in)
     return figure, add_axes(figure, (0.11, 0.16, 0.85, 0.74))
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG; equal figures give equal bytes."""
-    held = BytesIO()
-    figure.savefig(held, format="png", metadata={"Software": None})
-    return held.getvalue()
+    """Render a figure as PNG; equal figures give equal bytes."""
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""Files that are either whole or absent."""
+"""Files that are written in full or not at all."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ from pathlib import Path
 
 
 def replace_file(path: Path, content: str | bytes) -> None:
-    """Write a file under another name, and give it its own when it is whole.
+    """Write a file under a temporary name, then rename it.
+
+    Args:
+        path: file to write or replace.
+        text: its content.
 
     Raises:
-        OSError: if it cannot be written; what was there before then still is.
+        OSError: if it cannot be written; an existing file is then unchanged.
     """
     unfinished = path.with_name(f".{path.name}.tmp")
     try:
