@@ -97,7 +97,7 @@ def motions(walk: Walk, to_camera: Float, rng: np.random.Generator, moved: Float
         walk: poses of the first camera at times.
         to_camera: pose of the camera in the first one.
         rng: source of errors.
-        moved: pose in the first camera from the middle of the walk on, if it was knocked.
+        moved: pose in the first camera from the middle of the walk on, if it was moved on the rig.
     """
     stamps = [k * PERIOD_NS for k in range(FRAMES)]
     measured = []

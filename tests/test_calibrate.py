@@ -101,7 +101,7 @@ def test_command_wrong_rig_is_corrected(walk: Path, tmp_path: Path) -> None:
     save_rig(with_wrong_place(rig, 3.0, 0.05), wrong)
     ran = command("run", walk, "--rig", wrong, "--out", tmp_path / "results")
     assert ran.exit_code == 0
-    size = r"pair back is ([\d.]+) \(\+- ([\d.]+)\) deg and ([\d.]+) \(\+- ([\d.]+)\) cm from where the rig file has it"
+    size = r"pair back is ([\d.]+) \(\+- ([\d.]+)\) deg and ([\d.]+) \(\+- ([\d.]+)\) cm from where the rig"
     match = re.search(size, ran.stderr)
     assert match is not None, ran.stderr
     degrees, degrees_sigma, cm, cm_sigma = map(float, match.groups())
