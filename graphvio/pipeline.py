@@ -113,17 +113,16 @@ class _Run:
         """Process all measurements; a frameset's time is that of the odometry alone."""
         for measurement in self._source:
             if isinstance(measurement, FrameSet):
-                self._framesets += 1
-                self._keep(measurement)
+                self._add_frameset(measurement)
             begin = perf_counter()
             estimate = self._odometry.process(measurement)
             if estimate is not None:
                 self._frameset_ms.append(1e3 * (perf_counter() - begin))
-                self._add(estimate)
+                self._add_estimate(estimate)
         begin = perf_counter()
         for estimate in self._odometry.finish():
             self._frameset_ms.append(1e3 * (perf_counter() - begin))
-            self._add(estimate)
+            self._add_estimate(estimate)
             begin = perf_counter()
         wall_s = perf_counter() - self._start
         self._collect()
@@ -141,13 +140,14 @@ class _Run:
             truth=self._source.truth,
         )
 
-    def _keep(self, frameset: FrameSet) -> None:
+    def _add_frameset(self, frameset: FrameSet) -> None:
+        self._framesets += 1
         if self._keeps_framesets:
             self._pending[frameset.stamp_ns] = frameset
             if len(self._pending) > _MAX_PENDING_FRAMESETS:
                 self._pending.popitem(last=False)
 
-    def _add(self, estimate: Estimate) -> None:
+    def _add_estimate(self, estimate: Estimate) -> None:
         self._writer.add(estimate)
         self._before_start += estimate.status is Status.INITIALISING and estimate.nav_T_body is None
         self._collect()

@@ -39,8 +39,8 @@ from graphvio.trajectory import Trajectory
 MAX_GAP_S = 0.25
 _START_SHARE = 0.05
 _START_S = 2.0
-_LOOP_M = 1.0
-_LOOP_MIN_PATH_M = 4.0
+_MAX_LOOP_GAP_M = 1.0
+_MIN_LOOP_PATH_M = 4.0
 _MIN_PATH_M = 0.1
 _MIN_POSES = 3
 _NS_PER_S = 1e9
@@ -220,7 +220,7 @@ def _drift(estimate: Trajectory, truth: Trajectory) -> float:
 
 def _loop_closure(aligned: Trajectory, truth: Trajectory, path_m: float) -> LoopClosure | None:
     true_displacement = truth.positions[-1] - truth.positions[0]
-    if np.linalg.norm(true_displacement) > _LOOP_M or path_m < _LOOP_MIN_PATH_M:
+    if np.linalg.norm(true_displacement) > _MAX_LOOP_GAP_M or path_m < _MIN_LOOP_PATH_M:
         return None
     error_m = float(np.linalg.norm(aligned.positions[-1] - aligned.positions[0] - true_displacement))
     return LoopClosure(error_m, 100.0 * error_m / path_m)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from graphvio.errors import RigError
 from graphvio.rig import Camera, Imu, Rig, StereoPair, as_written
-from graphvio.rig_files.reading import NOISE_KEYS, Section, named, parse_yaml, read_yaml
+from graphvio.rig_files.reading import NOISE_KEYS, Section, named, parse_yaml, read_text
 
 VERSION = 1
 VERSION_KEY = "graphvio_rig"
@@ -28,23 +28,20 @@ def load(path: Path) -> Rig:
     Raises:
         RigError: if it cannot be read, lacks a value, or has an unknown key or an invalid value.
     """
-    return _rig(read_yaml(path), path)
+    return parse(read_text(path), path)
 
 
 def parse(text: str, path: Path) -> Rig:
-    """Read a rig from the text of a ``rig.yaml`` that is embedded in another file.
+    """Read a rig from the text of a ``rig.yaml``.
 
     Args:
         text: of the ``rig.yaml``.
-        path: of the other file, for messages.
+        path: of the file, or of another one in which it is embedded.
 
     Raises:
-        RigError: as `load`.
+        RigError: if it lacks a value, or has an unknown key or an invalid value.
     """
-    return _rig(parse_yaml(text, path), path)
-
-
-def _rig(document: Section, path: Path) -> Rig:
+    document = parse_yaml(text, path)
     version = document.values.get(VERSION_KEY)
     if version is None:
         raise RigError(f"{path}: {VERSION_KEY} is missing; begin the file with  {VERSION_KEY}: {VERSION}")
