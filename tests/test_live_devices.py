@@ -16,6 +16,7 @@ from graphvio.live.devices import Counts, DeviceLostError, DeviceSource, HandOve
 from graphvio.live.imu_merging import AccelOntoGyro
 from graphvio.live.sources import SourceSpec
 from graphvio.live.spec_options import choice_of, names_of, number_of, size_of
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.readings import ImuReading, Notice, Reading, host_ns
 from graphvio.rig import Rig
 
@@ -74,7 +75,16 @@ def test_device_source_lost_device_is_reported_and_restarted() -> None:
     assert isinstance(source.open(), Rig)
     found = take(source.readings(), 8)
     kinds = [reading.kind if isinstance(reading, Notice) else "imu" for reading in found]
-    assert kinds == ["imu", "imu", "device_lost", "device_back", "imu", "device_lost", "device_back", "imu"]
+    assert kinds == [
+        "imu",
+        "imu",
+        EventKind.DEVICE_LOST,
+        EventKind.DEVICE_BACK,
+        "imu",
+        EventKind.DEVICE_LOST,
+        EventKind.DEVICE_BACK,
+        "imu",
+    ]
     notices = [reading for reading in found if isinstance(reading, Notice)]
     assert notices[0].detail == "a: unplugged"
     assert notices[2].detail == "a: ValueError: what drivers say"
@@ -129,7 +139,7 @@ def test_device_source_failing_open_stops_all_devices() -> None:
 
 def test_mailbox_drops_old_readings_but_no_notice() -> None:
     mailbox = Mailbox(max_age_ns=100)
-    notice = Notice("device_lost", "a", 5)
+    notice = Notice(EventKind.DEVICE_LOST, "a", 5)
     mailbox.put("a", imu_reading(0))
     mailbox.put("a", notice)
     for stamp_ns in (50, 150, 200):

@@ -19,6 +19,7 @@ from graphvio.errors import SourceError
 from graphvio.live.devices import Counts, Device, DeviceSource
 from graphvio.live.imu_readers.iio_imu import IioImu, ScanElement, ScanFormat, mount_matrix
 from graphvio.live.imu_readers.serial_imu import ImuLines, SerialImu
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.readings import ImuReading, Notice, Reading, host_ns
 
 BAUD = 115_200
@@ -103,7 +104,7 @@ def test_imu_lines_counter_wrap_and_restart() -> None:
         1000 * (wrap_us - 1000),
         1000 * (wrap_us + 1000),
         1000 * (wrap_us + 5_000_000),
-        "clock_restarted",
+        EventKind.CLOCK_RESTARTED,
         70_000,
     ]
     (notice,) = [each for each in found if isinstance(each, Notice)]
@@ -160,13 +161,13 @@ def test_serial_imu_unplugged_port_reconnects(tmp_path: Path) -> None:
     os.close(controller)
     lost = next(readings)
     assert isinstance(lost, Notice)
-    assert lost.kind == "device_lost"
+    assert lost.kind == EventKind.DEVICE_LOST
     controller, port = os.openpty()
     tty.setraw(port)
     path.symlink_to(os.ttyname(port))
     back = next(readings)
     assert isinstance(back, Notice)
-    assert (back.kind, back.clock) == ("device_back", f"serial:{path}")
+    assert (back.kind, back.clock) == (EventKind.DEVICE_BACK, f"serial:{path}")
     os.write(controller, b"\n" + line(500))
     sample = next(readings)
     assert isinstance(sample, ImuReading)

@@ -23,6 +23,7 @@ from graphvio.live.devices import DeviceSource
 from graphvio.live.lens_fit import fit_rational
 from graphvio.live.sources import SourceSpec, kind_of
 from graphvio.live.sources.oak import StreamSettings, list_devices, open_source
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.rig import Rig
 
@@ -312,7 +313,7 @@ def test_source_unplugged_camera_reconnects(way: str) -> None:
         camera.alive = False
     lost = next(readings)
     assert isinstance(lost, Notice)
-    assert (lost.kind, lost.clock) == ("device_lost", "A")
+    assert (lost.kind, lost.clock) == (EventKind.DEVICE_LOST, "A")
     assert "unplugged" in lost.detail
     limit_s = time.monotonic() + 10.0
     while "Cannot find any device" not in source.health()[0].detail:
@@ -322,7 +323,7 @@ def test_source_unplugged_camera_reconnects(way: str) -> None:
     plugs.connected["A"] = again
     back = next(readings)
     assert isinstance(back, Notice)
-    assert (back.kind, back.clock) == ("device_back", "A")
+    assert (back.kind, back.clock) == (EventKind.DEVICE_BACK, "A")
     again.image(0, smooth(0), timedelta(seconds=1))
     assert isinstance(next(readings), CameraFrame)
     source.close()

@@ -19,6 +19,7 @@ from graphvio.geometry import se3, se3_inverse, so3_exp
 from graphvio.live.devices import DeviceSource
 from graphvio.live.sources import SourceSpec, kind_of
 from graphvio.live.sources.realsense import list_devices, open_source
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.rig import Rig, StereoPair
 
@@ -237,13 +238,13 @@ def test_source_unplugged_camera_reconnects() -> None:
     bus.unplug("0123")
     lost = next(readings)
     assert isinstance(lost, Notice)
-    assert (lost.kind, lost.clock) == ("device_lost", "0123")
+    assert (lost.kind, lost.clock) == (EventKind.DEVICE_LOST, "0123")
     assert "unplugged" in lost.detail
     again = Software("0123")
     bus.connected["0123"] = again
     back = next(readings)
     assert isinstance(back, Notice)
-    assert (back.kind, back.clock) == ("device_back", "0123")
+    assert (back.kind, back.clock) == (EventKind.DEVICE_BACK, "0123")
     again.image(1, noise_image(3, SIZE_PX), 50.0)
     frame = next(readings)
     assert isinstance(frame, CameraFrame)

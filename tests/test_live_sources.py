@@ -19,6 +19,7 @@ from graphvio.live.sources import SourceSpec, open_live_source
 from graphvio.live.sources.replay import Pace, paced, speed_of
 from graphvio.live.sources.simulated_faults import DeviceFaults, Outage, devices_of, with_faults
 from graphvio.live.sources.simulator import _leg
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.measurements.sensors import ImuSample, Measurement
 from graphvio.simulation import simulate
@@ -279,10 +280,10 @@ def test_outage_drops_readings_and_is_reported_once(recording: Path) -> None:
     readings = list(faulty(recording, DeviceFaults(outages=outages)))
     notices = [(r.kind, r.clock) for r in readings if isinstance(r, Notice)]
     assert notices == [
-        ("device_lost", "pair1"),
-        ("device_lost", "imu"),
-        ("device_back", "imu"),
-        ("device_back", "pair1"),
+        (EventKind.DEVICE_LOST, "pair1"),
+        (EventKind.DEVICE_LOST, "imu"),
+        (EventKind.DEVICE_BACK, "imu"),
+        (EventKind.DEVICE_BACK, "pair1"),
     ]
     frames, samples = images_and_samples(readings)
     gone = {f.stamp_ns - start_ns for f in frames if f.camera == "cam0"} - {

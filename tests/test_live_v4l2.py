@@ -26,6 +26,7 @@ from graphvio.live.sources.v4l2 import (
     open_v4l2,
     set_up,
 )
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
 
 SIZE_PX = (64, 48)
@@ -106,10 +107,10 @@ def test_source_splits_side_by_side_images(tmp_path: Path) -> None:
         assert left.decode().flags.c_contiguous
     lost = next(readings)
     assert isinstance(lost, Notice)
-    assert lost.kind == "device_lost"  # the file's end
+    assert lost.kind == EventKind.DEVICE_LOST  # the file's end
     back = next(readings)
     assert isinstance(back, Notice)
-    assert back.kind == "device_back"
+    assert back.kind == EventKind.DEVICE_BACK
     np.testing.assert_array_equal(frames_of(readings, 1)[0].decode(), frames[0].decode())
     source.close()
 

@@ -20,6 +20,7 @@ from graphvio.errors import MissingExtraError, RigError, SourceError
 from graphvio.live.source import LiveSource
 from graphvio.live.sources import open_live_source
 from graphvio.live.sources.ros2 import list_devices
+from graphvio.measurements.events import EventKind
 from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading
 from graphvio.rig import Rig
 
@@ -194,11 +195,11 @@ def test_source_lost_publisher_is_reported_and_read_again() -> None:
     source.open()
     listening = Listening(source)
     robot.end()
-    assert until(lambda: listening.notices() == ["device_lost"] * 2)
+    assert until(lambda: listening.notices() == [EventKind.DEVICE_LOST] * 2)
     assert not any(each.connected for each in source.health())
     again = robot_on(domain)
     try:
-        assert until(lambda: listening.notices() == ["device_lost"] * 2 + ["device_back"] * 2)
+        assert until(lambda: listening.notices() == [EventKind.DEVICE_LOST] * 2 + [EventKind.DEVICE_BACK] * 2)
         assert again.do("await /pair0") == "True"
         for number in range(FRAMESETS):
             assert again.do(str(number)) == "sent"
@@ -246,7 +247,7 @@ def rig_of_other_names() -> Rig:
 def test_open_missing_topics_are_named(domain: int, robot: Other) -> None:
     rig = small_rig()
     absent = open_live_source(f"ros2:?domain={domain}&cam0=/front/image_raw&wait_s=1.5", rig)
-    with pytest.raises(SourceError, match=r"nobody publishes /front/image_raw; topics on domain .* are .*/imu"):
+    with pytest.raises(SourceError, match=r"no publisher of /front/image_raw; topics on domain .* are .*/imu"):
         absent.open()
     of_another_type = open_live_source(f"ros2:?domain={domain}&cam0=/imu", rig)
     with pytest.raises(SourceError, match=r"/imu: has messages of type sensor_msgs/msg/Imu"):

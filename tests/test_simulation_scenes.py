@@ -23,7 +23,7 @@ def corners(image: Image) -> int:
 
 
 def at(simulator: Simulator, time_s: float) -> int:
-    return round(time_s * simulator.rate_hz)
+    return round(time_s * simulator.rates_hz[0])
 
 
 def test_build_scene_bad_arguments_are_refused() -> None:

@@ -69,7 +69,7 @@ class SensorTopic:
             return None
         if is_connected:
             return self.notice(EventKind.DEVICE_BACK, "is published again")
-        return self.notice(EventKind.DEVICE_LOST, "nobody publishes it any more")
+        return self.notice(EventKind.DEVICE_LOST, "has no publisher any more")
 
     def take(self) -> Iterator[ImuReading | CameraFrame]:
         """Yield the readings received since the last call."""

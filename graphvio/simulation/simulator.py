@@ -89,11 +89,6 @@ class Simulator:
         stamp = int(self.stamps_ns[index])
         return tuple(pair for pair, triggers in enumerate(self._triggers) if stamp in triggers)
 
-    @property
-    def rate_hz(self) -> float:
-        """Images per second of the first pair."""
-        return self.rates_hz[0]
-
     @cached_property
     def world_T_body(self) -> Float:
         """True poses (N, 4, 4) of the framesets."""

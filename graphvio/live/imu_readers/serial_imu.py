@@ -92,7 +92,7 @@ class ImuLines:
             return
         stamp_ns = self._counter.stamp_ns(stamp_us)
         if self._newest_ns is not None and stamp_ns < self._newest_ns - _BACKWARDS_NS:
-            self._counts.add("clock_restarted")
+            self._counts.add(EventKind.CLOCK_RESTARTED)
             self._counter = MicrosecondCounter()
             stamp_ns = self._counter.stamp_ns(stamp_us)
             detail = f"{self._clock}: its clock went back to {stamp_us} us; it has restarted"

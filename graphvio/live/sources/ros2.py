@@ -123,7 +123,7 @@ class Ros2Source:
             cameras = _topics_of(rig, self._chosen, types, self.name)
             if rig.imu is not None and imu is None:
                 raise SourceError(
-                    f"{self.name}: nobody publishes samples of an IMU, and the rig has one; start its publisher, or "
+                    f"{self.name}: no topic has samples of an IMU, but the rig has one; start its publisher, or "
                     "give a rig without"
                 )
         if self._body is not None:
@@ -189,7 +189,7 @@ class Ros2Source:
                 break
         if missing or not published:
             raise SourceError(
-                f"{self.name}: nobody publishes {min(missing, default='anything')}; topics on domain {self._domain} "
+                f"{self.name}: no publisher of {min(missing, default='any topic')}; topics on domain {self._domain} "
                 f"are {', '.join(sorted({each.topic for each in published})) or 'none'}. Start the publisher, or check "
                 "ROS_DOMAIN_ID and the network"
             )
@@ -239,4 +239,4 @@ def _no_writer(topic: SensorTopic, where: str) -> SourceError:
             f"{where}: the publisher of {topic.name} does not send lost samples again (best effort); leave out "
             "reliable=1"
         )
-    return SourceError(f"{where}: nobody publishes {topic.name} any more; start its publisher again")
+    return SourceError(f"{where}: {topic.name} has no publisher any more; start its publisher again")
