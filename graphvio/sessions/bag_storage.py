@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,18 +13,57 @@ from graphvio.errors import MissingExtraError
 from graphvio.sessions import cdr, ros1
 from graphvio.sessions.storage import exists_error, not_writable_error
 
+try:
+    from rosbags import rosbag1, rosbag2
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+except ImportError:
+    raise MissingExtraError("rosbags", "sessions", "writing a bag") from None
+
 _ROS2_VERSION: Final = 8  # of metadata.yaml; the newest whose QoS profiles older distributions read, too
+_FOREVER = QosTime(9223372036, 854775807)  # as ROS writes it
+_LATCHED = Qos(  # the quality of service of ROS 2 that corresponds to a latched topic of ROS 1
+    history=QosHistory.KEEP_LAST,
+    depth=1,
+    reliability=QosReliability.RELIABLE,
+    durability=QosDurability.TRANSIENT_LOCAL,
+    deadline=_FOREVER,
+    lifespan=_FOREVER,
+    liveliness=QosLiveliness.AUTOMATIC,
+    liveliness_lease_duration=_FOREVER,
+    avoid_ros_namespace_conventions=False,
+)
 
 
 class _Bag:
-    """Common part of bags of ROS 1 and ROS 2."""
+    """Common part of bags of ROS 1 and ROS 2: see `Storage`."""
 
     has_attachments = False
     is_readable_when_cut = False
 
+    def __init__(self, path: Path, writer: Callable[[], Any]) -> None:
+        self.path = path
+        try:
+            with _os_errors():
+                self._writer = writer()
+                self._writer.open()
+        except (rosbag1.WriterError, rosbag2.WriterError):
+            raise exists_error(path) from None
+        except OSError as error:
+            raise not_writable_error(path, error) from None
+
     def attach(self, name: str, text: str) -> None:
         """Raise an error: bags have no attachments."""
         raise NotImplementedError
+
+    def finish(self) -> None:
+        """Write the index."""
+        with _os_errors():
+            self._writer.close()
+
+    def close(self) -> None:
+        """Close the file if it was not finished."""
+        with _os_errors():
+            self._writer.abort()
 
 
 class Ros1Storage(_Bag):
@@ -33,23 +74,11 @@ class Ros1Storage(_Bag):
 
     Raises:
         SessionError: if the file exists or cannot be created.
-        MissingExtraError: if the extra ``sessions`` is not installed.
     """
 
     def __init__(self, path: Path) -> None:
-        try:
-            from rosbags.rosbag1 import Writer, WriterError
-        except ImportError:
-            raise MissingExtraError("rosbags", "sessions", "writing a bag") from None
-        self.path = path
+        super().__init__(path, lambda: rosbag1.Writer(path))
         self._connections: dict[str, tuple[Any, int]] = {}  # topic -> connection, messages so far
-        try:
-            self._writer = Writer(path)
-            self._writer.open()
-        except WriterError:
-            raise exists_error(path) from None
-        except OSError as error:
-            raise not_writable_error(path, error) from None
 
     def write(self, topic: str, stamp_ns: int, message: Any, is_latched: bool) -> None:
         """Store a ROS 2 message as the ROS 1 message: see `Storage`."""
@@ -62,14 +91,6 @@ class Ros1Storage(_Bag):
         self._connections[topic] = connection, count + 1
         self._writer.write(connection, stamp_ns, ros1.encode(message, count))
 
-    def finish(self) -> None:
-        """Write the index."""
-        self._writer.close()
-
-    def close(self) -> None:
-        """Close the file if it was not finished."""
-        self._writer.abort()
-
 
 class Ros2Storage(_Bag):
     """A ROS 2 bag: a folder with an SQLite file, which holds its messages once it is finished.
@@ -79,70 +100,30 @@ class Ros2Storage(_Bag):
 
     Raises:
         SessionError: if the folder exists or cannot be created.
-        MissingExtraError: if the extra ``sessions`` is not installed.
     """
 
     def __init__(self, path: Path) -> None:
-        try:
-            from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
-        except ImportError:
-            raise MissingExtraError("rosbags", "sessions", "writing a bag") from None
-        self.path = path
+        sqlite = rosbag2.StoragePlugin.SQLITE3
+        super().__init__(path, lambda: rosbag2.Writer(path, version=_ROS2_VERSION, storage_plugin=sqlite))
         self._connections: dict[str, Any] = {}
-        try:
-            self._writer = Writer(path, version=_ROS2_VERSION, storage_plugin=StoragePlugin.SQLITE3)
-            self._writer.open()
-        except WriterError:
-            raise exists_error(path) from None
-        except (OSError, sqlite3.Error) as error:
-            raise not_writable_error(path, _as_os_error(error)) from None
 
     def write(self, topic: str, stamp_ns: int, message: Any, is_latched: bool) -> None:
         """Store a message: see `Storage`."""
-        try:
+        with _os_errors():
             if topic not in self._connections:
                 self._connections[topic] = self._writer.add_connection(
                     topic,
                     message.__msgtype__,
                     typestore=cdr.types(),
-                    offered_qos_profiles=[_latched()] if is_latched else [],
+                    offered_qos_profiles=[_LATCHED] if is_latched else [],
                 )
             self._writer.write(self._connections[topic], stamp_ns, cdr.encode(message))
-        except sqlite3.Error as error:
-            raise _as_os_error(error) from None
-
-    def finish(self) -> None:
-        """Commit the messages, and write ``metadata.yaml``."""
-        try:
-            self._writer.close()
-        except sqlite3.Error as error:
-            raise _as_os_error(error) from None
-
-    def close(self) -> None:
-        """Close the file if it was not finished."""
-        try:
-            self._writer.abort()
-        except sqlite3.Error as error:
-            raise _as_os_error(error) from None
 
 
-def _as_os_error(error: OSError | sqlite3.Error) -> OSError:
-    return error if isinstance(error, OSError) else OSError(errno.EIO, str(error))
-
-
-def _latched() -> Any:
-    """The quality of service of ROS 2 that corresponds to a latched topic of ROS 1."""
-    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-
-    forever = QosTime(9223372036, 854775807)  # as ROS writes it
-    return Qos(
-        history=QosHistory.KEEP_LAST,
-        depth=1,
-        reliability=QosReliability.RELIABLE,
-        durability=QosDurability.TRANSIENT_LOCAL,
-        deadline=forever,
-        lifespan=forever,
-        liveliness=QosLiveliness.AUTOMATIC,
-        liveliness_lease_duration=forever,
-        avoid_ros_namespace_conventions=False,
-    )
+@contextmanager
+def _os_errors() -> Iterator[None]:
+    """Raise errors of SQLite as OSError."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise OSError(errno.EIO, str(error)) from None

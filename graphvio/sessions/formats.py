@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, Self
 
@@ -11,17 +10,13 @@ from graphvio.errors import SessionError
 from graphvio.measurements.events import Event
 from graphvio.measurements.sensors import Measurement
 from graphvio.rig import Rig
-from graphvio.sessions.bag_storage import Ros1Storage, Ros2Storage
 from graphvio.sessions.euroc_writer import EurocWriter
-from graphvio.sessions.mcap_storage import McapStorage
-from graphvio.sessions.storage import Storage
 from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
 
 FORMATS = ("mcap", "rosbag1", "rosbag2", "euroc")
 
 _BY_SUFFIX = {".mcap": "mcap", ".bag": "rosbag1"}
-_STORAGES: dict[str, Callable[[Path], Storage]] = {"mcap": McapStorage, "rosbag1": Ros1Storage, "rosbag2": Ros2Storage}
 
 
 class RecordingWriter(Protocol):
@@ -93,4 +88,8 @@ def open_writer(path: Path, rig: Rig, file_format: str, image_format: ImageForma
     """
     if file_format == "euroc":
         return EurocWriter(path, rig)
-    return SessionWriter(path, rig, image_format, _STORAGES[file_format])
+    if file_format == "mcap":
+        return SessionWriter(path, rig, image_format)
+    from graphvio.sessions.bag_storage import Ros1Storage, Ros2Storage
+
+    return SessionWriter(path, rig, image_format, Ros1Storage if file_format == "rosbag1" else Ros2Storage)
