@@ -19,7 +19,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def room_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated recording: 5 s in the room, the first of them at rest, both pairs and the IMU."""
+    """A simulated recording: 5 s in the room, the first of them at a standstill, both pairs and the IMU."""
     base = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         base = base.parent  # whichever process comes first renders it for all

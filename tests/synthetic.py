@@ -21,7 +21,7 @@ from graphvio.rig import Camera, Imu, Rig, StereoPair
 settings.register_profile("synthetic", deadline=None, derandomize=True)
 settings.load_profile("synthetic")
 
-UP = np.array([0.0, 0.0, GRAVITY_M_S2])  # specific force at rest
+UP = np.array([0.0, 0.0, GRAVITY_M_S2])  # specific force at a standstill
 CAM_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # body_R_cam of a camera that looks along x
 
 

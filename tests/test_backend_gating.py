@@ -14,8 +14,8 @@ def test_relative_covariance_against_monte_carlo() -> None:
     joint = random_covariance(rng, 12, 2e-3)
     a_T_b = se3_inverse(nav_T_a) @ nav_T_b
     errors = []
-    for drawn in rng.multivariate_normal(np.zeros(12), joint, size=20000):
-        moved = se3_inverse(nav_T_a @ se3_exp(drawn[:6])) @ nav_T_b @ se3_exp(drawn[6:])
+    for sampled in rng.multivariate_normal(np.zeros(12), joint, size=20000):
+        moved = se3_inverse(nav_T_a @ se3_exp(sampled[:6])) @ nav_T_b @ se3_exp(sampled[6:])
         errors.append(se3_log(se3_inverse(a_T_b) @ moved))
     whitener = np.linalg.inv(np.linalg.cholesky(relative_covariance(a_T_b, joint)))
     np.testing.assert_allclose(np.cov(whitener @ np.array(errors).T), np.eye(6), atol=0.06)
@@ -40,14 +40,14 @@ def test_consistent_innovations_pass_as_often_as_they_should(probability: float)
     truth = random_transform(rng, 0.3, 1.0)
     of_measured, of_predicted = random_covariance(rng, 6, 0.01), random_covariance(rng, 6, 0.02)
     n = 4000
-    drawn = zip(
+    samples = zip(
         rng.multivariate_normal(np.zeros(6), of_measured, size=n),
         rng.multivariate_normal(np.zeros(6), of_predicted, size=n),
         strict=True,
     )
     passed = sum(
         gate_motion(truth @ se3_exp(a), of_measured, truth @ se3_exp(b), of_predicted, probability).accepted
-        for a, b in drawn
+        for a, b in samples
     )
     band = 4.0 * np.sqrt(probability * (1.0 - probability) / n) + 0.003
     assert passed / n == pytest.approx(probability, abs=band)

@@ -51,7 +51,7 @@ def test_faulty_samples_are_named_and_left_out() -> None:
 
 
 @pytest.mark.parametrize(("step", "found"), [(0.0, slice(215, 400)), (0.02, slice(300, 400))], ids=["fine", "coarse"])
-def test_an_axis_that_sticks_while_others_live_is_told(step: float, found: slice) -> None:
+def test_stuck_axis_while_others_change_is_reported(step: float, found: slice) -> None:
     """Of readings that change with every sample at once; of coarse ones when the others have moved enough."""
     rng, buffer = np.random.default_rng(0), ImuBuffer(50.0)
     faults = []
@@ -103,7 +103,7 @@ def test_a_simulator_without_noise_is_not_stuck() -> None:
         assert buffer.add(sample(5 * MS * i, bend, speeding_up)) == ""
 
 
-def test_coarse_readings_at_rest_are_not_stuck() -> None:
+def test_stuck_axes_coarse_readings_at_a_standstill_pass() -> None:
     """Also after a turn: an accelerometer that hardly sees it repeats its values from time to time."""
     rng, buffer = np.random.default_rng(0), ImuBuffer(50.0)
     for i in range(600):
@@ -192,7 +192,7 @@ def constant_interval(rate: Float, force: Float, duration_s: float, rate_hz: flo
     return ImuInterval(np.full(n, 1.0 / rate_hz), np.tile(rate, (n, 1)), np.tile(force, (n, 1)))
 
 
-def test_at_rest_it_stays_at_rest() -> None:
+def test_preintegration_at_a_standstill_stays() -> None:
     pose = gtsam.Pose3(gtsam.Rot3.Ypr(0.3, -0.8, 1.2), np.array([1.0, 2.0, 3.0]))
     up_in_body = pose.rotation().matrix().T @ [0.0, 0.0, GRAVITY_M_S2]  # specific force points up
     end = predicted(constant_interval(np.zeros(3), up_in_body, 2.0), gtsam.NavState(pose, np.zeros(3)))

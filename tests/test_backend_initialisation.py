@@ -15,7 +15,9 @@ IMU = Imu()
 FORWARD = np.array([1.0, 0.0, 0.0])
 
 
-def resting(nav_R_body: Float, gyro_bias: Float, seed: int, duration_s: float = 1.0, noise: float = 1.0) -> ImuInterval:
+def stationary(
+    nav_R_body: Float, gyro_bias: Float, seed: int, duration_s: float = 1.0, noise: float = 1.0
+) -> ImuInterval:
     n = round(duration_s * IMU.rate_hz)
     rng = np.random.default_rng(seed)
     root = noise * np.sqrt(IMU.rate_hz)
@@ -37,12 +39,12 @@ def assert_heading_is_zero(nav_R_body: Float) -> None:
 
 
 @pytest.mark.parametrize("angles_deg", [(0, 0), (20, -35), (-50, 170), (5, 90)])
-def test_at_rest(angles_deg: tuple[float, float]) -> None:
+def test_initial_attitude_at_a_standstill_is_level(angles_deg: tuple[float, float]) -> None:
     truth = Rotation.from_euler("YX", angles_deg, degrees=True).as_matrix()
     bias = np.array([0.01, -0.02, 0.015])
     normalised = []
     for seed in range(10):
-        at = initial_attitude(resting(truth, bias, seed), 1.0, CONFIG)
+        at = initial_attitude(stationary(truth, bias, seed), 1.0, CONFIG)
         assert at.is_stationary
         assert np.rad2deg(tilt_between(at.nav_R_body, truth)) < 0.1
         assert np.abs(at.gyro_bias - bias).max() < 1e-3
@@ -52,7 +54,7 @@ def test_at_rest(angles_deg: tuple[float, float]) -> None:
 
 
 def test_tilt_sigma_covers_an_accelerometer_bias() -> None:
-    interval = resting(np.eye(3), np.zeros(3), 0)
+    interval = stationary(np.eye(3), np.zeros(3), 0)
     biased = ImuInterval(interval.steps_s, interval.angular_velocity, interval.linear_acceleration + 0.15 * FORWARD)
     at = initial_attitude(biased, 1.0, CONFIG)
     assert tilt_between(at.nav_R_body, np.eye(3)) < 1.1 * at.tilt_sigma_rad
@@ -97,14 +99,14 @@ def test_shorter_intervals_are_less_certain() -> None:
     assert short > 1.5 * long
 
 
-def test_rest_is_not_believed_too_easily() -> None:
-    shaken, turning, falling = (resting(np.eye(3), np.zeros(3), 0) for _ in range(3))
+def test_standstill_with_motion_is_not_detected() -> None:
+    shaken, turning, falling = (stationary(np.eye(3), np.zeros(3), 0) for _ in range(3))
     shake = 0.3 * np.sin(np.arange(200))[:, None] * np.ones(3)
     intervals = [
         ImuInterval(shaken.steps_s, shaken.angular_velocity, shaken.linear_acceleration + shake),
         ImuInterval(turning.steps_s, turning.angular_velocity + 0.3, turning.linear_acceleration),
         ImuInterval(falling.steps_s, falling.angular_velocity, falling.linear_acceleration + 0.08 * UP),
-        resting(np.eye(3), np.zeros(3), 0, duration_s=0.2),
+        stationary(np.eye(3), np.zeros(3), 0, duration_s=0.2),
     ]
     for interval in intervals:
         assert not initial_attitude(interval, 0.1, CONFIG).is_stationary

@@ -21,7 +21,7 @@ from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Imu
 
-IMU = Imu(accel_random_walk=1e-5, gyro_random_walk=1e-7)  # biases are drawn once
+IMU = Imu(accel_random_walk=1e-5, gyro_random_walk=1e-7)  # biases are sampled once
 PERIOD_NS = 200_000_000  # a keyframe then lasts long enough that errors look different from its two ends
 KEYFRAMES = 5  # framesets from one to the next
 FIRST, FRAMES = 2, 20  # the pose is composed from the first of these over so many: between two that are no keyframes
@@ -36,14 +36,14 @@ CONFIG = SmootherConfig(
 )
 
 
-def drawn(covariance: Float, rng: np.random.Generator) -> Float:
+def sampled(covariance: Float, rng: np.random.Generator) -> Float:
     return np.asarray(np.linalg.cholesky(covariance) @ rng.standard_normal(6))
 
 
 def motion_from(start_ns: int, end_ns: int, shared_error: Float, rng: np.random.Generator) -> RelativeMotion:
     """What vision says of the walk: the error of the reference is in body there, the motion's own in body now."""
     truth = np.linalg.inv(pose_at(start_ns * 1e-9)) @ pose_at(end_ns * 1e-9)
-    own = drawn(OWN, rng)
+    own = sampled(OWN, rng)
     measured = transform(shared_error[:3], shared_error[3:]) @ truth @ transform(own[:3], own[3:])
     adjoint = se3_adjoint(se3_inverse(truth))
     shared = adjoint @ SHARED @ adjoint.T
@@ -55,7 +55,7 @@ class Run:
     """A smoother that is fed the synthetic walk by keyframes.
 
     Attributes:
-        split: whether the smoother is told which part of the covariance is shared.
+        split: whether the smoother knows which part of the covariance is shared.
         statistics: the gate's, of motions that are not the first from their reference.
     """
 
@@ -80,7 +80,7 @@ class Run:
         for k in range(1, last + 1):
             reference = (k - 1) // KEYFRAMES * KEYFRAMES
             if k == reference + 1:
-                shared_error = drawn(SHARED, rng)
+                shared_error = sampled(SHARED, rng)
             motion = motion_from(reference * PERIOD_NS, k * PERIOD_NS, shared_error, rng)
             if not self.split:
                 motion = replace(motion, shared_covariance=np.zeros((6, 6)))
@@ -134,7 +134,7 @@ def test_a_pose_composed_over_twenty_frames_is_within_its_covariance(with_imu: b
     assert low < np.mean([run.nees() for run in runs(with_imu, True)]) < high
 
 
-def test_a_shared_error_taken_for_independent_ones_is_told_wrongly() -> None:
+def test_shared_error_taken_for_independent_is_inconsistent() -> None:
     """Vision alone does not know that it cancels between two motions; an IMU seems to average it away."""
     low, high = band(SEEDS)
     assert np.mean([run.nees() for run in runs(False, False)]) < low - 0.3
@@ -176,7 +176,7 @@ def test_what_is_kept_goes_along_where_only_the_newest_states_are_corrected() ->
     smoother.update({0})
     assert smoother._advanced
     assert np.linalg.norm(smoother.pose(0)[:3, 3] - before[:3, 3]) > 5e-3
-    told, covariance = (se3_inverse(smoother.pose(0)) @ smoother.pose(4 * PERIOD_NS)), smoother.covariance_since(0)
+    motion, covariance = (se3_inverse(smoother.pose(0)) @ smoother.pose(4 * PERIOD_NS)), smoother.covariance_since(0)
     smoother._window.optimize()
     whole = se3_inverse(smoother.pose(0)) @ smoother.pose(4 * PERIOD_NS)
-    assert np.abs(se3_log(se3_inverse(whole) @ told) / np.sqrt(np.diag(covariance))).max() < 0.01
+    assert np.abs(se3_log(se3_inverse(whole) @ motion) / np.sqrt(np.diag(covariance))).max() < 0.01

@@ -28,13 +28,13 @@ def known_to(nav_T_body: Float, speed_sigma: float = SPEED_SIGMA) -> InitialUnce
 
 @dataclass
 class Run:
-    """A smoother that is fed the synthetic walk, and what it was told at the start."""
+    """A smoother that is fed the synthetic walk, and what it was initialised with."""
 
     seed: int
     with_imu: bool = True
     config: SmootherConfig = CONFIG
     duration_s: float = 6.0
-    settled: list[tuple[int, Float]] = field(default_factory=list)
+    final: list[tuple[int, Float]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.rng = rng = np.random.default_rng(self.seed)
@@ -65,7 +65,7 @@ class Run:
         accepted = not gated or self.smoother.gate(motion).accepted
         if accepted:
             self.smoother.add_motion(motion)
-        self.settled += self.smoother.update(keep)
+        self.final += self.smoother.update(keep)
         return accepted
 
     def until(self, end_s: float) -> bool:
@@ -78,7 +78,7 @@ class Run:
         end_ns = self.smoother.latest_ns + round(duration_s * 1e9)
         while self.smoother.latest_ns < end_ns:
             self.predict(self.smoother.latest_ns + PERIOD_NS)
-            self.settled += self.smoother.update(keep)
+            self.final += self.smoother.update(keep)
             sigmas.append(self.sigma())
         return sigmas
 
@@ -137,14 +137,14 @@ def test_a_start_in_motion_without_imu_is_no_outlier() -> None:
     assert smoother.gate(measured_motion(0, PERIOD_NS, np.random.default_rng(0))).accepted
 
 
-def test_settled_poses_come_once_and_in_order() -> None:
+def test_final_poses_come_once_and_in_order() -> None:
     run = Run(0)
     run.until(3.0)
-    stamps = [stamp for stamp, _ in run.settled]
+    stamps = [stamp for stamp, _ in run.final]
     held = [stamp for stamp, _ in run.smoother.all_poses()]
     assert stamps + held == list(stamps_ns(3.0))
     assert held[0] == 2_000_000_000
-    for stamp, pose in run.settled:
+    for stamp, pose in run.final:
         assert np.linalg.norm(pose[:3, 3] - pose_at(stamp * 1e-9)[:3, 3]) < 0.1
 
 
@@ -154,11 +154,11 @@ def test_poses_of_the_window_are_those_of_the_whole_solution() -> None:
     while run.smoother._advanced < 2:
         run.step(run.smoother.latest_ns + PERIOD_NS)
     left = [run.smoother.pose(stamp) for stamp in run.smoother._stamps]
-    told = [pose for _, pose in run.smoother.all_poses()]
+    returned = [pose for _, pose in run.smoother.all_poses()]
     assert run.smoother._advanced == 0
     run.smoother.optimize()
     whole = [pose for _, pose in run.smoother.all_poses()]
-    off_m, off_before_m = (np.abs(np.array(poses) - whole)[:, :3, 3].max() for poses in (told, left))
+    off_m, off_before_m = (np.abs(np.array(poses) - whole)[:, :3, 3].max() for poses in (returned, left))
     assert off_m < 5e-5
     assert off_before_m > 5e-4
 
@@ -300,10 +300,10 @@ def test_tilt_is_uncertain_about_navs_axes_and_heading_is_not() -> None:
     np.testing.assert_allclose(sigmas[:3], [1e-3, 0.01, 0.01], rtol=1e-6)
 
 
-# ------------------------------------------------------------------ what is told of velocity and biases
+# ------------------------------------------------------------------ velocity and biases
 
 
-def test_velocity_and_biases_are_as_certain_as_is_told() -> None:
+def test_velocity_and_biases_errors_are_consistent() -> None:
     squares: dict[str, list[float]] = {"velocity": [], "gyro_bias": [], "accel_bias": []}
     for seed in range(20):
         run = Run(100 + seed)
@@ -318,17 +318,17 @@ def test_velocity_and_biases_are_as_certain_as_is_told() -> None:
         for name, (error, covariance) in errors.items():
             assert covariance is not None
             squares[name].append(float(error @ np.linalg.solve(covariance, error)))
-    # Of 3, the mean of 20 known to 0.55; the biases drawn here are less than the window is prepared for.
+    # Of 3, the mean of 20 known to 0.55; the biases sampled here are less than the window is prepared for.
     assert 1.5 < np.mean(squares["velocity"]) < 5.0
     assert 0.5 < np.mean(squares["gyro_bias"]) < 5.0
     assert np.mean(squares["accel_bias"]) < 5.0
     assert Run(0, with_imu=False).smoother.state_covariance().velocity is None
 
 
-# ------------------------------------------------------------------ rest
+# ------------------------------------------------------------------ zero velocity
 
 
-def resting(seed: int, told: bool, duration_s: float = 4.0) -> Run:
+def stationary(seed: int, updates: bool, duration_s: float = 4.0) -> Run:
     """A rig that stands still from a start that does not know it."""
     run = Run(seed, duration_s=0.0)
     rng, pose = run.rng, np.eye(4)
@@ -348,7 +348,7 @@ def resting(seed: int, told: bool, duration_s: float = 4.0) -> Run:
         still = RelativeMotion(stamp - PERIOD_NS, stamp, motion, np.diag(noise**2), np.zeros((6, 6)), 100)
         if run.smoother.gate(still).accepted:
             run.smoother.add_motion(still)
-        if told:
+        if updates:
             assert run.smoother.gate_zero_velocity().accepted
             run.smoother.add_zero_velocity()
         run.smoother.update(())
@@ -357,11 +357,11 @@ def resting(seed: int, told: bool, duration_s: float = 4.0) -> Run:
 
 def test_standing_still_the_velocity_is_known_and_the_pose_stays() -> None:
     drifts: dict[bool, list[float]] = {False: [], True: []}
-    for told in drifts:
+    for updates in drifts:
         for seed in range(6):
-            run = resting(seed, told)
-            drifts[told].append(float(np.linalg.norm(run.smoother.state().nav_T_body[:3, 3])))
-    run = resting(0, True)
+            run = stationary(seed, updates)
+            drifts[updates].append(float(np.linalg.norm(run.smoother.state().nav_T_body[:3, 3])))
+    run = stationary(0, True)
     known = run.smoother.state_covariance().velocity
     assert known is not None
     assert np.sqrt(np.trace(known)) < 0.005
@@ -369,7 +369,7 @@ def test_standing_still_the_velocity_is_known_and_the_pose_stays() -> None:
     assert np.mean(drifts[True]) < 0.5 * np.mean(drifts[False])
 
 
-def test_a_velocity_that_is_surely_another_is_no_rest() -> None:
+def test_zero_velocity_gate_with_a_certain_velocity_refuses() -> None:
     run = Run(8)
     run.until(2.0)
     run.predict(2_050_000_000)
@@ -382,7 +382,7 @@ def test_a_velocity_that_is_surely_another_is_no_rest() -> None:
 
 @pytest.mark.parametrize("with_imu", [True, False], ids=["imu", "vision"])
 def test_a_reset_changes_nothing_but_the_window(with_imu: bool) -> None:
-    """Estimates and what is told of them stay the same; the window's own position is certain again."""
+    """Estimates and their covariances stay the same; the window's own position is certain again."""
     never, often = (Run(9, with_imu=with_imu) for _ in range(2))
     for end_s in (1.0, 2.0, 3.0, 4.0, 5.0):
         for run in (never, often):
@@ -402,21 +402,21 @@ def test_a_reset_changes_nothing_but_the_window(with_imu: bool) -> None:
 
 
 def own_position_sigma_m(run: Run) -> float:
-    """What the window does not know of the newest position though it were told all else of that state."""
+    """What the window does not know of the newest position given all else of that state."""
     smoother = run.smoother
     k = smoother._index_of[smoother.latest_ns]
     keys = [x(k), v(k), b(k)] if smoother.has_imu else [x(k)]
     joint = smoother._window.joint_covariance(keys)
-    rest, position = np.delete(np.arange(len(joint)), slice(3, 6)), np.arange(3, 6)
-    gain = np.linalg.solve(joint[np.ix_(rest, rest)], joint[np.ix_(rest, position)])
-    own = joint[3:6, 3:6] - joint[np.ix_(position, rest)] @ gain
+    others, position = np.delete(np.arange(len(joint)), slice(3, 6)), np.arange(3, 6)
+    gain = np.linalg.solve(joint[np.ix_(others, others)], joint[np.ix_(others, position)])
+    own = joint[3:6, 3:6] - joint[np.ix_(position, others)] @ gain
     return float(np.sqrt(np.linalg.eigvalsh(own)[-1]))
 
 
 # ------------------------------------------------------------------ accelerations
 
 
-def test_accelerations_that_no_rig_has_are_told() -> None:
+def test_excess_acceleration_beyond_any_rig_is_returned() -> None:
     run = Run(11, with_imu=False)
     run.until(1.0)
     stamp = run.smoother.latest_ns + PERIOD_NS

@@ -40,7 +40,7 @@ def numerical(function: Callable[[Float], Float], size: int, h: float = 1e-6) ->
 
 
 @SEEDS
-def test_the_error_is_added_and_told_again(seed: int) -> None:
+def test_state_plus_and_minus_are_inverse(seed: int) -> None:
     rng = np.random.default_rng(seed)
     state, error = some_state(rng), 0.3 * rng.standard_normal(ERRORS)
     np.testing.assert_allclose(state.plus(error).minus(state), error, atol=1e-12)
@@ -142,15 +142,15 @@ def test_an_update_adds_information(seed: int) -> None:
 
 
 def test_the_gate_has_the_measurements_degrees_of_freedom() -> None:
-    """Of honest innovations, it refuses the share that it is set to."""
+    """Of consistent innovations, it refuses the share that it is set to."""
     rng = np.random.default_rng(0)
     state, rates = some_state(rng), VisualRates.of(some_motion(rng))
     running = ExtendedKalmanFilter(state, random_covariance(rng, ERRORS, 0.01))
     for nominal in (vision(state, rates), gyro(state, np.zeros(3), 0.1)):
         spread = nominal.by_error @ running.covariance @ nominal.by_error.T + nominal.covariance
         root = np.linalg.cholesky(spread)
-        drawn = [replace(nominal, innovation=root @ rng.standard_normal(len(root))) for _ in range(4000)]
-        refused = np.mean([not running.gate(each, 0.95).accepted for each in drawn])
+        sampled = [replace(nominal, innovation=root @ rng.standard_normal(len(root))) for _ in range(4000)]
+        refused = np.mean([not running.gate(each, 0.95).accepted for each in sampled])
         assert abs(refused - 0.05) < 0.012  # 3.5 sigma of 4000 draws
 
 
@@ -160,10 +160,10 @@ def test_a_reset_forgets_only_the_position_for_itself() -> None:
     running = ExtendedKalmanFilter(some_state(rng), random_covariance(rng, ERRORS, 0.1))
     before, state = running.covariance.copy(), running.state
     forgotten = running.reset_position(1e-3)
-    after, rest = running.covariance, slice(ATTITUDE.start, ERRORS)
+    after, others = running.covariance, slice(ATTITUDE.start, ERRORS)
     assert running.state is state
-    np.testing.assert_array_equal(after[rest, rest], before[rest, rest])
-    np.testing.assert_array_equal(after[POSITION, rest], before[POSITION, rest])
+    np.testing.assert_array_equal(after[others, others], before[others, others])
+    np.testing.assert_array_equal(after[POSITION, others], before[POSITION, others])
     np.testing.assert_allclose(after[POSITION, POSITION] + forgotten, before[POSITION, POSITION] + 1e-6 * np.eye(3))
     assert np.linalg.eigvalsh(forgotten).min() > 0.0
     assert np.linalg.eigvalsh(after).min() > 0.0

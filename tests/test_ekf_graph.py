@@ -60,9 +60,9 @@ class Comparison:
         for step in steps:
             running.predict(DT, SIGMAS)
             graph.predict(DT, SIGMAS)
-            offered = step.expectations()
-            passed = [each for each in offered if running.gate(each(running.state), PROBABILITY).accepted]
-            self.refused += len(offered) - len(passed)
+            candidates = step.expectations()
+            passed = [each for each in candidates if running.gate(each(running.state), PROBABILITY).accepted]
+            self.refused += len(candidates) - len(passed)
             if passed:
                 running.update(stacked([each(running.state) for each in passed]))
                 self.updates += 1
@@ -75,7 +75,7 @@ class Comparison:
             self.covariance_error = max(self.covariance_error, apart.max())
 
 
-def drawn(rng: np.random.Generator, start: FilterState, count: int) -> Iterator[Step]:
+def synthetic_steps(rng: np.random.Generator, start: FilterState, count: int) -> Iterator[Step]:
     """Measurements of a random walk of the process itself, one of 30 far off."""
     state, bias = start, 0.02 * rng.standard_normal(3)
     for _ in range(count):
@@ -92,11 +92,11 @@ def drawn(rng: np.random.Generator, start: FilterState, count: int) -> Iterator[
         yield Step(VisualRates(values, covariance), rate, force)
 
 
-def test_it_is_the_filter_on_drawn_data() -> None:
+def test_graph_on_synthetic_data_equals_the_filter() -> None:
     rng = np.random.default_rng(0)
     start = FilterState(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
     comparison = Comparison()
-    comparison.run(start, drawn(rng, start, 1000))
+    comparison.run(start, synthetic_steps(rng, start, 1000))
     assert (comparison.updates, comparison.refused > 20) == (1000, True)
     assert comparison.state_error < 1e-6
     assert comparison.covariance_error < 1e-6
@@ -115,7 +115,7 @@ def test_it_is_the_filter_on_a_real_imu() -> None:
 
 
 def real(rng: np.random.Generator, count: int) -> tuple[Iterator[Step], FilterState]:
-    """The IMU of EuRoC V1_01, and relative poses drawn around its truth, one of 30 far off; and the first state."""
+    """The IMU of EuRoC V1_01, and relative poses sampled around its truth, one of 30 far off; and the first state."""
     folder = REAL_DATA / "euroc_v101_imu" / "mav0"
     table = read_imu_csv(folder / "imu0" / "data.csv", FaultLog("euroc_v101_imu"))
     truth = load_trajectory(folder / "state_groundtruth_estimate0" / "data.csv")
@@ -145,17 +145,17 @@ def test_a_longer_lag_and_more_iterations_come_nearer_to_the_batch() -> None:
     """All measurements at once, iterated to convergence, have one solution; the filter is farther from it."""
     rng = np.random.default_rng(1)
     start = FilterState(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    steps = list(drawn(rng, start, 60))
-    running, offered = ExtendedKalmanFilter(start, START), []
+    steps = list(synthetic_steps(rng, start, 60))
+    running, candidates = ExtendedKalmanFilter(start, START), []
     for step in steps:  # what passes the filter's gates is given to all
         running.predict(DT, SIGMAS)
         passed = [each for each in step.expectations() if running.gate(each(running.state), PROBABILITY).accepted]
         running.update(stacked([each(running.state) for each in passed]))
-        offered.append(passed)
+        candidates.append(passed)
     ends = []
     for lag, iterations in ((1, 1), (10, 3), (100, 10)):
         graph = PaperGraph(start, START, lag, iterations)
-        for passed in offered:
+        for passed in candidates:
             graph.predict(DT, SIGMAS)
             for each in passed:
                 graph.add(each)

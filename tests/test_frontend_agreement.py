@@ -90,7 +90,7 @@ def test_of_sides_with_about_the_same_support_the_first_pair_comes_first() -> No
         assert [side.pairs for side in judged(mixed((TRUTH, points[0]), (DOOR, points[1]))).hypotheses] == [(0,), (1,)]
 
 
-def test_pairs_that_contradicted_each_other_need_less_to_be_told_apart() -> None:
+def test_pairs_that_contradicted_each_other_in_doubt_separate_sooner() -> None:
     off = transform([0.001, 0.0, 0.0], [0.0, 0.0, 0.0]) @ TRUTH  # between 2 and 5 sigma
     seen = mixed((TRUTH, 80), (off, 80))
     usual, doubtful = judged(seen), judged(seen, in_doubt=True)
@@ -102,7 +102,7 @@ def test_pairs_that_contradicted_each_other_need_less_to_be_told_apart() -> None
     assert len(judged(mixed((TRUTH, 80), (TRUTH, 80)), in_doubt=True).hypotheses) == 1
 
 
-def test_in_a_camp_each_pair_agrees_with_every_other() -> None:
+def test_consensus_set_has_pairs_that_all_agree() -> None:
     apart = {(0, 1): 30.0, (0, 2): 100.0, (1, 2): 30.0}  # a chain: the middle one agrees with both ends
     assert _consensus_sets([1, 0, 2], apart, in_doubt=False) == [[1, 0], [2]]
     assert _consensus_sets([2, 1, 0], apart, in_doubt=False) == [[2, 1], [0]]
@@ -210,7 +210,7 @@ def test_a_single_pair_has_nobody_to_contradict_it() -> None:
     assert agreement.own == {}
 
 
-def test_each_pair_is_told_its_own_error() -> None:
+def test_pair_report_has_the_pairs_own_error() -> None:
     quiet_px, loud_px = 0.15, 0.3
     quiet = seen_points(RIG, TRUTH, 200, np.random.default_rng(5), sigma_px=quiet_px).of_pair(0)
     loud = seen_points(RIG, TRUTH, 200, np.random.default_rng(6), sigma_px=loud_px).of_pair(1)
@@ -239,7 +239,7 @@ def test_a_pair_that_the_chosen_motion_does_not_explain_has_no_error_under_it() 
 @pytest.mark.parametrize("second", [TRUTH, DOOR], ids=["one world", "a door"])
 @pytest.mark.parametrize("seed", range(3))
 def test_swapping_pairs_changes_only_their_names(second: Float, seed: int) -> None:
-    """Other triples are drawn, so that motions agree as far as refinement converges: to a hundredth of a sigma."""
+    """Other triples are sampled, so that motions agree as far as refinement converges: to a hundredth of a sigma."""
     seen = mixed((TRUTH, 90), (second, 60), seed)
     order = np.argsort(1 - seen.pair, kind="stable")
     columns: list[AnyArray] = [column[order] for column in seen]
@@ -336,7 +336,7 @@ def test_images_that_all_repeat_say_nothing_for_sure() -> None:
     assert np.sqrt(motion.covariance[3, 3]) == pytest.approx(1.0, rel=0.01)  # a metre in a second
 
 
-def test_the_weakest_directions_of_a_motion_are_told() -> None:
+def test_weakest_sigmas_are_those_of_the_weakest_directions() -> None:
     turned = transform([0.3, -0.2, 0.5], [0.0, 0.0, 0.0])[:3, :3]
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = turned @ np.diag([1e-6, 4e-6, 2e-6]) @ turned.T
@@ -344,7 +344,7 @@ def test_the_weakest_directions_of_a_motion_are_told() -> None:
     assert replace(measured(TRUTH, 50), covariance=covariance).weakest_sigmas == pytest.approx((2e-3, 0.03))
 
 
-def test_max_distance_and_weak_directions_are_told() -> None:
+def test_graded_distance_and_weak_directions_enlarge_the_covariance() -> None:
     base = np.trace(measured(TRUTH, 200).covariance)
     assert np.trace(judgement([measured(TRUTH, 200)], 36.0, None, CONFIRMED)[0].covariance) == pytest.approx(3.0 * base)
     weak = replace(measured(TRUTH, 200), covariance=np.diag([1e-8] * 5 + [0.01]))
@@ -368,9 +368,9 @@ def test_the_share_that_stereo_confirms_is_that_of_all_corners() -> None:
         return replace(PairFrame.empty(), ids=np.arange(of), has_depth=np.arange(of) < with_depth)
 
     reference, current = {0: frame(90, 100), 1: frame(80, 100)}, {0: frame(60, 100), 1: frame(4, 50)}
-    told = stereo_share(reference, current, [0.1, 0.2])
-    assert told.share == pytest.approx((100 * 0.6 + 50 * 0.08) / 150)
-    assert told.baseline_m == 0.2
+    share_of_stereo = stereo_share(reference, current, [0.1, 0.2])
+    assert share_of_stereo.share == pytest.approx((100 * 0.6 + 50 * 0.08) / 150)
+    assert share_of_stereo.baseline_m == 0.2
     assert stereo_share({1: reference[1]}, current, [0.1, 0.2]).share == pytest.approx(0.08)
     assert stereo_share({**reference, 1: frame(0, 0)}, current, [0.1, 0.2]).share == pytest.approx(100 * 0.6 / 150)
     assert stereo_share({0: frame(0, 0)}, {0: frame(0, 0)}, [0.1, 0.2]).share == 0.0

@@ -135,8 +135,8 @@ def test_pure_translation_shows_rotation_only(translation_only: bool) -> None:
 
 @pytest.mark.parametrize(("known_to", "size"), [(1e-6, 0.5), (3e-4, None), (6e-3, 0.5 ** (1 / 3))])
 def test_a_corrected_pair_counts_for_what_is_known_of_its_place(known_to: float, size: float | None) -> None:
-    """With its place known exactly, both pairs count alike. With it hardly known, the first one alone tells the motion,
-    but for two of six directions: a turn about the axis of the motion's turn and a shift along it change nothing."""
+    """With exact extrinsics, both pairs count alike. With very uncertain ones, the first one alone determines the
+    motion up to two directions: a turn about the axis of the motion's turn and a shift along it."""
     rng, noise = np.random.default_rng(8), 1e-4
     covariance = noise**2 * np.eye(6)
     nees, sizes = [], []
@@ -148,10 +148,10 @@ def test_a_corrected_pair_counts_for_what_is_known_of_its_place(known_to: float,
             noisy = np.ascontiguousarray(se3_exp(noise * rng.standard_normal(6)) @ each)
             own.append(Refined(noisy, covariance, 0.5 * covariance, INLIER, ERRORS_PX))
         place = Misalignment(d, known_to**2 * np.eye(6), 100.0)
-        told = combined(own[0], [placed(own[0], None), placed(own[1], place)])
-        error = se3_log(np.ascontiguousarray(told.cur_T_ref @ np.linalg.inv(motion)))
-        nees.append(error @ np.linalg.solve(told.covariance, error))
-        sizes.append(np.linalg.det(told.covariance / noise**2) ** (1 / 6))
-        assert np.linalg.eigvalsh(told.covariance - told.shared_covariance).min() > 0.0
+        found = combined(own[0], [placed(own[0], None), placed(own[1], place)])
+        error = se3_log(np.ascontiguousarray(found.cur_T_ref @ np.linalg.inv(motion)))
+        nees.append(error @ np.linalg.solve(found.covariance, error))
+        sizes.append(np.linalg.det(found.covariance / noise**2) ** (1 / 6))
+        assert np.linalg.eigvalsh(found.covariance - found.shared_covariance).min() > 0.0
     assert 5.5 < np.mean(nees) < 6.5  # 400 draws of 6 degrees of freedom: 6.0 +- 0.17
     assert size is None or np.mean(sizes) == pytest.approx(size, rel=0.05)

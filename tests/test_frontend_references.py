@@ -49,7 +49,7 @@ def spent(reference: PairFrame, newest: PairFrame) -> bool:
 
 @pytest.mark.parametrize(("near_left", "expected"), [(30, False), (20, False), (8, True)])
 def test_a_keyframe_whose_near_points_have_gone_is_spent(near_left: int, expected: bool) -> None:
-    """Far points stay for long, and are most of them; what they tell of translation is nothing."""
+    """Far points stay for long, and are most of them; they do not constrain the translation."""
     depths = np.concatenate([np.full(100, FAR), np.full(30, NEAR)])
     reference = frame(0, depths)
     assert reference.constrains_translation(0.3).sum() == 30

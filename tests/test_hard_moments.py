@@ -163,17 +163,17 @@ def test_the_walk_as_it_is(room_walk: Path, measurements: list[Measurement]) -> 
         rotation_rad, translation_m = estimate.vision_sigmas or (np.inf, np.inf)
         assert 1e-6 < rotation_rad < 1e-3
         assert 1e-5 < translation_m < 5e-3
-    resting = [estimate.is_stationary for estimate in walk.estimates]
-    assert np.mean(resting[6:19]) > 0.9  # the first second, of which a quarter goes by before it can be told
-    assert not any(resting[:5])
-    assert not any(resting[40:])  # and then it has begun to walk
+    stationary = [estimate.is_stationary for estimate in walk.estimates]
+    assert np.mean(stationary[6:19]) > 0.9  # the first second, of which a quarter goes by before it can be detected
+    assert not any(stationary[:5])
+    assert not any(stationary[40:])  # and then it has begun to walk
     again = Walk(room_walk, measurements, as_it_is)
     for one, other in zip(walk.estimates, again.estimates, strict=True):
         assert np.array_equal(one.nav_T_body, other.nav_T_body)  # type: ignore[arg-type]
         assert np.array_equal(one.covariance, other.covariance)  # type: ignore[arg-type]
 
 
-def test_an_error_of_p12_is_told_and_corrected(room_walk: Path, measurements: list[Measurement]) -> None:
+def test_error_of_p12_is_reported_and_corrected(room_walk: Path, measurements: list[Measurement]) -> None:
     """1 degree and 3 cm: over each second the two pairs stay better than the better one of them.
 
     The ATE of so short a walk, half a millimetre, is partly luck: it stays below a multiple of the better pair's.
@@ -181,9 +181,9 @@ def test_an_error_of_p12_is_told_and_corrected(room_walk: Path, measurements: li
     rig = open_source(room_walk).rig.without_imu()
     error = misplacement(1.0, 0.03)
     walk = Walk(room_walk, measurements, as_it_is, rig=with_wrong_place(rig, 1.0, 0.03))
-    told = [event for event in walk.events if event.kind == "extrinsics_off"]
-    assert len(told) == 1
-    assert "pair back" in told[0].detail
+    reported = [event for event in walk.events if event.kind == "extrinsics_off"]
+    assert len(reported) == 1
+    assert "pair back" in reported[0].detail
     found = walk.odometry._frontend.misaligned[1].tangent
     assert np.linalg.norm(found + se3_log(error)) < np.hypot(np.deg2rad(0.2), 0.01)
 

@@ -1,4 +1,4 @@
-"""Ctrl-C at any moment: a line that tells what is there, and exit code 130."""
+"""Ctrl-C at any moment: a line that says what is there, and exit code 130."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def cold(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def interrupted_kernel(*_: Any, **__: Any) -> NoReturn:
-    """What numba makes of Ctrl-C in a kernel, a function further out having failed on that in turn."""
+    """What numba makes of Ctrl-C in a kernel, a function farther out having failed on that in turn."""
     try:
         try:
             raise KeyboardInterrupt
@@ -111,7 +111,7 @@ def test_a_recording_that_is_interrupted_can_be_read(
     ("command", "stub"),
     [("run", "graphvio.pipeline.run"), ("optimize", "graphvio.optimization.pipeline.optimize_sessions")],
 )
-def test_a_run_that_is_interrupted_tells_where_its_results_are(
+def test_run_interrupted_says_where_its_results_are(
     command: str, stub: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stub, interrupted_kernel)
@@ -171,10 +171,10 @@ def test_a_real_interrupt_ends_a_recording(recording: Path, tmp_path: Path) -> N
         for _ in range(5):
             recorder.stdout.readline()
         os.kill(recorder.pid, signal.SIGINT)
-        _, told = recorder.communicate(timeout=30)
-    assert recorder.returncode == 130, told
-    assert f"interrupted; what was recorded until then is in {out}, which can be read" in told
-    assert "Traceback" not in told
+        _, printed = recorder.communicate(timeout=30)
+    assert recorder.returncode == 130, printed
+    assert f"interrupted; what was recorded until then is in {out}, which can be read" in printed
+    assert "Traceback" not in printed
     file = open_store(out)
     assert file.is_whole
     assert 5 <= len(file.topics["/imu"].places) < 240

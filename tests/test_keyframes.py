@@ -131,7 +131,7 @@ def test_motions_between_keyframes_are_within_their_covariance(
         assert np.linalg.eigvalsh(now.relative_covariance)[0] > 0.0
         true = se3_inverse(world_T_body(truth, before.stamp_ns)) @ world_T_body(truth, now.stamp_ns)
         squares.append(squared_error(now.previous_T_body, true, now.relative_covariance))
-    # 6 where errors are as large as told; the room's are smaller, since noise is sharper than `pixel_sigma_px`.
+    # 6 where errors are consistent; the room's are smaller, since noise is sharper than `pixel_sigma_px`.
     assert 0.05 < np.mean(squares) < 10.0
     assert max(squares) < 30.0
 
@@ -232,7 +232,7 @@ def test_a_start_in_motion_has_no_keyframe_until_it_is_known(rig: Rig, measureme
 
 
 def test_a_break_of_the_epoch_breaks_the_chain_and_ends_the_map(rig: Rig, measurements: list[Measurement]) -> None:
-    begun, rest = until(measurements, 50), measurements[len(until(measurements, 50)) :]
+    begun, remaining = until(measurements, 50), measurements[len(until(measurements, 50)) :]
     odometry, keyframes, before = Odometry(rig), list[Keyframe](), list[Estimate]()
     front_end = FrontEnd(odometry)
     front_end.on_keyframe(keyframes.append)
@@ -244,7 +244,7 @@ def test_a_break_of_the_epoch_breaks_the_chain_and_ends_the_map(rig: Rig, measur
     assert front_end.correct(old, transform([0, 0, 1.0], [5.0, 0, 0]), TIGHT).accepted
     assert front_end.map_T_body(before[-1].stamp_ns) is not None
     estimates = []
-    for measurement in until(rest, 15):
+    for measurement in until(remaining, 15):
         estimate = odometry.process(replace(measurement, stamp_ns=measurement.stamp_ns + 10**13))
         if estimate is not None:
             estimates.append(estimate)
@@ -307,7 +307,7 @@ def test_landmarks_are_where_the_simulator_has_them(run: Run, rig: Rig) -> None:
 
 
 def test_landmarks_covariances_are_those_of_their_errors() -> None:
-    """Points drawn, seen with noise by both cameras of a pair, and triangulated."""
+    """Random points, seen with noise by both cameras of a pair, and triangulated."""
     rng, sigma_px, count, squares = np.random.default_rng(1), 0.3, 2000, list[Float]()
     rig = two_pair_rig()
     for j, pair in enumerate(rig.pairs):
@@ -452,8 +452,8 @@ def test_neither_listeners_nor_corrections_change_an_estimate(rig: Rig, measurem
         for keyframe in front_end.keyframes():
             read.append(keyframe)
             for k in range(keyframe.id + 1):
-                offered = transform([0, 0, 0], [10.0 * (keyframe.id % 2), 0, 0]) @ read[k].odom_T_body
-                moved.append(front_end.correct(k, offered, TIGHT).accepted)
+                candidate = transform([0, 0, 0], [10.0 * (keyframe.id % 2), 0, 0]) @ read[k].odom_T_body
+                moved.append(front_end.correct(k, candidate, TIGHT).accepted)
 
     def ask() -> None:
         while not is_over.is_set():

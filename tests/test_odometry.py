@@ -132,10 +132,10 @@ def test_framesets_are_not_held_for_ever(odometry: Odometry, measurements: list[
     cut = 400
     begun = [odometry.process(measurement) for measurement in measurements[:cut]]
     assert any(begun)
-    rest = framesets(measurements[cut:])
-    estimates = [e for f in rest if (e := odometry.process(f)) is not None]
+    remaining = framesets(measurements[cut:])
+    estimates = [e for f in remaining if (e := odometry.process(f)) is not None]
     wait_ns = Config().timing.max_imu_wait_ms * 1e6
-    assert len(estimates) >= len(rest) - wait_ns // 50_000_000 - 1
+    assert len(estimates) >= len(remaining) - wait_ns // 50_000_000 - 1
     assert all(e.status is Status.TRACKING for e in estimates)
     assert "imu_not_covering" in kinds(odometry)
 
@@ -192,7 +192,7 @@ def test_time_never_goes_back(odometry: Odometry, measurements: list[Measurement
     assert stamps == sorted(set(stamps))
 
 
-def test_unusable_samples_are_left_out_and_told(odometry: Odometry, measurements: list[Measurement]) -> None:
+def test_unusable_samples_are_left_out_and_reported(odometry: Odometry, measurements: list[Measurement]) -> None:
     for measurement in measurements[:300]:
         odometry.process(measurement)
     last = next(e for e in reversed(measurements[:300]) if isinstance(e, ImuSample))
@@ -272,19 +272,19 @@ def test_a_blackout_coasts_on_the_imu_with_growing_covariance(
     assert np.linalg.norm(steps, axis=1).max() < 0.12  # walking speed: at most 6 cm a frameset, and no jump
 
 
-def test_poses_are_told_at_the_imus_rate(room_walk: Path, measurements: list[Measurement], truth: Trajectory) -> None:
-    told: list[Prediction] = []
-    odometry = Odometry(open_source(room_walk).rig, on_prediction=told.append)
+def test_predictions_come_at_the_imus_rate(room_walk: Path, measurements: list[Measurement], truth: Trajectory) -> None:
+    predictions: list[Prediction] = []
+    odometry = Odometry(open_source(room_walk).rig, on_prediction=predictions.append)
     assert odometry.predict(measurements[0].stamp_ns) is None  # there is no pose yet
     estimates = feed(odometry, measurements)
-    rate_hz = len(told) / (1e-9 * (told[-1].stamp_ns - told[0].stamp_ns))
+    rate_hz = len(predictions) / (1e-9 * (predictions[-1].stamp_ns - predictions[0].stamp_ns))
     assert rate_hz == pytest.approx(200.0, rel=0.01)
-    assert (np.diff([each.stamp_ns for each in told]) > 0).all()
-    true, _ = truth.at(np.array([each.stamp_ns for each in told]), 0.1)
+    assert (np.diff([each.stamp_ns for each in predictions]) > 0).all()
+    true, _ = truth.at(np.array([each.stamp_ns for each in predictions]), 0.1)
     assert estimates[0].nav_T_body is not None
     first, _ = truth.at(np.array([estimates[0].stamp_ns]), 0.1)
     true_T_nav_heading = first.rotations[0] @ estimates[0].nav_T_body[:3, :3].T
-    placed = np.array([true_T_nav_heading @ each.nav_T_body[:3, 3] for each in told]) + first.positions[0]
+    placed = np.array([true_T_nav_heading @ each.nav_T_body[:3, 3] for each in predictions]) + first.positions[0]
     assert np.linalg.norm(placed - true.positions, axis=1).max() < 0.02
     newest = estimates[-1]
     again = odometry.predict(newest.stamp_ns)
@@ -330,12 +330,12 @@ def test_malformed_measurements_are_refused(odometry: Odometry) -> None:
         odometry.process(FrameSet(1, {0: (np.zeros((480, 640), np.uint8),)}))  # type: ignore[dict-item]
     image = np.zeros((480, 640), dtype=np.uint8)
     odometry.process(FrameSet(0, {0: np.stack([image, image])}))  # type: ignore[dict-item]
-    for images, told in (
+    for images, message in (
         ([(image, image)], "images is a list"),
         ({0: None}, "not two images"),
         ({0: (image, [[1, 2], [3, 4]])}, "something else than arrays"),
     ):
-        with pytest.raises(MeasurementError, match=told):
+        with pytest.raises(MeasurementError, match=message):
             odometry.process(FrameSet(0, images))  # type: ignore[arg-type]
     with pytest.raises(MeasurementError, match="all be numbers"):
         odometry.process(ImuSample(0, "fast", np.zeros(3)))  # type: ignore[arg-type]

@@ -36,36 +36,36 @@ def propagator(start_s: float = 1.0, end_s: float = 1.1) -> Propagator:
 
 @pytest.mark.parametrize("at_ms", [1000, 1003, 1050, 1099, 1100])
 def test_poses_between_samples_are_those_of_the_motion(at_ms: int) -> None:
-    told = propagator().predict(at_ms * MS)
-    assert told is not None
-    error = se3_log(se3_inverse(pose_at(at_ms * 1e-3)) @ told.nav_T_body)
+    predicted = propagator().predict(at_ms * MS)
+    assert predicted is not None
+    error = se3_log(se3_inverse(pose_at(at_ms * 1e-3)) @ predicted.nav_T_body)
     assert np.abs(error).max() < 2e-5
-    np.testing.assert_allclose(told.velocity_nav, velocity_at(at_ms * 1e-3), atol=1e-3)
-    np.testing.assert_allclose(told.angular_velocity, imu_at(at_ms * 1e-3)[0], atol=1e-3)
-    assert told.stamp_ns == at_ms * MS
-    assert told.epoch == 3
+    np.testing.assert_allclose(predicted.velocity_nav, velocity_at(at_ms * 1e-3), atol=1e-3)
+    np.testing.assert_allclose(predicted.angular_velocity, imu_at(at_ms * 1e-3)[0], atol=1e-3)
+    assert predicted.stamp_ns == at_ms * MS
+    assert predicted.epoch == 3
 
 
-def test_samples_that_come_one_by_one_tell_the_same() -> None:
+def test_add_one_by_one_predicts_the_same() -> None:
     whole, stepwise = propagator(), propagator(1.0, 1.0)
     stamps, values = samples(1.0, 1.1)
     for stamp, value in zip(stamps[1:].tolist(), values[1:], strict=True):
-        told, expected = stepwise.add(stamp, value), whole.predict(stamp)
-        assert told is not None
+        predicted, expected = stepwise.add(stamp, value), whole.predict(stamp)
+        assert predicted is not None
         assert expected is not None
-        np.testing.assert_array_equal(told.nav_T_body, expected.nav_T_body)
+        np.testing.assert_array_equal(predicted.nav_T_body, expected.nav_T_body)
 
 
 def test_beyond_the_newest_sample_it_goes_on_for_a_while() -> None:
-    told = propagator().predict(1150 * MS)
-    assert told is not None
-    assert np.abs(se3_log(se3_inverse(pose_at(1.15)) @ told.nav_T_body)).max() < 2e-2
+    predicted = propagator().predict(1150 * MS)
+    assert predicted is not None
+    assert np.abs(se3_log(se3_inverse(pose_at(1.15)) @ predicted.nav_T_body)).max() < 2e-2
     assert propagator().predict(1301 * MS) is None
     assert propagator().predict(999 * MS) is None
     assert Propagator(200.0, 50.0).predict(0) is None
 
 
-def test_nothing_is_told_across_a_gap_or_once_forgotten() -> None:
+def test_predict_across_a_gap_or_once_forgotten_is_none() -> None:
     gap = propagator()
     assert gap.add(1151 * MS, np.zeros(6)) is None
     assert gap.predict(1152 * MS) is None
@@ -87,20 +87,20 @@ def test_samples_behind_a_gap_are_not_reached() -> None:
         np.delete(stamps, range(3, 16)),
         np.delete(values, range(3, 16), axis=0),
     )
-    told, expected = made.predict(1100 * MS), Propagator(200.0, 50.0)
+    predicted, expected = made.predict(1100 * MS), Propagator(200.0, 50.0)
     expected.restart(1000 * MS, state_at(1.0), 0, np.zeros(3), stamps[:3], values[:3])
     held = expected.predict(1100 * MS)
-    assert told is not None
+    assert predicted is not None
     assert held is not None
-    np.testing.assert_array_equal(told.nav_T_body, held.nav_T_body)
+    np.testing.assert_array_equal(predicted.nav_T_body, held.nav_T_body)
 
 
 def test_an_imu_alone_is_not_believed_for_ever() -> None:
     made = propagator(1.0, 1.0)
     stamps, values = samples(1.0, 6.5)
-    told = [made.add(stamp, value) is not None for stamp, value in zip(stamps.tolist(), values, strict=True)]
-    assert told[1:1001] == [True] * 1000
-    assert not any(told[1001:])
+    predicted = [made.add(stamp, value) is not None for stamp, value in zip(stamps.tolist(), values, strict=True)]
+    assert predicted[1:1001] == [True] * 1000
+    assert not any(predicted[1001:])
 
 
 def test_a_sample_that_is_known_already_changes_nothing() -> None:
@@ -129,7 +129,7 @@ def test_without_samples_velocity_and_rate_in_body_go_on() -> None:
     assert made.predict(1201 * MS) is None
 
 
-def test_the_buffer_tells_the_imu_from_an_instant_on() -> None:
+def test_buffer_since_an_instant_interpolates() -> None:
     buffer = filled_buffer(IMU, 0.1, np.random.default_rng(1), GYRO_BIAS, ACCEL_BIAS)
     stamps, values = buffer.since(52 * MS)
     interval = buffer.interval(52 * MS, 100 * MS)
@@ -151,9 +151,9 @@ def test_one_thread_asks_while_another_works() -> None:
 
     def ask() -> None:
         while not done.is_set():
-            told = made.predict(1150 * MS)
-            if told is not None and np.abs(se3_log(se3_inverse(pose_at(1.15)) @ told.nav_T_body)).max() > 0.2:
-                wrong.append(told)
+            predicted = made.predict(1150 * MS)
+            if predicted is not None and np.abs(se3_log(se3_inverse(pose_at(1.15)) @ predicted.nav_T_body)).max() > 0.2:
+                wrong.append(predicted)
 
     asking = threading.Thread(target=ask)
     asking.start()

@@ -1,4 +1,4 @@
-"""The smoother on a real IMU, with motions of vision that are drawn from the truth beside it."""
+"""The smoother on a real IMU, with motions of vision that are sampled from the truth."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Beginning:
         return Beginning(stamps.tolist(), whole, poses.nav_T_body, gyro_bias + more_bias)
 
     def started(self, rng: np.random.Generator) -> Smoother:
-        """A smoother that begins at the file's pose and at rest, but for errors, and knows nothing of the biases."""
+        """A smoother initialised at the file's pose and at a standstill up to errors, with unknown biases."""
         pose = self.world_T_body[0]
         covariance = origin_covariance(pose[:3, :3], TILT_SIGMA)
         off = np.linalg.cholesky(covariance) @ rng.standard_normal(6)

@@ -1,4 +1,4 @@
-"""Starts in the midst of motion: attitude, velocity and biases come from the first motions by vision and the IMU."""
+"""Initialisation in motion: attitude, velocity and biases come from the first motions by vision and the IMU."""
 
 from dataclasses import dataclass, field, replace
 
@@ -60,7 +60,7 @@ class Outcome:
 
     Attributes:
         tilt_deg, speed_m_s: errors of roll and pitch, and of velocity in body.
-        tilt_sigma_deg, speed_sigma_m_s: as they are told.
+        tilt_sigma_deg, speed_sigma_m_s: as reported.
         step_m: how far the step to the frameset is from the true one, in the frame of the rig before it.
     """
 
@@ -117,15 +117,15 @@ def run(
                     estimator.apply(VisualResult(motion, Quality.GOOD, "", {}), is_stationary=False).motion is not None
                 )
         out.status.append(estimator.update(stamp_ns, used, frozenset()).status)
-        state, told = estimator.state(), estimator.covariance
+        state, covariance = estimator.state(), estimator.covariance
         rotation = state.nav_T_body[:3, :3]
         out.tilt_deg.append(float(np.rad2deg(np.arccos(min(rotation[2] @ true[2, :3], 1.0)))))
-        about_nav = (rotation @ told.pose[:3, :3] @ rotation.T)[:2, :2]
+        about_nav = (rotation @ covariance.pose[:3, :3] @ rotation.T)[:2, :2]
         out.tilt_sigma_deg.append(float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(about_nav)[-1]))))
         error = rotation.T @ state.velocity_nav - true[:3, :3].T @ swing.velocity(t)
-        assert told.velocity is not None
+        assert covariance.velocity is not None
         out.speed_m_s.append(float(np.linalg.norm(error)))
-        out.speed_sigma_m_s.append(float(np.sqrt(np.linalg.eigvalsh(told.velocity)[-1])))
+        out.speed_sigma_m_s.append(float(np.sqrt(np.linalg.eigvalsh(covariance.velocity)[-1])))
         step, true_step = (np.linalg.inv(a) @ b for a, b in ((before, state.nav_T_body), (true_before, true)))
         out.step_m.append(float(np.linalg.norm(step[:3, 3] - true_step[:3, 3])))
         before_ns, before, true_before = stamp_ns, state.nav_T_body, true
@@ -155,12 +155,12 @@ def test_without_motions_it_is_never_known() -> None:
     assert Status.TRACKING not in out.status
 
 
-def test_what_is_lacking_is_told_once() -> None:
-    """Of points that are all far away, vision tells the rotation alone."""
+def test_initialisation_that_lacks_something_is_reported_once() -> None:
+    """Of points that are all far away, vision measures the rotation alone."""
     out = run(0, 1.0, 0.5, sigmas=np.repeat([1e-3, 5.0], 3))
     assert set(out.status) <= {Status.INITIALISING, Status.COASTING}
-    ((told_s, _, detail),) = [event for event in out.events if event[1] == "not_initialised"]
-    assert told_s == pytest.approx(2.05, abs=0.01)
+    ((reported_s, _, detail),) = [event for event in out.events if event[1] == "not_initialised"]
+    assert reported_s == pytest.approx(2.05, abs=0.01)
     assert "velocity" in detail
 
 

@@ -41,7 +41,7 @@ class Run:
 
 
 def test_it_is_as_certain_as_it_may_be() -> None:
-    """Offsets that are drawn from what is thought of them at first; squared errors over the variance that is told."""
+    """Offsets sampled from their prior; squared errors over the reported variance."""
     rng, squares = np.random.default_rng(0), []
     for seed in range(60):
         error_s = 0.005 * rng.standard_normal()

@@ -136,7 +136,7 @@ def test_a_right_image_belongs_to_the_nearest_left_one() -> None:
     assert (index.left_alone.tolist(), index.right_alone.tolist()) == ([0], [53 * MS])
 
 
-def test_sides_further_apart_than_the_tolerance_are_no_pair(tmp_path: Path) -> None:
+def test_pair_images_beyond_the_tolerance_are_not_joined(tmp_path: Path) -> None:
     write_euroc(tmp_path)
     shifted = [f"{s + 3 * MS},{s}.png" for s in frame_stamps(10)]
     write_rows(tmp_path / "mav0/cam3/data.csv", shifted)
@@ -200,8 +200,8 @@ def images_of(*pairs: int) -> dict[int, tuple[np.ndarray, np.ndarray]]:
 def test_pairs_of_one_instant_that_come_separately_are_joined_while_held(
     first: tuple[int, ...], second: tuple[int, ...], apart_us: int, framesets: list[list[int]], kinds: list[str]
 ) -> None:
-    told: list[str] = []
-    synchroniser = Synchroniser(small_rig(2), Config(), lambda _, kind, __: told.append(kind))
+    reported: list[str] = []
+    synchroniser = Synchroniser(small_rig(2), Config(), lambda _, kind, __: reported.append(kind))
     synchroniser.add_frameset(FrameSet(START_NS, images_of(*first)))
     synchroniser.add_frameset(FrameSet(START_NS + 1000 * apart_us, images_of(*second)))
     held: list[FrameSet] = []
@@ -209,7 +209,7 @@ def test_pairs_of_one_instant_that_come_separately_are_joined_while_held(
         held.append(frameset)
     assert [sorted(frameset.images) for frameset in held] == framesets
     assert held[0].stamp_ns == START_NS
-    assert told == kinds
+    assert reported == kinds
 
 
 # ------------------------------------------------------------------ the odometry

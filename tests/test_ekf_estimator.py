@@ -1,4 +1,4 @@
-"""The paper's filter in the odometry's place: what it uses, refuses, forgets and tells."""
+"""The paper's filter in the odometry's place: what it uses, refuses, forgets and reports."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ class Walk:
     config: FilterConfig = field(default_factory=FilterConfig)
     with_imu: bool = True
     seed: int = 0
-    told: list[str] = field(default_factory=list)
+    kinds: list[str] = field(default_factory=list)
     statuses: list[Status] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.rng = np.random.default_rng(self.seed)
         rig = two_pair_rig(IMU if self.with_imu else None)
         config = replace(Config.from_yaml(PAPER), filter=self.config)
-        self.estimator = FilterEstimator(rig, config, lambda _, kind, detail: self.told.append(kind))
+        self.estimator = FilterEstimator(rig, config, lambda _, kind, detail: self.kinds.append(kind))
         self.imu = filled_buffer(IMU, 20.0, self.rng, GYRO_BIAS, np.zeros(3))
         interval = self.imu.segment(0, 1_000_000_000) if self.with_imu else None
         self.now_ns = 1_000_000_000
@@ -112,7 +112,7 @@ def test_an_impossible_acceleration_is_refused() -> None:
     walk = Walk(FilterConfig(gate_probability=0.9999999999, accel_sigma_m_s2=20.0))
     walk.steps(2.0)
     assert not walk.step(off=transform(np.zeros(3), [0.2, 0.0, 0.0]))  # 4 m/s within 50 ms
-    assert walk.told.count("vision_gated") == 1
+    assert walk.kinds.count("vision_gated") == 1
     assert walk.step()
 
 
@@ -120,7 +120,7 @@ def test_a_wrong_motion_is_gated_and_what_follows_is_not() -> None:
     walk = Walk()
     walk.steps(2.0)
     assert not walk.step(off=transform([0.0, 0.3, 0.0], np.zeros(3)))
-    assert walk.told == ["vision_gated"]
+    assert walk.kinds == ["vision_gated"]
     assert walk.statuses[-1] is Status.COASTING
     assert all(walk.steps(1.0))
 
@@ -137,10 +137,10 @@ def test_blind_the_gyro_holds_the_attitude_and_the_position_is_lost_in_the_end()
     assert np.arccos(np.clip(0.5 * (np.trace(found[:3, :3].T @ truth[:3, :3]) - 1.0), -1.0, 1.0)) < 0.03
     walk.steps(4.0, blind=True)
     assert walk.statuses[-1:] == [Status.LOST]
-    assert walk.told.count("lost") == 1
+    assert walk.kinds.count("lost") == 1
     walk.steps(0.5)
     assert walk.statuses[-1:] == [Status.TRACKING]
-    assert (walk.told[-1], walk.estimator.epoch) == ("new_epoch", 1)
+    assert (walk.kinds[-1], walk.estimator.epoch) == ("new_epoch", 1)
 
 
 def test_a_gate_that_shuts_for_long_opens_again() -> None:
@@ -148,11 +148,11 @@ def test_a_gate_that_shuts_for_long_opens_again() -> None:
     walk = Walk(FilterConfig(accel_sigma_m_s2=1.5, max_gated_s=0.5))
     walk.steps(2.0)
     walk.steps(1.5, off=transform(np.zeros(3), [0.3, 0.0, 0.0]))
-    assert walk.told.count("gate_reset") == 1
+    assert walk.kinds.count("gate_reset") == 1
     assert walk.statuses[-1:] == [Status.TRACKING]
 
 
-def test_resets_change_nothing_that_is_told() -> None:
+def test_position_reset_does_not_change_estimates() -> None:
     never, often = (Walk(FilterConfig(reset_s=reset_s)) for reset_s in (100.0, 0.5))
     for walk in (never, often):
         walk.steps(6.0)
@@ -167,7 +167,7 @@ def test_a_long_gap_opens_an_epoch() -> None:
     walk.now_ns += 5_000_000_000
     before = walk.sigma_m()
     walk.step()
-    assert (walk.told[-1], walk.estimator.epoch) == ("time_jump", 1)
+    assert (walk.kinds[-1], walk.estimator.epoch) == ("time_jump", 1)
     assert walk.sigma_m() > before + 0.9
 
 
