@@ -11,7 +11,7 @@ from graphvio.arrays import Float, Int
 from graphvio.live.clocks import ClockMap
 
 _BEGIN_NS = 1_700_000_000_000_000_000  # host's time
-_LEAST_DELAY_NS = 700_000
+_MIN_DELAY_NS = 700_000
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def synthetic_messages(
     """Messages from some time on; each waits for the ones before it, as in a queue."""
     count = round(duration_s * conditions.rate_hz)
     at_ns = np.round(np.arange(count) * (1e9 / conditions.rate_hz)).astype(np.int64)
-    true_ns = _BEGIN_NS + round(1e9 * begin_s) + _LEAST_DELAY_NS + at_ns
+    true_ns = _BEGIN_NS + round(1e9 * begin_s) + _MIN_DELAY_NS + at_ns
     stamps_ns = 5_000_000 + np.round(at_ns / (1.0 + 1e-6 * conditions.drift_ppm)).astype(np.int64)
     delay_ms = rng.exponential(conditions.jitter_ms, count)
     delay_ms += (rng.random(count) < conditions.outlier_share) * rng.exponential(conditions.outlier_ms, count)

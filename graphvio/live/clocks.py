@@ -20,7 +20,7 @@ _CONFIRMATIONS = 3  # readings that agree on another clock,
 _CONFIRMED_NS = 50_000_000  # for so long, so that a queue that empties is not enough,
 _CONFIRMED_PAUSE_NS = 1_000_000_000  # and longer if their stamps continue, which a pause of the host explains
 
-_MAX_BACK_NS = 250_000_000  # a stamp that is further behind its sensor's is of a clock that was set back
+_MAX_BACK_NS = 250_000_000  # a stamp that is farther behind its sensor's is of a clock that was set back
 _MAX_AHEAD_NS = 100_000_000  # of one sensor's stamps to the others'
 _GAP_NS = round((MAX_UNBRIDGED_S + 1.0) * 1e9)  # so that the odometry starts a new epoch
 _RECENT = 3
@@ -33,7 +33,7 @@ class ClockMap:
     stamp has been mapped, every stamp up to it always maps to the same time. Its errors are corrected by a rate on top
     of the drift, 0.5 s/s at most in its first second and 1 ms/s from then on.
 
-    The least delay of messages cannot be told from an offset: mapped times are later than the truth by it.
+    The least delay of messages cannot be distinguished from an offset: mapped times are later than the truth by it.
 
     A clock that is off by more than 0.5 s is mapped again; the drift, which is the crystal's, is kept. Three stamps
     have to agree on that over 50 ms, and are not mapped until they do.
