@@ -41,35 +41,25 @@ def rig_of_topics(messages: MessageReader, name: str) -> Rig | None:
     imu = next(iter(of_type(messages.topics, IMU)), None)
     found = []
     for pair, (left, right) in stereo_topics(images).items():
-        infos = [_info(messages, topic) for topic in (left, right)]
-        if infos[0] is not None and infos[1] is not None:
-            found.append((pair, left, right, infos[0], infos[1]))
+        left_info, right_info = _info(messages, left), _info(messages, right)
+        if left_info is not None and right_info is not None:
+            found.append((pair, left, right, left_info, right_info))
     if not found:
         return None
-    body = _first(messages, imu).header.frame_id if imu is not None else ""
-    first = _frame(found[0][3], found[0][1])
-    if imu is not None and path_between(transforms, body, first) is None:
-        raise RigError(
-            f"{name}: no transform leads from the IMU ({body}) to the camera {first}; give a rig of your own"
-        )
-    body = body if imu is not None else first
+    body = _first(messages, imu).header.frame_id if imu is not None else _frame(found[0][3], found[0][1])
     pairs = []
     for pair, left, right, left_info, right_info in found:
-        body_T_left = path_between(transforms, body, _frame(left_info, left))
+        left_frame = _frame(left_info, left)
+        body_T_left = path_between(transforms, body, left_frame)
         if body_T_left is None:
-            raise RigError(
-                f"{name}: no transform leads from {body} to {_frame(left_info, left)}; give a rig of your own"
-            )
-        left_T_right = path_between(transforms, _frame(left_info, left), _frame(right_info, right))
+            start = f"the IMU ({body})" if imu is not None else body
+            raise RigError(f"{name}: no transform leads from {start} to {left_frame}; give a rig of your own")
+        left_T_right = path_between(transforms, left_frame, _frame(right_info, right))
         if left_T_right is None or np.allclose(left_T_right, np.eye(4)):
             left_T_right = np.eye(4)
             left_T_right[0, 3] = -right_info.p[3] / right_info.p[0] if right_info.p[0] else 0.0
-        places = (body_T_left, body_T_left @ left_T_right)
-        cameras = [
-            _camera(topic, info, place)
-            for topic, info, place in zip((left, right), (left_info, right_info), places, strict=True)
-        ]
-        pairs.append(StereoPair(pair, *cameras))
+        left_camera = _camera(left, left_info, body_T_left)
+        pairs.append(StereoPair(pair, left_camera, _camera(right, right_info, body_T_left @ left_T_right)))
     return Rig(tuple(pairs), Imu() if imu is not None else None, name)
 
 
