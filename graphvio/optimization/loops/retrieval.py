@@ -35,10 +35,23 @@ def vocabulary(descriptors: Sequence[AnyArray], seed: int, max_words: int = _WOR
         return np.zeros((0, 128), dtype=np.float32)
     sample = np.concatenate(chosen).astype(np.float32) / np.float32(_LENGTH)
     words = min(max_words, len(sample))
-    cv2.setRNGSeed(seed)
     stop = (cv2.TERM_CRITERIA_MAX_ITER, _ITERATIONS, 0.0)
-    _, _, centres = cv2.kmeans(sample, words, None, stop, 1, cv2.KMEANS_PP_CENTERS)  # type: ignore[call-overload]
+    labels = _initial_labels(sample, words, rng)
+    _, _, centres = cv2.kmeans(sample, words, labels, stop, 1, cv2.KMEANS_USE_INITIAL_LABELS)
     return np.asarray(centres, dtype=np.float32)
+
+
+def _initial_labels(sample: AnyArray, words: int, rng: np.random.Generator) -> AnyArray:
+    """Choose initial words by k-means++ and return the nearest one (N, 1) of each row of a sample (N, D)."""
+    nearest, labels = np.full(len(sample), np.inf), np.zeros((len(sample), 1), dtype=np.int32)
+    chosen = int(rng.integers(len(sample)))
+    for word in range(words):
+        distances = ((sample - sample[chosen]) ** 2).sum(axis=1, dtype=np.float64)
+        labels[distances < nearest] = word
+        nearest = np.minimum(nearest, distances)
+        total = nearest.sum()
+        chosen = int(rng.choice(len(sample), p=nearest / total)) if total > 0.0 else int(rng.integers(len(sample)))
+    return labels
 
 
 def describe(descriptors: AnyArray, words: AnyArray) -> AnyArray:
