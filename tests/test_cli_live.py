@@ -22,12 +22,12 @@ from typer.testing import CliRunner
 from graphvio import FrameSet, open_source
 from graphvio.cli import app
 from graphvio.cli.dashboard import Dashboard, line_of, summary_of
-from graphvio.cli.stopping import StopSignals
 from graphvio.errors import GraphvioError, RigError
 from graphvio.live import sources
 from graphvio.measurements.events import Event
 from graphvio.measurements.readings import DeviceHealth
 from graphvio.queues import Broadcast
+from graphvio.runtime import StopSignals
 from graphvio.sessions.store import open_store
 
 pytest.importorskip("mcap")

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from graphvio import FrameSet, open_source
 from graphvio.cli import app, main
-from graphvio.cli.interrupts import HeldInterrupt, interruptible
 from graphvio.errors import MissingExtraError
+from graphvio.runtime import HeldInterrupt, interruptible
 from graphvio.sessions.store import open_store
 
 pytest.importorskip("mcap")

@@ -10,7 +10,7 @@ import pytest
 
 _CODE = """
 import ctypes, sys, threading
-from graphvio.live.heap import share_heap
+from graphvio.runtime import share_heap
 
 libc = ctypes.CDLL(None)
 libc.malloc.argtypes, libc.malloc.restype = [ctypes.c_size_t], ctypes.c_void_p

@@ -12,7 +12,6 @@ from graphvio.cli.dump_config import dump_config
 from graphvio.cli.evaluate import evaluate
 from graphvio.cli.fleet import fleet
 from graphvio.cli.info import info
-from graphvio.cli.interrupts import interruptible
 from graphvio.cli.live import live
 from graphvio.cli.optimize import optimize
 from graphvio.cli.record import convert, record
@@ -22,6 +21,7 @@ from graphvio.cli.simulate import simulate
 from graphvio.cli.slam import slam
 from graphvio.cli.view import view
 from graphvio.errors import GraphvioError
+from graphvio.runtime import interruptible
 
 EXIT_BAD_INPUT = 2
 

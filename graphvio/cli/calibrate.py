@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -67,6 +66,7 @@ def calibrate(
     from graphvio.config import Config
     from graphvio.errors import CalibrationError
     from graphvio.rig_files import save_rig
+    from graphvio.runtime import use_one_opencv_thread
     from graphvio.warmup import warm_up
 
     _check_places(out, report, [] if rig is None else [rig])
@@ -75,6 +75,7 @@ def calibrate(
     if correct_imu and (out is None or opened.rig.imu is None):
         raise CalibrationError("--correct-imu wants --out FILE to write the rig to, and a recording with an IMU")
     mode = _scale_mode(scale)
+    use_one_opencv_thread()
     warm_up(opened.rig.with_pairs([0]).without_imu(), settings)
     names = [pair.name for pair in opened.rig.pairs]
     with _Following(opened.frameset_count, names if guide else None) as following:
@@ -158,13 +159,15 @@ class _Following:
         self._interrupted = False
 
     def __enter__(self) -> _Following:
-        self._before = signal.signal(signal.SIGINT, self._interrupt)
+        from graphvio.runtime import on_interrupt
+
+        self._restore = on_interrupt(self._interrupt)
         if self._console.is_terminal:
             self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._let_go()
+        self._restore()
         if self._console.is_terminal:
             self._bar.stop()
         if self._advice is not None and not self._was_enough:
@@ -176,7 +179,7 @@ class _Following:
         self._bar.update(self._task, completed=number)
         if number == self._total:
             self._bar.update(self._task, description="all together")
-            self._let_go()
+            self._restore()  # from here on Ctrl-C ends the command
         if self._guide is not None and number % self._GUIDE_EVERY == 0:
             self._show(self._guide.advise(separate.motions()), number)
         return self._interrupted
@@ -189,14 +192,9 @@ class _Following:
         if newly_enough or (not self._console.is_terminal and number % self._PLAIN_EVERY == 0):
             self._console.print(f"frameset {number}: {advice.text}", soft_wrap=True, highlight=False)
 
-    def _interrupt(self, *_: object) -> None:
+    def _interrupt(self) -> None:
         self._interrupted = True
-        self._let_go()
         self._console.print(f"ended at frameset {self.framesets} of {self._total}", soft_wrap=True, highlight=False)
-
-    def _let_go(self) -> None:
-        """Ctrl-C ends the command from here on."""
-        signal.signal(signal.SIGINT, self._before)
 
 
 def _working(text: str) -> AbstractContextManager[object]:

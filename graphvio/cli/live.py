@@ -81,15 +81,14 @@ def run_live(
     from time import monotonic
 
     from graphvio.cli.dashboard import Dashboard, line_of, summary_of
-    from graphvio.cli.stopping import StopSignals, sigterm_as_interrupt
     from graphvio.config import Config
     from graphvio.live.health import HealthServer
-    from graphvio.live.heap import share_heap
     from graphvio.live.outputs import ViewOutput
     from graphvio.live.running import LiveOdometry
     from graphvio.live.session_recorder import SessionRecorder
     from graphvio.live.sources import open_live_source
     from graphvio.rig_files import load_rig
+    from graphvio.runtime import StopSignals, share_heap, sigterm_as_interrupt, use_one_opencv_thread
     from graphvio.warmup import warm_up
 
     if duration_s is not None and not duration_s > 0.0:
@@ -110,6 +109,7 @@ def run_live(
         stack.callback(opened.close)
         with sigterm_as_interrupt():  # nothing is there yet that would have to be saved
             used = opened.open()
+            use_one_opencv_thread()
             warm_up(used, settings)  # what sensors deliver meanwhile is not wanted
         signals = stack.enter_context(StopSignals())
         recording = stack.enter_context(ExitStack())  # ends after the run, so that it has all that was made

@@ -60,12 +60,12 @@ def optimize(
 
         graphvio optimize monday.mcap tuesday.mcap --out both
     """
-    from graphvio.cli.interrupts import interruptible
     from graphvio.cli.run import EXIT_INCOMPLETE, EXIT_INTERRUPTED, open_recording
     from graphvio.config import Config
     from graphvio.optimization.loops.database import colmap
     from graphvio.optimization.pipeline import optimize_sessions
     from graphvio.results import ResultWriter
+    from graphvio.runtime import interruptible, use_one_opencv_thread
     from graphvio.warmup import warm_up
 
     if not no_loops:
@@ -78,6 +78,7 @@ def optimize(
     folder = out
     if folder is None:
         folder = ResultWriter.new_folder(Path("results"), f"{opened[0].name}-optimized")
+    use_one_opencv_thread()
     for source in opened:
         warm_up(source.rig, settings)
     try:

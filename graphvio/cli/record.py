@@ -46,6 +46,7 @@ def record(
     from graphvio.config import Config
     from graphvio.errors import SessionError
     from graphvio.odometry import Odometry
+    from graphvio.runtime import use_one_opencv_thread
     from graphvio.sessions.writer import SessionWriter
     from graphvio.warmup import warm_up
 
@@ -53,6 +54,7 @@ def record(
         raise SessionError(f"{out}: is recorded as MCAP, which is read by its name; name it .mcap")
     settings = Config.load(config)
     opened = open_recording(source, rig, settings, pairs=None, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
+    use_one_opencv_thread()
     warm_up(opened.rig, settings)
     writer = SessionWriter(out, opened.rig, "png" if png else "raw")
     truth = _truth(opened, is_whole=from_s is None and to_s is None)
@@ -133,8 +135,8 @@ def _write(opened: Source, truth: Trajectory | None, writer: RecordingWriter, od
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from graphvio.cli.interrupts import HeldInterrupt, interruptible
     from graphvio.measurements.sensors import FrameSet
+    from graphvio.runtime import HeldInterrupt, interruptible
     from graphvio.sessions.writer import SessionWriter
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

@@ -55,11 +55,11 @@ def run(
     """
     from contextlib import ExitStack
 
-    from graphvio.cli.interrupts import interruptible
     from graphvio.config import Config
     from graphvio.pipeline import RunListener
     from graphvio.pipeline import run as run_pipeline
     from graphvio.results import ResultWriter
+    from graphvio.runtime import interruptible, use_one_opencv_thread
     from graphvio.viewer import Viewer
     from graphvio.warmup import warm_up
 
@@ -72,6 +72,7 @@ def run(
         if view or save_rrd:
             viewer = stack.enter_context(Viewer(opened.rig, spawn=view, save=save_rrd))
             listeners.append(RunListener(on_estimate=viewer.show, on_event=viewer.show_event))
+        use_one_opencv_thread()
         warm_up(opened.rig, settings)
         listeners.append(RunListener(on_progress=stack.enter_context(_ProgressLine()).show))
         try:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from graphvio.cli.stopping import held_back
 from graphvio.errors import GraphvioError, MapError, ServiceError
+from graphvio.runtime import stop_signals_blocked
 
 if TYPE_CHECKING:
     from multiprocessing.synchronize import Event
@@ -45,7 +45,7 @@ class SlamProcess:
         self._is_told = False
         context = get_context("spawn")
         self._ready = context.Event()  # before signals are blocked: its helper process, once started, unblocks them
-        with held_back():  # signals are for the odometry, with which the SLAM ends
+        with stop_signals_blocked():  # signals are for the odometry, with which the SLAM ends
             try:
                 self._folder = tempfile.mkdtemp(prefix="graphvio-map-")
             except OSError as error:

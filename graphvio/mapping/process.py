@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
@@ -17,6 +16,7 @@ from graphvio.config import Config
 from graphvio.errors import GraphvioError, MapError, ServiceError
 from graphvio.mapping.mapper import Mapper
 from graphvio.optimization.loops.database import colmap
+from graphvio.runtime import ignore_stop_signals, use_one_opencv_thread
 from graphvio.slam.client import Client
 from graphvio.slam.keyframe import Keyframe
 from graphvio.trajectory import Trajectory
@@ -26,7 +26,6 @@ from graphvio.warmup import warm_up
 
 _MAP_COLOUR, _ODOM_COLOUR = (40, 190, 90), (150, 150, 150)
 _SHOWN_EVERY = 3  # places
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclass(frozen=True)
@@ -70,11 +69,8 @@ def run_mapping(task: MappingTask, ready: Event) -> str:
         GraphvioError: if the odometry cannot be reached, or the map not be used or written.
     """
     colmap()  # takes SIGTERM for itself when it is loaded
-    for number in _SIGNALS:
-        # They are for the odometry, with which this ends. What is started here, as the page for browsers, is ended by
-        # them: it would inherit that they are ignored or blocked, but not a handler.
-        signal.signal(number, lambda *_: None)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+    ignore_stop_signals()  # they are for the odometry, with which this process ends
+    use_one_opencv_thread()
     with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map, task.folder) as mapper:
         warm_up(client.rig, task.config)
         try:

@@ -23,9 +23,9 @@ from campaigns.live_listener import Listener
 from campaigns.live_services import Services
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
-from graphvio.live.heap import share_heap
 from graphvio.live.running import LiveOdometry
 from graphvio.live.sources.simulator import SimulatedRig
+from graphvio.runtime import share_heap
 from graphvio.warmup import warm_up
 
 _SCENE = "room"

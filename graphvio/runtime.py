@@ -1,0 +1,221 @@
+"""Settings of the whole process: threads, memory and signals.
+
+No object of the library changes the process that it runs in. The command line makes the settings of this module; a
+program that embeds graphvio makes those that suit it:
+
+- `use_one_opencv_thread`, since pairs are tracked in threads of their own, with which OpenCV's would compete;
+- `share_heap` before threads are started, where images pass through many threads for hours;
+- `interruptible` around calls that Ctrl-C should end, even while compiled code runs.
+
+Compiled kernels are cached in the folder that the environment variable ``GRAPHVIO_CACHE_DIR`` names, see
+`graphvio.kernels.cache_root`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, Self
+
+from graphvio.errors import MissingExtraError
+
+_M_ARENA_MAX = -8  # of glibc's malloc.h
+_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+# ---------------------------------------------------------------------- threads and memory
+
+
+def use_one_opencv_thread() -> None:
+    """Switch off OpenCV's own threads in this process."""
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
+def share_heap() -> bool:
+    """Let all threads of this process that are started from now on allocate from one heap.
+
+    glibc gives threads heaps of their own, between which nothing is exchanged: a process through which images pass
+    keeps the free memory of each, and grows for minutes. It is as ``MALLOC_ARENA_MAX=1`` in the environment.
+
+    Returns:
+        Whether the C library has such an option. Heaps that exist already remain in use.
+    """
+    if not sys.platform.startswith("linux"):
+        return False
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    return mallopt is not None and mallopt(_M_ARENA_MAX, 1) == 1
+
+
+# ---------------------------------------------------------------------- Ctrl-C
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """End what is inside by `KeyboardInterrupt` at Ctrl-C, even if it came while compiled code ran.
+
+    Compiled kernels end by a `SystemError` in whose chain of causes the interrupt is, compiled libraries that are being
+    loaded by an `ImportError`, which may have been taken for a missing library.
+
+    Raises:
+        KeyboardInterrupt: At Ctrl-C.
+    """
+    try:
+        yield
+    except (SystemError, ImportError, MissingExtraError) as error:
+        if not _is_interrupt(error):
+            raise
+        raise KeyboardInterrupt from error
+
+
+def on_interrupt(handler: Callable[[], None]) -> Callable[[], None]:
+    """Call a function at the next Ctrl-C, and act as before at those that follow.
+
+    Args:
+        handler: Called in the main thread.
+
+    Returns:
+        A function that ends this earlier.
+    """
+    before: list[Any] = []
+
+    def restore() -> None:
+        if before:
+            signal.signal(signal.SIGINT, before.pop())
+
+    def handle(*_: object) -> None:
+        restore()
+        handler()
+
+    before.append(signal.signal(signal.SIGINT, handle))
+    return restore
+
+
+class HeldInterrupt:
+    """Holds back Ctrl-C inside until `check`, so that nothing is left half written; a second one acts as ever.
+
+    Outside of the main thread, and where Ctrl-C is ignored, nothing changes.
+    """
+
+    def __init__(self) -> None:
+        self._came = False
+        self._before: Any = None
+
+    def __enter__(self) -> Self:
+        is_main = threading.current_thread() is threading.main_thread()
+        if is_main and signal.getsignal(signal.SIGINT) not in (signal.SIG_IGN, None):
+            self._before = signal.signal(signal.SIGINT, self._hold)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._restore()
+
+    def check(self) -> None:
+        """End what is inside if Ctrl-C came.
+
+        Raises:
+            KeyboardInterrupt: If it did.
+        """
+        if self._came:
+            raise KeyboardInterrupt
+
+    def _hold(self, *_: object) -> None:
+        self._came = True
+        self._restore()
+
+    def _restore(self) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+            self._before = None
+
+
+# ---------------------------------------------------------------------- Ctrl-C and SIGTERM
+
+
+class StopSignals:
+    """Takes note of the first Ctrl-C or SIGTERM inside, so that all can be saved; a second one acts as ever.
+
+    Attributes:
+        came: Whether one did.
+    """
+
+    def __init__(self) -> None:
+        self.came = False
+        self._before: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> Self:
+        for number in _STOP_SIGNALS:
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):  # as in the background of a script
+                self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._restore()
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.came = True
+        self._restore()
+
+    def _restore(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
+
+
+@contextmanager
+def sigterm_as_interrupt() -> Iterator[None]:
+    """End what is inside by `KeyboardInterrupt` at SIGTERM, as at Ctrl-C, so that what it started is cleaned up."""
+    if signal.getsignal(signal.SIGTERM) in (signal.SIG_IGN, None):
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def stop_signals_blocked() -> Iterator[None]:
+    """Deliver Ctrl-C and SIGTERM after what is inside; processes that are started inside begin with both blocked."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOP_SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def ignore_stop_signals() -> None:
+    """Leave Ctrl-C and SIGTERM to the process that started this one.
+
+    Processes that are started here are ended by them: they would inherit that signals are ignored or blocked, but they
+    do not inherit a handler that does nothing.
+    """
+    for number in _STOP_SIGNALS:
+        signal.signal(number, lambda *_: None)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOP_SIGNALS)
+
+
+def ignore_interrupts() -> None:
+    """Leave Ctrl-C to the process that started this one, in the processes that this one starts as well."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _is_interrupt(error: BaseException) -> bool:
+    """Whether a Ctrl-C is in the chain of an error's causes."""
+    waiting: list[BaseException | None] = [error]
+    seen: set[int] = set()
+    while waiting:
+        at = waiting.pop()
+        if at is None or id(at) in seen:
+            continue
+        if isinstance(at, KeyboardInterrupt):
+            return True
+        seen.add(id(at))
+        waiting += [at.__cause__, at.__context__]
+    return False
