@@ -20,7 +20,7 @@ from graphvio.frontend.tracks import common_rows
 from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, so3_log
 from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Imu, Rig
-from graphvio.slam.descriptors import orientations
+from graphvio.slam.landmarks import orientations
 
 _POINTS = 20
 

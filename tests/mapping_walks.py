@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 from calibration_walks import walk_simulator
+from synthetic_front_end import SyntheticFrontEnd
 
 from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.config.stages import OptimizationConfig
 from graphvio.errors import SourceError
 from graphvio.geometry import se3_inverse
-from graphvio.mapping.drawn_front_end import DrawnFrontEnd
 from graphvio.mapping.mapper import Mapper
 from graphvio.measurements.sensors import FrameSet
 from graphvio.simulation import Simulator
@@ -48,7 +48,7 @@ def rendered(index: int) -> FrameSet:
     return simulator().frameset(index)
 
 
-class Refusing(DrawnFrontEnd):
+class Refusing(SyntheticFrontEnd):
     """Refuses corrections; to the first one it does not even answer."""
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
@@ -65,8 +65,8 @@ def front_end(
     step: int = 4,
     session: int = 0,
     breaks: Collection[int] = (),
-    kind: type[DrawnFrontEnd] = DrawnFrontEnd,
-) -> tuple[DrawnFrontEnd, Float]:
+    kind: type[SyntheticFrontEnd] = SyntheticFrontEnd,
+) -> tuple[SyntheticFrontEnd, Float]:
     """Keyframes of some framesets, 20 a second, and their true poses in the first one's.
 
     Args:
@@ -91,7 +91,7 @@ def front_end(
     return made, truth
 
 
-def mapped(made: DrawnFrontEnd, map_folder: Path | None = None, save: Path | None = None) -> Mapper:
+def mapped(made: SyntheticFrontEnd, map_folder: Path | None = None, save: Path | None = None) -> Mapper:
     """A mapper that has worked on all keyframes; what it kept on disk is gone, or saved."""
     with Mapper(made, CONFIG, map_folder) as mapper:
         made.has_room = lambda: mapper.summary()["places_waiting"] in (0, 1)

@@ -22,10 +22,9 @@ from graphvio.measurements.sensors import Measurement
 from graphvio.odometry.step import NewKeyframe, Step
 from graphvio.rig import Rig
 from graphvio.simulation.simulator import make_simulator
-from graphvio.slam.descriptors import describer
-from graphvio.slam.front_end import FrontEnd
+from graphvio.slam import FrontEnd
 from graphvio.slam.keyframe import Keyframe
-from graphvio.slam.landmarks import landmarks_of
+from graphvio.slam.landmarks import describer, landmarks_of
 from graphvio.slam.map_frame import MapFrame
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory

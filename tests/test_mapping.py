@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mapping_walks import CONFIG, Refusing, front_end, mapped
+from synthetic_front_end import SyntheticFrontEnd
 
 from graphvio.arrays import Float
 from graphvio.errors import MapError
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.mapping import saved_map
-from graphvio.mapping.drawn_front_end import DrawnFrontEnd
 from graphvio.mapping.mapper import Mapper
 from graphvio.trajectory_files import load_trajectory, save_trajectory
 
@@ -25,7 +25,7 @@ pytest.importorskip("pycolmap", reason="maps need the extra maps")
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    front_end: DrawnFrontEnd
+    front_end: SyntheticFrontEnd
     truth: Float
     mapper: Mapper
     folder: Path
@@ -156,7 +156,7 @@ def test_a_map_of_another_rig_is_refused(made: Made) -> None:
     left = walk.rig.pairs[0].left
     moved = replace(left, intrinsics=left.intrinsics + 1.0)
     pairs = (replace(walk.rig.pairs[0], left=moved), *walk.rig.pairs[1:])
-    other = DrawnFrontEnd(replace(walk.rig, pairs=pairs), [], np.zeros((0, 4, 4)), walk._frameset_at, (0.0, 0.0), 0)
+    other = SyntheticFrontEnd(replace(walk.rig, pairs=pairs), [], np.zeros((0, 4, 4)), walk._frameset_at, (0.0, 0.0), 0)
     with pytest.raises(MapError, match=r"another rig .intrinsics of cam0 differ"):
         Mapper(other, CONFIG, made.folder)
 

@@ -14,8 +14,7 @@ from graphvio.config.stages import OptimizationConfig
 from graphvio.errors import MapError, SourceError
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.mapping.intake import Intake
-from graphvio.mapping.keyframe_poses import spread_keyframes
-from graphvio.mapping.places import PlaceChooser, motion_between
+from graphvio.mapping.places import PlaceChooser, motion_between, spread_keyframes
 from graphvio.measurements.estimate import Status
 from graphvio.rig import Rig
 from graphvio.simulation import default_rig

@@ -19,7 +19,7 @@ pytest.importorskip("grpc")
 import grpc
 
 from graphvio.slam.client import Client
-from graphvio.slam.service.libraries import messages
+from graphvio.slam.service import messages
 from graphvio.slam.service.options import ServiceOptions
 from graphvio.slam.service.server import GrpcServer
 

@@ -19,9 +19,8 @@ from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
 
 pytest.importorskip("grpc")
 
-from graphvio.slam.service import convert, graphvio_pb2_grpc
+from graphvio.slam.service import convert, graphvio_pb2_grpc, messages
 from graphvio.slam.service.arrays import checked_covariance, checked_pose
-from graphvio.slam.service.libraries import messages
 
 ROOT = Path(__file__).parents[1]
 SERVICE = ROOT / "graphvio/slam/service"

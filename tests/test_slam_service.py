@@ -22,15 +22,14 @@ from test_slam_messages import assert_same
 from graphvio.errors import ServiceError
 from graphvio.measurements.events import Event
 from graphvio.queues import Broadcast
-from graphvio.slam.interface import FrontEnd
+from graphvio.slam.interface import SlamFrontEnd
 from graphvio.slam.keyframe import Keyframe
 
 pytest.importorskip("grpc")
 
 from graphvio.slam.client import Client, Update
 from graphvio.slam.service.options import ServiceOptions
-from graphvio.slam.service.pool import DaemonPool
-from graphvio.slam.service.server import GrpcServer
+from graphvio.slam.service.server import DaemonPool, GrpcServer
 
 ANY_PORT = ServiceOptions(port=0)
 
@@ -72,7 +71,7 @@ def in_thread(function: Callable[[], object]) -> threading.Thread:
 
 
 def test_the_client_is_a_front_end_with_the_rig_of_the_server(client: Client) -> None:
-    front_end: FrontEnd = client
+    front_end: SlamFrontEnd = client
     assert front_end.rig.name == "drawn"
     for camera, same in zip(served.rig().cameras, front_end.rig.cameras, strict=True):
         np.testing.assert_array_equal(camera.body_T_cam, same.body_T_cam)
@@ -123,7 +122,7 @@ def test_keyframes_that_are_no_longer_kept_are_passed_over_and_counted() -> None
     with GrpcServer(odometry, ANY_PORT) as server, Client(server.address) as client:
         assert client.info().oldest_keyframe_id == oldest
         assert [keyframe.id for keyframe in client.keyframes(10)] == list(range(oldest, 50))
-        from graphvio.slam.service.libraries import messages
+        from graphvio.slam.service import messages
 
         stub = client._connection.stub
         updates = list(stub.StreamKeyframes(messages.StreamKeyframesRequest(from_id=10)))

@@ -9,7 +9,7 @@ from graphvio import FrameSet, ImuSample, Odometry
 from graphvio.config import Config
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.simulation import default_rig, make_simulator
-from graphvio.slam.front_end import FrontEnd
+from graphvio.slam import FrontEnd
 from graphvio.slam.keyframe import Keyframe
 from graphvio.warmup import warm_up
 

@@ -9,7 +9,7 @@ from graphvio.config.stages import OptimizationConfig
 from graphvio.errors import MapError
 from graphvio.mapping.places import Anchored, NewPlace, PlaceChooser
 from graphvio.queues import BoundedQueue, WhenFull
-from graphvio.slam.interface import FrontEnd
+from graphvio.slam.interface import SlamFrontEnd
 
 _MAX_WAITING = 8  # places, with their images
 
@@ -25,7 +25,7 @@ class Intake:
         share: asked before each keyframe: the share of these distances that is enough now.
     """
 
-    def __init__(self, front_end: FrontEnd, settings: OptimizationConfig, share: Callable[[], float]) -> None:
+    def __init__(self, front_end: SlamFrontEnd, settings: OptimizationConfig, share: Callable[[], float]) -> None:
         self._front_end = front_end
         self._share = share
         self._chooser = PlaceChooser(settings.place_distance_m, settings.place_angle_deg)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
@@ -16,18 +18,15 @@ from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.mapping import saved_map
 from graphvio.mapping.intake import Intake
-from graphvio.mapping.keyframe_poses import spread_keyframes
-from graphvio.mapping.places import NewPlace
+from graphvio.mapping.places import NewPlace, spread_keyframes
 from graphvio.mapping.pose_graph import PoseGraph
 from graphvio.mapping.recognition import Recognition
-from graphvio.mapping.restoring import restored, to_saved
-from graphvio.mapping.stages import StageTimes
 from graphvio.mapping.store import PlaceStore
 from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.closures import LoopClosure, Place, closure_of
 from graphvio.optimization.loops.features import PlaceObserver
 from graphvio.optimization.loops.verification import FreshView, crossings, verified
-from graphvio.slam.interface import FrontEnd
+from graphvio.slam.interface import SlamFrontEnd
 from graphvio.trajectory import Trajectory
 
 _SEARCHING_SHARE = 0.25  # of the places' distance, as long as a fragment is not found in the map,
@@ -53,7 +52,7 @@ class Mapper:
     """
 
     def __init__(
-        self, front_end: FrontEnd, config: Config, map: Path | str | None = None, folder: Path | None = None
+        self, front_end: SlamFrontEnd, config: Config, map: Path | str | None = None, folder: Path | None = None
     ) -> None:
         self._front_end = front_end
         self._rig = front_end.rig
@@ -73,7 +72,7 @@ class Mapper:
         if folder is not None:
             kept = saved_map.load(folder, self._rig)
             saved_map.copy_files(folder, self._folder)
-            self._graph, self._recognition, self._places = restored(kept, self._config)
+            self._graph, self._recognition, self._places = saved_map.restored(kept, self._config)
         self._first = len(self._places)  # place of this session
         self._session = 1 + max((place.session for place in self._places), default=-1)
         self._store = PlaceStore(self._folder, self._rig)
@@ -84,7 +83,7 @@ class Mapper:
         self._lock = threading.RLock()  # held while the graph changes, or is read from another thread
         self._working = threading.Lock()  # held while a place is worked on
         self._is_stopped = False
-        self._times = StageTimes()
+        self._times = _StageTimes()
         self._tried = 0
         self._sent = 0
         self._refused: list[str] = []
@@ -132,7 +131,9 @@ class Mapper:
             MapError: if the folder holds something else, or cannot be written.
         """
         with self._working, self._lock:
-            saved_map.save(to_saved(self._graph, self._recognition, self._places), self._store, self._rig, Path(folder))
+            saved_map.save(
+                saved_map.to_saved(self._graph, self._recognition, self._places), self._store, self._rig, Path(folder)
+            )
 
     @property
     def is_localised(self) -> bool:
@@ -269,3 +270,25 @@ class Mapper:
     @staticmethod
     def _name(session: int) -> str:
         return f"session{session}"
+
+
+class _StageTimes:
+    """Sums by stage, in the order in which the stages were first reached."""
+
+    def __init__(self) -> None:
+        self._total_s: dict[str, float] = {}
+        self._count: dict[str, int] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count what is done inside, however it ends."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._total_s[name] = self._total_s.get(name, 0.0) + time.perf_counter() - begin
+            self._count[name] = self._count.get(name, 0) + 1
+
+    def summary(self) -> dict[str, float]:
+        """Mean milliseconds of each stage."""
+        return {f"{name}_ms": 1e3 * total / self._count[name] for name, total in self._total_s.items()}

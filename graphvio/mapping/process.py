@@ -94,7 +94,7 @@ class _WithImages:
         self._client = client
 
     def keyframes(self, from_id: int = 0) -> Iterator[Keyframe]:
-        """See `graphvio.slam.interface.FrontEnd`."""
+        """See `graphvio.slam.interface.SlamFrontEnd`."""
         return self._client.keyframes(from_id, with_images=True, with_descriptors=False)
 
 

@@ -27,8 +27,7 @@ from graphvio.sessions.messages import (
     pose_stamped,
     transform,
 )
-from graphvio.slam.epochs import map_of_epoch
-from graphvio.slam.interface import Served
+from graphvio.slam.interface import Served, map_of_epoch
 
 _STATIC: Final = "static"  # the static transforms, among the writers by type
 _DEPTH: Final = 200  # estimates that may be queued: ten seconds

@@ -14,10 +14,9 @@ from graphvio.measurements.estimate import Estimate, Prediction
 from graphvio.measurements.events import Event
 from graphvio.rig import Rig
 from graphvio.slam.keyframe import CorrectionResult, Keyframe
-from graphvio.slam.service import convert
+from graphvio.slam.service import convert, messages
 from graphvio.slam.service.arrays import maybe_floats, packed
 from graphvio.slam.service.connection import Connection
-from graphvio.slam.service.libraries import messages
 from graphvio.slam.service.security import read_token
 
 __all__ = ["Client", "ServerInfo", "Update", "read_token"]
@@ -64,7 +63,7 @@ class Update(Generic[S]):
 
 
 class Client:
-    """A `graphvio.slam.interface.FrontEnd` that is reached over gRPC; a context manager, usable from several threads.
+    """A `graphvio.slam.interface.SlamFrontEnd` over gRPC; a context manager, usable from several threads.
 
     Args:
         address: ``HOST:PORT``, or ``HOST`` with the usual port.

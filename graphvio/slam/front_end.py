@@ -13,10 +13,9 @@ from graphvio.measurements.events import EventKind
 from graphvio.odometry import Odometry
 from graphvio.odometry.step import NewKeyframe, Step
 from graphvio.rig import Rig
-from graphvio.slam.descriptors import describer
 from graphvio.slam.keyframe import CorrectionResult, Keyframe
 from graphvio.slam.keyframe_log import KeyframeLog
-from graphvio.slam.landmarks import landmarks_of
+from graphvio.slam.landmarks import describer, landmarks_of
 from graphvio.slam.map_frame import MapFrame
 
 

@@ -14,7 +14,7 @@ from graphvio.slam.keyframe import CorrectionResult, Keyframe
 from graphvio.slam.keyframe_log import KeyframeLog
 
 
-class FrontEnd(Protocol):
+class SlamFrontEnd(Protocol):
     """Keyframes out, corrections in; `graphvio.Odometry` and `graphvio.slam.client.Client` are such."""
 
     @property
@@ -60,7 +60,21 @@ class Served(Protocol):
         """(4, 4) in force, or None before the epoch's first correction."""
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
-        """See `FrontEnd.correct`; from any thread."""
+        """See `SlamFrontEnd.correct`; from any thread."""
 
     def status(self) -> Mapping[str, float | int | str | None]:
         """How it runs, by name: figures that the terminal and the metrics show, too; from any thread."""
+
+
+def newest_epoch(served: Served) -> int | None:
+    """The newest keyframe's, or None before the first."""
+    log = served.keyframe_log
+    newest = log.read(max(log.next_id - 1, 0), timeout_s=0.0)
+    return None if newest is None else newest.epoch
+
+
+def map_of_epoch(served: Served, epoch: int) -> Float | None:
+    """``map_T_odom`` (4, 4) in force, unless it is another epoch's than that of an estimate that waited."""
+    before = newest_epoch(served)
+    map_T_odom = served.map_T_odom
+    return map_T_odom if before == epoch == newest_epoch(served) else None

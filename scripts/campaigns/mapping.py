@@ -16,12 +16,12 @@ import numpy as np
 from benchmarks.command_line import Subparsers, add_command, add_report_options
 from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, machine, tell
+from synthetic_front_end import SyntheticFrontEnd
 
 from graphvio.arrays import Float, Int
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.geometry import se3_inverse, se3_log
-from graphvio.mapping.drawn_front_end import DrawnFrontEnd
 from graphvio.mapping.mapper import Mapper
 from graphvio.sources import open_source
 from graphvio.sources.base import Source
@@ -113,7 +113,7 @@ def _run(source: Source, draw: int, indices: Int, begin: Path | None, keep: Path
     all_true = first_T_world @ truth.at(source.stamps_ns, _GAP_S)[0].nav_T_body
     stamps, true = source.stamps_ns[indices], all_true[indices]
     pose_of = dict(zip(source.stamps_ns.tolist(), all_true, strict=True))
-    front_end = DrawnFrontEnd(
+    front_end = SyntheticFrontEnd(
         source.rig, stamps.tolist(), se3_inverse(true[0]) @ true, source.frameset_at, _SIGMAS, draw
     )
     with Mapper(front_end, Config(), begin) as mapper:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import ssl
 import threading
 import time
@@ -10,16 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from graphvio.errors import ServiceError
-from graphvio.slam.service.diagnosis import why_unreachable
-from graphvio.slam.service.libraries import grpc, stubs
-from graphvio.slam.service.options import DEFAULT_PORT, is_loopback
+from graphvio.slam.service import grpc, stubs
+from graphvio.slam.service.options import DEFAULT_PORT, RUN_KEY, is_loopback
 from graphvio.slam.service.security import bearer
-from graphvio.slam.service.streams import RUN_KEY
 
 _MESSAGE_BYTES = 256 * 2**20
 _WINDOW_BYTES = 4096
 _KEEPALIVE_MS, _PONG_MS = 10_000, 5_000
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 2.0
+_DIAGNOSIS_S = 3.0
 _TOO_LARGE = "larger than max"
 
 
@@ -131,7 +131,7 @@ class Connection:
     def _error(self, error: Any) -> ServiceError:
         code, details = error.code(), error.details() or ""
         if code is grpc.StatusCode.UNAVAILABLE and not self._closing.is_set():
-            text = why_unreachable(self._host, self._port, self._ca)
+            text = _why_unreachable(self._host, self._port, self._ca)
         elif code is grpc.StatusCode.UNAUTHENTICATED:
             text = f"{details}; give the one in the server's token file"
         elif code is grpc.StatusCode.DEADLINE_EXCEEDED:
@@ -194,3 +194,53 @@ def _read_certificates(path: Path) -> bytes:
     except OSError as error:
         raise ServiceError(f"{path}: cannot be read ({error.strerror}); give a PEM file of certificates") from None
     return content
+
+
+def _why_unreachable(host: str, port: int, ca: bytes | None) -> str:
+    """Try again by hand, and tell what is wrong and what to do.
+
+    Args:
+        host: of the server.
+        port: of the server.
+        ca: certificates in PEM that the client trusts, or None if it uses no TLS.
+    """
+    try:
+        with socket.create_connection((host, port), _DIAGNOSIS_S) as connection:
+            return _why_no_service(connection, host, ca)
+    except ConnectionRefusedError:
+        return "nothing listens there; is the service running, and the port right?"
+    except socket.gaierror:
+        return "there is no such host; check the name"
+    except TimeoutError:
+        return "it does not answer; is it switched on, and does a firewall let the port through?"
+    except OSError as error:
+        return f"it cannot be reached ({error.strerror or type(error).__name__}); check the address and the network"
+
+
+def _why_no_service(connection: socket.socket, host: str, ca: bytes | None) -> str:
+    try:
+        with _context(ca).wrap_socket(connection, server_hostname=host):
+            pass
+    except ssl.SSLCertVerificationError as error:
+        return (
+            f"its certificate is not trusted ({error.verify_message.rstrip('.')}); give the certificate of whoever "
+            "signed it as ca, and the server by a name that the certificate has"
+        )
+    except OSError:
+        if ca is None:
+            return "it does not answer as graphvio's service; check the port, or it may have too many clients"
+        return "it does not use TLS, or is no graphvio service; check the port, or leave ca out on the same machine"
+    if ca is None:
+        return "it demands TLS; give the certificate of whoever signed its own as ca"
+    return "it closed the connection; it may have too many clients"
+
+
+def _context(ca: bytes | None) -> ssl.SSLContext:
+    if ca is None:  # whether there is TLS at all is asked; nothing is sent
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE
+    else:
+        context = ssl.create_default_context(cadata=ca.decode("ascii", "replace"))
+    context.set_alpn_protocols(["h2"])
+    return context

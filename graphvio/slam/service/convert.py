@@ -18,8 +18,8 @@ from graphvio.measurements.motion import Quality
 from graphvio.rig import Camera, Rig, StereoPair, as_written
 from graphvio.rig_files import native
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
+from graphvio.slam.service import messages
 from graphvio.slam.service.arrays import byte_rows, floats, maybe_floats, packed, whole_numbers
-from graphvio.slam.service.libraries import messages
 
 _STATUS_OF = {getattr(messages, f"TRACKING_STATUS_{each.name}"): each for each in Status}
 _NUMBER_OF_STATUS = {status: number for number, status in _STATUS_OF.items()}

@@ -9,6 +9,7 @@ from pathlib import Path
 from graphvio.errors import ServiceError
 
 DEFAULT_PORT = 50551
+RUN_KEY = "graphvio-run"  # metadata that a stream begins with: it is open, though its first message may come late
 
 
 @dataclass(frozen=True)

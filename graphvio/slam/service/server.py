@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 import uuid
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from queue import SimpleQueue
 from typing import Any, Self
 
 from graphvio.errors import ServiceError
 from graphvio.slam.interface import Served
-from graphvio.slam.service.libraries import grpc, stubs
-from graphvio.slam.service.listening import cannot_listen, check_address
-from graphvio.slam.service.malformed import MalformedInterceptor
+from graphvio.slam.service import grpc, stubs
 from graphvio.slam.service.options import ServiceOptions
-from graphvio.slam.service.pool import DaemonPool
-from graphvio.slam.service.security import read_token, server_credentials, token_interceptor
-from graphvio.slam.service.servicer import Servicer
-from graphvio.slam.service.streams import STREAMS_OF_A_CLIENT, StreamLimit
+from graphvio.slam.service.security import MalformedInterceptor, read_token, server_credentials, token_interceptor
+from graphvio.slam.service.servicer import STREAMS_OF_A_CLIENT, Servicer, StreamLimit
 
 _CALL_THREADS = 8  # for calls that are no streams, however many streams there are
 _CALLS_WAITING = 64
@@ -37,7 +37,7 @@ def check(options: ServiceOptions) -> None:
     Raises:
         ServiceError: if the address is taken or not this machine's, or token, certificate or key cannot be used.
     """
-    check_address(options)
+    _check_address(options)
     server_credentials(options)
     if options.token_file is not None:
         read_token(options.token_file)
@@ -90,7 +90,7 @@ class GrpcServer:
         if self._server is not None:
             raise ServiceError(f"{self.address}: is served already; stop it first")
         options = self._options
-        check_address(options)
+        _check_address(options)
         credentials = server_credentials(options)
         interceptors = [] if options.token_file is None else [token_interceptor(read_token(options.token_file))]
         interceptors.append(MalformedInterceptor())
@@ -114,7 +114,7 @@ class GrpcServer:
         if not self._port:
             server.stop(None)
             pool.shutdown()
-            raise cannot_listen(options, "gRPC failed")
+            raise _cannot_listen(options, "gRPC failed")
         server.start()
         self._server, self._pool = server, pool
 
@@ -166,3 +166,91 @@ def _transport(options: ServiceOptions) -> list[tuple[str, int]]:
         ("grpc.http2.max_pings_without_data", 0),
         ("grpc.http2.min_recv_ping_interval_without_data_ms", _LEAST_PING_MS),
     ]
+
+
+def _check_address(options: ServiceOptions) -> None:
+    """Find out by trying.
+
+    Raises:
+        ServiceError: if the address is taken or not this machine's.
+    """
+    try:
+        found = socket.getaddrinfo(options.bare_host, options.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        for family, kind, protocol, _, address in found:
+            with socket.socket(family, kind, protocol) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # one that has just been closed is free
+                probe.bind(address)
+    except OSError as error:
+        raise _cannot_listen(options, error.strerror or type(error).__name__) from None
+    except ValueError:  # what cannot be a name
+        raise _cannot_listen(options, "no host's name") from None
+
+
+def _cannot_listen(options: ServiceOptions, reason: str) -> ServiceError:
+    """What is raised."""
+    return ServiceError(
+        f"{options.address}: cannot be listened on ({reason}); choose a port that nobody uses, and an address of this "
+        "machine"
+    )
+
+
+class DaemonPool(Executor):
+    """As `concurrent.futures.ThreadPoolExecutor`, but of daemon threads.
+
+    The standard one's are waited for when a program ends, and one with an open stream would never end.
+
+    Args:
+        most: threads at a time; they are started when they are needed.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._lock = threading.Lock()
+        self._threads: list[threading.Thread] = []
+        self._idle = 0
+        self._work: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._is_shut = False
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Call a function in one of the threads.
+
+        Raises:
+            RuntimeError: after `shutdown`, as the standard one.
+        """
+        future: Future[Any] = Future()
+
+        def run() -> None:
+            if not future.set_running_or_notify_cancel():
+                return
+            try:
+                future.set_result(fn(*args, **kwargs))
+            except BaseException as error:
+                future.set_exception(error)
+
+        with self._lock:
+            if self._is_shut:
+                raise RuntimeError("cannot schedule new futures after shutdown")
+            self._work.put(run)
+            if self._idle > 0:
+                self._idle -= 1
+            elif len(self._threads) < self._most:
+                thread = threading.Thread(target=self._serve, name=f"grpc-{len(self._threads)}", daemon=True)
+                self._threads.append(thread)
+                thread.start()
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Take no more work; what was taken is done."""
+        with self._lock:
+            self._is_shut = True
+            for _ in self._threads:
+                self._work.put(None)
+        if wait:
+            for thread in self._threads:
+                thread.join()
+
+    def _serve(self) -> None:
+        while (run := self._work.get()) is not None:
+            run()
+            with self._lock:
+                self._idle += self._work.empty()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -11,20 +12,85 @@ from typing import Any, TypeVar
 from graphvio.errors import GraphvioError, ServiceError
 from graphvio.measurements.estimate import Estimate, Prediction
 from graphvio.queues import BoundedQueue, Broadcast
-from graphvio.slam.epochs import map_of_epoch, newest_epoch
-from graphvio.slam.interface import Served
+from graphvio.slam.interface import Served, map_of_epoch, newest_epoch
 from graphvio.slam.keyframe_log import KeyframeLog
-from graphvio.slam.service import convert
+from graphvio.slam.service import convert, grpc, messages, stubs
 from graphvio.slam.service.arrays import checked_covariance, checked_pose, floats, packed
-from graphvio.slam.service.libraries import grpc, messages, stubs
-from graphvio.slam.service.streams import RUN_KEY, Stream, StreamLimit
+from graphvio.slam.service.options import RUN_KEY
 from graphvio.version import __version__
 
 _LOOK_S = 0.25  # how soon a stream sees that its client is gone or the server stops
 _WAITING = {messages.RATE_FRAME: 2, messages.RATE_IMU: 16}
 _EVENTS_WAITING = 256
+STREAMS_OF_A_CLIENT = 4
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
+
+
+class Stream:
+    """One that is open.
+
+    Args:
+        client: whose it is.
+
+    Attributes:
+        taken_s: when its client last took a message, or opened it, by `time.monotonic`.
+    """
+
+    def __init__(self, client: str) -> None:
+        self.client = client
+        self.taken_s = time.monotonic()
+
+    def taken(self) -> None:
+        """The client has taken a message."""
+        self.taken_s = time.monotonic()
+
+
+class StreamLimit:
+    """Lets in so many clients with streams, and so many streams of each.
+
+    Args:
+        max_clients: at a time.
+    """
+
+    def __init__(self, max_clients: int) -> None:
+        self._max_clients = max_clients
+        self._lock = threading.Lock()
+        self._streams: set[Stream] = set()
+
+    @property
+    def open_streams(self) -> int:
+        """How many there are now."""
+        with self._lock:
+            return len(self._streams)
+
+    def is_read_since(self, since_s: float) -> bool:
+        """Whether any client has taken a message after a time of `time.monotonic`."""
+        with self._lock:
+            return any(stream.taken_s > since_s for stream in self._streams)
+
+    def enter(self, client: str) -> Stream:
+        """Count a stream of a client.
+
+        Raises:
+            ServiceError: if there is no room.
+        """
+        with self._lock:
+            clients = {stream.client for stream in self._streams}
+            if client not in clients and len(clients) >= self._max_clients:
+                raise ServiceError(
+                    f"{self._max_clients} clients have streams already; end one, or raise the server's max_clients"
+                )
+            if sum(stream.client == client for stream in self._streams) >= STREAMS_OF_A_CLIENT:
+                raise ServiceError(f"a connection may have {STREAMS_OF_A_CLIENT} streams at a time; end one")
+            stream = Stream(client)
+            self._streams.add(stream)
+            return stream
+
+    def leave(self, stream: Stream) -> None:
+        """A stream that was counted has ended."""
+        with self._lock:
+            self._streams.remove(stream)
 
 
 class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]

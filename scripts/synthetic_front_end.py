@@ -24,7 +24,7 @@ _FIRST_SIGMAS = np.repeat([1.5e-2, 1e-3], 3)  # an odometry's at rest: gravity i
 _PATIENCE_S = 0.001
 
 
-class DrawnFrontEnd:
+class SyntheticFrontEnd:
     """Keyframes one after the other, each as soon as there is room for it.
 
     Args:
@@ -59,7 +59,7 @@ class DrawnFrontEnd:
 
     @property
     def rig(self) -> Rig:
-        """See `graphvio.slam.interface.FrontEnd`."""
+        """See `graphvio.slam.interface.SlamFrontEnd`."""
         return self._rig
 
     @property
@@ -68,7 +68,7 @@ class DrawnFrontEnd:
         return np.array([each.odom_T_body for each in self._keyframes])
 
     def keyframes(self, from_id: int = 0) -> Iterator[Keyframe]:
-        """See `graphvio.slam.interface.FrontEnd`."""
+        """See `graphvio.slam.interface.SlamFrontEnd`."""
         for each in self._keyframes[from_id:]:
             while not self.has_room():
                 time.sleep(_PATIENCE_S)
