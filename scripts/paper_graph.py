@@ -22,7 +22,7 @@ from graphvio.backend.noise import gaussian
 from graphvio.geometry import skew, so3_exp, so3_log, so3_right_jacobian, so3_right_jacobian_inverse
 
 Expectation = Callable[[FilterState], Measurement]
-"""What a measurement makes of a state."""
+"""Returns the linearised measurement at a state."""
 
 _PARTS = (slice(0, 3), slice(3, 6), slice(6, ERRORS))  # of the error: position, attitude, all others
 

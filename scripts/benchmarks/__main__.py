@@ -9,7 +9,7 @@ if __name__ == "__main__":
     sys.exit(
         run_command_line(
             "scripts/benchmark",
-            "Measures speed, accuracy and behaviour under faults. docs/benchmarks.md tells what is compared.",
+            "Measures speed, accuracy and behaviour under faults. docs/benchmarks.md says what is compared.",
             tuple(module.add_parser for module in (frontend, backend, accuracy, faults, optimize, slam)),
             "Timings mean something only on a machine that does nothing else meanwhile.",
         )

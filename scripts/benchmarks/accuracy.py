@@ -12,7 +12,7 @@ from benchmarks.bench import CLIP_TRUTH, Bench
 from benchmarks.motions import BREAK_SIGMA, BREAK_STATISTIC
 from benchmarks.picture import Panel, draw_trajectories
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import DOCS, Report, machine, tell
+from benchmarks.report import DOCS, Report, log_progress, machine
 from benchmarks.runs import HEAD, blinded, with_moved_pair
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
@@ -24,7 +24,7 @@ _FIRST_APPROACH = "paper, first approach"
 _FROM_PREVIOUS = "default, from the frame before"
 CLIP = DOCS.parents[1] / "shared" / "data" / "euroc_mh01_clip"
 CLIP_NAME = "EuRoC MH_01 clip"
-_DRAWN = (("corridor", True), ("corridor", False), ("stairs", False), (CLIP_NAME, False))  # with the IMU or without
+_PLOTTED = (("corridor", True), ("corridor", False), ("stairs", False), (CLIP_NAME, False))  # with the IMU or without
 _WITH_IMU = (DEFAULT, PAPER)  # a smoother, and the filter that it ought to beat
 AIM = 1.05
 """All pairs' ATE over that of the better pair alone: together they are at least as good as either."""
@@ -49,7 +49,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         type=Path,
         default=CLIP,
         metavar="DIR",
-        help="a real recording with truth, left out if it is not there (default: shared/data/euroc_mh01_clip beside "
+        help="a real recording with truth, left out if it is not there (default: shared/data/euroc_mh01_clip next to "
         "the project)",
     )
     parser.add_argument("--scenes", nargs="*", default=list(SCENE_NAMES), metavar="NAME", help="default: all")
@@ -89,7 +89,7 @@ def run_all(args: argparse.Namespace) -> None:
     if _BLIND_SCENE in recordings:
         _blind_table(report, bench, args.duration)
     picture = args.out / "trajectories.png"
-    panels = [_panel(bench, name, imu) for name, imu in (*_DRAWN, (args.clip.name, False)) if name in recordings]
+    panels = [_panel(bench, name, imu) for name, imu in (*_PLOTTED, (args.clip.name, False)) if name in recordings]
     panels = [panel for panel in panels if panel.lines]
     link = ""
     if panels:
@@ -100,7 +100,7 @@ def run_all(args: argparse.Namespace) -> None:
         report.save_to_docs("accuracy", link)
         if panels:
             (DOCS / "images" / "trajectories.png").write_bytes(picture.read_bytes())
-    tell(f"written to {args.out}")
+    log_progress(f"written to {args.out}")
 
 
 def _cases(profiles: list[str]) -> list[tuple[str, bool]]:
@@ -136,16 +136,16 @@ def _together_table(report: Report, bench: Bench, cases: list[tuple[str, bool]])
             all_m = everyone.epoch_ate_m
             which, single = bench.better_single(name, profile, imu)
             single_m = single.epoch_ate_m
-            gate_result = "met" if all_m <= AIM * single_m and np.isfinite(all_m) else "missed"
+            result = "met" if all_m <= AIM * single_m and np.isfinite(all_m) else "missed"
             errors = [_cm(all_m), _cm(single_m), which, _ratio(all_m, single_m)]
             errors.append(_ratio(everyone.ate_m, bench.least_ate_m(name, profile, imu)))
             seen = [f"{run.by_vision_percent:.0f}" for run in (everyone, single)]
-            rows.append([name, profile, _yes_or_no(imu), *errors, *seen, gate_result])
+            rows.append([name, profile, _yes_or_no(imu), *errors, *seen, result])
     if not rows:
         return
     report.add(
         "#### All pairs and the better one",
-        f"The same runs: ATE in cm by all pairs, beside the better pair alone, each epoch aligned by itself and "
+        f"The same runs: ATE in cm by all pairs and by the better pair alone, each epoch aligned by itself and "
         "without poses in which vision takes no part, of which there may be more or fewer (by vision, %). The aim "
         f"is a ratio of at most {AIM:g} everywhere; in a rich room, all pairs ought to be several times better (a "
         "ratio of 0.33 is three times). *In one piece* is the ratio of the ATE of the first table, all epochs aligned "
@@ -209,7 +209,7 @@ def _moved_table(report: Report, bench: Bench) -> None:
     report.add(
         "#### Error in P_12",
         f"All pairs with the default profile, the second pair's extrinsics off by {_ANGLE_DEG:g} degree and "
-        f"{100 * _SHIFT_M:g} cm; ATE in cm, beside the exact rig and the better pair alone.",
+        f"{100 * _SHIFT_M:g} cm; ATE in cm, next to those of the exact rig and of the better pair alone.",
     )
     errors_head = ["exact", "off", "better single", "which", "exact / single", "off / single"]
     report.table(["recording", "IMU", *errors_head, "breaks / motions", "refused"], rows)

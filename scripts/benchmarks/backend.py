@@ -1,8 +1,8 @@
-"""``scripts/benchmark backend``: what the back-end takes for a frameset, beside gtsam's own fixed-lag smoother.
+"""``scripts/benchmark backend``: the back-end's time for a frameset, and that of gtsam's fixed-lag smoother.
 
-A recording is run once, and what its back-end was given is noted: samples of the IMU and motions by vision. Then the
-back-end works through that again, without a front-end beside it, and gtsam's IncrementalFixedLagSmoother is given the
-factors that it made, frameset by frameset in turns.
+A recording is run once, and the inputs of its back-end are logged: IMU samples and motions by vision. Then the back-end
+processes them again without a front-end, and gtsam's IncrementalFixedLagSmoother is given the factors that it made,
+frameset by frameset in turns.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.backend_streams import Added, FactorLog, Stream, note_stream
 from benchmarks.command_line import Subparsers, add_command
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import Report, machine, tell
+from benchmarks.report import Report, log_progress, machine
 from graphvio.arrays import Float
 from graphvio.backend.factors import r, x
 from graphvio.backend.smoother_estimator import SmootherEstimator
@@ -29,13 +29,13 @@ from graphvio.errors import GraphvioError
 AIM_MS, AIM_P99_MS, AIM_PREDICTION_US = 1.5, 5.0, 50.0
 LAGS_S = (0.5, 0.75, 1.0, 2.0, 4.0)
 _WARM_UP = 20
-_FEWEST = 100
+_MIN_FRAMESETS = 100
 _NS_PER_S = 1e9
 
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``backend``."""
-    parser = add_command(subparsers, "backend", "the back-end's time, beside gtsam's own fixed-lag smoother", __doc__)
+    parser = add_command(subparsers, "backend", "time of the back-end and of gtsam's fixed-lag smoother", __doc__)
     parser.add_argument("--recording", type=Path, metavar="DIR", help="with an IMU (default: the simulated room)")
     parser.add_argument("--framesets", type=int, default=800, metavar="N", help="at most so many (default: 800)")
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
@@ -46,13 +46,13 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def main(args: argparse.Namespace) -> None:
     """Measure and report."""
-    if args.framesets < _FEWEST:
-        raise GraphvioError(f"percentiles need framesets: give {_FEWEST} or more")
+    if args.framesets < _MIN_FRAMESETS:
+        raise GraphvioError(f"percentiles need framesets: give {_MIN_FRAMESETS} or more")
     folder = simulated(args.data, "room") if args.recording is None else args.recording
-    tell("noting what the back-end is given")
+    log_progress("logging the inputs of the back-end")
     stream = note_stream(folder, args.framesets)
-    if stream.rig.imu is None or len(stream.framesets) < _FEWEST:
-        raise GraphvioError(f"{folder}: needs an IMU and {_FEWEST} framesets or more")
+    if stream.rig.imu is None or len(stream.framesets) < _MIN_FRAMESETS:
+        raise GraphvioError(f"{folder}: needs an IMU and {_MIN_FRAMESETS} framesets or more")
     report = Report()
     title = "the simulated room" if args.recording is None else "a recording"
     report.add(
@@ -62,7 +62,7 @@ def main(args: argparse.Namespace) -> None:
     )
     timings = {}
     for lag_s in LAGS_S:
-        tell(f"lag {lag_s:g} s")
+        log_progress(f"lag {lag_s:g} s")
         timings[lag_s] = _timed(stream, lag_s)
     head = ["lag, s", "ours, median ms", "p95", "p99", "gtsam's, median ms", "p95", "p99", "with covariance",
             "ours / gtsam's", "apart, mm"]  # fmt: skip

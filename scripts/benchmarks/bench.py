@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.motions import EXACT, TruthNoise
-from benchmarks.report import tell
+from benchmarks.report import log_progress
 from benchmarks.runs import Alter, Outcome, run
 from graphvio.config import Config
 from graphvio.rig import Rig
@@ -70,5 +70,7 @@ class Bench:
         noise = EXACT if recording in SCENE_NAMES else CLIP_TRUTH
         outcome = run(self.recordings[recording], used, self.configs[profile], alter, noise)
         pairs = " + ".join(pair.name for pair in rig.pairs)
-        tell(f"  {recording}, {profile}, {pairs}, {'with' if imu else 'without'} IMU: ATE {100 * outcome.ate_m:.2f} cm")
+        log_progress(
+            f"  {recording}, {profile}, {pairs}, {'with' if imu else 'without'} IMU: ATE {100 * outcome.ate_m:.2f} cm"
+        )
         return outcome

@@ -1,4 +1,4 @@
-"""What the command lines of ``scripts/benchmark`` and ``scripts/campaign`` have in common."""
+"""Common parts of the command lines of ``scripts/benchmark`` and ``scripts/campaign``."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ AddParser: TypeAlias = Callable[[Subparsers], None]
 
 
 def add_command(subparsers: Subparsers, name: str, summary: str, description: str | None) -> argparse.ArgumentParser:
-    """A subcommand whose help tells a module's docstring, line by line as it is."""
+    """Add a subcommand whose help is a module's docstring with its line breaks."""
     return subparsers.add_parser(
         name, help=summary, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
 
 
 def run_command_line(prog: str, description: str, subcommands: Sequence[AddParser], epilog: str = "") -> int:
-    """Parse, run, and turn a user's mistake into one line and exit code 2."""
+    """Parse the arguments and run the subcommand; an invalid input gives a one-line message and exit code 2."""
     parser = argparse.ArgumentParser(prog=prog, description=description, epilog=epilog)
     subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
     for add_parser in subcommands:
@@ -44,6 +44,6 @@ def run_command_line(prog: str, description: str, subcommands: Sequence[AddParse
 
 
 def add_report_options(parser: argparse.ArgumentParser) -> None:
-    """``--out`` and ``--docs``, where a report goes besides the screen."""
+    """Add ``--out`` and ``--docs``, which also write the report to a file."""
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
     parser.add_argument("--docs", action="store_true", help="write the report into docs/benchmarks.md")

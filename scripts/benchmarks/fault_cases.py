@@ -25,7 +25,7 @@ Intervals = tuple[tuple[float, float], ...]
 WALKS = ("room", "calibration", "stairs")
 """Scenes that faults are put into: seed k takes the one at k modulo their number."""
 
-_FIRST_S = 2.5  # the rig rests for a second and then needs another to walk
+_FIRST_S = 2.5  # the rig is stationary for a second and then accelerates for another
 _LASTS_S = (0.3, 2.2)
 _PAUSE_S = (0.7, 1.6)
 _KEPT = 80  # framesets before the present one that a fault may use
@@ -65,7 +65,7 @@ class Case:
         return tuple(intervals)
 
     def seed(self, seed: int) -> tuple[int, int]:
-        """Of all that is drawn for this case."""
+        """Seed of all random values of this case."""
         return seed, zlib.crc32(self.name.encode())
 
 
@@ -111,7 +111,7 @@ def hard_measurements(
 
     Args:
         case: what is wrong.
-        seed: of all that is drawn.
+        seed: of all random values.
         source: the recording; its length is ``duration_s``.
         truth: stamp -> ``world_T_body`` (4, 4), at the framesets' stamps.
         duration_s: of the recording.

@@ -1,7 +1,7 @@
 """Faults of light, sensors and lenses, as alterations of the images of framesets.
 
-A fault is a function of a `Moment` that returns the images that the rig would have delivered. It keeps no state: what
-is drawn for the length of a fault comes from `Moment.fixed`, what differs from image to image from `Moment.noise`.
+A fault is a function of a `Moment` that returns the images that the rig would have delivered. It keeps no state: random
+values that hold for the length of a fault come from `Moment.fixed`, those of a single image from `Moment.noise`.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Moment:
         return np.random.default_rng([*self.seed, 2, self.number, *key])
 
     def one_pair(self) -> list[int]:
-        """One pair, drawn for the length of the fault."""
+        """One pair, chosen at random for the length of the fault."""
         return [int(self.fixed(0).choice(sorted(self.images)))]
 
     def all_pairs(self) -> list[int]:

@@ -1,7 +1,7 @@
-"""Things that move before the cameras: a door that fills a view, people who cross, a crowd that walks as one.
+"""Objects that move in front of the cameras: a door that fills a view, people who cross, a crowd that walks as one.
 
-Each is a textured plane in the world. It is drawn into both images of a pair through the pair's own lenses, so that
-its disparities, its motion and its lens distortion are those of a real thing.
+Each is a textured plane in the world. It is rendered into both images of a pair with the pair's camera models, so that
+its disparities, its motion and its lens distortion are those of a real object.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def crowd_as_one(moment: Moment) -> Images:
 
 
 def draw_planes(moment: Moment, pairs: Sequence[int], planes: Sequence[Plane]) -> Images:
-    """The images of a moment with planes drawn over both sides of some pairs, the nearest in front."""
+    """The images of a moment with planes rendered over both sides of some pairs, the nearest in front."""
 
     def change(pair: int, side: int, image: Image) -> Image:
         camera = moment.rig.pairs[pair].right if side else moment.rig.pairs[pair].left
@@ -90,9 +90,9 @@ def draw_planes(moment: Moment, pairs: Sequence[int], planes: Sequence[Plane]) -
         depth = np.full(image.shape, np.inf, dtype=np.float32)
         for plane in planes:
             _draw(changed, depth, camera, cam_T_world @ plane.world_T_plane, plane)
-        drawn = np.isfinite(depth)
+        covered = np.isfinite(depth)
         noise = moment.noise(9, pair, side).standard_normal(image.shape, dtype=np.float32)
-        changed[drawn] += (noise * np.sqrt(0.02 * np.maximum(changed, 0.0) + 0.5))[drawn]
+        changed[covered] += (noise * np.sqrt(0.02 * np.maximum(changed, 0.0) + 0.5))[covered]
         return np.clip(np.rint(changed), 0, 255).astype(np.uint8)
 
     return moment.altered(pairs, change)
@@ -119,7 +119,7 @@ def _people(moment: Moment, pair: int, *, together: bool) -> list[Plane]:
 
 
 def _carried(moment: Moment, pair: int, left_T_plane: Float, own_velocity: Float) -> Float:
-    """``world_T_plane`` of a thing that keeps up with the walker and besides has a velocity (3,) of its own, m/s.
+    """``world_T_plane`` of an object that moves with the rig and has a velocity (3,) relative to it, m/s.
 
     The own velocity is in frame body as it was when the fault began.
     """

@@ -1,7 +1,7 @@
 """``scripts/benchmark faults``: does the front-end ever return a confident wrong motion?
 
-Hard scenes and faults of cameras, light and cables are run through the odometry, on vision alone and with the IMU, and
-every motion that the front-end returns is held against the truth.
+The odometry runs on hard scenes and on faults of cameras, light and cables, with vision alone and with the IMU, and
+every motion that the front-end returns is compared with the truth.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import numpy as np
 
 from benchmarks.command_line import add_command
 from benchmarks.fault_cases import CASES, WALKS, Case, hard_measurements
-from benchmarks.fault_judging import MATERIAL_DEG, MATERIAL_M, Judged, Outcome, Run
+from benchmarks.fault_outcomes import MATERIAL_DEG, MATERIAL_M, MotionOutcome, Outcome, Run
 from benchmarks.fault_scenes import CORRIDOR_S, recording
 from benchmarks.motions import BREAK_STATISTIC
 from benchmarks.recordings import add_data_option
-from benchmarks.report import Report, machine, tell
+from benchmarks.report import Report, log_progress, machine
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.measurements.motion import Quality
@@ -121,13 +121,13 @@ def _run_all(tasks: Sequence[Task], jobs: int) -> list[dict[bool, Outcome]]:
     if jobs == 1:
         for task in tasks:
             results.append(run_case(task))
-            tell(_progress(task, results[-1]))
+            log_progress(_progress(task, results[-1]))
         return results
     # A fork would copy the locks of the threads that have run before, and wait for them for ever.
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         for task, result in zip(tasks, pool.map(run_case, tasks), strict=True):
             results.append(result)
-            tell(_progress(task, result))
+            log_progress(_progress(task, result))
     return results
 
 
@@ -171,11 +171,11 @@ def _options(args: argparse.Namespace) -> str:
 def _write(report: Report, outcomes: Mapping[str, Mapping[bool, Outcome]]) -> None:
     report.add(
         "Every motion that the front-end returned, against the truth. *In faults* counts the framesets that a fault "
-        "touched. *NEES* is the squared Mahalanobis distance of the "
-        "motion from the truth (6 degrees of freedom: mean 6, median 5.3 where the covariance is honest). *> 5 sigma*: "
-        f"NEES above {BREAK_STATISTIC:.1f}; *material*: and besides wrong by more than {100 * MATERIAL_M:g} cm or "
-        f"{MATERIAL_DEG:g} degrees. *Used*: the odometry's gate let it through; where "
-        "pairs contradict each other, that side's motion which it took, with that side's own covariance."
+        "touched. *NEES* is the squared Mahalanobis distance of the motion from the truth (6 degrees of freedom: mean "
+        "6, median 5.3 where the covariance is consistent). *> 5 sigma*: "
+        f"NEES above {BREAK_STATISTIC:.1f}; *material*: and also wrong by more than {100 * MATERIAL_M:g} cm or "
+        f"{MATERIAL_DEG:g} degrees. *Used*: it passed the odometry's gate; where "
+        "pairs contradict each other, the motion and covariance of the consensus set that it used."
     )
     for mode, name in _MODES.items():
         report.add(f"#### {name}")
@@ -188,7 +188,7 @@ def _write(report: Report, outcomes: Mapping[str, Mapping[bool, Outcome]]) -> No
         rows.append(_row("**all**", total))
         report.table(_HEAD, rows)
         report.add(*_shares(total))
-        report.add(_gate_result(total))
+        report.add(_aim_result(total))
 
 
 def _row(title: str, outcome: Outcome) -> list[str]:
@@ -215,7 +215,7 @@ def _row(title: str, outcome: Outcome) -> list[str]:
     ]
 
 
-def _mean_inliers(motions: Sequence[Judged]) -> list[str]:
+def _mean_inliers(motions: Sequence[MotionOutcome]) -> list[str]:
     pairs = sorted({pair for motion in motions for pair in motion.inliers})
     return [f"{np.mean([motion.inliers.get(pair, 0) for motion in motions]):.0f}" for pair in pairs]
 
@@ -242,14 +242,14 @@ def _shares(total: Outcome) -> list[str]:
     return [*lines, f"- events: {kinds or 'none'}"]
 
 
-def _gate_result(total: Outcome) -> str:
+def _aim_result(total: Outcome) -> str:
     used = total.used
     aim = f"Aim: less than {100 * AIM_SHARE:g} % of the used motions beyond 5 sigma"
     if not used:
-        return f"{aim}: cannot be told, none was used."
+        return f"{aim}: undetermined, none was used."
     wrong = sum(m.wrong for m in used)
-    gate_result = "met" if wrong < AIM_SHARE * len(used) else "missed"
-    return f"{aim}: **{gate_result}**, {wrong} of {len(used)} ({100 * wrong / len(used):.3f} %)."
+    result = "met" if wrong < AIM_SHARE * len(used) else "missed"
+    return f"{aim}: **{result}**, {wrong} of {len(used)} ({100 * wrong / len(used):.3f} %)."
 
 
 def _list_motions(path: Path, outcomes: Mapping[str, Mapping[bool, Outcome]]) -> None:
@@ -264,7 +264,7 @@ def _list_motions(path: Path, outcomes: Mapping[str, Mapping[bool, Outcome]]) ->
                     table.writerows(_motion_row(case, mode, m, used) for m in motions)
 
 
-def _motion_row(case: str, with_imu: bool, m: Judged, used: bool) -> list[str]:
+def _motion_row(case: str, with_imu: bool, m: MotionOutcome, used: bool) -> list[str]:
     flags = (int(m.during), m.quality, int(used))
     figures = (f"{m.nees:.1f}", f"{m.error_m:.4f}", f"{m.error_deg:.3f}", f"{m.interval_s:.2f}")
     pairs = ("+".join(map(str, counts.values())) for counts in (m.inliers, m.points))

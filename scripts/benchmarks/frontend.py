@@ -1,4 +1,4 @@
-"""``scripts/benchmark frontend``: the time of each stage, beside a plain pipeline of OpenCV's functions."""
+"""``scripts/benchmark frontend``: the time of each stage, and that of a plain pipeline of OpenCV's functions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from benchmarks.backend import AIM_MS as BACKEND_AIM_MS
 from benchmarks.backend import AIM_P99_MS as BACKEND_AIM_P99_MS
 from benchmarks.growth import add_growth
 from benchmarks.recordings import Footage, add_data_option, simulated
-from benchmarks.report import Report, machine, tell
+from benchmarks.report import Report, log_progress, machine
 from benchmarks.timing import (
     WARM_UP,
     Contender,
@@ -39,14 +39,14 @@ AIM_SIZE_PX = (640, 480)
 BACKEND_STAGES = ("predict", "update")
 _SHORTEST_S = 12
 _RATE_HZ = 20
-_FEWEST = 10
+_MIN_FRAMESETS = 10
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
     parser = subparsers.add_parser(
         "frontend",
-        help="time of every stage, beside a pipeline of OpenCV's functions",
+        help="time of every stage, and of a pipeline of OpenCV's functions",
         description="Times the odometry, its front-end alone and a plain pipeline of OpenCV's functions in turns on "
         "the same images, which are decoded before. Prints medians, 95th and 99th percentiles for each stage, and "
         "how the front-end's time grows with features, hypotheses, pairs and image size.",
@@ -74,19 +74,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> None:
     """Measure and report."""
-    if min(args.framesets, args.growth_framesets) < _FEWEST or args.rounds < 1:
-        raise GraphvioError(f"percentiles need framesets: give {_FEWEST} or more, and at least one round")
+    if min(args.framesets, args.growth_framesets) < _MIN_FRAMESETS or args.rounds < 1:
+        raise GraphvioError(f"percentiles need framesets: give {_MIN_FRAMESETS} or more, and at least one round")
     config = Config.load(args.profile)
     count = WARM_UP + args.framesets
     longest = count if args.no_growth else max(count, WARM_UP + args.growth_framesets)
     folder = args.recording
     if folder is None:
         folder = simulated(args.data, "room", max(_SHORTEST_S, math.ceil((longest + 1) / _RATE_HZ)))
-    tell("decoding")
+    log_progress("decoding")
     footage = Footage.load(folder, longest)
-    if len(footage.steps) < WARM_UP + _FEWEST:
-        raise GraphvioError(f"{folder}: has {len(footage.steps)} framesets; {WARM_UP + _FEWEST} are needed")
-    tell("compiling")
+    if len(footage.steps) < WARM_UP + _MIN_FRAMESETS:
+        raise GraphvioError(f"{folder}: has {len(footage.steps)} framesets; {WARM_UP + _MIN_FRAMESETS} are needed")
+    log_progress("compiling")
     warm_up(footage.rig, config)  # for all processes
     report = Report()
     report.add(machine())
@@ -101,13 +101,13 @@ def run(args: argparse.Namespace) -> None:
 
 
 class _Round(NamedTuple):
-    """What one round tells.
+    """Result of one round.
 
     Attributes:
         whole, ours, theirs: times of the odometry, of the front-end alone and of the reference.
-        tracks, points: that the front-end has a pair, in the mean.
+        tracks, points: mean numbers of the front-end for each pair.
         failures: framesets in which it found no motion.
-        offered, inliers: points that the reference has a pair, in the mean, and the share of them that fits.
+        candidates, inliers: mean number of points of the reference for each pair, and the share of inliers.
     """
 
     whole: Timings
@@ -116,7 +116,7 @@ class _Round(NamedTuple):
     tracks: float
     points: float
     failures: int
-    offered: float
+    candidates: float
     inliers: float
 
 
@@ -146,7 +146,7 @@ def _stages(report: Report, footage: Footage, folder: Path, args: argparse.Names
     # Each in a process of its own: how fast OpenCV's threads are depends on the process as much as on the moment.
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
         for number in range(args.rounds):
-            tell(f"timing odometry, front-end and reference in turns, round {number + 1} of {args.rounds}")
+            log_progress(f"timing odometry, front-end and reference in turns, round {number + 1} of {args.rounds}")
             rounds.append(pool.submit(_round, folder, WARM_UP + args.framesets, args.profile).result())
     for one in rounds:
         whole.add(one.whole)
@@ -158,7 +158,7 @@ def _stages(report: Report, footage: Footage, folder: Path, args: argparse.Names
         f"{width}x{height} pixels, "
         f"{'with' if footage.rig.imu else 'without'} IMU. The front-end followed {last.tracks:.0f} tracks "
         f"a pair, {last.points:.0f} of them with depth and in the reference frameset, and found no motion "
-        f"in {last.failures} framesets; the reference offered {last.offered:.0f} points a pair, of "
+        f"in {last.failures} framesets; the reference had {last.candidates:.0f} candidate points a pair, of "
         f"which {100 * last.inliers:.0f} % were inliers."
     )
     ratios = [one.ours.median_ms / one.theirs.median_ms for one in rounds]
@@ -172,10 +172,10 @@ def _stages(report: Report, footage: Footage, folder: Path, args: argparse.Names
 
 
 def _aims(report: Report, rig: Rig, ratios: Sequence[float], odometry: Timings, reference_ms: float) -> None:
-    """What is aimed at beside what came out; the aims are for two pairs of one size."""
+    """Report the results next to the aims, which are for two pairs of one size."""
     has_aims = len(rig.pairs) == 2 and all(pair.left.size_px == AIM_SIZE_PX for pair in rig.pairs)
 
-    def gate_result(value: float, aim: float, unit: str = "") -> str:
+    def aim_result(value: float, aim: float, unit: str = "") -> str:
         return f"{aim:g}{unit}: {'met' if value <= aim else 'missed'}" if has_aims else "-"
 
     ratio, odometry_ms = float(np.median(ratios)), odometry.median_ms
@@ -185,15 +185,15 @@ def _aims(report: Report, rig: Rig, ratios: Sequence[float], odometry: Timings, 
     report.table(
         ["medians", "value", "aim"],
         [
-            [f"front-end / reference, median of the rounds' ({each})", f"{ratio:.2f}", gate_result(ratio, AIM)],
+            [f"front-end / reference, median of the rounds' ({each})", f"{ratio:.2f}", aim_result(ratio, AIM)],
             ["odometry / reference", f"{odometry_ms / reference_ms:.2f}", "-"],
-            ["odometry, a frameset", f"{odometry_ms:.1f} ms", gate_result(odometry_ms, AIM_MS, " ms")],
+            ["odometry, a frameset", f"{odometry_ms:.1f} ms", aim_result(odometry_ms, AIM_MS, " ms")],
             [
                 f"back-end in it ({' and '.join(BACKEND_STAGES)})",
                 f"{median_ms:.2f} ms",
-                gate_result(median_ms, BACKEND_AIM_MS, " ms"),
+                aim_result(median_ms, BACKEND_AIM_MS, " ms"),
             ],
-            ["the same, 99th percentile", f"{p99_ms:.2f} ms", gate_result(p99_ms, BACKEND_AIM_P99_MS, " ms")],
+            ["the same, 99th percentile", f"{p99_ms:.2f} ms", aim_result(p99_ms, BACKEND_AIM_P99_MS, " ms")],
         ],
     )
 

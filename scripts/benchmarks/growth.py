@@ -1,4 +1,4 @@
-"""How the front-end's time grows: with features, hypotheses, pairs and pixels, each beside the reference pipeline."""
+"""How the front-end's time grows: with features, hypotheses, pairs and pixels, each next to the reference pipeline."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.recordings import Footage
-from benchmarks.report import Report, tell
+from benchmarks.report import Report, log_progress
 from benchmarks.timing import WARM_UP, FrontendContender, ReferenceContender, take_turns
 from graphvio.config import Config
 from graphvio.warmup import warm_up
@@ -34,8 +34,8 @@ def add_growth(report: Report, footage: Footage, config: Config, framesets: int)
     short = footage.first(WARM_UP + framesets)
     report.add(
         f"Growth, {len(short.steps) - WARM_UP} framesets a row. A *track* is a corner followed in the left image, a "
-        "*point* one with depth that is offered to the estimation; both are means. *Reference* is the median of the "
-        "reference pipeline in the same turns, *ratio* that of the two medians."
+        "*point* one with depth that is a candidate of the estimation; both are means. *Reference* is the median of "
+        "the reference pipeline in the same turns, *ratio* that of the two medians."
     )
     _features(report, short, config)
     _hypotheses(report, short, config)
@@ -63,9 +63,9 @@ def _hypotheses(report: Report, footage: Footage, config: Config) -> None:
         rows.append([f"{count}", *_row(footage, varied, ReferenceContender(footage))])
     report.add(
         "#### Hypotheses",
-        "Here all hypotheses are drawn (`motion.confidence` 1); with the default, drawing ends once one is surely "
-        "sound, mostly after a batch or two. The reference is the same in each row; it tells how much the load "
-        "changed.",
+        "Here all hypotheses are sampled (`motion.confidence` 1); with the default, sampling ends once one is correct "
+        "with that confidence, mostly after a batch or two. The reference is the same in each row; it shows how much "
+        "the load changed.",
     )
     report.table(["hypotheses a pair", *_HEAD], rows)
 
@@ -96,7 +96,7 @@ def _row(footage: Footage, config: Config, reference: ReferenceContender) -> lis
     warm_up(footage.rig, config)
     frontend = FrontendContender(footage, config)
     ours, theirs = take_turns([frontend, reference], len(footage.steps))
-    tell(f"  {len(footage.rig.pairs)} pairs, {np.mean(frontend.tracks):.0f} tracks: {ours.median_ms:.1f} ms")
+    log_progress(f"  {len(footage.rig.pairs)} pairs, {np.mean(frontend.tracks):.0f} tracks: {ours.median_ms:.1f} ms")
     return [
         f"{np.mean(frontend.tracks):.0f}",
         f"{np.mean(frontend.points):.0f}",

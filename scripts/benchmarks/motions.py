@@ -1,4 +1,4 @@
-"""The motions that vision measures: overheard on their way to the odometry, and held against the truth."""
+"""The motions that vision measures, logged on their way to the odometry and compared with the truth."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ class MotionError(NamedTuple):
     error_deg: float
 
 
-class Overheard(NamedTuple):
-    """What vision said of a run.
+class VisionLog(NamedTuple):
+    """The front-end's results of a run.
 
     Attributes:
-        results: stamp -> what the front-end made of a frameset.
+        results: stamp -> the front-end's result.
         used: stamp -> the motion that went into the estimate: that of the result, or one of its alternatives.
     """
 
@@ -62,28 +62,28 @@ class Overheard(NamedTuple):
     used: dict[int, RelativeMotion]
 
 
-def overhear(odometry: Odometry) -> Overheard:
-    """Have what vision says noted while an odometry runs.
+def log_vision(odometry: Odometry) -> VisionLog:
+    """Log the front-end's results while an odometry runs.
 
-    An estimate does not carry the motion that vision measured, only the pose that came of it, in which IMU and earlier
-    motions hide an error; so the front-end's answers are overheard on their way to the odometry.
+    An estimate carries only the pose, in which IMU and earlier motions hide an error of the motion that vision
+    measured; so the results are logged on their way from the front-end to the estimator.
     """
     process, apply = odometry._frontend.process, odometry._estimator.apply
-    overheard = Overheard({}, {})
+    vision_log = VisionLog({}, {})
 
     def processed(frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
-        result = overheard.results[frameset.stamp_ns] = process(frameset, predict)
+        result = vision_log.results[frameset.stamp_ns] = process(frameset, predict)
         return result
 
     def applied(visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
         update = apply(visual, is_stationary)
         if update.motion is not None:
-            overheard.used[update.motion.stamp_ns] = update.motion
+            vision_log.used[update.motion.stamp_ns] = update.motion
         return update
 
     odometry._frontend.process = processed  # type: ignore[method-assign]
     odometry._estimator.apply = applied  # type: ignore[method-assign]
-    return overheard
+    return vision_log
 
 
 def uses_vision(estimate: Estimate) -> bool:
@@ -94,7 +94,7 @@ def uses_vision(estimate: Estimate) -> bool:
 def motion_error(
     motion: RelativeMotion, world_T_reference: Float, world_T_current: Float, noise: TruthNoise = EXACT
 ) -> MotionError:
-    """Hold a motion against the truth.
+    """Compare a motion with the truth.
 
     The error is the tangent ``log(true^-1 measured)``, in the body frame of the later instant as the covariance is.
 
@@ -110,7 +110,7 @@ def motion_error(
     try:
         statistic = float(error @ np.linalg.solve(motion.covariance + of_truth, error))
     except np.linalg.LinAlgError:
-        statistic = np.inf  # it claims to know something exactly
+        statistic = np.inf  # the covariance is singular
     if not statistic >= 0.0:
         statistic = np.inf
     return MotionError(statistic, float(np.linalg.norm(error[3:])), float(np.rad2deg(np.linalg.norm(error[:3]))))

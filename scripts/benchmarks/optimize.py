@@ -16,7 +16,7 @@ from benchmarks.optimize_recorded import AIMED_AT, Optimized, add_pairs, add_rec
 from benchmarks.optimize_retrieval import add_retrieval
 from benchmarks.optimize_synthetic import add_false_closures, add_hour
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import Report, machine, tell
+from benchmarks.report import Report, log_progress, machine
 from graphvio.errors import GraphvioError
 from graphvio.simulation import SCENE_NAMES
 from graphvio.sources import open_source
@@ -63,12 +63,12 @@ def main(args: argparse.Namespace) -> None:
 
 
 def _hour(report: Report, args: argparse.Namespace) -> None:
-    tell("synthetic sessions, each in a process of its own")
+    log_progress("synthetic sessions, each in a process of its own")
     add_hour(report, args.minutes)
 
 
 def _false(report: Report, args: argparse.Namespace) -> None:
-    tell("false closures")
+    log_progress("false closures")
     add_false_closures(report, args.seeds, args.jobs)
 
 
@@ -82,19 +82,19 @@ def _recorded(report: Report, args: argparse.Namespace) -> None:
         raise GraphvioError("nothing to run: no scene is named and the clip is not there")
     with tempfile.TemporaryDirectory() as folder:
         space = Path(folder)
-        tell("recordings, optimised as a whole")
+        log_progress("recordings, optimised as a whole")
         runs = {name: optimized(path, name, space / name) for name, path in recordings.items()}
         add_recordings(report, runs)
         if AIMED_AT in runs:
             add_pairs(report, _by_pairs(recordings[AIMED_AT], runs[AIMED_AT], space))
-        tell("retrieval")
+        log_progress("retrieval")
         add_retrieval(report, {name: run for name, run in runs.items() if name in _RETRIEVED})
 
 
 def _by_pairs(recording: Path, both: Optimized, space: Path) -> dict[str, Optimized]:
     """Optimise with each pair alone, and add the run with all of them."""
     pairs = open_source(recording).rig.pairs
-    tell(f"the {AIMED_AT} with each pair alone")
+    log_progress(f"the {AIMED_AT} with each pair alone")
     runs = {
         pair.name: optimized(recording, f"{AIMED_AT}-{pair.name}", space / f"pair-{j}", (j,))
         for j, pair in enumerate(pairs)

@@ -9,7 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
-from benchmarks.report import Report, tell
+from benchmarks.report import Report, log_progress
 from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
@@ -136,7 +136,7 @@ def optimized(folder: Path, name: str, out: Path, pairs: tuple[int, ...] | None 
     found = optimize_sessions([source], out, config, on_progress=lambda what, *_: note(_stage(what)))
     note("map")  # and the report
     made = Optimized(out, session, load_trajectory(source.truth), found, spent)
-    tell(
+    log_progress(
         f"  {name}: {sum(spent.values()):.0f} s, {int(made.used.sum())} of {len(made.used)} closures used, ATE "
         f"{100 * made.ates_m()[-1]:.2f} cm"
     )

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.optimize_recorded import Optimized
-from benchmarks.report import Report, tell
+from benchmarks.report import Report, log_progress
 from graphvio.arrays import AnyArray, Bool, Float
 from graphvio.config import Config
 from graphvio.evaluation import MAX_GAP_S
@@ -42,7 +42,7 @@ class _Views(NamedTuple):
 
 
 def add_retrieval(report: Report, runs: dict[str, Optimized]) -> None:
-    """Measure it on recordings that were optimised."""
+    """Measure retrieval on recordings that were optimised."""
     rows = []
     config = Config()
     for name, run in runs.items():
@@ -54,7 +54,7 @@ def add_retrieval(report: Report, runs: dict[str, Optimized]) -> None:
             rows.append(_row(name, f"VLAD, {words} words", views, similarity, perf_counter() - start))
         similarity, seconds = _by_tree(run, views)
         rows.append(_row(name, f"pycolmap, {_TREE_WORDS} words", views, similarity, seconds))
-        tell(f"  {name}: {len(views.names)} images, {asked} of them with others that show the same")
+        log_progress(f"  {name}: {len(views.names)} images, {asked} of them with others that show the same")
     report.add(
         "#### Retrieval",
         f"Images of the places, each asked for those more than {config.optimization.loop_interval_s:g} s away. Two "

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from synthetic_session import SyntheticSession, make_session
 
-from benchmarks.report import Report, tell
+from benchmarks.report import Report, log_progress
 from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.evaluation import evaluate
@@ -62,7 +62,7 @@ def add_hour(report: Report, minutes: Sequence[float]) -> None:
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
         for length in sorted(minutes):
             run = pool.submit(_hour, length).result()
-            tell(f"  {run.minutes:g} minutes: {run.seconds:.1f} s, {run.memory_mb:.0f} MB")
+            log_progress(f"  {run.minutes:g} minutes: {run.seconds:.1f} s, {run.memory_mb:.0f} MB")
             runs.append(run)
     report.add(
         "#### An hour",
@@ -86,15 +86,15 @@ def add_hour(report: Report, minutes: Sequence[float]) -> None:
     last = runs[-1]
     rows = []
     if last.minutes <= 60.0:
-        rows.append([f"time of {last.minutes:g} minutes, s", f"{last.seconds:.1f}", _gate_result(last.seconds, AIM_S)])
+        rows.append([f"time of {last.minutes:g} minutes, s", f"{last.seconds:.1f}", _aim_result(last.seconds, AIM_S)])
         rows.append([f"memory of {last.minutes:g} minutes, MB", f"{last.memory_mb:.0f}",
-                     _gate_result(last.memory_mb, AIM_MB)])  # fmt: skip
+                     _aim_result(last.memory_mb, AIM_MB)])  # fmt: skip
     for shorter, longer in pairwise(runs):
         names = f"{longer.minutes:g} and {shorter.minutes:g} minutes"
         length = longer.minutes / shorter.minutes
         rows.append([f"time, {names}: {length:g} would be linear", f"{longer.seconds / shorter.seconds:.2f}", ""])
         growth = longer.ratio / shorter.ratio
-        rows.append([f"ratio, {names}: 1 would be linear", f"{growth:.2f}", _gate_result(growth, AIM_GROWTH)])
+        rows.append([f"ratio, {names}: 1 would be linear", f"{growth:.2f}", _aim_result(growth, AIM_GROWTH)])
     report.table(["what", "value", "aim"], rows)
 
 
@@ -170,12 +170,12 @@ def add_false_closures(report: Report, seeds: int, jobs: int) -> None:
         for case, result in zip(cases, pool.map(_judged, cases), strict=True):
             results[case] = result
             if case.seed == seeds:
-                tell(f"  {_kind(case.shift_m)}, {case.false} false and {_RIGHT} true ones: done")
+                log_progress(f"  {_kind(case.shift_m)}, {case.false} false and {_RIGHT} true ones: done")
     rows, aims = [], []
     for shift_m, false in [(_ANYWHERE, 0), *product(_SHIFTS_M, _FALSE[1:])]:
         found = [results[_Case(each.seed, shift_m, false)] for each in clean]
         ratios = np.array([one.ate_m / results[each].ate_m for one, each in zip(found, clean, strict=True)])
-        aim = _gate_result(float(ratios.max()), AIM_ATE) if false == _AIMED_AT else ""
+        aim = _aim_result(float(ratios.max()), AIM_ATE) if false == _AIMED_AT else ""
         aims.append(aim)
         rows.append(
             [
@@ -243,7 +243,7 @@ def _kind(shift_m: float) -> str:
     return "anywhere" if shift_m == _ANYWHERE else f"all alike, {shift_m:g} m"
 
 
-def _gate_result(value: float, most: float) -> str:
+def _aim_result(value: float, most: float) -> str:
     return f"{most:g}: {'met' if value <= most else 'missed'}"
 
 

@@ -1,4 +1,4 @@
-"""The picture of the accuracy benchmark: what both pairs together walk, and what each walks alone, seen from above."""
+"""The plot of the accuracy benchmark: trajectories by all pairs and by each alone, seen from above."""
 
 from __future__ import annotations
 
@@ -55,8 +55,10 @@ def draw_trajectories(path: Path, panels: Sequence[Panel]) -> None:
         axes = figure.add_axes((left, (top_in - height_in) / total_in, width, height_in / total_in))
         view.draw(axes)
         top_in -= height_in + _BOTTOM_IN
-    told = "seen from above; each line begins at the true first pose, and again at the true pose after a declared break"
-    figure.text(_LEFT_IN / _WIDTH_IN, 0.12 / total_in, told, fontsize=9)
+    caption = (
+        "seen from above; each line begins at the true first pose, and again at the true pose after a declared break"
+    )
+    figure.text(_LEFT_IN / _WIDTH_IN, 0.12 / total_in, caption, fontsize=9)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, metadata={"Software": None} if path.suffix == ".png" else None)
@@ -131,13 +133,13 @@ class _Plan:
 
 
 def _from_start(outcome: Outcome) -> tuple[Float, float]:
-    """What is drawn when the first pose of each epoch is laid onto the true one.
+    """Return the line of a run, the first pose of each epoch aligned with the true one.
 
     Returns:
         Positions (N, 2) in the truth's frame, NaN between epochs; and how far the last one is from the truth, in
         space, metres.
     """
-    drawn, end_m = [], np.nan
+    plotted, end_m = [], np.nan
     for epoch in np.unique(outcome.epochs):
         poses = outcome.estimate.select(outcome.epochs == epoch)
         true_poses, known = outcome.truth.at(poses.stamps_ns, MAX_GAP_S)
@@ -147,5 +149,5 @@ def _from_start(outcome: Outcome) -> tuple[Float, float]:
         world_T_nav = true_poses.nav_T_body[0] @ se3_inverse(poses.nav_T_body[first])
         positions = poses.transformed(world_T_nav).positions
         end_m = float(np.linalg.norm(positions[last] - true_poses.positions[-1]))
-        drawn += [positions[first:, :2], np.full((1, 2), np.nan)]
-    return np.concatenate(drawn or [np.full((1, 2), np.nan)]), end_m
+        plotted += [positions[first:, :2], np.full((1, 2), np.nan)]
+    return np.concatenate(plotted or [np.full((1, 2), np.nan)]), end_m

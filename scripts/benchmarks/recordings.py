@@ -1,4 +1,4 @@
-"""The recordings that are measured on: simulated once and kept, and decoded into memory before anything is timed."""
+"""The recordings of the benchmarks: simulated once and kept, and decoded into memory before the clock runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 import graphvio
-from benchmarks.report import tell
+from benchmarks.report import log_progress
 from graphvio.arrays import Image
 from graphvio.errors import GraphvioError
 from graphvio.measurements.sensors import FrameSet, Measurement
@@ -54,15 +54,15 @@ def simulated(data: Path, scene: str, duration_s: float | None = None) -> Path:
 def rendered_once(data: Path, scene: str, variant: str, render: Callable[[Path], object], *sources: Path) -> Path:
     """The folder of a recording, which is rendered if it is missing.
 
-    Its name ends in a digest of the simulator's sources, so that a changed simulator renders anew; of the scenes'
+    Its name ends in a digest of the simulator's sources, so that a changed simulator renders it again; of the scenes'
     own modules only this scene's counts.
 
     Args:
         data: folder of all recordings.
         scene: of the simulator's, or one that the sources hold.
-        variant: tells this recording from all others of the scene.
+        variant: distinguishes this recording from all others of the scene.
         render: writes it into a folder that does not exist yet.
-        sources: further files that decide what is rendered.
+        sources: more files that decide what is rendered.
 
     Raises:
         GraphvioError: if it cannot be made.
@@ -71,7 +71,7 @@ def rendered_once(data: Path, scene: str, variant: str, render: Callable[[Path],
     folder = data / f"{name}-{_digest(scene, sources)}"
     if folder.is_dir():
         return folder
-    tell(f"rendering {name} into {data}; this is done once and takes about three times its length")
+    log_progress(f"rendering {name} into {data}; this is done once and takes about three times its length")
     try:
         data.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{name}-", dir=data) as unfinished:

@@ -43,7 +43,7 @@ class ReferencePipeline:
         rig: calibration.
         corners: at most so many in each left image.
         min_distance_px: least distance of two corners.
-        tracked: points offered to the resection, for each pair and frameset.
+        tracked: candidate points of the resection, for each pair and frameset.
         inliers: points that it explained.
         motions: ``left_T_left_prev`` (4, 4) of the newest frameset by pair, where one was found.
     """

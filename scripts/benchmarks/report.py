@@ -76,14 +76,14 @@ class Report:
             raise GraphvioError(f"docs/{page.name}: cannot be read ({error.strerror})") from None
         if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
             raise GraphvioError(f"docs/{page.name}: needs one line {begin} and after it one line {end}")
-        before, rest = text.split(begin)
-        after = rest.split(end)[1]
+        before, remaining = text.split(begin)
+        after = remaining.split(end)[1]
         inside = f"{self.text}\n{extra}\n" if extra else self.text
         page.write_text(f"{before}{begin}\n{inside}{end}{after}", encoding="utf-8")
 
 
-def tell(text: str) -> None:
-    """One line about progress, on stderr."""
+def log_progress(text: str) -> None:
+    """Print one line about progress to stderr."""
     print(text, file=sys.stderr, flush=True)
 
 

@@ -1,4 +1,4 @@
-"""One run of the odometry over a recording with truth, and what it is worth."""
+"""One run of the odometry over a recording with truth, and its errors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.motions import BREAK_STATISTIC, EXACT, Overheard, TruthNoise, motion_error, overhear, uses_vision
+from benchmarks.motions import BREAK_STATISTIC, EXACT, TruthNoise, VisionLog, log_vision, motion_error, uses_vision
 from benchmarks.recordings import blocks
 from graphvio.arrays import Bool, Float, Int
 from graphvio.config import Config
@@ -36,7 +36,7 @@ Alter = Callable[[FrameSet], FrameSet]
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a run came to.
+    """Result of a run.
 
     Attributes:
         estimate: causal poses of all epochs, ``nav_T_body``.
@@ -123,19 +123,19 @@ def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, n
         rig: pairs and IMU that are used.
         config: of the odometry.
         alter: applied to every frameset, or None.
-        noise: of the true poses; counts where breaks are told.
+        noise: of the true poses; breaks are determined with it.
 
     Raises:
         GraphvioError: if the recording cannot be read or has no truth.
     """
     source = open_source(recording, rig)
     if source.truth is None:
-        raise GraphvioError(f"{recording}: holds no true trajectory; accuracy cannot be told without")
+        raise GraphvioError(f"{recording}: holds no true trajectory; the accuracy cannot be measured without")
     truth = load_trajectory(source.truth)
     warm_up(source.rig, config)
     cv2.setNumThreads(-1)  # as in a new process; the odometry then sets what it wants
     odometry = Odometry(source.rig, config)
-    overheard = overhear(odometry)
+    vision_log = log_vision(odometry)
     estimates: list[Estimate] = []
     for block in blocks(iter(source), _BLOCK):
         for measurement in _altered(block, alter):
@@ -144,7 +144,7 @@ def run(recording: Path, rig: Rig, config: Config, alter: Alter | None = None, n
                 estimates.append(estimate)
     estimates += odometry.finish()
     cv2.setNumThreads(-1)
-    return _judge(estimates, overheard, truth, noise)
+    return _outcome(estimates, vision_log, truth, noise)
 
 
 def _altered(block: list[Measurement], alter: Alter | None) -> list[Measurement]:
@@ -153,12 +153,12 @@ def _altered(block: list[Measurement], alter: Alter | None) -> list[Measurement]
     return [alter(measurement) if isinstance(measurement, FrameSet) else measurement for measurement in block]
 
 
-def _judge(estimates: list[Estimate], overheard: Overheard, truth: Trajectory, noise: TruthNoise) -> Outcome:
+def _outcome(estimates: list[Estimate], vision_log: VisionLog, truth: Trajectory, noise: TruthNoise) -> Outcome:
     posed = [e for e in estimates if e.nav_T_body is not None]
     stamps_ns = np.array([e.stamp_ns for e in posed], dtype=np.int64)
     estimate = Trajectory(stamps_ns, np.array([e.nav_T_body for e in posed]).reshape(-1, 4, 4))
-    returned = sum(result.motion is not None for result in overheard.results.values())
-    statistics = _statistics(list(overheard.used.values()), truth, noise)
+    returned = sum(result.motion is not None for result in vision_log.results.values())
+    statistics = _statistics(list(vision_log.used.values()), truth, noise)
     try:
         evaluation = evaluate(estimate, truth)
     except TrajectoryError:
@@ -172,7 +172,7 @@ def _judge(estimates: list[Estimate], overheard: Overheard, truth: Trajectory, n
         framesets=len(estimates),
         motions=len(statistics),
         breaks=int(np.sum(statistics > BREAK_STATISTIC)),
-        refused=returned - len(overheard.used),
+        refused=returned - len(vision_log.used),
     )
 
 

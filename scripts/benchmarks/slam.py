@@ -1,7 +1,7 @@
-"""``scripts/benchmark slam``: what the reference SLAM makes of the odometry, and how it finds its way in a saved map.
+"""``scripts/benchmark slam``: accuracy of the reference SLAM, and relocalisation in a saved map.
 
-The command ``graphvio slam`` itself is run on the simulated loop at the sensors' pace, and again from other places of
-the same walk, with its very images, with the map that it saved.
+The command ``graphvio slam`` runs on the simulated loop at the sensors' pace, and again from other places of the same
+walk, on the same images, with the map that it saved.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks.command_line import Subparsers, add_command, add_report_options
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import Report, machine, tell
+from benchmarks.report import Report, log_progress, machine
 from graphvio.arrays import Float
 from graphvio.errors import GraphvioError
 from graphvio.evaluation import evaluate
@@ -28,7 +28,7 @@ from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
 _SCENE = "loop"
-_STARTS_S = (8.0, 30.0, 50.0)
+_SESSION_BEGINS_S = (8.0, 30.0, 50.0)
 _RELOCALISED_S = 15.0
 _GAP_S = 0.1
 _HEAD = ("error, mm", "odometry", "in the map as known then", "in the map as known at the end")
@@ -53,13 +53,13 @@ def main(args: argparse.Namespace) -> None:
         report.table(_HEAD, _errors(folder, out))
         report.add(_smoothness(folder, out))
         rows = []
-        for start_s in _STARTS_S:
+        for start_s in _SESSION_BEGINS_S:
             again = Path(made) / f"from-{start_s:g}"
             until_s = start_s + _RELOCALISED_S
             _slam(f"replay:{folder}?from_s={start_s:g}&to_s={until_s:g}", "--map", out, "--out", again)
             rows.append(_relocalised(folder, out, again, start_s))
-            tell(f"from {start_s:g} s")
-        report.add(f"In the saved map, from {len(_STARTS_S)} places of the walk, {_RELOCALISED_S:g} s each:")
+            log_progress(f"from {start_s:g} s")
+        report.add(f"In the saved map, from {len(_SESSION_BEGINS_S)} places of the walk, {_RELOCALISED_S:g} s each:")
         report.table(("begins at, s", "found after, s", "error when found, mm", "error at the end, mm"), rows)
     if args.out is not None:
         report.save(args.out)

@@ -30,7 +30,7 @@ class Contender(Protocol):
     """How many threads OpenCV uses while it is this pipeline's turn."""
 
     def step(self, index: int) -> dict[str, float]:
-        """Work on the next frameset; returns the milliseconds by stage, as the pipeline itself tells them."""
+        """Work on the next frameset; returns the milliseconds by stage, as the pipeline itself reports them."""
 
     def close(self) -> None:
         """End what it has running."""
@@ -113,7 +113,7 @@ class FrontendContender:
         self.tracks: list[int] = []
         """Corners followed in the left image, for each counted frameset and pair."""
         self.points: list[int] = []
-        """Points offered to the estimation, likewise."""
+        """Candidate points of the estimation, likewise."""
         self.failures = 0
         """Counted framesets without a motion."""
 

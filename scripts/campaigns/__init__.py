@@ -1,1 +1,1 @@
-"""Statistical claims by Monte Carlo: ``scripts/campaign``."""
+"""Monte Carlo campaigns and outages: ``scripts/campaign``."""

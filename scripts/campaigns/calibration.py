@@ -1,4 +1,4 @@
-"""``scripts/campaign calibration``: how well P_12 is found, and what it is information_gains to the odometry.
+"""``scripts/campaign calibration``: the accuracy of P_12, and its effect on the odometry.
 
 Three parts. Synthetic errors: 200 runs at each of several noise levels and shares of outliers, compared with the
 covariance. Images: two minutes of the scene ``calibration``, of which more and more framesets are used. Odometry:
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from benchmarks.command_line import add_command, add_report_options
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import Report, machine, tell
+from benchmarks.report import Report, log_progress, machine
 from benchmarks.runs import run, with_moved_pair
 from scipy.stats import chi2
 
@@ -93,12 +93,12 @@ def _synthetic(runs: int, jobs: int) -> list[list[str]]:
             for share in _OUTLIERS:
                 options = ([value] * runs for value in (rotation_rad, translation_m, share))
                 made = list(pool.map(one_run, range(runs), *options))
-                rows.append([f"{1e3 * rotation_rad:g}, {1e3 * translation_m:g}", f"{100 * share:g}", *_judged(made)])
-                tell(" | ".join(rows[-1]))
+                rows.append([f"{1e3 * rotation_rad:g}, {1e3 * translation_m:g}", f"{100 * share:g}", *_cells(made)])
+                log_progress(" | ".join(rows[-1]))
     return rows
 
 
-def _judged(runs: list[Run]) -> list[str]:
+def _cells(runs: list[Run]) -> list[str]:
     def rms(values: list[float]) -> float:
         return float(np.sqrt(np.mean(np.square(values))))
 
@@ -124,7 +124,7 @@ def _growth(recording: Path) -> tuple[Calibration, list[list[str]]]:
     def follow(number: int, separate: SeparateMotions) -> bool:
         if number in _FRAMESETS:
             rows.append(_growth_row(number, calibrate_pair(segments_of_motions(separate.motions())), truth))
-            tell(" | ".join(rows[-1]))
+            log_progress(" | ".join(rows[-1]))
         return False
 
     return calibrate_pairs(recording, on_frameset=follow), rows
@@ -155,7 +155,7 @@ def _odometry(data: Path, scenes: list[str], found: Calibration) -> list[list[st
         true = open_source(recording).rig
         rigs = [true, found.calibrated_rig(), with_moved_pair(true, 1, _WRONG_DEG, _WRONG_M)]
         for without, used in ((True, [rig.without_imu() for rig in rigs]), (False, rigs)):
-            tell(f"{scene}, {'cameras alone' if without else 'with the IMU'}")
+            log_progress(f"{scene}, {'cameras alone' if without else 'with the IMU'}")
             outcomes = [run(recording, rig, Config()) for rig in used]
             errors = np.array([1e3 * outcome.epoch_ate_m for outcome in outcomes])
             totals[int(without)] += errors

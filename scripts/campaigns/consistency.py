@@ -1,8 +1,8 @@
-"""``scripts/campaign consistency``: is the smoother as certain as it may be, and no more?
+"""``scripts/campaign consistency``: is the smoother consistent?
 
-Walks of the simulator's scenes are estimated many times, each with another IMU, other biases, another start and other
-errors of vision. Vision's errors are drawn from the covariances that the front-end tells on rendered images of a room;
-in a second set the whole odometry runs on rendered images, and only the IMU is another one each time.
+Walks of the simulator's scenes are estimated many times, each with other errors of IMU, initial state and vision. Those
+of vision are sampled from the covariances that the front-end reports on rendered images of a room; in a second set the
+whole odometry runs on rendered images, and only the IMU differs between runs.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from pathlib import Path
 
 from benchmarks.command_line import add_command
 from benchmarks.recordings import add_data_option
-from benchmarks.report import DOCS, Report, machine, tell
+from benchmarks.report import DOCS, Report, log_progress, machine
 
-from campaigns.drawn import Template, templates_of
 from campaigns.measures import HEAD, Squares, rows
 from campaigns.model_run import model_run
 from campaigns.picture import draw_consistency
 from campaigns.rendered_run import CALIBRATION_ERROR_SHARE, WITHOUT_SHARE, rendered_run
+from campaigns.synthetic_vision import Template, templates_of
 from campaigns.walks import SCENES
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
@@ -34,22 +34,20 @@ NAMES = {
     "accel bias": "accelerometer bias",
     "vision": "NIS of vision's motions",
 }
-DRAWN_NAMES = NAMES | {"imu": "the preintegrated IMU at the true states"}
+SYNTHETIC_NAMES = NAMES | {"imu": "the preintegrated IMU at the true states"}
 RENDERED_NAMES = NAMES | {f"pose over 10 s{WITHOUT_SHARE}": f"relative pose over 10 s{WITHOUT_SHARE}"}
-_WHERE = "room"  # whose images tell the covariances
+_WHERE = "room"  # on whose images the covariances are found
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``consistency``."""
     parser = add_command(subparsers, "consistency", "NEES and NIS over many runs", __doc__)
-    parser.add_argument("--seeds", type=int, default=50, help="runs with drawn errors (default: 50)")
+    parser.add_argument("--seeds", type=int, default=50, help="runs with synthetic errors (default: 50)")
     parser.add_argument("--rendered", type=int, default=3, help="runs of each rendered scene (default: 3)")
     parser.add_argument("--duration", type=float, default=25.0, metavar="S", help="seconds of a run (default: 25)")
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side (default: 2)")
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE.md", help="write the report to this file, a picture beside it"
-    )
-    parser.add_argument("--docs", action="store_true", help="write report and picture into docs/")
+    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file, a plot next to it")
+    parser.add_argument("--docs", action="store_true", help="write report and plot into docs/")
     add_data_option(parser)
     parser.set_defaults(run=main)
 
@@ -59,7 +57,7 @@ def main(args: argparse.Namespace) -> None:
     if args.seeds < 2 or args.rendered < 0 or args.jobs < 1 or args.duration < 20.0:
         raise GraphvioError("--seeds wants 2 or more, --rendered 0, --jobs 1 and --duration 20 or more")
     templates = templates_of(args.data, _WHERE)
-    drawn, rendered = Squares(), Squares()
+    synthetic, rendered = Squares(), Squares()
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
         tasks = [pool.submit(model_run, seed, templates, args.duration) for seed in range(args.seeds)]
         tasks += [
@@ -68,40 +66,40 @@ def main(args: argparse.Namespace) -> None:
             for seed in range(args.rendered)
         ]
         for number, task in enumerate(tasks):
-            squares = drawn if number < args.seeds else rendered
+            squares = synthetic if number < args.seeds else rendered
             for name, time_s, square, dimensions in task.result():
                 squares.add_square(name, number, time_s, square, dimensions)
-            tell(f"run {number + 1} of {len(tasks)}")
+            log_progress(f"run {number + 1} of {len(tasks)}")
     report = Report()
-    _write(report, args, drawn, rendered, templates)
+    _write(report, args, synthetic, rendered, templates)
     if args.out is not None:
         report.save(args.out)
-        draw_consistency(args.out.with_suffix(".png"), drawn, NAMES)
+        draw_consistency(args.out.with_suffix(".png"), synthetic, NAMES)
     if args.docs:
         report.save_to_docs("consistency", "![NEES over time](consistency.png)")
-        draw_consistency(DOCS / "consistency.png", drawn, NAMES)
+        draw_consistency(DOCS / "consistency.png", synthetic, NAMES)
 
 
 def _write(
-    report: Report, args: argparse.Namespace, drawn: Squares, rendered: Squares, templates: dict[int, Template]
+    report: Report, args: argparse.Namespace, synthetic: Squares, rendered: Squares, templates: dict[int, Template]
 ) -> None:
     report.add(
         machine(),
         "",
         f"`--seeds {args.seeds}`, `--rendered {args.rendered}`, `--duration {args.duration:g}`.",
         "",
-        "Squared Mahalanobis distances: of an honest estimator the mean is the number of dimensions. The band is that "
-        "of the mean of all runs at one time; of the times, 95 % are expected in it.",
+        "Squared Mahalanobis distances: of a consistent estimator the mean is the number of dimensions. The band is "
+        "that of the mean of all runs at one time; of the times, 95 % are expected in it.",
     )
     report.add(
-        "#### Errors drawn from the model",
+        "#### Errors sampled from the model",
         f"{args.seeds} runs on the walks of {', '.join(SCENES)}. Vision's covariances are those that the front-end "
-        f"told for {len(templates)} motions in the rendered {_WHERE}; IMU, biases and the start's errors are drawn "
-        "from what the smoother is told of them (`smoother.imu_noise_scale` 1). The last row compares the IMU from one "
-        "frameset to the next with the true states. It is a little careful: the mean of two samples has less noise "
-        "than one, and some error of the integration is allowed for.",
+        f"reported for {len(templates)} motions in the rendered {_WHERE}; errors of IMU, biases and initial state are "
+        "sampled from the model of the smoother (`smoother.imu_noise_scale` 1). The last row compares the IMU from one "
+        "frameset to the next with the true states. It is a little conservative: the mean of two samples has less "
+        "noise than one, and some error of the integration is allowed for.",
     )
-    report.table(HEAD, rows(drawn, DRAWN_NAMES))
+    report.table(HEAD, rows(synthetic, SYNTHETIC_NAMES))
     if args.rendered:
         report.add(
             "#### Rendered images",
@@ -109,9 +107,9 @@ def _write(
             "simulator does not have, errors of the calibration and an IMU noisier than its data sheet; here they do "
             f"not (`motion.calibration_error_share` {CALIBRATION_ERROR_SHARE:g} instead of "
             f"{Config().motion.calibration_error_share:g}, `smoother.imu_noise_scale` 1). That share stands for "
-            "errors of tracking that motions have in common, and was chosen on these recordings; a row tells what "
-            "comes of the pose over 10 s with a share of 0. What is known of the biases at the start is wider than "
-            "the simulator's are, so that less than the number of dimensions is expected of them and of the tilt. The "
-            "aim is a factor of 2 for the others.",
+            "errors of tracking that motions have in common, and was chosen on these recordings; a row shows the pose "
+            "over 10 s with a share of 0. The initial covariance of the biases is wider than the simulator's biases "
+            "are, so that less than the number of dimensions is expected of them and of the tilt. The aim is a factor "
+            "of 2 for the others.",
         )
         report.table(HEAD, rows(rendered, RENDERED_NAMES))

@@ -1,7 +1,7 @@
-"""``scripts/campaign endurance``: does the back-end stay as it is over an hour?
+"""``scripts/campaign endurance``: are time, memory and errors of the back-end constant over an hour?
 
-Rounds through a room, with an IMU whose biases go on drifting and motions by vision that are drawn from the truth. What
-a frameset takes, the process's memory, what is known of the state and how wrong it is are told for each part.
+The rig walks rounds through a room, with an IMU whose biases drift and motions by vision that are sampled around the
+truth. Time per frameset, memory of the process, errors of the state and their sigmas are reported for each part.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from time import perf_counter
 
 import numpy as np
 from benchmarks.command_line import Subparsers, add_command, add_report_options
-from benchmarks.report import Report, machine, tell
+from benchmarks.report import Report, log_progress, machine
 
 from campaigns.measures import heading_aligned, tilt_error
 from campaigns.walks import FRAMES_HZ
@@ -53,8 +53,8 @@ def main(args: argparse.Namespace) -> None:
     report.add(
         machine(),
         "",
-        f"`--minutes {args.minutes:g}`. Errors are those at the end of each part. The position's sigma grows, as "
-        "nothing ever tells where the rig is.",
+        f"`--minutes {args.minutes:g}`. Errors are those at the end of each part. The position's sigma grows, as no "
+        "measurement determines the position.",
     )
     report.table(_HEAD, _parts(60.0 * args.minutes))
     if args.out is not None:
@@ -107,7 +107,7 @@ def _parts(duration_s: float) -> list[list[str]]:
                     *_errors(estimator, states.world_T_body[k], track.gyro_bias[round(k * imu.rate_hz / FRAMES_HZ)]),
                 ]
             )
-            tell(" | ".join(rows[-1]))
+            log_progress(" | ".join(rows[-1]))
             spent_ms.clear()
     return rows
 
@@ -138,6 +138,6 @@ def _sigma(covariance: Float) -> float:
 
 
 def _memory_mb() -> float:
-    """What the process holds in memory now."""
+    """Resident memory of the process."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * 4096 / 2**20

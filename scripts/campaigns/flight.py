@@ -1,4 +1,4 @@
-"""A recorded IMU with a truth beside it, in an EuRoC folder."""
+"""A recorded IMU with its truth, in an EuRoC folder."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """The IMU in steps of 50 ms, and what the file tells of its states there.
+    """The IMU in steps of 50 ms, and the states that the file has there.
 
     Attributes:
         stamps_ns: N of them.
         intervals: N - 1, the IMU from each stamp to the next.
-        told: by the file; the velocities are those of its positions.
+        recorded: states of the file; the velocities are those of its positions.
     """
 
     stamps_ns: list[int]
     intervals: list[ImuInterval]
-    told: Truth
+    recorded: Truth
 
     @staticmethod
     def read(folder: Path) -> Flight:
@@ -75,8 +75,8 @@ class Flight:
         seconds, at = (1e-9 * (each - first) for each in (truth.stamps_ns, stamps))
         biases = np.stack([np.interp(at, seconds, column) for column in columns.T], axis=1)
         velocity = np.gradient(poses.positions, 1e-9 * STEP_NS, axis=0)
-        told = Truth(poses.nav_T_body, velocity, biases[:, :3], biases[:, 3:])
-        return Flight(stamps.tolist(), list(_intervals(table, stamps, folder)), told)
+        recorded = Truth(poses.nav_T_body, velocity, biases[:, :3], biases[:, 3:])
+        return Flight(stamps.tolist(), list(_intervals(table, stamps, folder)), recorded)
 
 
 def _bias_columns(path: Path, rows: int) -> Float:

@@ -1,7 +1,7 @@
-"""The truth of a recorded IMU, found anew from the positions beside it and the IMU alone.
+"""The truth of a recorded IMU, reconstructed from the recorded positions and the IMU alone.
 
-The orientations of such a file need not be those of the IMU. A batch over all of the recording does not ask for them:
-its unknowns are the IMU's poses, velocities and biases, and where on the body the positions were measured.
+The orientations of such a file need not be those of the IMU. A batch over all of the recording does not use them: its
+unknowns are the IMU's poses, velocities and biases, and the point of the body whose positions were measured.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ _LEVER_ARM = int(gtsam.symbol("l", 0))
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """What a batch finds of a flight.
+    """Result of a batch over a flight.
 
     Attributes:
         truth: the states.
         lever_arm: (3,) m, body: where the positions were measured.
         chi_square: twice the cost that is left.
-        freedom: what that is expected to be: residuals less unknowns.
+        freedom: its expectation, the number of residuals less that of unknowns.
     """
 
     truth: Truth
@@ -63,10 +63,10 @@ def reconstruct(flight: Flight, imu: Imu, noise_scale: float, rounds: int = 2) -
         flight: whose positions are taken, and whose orientations are where the search begins.
         imu: its noise densities.
         noise_scale: factor on them.
-        rounds: each preintegrates the IMU at the biases that the one before has found, the first at zero.
+        rounds: each preintegrates the IMU at the biases of the one before, the first at zero.
     """
-    told, zeros = flight.told, np.zeros_like(flight.told.gyro_bias)
-    truth, lever_arm = Truth(told.world_T_body, told.velocity_world, zeros, zeros), np.zeros(3)
+    recorded, zeros = flight.recorded, np.zeros_like(flight.recorded.gyro_bias)
+    truth, lever_arm = Truth(recorded.world_T_body, recorded.velocity_world, zeros, zeros), np.zeros(3)
     params = preintegration_params(imu, noise_scale)
     for _ in range(rounds):
         graph = _graph(flight, truth, params)
@@ -77,10 +77,10 @@ def reconstruct(flight: Flight, imu: Imu, noise_scale: float, rounds: int = 2) -
     return Reconstruction(truth, lever_arm, 2.0 * graph.error(values), freedom, gtsam.Marginals(graph, values))
 
 
-def turns(told: Truth, found: Truth) -> Float:
+def turns(recorded: Truth, found: Truth) -> Float:
     """Rotation vectors (N, 3) rad, in body, from one truth's orientations to another's."""
-    told_R_found = np.swapaxes(told.world_T_body[:, :3, :3], 1, 2) @ found.world_T_body[:, :3, :3]
-    return np.array([so3_log(np.ascontiguousarray(turn)) for turn in told_R_found])
+    recorded_R_found = np.swapaxes(recorded.world_T_body[:, :3, :3], 1, 2) @ found.world_T_body[:, :3, :3]
+    return np.array([so3_log(np.ascontiguousarray(turn)) for turn in recorded_R_found])
 
 
 def force_errors(flight: Flight, truth: Truth, imu: Imu) -> Float:
@@ -94,8 +94,8 @@ def force_errors(flight: Flight, truth: Truth, imu: Imu) -> Float:
     return errors
 
 
-def with_drawn_forces(flight: Flight, errors: Float, density: float, seed: int) -> Flight:
-    """A flight whose forces differ from a truth's by a constant and white noise, not by what was measured.
+def with_synthetic_forces(flight: Flight, errors: Float, density: float, seed: int) -> Flight:
+    """Return a flight whose forces are those of a truth with a constant bias and white noise.
 
     Args:
         flight: with the measured forces.
@@ -120,7 +120,7 @@ def allan_deviation(values: Float, steps: int) -> Float:
 
 def _graph(flight: Flight, around: Truth, params: gtsam.PreintegrationCombinedParams) -> gtsam.NonlinearFactorGraph:
     graph, noise = gtsam.NonlinearFactorGraph(), isotropic(3, _POSITION_SIGMA_M)
-    for k, world_T_body in enumerate(flight.told.world_T_body):
+    for k, world_T_body in enumerate(flight.recorded.world_T_body):
         graph.add(gtsam.GPSFactorArmCalib(x(k), _LEVER_ARM, world_T_body[:3, 3], noise))
     for k, (interval, bias) in enumerate(zip(flight.intervals, _biases(around)[:-1], strict=True)):
         measured = preintegrate(interval, params, bias)

@@ -1,8 +1,8 @@
-"""``scripts/campaign lags``: what a longer lag and more iterations gain over the paper's filter.
+"""``scripts/campaign lags``: the gain of a longer lag and more iterations over the paper's filter.
 
 The filter's model as a factor graph, with a lag of one step and one iteration, is the filter. Here both grow, on walks
-of the simulator with drawn errors of vision and IMU, which is blind for a second in every five; and the smoother that
-the odometry runs is held against them, on the same measurements.
+of the simulator with sampled errors of vision and IMU and without vision for a second in every five; the odometry's
+smoother is compared with them on the same measurements.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from multiprocessing import get_context
 
 import numpy as np
 from benchmarks.command_line import add_command, add_report_options
-from benchmarks.report import Report, machine, tell
+from benchmarks.report import Report, log_progress, machine
 
 from campaigns.paper_run import PaperRun, Track
 from campaigns.walks import FRAMES_HZ
@@ -46,13 +46,13 @@ def main(args: argparse.Namespace) -> None:
         for seed, result in enumerate(pool.map(one_run, range(args.seeds), [args.duration] * args.seeds)):
             for name, track in result.items():
                 tracks[name].append(track)
-            tell(f"run {seed + 1} of {args.seeds}")
+            log_progress(f"run {seed + 1} of {args.seeds}")
     report = Report()
     report.add(
         machine(),
         "",
         f"`--seeds {args.seeds}`, `--duration {args.duration:g}`. Root mean square errors against the truth, the start "
-        "being known: of the newest state when it is told, and of a state as it leaves the window.",
+        "being known: of the newest state when it is reported, and of a state as it leaves the window.",
     )
     rows = [_row("filter", "1", "1", tracks["filter"])]
     rows += [_row("its graph", str(lag), str(n), tracks[f"{lag}, {n}"]) for lag, n in LAGS]

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from benchmarks.command_line import Subparsers, add_command, add_report_options
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import Report, machine, tell
+from benchmarks.report import Report, log_progress, machine
 
 from campaigns.live_listener import Listener
 from graphvio.config import Config
@@ -77,7 +77,7 @@ def main(args: argparse.Namespace) -> None:
     rows = []
     for case in _CASES:
         rows.append([case.name, *_run(case, folder, args.seconds)])
-        tell(case.name)
+        log_progress(case.name)
     report.table(_HEAD, rows)
     lost_s = [_killed(folder, 4.0 + 1.3 * k) for k in range(args.kills)]
     if lost_s:

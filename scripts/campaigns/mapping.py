@@ -1,7 +1,7 @@
-"""``scripts/campaign mapping``: the reference SLAM by itself, on rendered images and poses with drawn drift.
+"""``scripts/campaign mapping``: the reference SLAM by itself, on rendered images and poses with synthetic drift.
 
-The errors are those of mapping, and not of an odometry: the front-end's keyframes are true poses with a random walk
-added, and covariances to match. Then sessions begin in a map that was saved.
+The errors are those of mapping and not of an odometry: the front-end's keyframes are true poses with a random walk
+added, and consistent covariances. Then sessions begin in a saved map.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from benchmarks.command_line import Subparsers, add_command, add_report_options
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import Report, machine, tell
+from benchmarks.report import Report, log_progress, machine
 from synthetic_front_end import SyntheticFrontEnd
 
 from graphvio.arrays import Float, Int
@@ -31,21 +31,21 @@ from graphvio.trajectory_files import load_trajectory
 _SCENE = "loop"
 _STEP = 5  # framesets from keyframe to keyframe: four a second
 _SIGMAS = (np.deg2rad(0.02), 0.01)  # of the drift after a metre
-_STARTS_S = (3.0, 35.0, 66.5)
+_SESSION_BEGINS_S = (3.0, 35.0, 66.5)
 _SESSION_S = 5.0
 _GAP_S = 0.1
-_WRONG_M, _WRONG_RAD = 0.5, 0.1  # closures further off join what is not the same place
-_DRAWN = ("draw", "error at the end, mm", "after mapping, mm", "rmse, mm", "after mapping, mm", "places",
-          "closures found", "wrong among them", "used", "wrong among them")  # fmt: skip
-_CORRECTIONS = ("draw", "corrections", "squared error by covariance: median", "greatest", "expected")
-_STARTED = ("begins at, s", "keyframes until found", "metres until found", "first correction off by, mm", "degrees",
-            "sigma told, mm", "last correction off by, mm")  # fmt: skip
+_WRONG_M, _WRONG_RAD = 0.5, 0.1  # closures farther off join different places
+_DRIFT_HEAD = ("draw", "error at the end, mm", "after mapping, mm", "rmse, mm", "after mapping, mm", "places",
+               "closures found", "wrong among them", "used", "wrong among them")  # fmt: skip
+_CORRECTIONS_HEAD = ("draw", "corrections", "squared error by covariance: median", "greatest", "expected")
+_SESSION_HEAD = ("begins at, s", "keyframes until found", "metres until found", "first correction off by, mm",
+                 "degrees", "reported sigma, mm", "last correction off by, mm")  # fmt: skip
 _STAGES = ("features", "keep", "description", "retrieval", "verification", "graph", "vocabulary")
 
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``mapping``."""
-    parser = add_command(subparsers, "mapping", "the reference SLAM on drawn drift, and in a saved map", __doc__)
+    parser = add_command(subparsers, "mapping", "the reference SLAM on synthetic drift, and in a saved map", __doc__)
     parser.add_argument("--draws", type=int, default=3, help="walks with another drift (default: 3)")
     add_report_options(parser)
     add_data_option(parser)
@@ -64,18 +64,18 @@ def main(args: argparse.Namespace) -> None:
         for draw in range(args.draws):
             keep = Path(made) / "map" if draw == 0 else None
             runs.append(_run(source, draw, np.arange(0, source.frameset_count, _STEP), None, keep))
-            tell(f"draw {draw}")
-        report.table(_DRAWN, [_drawn_row(draw, run) for draw, run in enumerate(runs)])
-        report.add("What the odometry was told, where it truly was:")
-        report.table(_CORRECTIONS, [_corrections_row(draw, run) for draw, run in enumerate(runs)])
+            log_progress(f"draw {draw}")
+        report.table(_DRIFT_HEAD, [_drift_row(draw, run) for draw, run in enumerate(runs)])
+        report.add("Corrections that the odometry received, compared with the truth:")
+        report.table(_CORRECTIONS_HEAD, [_corrections_row(draw, run) for draw, run in enumerate(runs)])
         rows = []
-        for start_s in _STARTS_S:
+        for start_s in _SESSION_BEGINS_S:
             first, last = (round(20 * at_s) for at_s in (start_s, start_s + _SESSION_S))
             indices = np.arange(first, min(last, source.frameset_count), 3)
-            rows.append(_started_row(start_s, _run(source, 100, indices, Path(made) / "map", None)))
-            tell(f"from {start_s:g} s")
-    report.add(f"In the saved map of draw 0, from {len(_STARTS_S)} places of the walk, {_SESSION_S:g} s each:")
-    report.table(_STARTED, rows)
+            rows.append(_session_row(start_s, _run(source, 100, indices, Path(made) / "map", None)))
+            log_progress(f"from {start_s:g} s")
+    report.add(f"In the saved map of draw 0, from {len(_SESSION_BEGINS_S)} places of the walk, {_SESSION_S:g} s each:")
+    report.table(_SESSION_HEAD, rows)
     report.add("Milliseconds by the clock, where they were needed; a place has up to three candidates:")
     report.table(("stage", "ms"), _stage_rows([run.summary for run in runs]))
     if args.out is not None:
@@ -86,7 +86,7 @@ def main(args: argparse.Namespace) -> None:
 
 @dataclass(frozen=True)
 class _Run:
-    """What came of one.
+    """Result of one run.
 
     Attributes:
         truth: (N, 4, 4) of the keyframes, in the map's frame.
@@ -132,7 +132,7 @@ def _run(source: Source, draw: int, indices: Int, begin: Path | None, keep: Path
         return _Run(true, front_end.odom_T_body, mapper.trajectory, front_end.corrections, closures, mapper.summary())
 
 
-def _drawn_row(draw: int, run: _Run) -> list[str]:
+def _drift_row(draw: int, run: _Run) -> list[str]:
     before, after = (
         1e3 * np.linalg.norm(poses[:, :3, 3] - run.truth[:, :3, 3], axis=1)
         for poses in (run.drifted, run.mapped.nav_T_body)
@@ -166,7 +166,7 @@ def _corrections_row(draw: int, run: _Run) -> list[str]:
     return [str(draw), str(len(squares)), f"{np.median(squares):.1f}", f"{max(squares):.1f}", "6"]
 
 
-def _started_row(start_s: float, run: _Run) -> list[str]:
+def _session_row(start_s: float, run: _Run) -> list[str]:
     if not run.corrections:
         return [f"{start_s:g}", "never", *["-"] * 5]
     number, pose, covariance = run.corrections[0]

@@ -1,4 +1,4 @@
-"""NEES and NIS of many runs: their means, and the bands that an honest estimator keeps."""
+"""NEES and NIS of many runs: their means, and the bands of a consistent estimator."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Squares:
         self.dimensions: dict[str, int] = {}
 
     def add(self, name: str, run: int, time_s: float, error: Float, covariance: Float) -> None:
-        """An error (M,) and the covariance (M, M) that was told."""
+        """Add the squared distance of an error (M,) with its reported covariance (M, M)."""
         self.add_square(name, run, time_s, float(error @ np.linalg.solve(covariance, error)), len(error))
 
     def add_square(self, name: str, run: int, time_s: float, square: float, dimensions: int) -> None:
@@ -45,7 +45,7 @@ class Squares:
         return len(self._of[name])
 
     def band(self, name: str) -> tuple[float, float]:
-        """In which the mean over the runs lies at one time, of an honest estimator, with a probability of 95 %."""
+        """Return the 95 % band of the mean over the runs at one time, for a consistent estimator."""
         return band(self.dimensions[name], self.runs(name))
 
     def share_in_band(self, name: str) -> float:

@@ -1,4 +1,4 @@
-"""One run of the smoother alone, on errors that are drawn from its own model."""
+"""One run of the smoother alone, with errors sampled from its own model."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from campaigns.drawn import DrawnVision, Template
 from campaigns.measures import tilt_error
+from campaigns.synthetic_vision import SyntheticVision, Template
 from campaigns.walks import FRAMES_HZ, Walk, buffer_of
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.smoother import Smoother
@@ -18,7 +18,7 @@ from graphvio.config.stages import SmootherConfig
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.measurements.imu_interval import ImuInterval
 
-_SETTLED_S = 2.0
+_WARM_UP_S = 2.0
 _TILT_SIGMA, _SPEED_SIGMA, _GYRO_BIAS_SIGMA, _ACCEL_BIAS_SIGMA = 0.02, 0.2, 0.01, 0.2  # the last is the smoother's
 _FIRST_GYRO_BIAS, _FIRST_ACCEL_BIAS = 4e-3, 4e-2  # that the simulator's IMU has
 
@@ -49,7 +49,7 @@ class _ModelRun:
         )
         self._buffer, self._imu_rate_hz = buffer_of(self._track), walk.imu.rate_hz
         self._stamps, self._truth, self._velocities = walk.stamps_ns, walk.world_T_body, walk.velocity_world
-        self._vision = DrawnVision(templates, self._truth, self._stamps, self._rng)
+        self._vision = SyntheticVision(templates, self._truth, self._stamps, self._rng)
         self._smoother = Smoother(SmootherConfig(imu_noise_scale=1.0), walk.imu)
         self._params = preintegration_params(walk.imu, 1.0)
 
@@ -57,31 +57,31 @@ class _ModelRun:
         """Go through the run."""
         smoother = self._smoother
         self._start()
-        anchors = {1: 0, 10: 0}  # seconds -> frameset from which the motion is measured
+        references = {1: 0, 10: 0}  # seconds -> frameset from which the motion is measured
         for k in range(1, len(self._stamps)):
             interval = self._buffer.interval(self._stamps[k - 1], self._stamps[k])
             assert interval is not None
             smoother.extend(self._stamps[k], interval)
-            if k > _SETTLED_S * FRAMES_HZ:
+            if k > _WARM_UP_S * FRAMES_HZ:
                 yield "imu", k / FRAMES_HZ, self._imu_square(interval, k), 15
             motion = self._vision.at(k)
             if motion is not None and smoother.knows(motion.reference_stamp_ns):
-                gate_result = smoother.gate(motion)
-                if k > _SETTLED_S * FRAMES_HZ:
-                    yield "vision", k / FRAMES_HZ, gate_result.statistic, 6
-                if gate_result.accepted:
+                gate = smoother.gate(motion)
+                if k > _WARM_UP_S * FRAMES_HZ:
+                    yield "vision", k / FRAMES_HZ, gate.statistic, 6
+                if gate.accepted:
                     smoother.add_motion(motion)
-            kept = {self._stamps[number] for number in anchors.values()}
+            kept = {self._stamps[number] for number in references.values()}
             following = self._vision.reference(k + 1)
             kept |= set() if following is None else {self._stamps[following]}
             smoother.update(kept)
-            if k % FRAMES_HZ == 0 and k >= _SETTLED_S * FRAMES_HZ:
+            if k % FRAMES_HZ == 0 and k >= _WARM_UP_S * FRAMES_HZ:
                 yield from self._state_squares(k)
-            for seconds, anchor in anchors.items():
-                if k - anchor == seconds * FRAMES_HZ:
-                    if anchor >= _SETTLED_S * FRAMES_HZ:
-                        yield self._motion_square(f"pose over {seconds} s", anchor, k)
-                    anchors[seconds] = k
+            for seconds, reference in references.items():
+                if k - reference == seconds * FRAMES_HZ:
+                    if reference >= _WARM_UP_S * FRAMES_HZ:
+                        yield self._motion_square(f"pose over {seconds} s", reference, k)
+                    references[seconds] = k
 
     def _start(self) -> None:
         """At the truth, but for errors of the start."""

@@ -24,7 +24,7 @@ Change = Callable[[Measurement], list[Measurement]]
 
 @dataclass(frozen=True)
 class Case:
-    """One thing, or two at once, that goes wrong.
+    """One fault, or two at once.
 
     Attributes:
         name: for people.
@@ -186,9 +186,9 @@ def _after(duration_s: float) -> float:
 _GOES_ON = "the same epoch goes on when images are back"
 _COASTED_ON = "coasts on the IMU with growing uncertainty"
 _COASTED = f"{_COASTED_ON}; {_GOES_ON}"
-_LOST = "coasts, then tells that it is lost and gives no pose; a new epoch when images are back"
+_LOST = "coasts, then reports that it is lost and gives no pose; a new epoch when images are back"
 _VISION_GOES_ON = "vision goes on without the IMU"
-_LEFT_OUT = "the axis that sticks is told; vision goes on without the IMU"
+_LEFT_OUT = "the axis that sticks is reported; vision goes on without the IMU"
 _NEW_EPOCH = "a new epoch at the last pose"
 
 CASES = (
@@ -208,9 +208,9 @@ CASES = (
     Case("axis 0 of gyro and accelerometer stuck, 2 s", _LEFT_OUT, _stuck(0), end_s=_after(2.0)),
     Case("axis 2 of gyro and accelerometer stuck, 2 s", _LEFT_OUT, _stuck(2), end_s=_after(2.0)),
     Case("one sample of the IMU repeated, 2 s", _LEFT_OUT, _repeated, end_s=_after(2.0)),
-    Case("gyro cut off at 0.15 rad/s, 3 s", "vision is refused for a second at most, then believed", _cut_off,
+    Case("gyro cut off at 0.15 rad/s, 3 s", "vision is refused for a second at most, then used", _cut_off,
          end_s=_after(3.0)),
-    Case("axis 2 stuck while all pairs are black, 0.5 s", "coasts with as much doubt as that deserves; " + _GOES_ON,
+    Case("axis 2 stuck while all pairs are black, 0.5 s", "coasts with growing uncertainty; " + _GOES_ON,
          _stuck_and_black, end_s=_after(0.5)),
     Case("all twice and with backward stamps, throughout", "both are left out: the same poses", _muddled,
          begin_s=-math.inf),

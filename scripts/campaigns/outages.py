@@ -1,7 +1,7 @@
-"""``scripts/campaign outages``: what becomes of the estimate when images or the IMU fail for a while, or for good?
+"""``scripts/campaign outages``: the estimate when images or the IMU fail for a while, or for good.
 
-The whole odometry with its defaults runs on the simulated room, once for each case of what can go wrong. A table tells
-what the estimates claimed meanwhile, how far they jumped, when vision was used again and how wrong the motion is.
+The whole odometry with its defaults runs on the simulated room, once for each case. A table shows the status of the
+estimates meanwhile, how far they jumped, when vision was used again and the error of the motion.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from benchmarks.command_line import Subparsers, add_command, add_report_options
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import Report, machine, tell
+from benchmarks.report import Report, log_progress, machine
 from scipy.stats import chi2
 
 from campaigns.outage_cases import BEGIN_S, CASES, Case, Delivery
@@ -32,9 +32,9 @@ from graphvio.trajectory_files import load_trajectory
 
 _SCENE = "room"
 _BEFORE_S, _AFTER_S = 1.0, 3.0
-_SETTLED_S = 2.0  # motions are measured from here on at the earliest: at first the tilt is known least
-_MOST_SIGMA = 3.0
-_MOST_STATISTIC = float(chi2.isf(chi2.sf(_MOST_SIGMA**2, 1), 6))  # as improbable of a pose, which has six numbers
+_WARM_UP_S = 2.0  # motions are measured from here on at the earliest: at first the tilt is known least
+_MAX_SIGMA = 3.0
+_MAX_STATISTIC = float(chi2.isf(chi2.sf(_MAX_SIGMA**2, 1), 6))  # as improbable of a pose, which has six numbers
 _BY_VISION = (Status.TRACKING, Status.INITIALISING)
 _HEAD = ("case", "poses, %", "while it lasts", "largest jump, mm", "at return", "recovery, s", "error, cm",
          "epochs", "events")  # fmt: skip
@@ -68,18 +68,18 @@ def main(args: argparse.Namespace) -> None:
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
         tasks = [pool.submit(run_case, number, folder) for number in range(len(CASES))]
         for number, (case, task) in enumerate(zip(CASES, tasks, strict=True)):
-            cells, claims = task.result()
+            cells, missed = task.result()
             rows.append([case.name, *cells])
-            broken += [f"- {case.name}: {claim}" for claim in claims]
-            tell(f"case {number + 1} of {len(CASES)}")
+            broken += [f"- {case.name}: {words}" for words in missed]
+            log_progress(f"case {number + 1} of {len(CASES)}")
     report.add("#### What is promised", "In all cases, time never goes back and there is no pose while lost.")
     report.table(("case", "promised"), [(case.name, case.promise) for case in CASES])
     report.add("#### What happened", _EXPLANATION)
     report.table(_HEAD, rows)
     report.add(
         "Asked of every case: each delivered frameset has an estimate, stamps increase, there is no pose while lost, "
-        f"and no return within an epoch is beyond {np.sqrt(_MOST_STATISTIC):.1f}, which is as improbable of a pose as "
-        f"{_MOST_SIGMA:g} sigma are of a number: " + ("**missed**." if broken else "**met**.")
+        f"and no return within an epoch is beyond {np.sqrt(_MAX_STATISTIC):.1f}, which is as improbable of a pose as "
+        f"{_MAX_SIGMA:g} sigma are of a number: " + ("**missed**." if broken else "**met**.")
     )
     if broken:
         report.add(*broken)
@@ -90,13 +90,13 @@ def main(args: argparse.Namespace) -> None:
 
 
 def run_case(number: int, folder: Path) -> tuple[list[str], list[str]]:
-    """Run one of the cases on a recording: its cells of the table, and what did not hold."""
+    """Run one of the cases on a recording; returns its cells of the table, and the requirements that it missed."""
     outcome = outcome_of(CASES[number], folder)
-    return outcome.cells(), outcome.broken()
+    return outcome.cells(), outcome.missed()
 
 
 def outcome_of(case: Case, folder: Path) -> Outcome:
-    """What a case leads to on a recording."""
+    """Run a case on a recording."""
     source = open_source(folder, to_s=case.length_s)
     assert source.truth is not None
     truth = load_trajectory(source.truth)
@@ -113,11 +113,11 @@ def outcome_of(case: Case, folder: Path) -> Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What one case led to.
+    """Result of one case.
 
     Attributes:
         case: which.
-        estimates: N of them, in the order in which they were told.
+        estimates: N of them, in the order in which they were reported.
         times_s: (N,) of the images, seconds of the recording after its first frameset.
         world_T_body: (N, 4, 4) true poses.
         given: number of the framesets that were delivered.
@@ -149,15 +149,15 @@ class Outcome:
             _counts(kinds),
         ]
 
-    def broken(self) -> list[str]:
-        """What did not hold of that which is asked of every case."""
+    def missed(self) -> list[str]:
+        """Return the requirements on every case that this one missed."""
         stamps = [e.stamp_ns for e in self.estimates]
         most = max(self.return_distances(), default=0.0)
         asked = {
             f"{len(stamps)} estimates of {self.given} framesets": len(stamps) == self.given,
             "stamps do not increase": stamps == sorted(set(stamps)),
             "a pose while lost": all(e.nav_T_body is None for e in self.estimates if e.status is Status.LOST),
-            f"a return by {most:.1f}": most**2 <= _MOST_STATISTIC,
+            f"a return by {most:.1f}": most**2 <= _MAX_STATISTIC,
         }
         return [words for words, held in asked.items() if not held]
 
@@ -181,7 +181,7 @@ class Outcome:
     def error_m(self) -> float:
         """Of the motion from before to after what goes wrong; NaN where there is no pose at its end."""
         end = int(np.searchsorted(self.times_s, self.case.over_s + _AFTER_S + 1e-3)) - 1
-        start_s = max(self.case.begin_s - _BEFORE_S, _SETTLED_S) - 1e-3
+        start_s = max(self.case.begin_s - _BEFORE_S, _WARM_UP_S) - 1e-3
         of_epoch = [e.epoch == self.estimates[end].epoch and e.nav_T_body is not None for e in self.estimates]
         start = int(np.flatnonzero((self.times_s >= start_s) & np.array(of_epoch))[0])
         return float(np.linalg.norm(self._error(start, end)[3:]))

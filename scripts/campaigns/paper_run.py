@@ -69,12 +69,12 @@ class PaperRun:
     def by_filter(self) -> dict[str, Track]:
         """The paper's filter."""
         running = ExtendedKalmanFilter(*self._start())
-        told = []
+        states = []
         for k in range(1, len(self._stamps)):
             running.predict(*self._process())
             running.update(stacked([each(running.state) for each in self._expectations(k)]))
-            told.append((k, running.state))
-        return {"newest": self._track(told), "leaving": self._track(told)}
+            states.append((k, running.state))
+        return {"newest": self._track(states), "leaving": self._track(states)}
 
     def by_graph(self, lag: int, iterations: int) -> dict[str, Track]:
         """A window of the filter's model."""
@@ -134,13 +134,13 @@ class PaperRun:
             made.append(lambda state: vision(state, rates))
         return made
 
-    def _track(self, told: list[tuple[int, FilterState]], velocities: Float | None = None) -> Track:
-        """Errors of states. Velocities (N + 1, 3) are those that are meant: the filter's are means over the step that
-        ends in the state."""
+    def _track(self, states: list[tuple[int, FilterState]], velocities: Float | None = None) -> Track:
+        """Errors of states. Velocities (N + 1, 3) default to the filter's, means over the step that ends in the
+        state."""
         if velocities is None:
             velocities = np.vstack([self._velocities[:1], 0.5 * (self._velocities[1:] + self._velocities[:-1])])
         errors = []
-        for k, state in told:
+        for k, state in states:
             true = self._truth[k]
             off = np.eye(4)
             off[:3, :3] = true[:3, :3] @ state.nav_R_body.T

@@ -1,4 +1,4 @@
-"""The picture of the consistency campaign: mean squares over time, each with its band."""
+"""The plot of the consistency campaign: mean squares over time, each with its band."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from graphvio.errors import GraphvioError
 _BLUE, _BAND = "#1f5fbf", "#dfe8f5"
 _COLUMNS = 2
 _DPI = 130
-_FEWEST_TIMES = 3
+_MIN_TIMES = 3
 
 
 def draw_consistency(path: Path, squares: Squares, names: Mapping[str, str]) -> None:
-    """Draw a panel for each quantity that is known at several times.
+    """Plot a panel for each quantity that is known at several times.
 
     Raises:
-        GraphvioError: if the picture cannot be written.
+        GraphvioError: if the plot cannot be written.
     """
-    drawn = [name for name in names if len(squares.over_time(name)[0]) >= _FEWEST_TIMES]
-    rows = -(-len(drawn) // _COLUMNS)
+    plotted = [name for name in names if len(squares.over_time(name)[0]) >= _MIN_TIMES]
+    rows = -(-len(plotted) // _COLUMNS)
     figure = Figure(figsize=(10.0, 2.3 * rows), dpi=_DPI, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, _COLUMNS, sharex=True, squeeze=False)
-    for axis in axes.flat[len(drawn) :]:
+    for axis in axes.flat[len(plotted) :]:
         axis.set_visible(False)
-    for axis, name in zip(axes.flat, drawn, strict=False):
+    for axis, name in zip(axes.flat, plotted, strict=False):
         times, means = squares.over_time(name)
         dimensions, (low, high) = squares.dimensions[name], squares.band(name)
         axis.axhspan(low, high, color=_BAND, label="95 % band")
@@ -42,7 +42,7 @@ def draw_consistency(path: Path, squares: Squares, names: Mapping[str, str]) -> 
     for axis in axes[-1]:
         axis.set_xlabel("seconds")
     axes[0, 0].legend(loc="upper right", fontsize=8)
-    figure.suptitle(f"Mean squared Mahalanobis distance of {squares.runs(drawn[0])} runs", fontsize=11)
+    figure.suptitle(f"Mean squared Mahalanobis distance of {squares.runs(plotted[0])} runs", fontsize=11)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path)

@@ -1,7 +1,8 @@
-"""``scripts/campaign rates``: the paper's figure 5, a blind turn as gyro, vision and estimate tell it.
+"""``scripts/campaign rates``: the paper's figure 5, the rates of a turn without vision.
 
-The bend of the simulated corridor, where both pairs see nothing but blank walls for a second: what the left cameras
-saw, and below it the angular rates in body. The estimate follows vision, then the gyro, then vision again.
+The bend of the simulated corridor, where both pairs see nothing but blank walls for a second: images of the left
+cameras, and below them the angular rates in body by gyro, vision and estimate. The estimate follows vision, then the
+gyro, then vision again.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from benchmarks.command_line import Subparsers, add_command
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import DOCS, tell
+from benchmarks.report import DOCS, log_progress
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -34,18 +35,18 @@ _DPI = 130
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``rates``."""
-    parser = add_command(subparsers, "rates", "a picture of a blind turn, as in the paper's figure 5", __doc__)
-    parser.add_argument("--out", type=Path, metavar="FILE.png", help="draw the picture into this file")
-    parser.add_argument("--docs", action="store_true", help="draw it into docs/images")
+    parser = add_command(subparsers, "rates", "a plot of a turn without vision, as in the paper's figure 5", __doc__)
+    parser.add_argument("--out", type=Path, metavar="FILE.png", help="write the plot to this file")
+    parser.add_argument("--docs", action="store_true", help="write it into docs/images")
     add_data_option(parser)
     parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:
-    """Run and draw."""
+    """Run and plot."""
     paths = [path for path in (args.out, DOCS / "images" / "rates.png" if args.docs else None) if path is not None]
     if not paths:
-        raise GraphvioError("where to? give --out FILE.png or --docs")
+        raise GraphvioError("no output is given: give --out FILE.png or --docs")
     blind_s = build_scene("corridor").events["blank"]
     begin_s, end_s = blind_s[0] - _AROUND_S, blind_s[1] + _AROUND_S
     source = open_source(simulated(args.data, "corridor"), to_s=end_s)
@@ -67,7 +68,7 @@ def main(args: argparse.Namespace) -> None:
     names = [pair.name for pair in source.rig.pairs]
     for path in paths:
         _draw(path, names, images, rates, blind_s)
-        tell(f"written: {path.name}")
+        log_progress(f"written: {path.name}")
 
 
 def _draw(

@@ -1,8 +1,8 @@
-"""``scripts/campaign real-imu``: is the smoother as certain as it may be where the IMU is a real one?
+"""``scripts/campaign real-imu``: is the smoother consistent with a real IMU?
 
-EuRoC V1_01 has 145 s of a real IMU and a truth, but no images: vision's motions are drawn from the truth. That is found
-anew from the file's positions and the IMU, as the file's orientations are not those of the IMU; how they differ is
-told, and what they would do.
+EuRoC V1_01 has 145 s of a real IMU and a truth, but no images: vision's motions are sampled around the truth. The truth
+is reconstructed from the file's positions and the IMU, as the file's orientations are not those of the IMU; their
+difference is reported, and its effect.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 from benchmarks.command_line import Subparsers, add_command, add_report_options
-from benchmarks.report import DOCS, Report, machine, tell
+from benchmarks.report import DOCS, Report, log_progress, machine
 
 from campaigns.consistency import NAMES
 from campaigns.flight import FRAMES_HZ, Flight, Truth
-from campaigns.imu_truth import Reconstruction, allan_deviation, force_errors, reconstruct, turns, with_drawn_forces
+from campaigns.imu_truth import Reconstruction, allan_deviation, force_errors, reconstruct, turns, with_synthetic_forces
 from campaigns.measures import Squares, tilt_error
 from campaigns.real_run import Miss, RealRun, real_run
 from graphvio.arrays import Float
@@ -38,13 +38,13 @@ _OWN = ("velocity", "tilt", "gyro bias", "accel bias")  # whose truth has a cova
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``real-imu``."""
     parser = add_command(subparsers, "real-imu", "NEES, NIS and biases on 145 s of a real IMU", __doc__)
-    parser.add_argument("--seeds", type=int, default=10, help="runs with drawn errors of vision (default: 10)")
+    parser.add_argument("--seeds", type=int, default=10, help="runs with sampled errors of vision (default: 10)")
     parser.add_argument(
         "--recording",
         type=Path,
         default=RECORDING,
         metavar="DIR",
-        help="EuRoC's V1_01 (default: shared/data/euroc_v101_imu beside the project)",
+        help="EuRoC's V1_01 (default: shared/data/euroc_v101_imu next to the project)",
     )
     add_report_options(parser)
     parser.set_defaults(run=main)
@@ -62,14 +62,14 @@ def main(args: argparse.Namespace) -> None:
     truth, errors = found.truth, force_errors(flight, found.truth, imu)
     white = config.imu_noise_scale * imu.accel_noise_density
     flights = [flight] * args.seeds
-    runs = _runs("as it is", flights, truth, config, imu)
+    runs = _runs("default", flights, truth, config, imu)
     wider = _runs("wider", flights, truth, replace(config, imu_noise_scale=_OTHER_SCALE), imu)
-    drawn = [with_drawn_forces(flight, errors, white, seed) for seed in range(args.seeds)]
+    synthetic = [with_synthetic_forces(flight, errors, white, seed) for seed in range(args.seeds)]
     steady = replace(truth, accel_bias=np.tile(errors.mean(axis=0), (len(truth.accel_bias), 1)))
     _write_consistency(report, runs, found, config)
-    _write_causes(report, errors, runs, wider, _runs("forces drawn", drawn, steady, config, imu), imu, config)
-    _write_biases(report, flight.told, truth, runs)
-    _write_told(report, runs[0], real_run(0, flight, flight.told, config, imu), flight.told, truth)
+    _write_causes(report, errors, runs, wider, _runs("synthetic forces", synthetic, steady, config, imu), imu, config)
+    _write_biases(report, flight.recorded, truth, runs)
+    _write_recorded(report, runs[0], real_run(0, flight, flight.recorded, config, imu), flight.recorded, truth)
     if args.out is not None:
         report.save(args.out)
     if args.docs:
@@ -80,17 +80,17 @@ def _runs(what: str, flights: list[Flight], truth: Truth, config: SmootherConfig
     runs = []
     for seed, flight in enumerate(flights):
         runs.append(real_run(seed, flight, truth, config, imu))
-        tell(f"{what}: run {seed + 1} of {len(flights)}")
+        log_progress(f"{what}: run {seed + 1} of {len(flights)}")
     return runs
 
 
 def _write_truth(report: Report, flight: Flight, found: Reconstruction, at_zero: Reconstruction) -> None:
-    told, truth = flight.told, found.truth
-    turned_deg = np.rad2deg(turns(told, truth))
+    recorded, truth = flight.recorded, found.truth
+    turned_deg = np.rad2deg(turns(recorded, truth))
     moved = np.abs(turns(at_zero.truth, truth)).max(), np.abs(at_zero.truth.accel_bias - truth.accel_bias).max()
     report.add(
         "#### The truth",
-        "The file beside the reconstruction, by body axis. Means and, of the rotation from the file's orientations to "
+        "The file and the reconstruction, by body axis. Means and, of the rotation from the file's orientations to "
         "the reconstruction's, the standard deviation, over all of the flight.",
     )
     report.table(
@@ -99,9 +99,9 @@ def _write_truth(report: Report, flight: Flight, found: Reconstruction, at_zero:
             _by_axis("rotation, deg", turned_deg.mean(axis=0), 2),
             _by_axis("its scatter, deg", turned_deg.std(axis=0), 2),
             _by_axis("where the positions are measured, cm", 100.0 * found.lever_arm, 2),
-            _by_axis("gyro bias by the file, mrad/s", 1e3 * told.gyro_bias.mean(axis=0), 2),
+            _by_axis("gyro bias by the file, mrad/s", 1e3 * recorded.gyro_bias.mean(axis=0), 2),
             _by_axis("gyro bias by the reconstruction, mrad/s", 1e3 * truth.gyro_bias.mean(axis=0), 2),
-            _by_axis("accelerometer bias by the file, m/s^2", told.accel_bias.mean(axis=0), 3),
+            _by_axis("accelerometer bias by the file, m/s^2", recorded.accel_bias.mean(axis=0), 3),
             _by_axis("accelerometer bias by the reconstruction, m/s^2", truth.accel_bias.mean(axis=0), 3),
         ],
     )
@@ -118,9 +118,10 @@ def _write_consistency(report: Report, runs: list[RealRun], found: Reconstructio
         "#### NEES and NIS",
         f"Means over time and {len(runs)} runs against the reconstruction, with `smoother.imu_noise_scale` "
         f"{config.imu_noise_scale:g}, the default; the aim is within a factor of {_FACTOR:g} of the number of "
-        "dimensions. *Shared* is what the mean error of all runs makes of it, *scattered* what their differences from "
-        "it make, both corrected for the number of runs. *With the truth's own*: the reconstruction's covariance is "
-        "added to the smoother's, as if their errors were independent; the aim is judged without it.",
+        "dimensions. *Shared* is the part due to the mean error of all runs, *scattered* that due to their "
+        "differences from it, both corrected for the number of runs. *With the truth's own*: the reconstruction's "
+        "covariance is added to the smoother's, as if their errors were independent; the aim is for the values "
+        "without it.",
     )
     table, met = [], 0
     for name, words in NAMES.items():
@@ -138,23 +139,23 @@ def _write_consistency(report: Report, runs: list[RealRun], found: Reconstructio
     refused, motions = sum(run.refused for run in runs), sum(len(run.gyro_biases) - 1 for run in runs)
     report.add(
         f"Aim: within a factor of {_FACTOR:g}: **{'met' if met == len(NAMES) else 'missed'}**, {met} of {len(NAMES)} "
-        f"rows. The gate refused {refused} of {motions} motions, none of which was drawn as an outlier."
+        f"rows. The gate refused {refused} of {motions} motions, none of which was sampled as an outlier."
     )
 
 
 def _write_causes(
-    report: Report, errors: Float, runs: list[RealRun], wider: list[RealRun], drawn: list[RealRun], imu: Imu,
+    report: Report, errors: Float, runs: list[RealRun], wider: list[RealRun], synthetic: list[RealRun], imu: Imu,
     config: SmootherConfig,
 ) -> None:  # fmt: skip
-    plain, other, ideal = _squares(runs), _squares(wider), _squares(drawn)
+    plain, other, ideal = _squares(runs), _squares(wider), _squares(synthetic)
     report.add(
-        "#### What makes them large",
+        "#### Causes of large values",
         f"The same runs with `smoother.imu_noise_scale` {_OTHER_SCALE:g}; and with the default on forces that are not "
-        "the measured ones, but those of the reconstruction with a constant bias and the white noise that the smoother "
-        "takes the accelerometer to have, drawn anew for each run. The gyro stays as it was measured.",
+        "the measured ones, but those of the reconstruction with a constant bias and the white noise of the smoother's "
+        "model of the accelerometer, sampled for each run. The gyro's measurements are unchanged.",
     )
     head = ("what", "dimensions", "default", "over dimensions", f"scale {_OTHER_SCALE:g}", "over dimensions",
-            "forces drawn", "over dimensions")  # fmt: skip
+            "synthetic forces", "over dimensions")  # fmt: skip
     rows = [[words, *(cell for cells in (_mean(plain, name), _mean(other, name)[1:], _mean(ideal, name)[1:])
                       for cell in cells)] for name, words in NAMES.items()]  # fmt: skip
     report.table(head, rows)
@@ -171,37 +172,37 @@ def _write_causes(
     report.table(("seconds", *_AXES, "model"), table)
 
 
-def _write_biases(report: Report, told: Truth, found: Truth, runs: list[RealRun]) -> None:
+def _write_biases(report: Report, recorded: Truth, found: Truth, runs: list[RealRun]) -> None:
     report.add(
         "#### Biases",
-        "How far the smoother's are from the file's and from the reconstruction's: median and 95th percentile over "
+        "Differences of the smoother's from the file's and from the reconstruction's: median and 95th percentile over "
         f"all runs and states after {_AFTER_S} s. The aim for the gyro is {1e3 * _GYRO_BIAS_AIM:g} mrad/s from the "
         "file. The file's accelerometer biases belong to its turned orientations: gravity is in them.",
     )
-    first, table, beyond = _AFTER_S * FRAMES_HZ, [], np.zeros(len(told.gyro_bias), dtype=np.bool_)
+    first, table, beyond = _AFTER_S * FRAMES_HZ, [], np.zeros(len(recorded.gyro_bias), dtype=np.bool_)
     for axis, letter in enumerate(_AXES):
         gyro = np.array([run.gyro_biases[:, axis] for run in runs])
-        beyond |= (np.abs(gyro - told.gyro_bias[:, axis]) > _GYRO_BIAS_AIM).any(axis=0)
-        by_file, by_fit = (_apart(gyro[:, first:], each.gyro_bias[first:, axis]) for each in (told, found))
-        gate_results = ["met" if value <= _GYRO_BIAS_AIM else "missed" for value in by_file]
-        table.append([f"gyro {letter}, mrad/s", *_pair(by_file), *gate_results, *_pair(by_fit)])
+        beyond |= (np.abs(gyro - recorded.gyro_bias[:, axis]) > _GYRO_BIAS_AIM).any(axis=0)
+        by_file, by_fit = (_apart(gyro[:, first:], each.gyro_bias[first:, axis]) for each in (recorded, found))
+        results = ["met" if value <= _GYRO_BIAS_AIM else "missed" for value in by_file]
+        table.append([f"gyro {letter}, mrad/s", *_pair(by_file), *results, *_pair(by_fit)])
     for axis, letter in enumerate(_AXES):
         accel = np.array([run.accel_biases[first:, axis] for run in runs])
-        by_file, by_fit = (_apart(accel, each.accel_bias[first:, axis]) for each in (told, found))
+        by_file, by_fit = (_apart(accel, each.accel_bias[first:, axis]) for each in (recorded, found))
         table.append([f"accelerometer {letter}, mm/s^2", *_pair(by_file), "-", "-", *_pair(by_fit)])
     report.table(("bias", "file: median", "95 %", "aim by median", "by 95 %", "reconstruction: median", "95 %"), table)
     sigmas = [np.sqrt(np.diag(m.covariance)) for m in runs[0].misses if (m.name, m.number) == ("gyro bias", first)]
     report.add(
         f"The last state of any run that is farther from the file's gyro biases than the aim is that at "
-        f"{np.flatnonzero(beyond)[-1] / FRAMES_HZ:.0f} s. At {_AFTER_S} s the first run tells standard deviations of "
+        f"{np.flatnonzero(beyond)[-1] / FRAMES_HZ:.0f} s. At {_AFTER_S} s the first run reports standard deviations of "
         f"{', '.join(f'{1e3 * sigma:.2f}' for sigma in sigmas[0])} mrad/s.",
     )
 
 
-def _write_told(report: Report, run: RealRun, by_file: RealRun, told: Truth, found: Truth) -> None:
+def _write_recorded(report: Report, run: RealRun, by_file: RealRun, recorded: Truth, found: Truth) -> None:
     report.add(
         "#### With the file's own orientations",
-        "One run whose vision is drawn from the file as it is, measured against the file, beside the run of the same "
+        "One run whose vision is sampled around the file's own poses, compared with the file, and the run of the same "
         "seed on the reconstruction.",
     )
     left, right = _squares([run]), _squares([by_file])
@@ -210,7 +211,7 @@ def _write_told(report: Report, run: RealRun, by_file: RealRun, told: Truth, fou
     report.table(("what", "dimensions", "reconstruction", "file"), rows)
     means = (
         each[_AFTER_S * FRAMES_HZ :, 1].mean()
-        for each in (told.accel_bias, found.accel_bias, run.accel_biases, by_file.accel_biases)
+        for each in (recorded.accel_bias, found.accel_bias, run.accel_biases, by_file.accel_biases)
     )
     words = ("file", "reconstruction", "smoother on the reconstruction", "smoother on the file")
     report.add(

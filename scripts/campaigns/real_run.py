@@ -1,4 +1,4 @@
-"""One run of the smoother alone on a recorded IMU, with motions of vision that are drawn from a truth."""
+"""One run of the smoother alone on a recorded IMU, with motions of vision that are sampled around a truth."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Imu
 
-_SETTLED_S = 2.0
+_WARM_UP_S = 2.0
 _SIGMAS = np.repeat([1e-3, 2e-3], 3)  # of vision: rad and metres from frame to frame
 _TILT_SIGMA, _SPEED_SIGMA, _GYRO_BIAS_SIGMA = 0.05, 0.2, 0.1
 _INTERVALS_S = (1, 10)
@@ -25,13 +25,13 @@ _INTERVALS_S = (1, 10)
 
 @dataclass(frozen=True, eq=False)
 class Miss:
-    """How far an estimate is from the truth, and how far it may be.
+    """Error of an estimate, and its reported covariance.
 
     Attributes:
         name: what it is of.
         number: of the state.
         error: (M,) truth less estimate.
-        covariance: (M, M) that was told.
+        covariance: (M, M) as reported.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Miss:
 
 @dataclass(frozen=True, eq=False)
 class RealRun:
-    """What a run has told.
+    """Result of a run.
 
     Attributes:
         misses: of the states at each second, of motions and of vision's innovations.
@@ -58,33 +58,33 @@ class RealRun:
 
 
 def real_run(seed: int, flight: Flight, truth: Truth, config: SmootherConfig, imu: Imu) -> RealRun:
-    """Go through a flight, with vision drawn from a truth; the biases are zero at the start."""
+    """Go through a flight, with vision sampled around a truth; the biases are zero at the start."""
     rng = np.random.default_rng([seed, 11])
     smoother = _started(flight, truth, config, imu, rng)
     misses: list[Miss] = []
     states, refused = [smoother.state()], 0
-    anchors = dict.fromkeys(_INTERVALS_S, 0)  # seconds -> number of the state from which the motion is measured
+    references = dict.fromkeys(_INTERVALS_S, 0)  # seconds -> number of the state from which the motion is measured
     for k in range(1, len(flight.stamps_ns)):
         smoother.extend(flight.stamps_ns[k], flight.intervals[k - 1])
-        motion = _drawn(flight, truth, k, rng)
-        gate_result = smoother.gate(motion)
-        settled = k >= _SETTLED_S * FRAMES_HZ
-        if settled:
-            misses.append(Miss("vision", k, gate_result.innovation, gate_result.covariance))
-        if gate_result.accepted:
+        motion = _measured_motion(flight, truth, k, rng)
+        gate = smoother.gate(motion)
+        counts = k >= _WARM_UP_S * FRAMES_HZ
+        if counts:
+            misses.append(Miss("vision", k, gate.innovation, gate.covariance))
+        if gate.accepted:
             smoother.add_motion(motion)
         else:
             refused += 1
-        smoother.update({flight.stamps_ns[k], *(flight.stamps_ns[number] for number in anchors.values())})
+        smoother.update({flight.stamps_ns[k], *(flight.stamps_ns[number] for number in references.values())})
         states.append(smoother.state())
-        if settled and k % FRAMES_HZ == 0:
+        if counts and k % FRAMES_HZ == 0:
             misses += _misses_of_state(smoother, truth, k)
-        for seconds, anchor in anchors.items():
-            if k - anchor == seconds * FRAMES_HZ:
-                if anchor >= _SETTLED_S * FRAMES_HZ:
-                    error, covariance = _motion_error(smoother, flight, truth, anchor, k)
+        for seconds, reference in references.items():
+            if k - reference == seconds * FRAMES_HZ:
+                if reference >= _WARM_UP_S * FRAMES_HZ:
+                    error, covariance = _motion_error(smoother, flight, truth, reference, k)
                     misses.append(Miss(f"pose over {seconds} s", k, error, covariance))
-                anchors[seconds] = k
+                references[seconds] = k
     gyro_biases, accel_biases = (
         np.array(each) for each in zip(*((state.gyro_bias, state.accel_bias) for state in states), strict=True)
     )
@@ -106,8 +106,8 @@ def _started(flight: Flight, truth: Truth, config: SmootherConfig, imu: Imu, rng
     return smoother
 
 
-def _drawn(flight: Flight, truth: Truth, k: int, rng: np.random.Generator) -> RelativeMotion:
-    """The motion between two frames, as vision would see it."""
+def _measured_motion(flight: Flight, truth: Truth, k: int, rng: np.random.Generator) -> RelativeMotion:
+    """Sample a measurement of the motion between two frames."""
     moved = _moved(truth, k - 1, k) @ se3_exp(_SIGMAS * rng.standard_normal(6))
     stamps = flight.stamps_ns
     return RelativeMotion(stamps[k - 1], stamps[k], moved, np.diag(_SIGMAS**2), np.zeros((6, 6)), 100)

@@ -1,4 +1,4 @@
-"""One run of the whole odometry on rendered images, with an IMU that is drawn anew."""
+"""One run of the whole odometry on rendered images, with a newly sampled IMU."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from graphvio.sources import open_source
 CALIBRATION_ERROR_SHARE = 2e-4
 """Of these runs: it stands for errors of tracking that motions have in common. The simulator's calibration has none."""
 WITHOUT_SHARE = ", share 0"
-_SETTLED_S = 2.0
-_WINDOW_S = {1: 1.0, 10: 10.0}  # lag that still has the state from which the motion is told
+_WARM_UP_S = 2.0
+_WINDOW_S = {1: 1.0, 10: 10.0}  # lag that still has the state from which the motion is measured
 
 
 def rendered_run(seed: int, scene: str, data: Path, duration_s: float) -> list[Square]:
@@ -37,7 +37,7 @@ def rendered_run(seed: int, scene: str, data: Path, duration_s: float) -> list[S
     stamps = np.array([e.stamp_ns for e in source if isinstance(e, ImuSample)], dtype=np.int64)
     times = np.clip((stamps - source.start_ns) * 1e-9, 0.0, motion.duration_s)
     track = measure(motion, source.rig.imu, times, stamps, 1000 + seed)
-    measurements = [_redrawn(measurement, track) for measurement in source]
+    measurements = [_resampled(measurement, track) for measurement in source]
     squares: list[Square] = []
     for seconds, share in ((1, CALIBRATION_ERROR_SHARE), (10, CALIBRATION_ERROR_SHARE), (10, 0.0)):
         config = Config(
@@ -53,7 +53,7 @@ def rendered_run(seed: int, scene: str, data: Path, duration_s: float) -> list[S
     return squares
 
 
-def _redrawn(measurement: Measurement, track: ImuTrack) -> Measurement:
+def _resampled(measurement: Measurement, track: ImuTrack) -> Measurement:
     if not isinstance(measurement, ImuSample):
         return measurement
     i = int(np.searchsorted(track.stamps_ns, measurement.stamp_ns))
@@ -71,13 +71,13 @@ class _Run:
             if estimate is None:
                 continue
             time_s = (estimate.stamp_ns - self._start_ns) * 1e-9
-            if seconds == 1 and time_s > _SETTLED_S and "vision" in estimate.innovations:
+            if seconds == 1 and time_s > _WARM_UP_S and "vision" in estimate.innovations:
                 yield "vision", time_s, estimate.innovations["vision"].statistic, 6
-            if abs(time_s - round(time_s)) > 1e-3 or time_s < _SETTLED_S:
+            if abs(time_s - round(time_s)) > 1e-3 or time_s < _WARM_UP_S:
                 continue
             if seconds == 1:
                 yield from self._state_squares(estimate, time_s)
-            if round(time_s) % seconds == 0 and time_s - seconds >= _SETTLED_S:
+            if round(time_s) % seconds == 0 and time_s - seconds >= _WARM_UP_S:
                 yield from self._motion_square(estimate, time_s, seconds)
 
     def _state_squares(self, estimate: Estimate, time_s: float) -> Iterator[Square]:

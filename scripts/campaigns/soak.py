@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from benchmarks.command_line import Subparsers, add_command, add_report_options
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import Report, machine, tell
+from benchmarks.report import Report, log_progress, machine
 
 from campaigns.live_listener import Listener
 from campaigns.live_services import Services
@@ -101,7 +101,7 @@ def _soak(
             if int(figures["estimates"] or 0) >= due * (len(rows) + 1):
                 memories.append(float(figures["memory_mb"] or np.nan))
                 rows.append(_row(figures, listener.error_mm, time.monotonic() - begun_s))
-                tell(f"{figures['estimates']} of {framesets}")
+                log_progress(f"{figures['estimates']} of {framesets}")
         running.stop()
         listener.thread.join()
         summary = "" if services is None else services.summary()

@@ -1,4 +1,4 @@
-"""Vision whose errors are drawn from the covariances that the front-end itself has told on images."""
+"""Motions with errors sampled from the covariances that the front-end reports on images."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from benchmarks.motions import overhear
+from benchmarks.motions import log_vision
 from benchmarks.recordings import simulated
 
 from graphvio.arrays import Float
@@ -20,7 +20,7 @@ from graphvio.sources import open_source
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """A motion that the front-end told: from which frameset to which, and how surely.
+    """The reference and covariance of a motion that the front-end measured.
 
     Attributes:
         reference: number of the frameset that it is measured from.
@@ -34,16 +34,16 @@ class Template:
 
 
 def templates_of(data: Path, scene: str) -> dict[int, Template]:
-    """Number of a frameset -> the motion that the front-end tells there, on a rendered scene."""
+    """Return the front-end's motions on a rendered scene, by the number of the frameset."""
     source = open_source(simulated(data, scene))
     odometry = Odometry(source.rig.without_imu())
-    overheard = overhear(odometry)
+    vision_log = log_vision(odometry)
     for measurement in source:
         if isinstance(measurement, FrameSet):
             odometry.process(measurement)
     odometry.finish()
-    number = {stamp_ns: k for k, stamp_ns in enumerate(sorted(overheard.results))}
-    motions = {stamp_ns: result.motion for stamp_ns, result in overheard.results.items()}
+    number = {stamp_ns: k for k, stamp_ns in enumerate(sorted(vision_log.results))}
+    motions = {stamp_ns: result.motion for stamp_ns, result in vision_log.results.items()}
     return {
         number[stamp_ns]: Template(number[motion.reference_stamp_ns], motion.covariance, motion.shared_covariance)
         for stamp_ns, motion in motions.items()
@@ -51,7 +51,7 @@ def templates_of(data: Path, scene: str) -> dict[int, Template]:
     }
 
 
-class DrawnVision:
+class SyntheticVision:
     """Motions with errors of their own and, for each reference, one that they share.
 
     Args:
@@ -71,11 +71,11 @@ class DrawnVision:
         self._shared: dict[int, tuple[Float, Float]] = {}  # reference -> covariance there, and the error
 
     def reference(self, number: int) -> int | None:
-        """Number of the frameset that the motion at a frameset is measured from, if there is one."""
+        """Return the number of the frameset that the motion at a frameset is measured from, if there is one."""
         return self._templates[number].reference if number in self._templates else None
 
     def at(self, number: int) -> RelativeMotion | None:
-        """What vision says at a frameset."""
+        """Return the motion that ends at a frameset, if there is one."""
         template = self._templates.get(number)
         if template is None:
             return None
@@ -84,14 +84,14 @@ class DrawnVision:
         if start not in self._shared:
             to_reference = se3_adjoint(true)
             shared = to_reference @ template.shared @ to_reference.T
-            self._shared[start] = shared, self._drawn(shared)
+            self._shared[start] = shared, self._sample(shared)
         shared, shared_error = self._shared[start]
         to_current = se3_adjoint(se3_inverse(true))
         own = own_covariance(template.covariance, to_current @ shared @ to_current.T)
-        measured = se3_exp(-shared_error) @ true @ se3_exp(self._drawn(own))
+        measured = se3_exp(-shared_error) @ true @ se3_exp(self._sample(own))
         return RelativeMotion(
             self._stamps_ns[start], self._stamps_ns[number], measured, template.covariance, template.shared, 300
         )
 
-    def _drawn(self, covariance: Float) -> Float:
+    def _sample(self, covariance: Float) -> Float:
         return np.linalg.cholesky(covariance) @ self._rng.standard_normal(6)

@@ -1,4 +1,4 @@
-"""Runs the odometry over a hard case and holds every motion of its front-end against the truth."""
+"""Runs the odometry on a hard case and compares every motion of its front-end with the truth."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from dataclasses import dataclass, field
 
-from benchmarks.motions import BREAK_STATISTIC, motion_error, overhear
+from benchmarks.motions import BREAK_STATISTIC, log_vision, motion_error
 from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
@@ -18,7 +18,7 @@ MATERIAL_M, MATERIAL_DEG = 0.01, 0.2
 
 
 @dataclass(frozen=True)
-class Judged:
+class MotionOutcome:
     """One motion that the front-end returned, or that the odometry used.
 
     Attributes:
@@ -30,7 +30,7 @@ class Judged:
         error_deg: of the rotation.
         interval_s: from its reference to its end.
         inliers: of each pair.
-        points: of each pair, that were offered to the estimation.
+        points: of each pair, candidates of the estimation.
     """
 
     since_s: float
@@ -56,7 +56,7 @@ class Judged:
 
 @dataclass
 class Outcome:
-    """What came of one run.
+    """Result of one run.
 
     Attributes:
         framesets: that the front-end was given.
@@ -64,15 +64,15 @@ class Outcome:
         failures: reason -> number of framesets without a motion.
         events: kind -> number.
         motions: all that were returned.
-        used: those that went into the estimate; where pairs contradict each other, one side's.
+        used: those that went into the estimate; where pairs contradict each other, that of one consensus set.
     """
 
     framesets: int = 0
     during: int = 0
     failures: Counter[str] = field(default_factory=Counter)
     events: Counter[str] = field(default_factory=Counter)
-    motions: list[Judged] = field(default_factory=list)
-    used: list[Judged] = field(default_factory=list)
+    motions: list[MotionOutcome] = field(default_factory=list)
+    used: list[MotionOutcome] = field(default_factory=list)
 
     def add(self, other: Outcome) -> None:
         """Count another run in."""
@@ -85,7 +85,7 @@ class Outcome:
 
 
 class Run:
-    """An odometry whose front-end is listened to; with the rig's IMU, or on vision alone.
+    """An odometry whose motions are logged; with the rig's IMU, or on vision alone.
 
     Args:
         rig: of the recording.
@@ -96,11 +96,11 @@ class Run:
     def __init__(self, rig: Rig, config: Config, *, with_imu: bool) -> None:
         self._with_imu = with_imu
         self._odometry = Odometry(rig if with_imu else rig.without_imu(), config)
-        self._overheard = overhear(self._odometry)
+        self._vision_log = log_vision(self._odometry)
         self._during: dict[int, bool] = {}
 
     def feed(self, measurement: Measurement, during: bool) -> None:
-        """Give it a measurement, and whether a fault lasts."""
+        """Process a measurement, given whether a fault is active."""
         if isinstance(measurement, FrameSet):
             self._during[measurement.stamp_ns] = during
         elif not self._with_imu:
@@ -108,25 +108,25 @@ class Run:
         self._odometry.process(measurement)
 
     def finish(self, truth: dict[int, Float], start_ns: int) -> Outcome:
-        """End the run and judge it by the truth, stamp -> ``world_T_body`` (4, 4)."""
+        """End the run and compare it with the truth, stamp -> ``world_T_body`` (4, 4)."""
         self._odometry.finish()
-        results, used = self._overheard
+        results, used = self._vision_log
         outcome = Outcome(len(results), sum(self._during.values()))
         outcome.events.update(event.kind for event in self._odometry.take_events())
         for stamp_ns, result in results.items():
             if result.motion is None:
                 outcome.failures[re.sub(r"\d+", "N", result.reason) or "no reason given"] += 1
             else:
-                outcome.motions.append(self._judged(stamp_ns, result, result.motion, truth, start_ns))
+                outcome.motions.append(self._motion_outcome(stamp_ns, result, result.motion, truth, start_ns))
             if stamp_ns in used:
-                outcome.used.append(self._judged(stamp_ns, result, used[stamp_ns], truth, start_ns))
+                outcome.used.append(self._motion_outcome(stamp_ns, result, used[stamp_ns], truth, start_ns))
         return outcome
 
-    def _judged(
+    def _motion_outcome(
         self, stamp_ns: int, result: VisualResult, motion: RelativeMotion, truth: dict[int, Float], start_ns: int
-    ) -> Judged:
+    ) -> MotionOutcome:
         error = motion_error(motion, truth[motion.reference_stamp_ns], truth[motion.stamp_ns])
-        return Judged(
+        return MotionOutcome(
             since_s=(stamp_ns - start_ns) * 1e-9,
             during=self._during[stamp_ns],
             quality=result.quality,
