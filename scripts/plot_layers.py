@@ -141,7 +141,7 @@ def plot(path: Path) -> None:
     axes.set(xlim=(-0.55, COLUMNS - 0.45), ylim=(-0.5, len(rows) - 0.5))
     axes.axis("off")
     figure.canvas.draw()
-    Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB").quantize(32).save(path, optimize=True)  # type: ignore[attr-defined]
+    Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB").quantize(32).save(path, optimize=True)
 
 
 if __name__ == "__main__":

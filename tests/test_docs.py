@@ -6,6 +6,8 @@ import sys
 from dataclasses import fields
 from pathlib import Path
 
+import plot_layers
+
 from graphvio.config import Config, profiles
 
 ROOT = Path(__file__).parents[1]
@@ -45,3 +47,19 @@ def test_every_link_between_the_documents_leads_somewhere() -> None:
 def test_the_architecture_names_existing_modules() -> None:
     for name in re.findall(r"`([\w/]+(?:\.py|/))`", (ROOT / "docs/architecture.md").read_text()):
         assert list((ROOT / "graphvio").rglob(name)) or (ROOT / "graphvio" / name).exists(), name
+
+
+def test_the_architecture_links_equations_to_existing_functions() -> None:
+    text = (ROOT / "docs/architecture.md").read_text()
+    links = re.findall(r"\[(\w+)\]\(\.\./(graphvio/[\w/]+\.py)\)", text)
+    assert len(links) > 13
+    for function, path in links:
+        assert f"\ndef {function}(" in (ROOT / path).read_text(), f"{path} has no {function}"
+    rows = "".join(re.findall(r"^\| (\(.*?) \|", text, re.MULTILINE))
+    assert [int(number) for number in re.findall(r"\d+", rows)] == list(range(1, 14))
+
+
+def test_the_layers_are_the_packages_that_exist() -> None:
+    layered = [name for layer in plot_layers.layers() for name in layer]
+    assert len(layered) == len(set(layered))
+    assert set(layered) == plot_layers.packages()
