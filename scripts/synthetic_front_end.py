@@ -1,6 +1,6 @@
-"""A front-end whose keyframes are true poses with drift drawn by chance, and whose images are real or rendered.
+"""A front-end whose keyframes are true poses with random drift, and whose images are real or rendered.
 
-For experiments with mapping alone: how far its result is from the truth does not depend on an odometry then.
+It measures mapping alone: the errors of the result do not depend on an odometry.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
 
-_LEAST_STEP_M = 0.05  # a motion is known no better than over this
-_FIRST_SIGMAS = np.repeat([1.5e-2, 1e-3], 3)  # an odometry's at rest: gravity is as uncertain as the IMU's bias
+_MIN_STEP_M = 0.05  # shorter motions have the sigmas of this length
+_FIRST_SIGMAS = np.repeat([1.5e-2, 1e-3], 3)  # of an odometry at standstill: gravity is as uncertain as the IMU's bias
 _PATIENCE_S = 0.001
 
 
 class SyntheticFrontEnd:
-    """Keyframes one after the other, each as soon as there is room for it.
+    """A SLAM front-end that yields keyframes one after another, each as soon as there is room for it.
 
     Args:
         rig: of the images.
@@ -38,7 +38,7 @@ class SyntheticFrontEnd:
 
     Attributes:
         corrections: (keyframe's id, map_T_body, covariance) in the order in which they came.
-        has_room: asked, again and again, before each keyframe.
+        has_room: polled before each keyframe.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class SyntheticFrontEnd:
     ) -> None:
         self._rig = rig
         self._frameset_at = frameset_at
-        self._keyframes = _drawn(stamps_ns, world_T_body, sigmas, seed, breaks)
+        self._keyframes = _with_drift(stamps_ns, world_T_body, sigmas, seed, breaks)
         self.corrections: list[tuple[int, Float, Float]] = []
         self.has_room: Callable[[], bool] = lambda: True
 
@@ -64,7 +64,7 @@ class SyntheticFrontEnd:
 
     @property
     def odom_T_body(self) -> Float:
-        """(N, 4, 4) with their drift."""
+        """Poses (N, 4, 4) with their drift."""
         return np.array([each.odom_T_body for each in self._keyframes])
 
     def keyframes(self, from_id: int = 0) -> Iterator[Keyframe]:
@@ -79,13 +79,13 @@ class SyntheticFrontEnd:
             )  # fmt: skip
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
-        """Take it in, whatever it is."""
+        """Accept every correction and store it."""
         self.corrections.append((keyframe_id, map_T_body, covariance))
         map_T_odom = map_T_body @ se3_inverse(self._keyframes[keyframe_id].odom_T_body)
         return CorrectionResult(True, "", None, chi_square_quantile(0.999, 6), map_T_odom)
 
 
-def _drawn(
+def _with_drift(
     stamps_ns: Sequence[int], world_T_body: Float, sigmas: tuple[float, float], seed: int, breaks: Collection[int]
 ) -> list[Keyframe]:
     rng = np.random.default_rng([seed, 11])
@@ -98,7 +98,7 @@ def _drawn(
             epoch += 1
         elif made:
             true = se3_inverse(world_T_body[k - 1]) @ world_T_body[k]
-            steps = np.sqrt(max(float(np.linalg.norm(true[:3, 3])), _LEAST_STEP_M)) * np.repeat(sigmas, 3)
+            steps = np.sqrt(max(float(np.linalg.norm(true[:3, 3])), _MIN_STEP_M)) * np.repeat(sigmas, 3)
             previous, motion, relative = k - 1, true @ se3_exp(steps * rng.standard_normal(6)), np.diag(steps**2)
             pose, covariance = composed(made[-1].odom_T_body, made[-1].covariance, motion, relative)
         else:

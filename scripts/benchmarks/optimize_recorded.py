@@ -161,9 +161,9 @@ def add_recordings(report: Report, runs: dict[str, Optimized]) -> None:
     report.add(
         "Closures: *wrong* ones are off from the truth by more than "
         f"{100 * WRONG_M:g} cm or {WRONG_DEG:g} degrees. *Error* is the median of the used ones, in mm: by how much "
-        "both ends of a closure lie to each other otherwise than they do in truth, by the online and by the optimised "
-        "poses; *from the closure* is the same, held against what the closure itself measured; *its own* is what the "
-        "closures are off by from the truth."
+        "the relative position of a closure's ends differs from the true one, by the online and by the optimised "
+        "poses; *from the closure* is the same difference from the closure's own measurement; *its own* is the error "
+        "of the closures themselves."
     )
     rows = []
     for name, run in runs.items():

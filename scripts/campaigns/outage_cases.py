@@ -1,4 +1,4 @@
-"""The cases of ``scripts/campaign outages``: what goes wrong with a recording's data, and what is promised then."""
+"""The cases of ``scripts/campaign outages``: what goes wrong with a recording's data, and what is requirementd then."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Case:
 
     Attributes:
         name: for people.
-        promise: what is to happen, for people.
+        requirement: what is to happen, for people.
         make: a fresh change, which is applied to the measurements from ``begin_s`` on and before ``end_s``.
         begin_s: seconds after the first frameset; minus infinity for all that comes before it, too.
         end_s: on the same scale; infinite where it never ends.
@@ -38,7 +38,7 @@ class Case:
     """
 
     name: str
-    promise: str
+    requirement: str
     make: Callable[[], Change]
     begin_s: float = BEGIN_S
     end_s: float = _FOR_EVER_S

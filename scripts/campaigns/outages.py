@@ -39,11 +39,11 @@ _BY_VISION = (Status.TRACKING, Status.INITIALISING)
 _HEAD = ("case", "poses, %", "while it lasts", "largest jump, mm", "at return", "recovery, s", "error, cm",
          "epochs", "events")  # fmt: skip
 _EXPLANATION = (
-    f"What goes wrong begins after {BEGIN_S:g} s of the {_SCENE} where nothing else is said. Poses: of the delivered "
+    f"The fault begins after {BEGIN_S:g} s of the {_SCENE} unless stated otherwise. Poses: of the delivered "
     "framesets, those whose estimate has one. Largest jump: the most by which a step from one frameset to the next, "
     "within an epoch, is off the true one, at return or elsewhere. At return: the Mahalanobis distance of such a step "
     "from coasting to vision, rotation included, under the covariance of the pose before. Recovery: from the end of "
-    f"what goes wrong until vision is used. Error: of the position by the motion from {_BEFORE_S:g} s before to "
+    f"the fault until vision is used. Error: of the position by the motion from {_BEFORE_S:g} s before to "
     f"{_AFTER_S:g} s after, or to the end; where an epoch began meanwhile, from its first pose on."
 )
 
@@ -72,14 +72,14 @@ def main(args: argparse.Namespace) -> None:
             rows.append([case.name, *cells])
             broken += [f"- {case.name}: {words}" for words in missed]
             log_progress(f"case {number + 1} of {len(CASES)}")
-    report.add("#### What is promised", "In all cases, time never goes back and there is no pose while lost.")
-    report.table(("case", "promised"), [(case.name, case.promise) for case in CASES])
-    report.add("#### What happened", _EXPLANATION)
+    report.add("#### Required", "In all cases, time never goes back and there is no pose while lost.")
+    report.table(("case", "required"), [(case.name, case.requirement) for case in CASES])
+    report.add("#### Results", _EXPLANATION)
     report.table(_HEAD, rows)
     report.add(
-        "Asked of every case: each delivered frameset has an estimate, stamps increase, there is no pose while lost, "
-        f"and no return within an epoch is beyond {np.sqrt(_MAX_STATISTIC):.1f}, which is as improbable of a pose as "
-        f"{_MAX_SIGMA:g} sigma are of a number: " + ("**missed**." if broken else "**met**.")
+        "Required of every case: each delivered frameset has an estimate, stamps increase, there is no pose while "
+        f"lost, and no return within an epoch is beyond {np.sqrt(_MAX_STATISTIC):.1f}, which is as improbable of a "
+        f"pose as {_MAX_SIGMA:g} sigma are of a number: " + ("**missed**." if broken else "**met**.")
     )
     if broken:
         report.add(*broken)
@@ -153,13 +153,13 @@ class Outcome:
         """Return the requirements on every case that this one missed."""
         stamps = [e.stamp_ns for e in self.estimates]
         most = max(self.return_distances(), default=0.0)
-        asked = {
+        requirements = {
             f"{len(stamps)} estimates of {self.given} framesets": len(stamps) == self.given,
             "stamps do not increase": stamps == sorted(set(stamps)),
             "a pose while lost": all(e.nav_T_body is None for e in self.estimates if e.status is Status.LOST),
             f"a return by {most:.1f}": most**2 <= _MAX_STATISTIC,
         }
-        return [words for words, held in asked.items() if not held]
+        return [words for words, held in requirements.items() if not held]
 
     def return_distances(self) -> list[float]:
         """How far each step from coasting to vision is off, Mahalanobis under what was known of the pose before."""
@@ -172,14 +172,14 @@ class Outcome:
         return distances
 
     def recovery_s(self) -> float:
-        """From the end of what goes wrong until vision is used again; NaN where it does not end."""
+        """Seconds from the end of the fault until vision is used again; NaN where it does not end."""
         after = self.times_s >= self.case.over_s - 1e-3
         used = [e.status in _BY_VISION and e.nav_T_body is not None for e in self.estimates]
         times_s = self.times_s[after & np.array(used)]
         return float(times_s[0] - self.case.over_s) if len(times_s) else np.nan
 
     def error_m(self) -> float:
-        """Of the motion from before to after what goes wrong; NaN where there is no pose at its end."""
+        """Error of the motion from before to after the fault; NaN where there is no pose at its end."""
         end = int(np.searchsorted(self.times_s, self.case.over_s + _AFTER_S + 1e-3)) - 1
         start_s = max(self.case.begin_s - _BEFORE_S, _WARM_UP_S) - 1e-3
         of_epoch = [e.epoch == self.estimates[end].epoch and e.nav_T_body is not None for e in self.estimates]
