@@ -1,4 +1,4 @@
-"""An odometry to be served whose threads are the test's: real broadcasts and log, drawn keyframes and estimates."""
+"""A synthetic odometry to be served: real broadcasts and log, random keyframes and estimates."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +27,7 @@ def rig(mask: Path | None = None) -> Rig:
 
     front = StereoPair("front", camera("cam0", 0.2, 0.05), camera("cam1", 0.2, -0.05))
     back = StereoPair("back", camera("cam2", 3.2, 0.05), camera("cam3", 3.2, -0.05))
-    return Rig((front, back), Imu(time_offset_s=1 / 3e3), "drawn")
+    return Rig((front, back), Imu(time_offset_s=1 / 3e3), "synthetic")
 
 
 def pose(rng: np.random.Generator) -> Float:
@@ -100,15 +100,15 @@ def prediction(number: int, epoch: int = 0) -> Prediction:
     return Prediction(START_NS + number * 5_000_000, pose(rng), rng.normal(size=3), rng.normal(size=3), epoch)
 
 
-class DrawnOdometry:
-    """What `graphvio.slam.interface.Served` asks for. Corrections of more than ten metres are not believed."""
+class SyntheticOdometry:
+    """A `graphvio.slam.interface.Served` that refuses corrections of more than ten metres."""
 
-    def __init__(self, most_bytes: int = 2**26) -> None:
+    def __init__(self, max_bytes: int = 2**26) -> None:
         self.rig = rig()
         self.estimates: Broadcast[Estimate] = Broadcast()
         self.predictions: Broadcast[Prediction] = Broadcast()
         self.events: Broadcast[Event] = Broadcast()
-        self.keyframe_log = KeyframeLog(most_bytes)
+        self.keyframe_log = KeyframeLog(max_bytes)
         self.map_T_odom: Float | None = None
         self.corrections: list[tuple[int, Float, Float]] = []
         self.figures: dict[str, float | int | str | None] = {}

@@ -22,8 +22,8 @@ def keyframe(number: int) -> Keyframe:
     )  # fmt: skip
 
 
-def filled(count: int, most_bytes: int = 2**20) -> KeyframeLog:
-    log = KeyframeLog(most_bytes)
+def filled(count: int, max_bytes: int = 2**20) -> KeyframeLog:
+    log = KeyframeLog(max_bytes)
     for number in range(count):
         log.add(keyframe(number))
     return log
@@ -37,7 +37,7 @@ def in_thread(work: Callable[[], object]) -> tuple[threading.Thread, list[object
 
 
 def test_memory_is_bounded_and_the_oldest_go() -> None:
-    log = filled(100, most_bytes=1000)
+    log = filled(100, max_bytes=1000)
     assert (log.oldest_id, log.next_id) == (95, 100)
     log.close()
     assert [each.id for each in log.follow(0)] == [95, 96, 97, 98, 99]
@@ -54,7 +54,7 @@ def test_landmarks_count_as_images_do() -> None:
 
 
 def test_the_newest_stays_however_large_it_is() -> None:
-    log = filled(3, most_bytes=10)
+    log = filled(3, max_bytes=10)
     assert (log.oldest_id, log.next_id) == (2, 3)
     newest = log.read(0)
     assert newest is not None
@@ -81,7 +81,7 @@ def test_ids_that_never_were_are_passed_over() -> None:
     assert [each.id for each in log.follow(5)] == [9, 11]
 
 
-def test_an_empty_log_tells_the_next_id() -> None:
+def test_an_empty_log_has_the_next_id() -> None:
     log = KeyframeLog()
     assert (log.oldest_id, log.next_id, log.is_closed) == (0, 0, False)
     assert log.read(0, timeout_s=0.0) is None

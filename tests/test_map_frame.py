@@ -1,4 +1,4 @@
-"""Where odom lies in the map: synthetic chains of keyframes whose drift is drawn, and corrections of them."""
+"""The map frame, by corrections of synthetic chains of keyframes with random drift."""
 
 import threading
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from graphvio.slam import map_frame
 from graphvio.slam.keyframe import Keyframe, Landmarks
 from graphvio.slam.map_frame import MapFrame
 
-SURE = 1.0 - 1e-12  # nothing that is drawn is refused
+SURE = 1.0 - 1e-12  # no random correction is refused
 DRIFT_SIGMAS = np.repeat([2e-3, 6e-3], 3)
 SIGMAS = np.repeat([5e-3, 2e-2], 3)  # of corrections
 
@@ -118,7 +118,7 @@ def test_errors_in_the_map_are_as_large_as_drift_and_corrections_make_them() -> 
 
 @given(st.permutations(range(8)), st.integers(0, 2**32 - 1))
 @settings(max_examples=40)
-def test_the_order_in_which_corrections_come_makes_no_difference(order: list[int], seed: int) -> None:
+def test_order_of_corrections_makes_no_difference(order: list[int], seed: int) -> None:
     rng = np.random.default_rng(seed)
     walk = chain(rng, 20)
     corrections = [walk.corrected(2 * k, rng) for k in range(8)]
@@ -174,7 +174,7 @@ def test_a_second_correction_of_a_keyframe_takes_the_place_of_the_first() -> Non
     assert twice.correct(*last).statistic == once.correct(*last).statistic
 
 
-def test_what_the_smoother_corrects_of_the_keyframe_before_is_drift() -> None:
+def test_the_smoothers_correction_of_the_previous_keyframe_is_drift() -> None:
     rng = np.random.default_rng(8)
     walk = chain(rng, 2)
     before, now = walk.keyframes
@@ -183,10 +183,10 @@ def test_what_the_smoother_corrects_of_the_keyframe_before_is_drift() -> None:
     moved = frame_with([before, replace(now, previous_T_body=known @ se3_exp(-shift))])
     still = frame_with([before, replace(now, previous_T_body=known)])
     tight = np.diag(np.repeat([1e-6, 1e-6], 3))
-    offered = walk.map_T_body[0] @ known @ se3_exp(shift)
+    correction = walk.map_T_body[0] @ known @ se3_exp(shift)
     for frame in (moved, still):
         frame.correct(0, walk.map_T_body[0], tight)
-    statistics = [frame.correct(1, offered, tight).statistic for frame in (moved, still)]
+    statistics = [frame.correct(1, correction, tight).statistic for frame in (moved, still)]
     assert statistics[0] is not None
     assert statistics[1] is not None
     assert statistics[0] < 1.0  # as much as was expected
@@ -197,7 +197,7 @@ def test_what_the_smoother_corrects_of_the_keyframe_before_is_drift() -> None:
 
 
 @pytest.mark.parametrize(("earlier", "tested"), [((2,), 9), ((2, 6), 9), ((2, 9), 5), ((5, 9), 2)])
-def test_what_is_right_is_refused_as_often_as_was_asked_for(earlier: tuple[int, ...], tested: int) -> None:
+def test_correct_corrections_are_refused_at_the_configured_rate(earlier: tuple[int, ...], tested: int) -> None:
     """In order, between others and before all of them: squared distances are chi-square's."""
     statistics = []
     for number in range(400):
@@ -227,7 +227,7 @@ def test_the_gate_is_where_the_probability_puts_it() -> None:
     assert accepted / 400 == pytest.approx(0.9, abs=3.0 * np.sqrt(0.09 / 400))
 
 
-def test_what_is_wrong_is_refused_and_told_and_moves_nothing() -> None:
+def test_a_wrong_correction_is_refused_and_moves_nothing() -> None:
     rng = np.random.default_rng(9)
     walk = chain(rng, 12)
     frame = frame_with(walk.keyframes, 0.999)
@@ -251,17 +251,17 @@ def test_contradictory_corrections_do_not_take_turns(pattern: str, moves: int) -
     walk = chain(rng, len(pattern))
     frame = frame_with(walk.keyframes, 0.999)
     off = {"A": np.eye(4), "B": transform([0, 0, 0.5], [5.0, 0, 0])}
-    told = 0
+    moved = 0
     for k, side in enumerate(pattern):
         keyframe_id, pose, covariance = walk.corrected(k, rng)
-        told += "refused corrections in a row agree" in frame.correct(keyframe_id, off[side] @ pose, covariance).reason
-    assert told == moves
+        moved += "refused corrections in a row agree" in frame.correct(keyframe_id, off[side] @ pose, covariance).reason
+    assert moved == moves
     true = walk.map_T_body[-1] @ se3_inverse(walk.keyframes[-1].odom_T_body)
     side = "B" if moves else "A"
     assert np.linalg.norm(se3_log(se3_inverse(off[side] @ true) @ in_force(frame))) < 0.5
 
 
-def test_however_long_each_side_insists_the_map_moves_ever_more_rarely() -> None:
+def test_two_contradicting_sources_move_the_map_ever_more_rarely() -> None:
     rng = np.random.default_rng(11)
     lengths = [3 * 2**k for k in range(7)]
     walk = chain(rng, sum(lengths))
@@ -274,7 +274,7 @@ def test_however_long_each_side_insists_the_map_moves_ever_more_rarely() -> None
     assert 2 <= moves <= np.log2(len(sides) / 3) + 1
 
 
-def test_who_repeats_himself_is_one_witness() -> None:
+def test_repeated_corrections_of_a_keyframe_count_once() -> None:
     rng = np.random.default_rng(12)
     walk = chain(rng, 10)
     frame = frame_with(walk.keyframes, 0.999)
@@ -341,7 +341,7 @@ def test_many_corrections_become_one_without_loss(monkeypatch: pytest.MonkeyPatc
     whole = frame_with(walk.keyframes)
     for each in corrections:
         whole.correct(*each)
-    monkeypatch.setattr(map_frame, "_MOST_CORRECTIONS", 20)
+    monkeypatch.setattr(map_frame, "_MAX_CORRECTIONS", 20)
     merged = frame_with(walk.keyframes)
     for each in corrections:
         merged.correct(*each)
@@ -363,7 +363,7 @@ def test_drift_since_a_keyframe_that_is_forgotten_is_known(monkeypatch: pytest.M
     first, last = walk.corrected(0, rng), walk.corrected(49, rng)
     statistics = []
     for most in (1000, 10):
-        monkeypatch.setattr(map_frame, "_MOST_KEYFRAMES", most)
+        monkeypatch.setattr(map_frame, "_MAX_KEYFRAMES", most)
         frame = frame_with(walk.keyframes[:1])
         frame.correct(*first)
         for keyframe in walk.keyframes[1:]:
@@ -378,17 +378,17 @@ def test_drift_since_a_keyframe_that_is_forgotten_is_known(monkeypatch: pytest.M
     [
         (np.eye(3), np.eye(6), r"map_T_body has shape \(3, 3\)"),
         (np.full((4, 4), np.nan), np.eye(6), "holds NaN"),
-        (2.0 * np.eye(4), np.eye(6), "no rigid transform: off by 3"),
-        (np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(6), "no rigid transform"),
-        ("here", np.eye(6), "no array of numbers"),
+        (2.0 * np.eye(4), np.eye(6), "not a rigid transform: off by 3"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(6), "not a rigid transform"),
+        ("here", np.eye(6), "not an array of numbers"),
         (np.eye(4), np.eye(3), r"covariance has shape \(3, 3\)"),
         (np.eye(4), -np.eye(6), "positive definite"),
         (np.eye(4), np.zeros((6, 6)), "positive definite"),
         (np.eye(4), np.eye(6) + np.eye(6, k=1), "not symmetric"),
-        (np.eye(4), [[1.0], [1.0, 2.0]], "no array of numbers"),
+        (np.eye(4), [[1.0], [1.0, 2.0]], "not an array of numbers"),
     ],
 )
-def test_what_is_no_pose_or_covariance_is_refused(pose: Float, covariance: Float, message: str) -> None:
+def test_an_invalid_pose_or_covariance_raises(pose: Float, covariance: Float, message: str) -> None:
     frame = frame_with(chain(np.random.default_rng(17), 2).keyframes)
     with pytest.raises(MeasurementError, match=message):
         frame.correct(0, pose, covariance)

@@ -104,7 +104,7 @@ def test_the_map_on_disk_is_whole(made: Made) -> None:
 
 @pytest.mark.parametrize("first", [40, 112])
 def test_another_session_finds_its_way_in_the_map(made: Made, tmp_path: Path, first: int) -> None:
-    """From two starts, where the map says that they are; and a third session would find both."""
+    """From two places of the map; a third session would find both."""
     walk, truth = front_end(first, first + 49, seed=2, step=2, session=1)
     again = mapped(walk, made.folder, save=tmp_path / "both")
     in_map = se3_inverse(front_end(0, 1, seed=0)[1][0]) @ truth
@@ -226,7 +226,7 @@ def test_what_was_there_before_a_place_cannot_be_kept_is_saved(tmp_path: Path) -
             (work / "images").touch()
 
     with Mapper(front_end(0, 120, seed=1)[0], CONFIG, folder=work) as mapper:
-        with pytest.raises(MapError, match="a place cannot be kept"):
+        with pytest.raises(MapError, match="a place cannot be stored"):
             mapper.run(obstruct)
         mapper.save(tmp_path / "map")
     assert not work.exists()

@@ -78,7 +78,7 @@ def test_places_are_as_far_apart_as_asked_for() -> None:
 
 
 def test_motion_and_covariance_follow_the_chain() -> None:
-    """What a place is told to be moved by scatters as its covariance says."""
+    """A place's motion scatters as its covariance says."""
     rng = np.random.default_rng(1)
     errors = []
     for _ in range(400):
@@ -111,9 +111,9 @@ def test_lost_keyframes_are_bridged_by_poses_in_the_epochs_frame() -> None:
     motion, covariance = motion_between(keys[1], keys[4])
     np.testing.assert_allclose(motion, STEP @ STEP @ STEP, atol=1e-12)
     assert np.linalg.eigvalsh(covariance - keys[4].covariance)[0] > 0.0
-    told, told_covariance = motion_between(keys[1], keys[2])
-    np.testing.assert_array_equal(told, STEP)
-    np.testing.assert_array_equal(told_covariance, np.diag(SIGMAS**2))
+    reported, reported_covariance = motion_between(keys[1], keys[2])
+    np.testing.assert_array_equal(reported, STEP)
+    np.testing.assert_array_equal(reported_covariance, np.diag(SIGMAS**2))
 
 
 def test_without_room_the_next_keyframe_is_the_place() -> None:
@@ -143,7 +143,7 @@ def test_what_comes_too_fast_is_skipped_and_counted() -> None:
     assert taken[-1] is None
 
 
-def test_failures_of_the_front_end_are_told_after_the_last_place() -> None:
+def test_failures_of_the_front_end_are_raised_after_the_last_place() -> None:
     intake = Intake(Listed(chain(1), SourceError("the wire is cut")), OptimizationConfig(), lambda: 1.0)
     intake.start()
     assert intake.next() is not None
@@ -154,7 +154,7 @@ def test_failures_of_the_front_end_are_told_after_the_last_place() -> None:
 def test_keyframes_without_images_are_refused() -> None:
     intake = Intake(Listed([replace(key, images={}) for key in chain(3)]), OptimizationConfig(), lambda: 1.0)
     intake.start()
-    with pytest.raises(MapError, match="carry no images"):
+    with pytest.raises(MapError, match="have no images"):
         intake.next()
 
 
@@ -168,16 +168,16 @@ def test_lost_keyframes_are_counted() -> None:
 
 def test_a_moved_place_takes_its_keyframes_along() -> None:
     """The second place was moved by 6 cm: those before it by their share of time, those behind it by all."""
-    chooser, keys, anchored = PlaceChooser(0.4, 90.0), chain(6), []
+    chooser, keys, located = PlaceChooser(0.4, 90.0), chain(6), []
     for key in keys:
         chooser.add(key)
-        at = chooser.anchored()
+        at = chooser.newest()
         assert at is not None
-        anchored.append(at)
+        located.append(at)
     three = np.linalg.matrix_power(STEP, 3)
     poses = [np.eye(4), three @ se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.06]))]
-    found = spread_keyframes(anchored, poses, [np.eye(4), three], {0})
+    found = spread_keyframes(located, poses, [np.eye(4), three], {0})
     assert found.stamps_ns.tolist() == [key.stamp_ns for key in keys]
     np.testing.assert_allclose(found.positions[:, 2], [0.0, 0.02, 0.04, 0.06, 0.06, 0.06], atol=1e-12)
-    not_joined = spread_keyframes(anchored, [None, poses[1]], [np.eye(4), three], {0, 1})
+    not_joined = spread_keyframes(located, [None, poses[1]], [np.eye(4), three], {0, 1})
     assert not_joined.stamps_ns.tolist() == [300, 400, 500]

@@ -32,7 +32,7 @@ def run(address: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_client_of_the_page_runs_as_typed() -> None:
-    odometry = served.DrawnOdometry()
+    odometry = served.SyntheticOdometry()
     odometry.keyframe_log.add(served.keyframe(0))
 
     def go_on() -> None:

@@ -29,15 +29,15 @@ MB = 2**20
 
 
 @pytest.fixture(scope="module")
-def odometry() -> served.DrawnOdometry:
-    drawn = served.DrawnOdometry()
-    drawn.keyframe_log.add(served.keyframe(0))
-    drawn.end()  # so that streams end
-    return drawn
+def odometry() -> served.SyntheticOdometry:
+    synthetic = served.SyntheticOdometry()
+    synthetic.keyframe_log.add(served.keyframe(0))
+    synthetic.end()  # so that streams end
+    return synthetic
 
 
 @pytest.fixture
-def server(odometry: served.DrawnOdometry) -> Iterator[GrpcServer]:
+def server(odometry: served.SyntheticOdometry) -> Iterator[GrpcServer]:
     odometry.corrections.clear()
     with GrpcServer(odometry, ServiceOptions(port=0)) as running:
         yield running
@@ -68,7 +68,7 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
     return bytes(changed)
 
 
-def test_requests_of_random_and_mutated_bytes(server: GrpcServer, odometry: served.DrawnOdometry) -> None:
+def test_requests_of_random_and_mutated_bytes(server: GrpcServer, odometry: served.SyntheticOdometry) -> None:
     rng = random.Random(4)
     whole = {
         "Correct": messages.CorrectRequest(

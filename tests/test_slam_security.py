@@ -96,15 +96,15 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
 
 
 @pytest.fixture
-def odometry() -> Iterator[served.DrawnOdometry]:
-    drawn = served.DrawnOdometry()
-    drawn.keyframe_log.add(served.keyframe(0))
-    yield drawn
-    drawn.end()
+def odometry() -> Iterator[served.SyntheticOdometry]:
+    synthetic = served.SyntheticOdometry()
+    synthetic.keyframe_log.add(served.keyframe(0))
+    yield synthetic
+    synthetic.end()
 
 
 @pytest.fixture
-def secure(odometry: served.DrawnOdometry, files: Files) -> Iterator[GrpcServer]:
+def secure(odometry: served.SyntheticOdometry, files: Files) -> Iterator[GrpcServer]:
     options = ServiceOptions("0.0.0.0", 0, files.certificate, files.key, files.token)
     with GrpcServer(odometry, options) as server:
         yield server
@@ -123,7 +123,7 @@ def test_with_tls_and_token_everything_works(secure: GrpcServer, files: Files) -
 
 
 def test_a_wrong_or_missing_token_is_refused_for_every_call(
-    secure: GrpcServer, files: Files, odometry: served.DrawnOdometry
+    secure: GrpcServer, files: Files, odometry: served.SyntheticOdometry
 ) -> None:
     for token in (None, TOKEN[:-1], TOKEN + "0", TOKEN.upper(), "x" * 4096):
         with pytest.raises(ServiceError, match="the token is missing or wrong; give the one in the server's token"):
@@ -167,7 +167,7 @@ def test_strangers_that_open_calls_and_say_nothing_hold_no_thread(secure: GrpcSe
         channel.close()
 
 
-def test_a_token_on_the_loopback_without_tls(odometry: served.DrawnOdometry, files: Files) -> None:
+def test_a_token_on_the_loopback_without_tls(odometry: served.SyntheticOdometry, files: Files) -> None:
     with GrpcServer(odometry, ServiceOptions(port=0, token_file=files.token)) as server:
         with Client(server.address, token=TOKEN) as client:
             assert client.info().next_keyframe_id == 1
@@ -175,15 +175,15 @@ def test_a_token_on_the_loopback_without_tls(odometry: served.DrawnOdometry, fil
             Client(server.address)
 
 
-def test_clients_without_tls_and_with_wrong_certificates_are_told_so(secure: GrpcServer, files: Files) -> None:
+def test_client_without_tls_or_with_wrong_certificate_raises(secure: GrpcServer, files: Files) -> None:
     address = at_home(secure)
-    with pytest.raises(ServiceError, match=f"{address}: it demands TLS; give the certificate of whoever"):
+    with pytest.raises(ServiceError, match=f"{address}: it demands TLS; give the certificate of its issuer"):
         Client(address, token=TOKEN)
     with pytest.raises(ServiceError, match=r"its certificate is not trusted \(.*issuer certificate"):
         Client(address, files.other_ca, TOKEN)
 
 
-def test_a_name_that_the_certificate_does_not_have(odometry: served.DrawnOdometry, files: Files) -> None:
+def test_a_name_that_the_certificate_does_not_have(odometry: served.SyntheticOdometry, files: Files) -> None:
     options = ServiceOptions("127.0.0.2", 0, files.certificate, files.key, files.token)
     with (
         GrpcServer(odometry, options) as server,
@@ -192,7 +192,7 @@ def test_a_name_that_the_certificate_does_not_have(odometry: served.DrawnOdometr
         Client(server.address, files.ca, TOKEN)
 
 
-def test_a_certificate_that_has_expired(odometry: served.DrawnOdometry, files: Files) -> None:
+def test_a_certificate_that_has_expired(odometry: served.SyntheticOdometry, files: Files) -> None:
     options = ServiceOptions("127.0.0.1", 0, files.expired, files.key, files.token)
     with (
         GrpcServer(odometry, options) as server,
@@ -201,7 +201,7 @@ def test_a_certificate_that_has_expired(odometry: served.DrawnOdometry, files: F
         Client(server.address, files.ca, TOKEN)
 
 
-def test_a_server_without_tls_is_told_to_a_client_with(odometry: served.DrawnOdometry, files: Files) -> None:
+def test_client_with_tls_of_server_without_raises(odometry: served.SyntheticOdometry, files: Files) -> None:
     with (
         GrpcServer(odometry, ServiceOptions(port=0)) as server,
         pytest.raises(ServiceError, match="it does not use TLS, or is no graphvio service"),
@@ -210,7 +210,7 @@ def test_a_server_without_tls_is_told_to_a_client_with(odometry: served.DrawnOdo
 
 
 def test_a_token_is_never_sent_in_the_clear_through_a_network() -> None:
-    with pytest.raises(ServiceError, match=r"robot:50551: the token would go through the network for all to read"):
+    with pytest.raises(ServiceError, match=r"robot:50551: the token would go through the network unencrypted"):
         Client("robot", token=TOKEN)
 
 
@@ -259,7 +259,7 @@ def test_token_files_that_others_can_read_or_that_hold_none(tmp_path: Path) -> N
         read_token(tmp_path / "absent")
 
 
-def test_certificates_that_cannot_be_used(odometry: served.DrawnOdometry, files: Files, tmp_path: Path) -> None:
+def test_certificates_that_cannot_be_used(odometry: served.SyntheticOdometry, files: Files, tmp_path: Path) -> None:
     def start(certificate: Path, key: Path) -> None:
         GrpcServer(odometry, ServiceOptions("0.0.0.0", 0, certificate, key, files.token)).start()
 
@@ -296,7 +296,7 @@ def test_certificates_that_cannot_be_used(odometry: served.DrawnOdometry, files:
 
 @pytest.mark.parametrize("address", ["", ":1", "host:", "host:0", "host:65536", "host:x", "::1:7", "host:\uff11"])
 def test_what_is_no_address(address: str) -> None:
-    with pytest.raises(ServiceError, match="is no address; give HOST:PORT"):
+    with pytest.raises(ServiceError, match="is not an address; give HOST:PORT"):
         Client(address)
 
 

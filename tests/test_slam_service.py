@@ -35,14 +35,14 @@ ANY_PORT = ServiceOptions(port=0)
 
 
 @pytest.fixture
-def odometry() -> Iterator[served.DrawnOdometry]:
-    drawn = served.DrawnOdometry()
-    yield drawn
-    drawn.end()
+def odometry() -> Iterator[served.SyntheticOdometry]:
+    synthetic = served.SyntheticOdometry()
+    yield synthetic
+    synthetic.end()
 
 
 @pytest.fixture
-def server(odometry: served.DrawnOdometry) -> Iterator[GrpcServer]:
+def server(odometry: served.SyntheticOdometry) -> Iterator[GrpcServer]:
     with GrpcServer(odometry, ANY_PORT) as running:
         yield running
 
@@ -72,12 +72,12 @@ def in_thread(function: Callable[[], object]) -> threading.Thread:
 
 def test_the_client_is_a_front_end_with_the_rig_of_the_server(client: Client) -> None:
     front_end: SlamFrontEnd = client
-    assert front_end.rig.name == "drawn"
+    assert front_end.rig.name == "synthetic"
     for camera, same in zip(served.rig().cameras, front_end.rig.cameras, strict=True):
         np.testing.assert_array_equal(camera.body_T_cam, same.body_T_cam)
 
 
-def test_info_tells_which_keyframes_there_are(odometry: served.DrawnOdometry, client: Client) -> None:
+def test_info_has_the_ids_of_the_keyframes_that_are_kept(odometry: served.SyntheticOdometry, client: Client) -> None:
     info = client.info()
     assert (info.epoch, info.oldest_keyframe_id, info.next_keyframe_id, info.has_ended) == (None, 0, 0, False)
     for number in range(3):
@@ -90,7 +90,7 @@ def test_info_tells_which_keyframes_there_are(odometry: served.DrawnOdometry, cl
 
 
 def test_keyframes_come_whole_as_they_are_made_and_end_with_the_odometry(
-    odometry: served.DrawnOdometry, client: Client
+    odometry: served.SyntheticOdometry, client: Client
 ) -> None:
     for number in range(3):
         odometry.keyframe_log.add(served.keyframe(number))
@@ -113,7 +113,7 @@ def test_keyframes_come_whole_as_they_are_made_and_end_with_the_odometry(
 
 
 def test_keyframes_that_are_no_longer_kept_are_passed_over_and_counted() -> None:
-    odometry = served.DrawnOdometry(most_bytes=100_000)  # some eight of them
+    odometry = served.SyntheticOdometry(max_bytes=100_000)  # some eight of them
     for number in range(50):
         odometry.keyframe_log.add(served.keyframe(number))
     odometry.end()
@@ -130,7 +130,7 @@ def test_keyframes_that_are_no_longer_kept_are_passed_over_and_counted() -> None
 
 
 def test_estimates_and_predictions_come_whole_with_the_correction_in_force(
-    odometry: served.DrawnOdometry, client: Client
+    odometry: served.SyntheticOdometry, client: Client
 ) -> None:
     odometry.keyframe_log.add(served.keyframe(0, epoch=4))
     estimates, predictions = client.estimates(), client.estimates("imu")
@@ -158,7 +158,7 @@ def test_estimates_and_predictions_come_whole_with_the_correction_in_force(
     assert (without.state.epoch, without.map_T_odom) == (3, None)
 
 
-def test_events_and_figures(odometry: served.DrawnOdometry, client: Client) -> None:
+def test_events_and_figures(odometry: served.SyntheticOdometry, client: Client) -> None:
     event = Event(served.START_NS, "vision_gated", "χ² = 31")
     got: list[Event] = []
     reader = in_thread(lambda: got.extend(client.events()))
@@ -171,7 +171,9 @@ def test_events_and_figures(odometry: served.DrawnOdometry, client: Client) -> N
     assert client.status() == dict(sorted(odometry.figures.items()))
 
 
-def test_corrections_arrive_to_the_last_bit_and_are_answered(odometry: served.DrawnOdometry, client: Client) -> None:
+def test_corrections_arrive_to_the_last_bit_and_are_answered(
+    odometry: served.SyntheticOdometry, client: Client
+) -> None:
     rng = np.random.default_rng(3)
     near, covariance = served.pose(rng), served.covariance(rng)
     result = client.correct(5, near, covariance)
@@ -188,7 +190,7 @@ def test_corrections_arrive_to_the_last_bit_and_are_answered(odometry: served.Dr
 
 
 def test_corrections_that_are_malformed_never_reach_the_odometry(
-    odometry: served.DrawnOdometry, client: Client
+    odometry: served.SyntheticOdometry, client: Client
 ) -> None:
     pose, covariance = np.eye(4), np.eye(6)
     nan, bent, negative = pose.copy(), pose.copy(), -covariance
@@ -209,8 +211,8 @@ def test_corrections_that_are_malformed_never_reach_the_odometry(
     assert not odometry.corrections
 
 
-def test_an_odometry_that_fails_is_told_and_the_server_goes_on(
-    odometry: served.DrawnOdometry, client: Client, caplog: pytest.LogCaptureFixture
+def test_an_odometry_that_fails_is_reported_and_the_server_continues(
+    odometry: served.SyntheticOdometry, client: Client, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(*_: object) -> None:
         raise ZeroDivisionError("secret")
@@ -231,7 +233,7 @@ def test_an_odometry_that_fails_is_told_and_the_server_goes_on(
 
 
 def test_a_slow_client_gets_new_estimates_and_all_that_it_missed_are_counted(
-    odometry: served.DrawnOdometry, client: Client
+    odometry: served.SyntheticOdometry, client: Client
 ) -> None:
     stream = client.estimates()
     got: list[tuple[int, int]] = []
@@ -260,7 +262,7 @@ def test_a_slow_client_gets_new_estimates_and_all_that_it_missed_are_counted(
 
 
 def test_publishing_never_waits_for_a_client_that_does_not_read(
-    odometry: served.DrawnOdometry, server: GrpcServer
+    odometry: served.SyntheticOdometry, server: GrpcServer
 ) -> None:
     """Structurally: with its stream's thread held up in the middle of sending, a whole run is published."""
     with Client(server.address) as stalled:
@@ -288,7 +290,7 @@ def test_publishing_never_waits_for_a_client_that_does_not_read(
 
 
 def test_streams_end_with_their_client_and_with_the_iterator(
-    odometry: served.DrawnOdometry, server: GrpcServer
+    odometry: served.SyntheticOdometry, server: GrpcServer
 ) -> None:
     odometry.keyframe_log.add(served.keyframe(0))
     with Client(server.address) as client:
@@ -313,7 +315,7 @@ def test_closing_from_another_thread_ends_a_waiting_iterator(client: Client, ser
     assert not reader.is_alive()
 
 
-def test_there_is_room_for_so_many_clients_and_others_are_still_answered(odometry: served.DrawnOdometry) -> None:
+def test_there_is_room_for_so_many_clients_and_others_are_still_answered(odometry: served.SyntheticOdometry) -> None:
     odometry.keyframe_log.add(served.keyframe(0))
     with GrpcServer(odometry, replace(ANY_PORT, max_clients=2)) as server:
         clients = [Client(server.address) for _ in range(3)]
@@ -332,7 +334,7 @@ def test_there_is_room_for_so_many_clients_and_others_are_still_answered(odometr
             client.close()
 
 
-def test_keyframes_go_on_where_they_were_when_the_server_was_away(odometry: served.DrawnOdometry) -> None:
+def test_keyframes_go_on_where_they_were_when_the_server_was_away(odometry: served.SyntheticOdometry) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -385,7 +387,7 @@ class CuttingProxy:
 
 
 def test_connections_cut_within_messages_cost_no_keyframe_and_give_none_twice(
-    odometry: served.DrawnOdometry, server: GrpcServer
+    odometry: served.SyntheticOdometry, server: GrpcServer
 ) -> None:
     for number in range(80):
         odometry.keyframe_log.add(served.keyframe(number))
@@ -400,7 +402,7 @@ def test_connections_cut_within_messages_cost_no_keyframe_and_give_none_twice(
         assert_same(keyframe, served.keyframe(number))
 
 
-def test_another_run_of_the_odometry_is_not_taken_for_the_same(odometry: served.DrawnOdometry) -> None:
+def test_another_run_of_the_odometry_is_not_taken_for_the_same(odometry: served.SyntheticOdometry) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         options = ServiceOptions(port=free.getsockname()[1])
@@ -418,7 +420,7 @@ def test_another_run_of_the_odometry_is_not_taken_for_the_same(odometry: served.
                 client.correct(0, np.eye(4), np.eye(6))
 
 
-def test_patience_ends(odometry: served.DrawnOdometry) -> None:
+def test_patience_ends(odometry: served.SyntheticOdometry) -> None:
     odometry.keyframe_log.add(served.keyframe(0))
     server = GrpcServer(odometry, ANY_PORT)
     server.start()
@@ -430,7 +432,7 @@ def test_patience_ends(odometry: served.DrawnOdometry) -> None:
             next(stream)
 
 
-def test_what_is_left_of_an_odometry_that_has_ended_is_read_to_its_end(odometry: served.DrawnOdometry) -> None:
+def test_what_is_left_of_an_odometry_that_has_ended_is_read_to_its_end(odometry: served.SyntheticOdometry) -> None:
     for number in range(200):
         odometry.keyframe_log.add(served.keyframe(number))
     server = GrpcServer(odometry, ANY_PORT)
@@ -445,7 +447,7 @@ def test_what_is_left_of_an_odometry_that_has_ended_is_read_to_its_end(odometry:
         assert not stopper.is_alive()
 
 
-def test_what_waits_for_a_slow_reader_of_estimates_reaches_it_after_the_end(odometry: served.DrawnOdometry) -> None:
+def test_what_waits_for_a_slow_reader_of_estimates_reaches_it_after_the_end(odometry: served.SyntheticOdometry) -> None:
     got: list[tuple[int, int]] = []
     may_go_on = threading.Event()
     published = 2_000
@@ -475,7 +477,7 @@ def test_what_waits_for_a_slow_reader_of_estimates_reaches_it_after_the_end(odom
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGSTOP")
-def test_a_reader_that_takes_nothing_does_not_hold_the_end(odometry: served.DrawnOdometry) -> None:
+def test_a_reader_that_takes_nothing_does_not_hold_the_end(odometry: served.SyntheticOdometry) -> None:
     for number in range(200):
         odometry.keyframe_log.add(served.keyframe(number))
     server = GrpcServer(odometry, replace(ANY_PORT, keepalive_s=3600.0))
@@ -514,7 +516,7 @@ def line_of(keyframe: Keyframe) -> str:
 
 
 def test_a_client_that_is_killed_goes_on_without_a_missing_keyframe(
-    odometry: served.DrawnOdometry, server: GrpcServer
+    odometry: served.SyntheticOdometry, server: GrpcServer
 ) -> None:
     count = 200
 
@@ -536,13 +538,13 @@ def test_a_client_that_is_killed_goes_on_without_a_missing_keyframe(
     maker.join(20.0)
     odometry.end()
     process = reader_process(server, len(got))
-    rest, _ = process.communicate(timeout=60)
-    got += rest.split("\n")[:-1]
+    remaining, _ = process.communicate(timeout=60)
+    got += remaining.split("\n")[:-1]
     assert got == [line_of(served.keyframe(number)) for number in range(count)]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGSTOP")
-def test_a_client_that_no_longer_answers_is_given_up(odometry: served.DrawnOdometry) -> None:
+def test_a_client_that_no_longer_answers_is_given_up(odometry: served.SyntheticOdometry) -> None:
     odometry.keyframe_log.add(served.keyframe(0))
     with GrpcServer(odometry, replace(ANY_PORT, keepalive_s=1.0)) as server:
         process = reader_process(server, 0)
@@ -557,13 +559,13 @@ def test_a_client_that_no_longer_answers_is_given_up(odometry: served.DrawnOdome
 
 
 def test_a_port_that_is_taken_and_a_second_start(
-    server: GrpcServer, odometry: served.DrawnOdometry, capfd: pytest.CaptureFixture[str]
+    server: GrpcServer, odometry: served.SyntheticOdometry, capfd: pytest.CaptureFixture[str]
 ) -> None:
     port = int(server.address.rpartition(":")[2])
     with pytest.raises(ServiceError, match=f"127.0.0.1:{port}: cannot be listened on .Address already in use"):
         GrpcServer(odometry, ServiceOptions(port=port)).start()
     assert capfd.readouterr().err == ""  # gRPC has nothing to add
-    with pytest.raises(ServiceError, match=r"cannot be listened on .no host's name"):
+    with pytest.raises(ServiceError, match=r"cannot be listened on .not a host name"):
         GrpcServer(odometry, ServiceOptions("a..b", 0, Path("absent"), Path("absent"), Path("absent"))).start()
     with pytest.raises(ServiceError, match="is served already"):
         server.start()
@@ -576,7 +578,7 @@ from graphvio.slam.client import Client
 from graphvio.slam.service.options import ServiceOptions
 from graphvio.slam.service.server import GrpcServer
 
-odometry = served.DrawnOdometry()
+odometry = served.SyntheticOdometry()
 odometry.keyframe_log.add(served.keyframe(0))
 server = GrpcServer(odometry, ServiceOptions(port=0))
 server.start()

@@ -1,1 +1,1 @@
-"""A small SLAM system beside the odometry: places recognised, a pose graph, a map that is kept."""
+"""A small SLAM system on top of the odometry: place recognition, a pose graph and maps on disk."""

@@ -1,4 +1,4 @@
-"""The odometry's chains of places by themselves, and how well they know the motion between any two places of one."""
+"""Chains of places by the odometry alone, with the covariance of the motion between any two places of one."""
 
 from __future__ import annotations
 
@@ -15,43 +15,49 @@ from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 from graphvio.optimization.solver import Edge
 
 EXACT: Final = 1e-12 * np.eye(6)
-"""A micrometre, a microradian: keeps a covariance that says nothing is uncertain invertible."""
+"""Covariance of a micrometre and a microradian, which keeps a covariance of zero invertible."""
 
 
 class Chains:
-    """Places in the order of time, in fragments: each is a chain of motions whose errors are independent.
+    """Places in the order of time, in fragments: chains of motions with independent errors.
 
-    The covariance of a motion between two places is a difference of two sums: it costs the same over any length.
+    The covariance of a motion between two places is a difference of two sums, so its cost is constant.
+
+    Attributes:
+        first_places: Index of each fragment's first place.
+        motions: Motion (4, 4) from the previous place to each place.
+        covariances: Covariance (6, 6) of each motion.
+        poses: Pose (4, 4) of each place in its fragment's odom frame.
     """
 
     def __init__(self) -> None:
-        self.starts: list[int] = []
+        self.first_places: list[int] = []
         self.motions: list[Float] = []
         self.covariances: list[Float] = []
         self.poses: list[Float] = []
         self._sums: list[Float] = []
-        self._factors: dict[int, gtsam.NonlinearFactor] = {}  # place -> its motion from the one before
+        self._factors: dict[int, gtsam.NonlinearFactor] = {}  # place -> its motion from the previous one
 
     def __len__(self) -> int:
         return len(self.poses)
 
     @property
     def fragments(self) -> list[range]:
-        """Places of each."""
-        ends = [*self.starts[1:], len(self)]
-        return [range(start, end) for start, end in zip(self.starts, ends, strict=True)]
+        """Range of the places of each fragment."""
+        ends = [*self.first_places[1:], len(self)]
+        return [range(start, end) for start, end in zip(self.first_places, ends, strict=True)]
 
     def fragment(self, place: int) -> int:
-        """The fragment of a place."""
-        return int(np.searchsorted(self.starts, place, side="right")) - 1
+        """Return the fragment of a place."""
+        return int(np.searchsorted(self.first_places, place, side="right")) - 1
 
     def begin(self, odom_T_body: Float) -> None:
         """Add a fragment with its first place (4, 4), in its odom frame."""
-        self.starts.append(len(self))
+        self.first_places.append(len(self))
         self._append(np.eye(4), np.zeros((6, 6)), odom_T_body, np.zeros((6, 6)))
 
     def add(self, previous_T_body: Float, covariance: Float) -> None:
-        """Add a place to the last fragment: its motion (4, 4) from the place before it, and its covariance (6, 6)."""
+        """Add a place to the last fragment by its motion (4, 4) from the previous place, with covariance (6, 6)."""
         covariance = _regular(covariance)
         pose = self.poses[-1] @ previous_T_body
         adjoint = se3_adjoint(pose)
@@ -60,7 +66,7 @@ class Chains:
         self._factors[n] = Edge(n - 1, n, previous_T_body, covariance).factor()
 
     def motion(self, first: int, second: int) -> tuple[Float, Float]:
-        """``first_T_second`` (4, 4) of two places of a fragment, and its covariance (6, 6), in body at the second."""
+        """Return ``first_T_second`` (4, 4) within a fragment, and its covariance (6, 6) in body at the second place."""
         relative = se3_inverse(self.poses[first]) @ self.poses[second]
         low, high = sorted((first, second))
         adjoint = se3_adjoint(se3_inverse(self.poses[second]))
@@ -68,38 +74,38 @@ class Chains:
         return relative, 0.5 * (covariance + covariance.T)
 
     def distance(self, edge: Edge) -> float:
-        """Squared Mahalanobis distance of a closure within a fragment, 6 degrees of freedom."""
+        """Return the squared Mahalanobis distance of a closure within a fragment, 6 degrees of freedom."""
         relative, covariance = self.motion(edge.first, edge.second)
         error = se3_log(se3_inverse(relative) @ edge.first_T_second)
         return float(error @ np.linalg.solve(covariance + edge.covariance, error))
 
     def add_to(self, graph: gtsam.NonlinearFactorGraph, fragment: int) -> None:
-        """Add a fragment's motions to a graph, whose variables are the places' numbers."""
+        """Add a fragment's motions as factors to a graph whose variables are the places' indices."""
         for place in self.fragments[fragment][1:]:
             graph.add(self._factors[place])
 
     def prior(self, fragment: int) -> gtsam.NonlinearFactor:
-        """Where a fragment begins, which makes its frame: certain, however little odometry knows of gravity there."""
-        start = self.starts[fragment]
+        """Return the prior of a fragment's first place, which defines its frame and is therefore certain."""
+        start = self.first_places[fragment]
         return gtsam.PriorFactorPose3(x(start), gtsam.Pose3(self.poses[start]), gaussian(EXACT))
 
     @staticmethod
-    def of(starts: Sequence[int], firsts: Float, motions: Float, covariances: Float) -> Chains:
-        """Chains again from what they were made of.
+    def of(first_places: Sequence[int], first_poses: Float, motions: Float, covariances: Float) -> Chains:
+        """Restore chains from their motions.
 
         Args:
-            starts: first place of each of F fragments.
-            firsts: (F, 4, 4) poses of these.
-            motions: (N, 4, 4) of all places; those of the first ones are not used.
-            covariances: (N, 6, 6).
+            first_places: First place of each of F fragments.
+            first_poses: (F, 4, 4) poses of these.
+            motions: (N, 4, 4) motions of all places; those of the first places are not used.
+            covariances: (N, 6, 6) covariances of the motions.
         """
-        made = Chains()
+        chains = Chains()
         for n, (motion, covariance) in enumerate(zip(motions, covariances, strict=True)):
-            if n in starts:
-                made.begin(firsts[list(starts).index(n)])
+            if n in first_places:
+                chains.begin(first_poses[list(first_places).index(n)])
             else:
-                made.add(motion, covariance)
-        return made
+                chains.add(motion, covariance)
+        return chains
 
     def _append(self, motion: Float, covariance: Float, pose: Float, total: Float) -> None:
         self.motions.append(motion)

@@ -1,4 +1,4 @@
-"""Takes keyframes as fast as they come, and keeps those that are places for who works on them."""
+"""Reads keyframes as fast as they come, and queues those that are places."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from graphvio.config.stages import OptimizationConfig
 from graphvio.errors import MapError
-from graphvio.mapping.places import Anchored, NewPlace, PlaceChooser
+from graphvio.mapping.places import KeyframeAtPlace, NewPlace, PlaceChooser
 from graphvio.queues import BoundedQueue, WhenFull
 from graphvio.slam.interface import SlamFrontEnd
 
@@ -15,14 +15,14 @@ _MAX_WAITING = 8  # places, with their images
 
 
 class Intake:
-    """Reads a front-end in a thread of its own, so that its keyframes are never waited for.
+    """Reads a front-end's keyframes in a thread of its own, so that the front-end never waits.
 
-    When too many places wait, further keyframes are none: the map gets coarser, but does not fall behind.
+    While too many places wait, no keyframe becomes a place: the map gets coarser, but does not fall behind.
 
     Args:
-        front_end: whose keyframes are read.
-        settings: how far apart places are.
-        share: asked before each keyframe: the share of these distances that is enough now.
+        front_end: The front-end.
+        settings: Distances between places.
+        share: Returns, before each keyframe, the share of these distances that is sufficient now.
     """
 
     def __init__(self, front_end: SlamFrontEnd, settings: OptimizationConfig, share: Callable[[], float]) -> None:
@@ -31,46 +31,48 @@ class Intake:
         self._chooser = PlaceChooser(settings.place_distance_m, settings.place_angle_deg)
         self._lock = threading.Lock()
         self._waiting: BoundedQueue[NewPlace] = BoundedQueue(_MAX_WAITING, WhenFull.DROP_NEWEST)
-        self._keyframes: list[Anchored] = []
+        self._keyframes: list[KeyframeAtPlace] = []
         self._skipped = 0
         self._lost = 0
         self._failure: BaseException | None = None
 
     @property
     def skipped(self) -> int:
-        """Places that were none because too many waited."""
+        """Number of keyframes that did not become places because too many waited."""
         return self._skipped
 
     @property
     def lost(self) -> int:
-        """Keyframes whose ids were passed over."""
+        """Number of keyframes that were lost: gaps in their ids."""
         return self._lost
 
     @property
     def waiting(self) -> int:
-        """Places that are not worked on yet."""
+        """Number of places in the queue."""
         return len(self._waiting)
 
     @property
-    def keyframes(self) -> list[Anchored]:
-        """All that belong to a place, so far."""
+    def keyframes(self) -> list[KeyframeAtPlace]:
+        """All keyframes so far that belong to a place."""
         with self._lock:
             return list(self._keyframes)
 
     def start(self) -> None:
-        """Begin to read."""
+        """Start the reading thread."""
         threading.Thread(target=self._read, name="graphvio-keyframes", daemon=True).start()
 
     def stop(self) -> None:
-        """Read no more; places that wait are dropped."""
+        """Stop reading, and drop waiting places."""
         self._waiting.abandon()
 
     def next(self) -> NewPlace | None:
-        """The next place, waited for; None when there will be none.
+        """Wait for the next place.
+
+        Returns:
+            The place, or None after the last one.
 
         Raises:
-            GraphvioError: whatever the front-end raised, after all places that came before it; MapError, if its
-                keyframes carry no images.
+            GraphvioError: The front-end's error, after all places before it; a MapError if keyframes have no images.
         """
         place = self._waiting.get()
         if place is None and self._failure is not None:
@@ -89,16 +91,16 @@ class Intake:
         expected: int | None = None
         for keyframe in self._front_end.keyframes():
             if expected is None and not keyframe.images:
-                raise MapError("the keyframes carry no images, and places are recognised by them: ask for images")
+                raise MapError("the keyframes have no images, by which places are recognised; request images")
             with self._lock:
                 if self._waiting.is_closed:
                     return
                 self._lost += max(keyframe.id - (keyframe.id if expected is None else expected), 0)
                 expected = keyframe.id + 1
                 place, is_one = self._chooser.add(keyframe, self._share(), len(self._waiting) < _MAX_WAITING)
-                anchored = self._chooser.anchored()
-                if anchored is not None:
-                    self._keyframes.append(anchored)
+                newest = self._chooser.newest()
+                if newest is not None:
+                    self._keyframes.append(newest)
                 if place is not None:
                     self._waiting.put(place)
                 self._skipped += is_one and place is None

@@ -1,4 +1,4 @@
-"""The SLAM system: places are recognised, the pose graph is optimised, and the odometry is told where it is."""
+"""The SLAM system: recognises places, optimises the pose graph and corrects the odometry."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ from graphvio.optimization.loops.verification import FreshView, crossings, verif
 from graphvio.slam.interface import SlamFrontEnd
 from graphvio.trajectory import Trajectory
 
-_SEARCHING_SHARE = 0.25  # of the places' distance, as long as a fragment is not found in the map,
-_SEARCHING_PLACES = 20  # at its first places: what is unknown by then is not found sooner by looking more often
+_SEARCHING_SHARE = 0.25  # of the places' distance while a fragment is not located in the map,
+_MAX_SEARCHING_PLACES = 20  # for its first places: later, denser places do not locate it sooner
 
 
 class Mapper:
-    """Makes a map of what a front-end sees, and corrects it; a context manager that removes what it keeps meanwhile.
+    """Makes a map from a front-end's keyframes, and corrects the front-end; a context manager.
 
-    The map's frame is the odom frame of the first epoch, or the loaded map's. An epoch that begins later, or a session
-    in a loaded map, is a part of its own until closures of three of its places agree on where it is; only then the
-    front-end is told.
+    The map's frame is the odom frame of the first epoch, or the loaded map's. A later epoch, or a session in a loaded
+    map, is a separate fragment until closures of three of its places agree on where it is; only then the front-end is
+    corrected.
 
     Args:
-        front_end: its keyframes must carry images.
-        config: its ``optimization`` says what places and closures are.
-        map: folder of a saved map to begin with, or None.
-        folder: empty, to keep in what it needs; removed by `close`. None: one is made for temporary files.
+        front_end: The front-end, such as `graphvio.slam.FrontEnd`; its keyframes must have images.
+        config: Its section ``optimization`` has the settings of places and closures.
+        map: Folder of a saved map to begin with, or None.
+        folder: Empty folder for temporary files, removed by `close`; None for one in the system's folder.
 
     Raises:
-        MapError: if the map cannot be used with the front-end's rig.
-        MissingExtraError: if the extra ``maps`` is not installed.
+        MapError: If the map cannot be used with the front-end's rig.
+        MissingExtraError: If the extra ``maps`` is not installed.
     """
 
     def __init__(
@@ -73,15 +73,15 @@ class Mapper:
             kept = saved_map.load(folder, self._rig)
             saved_map.copy_files(folder, self._folder)
             self._graph, self._recognition, self._places = saved_map.restored(kept, self._config)
-        self._first = len(self._places)  # place of this session
+        self._first = len(self._places)  # first place of this session
         self._session = 1 + max((place.session for place in self._places), default=-1)
         self._store = PlaceStore(self._folder, self._rig)
         self._observer = PlaceObserver(self._rig, self._config)
-        self._share = _SEARCHING_SHARE if self._first else 1.0  # of the places' distance that makes the next one
+        self._share = _SEARCHING_SHARE if self._first else 1.0  # of the distance between places
         self._intake = Intake(self._front_end, settings, lambda: self._share)
         self._keyframe_ids: list[int] = []
-        self._lock = threading.RLock()  # held while the graph changes, or is read from another thread
-        self._working = threading.Lock()  # held while a place is worked on
+        self._lock = threading.RLock()  # held while the graph changes, or is read in another thread
+        self._working = threading.Lock()  # held while a place is processed
         self._is_stopped = False
         self._times = _StageTimes()
         self._tried = 0
@@ -97,13 +97,13 @@ class Mapper:
         self.close()
 
     def run(self, on_place: Callable[[Mapper], None] | None = None) -> None:
-        """Work until the front-end's keyframes have ended, or `stop`.
+        """Process places until the front-end's keyframes end, or `stop` is called.
 
         Args:
-            on_place: called after each place, in this thread.
+            on_place: Called after each place, in this thread.
 
         Raises:
-            GraphvioError: if the front-end fails, or a place cannot be kept. What there was before can be saved.
+            GraphvioError: If the front-end fails, or a place cannot be stored. The map until then can be saved.
         """
         self._intake.start()
         while not self._is_stopped and (place := self._intake.next()) is not None:
@@ -113,22 +113,22 @@ class Mapper:
                 on_place(self)
 
     def stop(self) -> None:
-        """End `run` after the place that it works on; from any thread."""
+        """End `run` after the current place; thread-safe."""
         self._is_stopped = True
         self._intake.stop()
 
     def close(self) -> None:
-        """Remove what was kept on disk; a map that is wanted is saved before."""
+        """Delete the temporary files; `save` the map before."""
         self.stop()
         with self._working:
             self._store.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def save(self, folder: Path | str) -> None:
-        """Write the map; one that was in the folder is replaced. From any thread, while it runs between two places.
+        """Write the map to a folder, where it replaces an older one; thread-safe, between two places.
 
         Raises:
-            MapError: if the folder holds something else, or cannot be written.
+            MapError: If the folder contains other files, or cannot be written.
         """
         with self._working, self._lock:
             saved_map.save(
@@ -137,37 +137,37 @@ class Mapper:
 
     @property
     def is_localised(self) -> bool:
-        """Whether the newest place is in the map's frame."""
+        """Whether the newest place is located in the map's frame."""
         with self._lock:
             newest = len(self._graph) - 1
             return newest >= self._first and self._graph.is_in_map(newest)
 
     @property
     def trajectory(self) -> Trajectory:
-        """All keyframes of this session that are in the map, where they are now in its frame."""
+        """Optimised poses, in the map's frame, of this session's keyframes that are located in it."""
         with self._lock:
             poses = [
                 self._graph.pose(k) if self._graph.is_in_map(k) else None for k in range(self._first, len(self._graph))
             ]
-            begins = {start - self._first for start in self._graph.chains.starts}
+            begins = {place - self._first for place in self._graph.chains.first_places}
             motions = self._graph.chains.motions[self._first :]
         return spread_keyframes(self._intake.keyframes, poses, motions, begins)
 
     @property
     def place_poses(self) -> Float:
-        """(N, 4, 4) of all places that are in the map, those of earlier sessions too."""
+        """(N, 4, 4) poses of all places in the map, including earlier sessions."""
         with self._lock:
             poses = [self._graph.pose(k) for k in range(len(self._graph)) if self._graph.is_in_map(k)]
         return np.array(poses).reshape(-1, 4, 4)
 
     @property
     def closures(self) -> list[tuple[LoopClosure, bool]]:
-        """All closures, and whether the map rests on them; rows of their places are numbers of the map's places."""
+        """All closures, and whether the solution uses them; rows of their places are indices of the map's places."""
         with self._lock:
             return [(each.closure, each.is_used) for each in self._graph.closures]
 
     def summary(self) -> Mapping[str, float | int | str | None]:
-        """How it went, by name."""
+        """Return the figures of the run by name."""
         with self._lock:
             in_map = sum(self._graph.is_in_map(k) for k in range(len(self._graph)))
             found, used = len(self._graph.closures), sum(each.is_used for each in self._graph.closures)
@@ -200,13 +200,13 @@ class Mapper:
         with self._lock:
             self._places.append(Place(self._session, number, keyframe.stamp_ns))
             self._keyframe_ids.append(keyframe.id)
-            # The graph comes last: what is saved after an interruption is what it holds.
+            # The graph comes last: after an interruption, the places that it contains are saved.
             if new.previous_T_body is None or new.covariance is None:
                 self._graph.begin(keyframe.odom_T_body)
             else:
                 self._graph.add(new.previous_T_body, new.covariance)
         if number == 0:
-            self._correct(number)  # here the map begins
+            self._correct(number)  # the map begins here
         with clock.stage("retrieval"):
             similar = self._recognition.similar(number, self._may, self._config.optimization.loop_candidates)
         found = []
@@ -218,20 +218,20 @@ class Mapper:
                 found.append(closure)
         if found:
             self._close_loops(found, number)
-        start = self._graph.chains.starts[-1]
-        is_searching = not self._graph.is_in_map(start) and len(self._graph) - start < _SEARCHING_PLACES
+        first = self._graph.chains.first_places[-1]
+        is_searching = not self._graph.is_in_map(first) and len(self._graph) - first < _MAX_SEARCHING_PLACES
         self._share = _SEARCHING_SHARE if is_searching else 1.0
         if self._recognition.is_due:
             with clock.stage("vocabulary"):
                 self._recognition.learn(self._descriptors)
 
     def _may(self, earlier: int) -> bool:
-        """Whether a place may be compared with the newest one."""
+        """Return whether a place may be compared with the newest one."""
         one, newest = self._places[earlier], self._places[-1]
         if not self._graph.may_see(earlier, newest.row):
             return False
         chains = self._graph.chains
-        if one.session != newest.session or chains.fragment(earlier) != len(chains.starts) - 1:
+        if one.session != newest.session or chains.fragment(earlier) != len(chains.first_places) - 1:
             return True
         return abs(newest.stamp_ns - one.stamp_ns) > round(self._config.optimization.loop_interval_s * 1e9)
 
@@ -251,13 +251,13 @@ class Mapper:
             self._correct(number)
 
     def _correct(self, number: int) -> None:
-        """Tell the front-end where a place of this session is in the map."""
+        """Send the front-end the pose of a place of this session in the map."""
         with self._lock:
             pose, covariance = self._graph.pose(number), self._graph.covariance(number)
         self._sent += 1
         try:
             result = self._front_end.correct(self._keyframe_ids[number - self._first], pose, covariance)
-        except GraphvioError as error:  # one that has ended takes none; its keyframes tell whether it has
+        except GraphvioError as error:  # also if it has ended, which its keyframes show
             self._refused.append(str(error))
             return
         if not result.accepted:
@@ -273,7 +273,7 @@ class Mapper:
 
 
 class _StageTimes:
-    """Sums by stage, in the order in which the stages were first reached."""
+    """Processing times by stage, in the order in which the stages were first entered."""
 
     def __init__(self) -> None:
         self._total_s: dict[str, float] = {}
@@ -281,7 +281,7 @@ class _StageTimes:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Count what is done inside, however it ends."""
+        """Add the time inside the context to a stage."""
         begin = time.perf_counter()
         try:
             yield
@@ -290,5 +290,5 @@ class _StageTimes:
             self._count[name] = self._count.get(name, 0) + 1
 
     def summary(self) -> dict[str, float]:
-        """Mean milliseconds of each stage."""
+        """Return the mean time of each stage, milliseconds."""
         return {f"{name}_ms": 1e3 * total / self._count[name] for name, total in self._total_s.items()}

@@ -1,4 +1,4 @@
-"""Which keyframes are places, and how each lies to the one before it by the odometry's own chain."""
+"""Selection of places among the keyframes, and the keyframes' poses relative to them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from graphvio.trajectory import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class NewPlace:
-    """A keyframe at which the rig looks around.
+    """A keyframe that was selected as a place.
 
     Attributes:
-        keyframe: of it.
-        previous_T_body: (4, 4) from the place before it, or None where a fragment begins.
-        covariance: (6, 6) of that, tangent ``[rotation, translation]`` in body here, or None with it.
+        keyframe: The keyframe.
+        previous_T_body: (4, 4) motion from the previous place, or None for the first place of a fragment.
+        covariance: (6, 6) of the motion, tangent ``[rotation, translation]`` in body at this place, or None with it.
     """
 
     keyframe: Keyframe
@@ -29,13 +29,13 @@ class NewPlace:
 
 
 @dataclass(frozen=True, eq=False)
-class Anchored:
-    """Where a keyframe is.
+class KeyframeAtPlace:
+    """A keyframe's pose relative to the last place before it.
 
     Attributes:
-        stamp_ns: of it.
-        place: how many places were chosen before the one that it is measured from.
-        place_T_body: (4, 4) by the odometry's chain; what closures say later moves the place.
+        stamp_ns: Stamp of the keyframe.
+        place: Index of the place.
+        place_T_body: (4, 4) by the odometry; closures move the place.
     """
 
     stamp_ns: int
@@ -44,11 +44,11 @@ class Anchored:
 
 
 class PlaceChooser:
-    """Follows the chain of keyframes, and tells which of them are places.
+    """Selects places in a chain of keyframes.
 
     Args:
-        distance_m: a keyframe so far from the place before it is one,
-        angle_deg: or turned by so much.
+        distance_m: Minimal distance from the previous place,
+        angle_deg: or minimal rotation.
     """
 
     def __init__(self, distance_m: float, angle_deg: float) -> None:
@@ -61,15 +61,15 @@ class PlaceChooser:
         self._covariance = np.zeros((6, 6))
 
     def add(self, keyframe: Keyframe, share: float = 1.0, has_room: bool = True) -> tuple[NewPlace | None, bool]:
-        """Take the next keyframe.
+        """Add the next keyframe.
 
         Args:
-            keyframe: of increasing ids.
-            share: of distance and angle that is enough: less than one where places are wanted densely.
-            has_room: whether a place can be taken; if not, the next keyframe can be one.
+            keyframe: The keyframe; ids increase.
+            share: Sufficient share of distance and angle: less than one for denser places.
+            has_room: Whether a place can be queued; if not, the next keyframe can become one.
 
         Returns:
-            The place that it is, or None; and whether it would have been one, had there been room.
+            The place, or None; and whether the keyframe qualifies as a place, with or without room.
         """
         last = self._last
         self._last = keyframe
@@ -89,11 +89,11 @@ class PlaceChooser:
         self._motion, self._covariance = np.eye(4), np.zeros((6, 6))
         return place, True
 
-    def anchored(self) -> Anchored | None:
-        """Where the newest keyframe is; None as long as its fragment has no place."""
+    def newest(self) -> KeyframeAtPlace | None:
+        """Return the newest keyframe's relative pose; None as long as its fragment has no place."""
         if self._last is None or self._begins:
             return None
-        return Anchored(self._last.stamp_ns, self._count - 1, self._motion)
+        return KeyframeAtPlace(self._last.stamp_ns, self._count - 1, self._motion)
 
     def _is_far(self, share: float) -> bool:
         angle_deg = np.rad2deg(np.linalg.norm(so3_log(np.ascontiguousarray(self._motion[:3, :3]))))
@@ -102,10 +102,10 @@ class PlaceChooser:
 
 
 def motion_between(last: Keyframe, keyframe: Keyframe) -> tuple[Float, Float]:
-    """``last_T_body`` (4, 4) of two keyframes of an epoch, and its covariance (6, 6), in body at the second.
+    """Return ``last_T_body`` (4, 4) of two keyframes of an epoch, and its covariance (6, 6) in body at the second.
 
-    Where keyframes between them are lost, or the odometry does not tell, the poses in the epoch's frame do. Their
-    errors are then taken for independent: those that are in common make the motion only better than that.
+    If keyframes between them are lost, or the odometry reports no motion, it follows from their poses in odom, whose
+    errors are assumed to be independent. This is pessimistic: common errors cancel out.
     """
     motion = se3_inverse(last.odom_T_body) @ keyframe.odom_T_body
     covariance = keyframe.relative_covariance
@@ -119,36 +119,41 @@ def motion_between(last: Keyframe, keyframe: Keyframe) -> tuple[Float, Float]:
 def composed(
     a_T_b: Float, a_covariance: Float, b_T_c: Float, b_covariance: Float, begins: bool = False
 ) -> tuple[Float, Float]:
-    """``a_T_c`` and its covariance (6, 6) in c, of two motions whose errors are independent.
+    """Return ``a_T_c`` (4, 4) and its covariance (6, 6) in c, of two motions with independent errors.
 
     Args:
-        a_T_b: (4, 4).
-        a_covariance: (6, 6) of it, in b; with ``begins`` of a pose of a, in a.
-        b_T_c: (4, 4).
-        b_covariance: (6, 6) of it, in c.
-        begins: whether the first covariance is of the motion's beginning.
+        a_T_b: (4, 4) first motion.
+        a_covariance: (6, 6) of ``a_T_b``, in b; with ``begins`` of the pose of a, in a.
+        b_T_c: (4, 4) second motion.
+        b_covariance: (6, 6) of ``b_T_c``, in c.
+        begins: Whether the first covariance is that of the pose of a.
     """
     adjoint = se3_adjoint(se3_inverse(a_T_b if begins else b_T_c))
     return a_T_b @ b_T_c, adjoint @ a_covariance @ adjoint.T + b_covariance
 
 
 def spread_keyframes(
-    keyframes: Sequence[Anchored], poses: Sequence[Float | None], motions: Sequence[Float], begins: Collection[int]
+    keyframes: Sequence[KeyframeAtPlace],
+    poses: Sequence[Float | None],
+    motions: Sequence[Float],
+    begins: Collection[int],
 ) -> Trajectory:
-    """The odometry's chain from place to place is kept, and what it differs by at the next place shared out by time.
+    """Return the trajectory of all keyframes, given the places' poses.
+
+    Between two places the odometry's chain is kept, and its error at the second place is distributed over time.
 
     Args:
-        keyframes: in the order of time.
-        poses: (4, 4) of the places, as far as they are worked on; None of those that are not in the map.
-        motions: (4, 4) by the odometry from the place before to each place.
-        begins: places that have none before.
+        keyframes: The keyframes in the order of time.
+        poses: (4, 4) poses of the places processed so far; None for those that are not in the map.
+        motions: (4, 4) motion by the odometry from the previous place to each place.
+        begins: First places of the fragments.
     """
     stamp_of: dict[int, int] = {}
     for each in keyframes:
         stamp_of.setdefault(each.place, each.stamp_ns)
     errors: dict[int, Float] = {}
     stamps: list[int] = []
-    made: list[Float] = []
+    corrected: list[Float] = []
     for each in keyframes:
         k = each.place
         pose = poses[k] if k < len(poses) else None
@@ -161,5 +166,5 @@ def spread_keyframes(
                 errors[k] = se3_log(se3_inverse(motions[k + 1]) @ se3_inverse(pose) @ after)
             share = errors[k] * (each.stamp_ns - stamp_of[k]) / (stamp_of[k + 1] - stamp_of[k])
         stamps.append(each.stamp_ns)
-        made.append(pose @ each.place_T_body @ se3_exp(share))
-    return Trajectory(np.array(stamps, dtype=np.int64), np.array(made).reshape(-1, 4, 4))
+        corrected.append(pose @ each.place_T_body @ se3_exp(share))
+    return Trajectory(np.array(stamps, dtype=np.int64), np.array(corrected).reshape(-1, 4, 4))

@@ -1,4 +1,4 @@
-"""The reference SLAM in a process of its own, at the other end of the odometry's gRPC service."""
+"""The SLAM system in a process of its own, as a client of the odometry's gRPC service."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from graphvio.viewer import Viewer, WebOptions
 from graphvio.warmup import warm_up
 
 _MAP_COLOUR, _ODOM_COLOUR = (40, 190, 90), (150, 150, 150)
-_SHOWN_EVERY = 3  # places
+_VIEWED_EVERY = 3  # places
 
 
 @dataclass(frozen=True)
 class MappingTask:
-    """What the process is to do.
+    """Options of the process.
 
     Attributes:
-        address: of the odometry's service.
-        config: of the odometry, whose ``optimization`` says what places and closures are.
-        map: folder of a saved map to begin with, or None.
-        out: folder for the map, or None.
-        view: open rerun's window.
-        web_port: let a browser watch on this port, or None.
-        save_rrd: write what the viewer shows, or None.
-        folder: empty, to work in; removed in the end. None: one is made.
+        address: Address of the odometry's service.
+        config: Configuration of the odometry, with the settings of places and closures.
+        map: Folder of a saved map to begin with, or None.
+        out: Folder for the new map, or None.
+        view: Open rerun's window.
+        web_port: Port of the view in a browser, or None.
+        save_rrd: File for the viewer's data, or None.
+        folder: Empty folder for temporary files, removed at the end; None for one in the system's folder.
     """
 
     address: str
@@ -54,21 +54,21 @@ class MappingTask:
 
 
 def run_mapping(task: MappingTask, ready: Event) -> str:
-    """Map until the odometry ends, and save the map; in a process of its own, whose signals it ignores from here on.
+    """Map until the odometry ends, and save the map; to be called in a process of its own, which then ignores signals.
 
-    After a failure, what is there by then is saved.
+    After a failure, the map until then is saved.
 
     Args:
-        task: what to do.
-        ready: is set when keyframes may come.
+        task: Options.
+        ready: Set when keyframes may come.
 
     Returns:
         The summary, in one line.
 
     Raises:
-        GraphvioError: if the odometry cannot be reached, or the map not be used or written.
+        GraphvioError: If the odometry cannot be reached, or the map cannot be used or written.
     """
-    colmap()  # takes SIGTERM for itself when it is loaded
+    colmap()  # installs its own handler of SIGTERM when it is loaded
     ignore_stop_signals()  # they are for the odometry, with which this process ends
     use_one_opencv_thread()
     with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map, task.folder) as mapper:
@@ -76,17 +76,17 @@ def run_mapping(task: MappingTask, ready: Event) -> str:
         try:
             _follow(client, mapper, task, ready)
         except GraphvioError as error:
-            raise MapError(f"{error}{_rescued(mapper, task.out)}") from None
+            raise MapError(f"{error}{_save_after_failure(mapper, task.out)}") from None
         except Exception as error:
-            error.add_note(_rescued(mapper, task.out))
+            error.add_note(_save_after_failure(mapper, task.out))
             raise
         if task.out is not None:
             _save(mapper, task.out)
-        return told(mapper)
+        return summary_line(mapper)
 
 
 class _WithImages:
-    """The client as a front-end whose keyframes carry images: places are recognised by features of their own."""
+    """The client as a front-end whose keyframes have images."""
 
     def __init__(self, client: Client) -> None:
         self.rig = client.rig
@@ -98,8 +98,8 @@ class _WithImages:
         return self._client.keyframes(from_id, with_images=True, with_descriptors=False)
 
 
-def told(mapper: Mapper) -> str:
-    """The summary in one line."""
+def summary_line(mapper: Mapper) -> str:
+    """Return the mapper's summary in one line."""
     figures = {name: value for name, value in mapper.summary().items() if value is not None}
     return "map: " + ", ".join(
         f"{name} {value:.1f}" if isinstance(value, float) else f"{name} {value}" for name, value in figures.items()
@@ -111,8 +111,8 @@ def _save(mapper: Mapper, out: Path) -> None:
     save_trajectory(mapper.trajectory, out / "trajectory.txt")
 
 
-def _rescued(mapper: Mapper, out: Path | None) -> str:
-    """Save what there is after a failure; what became of it, to be put behind what is told of that."""
+def _save_after_failure(mapper: Mapper, out: Path | None) -> str:
+    """Save the map after a failure; return the outcome, to be appended to the error's message."""
     if out is None or not mapper.summary()["places"]:
         return ""
     try:
@@ -134,7 +134,7 @@ def _follow(client: Client, mapper: Mapper, task: MappingTask, ready: Event) -> 
         ready.set()
 
         def show(at: Mapper) -> None:
-            if len(at.place_poses) % _SHOWN_EVERY == 0:
+            if len(at.place_poses) % _VIEWED_EVERY == 0:
                 viewer.show_path("map", at.trajectory, _MAP_COLOUR)
 
         mapper.run(show)
@@ -144,7 +144,7 @@ def _follow(client: Client, mapper: Mapper, task: MappingTask, ready: Event) -> 
 
 
 class _OdomPath:
-    """Shows the estimates as they come, and keeps their path."""
+    """Shows the estimates as they come, and records their path."""
 
     def __init__(self, client: Client, viewer: Viewer) -> None:
         self._client = client
@@ -155,11 +155,11 @@ class _OdomPath:
 
     @property
     def path(self) -> Trajectory:
-        """All of it."""
+        """The path until now."""
         return Trajectory(np.array(self._stamps, dtype=np.int64), np.array(self._poses).reshape(-1, 4, 4))
 
     def _listen(self) -> None:
-        with suppress(ServiceError):  # the service has gone, which the mapping itself tells of
+        with suppress(ServiceError):  # the service has ended, which the mapper reports
             for update in self._client.estimates():
                 self._viewer.show(None, update.state)
                 if update.state.nav_T_body is not None:

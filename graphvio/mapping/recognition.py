@@ -1,4 +1,4 @@
-"""Which known places look like the one that is seen now: a vocabulary that is learnt as places come."""
+"""Retrieval of similar places, by a vocabulary that is learnt as places come."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from graphvio.arrays import AnyArray, Int
 from graphvio.optimization.loops.retrieval import describe, most_similar, vocabulary
 
-_FIRST = 8  # places of which a vocabulary is made,
-_LAST = 256  # and made anew when they have doubled, up to these: more would not change what the words are
+_MIN_PLACES = 8  # of which a vocabulary is learnt,
+_MAX_PLACES = 256  # and learnt again when their number has doubled, up to these: more would not change the words
 
 
 class Recognition:
-    """Images of places as vectors.
+    """Places as vectors of visual words.
 
     Args:
-        seed: of the vocabulary.
-        words: (W, 128) of an earlier map, or none.
-        learnt_from: places that these were made of.
+        seed: Seed of the vocabulary's clustering.
+        words: (W, 128) vocabulary of an earlier map, or None.
+        learnt_from: Number of places from which it was learnt.
     """
 
     def __init__(self, seed: int, words: AnyArray | None = None, learnt_from: int = 0) -> None:
@@ -28,25 +28,25 @@ class Recognition:
         self.learnt_from = learnt_from
         self._seed = seed
         self._pairs: list[list[int]] = []  # of each place
-        self._starts: list[int] = []
+        self._first_rows: list[int] = []
         self._vectors = np.zeros((0, self.words.size), dtype=np.float32)
         self._rows = 0
 
     def __len__(self) -> int:
-        return len(self._starts)
+        return len(self._first_rows)
 
     @property
     def is_due(self) -> bool:
-        """Whether the vocabulary has to be learnt anew."""
-        return len(self) >= max(_FIRST, 2 * self.learnt_from) and self.learnt_from < _LAST
+        """Whether the vocabulary must be learnt again."""
+        return len(self) >= max(_MIN_PLACES, 2 * self.learnt_from) and self.learnt_from < _MAX_PLACES
 
     def add(self, descriptors: Mapping[int, AnyArray]) -> None:
-        """Add the next place: pair -> descriptors (K, 128), uint8, of its left image."""
+        """Add the next place by its descriptors: pair -> (K, 128), uint8, of the left image."""
         self.add_described(sorted(descriptors), [describe(descriptors[j], self.words) for j in sorted(descriptors)])
 
     def add_described(self, pairs: Sequence[int], vectors: Sequence[AnyArray]) -> None:
-        """Add the next place by what its images look like."""
-        self._starts.append(self._rows)
+        """Add the next place by the vectors of its pairs' left images."""
+        self._first_rows.append(self._rows)
         self._pairs.append(list(pairs))
         while self._rows + len(vectors) > len(self._vectors):
             self._vectors = np.concatenate(
@@ -57,48 +57,48 @@ class Recognition:
             self._rows += 1
 
     def learn(self, descriptors: Callable[[int, int], AnyArray]) -> None:
-        """Make the vocabulary of all places, and describe them by it.
+        """Learn the vocabulary from all places, and describe them by it.
 
         Args:
-            descriptors: of a place's number and pair.
+            descriptors: Returns the descriptors of a place's index and pair.
         """
         images = [(place, j) for place, pairs in enumerate(self._pairs) for j in pairs]
-        self.words = vocabulary(_Read(images, descriptors), self._seed)
+        self.words = vocabulary(_LazyDescriptors(images, descriptors), self._seed)
         self.learnt_from = len(self)
         self._vectors = np.zeros((self._rows, self.words.size), dtype=np.float32)
         for row, image in enumerate(images):
             self._vectors[row] = describe(descriptors(*image), self.words)
 
-    def similar(self, place: int, may: Callable[[int], bool], most: int) -> list[int]:
-        """The places before a place that look most like it.
+    def similar(self, place: int, may: Callable[[int], bool], max_count: int) -> list[int]:
+        """Return the earlier places that are most similar to a place.
 
         Args:
-            place: its number.
-            may: whether it may be compared with another.
-            most: places.
+            place: Index of the place.
+            may: Whether an earlier place may be compared with it.
+            max_count: Maximal number of places.
         """
         if not place or not self.words.size or not self._pairs[place]:
             return []
-        # Starts of places without an image would be taken for others' images.
+        # First rows of places without an image belong to other places.
         seen = np.array([k for k in range(place) if self._pairs[k]], dtype=np.int64)
         if not len(seen):
             return []
-        starts = np.array(self._starts, dtype=np.int64)
-        before = self._vectors[: starts[place]]
-        found = most_similar(self.vectors(place), before, starts[seen], lambda k: may(int(seen[k])), most)
+        first_rows = np.array(self._first_rows, dtype=np.int64)
+        before = self._vectors[: first_rows[place]]
+        found = most_similar(self.vectors(place), before, first_rows[seen], lambda k: may(int(seen[k])), max_count)
         return [int(seen[k]) for _, k in found]
 
     def pairs(self, place: int) -> Int:
-        """(P,) whose left images are known of a place."""
+        """Return the pairs (P,) of a place's images."""
         return np.array(self._pairs[place], dtype=np.int64)
 
     def vectors(self, place: int) -> AnyArray:
-        """(P, D) of these."""
-        return self._vectors[self._starts[place] : self._starts[place] + len(self._pairs[place])]
+        """Return the vectors (P, D) of a place's images."""
+        return self._vectors[self._first_rows[place] : self._first_rows[place] + len(self._pairs[place])]
 
 
-class _Read(Sequence[AnyArray]):
-    """Descriptors of images, read when they are asked for."""
+class _LazyDescriptors(Sequence[AnyArray]):
+    """Descriptors of images, read on access."""
 
     def __init__(self, images: Sequence[tuple[int, int]], descriptors: Callable[[int, int], AnyArray]) -> None:
         self._images = images

@@ -1,8 +1,8 @@
-"""A map on disk: a folder of places with their poses, what they look like, and the graph that holds them together.
+"""A map on disk: a folder with the places, their poses and features, and the pose graph.
 
-``map.json`` is the header, with the version and the digests of the files that must be whole; ``map.npz`` the places
-and chains; ``closures.npz``; ``features.db`` COLMAP's database; ``rig.yaml``. Images are not kept: closures on places
-of a map rest on features, and several of them place a session as well as patches would, in a third of the space.
+``map.json`` is the header, with the version and the digests of the other files; ``map.npz`` has the places and chains,
+``closures.npz`` the closures, ``features.db`` (COLMAP's database) the features, ``rig.yaml`` the rig. Images are not
+saved: several closures by features alone locate a session as well as patches would, in a third of the space.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from graphvio.arrays import AnyArray, Bool, Float, Int
 from graphvio.config import Config
 from graphvio.errors import GraphvioError, MapError
 from graphvio.mapping.chains import Chains
-from graphvio.mapping.pose_graph import Judged, PoseGraph
+from graphvio.mapping.pose_graph import PoseGraph, TestedClosure
 from graphvio.mapping.recognition import Recognition
 from graphvio.mapping.store import DATABASE, PlaceStore, copy_database
 from graphvio.optimization.loops.closures import LoopClosure, Place, closures_to_bytes, load_closures
@@ -33,40 +33,41 @@ from graphvio.version import __version__
 
 FORMAT, VERSION = "graphvio map", 2
 _HEADER, _RIG, _PLACES, _CLOSURES = "map.json", "rig.yaml", "map.npz", "closures.npz"
-_CHECKED = (_PLACES, _CLOSURES, DATABASE)
-_OWN = (_HEADER, _RIG, *_CHECKED)
-_RIG_TOLERANCE = 1e-9  # a file keeps all digits; this is rounding
+_DIGESTED = (_PLACES, _CLOSURES, DATABASE)
+_OWN = (_HEADER, _RIG, *_DIGESTED)
+_COLUMN_OF = {"first_places": "starts"}  # attributes whose columns in the file have another name
+_RIG_TOLERANCE = 1e-9  # a file has all digits; this is rounding
 
 
 @dataclass(frozen=True, eq=False)
 class SavedMap:
-    """N places in F fragments.
+    """N places in F fragments, and L closures.
 
     Attributes:
-        session: (N,) number of the session that saw each.
-        stamp_ns: (N,).
-        map_T_body: (N, 4, 4), each in its component's frame.
-        covariance: (N, 6, 6) of these, tangent ``[rotation, translation]`` in body.
-        starts: (F,) first place of each fragment.
-        component: (F,) the fragment in whose frame each is; 0 is the map's.
-        firsts: (F, 4, 4) of these in their odom frames.
-        motions: (N, 4, 4) from the place before.
-        motion_covariances: (N, 6, 6).
-        words: (W, 128) of the vocabulary.
-        learnt_from: places that it was made of.
-        vectors: (M, D) of the places' images.
-        vector_place: (M,) their places,
-        vector_pair: (M,) and pairs.
-        closures: all that were found.
-        is_used: (L,) which of them the poses rest on,
-        is_refuted: (L,) and which the odometry refutes.
+        session: (N,) number of each place's session.
+        stamp_ns: (N,) stamps.
+        map_T_body: (N, 4, 4) poses, each in its component's frame.
+        covariance: (N, 6, 6) of the poses, tangent ``[rotation, translation]`` in body.
+        first_places: (F,) first place of each fragment.
+        component: (F,) the fragment in whose frame each fragment is; 0 is the map's.
+        firsts: (F, 4, 4) poses of the first places in their odom frames.
+        motions: (N, 4, 4) motions from the previous place.
+        motion_covariances: (N, 6, 6) covariances of the motions.
+        words: (W, 128) vocabulary.
+        learnt_from: Number of places from which it was learnt.
+        vectors: (M, D) vectors of the places' images.
+        vector_place: (M,) place of each vector.
+        vector_pair: (M,) pair of each vector.
+        closures: All closures that were found.
+        is_used: (L,) whether the solution uses each closure.
+        is_refuted: (L,) whether each closure contradicts the odometry.
     """
 
     session: Int
     stamp_ns: Int
     map_T_body: Float
     covariance: Float
-    starts: Int
+    first_places: Int
     component: Int
     firsts: Float
     motions: Float
@@ -82,10 +83,10 @@ class SavedMap:
 
 
 def save(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
-    """Write a map, whole or not at all; one that was there before is replaced, other files in the folder stay.
+    """Write a map atomically; an older map is replaced, other files in the folder stay.
 
     Raises:
-        MapError: if the folder holds something else, or cannot be written.
+        MapError: If the folder contains other files but no map, or cannot be written.
     """
     check_target(folder)
     folder = folder.resolve()  # what is replaced is a folder, not a link to it
@@ -109,10 +110,10 @@ def save(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
 
 
 def check_map(folder: Path) -> None:
-    """Make sure that a folder holds a map that this version reads; of which rig, and whether it is whole, `load` finds.
+    """Check that a folder contains a map of this version; `load` checks its rig and digests.
 
     Raises:
-        MapError: if it does not.
+        MapError: If it does not.
     """
     _header(folder)
 
@@ -121,11 +122,11 @@ def load(folder: Path, rig: Rig) -> SavedMap:
     """Read a map.
 
     Args:
-        folder: of it.
-        rig: whose map it must be.
+        folder: Folder of the map.
+        rig: The rig; that of the map must be the same.
 
     Raises:
-        MapError: if it is none, of another version or rig, or damaged.
+        MapError: If the folder contains no map, one of another version or rig, or a damaged one.
     """
     header = _header(folder)
     try:
@@ -137,12 +138,13 @@ def load(folder: Path, rig: Rig) -> SavedMap:
         raise MapError(
             f"{folder}: is a map of another rig ({differs}); use the rig.yaml in it, or make a new map with this rig"
         )
-    for name in _CHECKED:
+    for name in _DIGESTED:
         if _digest(folder / name) != header["files"].get(name):
             raise MapError(f"{folder / name}: is damaged or missing; restore the map from a copy, or make a new one")
     try:
         with np.load(folder / _PLACES, allow_pickle=False) as file:
-            columns = {name: file[name] for name in file.files}
+            attributes = {column: name for name, column in _COLUMN_OF.items()}
+            columns = {attributes.get(name, name): file[name] for name in file.files}
         columns["vectors"] = columns["vectors"].astype(np.float32)
         learnt_from = int(columns.pop("learnt_from"))
         return SavedMap(**columns, learnt_from=learnt_from, closures=load_closures(folder / _CLOSURES))
@@ -151,26 +153,26 @@ def load(folder: Path, rig: Rig) -> SavedMap:
 
 
 def check_target(folder: Path) -> None:
-    """Make sure that a map may be written to a folder: a new or empty one, or one that holds a map.
+    """Check that a map may be written to a folder: it is new or empty, or contains a map.
 
     Raises:
-        MapError: if it holds something else.
+        MapError: If it contains other files.
     """
     if folder.exists() and not (folder / _HEADER).is_file() and (not folder.is_dir() or any(folder.iterdir())):
         raise MapError(f"{folder}: holds something else than a map; name another folder")
 
 
 def copy_files(folder: Path, into: Path) -> None:
-    """Bring a map's features where they can be added to.
+    """Copy a map's features to a folder where more can be added.
 
     Raises:
-        MapError: if they cannot be copied.
+        MapError: If they cannot be copied.
     """
     copy_database(folder / DATABASE, into / DATABASE)
 
 
 def to_saved(graph: PoseGraph, recognition: Recognition, places: Sequence[Place]) -> SavedMap:
-    """All that has to be kept, of the places that the graph holds."""
+    """Return the map with the places that the graph contains."""
     chains, closures, n = graph.chains, graph.closures, len(graph)
     pairs = [recognition.pairs(place) for place in range(n)]
     size = recognition.words.size
@@ -179,9 +181,9 @@ def to_saved(graph: PoseGraph, recognition: Recognition, places: Sequence[Place]
         stamp_ns=np.array([place.stamp_ns for place in places[:n]], dtype=np.int64),
         map_T_body=np.array([graph.pose(k) for k in range(n)]).reshape(-1, 4, 4),
         covariance=np.array([graph.covariance(k) for k in range(n)]).reshape(-1, 6, 6),
-        starts=np.array(chains.starts, dtype=np.int64),
+        first_places=np.array(chains.first_places, dtype=np.int64),
         component=np.array(graph.component, dtype=np.int64),
-        firsts=np.array([chains.poses[start] for start in chains.starts]).reshape(-1, 4, 4),
+        firsts=np.array([chains.poses[place] for place in chains.first_places]).reshape(-1, 4, 4),
         motions=np.array(chains.motions).reshape(-1, 4, 4),
         motion_covariances=np.array(chains.covariances).reshape(-1, 6, 6),
         words=recognition.words,
@@ -196,10 +198,10 @@ def to_saved(graph: PoseGraph, recognition: Recognition, places: Sequence[Place]
 
 
 def restored(kept: SavedMap, config: Config) -> tuple[PoseGraph, Recognition, list[Place]]:
-    """The graph as it was, what its places look like, and the places."""
-    chains = Chains.of(kept.starts.tolist(), kept.firsts, kept.motions, kept.motion_covariances)
+    """Restore the graph, the recognition and the places of a map."""
+    chains = Chains.of(kept.first_places.tolist(), kept.firsts, kept.motions, kept.motion_covariances)
     closures = [
-        Judged(
+        TestedClosure(
             each,
             Edge(each.reference.row, each.current.row, each.reference_T_current, each.covariance),
             bool(is_used),
@@ -225,8 +227,8 @@ def restored(kept: SavedMap, config: Config) -> tuple[PoseGraph, Recognition, li
 def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
     folder.chmod(0o755)
     store.copy_to(folder)
-    columns = {name: value for name, value in vars(kept).items() if name != "closures"}
-    columns["vectors"] = kept.vectors.astype(np.float16)  # their ranking does not need more
+    columns = {_COLUMN_OF.get(name, name): value for name, value in vars(kept).items() if name != "closures"}
+    columns["vectors"] = kept.vectors.astype(np.float16)  # sufficient for their ranking
     np.savez(folder / _PLACES, **columns)
     (folder / _CLOSURES).write_bytes(closures_to_bytes(kept.closures))
     save_rig(_without_masks(rig), folder / _RIG)
@@ -237,16 +239,16 @@ def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
         "rig": rig.name,
         "places": len(kept.stamp_ns),
         "sessions": len(set(kept.session.tolist())),
-        "files": {name: _digest(folder / name) for name in _CHECKED},
+        "files": {name: _digest(folder / name) for name in _DIGESTED},
     }
     (folder / _HEADER).write_text(json.dumps(header, indent=2) + "\n", encoding="utf-8")
 
 
 def _move_others(folder: Path, into: Path) -> None:
-    """Move all that is not a map's own.
+    """Move the files that do not belong to a map.
 
     Raises:
-        MapError: if that cannot be.
+        MapError: If that fails.
     """
     for path in folder.iterdir():
         if path.name not in _OWN:
@@ -281,7 +283,7 @@ def _digest(path: Path) -> str:
 
 
 def _difference(rig: Rig, other: Rig) -> str:
-    """Describe how the cameras of two rigs differ; empty where they do not. IMU and masks do not count."""
+    """Describe how the cameras of two rigs differ, IMU and masks aside; empty if they do not."""
     names, others = [each.name for each in rig.cameras], [each.name for each in other.cameras]
     if names != others:
         return f"cameras {', '.join(names)} here, {', '.join(others)} there"
@@ -295,7 +297,7 @@ def _difference(rig: Rig, other: Rig) -> str:
 
 
 def _without_masks(rig: Rig) -> Rig:
-    """The same rig, whose file refers to no others."""
+    """Return the rig without masks, so that its file refers to no others."""
     pairs = tuple(
         replace(pair, left=replace(pair.left, mask=None), right=replace(pair.right, mask=None)) for pair in rig.pairs
     )

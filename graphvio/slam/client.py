@@ -1,4 +1,4 @@
-"""The odometry at the other end of a wire, as if it were here; needs the optional part ``serve``."""
+"""The client of an odometry that is served over gRPC by another process; needs the extra ``serve``."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ S = TypeVar("S", Estimate, Prediction)
 
 @dataclass(frozen=True)
 class ServerInfo:
-    """What a server serves.
+    """State of the odometry that a server serves.
 
     Attributes:
-        version: of graphvio there.
-        run_id: names the run of the odometry.
-        epoch: of the newest keyframe, or None before the first.
-        oldest_keyframe_id: that is still kept.
-        next_keyframe_id: the newest one's, plus one.
-        has_ended: whether no keyframe is to come.
+        version: Version of graphvio on the server.
+        run_id: Unique name of the odometry's run.
+        epoch: Epoch of the newest keyframe, or None before the first.
+        oldest_keyframe_id: Id of the oldest keyframe that is still kept.
+        next_keyframe_id: Id of the newest keyframe, plus one.
+        has_ended: Whether the odometry has ended: no keyframe will follow.
     """
 
     version: str
@@ -47,14 +47,14 @@ class ServerInfo:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Update(Generic[S]):
-    """Where the rig is.
+    """A state of the rig, as the server sent it.
 
     Attributes:
-        state: an estimate, without what diagnoses the odometry (innovations, rates, pairs, times), or a prediction.
+        state: An estimate, without the odometry's diagnostics (innovations, rates, pairs, times), or a prediction.
             Its nav frame is the epoch's odom frame.
-        map_T_odom: (4, 4) in force for the state's epoch when it was sent, or None before the first correction.
-        missed: how many were left out since the one before, because this client was slow. What came while a connection
-            was broken is not counted.
+        map_T_odom: (4, 4) correction in force for the state's epoch when it was sent, or None before the first one.
+        missed: Number of updates dropped since the previous one because this client was too slow. Updates that were
+            lost while a connection was broken are not counted.
     """
 
     state: S
@@ -63,19 +63,19 @@ class Update(Generic[S]):
 
 
 class Client:
-    """A `graphvio.slam.interface.SlamFrontEnd` over gRPC; a context manager, usable from several threads.
+    """A `graphvio.slam.interface.SlamFrontEnd` over gRPC; a context manager, thread-safe.
 
     Args:
-        address: ``HOST:PORT``, or ``HOST`` with the usual port.
-        ca: PEM file of the certificates to trust, for a server with TLS; its name must be one that its certificate has.
-        token: what the server demands; `read_token` reads it from a file.
-        timeout_s: how long an answer may take.
-        patience_s: how long iterators try to come back when the connection is broken.
+        address: ``HOST:PORT``, or ``HOST`` with the default port.
+        ca: PEM file of the trusted certificates, for a server with TLS; its host name must be in its certificate.
+        token: The server's token; `read_token` reads it from a file.
+        timeout_s: Timeout of a call.
+        patience_s: How long iterators try to reconnect after the connection is lost.
 
     Raises:
-        MissingExtraError: when the module is imported, if grpcio is not installed.
-        ServiceError: if the server cannot be reached or refuses. All methods may raise it.
-        RigError: if its rig is not usable here.
+        MissingExtraError: On import of the module, if grpcio is not installed.
+        ServiceError: If the server cannot be reached or refuses. All methods may raise it.
+        RigError: If this version cannot read the server's rig.
     """
 
     def __init__(
@@ -104,11 +104,11 @@ class Client:
 
     @property
     def rig(self) -> Rig:
-        """Cameras and IMU of the keyframes; masks stay with the cameras."""
+        """Cameras and IMU of the keyframes, without masks."""
         return self._rig
 
     def info(self) -> ServerInfo:
-        """What is served now."""
+        """Return the state of the served odometry."""
         answer = self._info()
         return ServerInfo(
             version=answer.version,
@@ -120,23 +120,23 @@ class Client:
         )
 
     def status(self) -> dict[str, convert.Value]:
-        """How the odometry runs, by name."""
+        """Return the figures of the odometry's run by name."""
         return convert.status_of(self._call("GetStatus", messages.GetStatusRequest()))
 
     def keyframes(
         self, from_id: int = 0, *, with_images: bool = False, with_descriptors: bool = True
     ) -> Iterator[Keyframe]:
-        """Keyframes as they come, each waited for, until the odometry has ended.
+        """Yield keyframes as they come until the odometry has ended.
 
-        When the connection breaks, it is made again, and the iterator goes on with the next keyframe.
+        After a lost connection it reconnects, and goes on with the next keyframe.
 
         Args:
-            from_id: where to begin. Ids that are passed over were no longer kept.
-            with_images: whether they are wanted, too; about a byte for each pixel.
-            with_descriptors: whether landmarks are to have them.
+            from_id: Id of the first keyframe. Ids that are skipped were no longer kept.
+            with_images: Request the images, about one byte a pixel.
+            with_descriptors: Request the landmarks' descriptors.
 
         Raises:
-            ServiceError: also if another run of the odometry is served meanwhile; its ids mean something else.
+            ServiceError: Also if the server meanwhile serves another run, whose ids have no relation to these.
         """
         next_id = from_id
 
@@ -159,34 +159,34 @@ class Client:
     def estimates(
         self, rate: Literal["frame", "imu"] = "frame"
     ) -> Iterator[Update[Estimate]] | Iterator[Update[Prediction]]:
-        """Where the rig is, from now on, until the odometry has ended; new ones for whoever is slow.
+        """Yield states from now on until the odometry has ended; a slow reader gets the newest ones.
 
         Args:
-            rate: estimates at each frameset, or predictions at each sample of the IMU.
+            rate: ``frame`` for an estimate at each frameset, ``imu`` for a prediction at each sample of the IMU.
         """
         return self._estimates() if rate == "frame" else self._predictions()
 
     def events(self) -> Iterator[Event]:
-        """What a person would want to know of, from now on, until the odometry has ended."""
+        """Yield the odometry's events from now on until it has ended."""
         request = messages.StreamEventsRequest(run_id=self._run_id)
         for update in self._connection.follow(self._connection.stub.StreamEvents, lambda: request):
             yield Event(update.stamp_ns, update.kind, update.detail)
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
-        """Say where a keyframe is in the map.
+        """Correct where a keyframe is in the map.
 
-        It is not sent again when the connection breaks: whether it has arrived is then not known.
+        It is not repeated after a lost connection: whether it arrived is then unknown.
 
         Args:
-            keyframe_id: of it.
-            map_T_body: (4, 4) of body there.
+            keyframe_id: Id of a keyframe of the newest epoch.
+            map_T_body: (4, 4) pose of body in the map.
             covariance: (6, 6), tangent ``[rotation, translation]`` in body.
 
         Returns:
-            What became of it; a correction that is not believed raises nothing.
+            Whether it was accepted; a correction that fails the innovation test raises nothing.
 
         Raises:
-            ServiceError: if it is malformed, too, or another run of the odometry is served meanwhile.
+            ServiceError: Also if the correction is malformed, or the server meanwhile serves another run.
         """
         request = messages.CorrectRequest(
             keyframe_id=keyframe_id,
@@ -197,7 +197,7 @@ class Client:
         return convert.result_of(self._call("Correct", request))
 
     def close(self) -> None:
-        """End all iterators and the connection; from any thread, a second time does nothing."""
+        """End all iterators and close the connection; thread-safe, and idempotent."""
         self._connection.close()
 
     def _estimates(self) -> Iterator[Update[Estimate]]:

@@ -1,4 +1,4 @@
-"""What a SLAM system may use of the odometry, be it in the same process or at the other end of a wire."""
+"""Interfaces between the odometry, SLAM systems and the services that publish it."""
 
 from __future__ import annotations
 
@@ -15,38 +15,45 @@ from graphvio.slam.keyframe_log import KeyframeLog
 
 
 class SlamFrontEnd(Protocol):
-    """Keyframes out, corrections in; `graphvio.Odometry` and `graphvio.slam.client.Client` are such."""
+    """Keyframes out, corrections in.
+
+    `graphvio.slam.FrontEnd` implements it for an odometry in the same process, `graphvio.slam.client.Client` for one in
+    another process.
+    """
 
     @property
     def rig(self) -> Rig:
         """Cameras and IMU of the keyframes."""
 
     def keyframes(self, from_id: int = 0) -> Iterator[Keyframe]:
-        """Keyframes as they come, each waited for, until the odometry has ended.
+        """Yield keyframes as they come until the odometry has ended.
 
         Args:
-            from_id: where to begin, or to go on after a break. Ids that are passed over were no longer kept.
+            from_id: Id of the first keyframe. Ids that are skipped were no longer kept.
         """
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
-        """Say where a keyframe is in the map.
+        """Correct where a keyframe is in the map.
 
         Args:
-            keyframe_id: of it.
-            map_T_body: (4, 4) of body there.
+            keyframe_id: Id of a keyframe of the newest epoch.
+            map_T_body: (4, 4) pose of body in the map.
             covariance: (6, 6), tangent ``[rotation, translation]`` in body.
+
+        Returns:
+            Whether it was accepted.
         """
 
 
 class Served(Protocol):
-    """What the services hand on: a running odometry, whose threads never wait for those who listen.
+    """A running odometry as the services see it; its threads never wait for subscribers.
 
     Attributes:
-        rig: cameras and IMU.
-        estimates: of the framesets, as they are made.
-        predictions: at each sample of the IMU.
-        events: as they happen.
-        keyframe_log: the newest keyframes; closed when the odometry has ended.
+        rig: Cameras and IMU.
+        estimates: Estimates of the framesets.
+        predictions: Predictions at each sample of the IMU.
+        events: Events of the run.
+        keyframe_log: The newest keyframes; closed when the odometry has ended.
     """
 
     rig: Rig
@@ -57,24 +64,24 @@ class Served(Protocol):
 
     @property
     def map_T_odom(self) -> Float | None:
-        """(4, 4) in force, or None before the epoch's first correction."""
+        """Correction in force, (4, 4), or None before the epoch's first."""
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
-        """See `SlamFrontEnd.correct`; from any thread."""
+        """See `SlamFrontEnd.correct`; thread-safe."""
 
     def status(self) -> Mapping[str, float | int | str | None]:
-        """How it runs, by name: figures that the terminal and the metrics show, too; from any thread."""
+        """Return the figures of the run by name; thread-safe."""
 
 
 def newest_epoch(served: Served) -> int | None:
-    """The newest keyframe's, or None before the first."""
+    """Return the epoch of the newest keyframe, or None before the first."""
     log = served.keyframe_log
     newest = log.read(max(log.next_id - 1, 0), timeout_s=0.0)
     return None if newest is None else newest.epoch
 
 
 def map_of_epoch(served: Served, epoch: int) -> Float | None:
-    """``map_T_odom`` (4, 4) in force, unless it is another epoch's than that of an estimate that waited."""
+    """Return ``map_T_odom`` (4, 4) in force; None if the odometry is in another epoch by now."""
     before = newest_epoch(served)
     map_T_odom = served.map_T_odom
     return map_T_odom if before == epoch == newest_epoch(served) else None

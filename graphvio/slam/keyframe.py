@@ -1,4 +1,4 @@
-"""What a SLAM system gets from the odometry, and what it is told of its corrections."""
+"""Keyframes with their landmarks, and results of corrections."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from graphvio.measurements.estimate import Status
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
-    """N points that the pairs see at a keyframe.
+    """N points that the stereo pairs see at a keyframe.
 
     Attributes:
         pair: (N,) index of the pair that sees each.
-        track_id: (N,) identity within the pair: the same in every keyframe in which the corner is still followed.
+        track_id: (N,) identity within the pair: the same in all keyframes in which the corner is tracked.
         points_body: (N, 3) metres, in body at the keyframe.
         covariances: (N, 3, 3) m^2 of ``points_body``.
         left_px: (N, 2) pixels in the pair's left image.
         right_px: (N, 2) pixels in its right image.
-        descriptors: (N, D) uint8 of the left image: ORB has D = 32, SIFT 128, and 0 is none.
+        descriptors: (N, D) uint8 of the left image; D is 32 for ORB, 128 for SIFT, 0 without descriptors.
     """
 
     pair: Int
@@ -38,7 +38,7 @@ class Landmarks:
 
     @staticmethod
     def none() -> Landmarks:
-        """No points."""
+        """Return zero landmarks."""
         whole, pixels = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
         return Landmarks(
             whole, whole, np.zeros((0, 3)), np.zeros((0, 3, 3)), pixels, pixels, np.zeros((0, 0), dtype=np.uint8)
@@ -47,21 +47,21 @@ class Landmarks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """A frameset that later motions are measured from, with what was seen there.
+    """A frameset from which later motions are measured, with its landmarks.
 
     Attributes:
-        id: counts the keyframes of an odometry, over all epochs.
-        epoch: poses of different epochs do not share an odom frame.
-        stamp_ns: of the frameset.
-        status: what the pose rests on.
-        odom_T_body: (4, 4) causal pose in the epoch's odom frame, as the estimate of this frameset has it.
+        id: Number of the keyframe in its run, over all epochs.
+        epoch: Its epoch; poses of different epochs do not share an odom frame.
+        stamp_ns: Stamp of the frameset.
+        status: What the pose is based on.
+        odom_T_body: (4, 4) causal pose in the epoch's odom frame, as in this frameset's estimate.
         covariance: (6, 6) of ``odom_T_body``, tangent ``[rotation, translation]`` in body.
-        previous_id: the keyframe before this one in the epoch, or None for the first one.
-        previous_T_body: (4, 4) of body there to body here, as known now: the smoother may have corrected the keyframe
-            before since it came. None for the first one.
-        relative_covariance: (6, 6) of ``previous_T_body``, tangent in body here, or None.
-        landmarks: of all pairs that are in the frameset.
-        images: pair index -> (left, right) uint8; empty unless they are asked for.
+        previous_id: Id of the previous keyframe in the epoch, or None for the first one.
+        previous_T_body: (4, 4) motion of body since the previous keyframe, as estimated now: the smoother may have
+            corrected the previous keyframe since it was reported. None for the first one.
+        relative_covariance: (6, 6) of ``previous_T_body``, tangent in body at this keyframe, or None.
+        landmarks: Landmarks of all pairs in the frameset.
+        images: Pair index -> (left, right) uint8; empty unless requested.
     """
 
     id: int
@@ -79,13 +79,13 @@ class Keyframe:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectionResult:
-    """What became of a correction.
+    """The outcome of a correction.
 
     Attributes:
-        accepted: whether ``map_T_odom`` took it in.
-        reason: why not, or empty.
-        statistic: squared Mahalanobis distance from what was expected, 6 degrees of freedom; None where nothing was.
-        threshold: the gate's.
+        accepted: Whether ``map_T_odom`` was updated by it.
+        reason: Why it was refused, or that the map moved; else empty.
+        statistic: Squared Mahalanobis distance from the expected correction, 6 degrees of freedom; None without one.
+        threshold: Threshold of the innovation test.
         map_T_odom: (4, 4) in force afterwards, or None.
     """
 

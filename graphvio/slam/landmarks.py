@@ -1,4 +1,4 @@
-"""What the pairs see at a keyframe, as points in body."""
+"""Landmarks of a keyframe: tracked corners as points in body, with ORB or SIFT descriptors by OpenCV."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from graphvio.rig import Rig, StereoPair
 from graphvio.slam.keyframe import Landmarks
 
 Describe = Callable[[Image, Float], AnyArray]
-"""Takes an image and pixels (N, 2), and gives descriptors (N, D) uint8."""
+"""Computes the descriptors (N, D), uint8, of an image at pixels (N, 2)."""
 
-_MIN_DEPTH_SIGMAS = 3.0  # farther away a depth has no covariance in metres
-_RADIUS = 15  # of the patch that ORB compares
-_BORDER_PX = 40  # so that no corner is too near to the edge of the image
+_MIN_DEPTH_SIGMAS = 3.0  # a more uncertain depth has no covariance in metres
+_RADIUS = 15  # of ORB's patch
+_BORDER_PX = 40  # added, so that no corner is too near to the edge of the image
 _SIFT_SIZE_PX = 7.0
 
 
@@ -31,15 +31,15 @@ def landmarks_of(
     pixel_sigma_px: float,
     describe: Describe | None,
 ) -> Landmarks:
-    """The tracks whose depth is known to a third at least.
+    """Return the tracks whose inverse depth exceeds three standard deviations.
 
     Args:
-        rig: of the pairs.
-        body_T_left: (P, 4, 4) of the pairs' left cameras, with the corrections that are in force.
-        frames: pair -> its tracks.
-        images: pair -> (left, right).
-        pixel_sigma_px: of a tracked corner, in one image.
-        describe: makes descriptors of a left image's pixels, or None for none.
+        rig: The rig with P pairs.
+        body_T_left: (P, 4, 4) poses of the left cameras, with the corrections in force.
+        frames: Pair index -> its tracks.
+        images: Pair index -> (left, right).
+        pixel_sigma_px: Standard deviation of a tracked corner in one image.
+        describe: Computes descriptors in a left image, or None for no descriptors.
     """
     parts = [
         _of_pair(j, rig.pairs[j], body_T_left[j], frame, images[j][0], pixel_sigma_px, describe)
@@ -64,7 +64,7 @@ def _of_pair(
     n = len(frame.ids)
     x, y, w = frame.points.T
     in_left = np.column_stack([x, y, np.ones(n)]) / w[:, None]
-    by_point = np.zeros((n, 3, 3))  # derivative of the point by [x, y, 1/Z]
+    by_point = np.zeros((n, 3, 3))  # derivative of the point with respect to [x, y, 1/Z]
     by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / w
     by_point[:, :, 2] = -in_left / w[:, None]
     turned = body_T_left[:3, :3] @ by_point
@@ -83,7 +83,7 @@ def _of_pair(
 
 
 def describer(kind: Literal["orb", "sift", "none"]) -> Describe | None:
-    """What makes descriptors of a kind."""
+    """Return the function that computes descriptors of a kind, or None for no descriptors."""
     if kind == "none":
         return None
     if kind == "orb":
@@ -110,7 +110,7 @@ def _described(extractor: cv2.Feature2D, width: int, size_px: float, image: Imag
 
 @kernel
 def orientations(image: Image, pixels: Float) -> Float:
-    """Angles (N,), radians, from pixels (N, 2) to the centroids of the grey levels around them.
+    """Return the orientations (N,), radians, of the patches at pixels (N, 2): towards their intensity centroids.
 
     Rublee et al., ORB: an efficient alternative to SIFT or SURF, ICCV 2011, section 3.2.
     """

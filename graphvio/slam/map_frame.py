@@ -1,9 +1,9 @@
-"""Where the odometry's frame lies in a map, by what a SLAM system says of single keyframes (REP 105).
+"""The odometry's frame in a map (REP-105), estimated from corrections of single keyframes.
 
-The unknown is ``map_T_odom``. What odometry drifts from one keyframe to the next makes it walk; a correction measures
-it at its keyframe. All covariances are taken to the tangent in odom, where they add up, so that corrections may come in
-any order: a Kalman filter takes them in by the order of their keyframes, anew when one came late. Corrections are taken
-for independent of each other.
+The state is ``map_T_odom``, a random walk whose process noise is the odometry's drift between keyframes; a correction
+measures it at its keyframe. All covariances are expressed in the tangent in odom, where they add up. A Kalman filter
+fuses corrections in the order of their keyframes, and is run again over all of them when one comes late. Corrections
+are assumed to be independent of each other.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from graphvio.errors import MeasurementError
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.slam.keyframe import CorrectionResult, Keyframe
 
-_MOST_KEYFRAMES = 10_000  # that can be corrected; an hour or so
-_MOST_CORRECTIONS = 200  # that are taken in anew when one comes late
-_FIRST_AGREEMENT = 3  # refused corrections in a row that must agree to be believed; each time it takes twice as many
+_MAX_KEYFRAMES = 10_000  # that can be corrected; about an hour
+_MAX_CORRECTIONS = 200  # that are fused again when one comes late
+_FIRST_AGREEMENT = 3  # refused corrections in a row that must agree to be accepted; doubled each time
 _RIGID = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class _Passed:
-    """A keyframe: its pose, and the odometry's drift (6, 6) until there, tangent in odom."""
+    """A past keyframe: its pose, and the covariance (6, 6) of the drift up to it, tangent in odom."""
 
     odom_T_body: Float
     drift: Float
@@ -36,15 +36,15 @@ class _Passed:
 
 @dataclass(frozen=True, eq=False)
 class _Correction:
-    """``map_T_odom`` as a correction of a keyframe, or several up to there, have it.
+    """``map_T_odom`` by one correction, or by several fused ones.
 
     Attributes:
-        epoch: of the keyframe.
-        keyframe_id: of it.
+        epoch: Epoch of the keyframe.
+        keyframe_id: Id of the keyframe.
         map_T_odom: (4, 4).
         covariance: (6, 6), tangent in odom.
-        drift: the odometry's until there, (6, 6); kept here because the keyframe may be forgotten sooner.
-        is_many: whether it stands for several.
+        drift: Covariance (6, 6) of the drift up to the keyframe, which may be dropped sooner than the correction.
+        is_many: Whether it represents several corrections.
     """
 
     epoch: int
@@ -56,10 +56,10 @@ class _Correction:
 
 
 class MapFrame:
-    """``map_T_odom`` of the newest epoch; from any thread.
+    """Estimator of ``map_T_odom`` in the newest epoch; thread-safe.
 
     Args:
-        probability: corrections outside this share of the chi-square distribution are refused.
+        probability: Share of the chi-square distribution beyond which corrections are refused.
     """
 
     def __init__(self, probability: float) -> None:
@@ -70,31 +70,29 @@ class MapFrame:
         self._accepted: list[_Correction] = []  # in the order of keyframes
         self._refused: list[_Correction] = []  # since the last one that was accepted, the newest of each keyframe
         self._agreement = _FIRST_AGREEMENT
-        self._estimator: _Correction | None = (
-            None  # what all that were accepted say together, at the last one's keyframe
-        )
+        self._estimate: _Correction | None = None  # all accepted ones fused, at the last one's keyframe
 
     @property
     def map_T_odom(self) -> Float | None:
         """(4, 4), or None before the epoch's first correction."""
-        estimator = self._estimator
-        return None if estimator is None else estimator.map_T_odom.copy()
+        estimate = self._estimate
+        return None if estimate is None else estimate.map_T_odom.copy()
 
     def of_epoch(self, epoch: int) -> Float | None:
-        """The same (4, 4) for an epoch's odom frame; None if it is known of none or of another one."""
-        estimator = self._estimator  # read once: with its epoch, since the next one may begin at any time
-        return None if estimator is None or estimator.epoch != epoch else estimator.map_T_odom.copy()
+        """Return ``map_T_odom`` (4, 4) if it is known for this epoch, else None."""
+        estimate = self._estimate  # read once: with its epoch, since the next one may begin at any time
+        return None if estimate is None or estimate.epoch != epoch else estimate.map_T_odom.copy()
 
     def begin(self, epoch: int) -> None:
-        """An epoch runs; a new one ends what was known of the old one."""
+        """Set the epoch; a new one discards the corrections of the old one."""
         if epoch != self._epoch:
             with self._lock:
                 self._epoch = epoch
                 self._passed, self._accepted, self._refused = {}, [], []
-                self._agreement, self._estimator = _FIRST_AGREEMENT, None
+                self._agreement, self._estimate = _FIRST_AGREEMENT, None
 
     def add(self, keyframe: Keyframe) -> None:
-        """The next keyframe."""
+        """Add the next keyframe."""
         self.begin(keyframe.epoch)
         with self._lock:
             drift = np.zeros((6, 6))
@@ -102,50 +100,53 @@ class MapFrame:
                 last = self._passed[next(reversed(self._passed))]
                 drift = last.drift + _drifted(last.odom_T_body, keyframe)
             self._passed[keyframe.id] = _Passed(keyframe.odom_T_body, drift)
-            if len(self._passed) > _MOST_KEYFRAMES:
+            if len(self._passed) > _MAX_KEYFRAMES:
                 del self._passed[next(iter(self._passed))]
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
-        """Take in where a keyframe is in the map, or refuse it.
+        """Fuse a correction of where a keyframe is in the map, or refuse it.
 
-        What is far from expected is refused, until so many in a row agree with each other that they are believed; the
-        next time it takes twice as many, so that two that contradict each other do not take turns.
+        A correction that fails the innovation test is refused, until several refused ones in a row agree with each
+        other. Each time this takes twice as many, so that two contradicting sources do not alternate.
 
         Args:
-            keyframe_id: of the newest epoch; a second correction of a keyframe takes the place of the first.
-            map_T_body: (4, 4).
+            keyframe_id: Id of a keyframe of the newest epoch; a second correction of a keyframe replaces the first.
+            map_T_body: (4, 4) pose of body in the map.
             covariance: (6, 6), tangent ``[rotation, translation]`` in body.
 
+        Returns:
+            Whether it was accepted, and the test's figures.
+
         Raises:
-            MeasurementError: if the pose is not rigid, or the covariance is none.
+            MeasurementError: If the pose is not rigid, or the covariance is not positive definite.
         """
         map_T_body, covariance = _checked(map_T_body, covariance)
         with self._lock:
             if keyframe_id not in self._passed:
-                return self._refusal(f"keyframe {keyframe_id} is not of the newest epoch, or too old, or never was")
+                return self._refusal(f"keyframe {keyframe_id} is not of the newest epoch, too old, or unknown")
             assert self._epoch is not None
             passed = self._passed[keyframe_id]
             to_odom = se3_adjoint(passed.odom_T_body)
-            offered = _Correction(
+            candidate = _Correction(
                 self._epoch,
                 keyframe_id,
                 map_T_body @ se3_inverse(passed.odom_T_body),
                 to_odom @ covariance @ to_odom.T,
                 passed.drift,
             )
-            if self._estimator is None:
-                return self._accept(offered, None)
-            statistic = _distance(self._expected_at(offered), offered)
+            if self._estimate is None:
+                return self._accept(candidate, None)
+            statistic = _distance(self._expected_at(candidate), candidate)
             if statistic <= self._threshold:
-                return self._accept(offered, statistic)
-            # Said again of one keyframe, it is no second witness.
-            self._refused = [*(each for each in self._refused if each.keyframe_id != keyframe_id), offered]
+                return self._accept(candidate, statistic)
+            # A repeated correction of a keyframe is no independent one.
+            self._refused = [*(each for each in self._refused if each.keyframe_id != keyframe_id), candidate]
             newest = self._refused[-self._agreement :]
             if len(newest) == self._agreement and self._agree(newest):
                 self._agreement *= 2
-                self._accepted, self._estimator = newest[:-1], None
+                self._accepted, self._estimate = newest[:-1], None
                 return self._accept(
-                    offered, statistic, f"{len(newest)} refused corrections in a row agree: the map moves"
+                    candidate, statistic, f"{len(newest)} refused corrections in a row agree: the map moves"
                 )
             del self._refused[: -4 * self._agreement]
             return self._refusal(
@@ -153,31 +154,31 @@ class MapFrame:
                 statistic,
             )
 
-    def _accept(self, offered: _Correction, statistic: float | None, reason: str = "") -> CorrectionResult:
-        others = [each for each in self._accepted if each.is_many or each.keyframe_id != offered.keyframe_id]
-        estimator, count = self._estimator, len(self._accepted)
-        self._accepted = sorted([*others, offered], key=lambda each: each.keyframe_id)
+    def _accept(self, candidate: _Correction, statistic: float | None, reason: str = "") -> CorrectionResult:
+        others = [each for each in self._accepted if each.is_many or each.keyframe_id != candidate.keyframe_id]
+        estimate, count = self._estimate, len(self._accepted)
+        self._accepted = sorted([*others, candidate], key=lambda each: each.keyframe_id)
         self._refused = []
-        if estimator is None or estimator.keyframe_id > offered.keyframe_id or len(self._accepted) != count + 1:
-            self._estimator = _fused(self._accepted)
+        if estimate is None or estimate.keyframe_id > candidate.keyframe_id or len(self._accepted) != count + 1:
+            self._estimate = _fused(self._accepted)
         else:
-            self._estimator = _fused([estimator, offered])
-        if len(self._accepted) > _MOST_CORRECTIONS:  # the older half becomes one
-            half = self._accepted[: _MOST_CORRECTIONS // 2]
+            self._estimate = _fused([estimate, candidate])
+        if len(self._accepted) > _MAX_CORRECTIONS:  # the older half becomes one
+            half = self._accepted[: _MAX_CORRECTIONS // 2]
             self._accepted = [replace(_fused(half), is_many=True), *self._accepted[len(half) :]]
         return CorrectionResult(True, reason, statistic, self._threshold, self.map_T_odom)
 
     def _refusal(self, reason: str, statistic: float | None = None) -> CorrectionResult:
         return CorrectionResult(False, reason, statistic, self._threshold, self.map_T_odom)
 
-    def _expected_at(self, offered: _Correction) -> _Correction:
-        """What all that were accepted say at the keyframe of one more: those before it and those after it."""
-        assert self._estimator is not None
-        if self._estimator.keyframe_id <= offered.keyframe_id:
-            return _carried(self._estimator, offered)
-        before = [each for each in self._accepted if each.keyframe_id <= offered.keyframe_id]
-        after = [each for each in self._accepted if each.keyframe_id > offered.keyframe_id]
-        return _fused([_carried(_fused(side), offered) for side in (before, after[::-1]) if side])
+    def _expected_at(self, candidate: _Correction) -> _Correction:
+        """Return the accepted corrections fused at the keyframe of a candidate."""
+        assert self._estimate is not None
+        if self._estimate.keyframe_id <= candidate.keyframe_id:
+            return _carried(self._estimate, candidate)
+        before = [each for each in self._accepted if each.keyframe_id <= candidate.keyframe_id]
+        after = [each for each in self._accepted if each.keyframe_id > candidate.keyframe_id]
+        return _fused([_carried(_fused(part), candidate) for part in (before, after[::-1]) if part])
 
     def _agree(self, corrections: Sequence[_Correction]) -> bool:
         last = corrections[-1]
@@ -185,44 +186,44 @@ class MapFrame:
 
 
 def _fused(corrections: Sequence[_Correction]) -> _Correction:
-    """What corrections say together at the last one's keyframe; their keyframes go forward, or all back."""
-    estimator = corrections[0]
-    for offered in corrections[1:]:
-        prior = estimator.covariance + _drift(estimator, offered)
-        gain = np.linalg.solve(prior + offered.covariance, prior).T
-        step = gain @ _difference(estimator, offered)
-        rest = np.eye(6) - gain
-        estimator = replace(
-            offered,
-            map_T_odom=estimator.map_T_odom @ se3_exp(step),
-            covariance=rest @ prior @ rest.T + gain @ offered.covariance @ gain.T,
+    """Fuse corrections at the last one's keyframe; their keyframes are in ascending or descending order."""
+    estimate = corrections[0]
+    for candidate in corrections[1:]:
+        prior = estimate.covariance + _drift(estimate, candidate)
+        gain = np.linalg.solve(prior + candidate.covariance, prior).T
+        step = gain @ _difference(estimate, candidate)
+        remaining = np.eye(6) - gain
+        estimate = replace(
+            candidate,
+            map_T_odom=estimate.map_T_odom @ se3_exp(step),
+            covariance=remaining @ prior @ remaining.T + gain @ candidate.covariance @ gain.T,
         )
-    return estimator
+    return estimate
 
 
-def _carried(estimator: _Correction, to: _Correction) -> _Correction:
-    """A estimator at another's keyframe."""
-    return replace(to, map_T_odom=estimator.map_T_odom, covariance=estimator.covariance + _drift(estimator, to))
+def _carried(estimate: _Correction, to: _Correction) -> _Correction:
+    """Return an estimate at another keyframe."""
+    return replace(to, map_T_odom=estimate.map_T_odom, covariance=estimate.covariance + _drift(estimate, to))
 
 
 def _distance(one: _Correction, other: _Correction) -> float:
-    """Squared Mahalanobis distance."""
+    """Return the squared Mahalanobis distance."""
     difference = _difference(one, other)
     covariance = one.covariance + other.covariance + _drift(one, other)
     return float(difference @ np.linalg.solve(covariance, difference))
 
 
 def _drift(one: _Correction, other: _Correction) -> Float:
-    """What odometry may have drifted between two keyframes, (6, 6), tangent in odom."""
+    """Return the covariance (6, 6) of the drift between two keyframes, tangent in odom."""
     first, last = sorted((one, other), key=lambda each: each.keyframe_id)
     return np.asarray(last.drift - first.drift)
 
 
 def _drifted(odom_T_previous: Float, keyframe: Keyframe) -> Float:
-    """What odometry may have drifted from the keyframe before to this one, (6, 6), tangent in odom.
+    """Return the covariance (6, 6) of the drift since the previous keyframe, tangent in odom.
 
-    Poses in odom are causal. By what the keyframe before has been corrected since then, odom moved: no part of the
-    relative covariance, and often more than it.
+    Poses in odom are causal: the smoother's later correction of the previous keyframe moves odom. It is no part of the
+    relative covariance, and often larger.
     """
     if keyframe.previous_T_body is None or keyframe.relative_covariance is None:
         return np.zeros((6, 6))
@@ -239,21 +240,19 @@ def _checked(map_T_body: Float, covariance: Float) -> tuple[Float, Float]:
     try:
         pose, spread = (np.array(each, dtype=np.float64) for each in (map_T_body, covariance))
     except (TypeError, ValueError):
-        raise MeasurementError("map_T_body or covariance is no array of numbers; give (4, 4) and (6, 6)") from None
+        raise MeasurementError("map_T_body or covariance is not an array of numbers; give (4, 4) and (6, 6)") from None
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise MeasurementError(f"map_T_body has shape {pose.shape}, or holds NaN; give a rigid transform (4, 4)")
     rotation = pose[:3, :3]
     off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(pose[3] - [0, 0, 0, 1]).max())
     if off > _RIGID or np.linalg.det(rotation) < 0.0:
         raise MeasurementError(
-            f"map_T_body is no rigid transform: off by {off:.2g}; give rotation and translation (4, 4)"
+            f"map_T_body is not a rigid transform: off by {off:.2g}; give rotation and translation (4, 4)"
         )
     if spread.shape != (6, 6) or not np.isfinite(spread).all():
         raise MeasurementError(
             f"covariance has shape {spread.shape}, or holds NaN; give (6, 6) [rotation, translation]"
         )
     if not np.allclose(spread, spread.T, rtol=1e-6, atol=1e-12) or np.linalg.eigvalsh(spread)[0] <= 0.0:
-        raise MeasurementError(
-            "covariance is not symmetric and positive definite; say how well each direction is known"
-        )
+        raise MeasurementError("covariance is not symmetric and positive definite; give a variance for each direction")
     return pose, 0.5 * (spread + spread.T)

@@ -1,4 +1,4 @@
-"""A client's connection: channel, token, calls, and gRPC's failures as typed errors."""
+"""A client's connection: channel, token and calls; gRPC's failures become typed errors."""
 
 from __future__ import annotations
 
@@ -15,26 +15,27 @@ from graphvio.slam.service import grpc, stubs
 from graphvio.slam.service.options import DEFAULT_PORT, RUN_KEY, is_loopback
 from graphvio.slam.service.security import bearer
 
-_MESSAGE_BYTES = 256 * 2**20
+_MAX_MESSAGE_BYTES = 256 * 2**20
 _WINDOW_BYTES = 4096
 _KEEPALIVE_MS, _PONG_MS = 10_000, 5_000
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 2.0
+_FIRST_WAIT_S, _MAX_WAIT_S = 0.1, 2.0
 _DIAGNOSIS_S = 3.0
 _TOO_LARGE = "larger than max"
 
 
 class Connection:
-    """Calls a server, and opens streams again that break.
+    """A connection to a server, which reopens broken streams.
 
     Args:
-        address: ``HOST:PORT``, or ``HOST`` with the usual port.
-        ca: PEM file of the certificates that are trusted, or None for no TLS.
-        token: what the server demands, or None.
-        timeout_s: how long an answer may take.
-        patience_s: how long a broken stream is tried again.
+        address: ``HOST:PORT``, or ``HOST`` with the default port.
+        ca: PEM file of the trusted certificates, or None for no TLS.
+        token: The server's token, or None.
+        timeout_s: Timeout of a call.
+        patience_s: How long a broken stream is retried.
 
     Raises:
-        ServiceError: if the address is none, the certificates cannot be read, or the token would go unencrypted.
+        ServiceError: If the address is invalid, the certificates cannot be read, or the token would be sent
+            unencrypted.
     """
 
     def __init__(
@@ -45,7 +46,7 @@ class Connection:
         self.address = f"{host}:{self._port}"
         self._ca = None if ca is None else _read_certificates(Path(ca))
         if token is not None and ca is None and not is_loopback(self._host):
-            raise ServiceError(f"{self.address}: the token would go through the network for all to read; give a ca")
+            raise ServiceError(f"{self.address}: the token would go through the network unencrypted; give a ca")
         self._metadata = () if token is None else (bearer(token),)
         self._timeout_s = timeout_s
         self._patience_s = patience_s
@@ -60,10 +61,14 @@ class Connection:
         self.stub = stubs.FrontEndStub(self._channel)
 
     def call(self, method: Any, request: Any) -> Any:
-        """The answer to a request.
+        """Return the server's answer to a request.
+
+        Args:
+            method: Method of `stub`.
+            request: Its message.
 
         Raises:
-            ServiceError: if there is none.
+            ServiceError: If the call fails.
         """
         self._check_open()
         try:
@@ -72,10 +77,14 @@ class Connection:
             raise self._error(error) from None
 
     def follow(self, method: Any, next_request: Callable[[], Any]) -> Iterator[Any]:
-        """Messages of a stream until the server ends it; when it breaks, it is opened again with the next request.
+        """Yield the messages of a stream until the server ends it; reopen it when it breaks.
+
+        Args:
+            method: Method of `stub`.
+            next_request: Returns the request with which the stream is opened again.
 
         Raises:
-            ServiceError: if the server refuses, or stays away for longer than the patience.
+            ServiceError: If the server refuses, or does not return within ``patience_s``.
         """
         self._check_open()
         broken_at: float | None = None
@@ -100,10 +109,10 @@ class Connection:
             finally:
                 self._end(call)
             self._closing.wait(wait_s)
-            wait_s = min(2.0 * wait_s, _LONGEST_WAIT_S)
+            wait_s = min(2.0 * wait_s, _MAX_WAIT_S)
 
     def close(self) -> None:
-        """End all streams and the connection; from any thread, a second time does nothing."""
+        """End all streams and close the connection; thread-safe, and idempotent."""
         with self._lock:
             self._closing.set()
             calls = list(self._calls)
@@ -139,14 +148,14 @@ class Connection:
         elif code is grpc.StatusCode.UNIMPLEMENTED:
             text = "does not know this call; is it graphvio's service, and of the same version?"
         elif code is grpc.StatusCode.RESOURCE_EXHAUSTED and _TOO_LARGE in details:
-            text = f"sent a message of more than {_MESSAGE_BYTES >> 20} MB; ask for keyframes without images"
+            text = f"sent a message of more than {_MAX_MESSAGE_BYTES >> 20} MB; ask for keyframes without images"
         else:
             text = details or code.name.lower().replace("_", " ")
         return ServiceError(f"{self.address}: {text}")
 
 
 def _may_pass(error: Any, has_begun: bool) -> bool:
-    """Whether the same stream may be had a moment later."""
+    """Return whether reopening the stream may succeed."""
     code, details = error.code(), error.details() or ""
     if code is grpc.StatusCode.RESOURCE_EXHAUSTED:  # the server may still count the stream that has just broken
         return has_begun and _TOO_LARGE not in details
@@ -156,19 +165,19 @@ def _may_pass(error: Any, has_begun: bool) -> bool:
 
 def _transport() -> list[tuple[str, int]]:
     return [
-        ("grpc.max_receive_message_length", _MESSAGE_BYTES),
-        # With gRPC's own window, which grows, a slow client would read what is half a minute old and more.
+        ("grpc.max_receive_message_length", _MAX_MESSAGE_BYTES),
+        # With gRPC's default window, which grows, a slow client would read data that is half a minute old.
         ("grpc.http2.lookahead_bytes", _WINDOW_BYTES),
         ("grpc.http2.bdp_probe", 0),
         ("grpc.enable_http_proxy", 0),  # robots are reached directly
-        ("grpc.use_local_subchannel_pool", 1),  # one connection a client, not a process
+        ("grpc.use_local_subchannel_pool", 1),  # one connection per client, not per process
         ("grpc.enable_retries", 0),
         ("grpc.initial_reconnect_backoff_ms", 200),
         ("grpc.min_reconnect_backoff_ms", 3_000),
         ("grpc.max_reconnect_backoff_ms", 2_000),
         ("grpc.keepalive_time_ms", _KEEPALIVE_MS),
         ("grpc.keepalive_timeout_ms", _PONG_MS),
-        ("grpc.http2.ping_timeout_ms", _PONG_MS),  # else any other ping on its way puts it off to a minute
+        ("grpc.http2.ping_timeout_ms", _PONG_MS),  # else any other ping in flight delays it to a minute
         ("grpc.http2.max_pings_without_data", 0),
     ]
 
@@ -181,7 +190,7 @@ def _split(address: str) -> tuple[str, int]:
         host, port = "", ""
     host = host.strip("[]")
     if not host or not port.isascii() or not port.isdigit() or not 0 < int(port) < 2**16:
-        raise ServiceError(f"{address!r}: is no address; give HOST:PORT, an IPv6 host in brackets")
+        raise ServiceError(f"{address!r}: is not an address; give HOST:PORT, an IPv6 host in brackets")
     return host, int(port)
 
 
@@ -197,12 +206,12 @@ def _read_certificates(path: Path) -> bytes:
 
 
 def _why_unreachable(host: str, port: int, ca: bytes | None) -> str:
-    """Try again by hand, and tell what is wrong and what to do.
+    """Connect without gRPC, whose messages name no remedy, and return what is wrong and what to do.
 
     Args:
-        host: of the server.
-        port: of the server.
-        ca: certificates in PEM that the client trusts, or None if it uses no TLS.
+        host: Host of the server.
+        port: Port of the server.
+        ca: Trusted certificates in PEM, or None without TLS.
     """
     try:
         with socket.create_connection((host, port), _DIAGNOSIS_S) as connection:
@@ -223,20 +232,20 @@ def _why_no_service(connection: socket.socket, host: str, ca: bytes | None) -> s
             pass
     except ssl.SSLCertVerificationError as error:
         return (
-            f"its certificate is not trusted ({error.verify_message.rstrip('.')}); give the certificate of whoever "
-            "signed it as ca, and the server by a name that the certificate has"
+            f"its certificate is not trusted ({error.verify_message.rstrip('.')}); give the certificate of its "
+            "issuer as ca, and the server by a name that the certificate has"
         )
     except OSError:
         if ca is None:
             return "it does not answer as graphvio's service; check the port, or it may have too many clients"
         return "it does not use TLS, or is no graphvio service; check the port, or leave ca out on the same machine"
     if ca is None:
-        return "it demands TLS; give the certificate of whoever signed its own as ca"
+        return "it demands TLS; give the certificate of its issuer as ca"
     return "it closed the connection; it may have too many clients"
 
 
 def _context(ca: bytes | None) -> ssl.SSLContext:
-    if ca is None:  # whether there is TLS at all is asked; nothing is sent
+    if ca is None:  # only find out whether the server uses TLS
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         context.check_hostname = False
         context.verify_mode = ssl.CERT_NONE

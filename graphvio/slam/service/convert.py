@@ -1,4 +1,4 @@
-"""Keyframes, estimates and the like as messages, and back; nothing is lost that the messages have a field for."""
+"""Conversion between graphvio's types and messages, lossless for all fields that the messages have."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ Value = float | int | str | None
 
 
 def rig_text(rig: Rig) -> str:
-    """The text of a ``rig.yaml`` without masks, which are files of the machine that has the cameras."""
+    """Return the text of a ``rig.yaml`` without masks, which are files on the server's machine."""
     pairs = tuple(StereoPair(pair.name, _bare(pair.left), _bare(pair.right)) for pair in rig.pairs)
     return native.to_text(replace(rig, pairs=pairs), Path("/"))
 
 
 def rig_of(text: str, origin: str) -> Rig:
-    """The rig that a service has told.
+    """Parse the rig that a server sent.
 
     Raises:
-        RigError: if this version of graphvio cannot read it.
+        RigError: If this version of graphvio cannot read it.
     """
     return native.parse(text, Path(origin))
 
@@ -50,7 +50,7 @@ def _bare(camera: Camera) -> Camera:
 
 
 def estimate_message(estimate: Estimate) -> Any:
-    """``Estimate`` of the proto."""
+    """Return the proto's ``Estimate``."""
     return messages.Estimate(
         stamp_ns=estimate.stamp_ns,
         status=_NUMBER_OF_STATUS[estimate.status],
@@ -72,10 +72,10 @@ def estimate_message(estimate: Estimate) -> Any:
 
 
 def estimate_of(message: Any) -> Estimate:
-    """The estimate; what diagnoses the odometry is not in the message, and empty.
+    """Return the estimate; the odometry's diagnostics are not in the message, and empty.
 
     Raises:
-        ServiceError: if the message is malformed, as with all functions below that take one.
+        ServiceError: If the message is malformed, as in all functions below that convert a message.
     """
     return Estimate(
         stamp_ns=message.stamp_ns,
@@ -98,7 +98,7 @@ def estimate_of(message: Any) -> Estimate:
 
 
 def prediction_message(prediction: Prediction) -> Any:
-    """``Prediction`` of the proto."""
+    """Return the proto's ``Prediction``."""
     return messages.Prediction(
         stamp_ns=prediction.stamp_ns,
         epoch=prediction.epoch,
@@ -109,7 +109,7 @@ def prediction_message(prediction: Prediction) -> Any:
 
 
 def prediction_of(message: Any) -> Prediction:
-    """The prediction."""
+    """Return the prediction."""
     return Prediction(
         stamp_ns=message.stamp_ns,
         nav_T_body=floats(message.odom_T_body, (4, 4), "prediction: odom_T_body"),
@@ -120,12 +120,12 @@ def prediction_of(message: Any) -> Prediction:
 
 
 def event_message(event: Event, missed: int) -> Any:
-    """``EventUpdate`` of the proto."""
+    """Return the proto's ``EventUpdate``."""
     return messages.EventUpdate(stamp_ns=event.stamp_ns, kind=event.kind, detail=event.detail, missed=missed)
 
 
 def keyframe_message(keyframe: Keyframe, with_images: bool, with_descriptors: bool) -> Any:
-    """``Keyframe`` of the proto."""
+    """Return the proto's ``Keyframe``."""
     message = messages.Keyframe(
         id=keyframe.id,
         epoch=keyframe.epoch,
@@ -144,7 +144,7 @@ def keyframe_message(keyframe: Keyframe, with_images: bool, with_descriptors: bo
 
 
 def keyframe_of(message: Any) -> Keyframe:
-    """The keyframe."""
+    """Return the keyframe."""
     where = f"keyframe {message.id}"
     return Keyframe(
         id=message.id,
@@ -198,7 +198,7 @@ def _image_of(message: Any, where: str) -> AnyArray:
 
 
 def result_message(result: CorrectionResult) -> Any:
-    """``CorrectResponse`` of the proto."""
+    """Return the proto's ``CorrectResponse``."""
     return messages.CorrectResponse(
         accepted=bool(result.accepted),
         reason=result.reason,
@@ -209,7 +209,7 @@ def result_message(result: CorrectionResult) -> Any:
 
 
 def result_of(message: Any) -> CorrectionResult:
-    """What became of a correction."""
+    """Return the outcome of a correction."""
     return CorrectionResult(
         accepted=message.accepted,
         reason=message.reason,
@@ -220,7 +220,7 @@ def result_of(message: Any) -> CorrectionResult:
 
 
 def status_message(status: Mapping[str, Value]) -> Any:
-    """``StatusReport`` of the proto."""
+    """Return the proto's ``StatusReport``."""
     report = messages.StatusReport()
     for name, value in status.items():
         _set_value(report.values[name], value)
@@ -228,7 +228,7 @@ def status_message(status: Mapping[str, Value]) -> Any:
 
 
 def status_of(message: Any) -> dict[str, Value]:
-    """Figures by name, in alphabetical order."""
+    """Return the figures by name, in alphabetical order."""
     values = ((name, message.values[name]) for name in sorted(message.values))
     return {name: _maybe(value, value.WhichOneof("value") or "number") for name, value in values}
 
@@ -240,7 +240,7 @@ def _set_value(message: Any, value: Any) -> None:
         message.text = value
         return
     try:
-        whole = operator.index(value)  # numpy's integers are no int
+        whole = operator.index(value)  # also numpy's integers
     except TypeError:
         message.number = float(value)
         return

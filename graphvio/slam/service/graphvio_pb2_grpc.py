@@ -70,47 +70,47 @@ class FrontEndServicer:
     """Missing associated documentation comment in .proto file."""
 
     def GetInfo(self, request, context):
-        """What is served. The first call of a client, since the others take its run_id.
+        """State of the served odometry. The first call of a client, since the others take its run_id.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def GetStatus(self, request, context):
-        """How the odometry runs: the figures that its terminal shows.
+        """Figures of the run, as shown in its terminal.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def StreamEstimates(self, request, context):
-        """Where the rig is, from now on, until the odometry has ended. A client that is slow gets new ones and is told how
-        many it missed, as far as its own library lets it: what fits into its HTTP/2 window has left the server, and is
-        read however old it is. Take a small one (in gRPC's core: lookahead_bytes 4096, bdp_probe 0), or read in a thread
-        that keeps the newest.
+        """States of the rig from now on, until the odometry has ended. A slow client gets the newest ones and the number of
+        those it missed, except for what fits into its HTTP/2 window: that has left the server, and is read however old it
+        is. Use a small window (in gRPC's core: lookahead_bytes 4096, bdp_probe 0), or read in a thread that keeps the
+        newest.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def StreamKeyframes(self, request, context):
-        """Keyframes from an id on, each waited for, until the odometry has ended; at the pace of the client. After a break,
-        call again with the id after the last one that was received.
+        """Keyframes from an id on, until the odometry has ended; at the pace of the client. After a lost connection, call
+        again with the id after the last one that was received.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def StreamEvents(self, request, context):
-        """What a person would want to know of, from now on: gates, resets, faults.
+        """Events from now on: gated measurements, resets, faults.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
     def Correct(self, request, context):
-        """Say where a keyframe is in the map. INVALID_ARGUMENT if the request is malformed; a correction that is well formed
-        but not believed is answered with accepted = false.
+        """Correct where a keyframe is in the map. INVALID_ARGUMENT if the request is malformed; a well-formed correction that
+        fails the innovation test is answered with accepted = false.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

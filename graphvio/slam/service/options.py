@@ -1,4 +1,4 @@
-"""Where the service listens, and whom it lets in."""
+"""Options of the service: its address, and the clients that it accepts."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from pathlib import Path
 from graphvio.errors import ServiceError
 
 DEFAULT_PORT = 50551
-RUN_KEY = "graphvio-run"  # metadata that a stream begins with: it is open, though its first message may come late
+RUN_KEY = "graphvio-run"  # key of a stream's initial metadata
 
 
 @dataclass(frozen=True)
 class ServiceOptions:
-    """How the service is offered.
+    """Options of the service.
 
     Attributes:
-        host: address to listen on: 127.0.0.1, or another one, such as 0.0.0.0 for all, with TLS and a token.
-        port: 0 takes any that is free.
+        host: Address to listen on: 127.0.0.1, or with TLS and a token another one, such as 0.0.0.0 for all.
+        port: TCP port; 0 for any free one.
         certificate: PEM file with the server's certificate, followed by those that signed it.
         key: PEM file with its private key, not encrypted.
-        token_file: what clients have to know, in a file that only its owner can read.
-        max_clients: connections that may have streams at a time; each has room for four.
-        keepalive_s: a client that does not answer for so long, and half of it again, is taken for gone.
+        token_file: File with the token that clients must send, readable by its owner only.
+        max_clients: Maximal number of connections with open streams, of which each may have four.
+        keepalive_s: A client that does not answer for one and a half times as long is disconnected.
 
     Raises:
-        ServiceError: if a value is not valid, or an address that others reach would be open to all.
+        ServiceError: If a value is invalid, or a public address lacks TLS or a token.
     """
 
     host: str = "127.0.0.1"
@@ -55,18 +55,18 @@ class ServiceOptions:
 
     @property
     def bare_host(self) -> str:
-        """Where to listen; ``localhost`` is 127.0.0.1 only."""
+        """Host to listen on; ``localhost`` is 127.0.0.1 only."""
         return "127.0.0.1" if self.host == "localhost" else self.host
 
     @property
     def address(self) -> str:
-        """As gRPC takes it; IPv6 in brackets."""
+        """``HOST:PORT`` as gRPC expects it; IPv6 in brackets."""
         host = self.bare_host
         return f"[{host}]:{self.port}" if ":" in host else f"{host}:{self.port}"
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine is meant. Names but ``localhost`` are not: what they mean can change."""
+    """Return whether a host is a loopback address. Other names than ``localhost`` are not: they may be redefined."""
     if host == "localhost":
         return True
     try:

@@ -1,4 +1,4 @@
-"""Tokens and certificates of the service."""
+"""Tokens, certificates and checks of requests."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _TOKEN = re.compile(r"[!-~]{16,4096}")
 
 
 def bearer(token: str) -> tuple[str, str]:
-    """What a client sends with each call."""
+    """Return the metadata of a client's calls."""
     return (TOKEN_KEY, f"Bearer {token}")
 
 
 def read_token(path: str | Path) -> str:
-    """The token in a file, without the line's end.
+    """Read the token in a file.
 
     Raises:
-        ServiceError: if the file cannot be read, can be read by others than its owner, or holds no token.
+        ServiceError: If the file cannot be read, is readable by others than its owner, or holds no token.
     """
     text = _read_private(Path(path), "token", stat.S_IRWXG | stat.S_IRWXO).decode("utf-8", "replace").strip()
     if not _TOKEN.fullmatch(text):
@@ -44,17 +44,17 @@ def read_token(path: str | Path) -> str:
 
 
 def server_credentials(options: ServiceOptions) -> Any | None:
-    """TLS of the server, or None if it is to have none.
+    """Return gRPC's credentials of a server with TLS, or None without TLS.
 
     Raises:
-        ServiceError: if certificate or key cannot be read, do not belong to each other, or the key is open to all.
+        ServiceError: If certificate or key cannot be read, do not match, or the key is readable by all.
     """
     if options.certificate is None or options.key is None:
         return None
     key = _read_private(options.key, "TLS key", stat.S_IRWXO)
     try:
         certificate = options.certificate.read_bytes()
-        # gRPC would take anything here, and fail at each client.
+        # gRPC accepts anything here, and fails at each client.
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(options.certificate, options.key, password=_no_password)
     except (OSError, ssl.SSLError) as error:
         raise ServiceError(
@@ -65,12 +65,12 @@ def server_credentials(options: ServiceOptions) -> Any | None:
 
 
 def token_interceptor(token: str) -> Any:
-    """Refuses every call, also of methods that do not exist, that does not carry the token."""
+    """Return an interceptor that refuses every call without the token, also of methods that do not exist."""
 
     def refuse(_: Any, context: Any) -> Any:
         return context.abort(grpc.StatusCode.UNAUTHENTICATED, "the token is missing or wrong")
 
-    # As a stream of requests: for a single one, a thread would wait until the stranger chooses to send it.
+    # A stream of requests: for a single request, a thread would wait until the client sends it.
     refusal = grpc.stream_stream_rpc_method_handler(refuse)
     expected = _digest(bearer(token)[1])
 
@@ -84,7 +84,11 @@ def token_interceptor(token: str) -> Any:
 
 
 class MalformedInterceptor(grpc.ServerInterceptor):  # type: ignore[misc]
-    """Answers INVALID_ARGUMENT to what the proto does not describe."""
+    """Answers INVALID_ARGUMENT to requests that cannot be parsed.
+
+    When a deserializer raises, grpcio answers, but keeps the stream (seen with 1.85): after a dozen such requests the
+    connection accepts no calls any more. So none raises here.
+    """
 
     def intercept_service(self, continuation: Callable[[Any], Any], details: Any) -> Any:
         """See `grpc.ServerInterceptor`."""
@@ -114,14 +118,14 @@ def _tolerant(deserialize: Callable[[bytes], Any]) -> Callable[[bytes], Any]:
 def _guarded(answer: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     def guarded(request: Any, context: Any) -> Any:
         if request is _MALFORMED:
-            context.abort(grpc.StatusCode.INVALID_ARGUMENT, "the request is no message of this call; see the proto")
+            context.abort(grpc.StatusCode.INVALID_ARGUMENT, "the request is not a message of this call; see the proto")
         return answer(request, context)
 
     return guarded
 
 
 def _digest(text: str | bytes) -> bytes:
-    """Of one length whatever was given, so that the comparison's time tells nothing of the token's."""
+    """Return a digest, so that the time of a comparison does not depend on the token's length."""
     return hashlib.sha256(text.encode() if isinstance(text, str) else text).digest()
 
 

@@ -1,4 +1,4 @@
-"""The server: opens the port, lets clients in, and answers them beside the odometry."""
+"""The gRPC server of a running odometry."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from graphvio.slam.service.options import ServiceOptions
 from graphvio.slam.service.security import MalformedInterceptor, read_token, server_credentials, token_interceptor
 from graphvio.slam.service.servicer import STREAMS_OF_A_CLIENT, Servicer, StreamLimit
 
-_CALL_THREADS = 8  # for calls that are no streams, however many streams there are
-_CALLS_WAITING = 64
-_REQUEST_BYTES = 64 * 2**10
-_METADATA_BYTES = 16 * 2**10
+_CALL_THREADS = 8  # for calls other than streams
+_MAX_WAITING_CALLS = 64
+_MAX_REQUEST_BYTES = 64 * 2**10
+_MAX_METADATA_BYTES = 16 * 2**10
 _HANDSHAKE_MS = 5_000
-_IDLE_MS = 300_000
-_LEAST_PING_MS = 4_000
-READ_S = 60.0  # for those who read what is left of an odometry that has ended
-_STALLED_S = 5.0  # a stream of which nothing is taken for so long is not read
-_CUT_S = 0.5  # for streams and calls to see that the server stops
-_LOOK_S = 0.05
+_MAX_IDLE_MS = 300_000
+_MIN_PING_MS = 4_000
+READ_S = 60.0  # for clients to read the last messages of an odometry that has ended
+_STALLED_S = 5.0  # a stream without a message read for so long is considered stalled
+_CUT_S = 0.5  # for streams and calls to notice that the server stops
+_POLL_S = 0.05
 
 
 def check(options: ServiceOptions) -> None:
-    """Find out what would keep a server from starting, without starting one.
+    """Check that a server could be started, without starting one.
 
     Raises:
-        ServiceError: if the address is taken or not this machine's, or token, certificate or key cannot be used.
+        ServiceError: If the address is in use or not this machine's, or token, certificate or key are unusable.
     """
     _check_address(options)
     server_credentials(options)
@@ -44,14 +44,14 @@ def check(options: ServiceOptions) -> None:
 
 
 class GrpcServer:
-    """Serves a running odometry; a context manager.
+    """Server of a running odometry; a context manager.
 
     Args:
-        served: the odometry. It is only read from, and told corrections.
-        options: where, and for whom.
+        served: The odometry; the server only reads from it and passes corrections on.
+        options: Address and accepted clients.
 
     Raises:
-        MissingExtraError: when the module is imported, if grpcio is not installed.
+        MissingExtraError: On import of the module, if grpcio is not installed.
     """
 
     def __init__(self, served: Served, options: ServiceOptions | None = None) -> None:
@@ -73,19 +73,19 @@ class GrpcServer:
 
     @property
     def address(self) -> str:
-        """``HOST:PORT`` where it listens, with the port that was found if any was asked for."""
+        """``HOST:PORT`` of the server, with the port that was chosen for port 0."""
         return f"{self._options.address.rpartition(':')[0]}:{self._port or self._options.port}"
 
     @property
     def open_streams(self) -> int:
-        """How many streams clients have open."""
+        """Number of open streams of all clients."""
         return self._limit.open_streams
 
     def start(self) -> None:
-        """Listen; clients are served from here on, in threads of the server.
+        """Start to listen and to serve clients, in threads of the server.
 
         Raises:
-            ServiceError: if the address is taken or not this machine's, or token, certificate or key cannot be used.
+            ServiceError: If the address is in use or not this machine's, or token, certificate or key are unusable.
         """
         if self._server is not None:
             raise ServiceError(f"{self.address}: is served already; stop it first")
@@ -100,7 +100,7 @@ class GrpcServer:
             pool,
             interceptors=interceptors,
             options=_transport(options),
-            maximum_concurrent_rpcs=threads + _CALLS_WAITING,
+            maximum_concurrent_rpcs=threads + _MAX_WAITING_CALLS,
         )
         self._stopping = threading.Event()
         stubs.add_FrontEndServicer_to_server(Servicer(self._served, self._run_id, self._limit, self._stopping), server)
@@ -118,24 +118,27 @@ class GrpcServer:
         server.start()
         self._server, self._pool = server, pool
 
-    def drain(self, most_s: float = READ_S) -> bool:
-        """Let streams of an odometry that has ended be read to their end; whether all have been.
+    def drain(self, timeout_s: float = READ_S) -> bool:
+        """Wait until clients have read the streams of an odometry that has ended.
 
         Args:
-            most_s: how long. It is given up before when nothing is taken of any stream for 5 s.
+            timeout_s: Maximal time to wait. It ends sooner when no message of any stream is read for 5 s.
+
+        Returns:
+            Whether all streams have been read to their end.
         """
         begun_s = time.monotonic()
-        while self.open_streams and (now_s := time.monotonic()) - begun_s < most_s:
+        while self.open_streams and (now_s := time.monotonic()) - begun_s < timeout_s:
             if now_s - begun_s > _STALLED_S and not self._limit.is_read_since(now_s - _STALLED_S):
                 break
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
         return not self.open_streams
 
     def stop(self, grace_s: float = READ_S) -> None:
-        """Listen no more, and end all streams; a second time does nothing.
+        """Stop the server and end all streams; idempotent.
 
         Args:
-            grace_s: streams of an odometry that has ended may go on for so long, see `drain`.
+            grace_s: Maximal time to read the streams of an odometry that has ended, see `drain`.
         """
         if self._server is None or self._pool is None:
             return
@@ -150,61 +153,59 @@ class GrpcServer:
 def _transport(options: ServiceOptions) -> list[tuple[str, int]]:
     keepalive_ms = int(1e3 * options.keepalive_s)
     return [
-        ("grpc.so_reuseport", 0),  # else a second server on the same port would take half of the clients
-        ("grpc.max_receive_message_length", _REQUEST_BYTES),
+        ("grpc.so_reuseport", 0),  # else a second server on the port would get half of the clients
+        ("grpc.max_receive_message_length", _MAX_REQUEST_BYTES),
         ("grpc.max_send_message_length", -1),
-        ("grpc.max_metadata_size", _METADATA_BYTES),
+        ("grpc.max_metadata_size", _MAX_METADATA_BYTES),
         ("grpc.max_concurrent_streams", STREAMS_OF_A_CLIENT + _CALL_THREADS),
-        # What takes a connection without ever asking for anything must not keep others out.
+        # Connections without calls must not keep others out.
         ("grpc.max_allowed_incoming_connections", 4 * options.max_clients + 32),
         ("grpc.server_handshake_timeout_ms", _HANDSHAKE_MS),
-        ("grpc.max_connection_idle_ms", _IDLE_MS),
+        ("grpc.max_connection_idle_ms", _MAX_IDLE_MS),
         ("grpc.keepalive_time_ms", keepalive_ms),
         ("grpc.keepalive_timeout_ms", keepalive_ms // 2),
-        ("grpc.http2.ping_timeout_ms", keepalive_ms // 2),  # else any other ping on its way puts it off to a minute
+        ("grpc.http2.ping_timeout_ms", keepalive_ms // 2),  # else any other ping in flight delays it to a minute
         ("grpc.keepalive_permit_without_calls", 1),
         ("grpc.http2.max_pings_without_data", 0),
-        ("grpc.http2.min_recv_ping_interval_without_data_ms", _LEAST_PING_MS),
+        ("grpc.http2.min_recv_ping_interval_without_data_ms", _MIN_PING_MS),
     ]
 
 
 def _check_address(options: ServiceOptions) -> None:
-    """Find out by trying.
+    """Check that the address can be bound: gRPC would write lines of its own to the terminal if not.
 
     Raises:
-        ServiceError: if the address is taken or not this machine's.
+        ServiceError: If the address is in use or not this machine's.
     """
     try:
         found = socket.getaddrinfo(options.bare_host, options.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         for family, kind, protocol, _, address in found:
             with socket.socket(family, kind, protocol) as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # one that has just been closed is free
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port that was just closed is free
                 probe.bind(address)
     except OSError as error:
         raise _cannot_listen(options, error.strerror or type(error).__name__) from None
-    except ValueError:  # what cannot be a name
-        raise _cannot_listen(options, "no host's name") from None
+    except ValueError:
+        raise _cannot_listen(options, "not a host name") from None
 
 
 def _cannot_listen(options: ServiceOptions, reason: str) -> ServiceError:
-    """What is raised."""
     return ServiceError(
-        f"{options.address}: cannot be listened on ({reason}); choose a port that nobody uses, and an address of this "
-        "machine"
+        f"{options.address}: cannot be listened on ({reason}); choose a free port, and an address of this machine"
     )
 
 
 class DaemonPool(Executor):
-    """As `concurrent.futures.ThreadPoolExecutor`, but of daemon threads.
+    """A `concurrent.futures.ThreadPoolExecutor` of daemon threads.
 
-    The standard one's are waited for when a program ends, and one with an open stream would never end.
+    A program waits for the standard one's threads when it ends; with an open stream it would wait forever.
 
     Args:
-        most: threads at a time; they are started when they are needed.
+        max_threads: Maximal number of threads; they are started on demand.
     """
 
-    def __init__(self, most: int) -> None:
-        self._most = most
+    def __init__(self, max_threads: int) -> None:
+        self._max_threads = max_threads
         self._lock = threading.Lock()
         self._threads: list[threading.Thread] = []
         self._idle = 0
@@ -212,10 +213,10 @@ class DaemonPool(Executor):
         self._is_shut = False
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Call a function in one of the threads.
+        """Call a function in one of the threads; see `concurrent.futures.Executor.submit`.
 
         Raises:
-            RuntimeError: after `shutdown`, as the standard one.
+            RuntimeError: After `shutdown`.
         """
         future: Future[Any] = Future()
 
@@ -233,14 +234,14 @@ class DaemonPool(Executor):
             self._work.put(run)
             if self._idle > 0:
                 self._idle -= 1
-            elif len(self._threads) < self._most:
+            elif len(self._threads) < self._max_threads:
                 thread = threading.Thread(target=self._serve, name=f"grpc-{len(self._threads)}", daemon=True)
                 self._threads.append(thread)
                 thread.start()
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Take no more work; what was taken is done."""
+        """Accept no more work; submitted work is done. See `concurrent.futures.Executor.shutdown`."""
         with self._lock:
             self._is_shut = True
             for _ in self._threads:

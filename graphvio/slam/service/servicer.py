@@ -1,4 +1,4 @@
-"""What the service answers to each call. Each runs in a thread of the server's pool, never in the odometry's."""
+"""The service's answers. Calls run in threads of the server's pool, never in the odometry's."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from graphvio.slam.service.arrays import checked_covariance, checked_pose, float
 from graphvio.slam.service.options import RUN_KEY
 from graphvio.version import __version__
 
-_LOOK_S = 0.25  # how soon a stream sees that its client is gone or the server stops
-_WAITING = {messages.RATE_FRAME: 2, messages.RATE_IMU: 16}
-_EVENTS_WAITING = 256
+_POLL_S = 0.25  # within which a stream notices that its client is gone or the server stops
+_MAX_WAITING = {messages.RATE_FRAME: 2, messages.RATE_IMU: 16}
+_MAX_WAITING_EVENTS = 256
 STREAMS_OF_A_CLIENT = 4
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
 class Stream:
-    """One that is open.
+    """An open stream.
 
     Args:
-        client: whose it is.
+        client: Address of its client.
 
     Attributes:
-        taken_s: when its client last took a message, or opened it, by `time.monotonic`.
+        read_s: When its client last read a message, or opened it, by `time.monotonic`.
     """
 
     def __init__(self, client: str) -> None:
         self.client = client
-        self.taken_s = time.monotonic()
+        self.read_s = time.monotonic()
 
-    def taken(self) -> None:
-        """The client has taken a message."""
-        self.taken_s = time.monotonic()
+    def set_read(self) -> None:
+        """Note that the client has read a message."""
+        self.read_s = time.monotonic()
 
 
 class StreamLimit:
-    """Lets in so many clients with streams, and so many streams of each.
+    """The open streams, whose number is limited by client and in total.
 
     Args:
-        max_clients: at a time.
+        max_clients: Maximal number of clients with open streams.
     """
 
     def __init__(self, max_clients: int) -> None:
@@ -60,20 +60,20 @@ class StreamLimit:
 
     @property
     def open_streams(self) -> int:
-        """How many there are now."""
+        """Number of open streams."""
         with self._lock:
             return len(self._streams)
 
     def is_read_since(self, since_s: float) -> bool:
-        """Whether any client has taken a message after a time of `time.monotonic`."""
+        """Return whether any client has read a message after a time of `time.monotonic`."""
         with self._lock:
-            return any(stream.taken_s > since_s for stream in self._streams)
+            return any(stream.read_s > since_s for stream in self._streams)
 
     def enter(self, client: str) -> Stream:
-        """Count a stream of a client.
+        """Add a stream of a client.
 
         Raises:
-            ServiceError: if there is no room.
+            ServiceError: If the limits are reached.
         """
         with self._lock:
             clients = {stream.client for stream in self._streams}
@@ -88,19 +88,19 @@ class StreamLimit:
             return stream
 
     def leave(self, stream: Stream) -> None:
-        """A stream that was counted has ended."""
+        """Remove a stream that has ended."""
         with self._lock:
             self._streams.remove(stream)
 
 
 class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
-    """Answers for one odometry.
+    """Answers the calls to one odometry.
 
     Args:
-        served: the odometry.
-        run_id: names it.
-        limit: of streams.
-        stopping: set when streams are to end though the odometry goes on.
+        served: The odometry.
+        run_id: Unique name of its run.
+        limit: Limit of streams.
+        stopping: Set when streams must end though the odometry continues.
     """
 
     def __init__(self, served: Served, run_id: str, limit: StreamLimit, stopping: threading.Event) -> None:
@@ -111,7 +111,7 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
         self._rig_text = convert.rig_text(served.rig)
 
     def GetInfo(self, request: Any, context: Any) -> Any:
-        """What is served; as with all below, the proto tells what is asked and answered."""
+        """Return the state of the odometry; see the proto for requests and answers."""
         log = self._served.keyframe_log
         return messages.Info(
             version=__version__,
@@ -124,11 +124,11 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
         )
 
     def GetStatus(self, request: Any, context: Any) -> Any:
-        """How the odometry runs."""
+        """Return the figures of the run."""
         return _answer(context, lambda: convert.status_message(self._served.status()))
 
     def StreamEstimates(self, request: Any, context: Any) -> Iterator[Any]:
-        """Where the rig is, from now on."""
+        """Yield estimates or predictions from now on."""
         broadcast: Broadcast[Any]
         if request.rate == messages.RATE_FRAME:
             broadcast = self._served.estimates
@@ -137,35 +137,35 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
         else:
             context.abort(grpc.StatusCode.INVALID_ARGUMENT, "rate: choose RATE_FRAME or RATE_IMU")
         with self._stream(request, context) as stream:
-            for state, missed in self._listen(broadcast, _WAITING[request.rate], stream, context):
+            for state, missed in self._listen(broadcast, _MAX_WAITING[request.rate], stream, context):
                 yield self._update(state, missed)
 
     def StreamKeyframes(self, request: Any, context: Any) -> Iterator[Any]:
-        """Keyframes from an id on."""
+        """Yield keyframes from an id on."""
         if request.from_id < 0:
             context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"from_id is {request.from_id}; the first keyframe is 0")
         log = self._served.keyframe_log
         next_id = request.from_id
         with self._stream(request, context) as stream:
             while context.is_active():
-                keyframe = log.read(next_id, _LOOK_S)
+                keyframe = log.read(next_id, _POLL_S)
                 if keyframe is not None:
                     message = convert.keyframe_message(keyframe, request.with_images, request.with_descriptors)
                     yield messages.KeyframeUpdate(keyframe=message, gone=keyframe.id - next_id)
-                    stream.taken()  # one is asked for when the one before has gone out
+                    stream.set_read()  # the next message is requested when the previous one has been sent
                     next_id = keyframe.id + 1
                 elif log.is_closed and log.next_id <= next_id:
                     return
                 self._abort_if_stopping(log, context)
 
     def StreamEvents(self, request: Any, context: Any) -> Iterator[Any]:
-        """What happens, from now on."""
+        """Yield events from now on."""
         with self._stream(request, context) as stream:
-            for event, missed in self._listen(self._served.events, _EVENTS_WAITING, stream, context):
+            for event, missed in self._listen(self._served.events, _MAX_WAITING_EVENTS, stream, context):
                 yield convert.event_message(event, missed)
 
     def Correct(self, request: Any, context: Any) -> Any:
-        """A correction: checked for its form here, judged by the odometry."""
+        """Check the form of a correction, and pass it to the odometry."""
         self._check_run(request, context)
         try:
             if request.keyframe_id < 0:
@@ -188,18 +188,18 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
         return update
 
     def _listen(self, broadcast: Broadcast[T], depth: int, stream: Stream, context: Any) -> Iterator[tuple[T, int]]:
-        """Items as they come, each with the number of those left out before it."""
+        """Yield items as they come, each with the number of items dropped before it."""
         subscription = broadcast.subscribe(depth)
-        told = 0
+        reported = 0
         try:
             while context.is_active():
                 was_closed = subscription.is_closed
-                item = subscription.get(_LOOK_S)
+                item = subscription.get(_POLL_S)
                 if item is not None:
                     missed = subscription.dropped()
-                    yield item, missed - told
-                    stream.taken()
-                    told = missed
+                    yield item, missed - reported
+                    stream.set_read()
+                    reported = missed
                 elif was_closed:
                     return
                 self._abort_if_stopping(subscription, context)
@@ -214,7 +214,7 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
         except ServiceError as error:
             context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, str(error))
         try:
-            # Sent before there is a first message, which may be long in coming: the client knows that it is through.
+            # Sent before the first message, which may come late: the client knows that the stream is open.
             context.send_initial_metadata(((RUN_KEY, self._run_id),))
             yield stream
         finally:
@@ -224,12 +224,12 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
         if request.run_id not in ("", self._run_id):
             context.abort(
                 grpc.StatusCode.FAILED_PRECONDITION,
-                "another run of the odometry is served now, in which ids of keyframes mean something else; begin anew",
+                "another run of the odometry is served now, with other keyframes; connect again",
             )
 
     def _abort_if_stopping(self, read: KeyframeLog | BoundedQueue[Any], context: Any) -> None:
-        """End a stream that would go on; what is left of an odometry that has ended may still be read."""
-        if self._stopping.is_set() and not read.is_closed:  # in this order: an odometry ends before its server stops
+        """End a stream of a running odometry; one of an odometry that has ended may be read to its end."""
+        if self._stopping.is_set() and not read.is_closed:  # in this order: odometries end before their server
             context.abort(grpc.StatusCode.UNAVAILABLE, "the server stops")
 
 
@@ -240,5 +240,5 @@ def _answer(context: Any, make: Callable[[], Any]) -> Any:
         code, text = grpc.StatusCode.FAILED_PRECONDITION, str(error)
     except Exception as error:
         _log.exception("a call failed")
-        code, text = grpc.StatusCode.INTERNAL, f"the server failed ({type(error).__name__}); its log tells more"
+        code, text = grpc.StatusCode.INTERNAL, f"the server failed ({type(error).__name__}); see its log"
     return context.abort(code, text)
