@@ -1,4 +1,4 @@
-"""A front-end of rendered images and drawn drift: a rig that goes round and round in the calibration room."""
+"""A front-end with rendered images and random drift: a rig that moves in circles in the calibration room."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def rendered(index: int) -> FrameSet:
 
 
 class Refusing(SyntheticFrontEnd):
-    """Refuses corrections; to the first one it does not even answer."""
+    """Refuses corrections; the first one raises."""
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
         result = super().correct(keyframe_id, map_T_body, covariance)
@@ -74,7 +74,7 @@ def front_end(
         last: not taken any more.
         seed: of the drift.
         step: from keyframe to keyframe.
-        session: tells its stamps from those of others.
+        session: number of the session, which offsets its stamps.
         breaks: keyframes with which epochs begin.
         kind: of front-end.
     """

@@ -1,4 +1,4 @@
-"""The map's pose graph on drawn chains: what closures are believed, and how well it knows where places are."""
+"""The map's pose graph on random chains: which closures are used, and the covariance of places."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def circle(laps: float, count: int) -> Float:
 
 
 def walked(graph: PoseGraph, truth: Float, rng: np.random.Generator, origin: Float | None = None) -> None:
-    """Add a fragment with drawn drift; its odom frame is the world, or where the origin (4, 4) is."""
+    """Add a fragment with random drift; its odom frame is the world, or at the origin (4, 4)."""
     world_T_odom = np.eye(4) if origin is None else origin
     graph.begin(se3_inverse(world_T_odom) @ truth[0])
     for one, other in pairwise(truth):
@@ -75,7 +75,7 @@ def test_a_covariance_that_says_nothing_is_uncertain_can_be_used() -> None:
     assert np.linalg.eigvalsh(chains.motion(0, 1)[1])[0] > 0.0
 
 
-def test_closures_take_the_drift_away_and_the_covariance_tells_how_far() -> None:
+def test_closures_remove_drift_consistently_with_the_covariance() -> None:
     truth = circle(1.5, 60)
     squares, before, after = [], [], []
     for seed in range(12):
@@ -102,7 +102,7 @@ def test_a_closure_that_the_odometry_refutes_is_never_used() -> None:
 
 
 def test_a_wrong_closure_that_came_first_is_given_up() -> None:
-    """The odometry could not tell; five others, one after the other, can."""
+    """The odometry does not refute it; five other closures do, one after the other."""
     truth, rng = circle(1.5, 60), np.random.default_rng(5)
     graph = PoseGraph(PROBABILITY)
     walked(graph, truth, rng)

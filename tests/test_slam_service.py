@@ -1,5 +1,6 @@
 """A real server and real clients over sockets of the loopback; the odometry behind them is the test's."""
 
+import inspect
 import os
 import signal
 import socket
@@ -22,6 +23,7 @@ from test_slam_messages import assert_same
 from graphvio.errors import ServiceError
 from graphvio.measurements.events import Event
 from graphvio.queues import Broadcast
+from graphvio.slam import FrontEnd
 from graphvio.slam.interface import SlamFrontEnd
 from graphvio.slam.keyframe import Keyframe
 
@@ -68,6 +70,20 @@ def in_thread(function: Callable[[], object]) -> threading.Thread:
     thread = threading.Thread(target=function, daemon=True)
     thread.start()
     return thread
+
+
+def test_front_end_and_client_have_the_interface_of_the_protocol() -> None:
+    names = [name for name in vars(SlamFrontEnd) if not name.startswith("_")]
+    assert sorted(names) == ["correct", "keyframes", "rig"]
+    for kind in (FrontEnd, Client):
+        assert isinstance(inspect.getattr_static(kind, "rig"), property)
+        for name in ("keyframes", "correct"):
+            expected = inspect.signature(getattr(SlamFrontEnd, name))
+            found = inspect.signature(getattr(kind, name))
+            options = [each for each in found.parameters.values() if each.kind is inspect.Parameter.KEYWORD_ONLY]
+            assert all(option.default is not inspect.Parameter.empty for option in options)
+            common = [each for each in found.parameters.values() if each not in options]
+            assert found.replace(parameters=common) == expected
 
 
 def test_the_client_is_a_front_end_with_the_rig_of_the_server(client: Client) -> None:

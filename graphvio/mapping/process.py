@@ -71,7 +71,7 @@ def run_mapping(task: MappingTask, ready: Event) -> str:
     colmap()  # installs its own handler of SIGTERM when it is loaded
     ignore_stop_signals()  # they are for the odometry, with which this process ends
     use_one_opencv_thread()
-    with Client(task.address) as client, Mapper(_WithImages(client), task.config, task.map, task.folder) as mapper:
+    with Client(task.address) as client, Mapper(ClientWithImages(client), task.config, task.map, task.folder) as mapper:
         warm_up(client.rig, task.config)
         try:
             _follow(client, mapper, task, ready)
@@ -85,8 +85,12 @@ def run_mapping(task: MappingTask, ready: Event) -> str:
         return summary_line(mapper)
 
 
-class _WithImages:
-    """The client as a front-end whose keyframes have images."""
+class ClientWithImages:
+    """A client as a front-end whose keyframes have images, as the mapper needs them.
+
+    Args:
+        client: The client.
+    """
 
     def __init__(self, client: Client) -> None:
         self.rig = client.rig
