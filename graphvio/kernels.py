@@ -72,7 +72,7 @@ def fast_kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 def _compile(function: Callable[P, R], *, fastmath: bool | set[str]) -> Callable[P, R]:
     callers_choice = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(cache_root() / _digest(function.__module__))  # read when the cache is attached
+    numba.config.CACHE_DIR = str(cache_root() / source_digest(function.__module__))  # read when the cache is attached
     try:
         # What a kernel calls becomes part of it. Else the linker takes whichever copy of the callee it met first, and
         # these differ by how often they were optimised: the run that compiles would not give what later ones give.
@@ -87,11 +87,12 @@ def _compile(function: Callable[P, R], *, fastmath: bool | set[str]) -> Callable
 
 def any_compiled_before(module: str) -> bool:
     """Return whether the cache holds code of a module's kernels, so that a first call need not compile."""
-    return any((cache_root() / _digest(module)).rglob("*.nbc"))
+    return any((cache_root() / source_digest(module)).rglob("*.nbc"))
 
 
 @functools.cache
-def _digest(module: str) -> str:
+def source_digest(module: str) -> str:
+    """Return a module's name with a digest of its source and of all that it imports from this package."""
     sources: dict[str, bytes] = {}
     pending = [module]
     while pending:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from recordings import half_size_rig
+from rendered import rendered_once
 
 from graphvio.arrays import Float
 from graphvio.geometry import se3_exp
@@ -51,8 +53,15 @@ def walk_simulator(duration_s: float, course: Course | None = None, trigger_offs
 
 
 def recorded(folder: Path, duration_s: float, course: Course | None = None, trigger_offset_ms: float = 0.0) -> Path:
-    """A recording of what the simulator sees."""
-    return write_recording(walk_simulator(duration_s, course, trigger_offset_ms), folder).path
+    """Write a recording of what the simulator sees into a folder, and return the folder."""
+
+    def write(cached: Path) -> None:
+        write_recording(walk_simulator(duration_s, course, trigger_offset_ms), cached)
+
+    name = "circle" if course is None else course.__name__.replace("_", "-")
+    cached = rendered_once(f"calibration-{name}-{duration_s:g}-{trigger_offset_ms:g}", write)
+    shutil.copytree(cached, folder, dirs_exist_ok=True)
+    return folder
 
 
 def misplacement(degrees: float, metres: float) -> Float:

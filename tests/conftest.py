@@ -1,11 +1,10 @@
 """Fixtures that several test files share."""
 
-import fcntl
-import os
 from pathlib import Path
 
 import matplotlib
 import pytest
+from rendered import rendered_once
 
 from graphvio.simulation import simulate
 
@@ -18,17 +17,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session")
-def room_walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def room_walk() -> Path:
     """A simulated recording: 5 s in the room, the first of them at a standstill, both pairs and the IMU."""
-    base = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        base = base.parent  # whichever process comes first renders it for all
-    out = base / "simulated" / "room"
-    out.parent.mkdir(exist_ok=True)
-    with (out.parent / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not out.exists():
-            unfinished = out.with_name(f"unfinished-{os.getpid()}")
-            simulate("room", unfinished, duration_s=5.0, seed=3)
-            unfinished.rename(out)
-    return out
+    return rendered_once("room", lambda out: simulate("room", out, duration_s=5.0, seed=3), 5.0, 3)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from recordings import half_size_rig
+from rendered import rendered_once
 
 from graphvio.config import Config
 from graphvio.pipeline import run
@@ -18,11 +19,14 @@ DURATION_S = 30.0
 
 
 @pytest.fixture(scope="module")
-def corridor(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    simulator = Simulator(build_scene("corridor", DURATION_S), half_size_rig(), 0)
-    recording = write_recording(simulator, tmp_path_factory.mktemp("simulated") / "corridor")
-    assert {"door", "people", "blank"} <= {name for name, (_, end) in recording.events.items() if end < DURATION_S}
-    return recording.path
+def corridor() -> Path:
+    scene = build_scene("corridor", DURATION_S)
+    assert {"door", "people", "blank"} <= {name for name, (_, end) in scene.events.items() if end < DURATION_S}
+
+    def write(folder: Path) -> None:
+        write_recording(Simulator(scene, half_size_rig(), 0), folder)
+
+    return rendered_once("corridor-320x240", write, DURATION_S)
 
 
 @pytest.mark.parametrize(("pairs", "max_drift_percent"), [([0, 1], 0.2), ([0], 1.0), ([1], 1.0)])

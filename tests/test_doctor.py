@@ -48,7 +48,7 @@ def test_state_of_the_kernel_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert empty["folder"] == str(tmp_path)
     assert empty["files"] == 0
     assert not any(empty["compiled_modules"].values())
-    folder = tmp_path / kernels._digest("graphvio.geometry") / "x"
+    folder = tmp_path / kernels.source_digest("graphvio.geometry") / "x"
     folder.mkdir(parents=True)
     (folder / "skew.nbc").write_bytes(bytes(100))
     found = doctor.examine()["kernel_cache"]

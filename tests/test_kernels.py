@@ -21,10 +21,10 @@ ROOT = Path(kernels.__file__).parents[1]
 def forgetful() -> Iterator[None]:
     """Nothing that `kernels` remembers of this process' environment or sources leaks in or out."""
     kernels.cache_root.cache_clear()
-    kernels._digest.cache_clear()
+    kernels.source_digest.cache_clear()
     yield
     kernels.cache_root.cache_clear()
-    kernels._digest.cache_clear()
+    kernels.source_digest.cache_clear()
 
 
 @pytest.mark.usefixtures("forgetful")
@@ -80,8 +80,8 @@ def test_digest_changes_with_whatever_is_imported(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(kernels, "_PACKAGE", package)
 
     def digest() -> str:
-        kernels._digest.cache_clear()
-        return kernels._digest("graphvio.top")
+        kernels.source_digest.cache_clear()
+        return kernels.source_digest("graphvio.top")
 
     first = digest()
     assert first.startswith("graphvio.top-")
@@ -105,7 +105,7 @@ def test_digest_of_a_real_kernel_reaches_geometry(monkeypatch: pytest.MonkeyPatc
         return read_bytes(path)
 
     monkeypatch.setattr(Path, "read_bytes", spy)
-    kernels._digest("graphvio.frontend.refinement")
+    kernels.source_digest("graphvio.frontend.refinement")
     assert {"refinement.py", "cost.py", "geometry.py", "kernels.py", "observations.py"} <= set(read)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recordings import half_size_rig
+from rendered import rendered_once
 
 from graphvio import Config, Estimate, FrameSet, ImuSample, Odometry, Status, open_source
 from graphvio.arrays import Float
@@ -28,9 +29,11 @@ MS = 1_000_000
 
 
 @pytest.fixture(scope="module")
-def walk_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    simulator = Simulator(build_scene("room", DURATION_S), half_size_rig(), 0)
-    return write_recording(simulator, tmp_path_factory.mktemp("simulated") / "room").path
+def walk_folder() -> Path:
+    def write(folder: Path) -> None:
+        write_recording(Simulator(build_scene("room", DURATION_S), half_size_rig(), 0), folder)
+
+    return rendered_once("room-320x240", write, DURATION_S)
 
 
 @pytest.fixture(scope="module")

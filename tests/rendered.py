@@ -1,0 +1,41 @@
+"""Simulated recordings on disk, each rendered once for all processes and all runs of the tests."""
+
+import fcntl
+import hashlib
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from graphvio.kernels import source_digest
+
+_HERE = Path(__file__).parent
+_MAKERS = ("recordings.py", "calibration_walks.py", "rendered.py")  # in tests, of what is rendered
+
+
+def rendered_once(name: str, write: Callable[[Path], object], *options: object) -> Path:
+    """Return a folder with a recording, which is rendered if no run of the tests has done so before.
+
+    Nobody may write into it. It is kept in the user's cache, by the digest of the simulator's sources.
+
+    Args:
+        name: Readable part of the folder's name.
+        write: Renders into a folder that does not exist.
+        options: All that the recording depends on apart from the sources; their text is part of the key.
+    """
+    key = hashlib.sha256(source_digest("graphvio.simulation.recording").encode() + repr(options).encode())
+    for maker in _MAKERS:
+        key.update((_HERE / maker).read_bytes())
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "graphvio" / "test-recordings"
+    cache.mkdir(parents=True, exist_ok=True)
+    folder = cache / f"{name}-{key.hexdigest()[:16]}"
+    with (cache / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # whichever process comes first renders it for all
+        if not folder.exists():
+            for outdated in cache.glob(f"{name}-*"):
+                shutil.rmtree(outdated)
+            unfinished = folder.with_name(f".{folder.name}")
+            shutil.rmtree(unfinished, ignore_errors=True)
+            write(unfinished)
+            unfinished.rename(folder)
+    return folder
