@@ -1,4 +1,4 @@
-"""Compiles what the odometry and the simulator need into the cache, where the processes of the tests find it."""
+"""Compiles the kernels of the odometry and the simulator into the cache that the tests' processes share."""
 
 from graphvio.config import Config
 from graphvio.simulation.simulator import make_simulator

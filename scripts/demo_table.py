@@ -1,4 +1,4 @@
-"""The closing table of scripts/demo: what the run reached, and where it left its files."""
+"""The closing table of scripts/demo: figures of the run, and its files."""
 
 import json
 import sys

@@ -152,8 +152,8 @@ def _measurement(keys: Sequence[int], expectation: Expectation, state: FilterSta
 
 
 def _process(before: Sequence[int], after: Sequence[int], dt: float, sigmas: Float) -> gtsam.CustomFactor:
-    """Eq. (11) and (12), solved for the noise: what is moved beyond the velocities, which must be nothing, and by how
-    much the velocities and the bias change."""
+    """Eq. (11) and (12), solved for the noise: the motion beyond the velocities, which must be zero, and the changes of
+    the velocities and the bias."""
     noise = gtsam.noiseModel.Constrained.MixedSigmas(1.0, np.concatenate([np.zeros(6), sigmas]))
 
     def _error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:

@@ -31,7 +31,7 @@ AIM = 1.05
 _ANGLE_DEG, _SHIFT_M = 1.0, 0.03
 _BLIND_SCENE, _BLIND_S, _BLIND_FROM_S = "room", 5.0, 10.0
 _BLIND_FROM_SHARE, _BLIND_SHARE = 0.3, 0.4
-"""Of a walk that is too short for these seconds, so that it is seen before, during and after."""
+"""Shares of a walk that is too short for these times."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -191,7 +191,7 @@ def _filters_table(report: Report, bench: Bench) -> None:
 
 
 def _moved_table(report: Report, bench: Bench) -> None:
-    """The second pair is not where the calibration says; both pairs ought to be no worse than the better alone."""
+    """Add the table of runs with an error in the second pair's extrinsics."""
     rows = []
     for name in bench.with_several_pairs:
         moved = with_moved_pair(bench.rig(name), 1, _ANGLE_DEG, _SHIFT_M)
@@ -238,7 +238,7 @@ def _blind_table(report: Report, bench: Bench, duration_s: float | None) -> None
 
 
 def _blind_interval(duration_s: float | None) -> tuple[float, float]:
-    """From when to when a pair is blind, seconds; a short walk is blind for a share of its length."""
+    """Return the interval in which a pair is blind, seconds; in a short walk it is a share of its length."""
     if duration_s is None:
         return _BLIND_FROM_S, _BLIND_FROM_S + _BLIND_S
     begin_s = min(_BLIND_FROM_S, _BLIND_FROM_SHARE * duration_s)

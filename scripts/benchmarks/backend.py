@@ -16,8 +16,8 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from benchmarks.backend_streams import Added, FactorLog, Stream, note_stream
-from benchmarks.command_line import Subparsers, add_command
+from benchmarks.backend_streams import Added, FactorLog, Stream, log_stream
+from benchmarks.command_line import Subparsers, add_command, add_report_options
 from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, log_progress, machine
 from graphvio.arrays import Float
@@ -35,13 +35,11 @@ _NS_PER_S = 1e9
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``backend``."""
-    parser = add_command(subparsers, "backend", "time of the back-end and of gtsam's fixed-lag smoother", __doc__)
+    parser = add_command(subparsers, "backend", "time of the back-end and of gtsam's fixed-lag smoother", __doc__, main)
     parser.add_argument("--recording", type=Path, metavar="DIR", help="with an IMU (default: the simulated room)")
     parser.add_argument("--framesets", type=int, default=800, metavar="N", help="at most so many (default: 800)")
-    parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
-    parser.add_argument("--docs", action="store_true", help="put the report into docs/benchmarks.md")
+    add_report_options(parser)
     add_data_option(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:
@@ -50,7 +48,7 @@ def main(args: argparse.Namespace) -> None:
         raise GraphvioError(f"percentiles need framesets: give {_MIN_FRAMESETS} or more")
     folder = simulated(args.data, "room") if args.recording is None else args.recording
     log_progress("logging the inputs of the back-end")
-    stream = note_stream(folder, args.framesets)
+    stream = log_stream(folder, args.framesets)
     if stream.rig.imu is None or len(stream.framesets) < _MIN_FRAMESETS:
         raise GraphvioError(f"{folder}: needs an IMU and {_MIN_FRAMESETS} framesets or more")
     report = Report()
@@ -91,15 +89,12 @@ def main(args: argparse.Namespace) -> None:
             ],
         ],
     )
-    if args.out is not None:
-        report.save(args.out)
-    if args.docs:
-        report.save_to_docs("backend")
+    report.write(args, "backend")
 
 
 class _Timing(NamedTuple):
-    """Milliseconds for each counted frameset, how far apart the two newest positions are, metres, and whether ours
-    solved the whole window."""
+    """Milliseconds for each counted frameset, distance of the two newest positions, and whether ours solved the whole
+    window."""
 
     ours_ms: Float
     theirs_ms: Float
@@ -131,7 +126,7 @@ def _timed(stream: Stream, lag_s: float) -> _Timing:
 
 
 class _Incremental:
-    """gtsam's incremental fixed-lag smoother on the factors of ours."""
+    """gtsam's incremental fixed-lag smoother, with the factors of ours."""
 
     def __init__(self, lag_s: float) -> None:
         params = gtsam.ISAM2Params()
@@ -140,7 +135,7 @@ class _Incremental:
         self._known: set[int] = set()
 
     def step(self, stamp_ns: int, newest: int, references: list[int], added: Added) -> tuple[float, float, Float]:
-        """Seconds for the newest pose, and for its covariance; and its position (3,).
+        """Return the seconds for the newest pose and for its covariance, and its position (3,).
 
         Args:
             stamp_ns: of the newest state.

@@ -1,10 +1,11 @@
-"""What goes into the back-end over a run, noted so that it can be repeated; and the factors that it makes."""
+"""Logs of the back-end: its inputs over a run, so that it can be repeated, and the factors that it makes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from inspect import signature
 from itertools import count, takewhile
 from pathlib import Path
 from time import perf_counter
@@ -19,11 +20,11 @@ from graphvio.odometry import Odometry
 from graphvio.rig import Rig
 from graphvio.sources import open_source
 
-_STEPS = ("start", "predict", "use", "update")
+_STEPS = ("initialise", "predict", "apply", "update")
 
 
 class Call(NamedTuple):
-    """A step of the back-end, see `graphvio.backend.estimator.StateEstimator`, and what it was given."""
+    """A call of a method of `graphvio.backend.estimator.StateEstimator`."""
 
     name: str
     arguments: tuple[Any, ...]
@@ -31,12 +32,12 @@ class Call(NamedTuple):
 
 @dataclass(frozen=True)
 class Stream:
-    """What the back-end was given for each frameset of a recording.
+    """Inputs of the back-end for each frameset of a recording.
 
     Attributes:
         rig: of the recording.
         framesets: the calls for each, the last of which is ``update``.
-        prediction_us: what `Odometry.predict` took at each sample of the IMU beyond the newest frameset.
+        prediction_us: time of `Odometry.predict` at each sample of the IMU beyond the newest frameset.
     """
 
     rig: Rig
@@ -44,18 +45,17 @@ class Stream:
     prediction_us: list[float]
 
 
-def note_stream(folder: Path, most: int) -> Stream:
-    """Run the odometry on the first framesets of a recording, and note what its back-end is given."""
+def log_stream(folder: Path, most: int) -> Stream:
+    """Run the odometry on the first framesets of a recording, and log the calls of its back-end."""
     source = open_source(folder)
     odometry = Odometry(source.rig)
     framesets: list[list[Call]] = [[]]
     estimator: Any = odometry._estimator
     for name in _STEPS:
-        _note(estimator, name, framesets)
+        _log_calls(estimator, name, framesets)
     prediction_us = []
-    for measurement in list(
-        takewhile(_before(most), source)
-    ):  # decoded before, so that no time is of the threads for that
+    # Decoded before, so that no decoding threads run meanwhile.
+    for measurement in list(takewhile(_before(most), source)):
         odometry.process(measurement)
         if isinstance(measurement, ImuSample):
             start = perf_counter()
@@ -66,30 +66,31 @@ def note_stream(folder: Path, most: int) -> Stream:
 
 
 def _before(most: int) -> Callable[[Measurement], bool]:
-    """Whether a measurement is one of the first framesets, or comes before the next one."""
+    """Return a predicate that is true until so many framesets have passed."""
     framesets = count()
     return lambda measurement: not isinstance(measurement, FrameSet) or next(framesets) < most
 
 
-def _note(estimator: Any, name: str, framesets: list[list[Call]]) -> None:
+def _log_calls(estimator: Any, name: str, framesets: list[list[Call]]) -> None:
     step = getattr(estimator, name)
 
-    def noted(*arguments: Any) -> Any:
-        kept = (replace(arguments[0], pairs={}), *arguments[1:]) if name == "use" else arguments
+    def logged(*positional: Any, **named: Any) -> Any:
+        arguments = signature(step).bind(*positional, **named).args
+        kept = (replace(arguments[0], pairs={}), *arguments[1:]) if name == "apply" else arguments
         framesets[-1].append(Call(name, kept))
         if name == "update":
             framesets.append([])
         return step(*arguments)
 
-    setattr(estimator, name, noted)
+    setattr(estimator, name, logged)
 
 
 class Added(NamedTuple):
-    """What the smoother inserted for a frameset.
+    """Factors and variables that the smoother inserted for a frameset.
 
     Attributes:
         factors: in the order in which they were inserted.
-        values: the variables that are new with them, as they were predicted.
+        values: the new variables, with their predicted values.
     """
 
     factors: gtsam.NonlinearFactorGraph
@@ -97,19 +98,19 @@ class Added(NamedTuple):
 
 
 class FactorLog:
-    """What the windows of all smoothers that are made from now on insert."""
+    """Log of the factors that all smoothers created after it insert."""
 
     def __init__(self) -> None:
         self._added = Added(gtsam.NonlinearFactorGraph(), gtsam.Values())
-        smoother.Window = partial(_NotedWindow, self)  # type: ignore[assignment, attr-defined]
+        smoother.Window = partial(_LoggedWindow, self)  # type: ignore[assignment, attr-defined]
 
     def take(self) -> Added:
-        """What was inserted since the last call."""
+        """Return what was inserted since the last call."""
         taken, self._added = self._added, Added(gtsam.NonlinearFactorGraph(), gtsam.Values())
         return taken
 
     def add(self, factor: gtsam.NonlinearFactor, new: set[int], values: gtsam.Values) -> None:
-        """Note a factor, and its variables that are new, which have values."""
+        """Log a factor and its new variables, whose values are given."""
         self._added.factors.push_back(factor)
         for key in new:
             kind = chr(gtsam.Symbol(key).chr())
@@ -121,14 +122,14 @@ class FactorLog:
                 self._added.values.insert(key, values.atPose3(key))
 
 
-class _NotedWindow(Window):
+class _LoggedWindow(Window):
     def __init__(self, log: FactorLog, min_iterations: int = 1) -> None:
         super().__init__(min_iterations)
         self._log = log
-        self._noted: set[int] = set()
+        self._logged: set[int] = set()
 
     def add(self, factor: gtsam.NonlinearFactor) -> None:
         super().add(factor)
-        new = set(factor.keys()) - self._noted
-        self._noted |= new
+        new = set(factor.keys()) - self._logged
+        self._logged |= new
         self._log.add(factor, new, self.values)

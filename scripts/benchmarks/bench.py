@@ -14,7 +14,7 @@ from graphvio.simulation import SCENE_NAMES
 from graphvio.sources import open_source
 
 CLIP_TRUTH = TruthNoise(angle_rad=3e-4, position_m=1e-3)
-"""Taken for a real recording: an assumption, about right for a laser tracker fused with an IMU."""
+"""Assumed for a real recording, about right for a laser tracker fused with an IMU."""
 
 
 @dataclass
@@ -27,29 +27,29 @@ class Bench:
     _done: dict[tuple[str, str, tuple[int, ...], bool], Outcome] = field(default_factory=dict)
 
     def rig(self, recording: str) -> Rig:
-        """As the recording carries it."""
+        """Return the rig of a recording."""
         if recording not in self._rigs:
             self._rigs[recording] = open_source(self.recordings[recording]).rig
         return self._rigs[recording]
 
     def choices(self, recording: str) -> list[tuple[int, ...]]:
-        """All pairs, then each alone."""
+        """Return the combinations of pairs that are run: all pairs, then each alone."""
         count = len(self.rig(recording).pairs)
         return [tuple(range(count)), *((j,) for j in range(count) if count > 1)]
 
     def pair_names(self, recording: str, pairs: tuple[int, ...]) -> str:
-        """The names of pairs."""
+        """Return the names of pairs."""
         return " + ".join(self.rig(recording).pairs[j].name for j in pairs)
 
     def better_single(self, recording: str, profile: str, imu: bool) -> tuple[str, Outcome]:
-        """The pair that does better alone by its ATE by epoch, and its run."""
+        """Return the pair with the least ATE by epoch alone, and its run."""
         _, *alone = self.choices(recording)
         runs = {self.pair_names(recording, p): self.outcome(recording, profile, p, imu) for p in alone}
         best = min(runs, key=lambda name: runs[name].epoch_ate_m)
         return best, runs[best]
 
     def least_ate_m(self, recording: str, profile: str, imu: bool) -> float:
-        """The least ATE of a single pair, all epochs aligned together."""
+        """Return the least ATE of a single pair, all epochs aligned together, metres."""
         return min(self.outcome(recording, profile, pair, imu).ate_m for pair in self.choices(recording)[1:])
 
     @property
@@ -58,14 +58,14 @@ class Bench:
         return [name for name in self.recordings if len(self.rig(name).pairs) > 1]
 
     def outcome(self, recording: str, profile: str, pairs: tuple[int, ...], imu: bool) -> Outcome:
-        """The run of a case, which is made once."""
+        """Return the run of a case, which is made once."""
         key = (recording, profile, pairs, imu)
         if key not in self._done:
             self._done[key] = self.special(recording, profile, self.rig(recording).with_pairs(pairs), imu)
         return self._done[key]
 
     def special(self, recording: str, profile: str, rig: Rig, imu: bool, alter: Alter | None = None) -> Outcome:
-        """A run with another rig or other images."""
+        """Run with another rig or other images."""
         used = rig if imu else rig.without_imu()
         noise = EXACT if recording in SCENE_NAMES else CLIP_TRUTH
         outcome = run(self.recordings[recording], used, self.configs[profile], alter, noise)

@@ -18,11 +18,15 @@ AddParser: TypeAlias = Callable[[Subparsers], None]
 """Adds a subcommand's parser, whose default ``run`` takes the parsed arguments."""
 
 
-def add_command(subparsers: Subparsers, name: str, summary: str, description: str | None) -> argparse.ArgumentParser:
+def add_command(
+    subparsers: Subparsers, name: str, summary: str, description: str | None, run: Callable[[argparse.Namespace], None]
+) -> argparse.ArgumentParser:
     """Add a subcommand whose help is a module's docstring with its line breaks."""
-    return subparsers.add_parser(
+    parser = subparsers.add_parser(
         name, help=summary, description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.set_defaults(run=run)
+    return parser
 
 
 def run_command_line(prog: str, description: str, subcommands: Sequence[AddParser], epilog: str = "") -> int:

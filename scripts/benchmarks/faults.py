@@ -31,7 +31,7 @@ from graphvio.trajectory_files import load_trajectory
 from graphvio.warmup import warm_up
 
 AIM_SHARE = 0.001
-"""Of the motions that the odometry uses, fewer are wrong beyond 5 sigma."""
+"""Largest share of the used motions that may be wrong beyond 5 sigma."""
 _MODES = {False: "Vision alone", True: "Vision and IMU"}
 _HEAD = (
     "case", "framesets", "in faults", "returned", "weak", "failed", "commonest reason", "inliers a pair",
@@ -58,7 +58,7 @@ class Task:
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``faults``."""
     summary = "hard scenes and faults: the share of motions that are confident and wrong"
-    parser = add_command(subparsers, "faults", summary, __doc__)
+    parser = add_command(subparsers, "faults", summary, __doc__, main)
     parser.add_argument("--seeds", type=int, default=1, help="runs of each case, each on another walk (default: 1)")
     parser.add_argument("--duration", type=float, default=12.0, metavar="S", help="seconds of a walk (default: 12)")
     parser.add_argument("--cases", nargs="+", metavar="CASE", choices=[c.name for c in CASES], help="only these")
@@ -69,7 +69,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--config", metavar="NAME", help="profile or YAML file to run with (default: the defaults)")
     parser.add_argument("--docs", action="store_true", help="write the report into docs/benchmarks.md")
     add_data_option(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:
@@ -90,16 +89,13 @@ def main(args: argparse.Namespace) -> None:
     report.add(machine())
     report.add(_options(args))
     _write(report, outcomes)
-    if args.out is not None:
-        report.save(args.out)
+    report.write(args, "faults")
     if args.motions is not None:
         _list_motions(args.motions, outcomes)
-    if args.docs:
-        report.save_to_docs("faults")
 
 
 def run_case(task: Task) -> dict[bool, Outcome]:
-    """One case, without (False) and with (True) the IMU, on the very same images."""
+    """One case, without (False) and with (True) the IMU, on the same images."""
     case, duration_s = _case(task)
     source = open_source(_folder(task))
     if task.pairs is not None:

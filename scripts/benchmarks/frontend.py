@@ -94,10 +94,7 @@ def run(args: argparse.Namespace) -> None:
     _stages(report, footage, folder, args, title)
     if not args.no_growth:
         add_growth(report, footage, config, args.growth_framesets)
-    if args.out is not None:
-        report.save(args.out)
-    if args.docs:
-        report.save_to_docs("frontend")
+    report.write(args, "frontend")
 
 
 class _Round(NamedTuple):

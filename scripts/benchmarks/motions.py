@@ -22,7 +22,7 @@ BREAK_STATISTIC = float(chi2.isf(2.0 * norm.sf(BREAK_SIGMA), 6))
 
 
 class TruthNoise(NamedTuple):
-    """How good true poses are.
+    """Standard deviations of true poses.
 
     Attributes:
         angle_rad: standard deviation of their orientations, about each axis.
@@ -37,7 +37,7 @@ EXACT = TruthNoise()
 
 
 class MotionError(NamedTuple):
-    """How far a motion is from the truth.
+    """Error of a motion.
 
     Attributes:
         statistic: squared Mahalanobis distance by the motion's own covariance, 6 degrees of freedom.

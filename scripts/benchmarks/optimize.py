@@ -29,7 +29,7 @@ _RETRIEVED = (AIMED_AT, "room")
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``optimize``."""
-    parser = add_command(subparsers, "optimize", "sessions as a whole: time, accuracy, false closures", __doc__)
+    parser = add_command(subparsers, "optimize", "sessions as a whole: time, accuracy, false closures", __doc__, main)
     parser.add_argument("--parts", nargs="+", choices=_PARTS, default=_PARTS, help="default: all")
     parser.add_argument("--minutes", type=float, nargs="+", default=[15.0, 30.0, 60.0], metavar="M",
                         help="lengths of the synthetic sessions (default: 15 30 60)")  # fmt: skip
@@ -43,7 +43,6 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="write a report of each part to this folder")
     parser.add_argument("--docs", action="store_true", help="put the reports into docs/benchmarks.md")
     add_data_option(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:

@@ -61,7 +61,7 @@ class Optimized:
         return np.array([any(a != b for a, b in loop.closure.pairs) for loop in self.found.loops], dtype=bool)
 
     def ate_m(self, poses: Float) -> float:
-        """Of poses (F, 4, 4) of all framesets."""
+        """Return the ATE of poses (F, 4, 4) of all framesets."""
         stamps_ns = self.found.sessions[0].record.stamps_ns
         return evaluate(Trajectory(stamps_ns, poses), self.truth).ate_position_m.rmse
 
@@ -74,7 +74,7 @@ class Optimized:
         return online, smoothed, without, with_loops
 
     def closures_off(self) -> Float:
-        """What each closure is off by from the truth: (L, 2) metres and degrees; NaN where that is not known."""
+        """Return the errors of all closures: (L, 2) metres and degrees; NaN where the truth is not known."""
         made = np.full((len(self.found.loops), 2), np.nan)
         record = self.found.sessions[0].record
         for number, loop in enumerate(self.found.loops):
@@ -85,7 +85,7 @@ class Optimized:
         return made
 
     def ends_off_m(self, poses: Float) -> Float:
-        """By how much poses (F, 4, 4) and the truth differ in how both ends of each used closure lie to each other."""
+        """Return the errors of the relative positions of both ends of each used closure, by poses (F, 4, 4)."""
         made = []
         record = self.found.sessions[0].record
         for loop in (loop for loop in self.found.loops if not loop.refusal):

@@ -127,7 +127,7 @@ def _hour(minutes: float) -> _Hour:
 
 
 def _reference_s(states: int) -> float:
-    """Of the processor, for a chain of so many states: factored forwards and solved backwards, block by block."""
+    """Processor time of a chain of so many states, factored forwards and solved backwards block by block."""
     rng = np.random.default_rng(0)
     coupling = 0.2 * rng.standard_normal((_BLOCK, _BLOCK))
     own = 10.0 * np.eye(_BLOCK) + coupling @ coupling.T
@@ -229,7 +229,7 @@ def _all_alike(session: SyntheticSession, shift_m: float, false: int) -> Synthet
 
 
 def _used(session: SyntheticSession, found: Optimization) -> tuple[int, int]:
-    """How many right and false closures are used."""
+    """Return the numbers of right and of false closures that are used."""
     used = [not loop.refusal for loop in found.loops]
     right = len(used) - session.false
     return sum(used[:right]), sum(used[right:])

@@ -11,9 +11,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from benchmarks.report import writing
 from benchmarks.runs import Outcome
 from graphvio.arrays import Float
-from graphvio.errors import GraphvioError
 from graphvio.evaluation import MAX_GAP_S
 from graphvio.geometry import se3_inverse
 
@@ -38,7 +38,7 @@ class Panel:
 
 
 def draw_trajectories(path: Path, panels: Sequence[Panel]) -> None:
-    """Draw x-y plans below each other, each epoch laid onto the truth at its first pose and nowhere else.
+    """Draw x-y plans below each other, each epoch aligned with the truth at its first pose.
 
     Raises:
         GraphvioError: if the picture cannot be written.
@@ -59,11 +59,8 @@ def draw_trajectories(path: Path, panels: Sequence[Panel]) -> None:
         "seen from above; each line begins at the true first pose, and again at the true pose after a declared break"
     )
     figure.text(_LEFT_IN / _WIDTH_IN, 0.12 / total_in, caption, fontsize=9)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with writing(path):
         figure.savefig(path, metadata={"Software": None} if path.suffix == ".png" else None)
-    except OSError as error:
-        raise GraphvioError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
 
 
 class _Plan:

@@ -25,7 +25,7 @@ from graphvio.sources import open_source
 
 
 def add_data_option(parser: argparse.ArgumentParser) -> None:
-    """``--data DIR``, where simulated recordings are kept."""
+    """Add ``--data DIR``, where simulated recordings are kept."""
     default = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "graphvio" / "benchmarks"
     parser.add_argument(
         "--data",
@@ -89,7 +89,7 @@ def rendered_once(data: Path, scene: str, variant: str, render: Callable[[Path],
 
 @cache
 def _digest(scene: str, sources: tuple[Path, ...]) -> str:
-    """Of everything that decides the bytes of a recording: the simulator, and what it takes from the package."""
+    """Digest of all sources that determine the bytes of a recording: the simulator, and the modules that it imports."""
     package = Path(graphvio.__file__).parent
     taken = ("cameras.py", "geometry.py", "kernels.py", "rig.py", "rig_files/native.py", "sessions/euroc_layout.py")
     scenes = package / "simulation" / "scenes"

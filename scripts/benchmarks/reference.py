@@ -1,4 +1,4 @@
-"""A plain stereo odometry of OpenCV's functions, as a measure of the machine: what most people would write first.
+"""A plain stereo odometry of OpenCV's functions, as a measure of the machine.
 
 For each pair: corners by ``goodFeaturesToTrack``, matched to the right image and followed to the next left image by
 ``calcOpticalFlowPyrLK``, triangulated, and the motion by ``solvePnPRansac``. Pairs come one after another, and OpenCV
@@ -28,7 +28,7 @@ _MIN_POINTS = 6
 
 @dataclass
 class _Seen:
-    """What is kept of a pair's last images: corners (N, 2) float32 and points (N, 3) of the left camera."""
+    """A pair's last left image, its corners (N, 2) float32 and points (N, 3) in the left camera."""
 
     left: Image
     corners: Any
@@ -101,7 +101,7 @@ class ReferencePipeline:
 
 
 def _follow(first: Image, second: Image, corners: Any) -> tuple[Any, Bool]:
-    """Where corners (N, 2) lie in a second image (N, 2), and whether each was found (N,)."""
+    """Return the corners (N, 2) in a second image, and whether each was found (N,)."""
     if not len(corners):
         return corners, np.zeros(0, dtype=np.bool_)
     moved, status, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None)  # type: ignore[call-overload]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
@@ -43,7 +45,7 @@ class Report:
 
     @property
     def text(self) -> str:
-        """All of it, ending in a newline."""
+        """The whole text, ending in a newline."""
         return "\n".join(self._lines).rstrip() + "\n"
 
     def save(self, path: Path) -> None:
@@ -52,11 +54,15 @@ class Report:
         Raises:
             GraphvioError: if it cannot be written.
         """
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+        with writing(path):
             path.write_text(self.text, encoding="utf-8")
-        except OSError as error:
-            raise GraphvioError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
+
+    def write(self, args: argparse.Namespace, name: str) -> None:
+        """Write the report where ``--out`` and ``--docs`` say, the latter between the markers of a name."""
+        if args.out is not None:
+            self.save(args.out)
+        if args.docs:
+            self.save_to_docs(name)
 
     def save_to_docs(self, name: str, extra: str = "") -> None:
         """Replace what stands between ``<!-- name -->`` and ``<!-- /name -->`` in docs/benchmarks.md.
@@ -80,6 +86,16 @@ class Report:
         after = remaining.split(end)[1]
         inside = f"{self.text}\n{extra}\n" if extra else self.text
         page.write_text(f"{before}{begin}\n{inside}{end}{after}", encoding="utf-8")
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Make the folder of a file that is written inside; an `OSError` becomes a `GraphvioError`."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise GraphvioError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
 
 
 def log_progress(text: str) -> None:

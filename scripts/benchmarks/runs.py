@@ -31,7 +31,7 @@ _BLOCK = 40
 _RPE_METRES = ("5 m", "1 m")
 
 Alter = Callable[[FrameSet], FrameSet]
-"""What is done to each frameset before the odometry sees it."""
+"""Alters each frameset before the odometry processes it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,10 +36,9 @@ _HEAD = ("error, mm", "odometry", "in the map as known then", "in the map as kno
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``slam``."""
-    parser = add_command(subparsers, "slam", "the reference SLAM on the loop, and in the map that it saved", __doc__)
+    parser = add_command(subparsers, "slam", "the reference SLAM on the loop, and in its saved map", __doc__, main)
     add_report_options(parser)
     add_data_option(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:
@@ -61,10 +60,7 @@ def main(args: argparse.Namespace) -> None:
             log_progress(f"from {start_s:g} s")
         report.add(f"In the saved map, from {len(_SESSION_BEGINS_S)} places of the walk, {_RELOCALISED_S:g} s each:")
         report.table(("begins at, s", "found after, s", "error when found, mm", "error at the end, mm"), rows)
-    if args.out is not None:
-        report.save(args.out)
-    if args.docs:
-        report.save_to_docs("slam")
+    report.write(args, "slam")
 
 
 def _slam(source: str, *arguments: str | Path) -> None:
@@ -76,7 +72,7 @@ def _slam(source: str, *arguments: str | Path) -> None:
 
 
 def _errors(folder: Path, out: Path) -> list[list[str]]:
-    """As ``graphvio evaluate`` has them."""
+    """Return rows of the errors that ``graphvio evaluate`` reports."""
     rows: list[list[str]] = [["ATE, rmse"], ["drift: the end's error where the start is aligned"]]
     for name in ("odometry.txt", "online.txt", "trajectory.txt"):
         found = evaluate(load_trajectory(out / name), _truth(folder))

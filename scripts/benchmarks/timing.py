@@ -1,4 +1,4 @@
-"""Timing of several pipelines on the same framesets, in turns, so that all of them meet much the same load."""
+"""Timing of several pipelines on the same framesets, in turns, so that all of them run under a similar load."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class Contender(Protocol):
     """A pipeline that is timed."""
 
     opencv_threads: int
-    """How many threads OpenCV uses while it is this pipeline's turn."""
+    """Number of OpenCV's threads during this pipeline's turn."""
 
     def step(self, index: int) -> dict[str, float]:
         """Work on the next frameset; returns the milliseconds by stage, as the pipeline itself reports them."""
 
     def close(self) -> None:
-        """End what it has running."""
+        """End its threads."""
 
 
 @dataclass
@@ -102,7 +102,7 @@ def _set_opencv_threads(threads: int) -> None:
 
 
 class FrontendContender:
-    """The front-end alone, started from the prediction that the last motion goes on."""
+    """The front-end alone, with the prediction that the last motion continues."""
 
     def __init__(self, footage: Footage, config: Config) -> None:
         cv2.setNumThreads(_OWN_THREADS)
@@ -170,4 +170,4 @@ class ReferenceContender:
         return self.pipeline.process(self._framesets[index])
 
     def close(self) -> None:
-        """Nothing is left running."""
+        """Do nothing: no threads are left."""

@@ -45,13 +45,12 @@ _ODOMETRY_HEAD = ("recording", "IMU", "true rig", "found rig", "found / true", "
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``calibration``."""
-    parser = add_command(subparsers, "calibration", "how well P_12 is found from motion", __doc__)
+    parser = add_command(subparsers, "calibration", "how well P_12 is found from motion", __doc__, main)
     parser.add_argument("--runs", type=int, default=200, help="runs of each case with synthetic errors (default: 200)")
     parser.add_argument("--scenes", nargs="*", default=list(SCENE_NAMES), metavar="NAME", help="default: all")
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side (default: 2)")
     add_data_option(parser)
     add_report_options(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:
@@ -80,10 +79,7 @@ def main(args: argparse.Namespace) -> None:
         "odometry notices and corrects.",
     )
     report.table(_ODOMETRY_HEAD, _odometry(args.data, args.scenes, whole))
-    if args.out is not None:
-        report.save(args.out)
-    if args.docs:
-        report.save_to_docs("calibration")
+    report.write(args, "calibration")
 
 
 def _synthetic(runs: int, jobs: int) -> list[list[str]]:

@@ -41,7 +41,7 @@ _WHERE = "room"  # on whose images the covariances are found
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``consistency``."""
-    parser = add_command(subparsers, "consistency", "NEES and NIS over many runs", __doc__)
+    parser = add_command(subparsers, "consistency", "NEES and NIS over many runs", __doc__, main)
     parser.add_argument("--seeds", type=int, default=50, help="runs with synthetic errors (default: 50)")
     parser.add_argument("--rendered", type=int, default=3, help="runs of each rendered scene (default: 3)")
     parser.add_argument("--duration", type=float, default=25.0, metavar="S", help="seconds of a run (default: 25)")
@@ -49,7 +49,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file, a plot next to it")
     parser.add_argument("--docs", action="store_true", help="write report and plot into docs/")
     add_data_option(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:

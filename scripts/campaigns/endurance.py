@@ -39,10 +39,9 @@ _HEAD = ("minutes", "median ms", "99th percentile", "memory, MB", "variables", "
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``endurance``."""
-    parser = add_command(subparsers, "endurance", "memory, time and numerics of the back-end over an hour", __doc__)
+    parser = add_command(subparsers, "endurance", "memory, time and errors of the back-end over an hour", __doc__, main)
     parser.add_argument("--minutes", type=float, default=60.0, help="of the walk (default: 60)")
     add_report_options(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:
@@ -57,10 +56,7 @@ def main(args: argparse.Namespace) -> None:
         "measurement determines the position.",
     )
     report.table(_HEAD, _parts(60.0 * args.minutes))
-    if args.out is not None:
-        report.save(args.out)
-    if args.docs:
-        report.save_to_docs("endurance")
+    report.write(args, "endurance")
 
 
 def _parts(duration_s: float) -> list[list[str]]:

@@ -43,7 +43,7 @@ class Reconstruction:
     _marginals: gtsam.Marginals
 
     def covariances(self, numbers: Int) -> dict[int, StateCovariance]:
-        """How well some of the states (M,) are known, by number."""
+        """Return the covariances of some states (M,) by number."""
         known = {}
         for k in numbers.tolist():
             biases = self._marginals.marginalCovariance(b(k))
@@ -78,13 +78,13 @@ def reconstruct(flight: Flight, imu: Imu, noise_scale: float, rounds: int = 2) -
 
 
 def turns(recorded: Truth, found: Truth) -> Float:
-    """Rotation vectors (N, 3) rad, in body, from one truth's orientations to another's."""
+    """Return rotation vectors (N, 3) rad, in body, from one truth's orientations to another's."""
     recorded_R_found = np.swapaxes(recorded.world_T_body[:, :3, :3], 1, 2) @ found.world_T_body[:, :3, :3]
     return np.array([so3_log(np.ascontiguousarray(turn)) for turn in recorded_R_found])
 
 
 def force_errors(flight: Flight, truth: Truth, imu: Imu) -> Float:
-    """Mean specific force (N - 1, 3) m/s^2 of each step as measured, less that of a truth; body, bias included."""
+    """Return the mean specific force (N - 1, 3) m/s^2 of each step less that of a truth, in body with bias."""
     step_s, up = 1e-9 * STEP_NS, np.array([0.0, 0.0, GRAVITY_M_S2])
     params, errors = preintegration_params(imu, 1.0), np.empty((len(flight.intervals), 3))
     for k, (interval, bias) in enumerate(zip(flight.intervals, _biases(truth)[:-1], strict=True)):
@@ -112,7 +112,7 @@ def with_synthetic_forces(flight: Flight, errors: Float, density: float, seed: i
 
 
 def allan_deviation(values: Float, steps: int) -> Float:
-    """Of the columns (M,) of values (N, M), between means over so many steps."""
+    """Return the Allan deviation (M,) of the columns of values (N, M), between means over so many steps."""
     sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     means = (sums[steps:] - sums[:-steps]) / steps
     return np.asarray(np.sqrt(0.5 * np.mean((means[steps:] - means[:-steps]) ** 2, axis=0)))

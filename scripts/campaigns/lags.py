@@ -29,12 +29,11 @@ _HEAD = ("estimator", "lag, steps", "iterations", "position, cm", "velocity, cm/
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add ``lags``."""
-    parser = add_command(subparsers, "lags", "the paper's filter against windows of its model", __doc__)
+    parser = add_command(subparsers, "lags", "the paper's filter against windows of its model", __doc__, main)
     parser.add_argument("--seeds", type=int, default=50, help="runs (default: 50)")
     parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="seconds of a run (default: 20)")
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side (default: 2)")
     add_report_options(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:
@@ -59,10 +58,7 @@ def main(args: argparse.Namespace) -> None:
     lag = str(round(SmootherConfig().lag_s * FRAMES_HZ))
     rows.append(_row("the odometry's smoother", lag, "all states every third step", tracks["smoother"]))
     report.table(_HEAD, rows)
-    if args.out is not None:
-        report.save(args.out)
-    if args.docs:
-        report.save_to_docs("lags")
+    report.write(args, "lags")
 
 
 def one_run(seed: int, duration_s: float) -> dict[str, dict[str, Track]]:

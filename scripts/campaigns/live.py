@@ -59,12 +59,11 @@ _CASES = (
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``live``."""
-    parser = add_command(subparsers, "live", "unplugged, drifting, stalled, overloaded and killed", __doc__)
+    parser = add_command(subparsers, "live", "unplugged, drifting, stalled, overloaded and killed", __doc__, main)
     parser.add_argument("--seconds", type=float, default=25.0, help="of each case (default: 25)")
     parser.add_argument("--kills", type=int, default=5, help="recordings that are killed (default: 5)")
     add_report_options(parser)
     add_data_option(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:
@@ -85,10 +84,7 @@ def main(args: argparse.Namespace) -> None:
             f"Recordings killed at {len(lost_s)} moments: all could be read, to {max(lost_s):.2f} s before the newest "
             "frameset at most."
         )
-    if args.out is not None:
-        report.save(args.out)
-    if args.docs:
-        report.save_to_docs("live")
+    report.write(args, "live")
 
 
 def _run(case: _Case, folder: Path, seconds: float) -> list[str]:

@@ -61,7 +61,7 @@ class Listener:
         """The true pose nearest to a stamp's position in the walk to and fro."""
         length_ns = self._end_ns - self._start_ns
         assert self._first_ns is not None
-        along_ns = (stamp_ns - self._first_ns) % (2 * length_ns)  # whatever clock the stamps are of
+        along_ns = (stamp_ns - self._first_ns) % (2 * length_ns)  # for stamps of any clock
         wanted_ns = self._start_ns + min(along_ns, 2 * length_ns - along_ns)
         at = int(np.argmin(np.abs(self._truth.stamps_ns - wanted_ns)))
         return np.ascontiguousarray(self._truth.nav_T_body[at])

@@ -45,11 +45,10 @@ _STAGES = ("features", "keep", "description", "retrieval", "verification", "grap
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``mapping``."""
-    parser = add_command(subparsers, "mapping", "the reference SLAM on synthetic drift, and in a saved map", __doc__)
+    parser = add_command(subparsers, "mapping", "the reference SLAM on synthetic drift, and in its map", __doc__, main)
     parser.add_argument("--draws", type=int, default=3, help="walks with another drift (default: 3)")
     add_report_options(parser)
     add_data_option(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:
@@ -78,10 +77,7 @@ def main(args: argparse.Namespace) -> None:
     report.table(_SESSION_HEAD, rows)
     report.add("Milliseconds by the clock, where they were needed; a place has up to three candidates:")
     report.table(("stage", "ms"), _stage_rows([run.summary for run in runs]))
-    if args.out is not None:
-        report.save(args.out)
-    if args.docs:
-        report.save_to_docs("mapping")
+    report.write(args, "mapping")
 
 
 @dataclass(frozen=True)

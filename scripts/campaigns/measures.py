@@ -15,7 +15,7 @@ CONFIDENCE = 0.95
 
 
 class Squares:
-    """Squared Mahalanobis distances by what they are of, run and time."""
+    """Squared Mahalanobis distances by quantity, run and time."""
 
     def __init__(self) -> None:
         self._of: dict[str, dict[int, dict[float, float]]] = defaultdict(lambda: defaultdict(dict))
@@ -26,22 +26,22 @@ class Squares:
         self.add_square(name, run, time_s, float(error @ np.linalg.solve(covariance, error)), len(error))
 
     def add_square(self, name: str, run: int, time_s: float, square: float, dimensions: int) -> None:
-        """A squared distance and its number of dimensions."""
+        """Add a squared distance and its number of dimensions."""
         self.dimensions[name] = dimensions
         self._of[name][run][round(time_s, 3)] = square
 
     def over_time(self, name: str) -> tuple[Float, Float]:
-        """Times (T,) that all runs have, and mean squares (T,) of the runs there."""
+        """Return the times (T,) that all runs have, and mean squares (T,) of the runs there."""
         runs = list(self._of[name].values())
         times = sorted(frozenset.intersection(*(frozenset(run) for run in runs)))
         return np.array(times), np.array([np.mean([run[t] for run in runs]) for t in times])
 
     def mean(self, name: str) -> float:
-        """Of all runs and times."""
+        """Return the mean over all runs and times."""
         return float(np.mean([square for run in self._of[name].values() for square in run.values()]))
 
     def runs(self, name: str) -> int:
-        """How many there are."""
+        """Return the number of runs."""
         return len(self._of[name])
 
     def band(self, name: str) -> tuple[float, float]:
@@ -49,21 +49,21 @@ class Squares:
         return band(self.dimensions[name], self.runs(name))
 
     def share_in_band(self, name: str) -> float:
-        """Of the times."""
+        """Return the share of the times whose mean is in the band."""
         low, high = self.band(name)
         _, means = self.over_time(name)
         return float(np.mean((means >= low) & (means <= high)))
 
 
 def band(dimensions: int, runs: int) -> tuple[float, float]:
-    """The 95 % band of the mean of so many independent chi-square variables."""
+    """Return the 95 % band of the mean of so many independent chi-square variables."""
     tail = 0.5 * (1.0 - CONFIDENCE)
     low, high = chi2.ppf([tail, 1.0 - tail], dimensions * runs) / runs
     return float(low), float(high)
 
 
 def rows(squares: Squares, names: Mapping[str, str]) -> list[list[str]]:
-    """Rows of a table: what, dimensions, mean, band, share of the times in it."""
+    """Return rows of a table: quantity, dimensions, mean, band, share of the times in it."""
     made = []
     for name, words in names.items():
         low, high = squares.band(name)
@@ -78,7 +78,7 @@ HEAD = ("what", "dimensions", "mean", f"{100 * CONFIDENCE:.0f} % band", "times i
 
 
 def tilt_error(nav_T_body: Float, true: Float, covariance: Float) -> tuple[Float, Float]:
-    """Error (2,) of roll and pitch about nav's horizontal axes, and its covariance (2, 2), from the pose's (6, 6)."""
+    """Return error (2,) and covariance (2, 2), from the pose (6, 6), of roll and pitch about nav's horizontal axes."""
     rotation = nav_T_body[:3, :3]
     off = np.eye(4)
     off[:3, :3] = true[:3, :3] @ rotation.T
@@ -87,7 +87,7 @@ def tilt_error(nav_T_body: Float, true: Float, covariance: Float) -> tuple[Float
 
 
 def heading_aligned(nav_T_body: Float, world_T_body: Float) -> Float:
-    """``nav_T_world`` (4, 4) that is upright and gives both poses one heading: nav's is that of its first pose."""
+    """Return the upright ``nav_T_world`` (4, 4) that gives both poses the same heading."""
     about = nav_T_body @ se3_inverse(np.ascontiguousarray(world_T_body))
     heading = np.arctan2(about[1, 0] - about[0, 1], about[0, 0] + about[1, 1])
     turned = np.eye(4)

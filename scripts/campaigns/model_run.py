@@ -23,7 +23,7 @@ _TILT_SIGMA, _SPEED_SIGMA, _GYRO_BIAS_SIGMA, _ACCEL_BIAS_SIGMA = 0.02, 0.2, 0.01
 _FIRST_GYRO_BIAS, _FIRST_ACCEL_BIAS = 4e-3, 4e-2  # that the simulator's IMU has
 
 Square = tuple[str, float, float, int]
-"""What it is of, seconds, squared Mahalanobis distance, dimensions."""
+"""Quantity, seconds, squared Mahalanobis distance, dimensions."""
 
 
 def model_run(seed: int, templates: dict[int, Template], duration_s: float) -> list[Square]:
@@ -56,7 +56,7 @@ class _ModelRun:
     def squares(self) -> Iterator[Square]:
         """Go through the run."""
         smoother = self._smoother
-        self._start()
+        self._initialise()
         references = {1: 0, 10: 0}  # seconds -> frameset from which the motion is measured
         for k in range(1, len(self._stamps)):
             interval = self._buffer.interval(self._stamps[k - 1], self._stamps[k])
@@ -83,8 +83,8 @@ class _ModelRun:
                         yield self._motion_square(f"pose over {seconds} s", reference, k)
                     references[seconds] = k
 
-    def _start(self) -> None:
-        """At the truth, but for errors of the start."""
+    def _initialise(self) -> None:
+        """Initialise at the truth with errors of the initial state."""
         rng, pose = self._rng, self._truth[0]
         covariance = origin_covariance(pose[:3, :3], _TILT_SIGMA)
         known = InitialUncertainty(covariance, _SPEED_SIGMA, _GYRO_BIAS_SIGMA)
@@ -107,7 +107,7 @@ class _ModelRun:
             yield name, time_s, float(error @ np.linalg.solve(covariance, error)), len(error)
 
     def _imu_square(self, interval: ImuInterval, k: int) -> float:
-        """How far the IMU from one frameset to the next, with the walk of its biases, is from the truth."""
+        """Squared distance of the IMU from one frameset to the next, with the walk of its biases, from the truth."""
         biases = []
         for number in (k - 1, k):
             sample = round(number / FRAMES_HZ * self._imu_rate_hz)

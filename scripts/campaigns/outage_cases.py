@@ -1,4 +1,4 @@
-"""The cases of ``scripts/campaign outages``: what goes wrong with a recording's data, and what is requirementd then."""
+"""The cases of ``scripts/campaign outages``: faults of a recording's data, and the required behaviour."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import numpy as np
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 
 BEGIN_S = 3.0
-"""Of what goes wrong, after the recording's first frameset."""
+"""Begin of the faults, after the recording's first frameset."""
 _LENGTH_S, _LONGER_S = 12.0, 16.0  # of the recording that is run
 _END_OF_VISION_S = 8.0
-_FOR_EVER_S = math.inf
+_NEVER_S = math.inf
 _MS = 1_000_000
 
 Change = Callable[[Measurement], list[Measurement]]
-"""What is delivered in place of a measurement; nothing where it stays away."""
+"""Returns the measurements that are delivered in place of one."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Case:
     """One fault, or two at once.
 
     Attributes:
-        name: for people.
-        requirement: what is to happen, for people.
-        make: a fresh change, which is applied to the measurements from ``begin_s`` on and before ``end_s``.
+        name: in the tables.
+        requirement: the required behaviour, for the table.
+        make: returns a new change, which is applied to the measurements from ``begin_s`` on and before ``end_s``.
         begin_s: seconds after the first frameset; minus infinity for all that comes before it, too.
         end_s: on the same scale; infinite where it never ends.
         late_s: framesets are delivered so much later than the IMU's samples of their instant.
@@ -41,18 +41,18 @@ class Case:
     requirement: str
     make: Callable[[], Change]
     begin_s: float = BEGIN_S
-    end_s: float = _FOR_EVER_S
+    end_s: float = _NEVER_S
     late_s: float = 0.0
     jump_s: float = 0.0
     length_s: float = _LENGTH_S
 
     @property
     def over_s(self) -> float:
-        """When it is over: a jump of the clock is at once, and only its stamps stay."""
+        """End of the fault, seconds; a jump of the clock has no duration."""
         return self.begin_s if self.jump_s > 0.0 else self.end_s
 
     def true_ns(self, stamp_ns: int, start_ns: int) -> int:
-        """The recording's stamp of what was delivered with a stamp, int64 nanoseconds."""
+        """Return the recording's stamp of a delivered stamp, int64 nanoseconds."""
         jumped = self.jump_s > 0.0 and (stamp_ns - start_ns) * 1e-9 > self.begin_s + 0.5 * self.jump_s
         return stamp_ns - round(self.jump_s * 1e9) if jumped else stamp_ns
 
@@ -157,7 +157,7 @@ def _not_a_number() -> Change:
 
 
 def _muddled() -> Change:
-    """Every measurement twice, and once with a stamp that lies back."""
+    """Every measurement twice, and once with an earlier stamp."""
 
     def three(measurement: Measurement) -> list[Measurement]:
         back_ms = 20 if isinstance(measurement, ImuSample) else 200
@@ -217,4 +217,4 @@ CASES = (
     Case("all clocks jump by 7 s", _NEW_EPOCH, _jumped(7.0), jump_s=7.0),
     Case("all clocks jump by 10 000 s", _NEW_EPOCH, _jumped(10_000.0), jump_s=10_000.0),
 )  # fmt: skip
-"""Nothing at all first, to compare with."""
+"""The first has no fault, as a baseline."""

@@ -50,11 +50,10 @@ _EXPLANATION = (
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``outages``."""
-    parser = add_command(subparsers, "outages", "blackouts and faults of the data, and how each ends", __doc__)
+    parser = add_command(subparsers, "outages", "blackouts and faults of the data, and how each ends", __doc__, main)
     parser.add_argument("--jobs", type=int, default=2, help="runs side by side (default: 2)")
     add_report_options(parser)
     add_data_option(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:
@@ -83,10 +82,7 @@ def main(args: argparse.Namespace) -> None:
     )
     if broken:
         report.add(*broken)
-    if args.out is not None:
-        report.save(args.out)
-    if args.docs:
-        report.save_to_docs("outages")
+    report.write(args, "outages")
 
 
 def run_case(number: int, folder: Path) -> tuple[list[str], list[str]]:
@@ -132,7 +128,7 @@ class Outcome:
     events: list[Event]
 
     def cells(self) -> list[str]:
-        """Of the table, after the case's name."""
+        """Return the cells of the table after the case's name."""
         estimates = self.estimates
         distances = self.return_distances()
         lasts = (self.times_s >= self.case.begin_s - 1e-3) & (self.times_s < self.case.over_s - 1e-3)
@@ -162,7 +158,7 @@ class Outcome:
         return [words for words, held in requirements.items() if not held]
 
     def return_distances(self) -> list[float]:
-        """How far each step from coasting to vision is off, Mahalanobis under what was known of the pose before."""
+        """Return the Mahalanobis distances of steps from coasting to vision, by the covariance of the pose before."""
         distances = []
         for i, (before, after) in enumerate(pairwise(self.estimates)):
             returned = before.status is Status.COASTING and after.status in _BY_VISION
@@ -187,9 +183,9 @@ class Outcome:
         return float(np.linalg.norm(self._error(start, end)[3:]))
 
     def _error(self, i: int, j: int) -> Float:
-        """Tangent (6,) in the earlier body by which the motion between two estimates is off the true one.
+        """Return the error (6,) of the motion between two estimates, a tangent in the earlier body.
 
-        NaN where they are not of one epoch or one has no pose.
+        NaN where the estimates are of different epochs or one has no pose.
         """
         start, end = self.estimates[i], self.estimates[j]
         if start.nav_T_body is None or end.nav_T_body is None or start.epoch != end.epoch:

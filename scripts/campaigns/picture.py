@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from benchmarks.report import writing
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from campaigns.measures import Squares
-from graphvio.errors import GraphvioError
 
 _BLUE, _BAND = "#1f5fbf", "#dfe8f5"
 _COLUMNS = 2
@@ -43,8 +43,5 @@ def draw_consistency(path: Path, squares: Squares, names: Mapping[str, str]) -> 
         axis.set_xlabel("seconds")
     axes[0, 0].legend(loc="upper right", fontsize=8)
     figure.suptitle(f"Mean squared Mahalanobis distance of {squares.runs(plotted[0])} runs", fontsize=11)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with writing(path):
         figure.savefig(path)
-    except OSError as error:
-        raise GraphvioError(f"{path}: cannot be written ({error.strerror}); choose another place") from None

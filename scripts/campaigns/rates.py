@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from benchmarks.command_line import Subparsers, add_command
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import DOCS, log_progress
+from benchmarks.report import DOCS, log_progress, writing
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -35,11 +35,10 @@ _DPI = 130
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``rates``."""
-    parser = add_command(subparsers, "rates", "a plot of a turn without vision, as in the paper's figure 5", __doc__)
+    parser = add_command(subparsers, "rates", "a plot of a turn without vision, the paper's figure 5", __doc__, main)
     parser.add_argument("--out", type=Path, metavar="FILE.png", help="write the plot to this file")
     parser.add_argument("--docs", action="store_true", help="write it into docs/images")
     add_data_option(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:
@@ -99,11 +98,8 @@ def _draw(
         _draw_axis(axes, i, rates, blind_s)
     plots[-1].set_xlabel("seconds")
     below.legend(*plots[0].get_legend_handles_labels(), loc="outside upper center", fontsize=9, ncols=4)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with writing(path):
         figure.savefig(path)
-    except OSError as error:
-        raise GraphvioError(f"{path}: cannot be written ({error.strerror}); choose another place") from None
 
 
 def _draw_axis(axes: Any, i: int, rates: dict[str, list[tuple[float, Float]]], blind_s: tuple[float, float]) -> None:

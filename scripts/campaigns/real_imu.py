@@ -37,7 +37,7 @@ _OWN = ("velocity", "tilt", "gyro bias", "accel bias")  # whose truth has a cova
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``real-imu``."""
-    parser = add_command(subparsers, "real-imu", "NEES, NIS and biases on 145 s of a real IMU", __doc__)
+    parser = add_command(subparsers, "real-imu", "NEES, NIS and biases on 145 s of a real IMU", __doc__, main)
     parser.add_argument("--seeds", type=int, default=10, help="runs with sampled errors of vision (default: 10)")
     parser.add_argument(
         "--recording",
@@ -47,7 +47,6 @@ def add_parser(subparsers: Subparsers) -> None:
         help="EuRoC's V1_01 (default: shared/data/euroc_v101_imu next to the project)",
     )
     add_report_options(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:
@@ -70,10 +69,7 @@ def main(args: argparse.Namespace) -> None:
     _write_causes(report, errors, runs, wider, _runs("synthetic forces", synthetic, steady, config, imu), imu, config)
     _write_biases(report, flight.recorded, truth, runs)
     _write_recorded(report, runs[0], real_run(0, flight, flight.recorded, config, imu), flight.recorded, truth)
-    if args.out is not None:
-        report.save(args.out)
-    if args.docs:
-        report.save_to_docs("real-imu")
+    report.write(args, "real-imu")
 
 
 def _runs(what: str, flights: list[Flight], truth: Truth, config: SmootherConfig, imu: Imu) -> list[RealRun]:
@@ -222,7 +218,7 @@ def _write_recorded(report: Report, run: RealRun, by_file: RealRun, recorded: Tr
 
 
 def _squares(runs: list[RealRun], uncertainty: dict[tuple[str, int], Float] | None = None) -> Squares:
-    """Of all misses; a truth's own covariances, by name and number of the state, are added where there are some."""
+    """Return the squares of all errors, with the truth's own covariances added, by name and number of the state."""
     squares = Squares()
     for seed, run in enumerate(runs):
         for miss in run.misses:
@@ -249,7 +245,7 @@ def _uncertainty(found: Reconstruction, runs: list[RealRun]) -> dict[tuple[str, 
 
 
 def _scattered(runs: list[RealRun], name: str) -> float:
-    """Mean squared distance from the mean error of all runs, of which there are infinitely many."""
+    """Mean squared distance from the mean error of all runs, corrected for the number of runs."""
     by_number: dict[int, list[Miss]] = defaultdict(list)
     for run in runs:
         for miss in run.misses:
@@ -271,7 +267,7 @@ def _mean(squares: Squares, name: str) -> tuple[str, str, str]:
 
 
 def _apart(found: Float, reference: Float) -> tuple[float, float]:
-    """Median and 95th percentile of how far biases (S, N) are from others (N,)."""
+    """Median and 95th percentile of the differences of biases (S, N) from others (N,)."""
     away = np.abs(found - reference)
     return float(np.median(away)), float(np.percentile(away, 95.0))
 

@@ -28,7 +28,7 @@ class Miss:
     """Error of an estimate, and its reported covariance.
 
     Attributes:
-        name: what it is of.
+        name: of the quantity.
         number: of the state.
         error: (M,) truth less estimate.
         covariance: (M, M) as reported.
@@ -60,7 +60,7 @@ class RealRun:
 def real_run(seed: int, flight: Flight, truth: Truth, config: SmootherConfig, imu: Imu) -> RealRun:
     """Go through a flight, with vision sampled around a truth; the biases are zero at the start."""
     rng = np.random.default_rng([seed, 11])
-    smoother = _started(flight, truth, config, imu, rng)
+    smoother = _initialised(flight, truth, config, imu, rng)
     misses: list[Miss] = []
     states, refused = [smoother.state()], 0
     references = dict.fromkeys(_INTERVALS_S, 0)  # seconds -> number of the state from which the motion is measured
@@ -91,8 +91,8 @@ def real_run(seed: int, flight: Flight, truth: Truth, config: SmootherConfig, im
     return RealRun(misses, gyro_biases, accel_biases, refused)
 
 
-def _started(flight: Flight, truth: Truth, config: SmootherConfig, imu: Imu, rng: np.random.Generator) -> Smoother:
-    """At the truth, but for errors of the start."""
+def _initialised(flight: Flight, truth: Truth, config: SmootherConfig, imu: Imu, rng: np.random.Generator) -> Smoother:
+    """Return a smoother at the truth with errors of the initial state."""
     pose = np.ascontiguousarray(truth.world_T_body[0])
     covariance = origin_covariance(pose[:3, :3], _TILT_SIGMA)
     off = np.linalg.cholesky(covariance) @ rng.standard_normal(6)
@@ -125,7 +125,7 @@ def _misses_of_state(smoother: Smoother, truth: Truth, k: int) -> Iterator[Miss]
 
 
 def _motion_error(smoother: Smoother, flight: Flight, truth: Truth, start: int, end: int) -> tuple[Float, Float]:
-    """Of the motion between two states: error (6,) and covariance (6, 6), in body at its end."""
+    """Return error (6,) and covariance (6, 6) of the motion between two states, in body at its end."""
     start_ns, end_ns = flight.stamps_ns[start], flight.stamps_ns[end]
     estimated = se3_inverse(smoother.pose(start_ns)) @ smoother.pose(end_ns)
     return se3_log(se3_inverse(estimated) @ _moved(truth, start, end)), smoother.covariance_since(start_ns)

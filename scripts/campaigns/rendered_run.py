@@ -23,7 +23,7 @@ from graphvio.simulation.motion import MotionStates
 from graphvio.sources import open_source
 
 CALIBRATION_ERROR_SHARE = 2e-4
-"""Of these runs: it stands for errors of tracking that motions have in common. The simulator's calibration has none."""
+"""Stands for errors of tracking that motions have in common; the simulator's calibration has none."""
 WITHOUT_SHARE = ", share 0"
 _WARM_UP_S = 2.0
 _WINDOW_S = {1: 1.0, 10: 10.0}  # lag that still has the state from which the motion is measured
@@ -65,7 +65,7 @@ class _Run:
         self._start_ns, self._odometry, self._track, self._states = start_ns, odometry, track, states
 
     def squares(self, measurements: list[Measurement], seconds: int) -> Iterator[Square]:
-        """Those of the motion over so many seconds; with one second, those of the states, too."""
+        """Yield the squares of motions over so many seconds and, with one second, of the states."""
         for measurement in measurements:
             estimate = self._odometry.process(measurement)
             if estimate is None:

@@ -37,7 +37,7 @@ _Figures = Mapping[str, float | int | str | None]
 
 def add_parser(subparsers: Subparsers) -> None:
     """Add ``soak``."""
-    parser = add_command(subparsers, "soak", "memory, latency and losses of the live system over hours", __doc__)
+    parser = add_command(subparsers, "soak", "memory, latency and losses of the live system over hours", __doc__, main)
     parser.add_argument("--framesets", type=int, default=20_000, help="number of framesets (default: 20000)")
     parser.add_argument("--real-time", action="store_true", help="at the sensors' pace, not as fast as possible")
     parser.add_argument(
@@ -45,7 +45,6 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     add_report_options(parser)
     add_data_option(parser)
-    parser.set_defaults(run=main)
 
 
 def main(args: argparse.Namespace) -> None:
@@ -70,10 +69,7 @@ def main(args: argparse.Namespace) -> None:
     )
     if services_summary:
         report.add(services_summary)
-    if args.out is not None:
-        report.save(args.out)
-    if args.docs:
-        report.save_to_docs("soak-services" if args.services else "soak")
+    report.write(args, "soak-services" if args.services else "soak")
 
 
 def _soak(

@@ -15,7 +15,7 @@ FRAMES_HZ = 20
 
 
 class Walk:
-    """A walk's truth, and what an IMU measures on it.
+    """A walk's truth and the measurements of an IMU on it.
 
     Args:
         seed: of the IMU; the scenes take turns.
