@@ -40,7 +40,7 @@ def command(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["compare", *map(str, arguments)], env={"COLUMNS": "160"})
 
 
-def test_results_are_held_against_one_truth(files: dict[str, Path], tmp_path: Path) -> None:
+def test_compare_several_results_with_one_truth(files: dict[str, Path], tmp_path: Path) -> None:
     plot = tmp_path / "compared.png"
     done = command(files["good"], files["bad"], files["folder"], "--truth", files["truth"], "--plot", plot)
     assert done.exit_code == 0, done.output
@@ -53,27 +53,27 @@ def test_results_are_held_against_one_truth(files: dict[str, Path], tmp_path: Pa
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
 
 
-def test_folders_may_give_their_smoothed_poses(files: dict[str, Path]) -> None:
+def test_compare_smoothed_uses_smoothed_poses(files: dict[str, Path]) -> None:
     done = command(files["good"], files["folder"], "--truth", files["truth"], "--smoothed")
     (row,) = [row.split("│") for row in done.stdout.splitlines() if "walk-1" in row]
     assert float(row[3]) == pytest.approx(0.5, rel=0.05)
 
 
-def test_without_a_truth_the_first_is_the_reference(files: dict[str, Path]) -> None:
+def test_compare_without_truth_takes_the_first_as_reference(files: dict[str, Path]) -> None:
     done = command(files["truth"], files["good"])
     assert done.exit_code == 0
     assert "truth" not in done.stdout
     assert "good" in done.stdout
 
 
-def test_a_gate_tells_what_is_above_it(files: dict[str, Path]) -> None:
+def test_compare_max_ate_names_results_above(files: dict[str, Path]) -> None:
     done = command(files["good"], files["bad"], "--truth", files["truth"], "--max-ate", "0.03")
     assert done.exit_code == 4
     assert "ATE above 0.03 m: bad" in done.stderr
     assert command(files["good"], "--truth", files["truth"], "--max-ate", "0.03").exit_code == 0
 
 
-def test_one_that_cannot_be_compared_is_told_and_stops_no_other(files: dict[str, Path], tmp_path: Path) -> None:
+def test_compare_unmatched_result_is_reported_and_others_compared(files: dict[str, Path], tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere.txt"
     other = walk(0.01)
     save_trajectory(Trajectory(other.stamps_ns + 10**15, other.nav_T_body), elsewhere)
@@ -83,5 +83,5 @@ def test_one_that_cannot_be_compared_is_told_and_stops_no_other(files: dict[str,
     assert "good" in done.stdout
 
 
-def test_one_result_alone_is_refused(files: dict[str, Path]) -> None:
+def test_compare_one_result_is_refused(files: dict[str, Path]) -> None:
     assert "nothing to compare" in str(command(files["good"]).exception)

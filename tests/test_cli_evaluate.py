@@ -20,7 +20,7 @@ def walk(scale: float = 1.0) -> Trajectory:
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """Exit code of the program itself, as a shell would see it."""
+    """Return the exit code of the program, as a shell would see it."""
     monkeypatch.setattr("sys.argv", ["graphvio", *map(str, arguments)])
     monkeypatch.setenv("COLUMNS", "120")
     with pytest.raises(SystemExit) as ended:
@@ -39,7 +39,7 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path / "estimate.txt", tmp_path / "data.csv"
 
 
-def test_table_figures_and_picture(
+def test_evaluate_writes_table_figures_and_picture(
     files: tuple[Path, Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -62,7 +62,7 @@ def test_table_figures_and_picture(
     ("text", "message"),
     [("", "holds no pose"), ("1 2 3\n", "line 1: has 3 columns"), ("5.0 0 0 0 0 0 0 1\n", "at least 3 are needed")],
 )
-def test_bad_files_give_one_line(
+def test_evaluate_bad_file_is_one_line(
     files: tuple[Path, Path],
     text: str,
     message: str,
@@ -77,7 +77,7 @@ def test_bad_files_give_one_line(
     assert shown.out == ""
 
 
-def test_gap_of_the_truth_can_be_chosen(
+def test_evaluate_max_gap_limits_interpolation(
     files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save_trajectory(walk().select(np.arange(0, 400, 10)), tmp_path / "sparse.txt")
@@ -90,7 +90,7 @@ def test_gap_of_the_truth_can_be_chosen(
         assert json.loads((tmp_path / "e.json").read_text())["associated"] == expected
 
 
-def test_unwritable_json(
+def test_evaluate_unwritable_json_is_an_error(
     files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(monkeypatch, "evaluate", *files, "--json", files[0].parent / "no" / "e.json") == 2

@@ -1,4 +1,4 @@
-"""``graphvio live``, as it is typed: results, ends, and what cannot be done in one line."""
+"""``graphvio live`` as it is typed: results, ends of runs, and refusals in one line."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from graphvio.sessions.store import open_store
 pytest.importorskip("mcap")
 pytest.importorskip("prometheus_client")
 
-SOON_S = 100.0  # until then an end is waited for; only a test that fails takes so long
+SOON_S = 100.0  # only a test that fails takes so long
 MAIN = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -48,7 +48,7 @@ def graphvio(*arguments: object) -> list[str]:
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twenty seconds of noise at rest."""
+    """Twenty seconds of noise at a standstill."""
     return write_euroc(tmp_path_factory.mktemp("cli_live") / "walk", frames=400, pairs=1)
 
 
@@ -62,7 +62,7 @@ def live(*arguments: object) -> Any:
 
 
 def refused(*arguments: object) -> str:
-    """The one line, exit code 2; as `graphvio.cli.main` makes it of the error."""
+    """Return the one line that `graphvio.cli.main` prints with exit code 2."""
     done = subprocess.run(graphvio("live", *arguments), capture_output=True, text=True, timeout=SOON_S)
     assert done.returncode == 2, (done.stdout, done.stderr)
     (line,) = done.stderr.splitlines()
@@ -70,7 +70,7 @@ def refused(*arguments: object) -> str:
     return line
 
 
-def until(is_so: Callable[[], Any], process: subprocess.Popen[Any]) -> None:
+def wait_until(is_so: Callable[[], Any], process: subprocess.Popen[Any]) -> None:
     end_s = time.monotonic() + SOON_S
     while not is_so():
         assert process.poll() is None
@@ -82,14 +82,14 @@ def until(is_so: Callable[[], Any], process: subprocess.Popen[Any]) -> None:
 
 
 def recording_process(recording: Path, out: Path, *options: object) -> subprocess.Popen[str]:
-    """One that records, and has begun to."""
+    """Start a process that records, and wait until it has begun to."""
     process = subprocess.Popen(
         graphvio("live", f"replay:{recording}", "--record", out, *options),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
-    until(lambda: out.exists() and out.stat().st_size > 200_000, process)
+    wait_until(lambda: out.exists() and out.stat().st_size > 200_000, process)
     return process
 
 
@@ -98,22 +98,22 @@ def framesets_in(session: Path) -> int:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])
-def test_a_signal_ends_it_with_everything_saved(recording: Path, tmp_path: Path, number: signal.Signals) -> None:
+def test_live_at_a_signal_saves_everything(recording: Path, tmp_path: Path, number: signal.Signals) -> None:
     out = tmp_path / "walk.mcap"
     process = recording_process(recording, out)
     process.send_signal(number)
-    told, errors = process.communicate(timeout=SOON_S)
+    output, errors = process.communicate(timeout=SOON_S)
     assert process.returncode == 0, errors
     assert "Traceback" not in errors
     assert open_store(out).is_whole
     framesets = framesets_in(out)
     assert 0 < framesets < 400
-    assert f"{out}: " in told.splitlines()[-1]
-    assert told.splitlines()[-1].endswith(f" {framesets} framesets")
-    assert f" of {framesets} framesets, latency p99 " in told.splitlines()[-2]
+    assert f"{out}: " in output.splitlines()[-1]
+    assert output.splitlines()[-1].endswith(f" {framesets} framesets")
+    assert f" of {framesets} framesets, latency p99 " in output.splitlines()[-2]
 
 
-def test_what_a_killed_one_recorded_can_be_read(recording: Path, tmp_path: Path) -> None:
+def test_live_killed_leaves_a_readable_recording(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "walk.mcap"
     process = recording_process(recording, out)
     process.kill()
@@ -129,15 +129,15 @@ signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 import graphvio.warmup
 graphvio.warmup.warm_up = lambda *_: None
 from graphvio.sessions import mcap_storage
-mcap_storage._CHUNK_BYTES = 20_000  # what is on the disk must not depend on how fast this machine is
+mcap_storage._CHUNK_BYTES = 20_000  # so that the size on the disk does not depend on speed
 from graphvio.cli import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, resource.RLIM_INFINITY))
 main()
 """
 
 
-def test_a_full_disk_ends_the_recording_and_not_the_run(recording: Path, tmp_path: Path) -> None:
-    """A limit on the size of files is as good as a full disk."""
+def test_live_full_disk_ends_only_the_recording(recording: Path, tmp_path: Path) -> None:
+    """A limit on the size of files stands for a full disk."""
     out = tmp_path / "full.mcap"
     done = subprocess.run(
         [sys.executable, "-c", _LIMITED, "live", f"replay:{recording}?speed=max&to_s=5", "--record", str(out)],
@@ -147,14 +147,14 @@ def test_a_full_disk_ends_the_recording_and_not_the_run(recording: Path, tmp_pat
     )
     assert done.returncode == 3, done.stderr
     assert "Traceback" not in done.stderr
-    told = re.search(r"recording stopped .*: (\d+) framesets of 101$", done.stderr.splitlines()[-1])
-    assert told is not None, done.stderr
-    assert int(told[1]) == framesets_in(out)
+    stopped = re.search(r"recording stopped .*: (\d+) framesets of 101$", done.stderr.splitlines()[-1])
+    assert stopped is not None, done.stderr
+    assert int(stopped[1]) == framesets_in(out)
     assert "101 estimates of 101 framesets" in done.stdout
     assert 5 < framesets_in(out) < 101
 
 
-def test_a_panel_is_drawn_in_a_terminal(recording: Path) -> None:
+def test_live_in_a_terminal_shows_a_panel(recording: Path) -> None:
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
         graphvio("live", f"replay:{recording}", "--health-port", 0),
@@ -174,7 +174,7 @@ def test_a_panel_is_drawn_in_a_terminal(recording: Path) -> None:
 
     reader = threading.Thread(target=read, daemon=True)
     reader.start()
-    until(lambda: shown.count(b"latency") >= 2 and b"given up" in shown, process)
+    wait_until(lambda: shown.count(b"latency") >= 2 and b"given up" in shown, process)
     process.send_signal(signal.SIGINT)
     assert process.wait(SOON_S) == 0
     reader.join(SOON_S)
@@ -187,15 +187,15 @@ def test_a_panel_is_drawn_in_a_terminal(recording: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (["simulater"], "there is no live source 'simulater'"),
         (["replay:nowhere"], "nowhere"),
         ([], "give a SOURCE, or --list"),
     ],
 )
-def test_what_cannot_be_run_is_one_line(arguments: list[str], told: str) -> None:
-    assert told in refused(*arguments)
+def test_live_wrong_source_is_one_line(arguments: list[str], message: str) -> None:
+    assert message in refused(*arguments)
 
 
 # ---------------------------------------------------------------- in this process
@@ -203,7 +203,7 @@ def test_what_cannot_be_run_is_one_line(arguments: list[str], told: str) -> None
 
 @pytest.mark.usefixtures("cold")
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (["replay:{recording}?sped=2"], "replay has no option 'sped'"),
         (["replay:{recording}", "--record", "walk.bag"], "name it .mcap"),
@@ -212,13 +212,13 @@ def test_what_cannot_be_run_is_one_line(arguments: list[str], told: str) -> None
         (["replay:{recording}", "--rig", "nothing.yaml"], "nothing.yaml"),
     ],
 )
-def test_what_cannot_be_opened_is_an_error_that_is_told(recording: Path, arguments: list[str], told: str) -> None:
+def test_live_wrong_option_is_an_error(recording: Path, arguments: list[str], message: str) -> None:
     done = live(*(each.format(recording=recording) for each in arguments))
     assert isinstance(done.exception, GraphvioError)
-    assert told in str(done.exception)
+    assert message in str(done.exception)
 
 
-def test_a_recording_that_exists_is_told_before_a_source_is_opened(tmp_path: Path) -> None:
+def test_live_existing_recording_is_refused_before_the_source_opens(tmp_path: Path) -> None:
     out = tmp_path / "walk.mcap"
     out.touch()
     done = live("replay:no-recording", "--record", out)
@@ -227,7 +227,7 @@ def test_a_recording_that_exists_is_told_before_a_source_is_opened(tmp_path: Pat
 
 
 @pytest.mark.usefixtures("cold")
-def test_what_fails_in_a_thread_is_told_and_what_came_is_saved(
+def test_live_error_in_a_thread_is_raised_and_the_recording_saved(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from graphvio.odometry import Odometry
@@ -251,14 +251,14 @@ def test_what_fails_in_a_thread_is_told_and_what_came_is_saved(
 
 
 @pytest.mark.usefixtures("cold")
-def test_it_ends_after_the_time_that_was_asked_for(recording: Path) -> None:
+def test_live_ends_after_the_given_duration(recording: Path) -> None:
     done = live(f"replay:{recording}?speed=0.1", "--for", "0.5")
     assert done.exit_code == 0, done.exception
     assert "estimates of" in done.stdout
 
 
 @pytest.mark.usefixtures("cold")
-def test_a_wrong_port_leaves_no_thread_and_no_recording(recording: Path, tmp_path: Path) -> None:
+def test_live_port_in_use_leaves_no_thread_and_no_recording(recording: Path, tmp_path: Path) -> None:
     from graphvio.live.health import HealthServer
 
     taken, out = HealthServer(dict), tmp_path / "walk.mcap"
@@ -269,7 +269,7 @@ def test_a_wrong_port_leaves_no_thread_and_no_recording(recording: Path, tmp_pat
     assert not [t.name for t in threading.enumerate() if t.name in ("graphvio-capture", "graphvio-odometry")]
 
 
-def test_all_kinds_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_list_names_all_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
     folder = Path(str(sources.__file__)).parent
     there = tuple(kind for kind in sources.KINDS if (folder / f"{kind}.py").exists())
     assert {"replay", "simulator"} <= set(there)
@@ -280,7 +280,7 @@ def test_all_kinds_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "simulator  simulator:room   simulated rig, scene room" in done.stdout
 
 
-def test_a_library_that_is_missing_is_listed_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_list_names_a_missing_library(monkeypatch: pytest.MonkeyPatch) -> None:
     from graphvio.errors import MissingExtraError
     from graphvio.live.sources import replay, simulator
 
@@ -301,7 +301,7 @@ def test_a_library_that_is_missing_is_listed_as_that(monkeypatch: pytest.MonkeyP
 # ---------------------------------------------------------------- signals
 
 
-def test_the_first_signal_is_a_wish_and_the_second_acts_as_ever() -> None:
+def test_stop_signals_second_interrupt_is_raised() -> None:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with StopSignals() as signals:
@@ -314,7 +314,7 @@ def test_the_first_signal_is_a_wish_and_the_second_acts_as_ever() -> None:
         signal.signal(signal.SIGINT, before)
 
 
-def test_a_signal_that_is_ignored_stays_so() -> None:
+def test_stop_signals_ignored_signal_stays_ignored() -> None:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with StopSignals() as signals:
@@ -328,7 +328,7 @@ def test_a_signal_that_is_ignored_stays_so() -> None:
         signal.signal(signal.SIGINT, before)
 
 
-# ---------------------------------------------------------------- what is shown
+# ---------------------------------------------------------------- display
 
 FIGURES: dict[str, float | int | str | None] = {
     "status": "tracking", "epoch": 1, "estimate_hz": 19.5, "frameset_hz": 20.0, "imu_hz": 200.0, "latency_p50_ms": 31.2,
@@ -340,7 +340,7 @@ FIGURES: dict[str, float | int | str | None] = {
 }  # fmt: skip
 
 
-def test_all_of_it_in_one_line() -> None:
+def test_line_of_has_all_figures() -> None:
     line = line_of(FIGURES)
     assert "\n" not in line
     for part in (
@@ -354,19 +354,19 @@ def test_all_of_it_in_one_line() -> None:
     )
 
 
-def test_before_anything_is_known() -> None:
+def test_line_of_without_figures_has_no_none() -> None:
     assert line_of({}).startswith("waiting ")
     assert "None" not in line_of({"temperature_c": None, "latency_p50_ms": None, "corner_share": 1.0})
     assert summary_of({}) == "0 estimates of 0 framesets, latency p99 - ms"
 
 
-def test_why_a_recording_stopped_takes_the_place_of_its_size() -> None:
+def test_line_of_stopped_recording_says_why() -> None:
     line = line_of({**FIGURES, "recording_stopped": "walk.mcap: recording stopped (No space left on device)"})
     assert "No space left on device" in line
     assert "GB free" not in line
 
 
-def test_messages_of_one_kind_do_not_flood_the_terminal() -> None:
+def test_dashboard_repeated_events_are_shown_once() -> None:
     events: Broadcast[Event] = Broadcast()
     dashboard = Dashboard("walk", events.subscribe(64))
     shown = Console(record=True, file=open(os.devnull, "w"), width=200)  # noqa: PTH123, SIM115
@@ -374,16 +374,16 @@ def test_messages_of_one_kind_do_not_flood_the_terminal() -> None:
     for i in range(20):
         events.publish(Event(i, "vision_gated", f"[{i}]"))
     events.publish(Event(20, "device_lost", "front was unplugged"))
-    dashboard.draw(FIGURES, [])
+    dashboard.show(FIGURES, [])
     lines = shown.export_text().splitlines()
     assert lines[:2] == ["vision_gated: [0]", "device_lost: front was unplugged"]
     assert lines[2].startswith("tracking")
     assert len(lines) == 3
 
 
-def test_the_panel_has_devices_and_messages() -> None:
+def test_dashboard_panel_has_devices_and_events() -> None:
     dashboard = Dashboard("walk", Broadcast[Event]().subscribe(1))
-    dashboard._tell(Event(0, "stage_stuck", "output has worked on one thing"), 100.0)
+    dashboard._show_event(Event(0, "stage_stuck", "output has worked on one thing"), 100.0)
     console = Console(record=True, file=open(os.devnull, "w"), width=150)  # noqa: PTH123, SIM115
     console.print(dashboard._panel(FIGURES, [DeviceHealth("front", False, "unplugged", {"dropped": 3})]))
     text = console.export_text()

@@ -1,4 +1,4 @@
-"""``graphvio serve``, as it is typed: a client takes keyframes and corrects; wrong settings are told at once."""
+"""``graphvio serve`` as it is typed: a client takes keyframes and corrects; wrong settings are refused at once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from graphvio.cli.run import EXIT_INTERRUPTED
+from graphvio.cli.shared import EXIT_INTERRUPTED
 from graphvio.errors import ServiceError
 
 pytest.importorskip("grpc")
@@ -34,17 +34,17 @@ def serve(*arguments: object) -> subprocess.Popen[str]:
 
 
 def address_of(process: subprocess.Popen[str]) -> str:
-    """What the command tells of its service."""
-    return told(process, "gRPC: ").removeprefix("gRPC: ")
+    """Return the address of gRPC that the command prints."""
+    return printed(process, "gRPC: ").removeprefix("gRPC: ")
 
 
-def told(process: subprocess.Popen[str], start: str) -> str:
-    """The next line that begins so."""
+def printed(process: subprocess.Popen[str], start: str) -> str:
+    """Return the next line that begins so."""
     assert process.stderr is not None
     return next(line for line in process.stderr if line.startswith(start)).strip()
 
 
-def test_keyframes_go_out_and_a_correction_comes_in(room_walk: Path) -> None:
+def test_serve_sends_keyframes_and_takes_a_correction(room_walk: Path) -> None:
     process = serve(f"replay:{room_walk}?speed=0.7", "--port", 0)
     try:
         with Client(address_of(process)) as client:
@@ -66,13 +66,13 @@ def test_keyframes_go_out_and_a_correction_comes_in(room_walk: Path) -> None:
     np.testing.assert_allclose(results[0].map_T_odom, map_T_odom, atol=1e-9)
 
 
-def test_a_slow_reader_gets_the_last_keyframe(room_walk: Path) -> None:
+def test_serve_slow_reader_gets_the_last_keyframe(room_walk: Path) -> None:
     process = serve(f"replay:{room_walk}?speed=0.7", "--port", 0)
     try:
         with Client(address_of(process), patience_s=0.0) as client:
             stream = client.keyframes(with_images=True)
             ids = [next(stream).id]
-            assert "60 s at most" in told(process, "waiting for")
+            assert "60 s at most" in printed(process, "waiting for")
             info = client.info()
             ids += [keyframe.id for keyframe in stream]
         assert process.wait(SOON_S) == 0
@@ -82,7 +82,7 @@ def test_a_slow_reader_gets_the_last_keyframe(room_walk: Path) -> None:
     assert ids == list(range(info.next_keyframe_id))
 
 
-def test_a_second_ctrl_c_does_not_wait_for_readers(room_walk: Path) -> None:
+def test_serve_second_ctrl_c_does_not_wait_for_readers(room_walk: Path) -> None:
     process = serve(f"replay:{room_walk}?speed=0.7", "--port", 0)
     try:
         with Client(address_of(process), patience_s=0.0) as client:
@@ -91,10 +91,10 @@ def test_a_second_ctrl_c_does_not_wait_for_readers(room_walk: Path) -> None:
             while client.info().next_keyframe_id < 4:  # more than is on its way
                 time.sleep(0.05)
             process.send_signal(signal.SIGINT)
-            told(process, "waiting for")
+            printed(process, "waiting for")
             process.send_signal(signal.SIGINT)
             assert process.wait(SOON_S) == EXIT_INTERRUPTED
-            with pytest.raises(ServiceError):  # the end is missing, and that is told
+            with pytest.raises(ServiceError):  # the end is missing
                 list(stream)
     finally:
         process.kill()
@@ -109,9 +109,7 @@ def test_a_second_ctrl_c_does_not_wait_for_readers(room_walk: Path) -> None:
         (("--png",), "--record"),
     ],
 )
-def test_what_cannot_be_is_one_line_and_no_sensor_is_started(
-    room_walk: Path, arguments: tuple[str, ...], expected: str
-) -> None:
+def test_serve_wrong_option_is_one_line(room_walk: Path, arguments: tuple[str, ...], expected: str) -> None:
     process = serve(f"replay:{room_walk}", *arguments)
     _, errors = process.communicate(timeout=SOON_S)
     assert process.returncode == 2
@@ -119,7 +117,7 @@ def test_what_cannot_be_is_one_line_and_no_sensor_is_started(
     assert len(errors.strip().splitlines()) == 1
 
 
-def test_keys_and_the_port_are_tried_before_anything_is_recorded(room_walk: Path, tmp_path: Path) -> None:
+def test_serve_wrong_keys_or_port_leave_no_recording(room_walk: Path, tmp_path: Path) -> None:
     def refusal(*arguments: object) -> str:
         process = serve(f"replay:{room_walk}", *arguments, "--record", tmp_path / "walk.mcap")
         _, errors = process.communicate(timeout=SOON_S)
@@ -142,6 +140,6 @@ def test_keys_and_the_port_are_tried_before_anything_is_recorded(room_walk: Path
         assert f"127.0.0.1:{port}: cannot be listened on" in refusal("--port", port)
 
 
-def test_nobody_serves() -> None:
+def test_client_without_a_server_is_an_error() -> None:
     with pytest.raises(ServiceError, match="nothing listens there"):
         Client("127.0.0.1:1", timeout_s=1.0, patience_s=0.1)

@@ -1,4 +1,4 @@
-"""``graphvio slam``, as it is typed: the SLAM in its own process makes a map, and finds its way in one that is kept."""
+"""``graphvio slam`` as it is typed: the SLAM in its own process makes a map, and localises in a saved one."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def slam(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def made(room_walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A map of the walk, made with all that can run beside."""
+    """A map of the walk, made while all services run."""
     out = tmp_path_factory.mktemp("slam") / "map"
     web = free_options()
     shown = ("--save-rrd", out.parent / "shown.rrd", "--web", web.port)
@@ -49,9 +49,7 @@ def made(room_walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_map_is_made_and_its_paths_are_those_of_the_odometry_until_a_loop_is_closed(
-    made: Path, room_walk: Path
-) -> None:
+def test_slam_makes_a_map_with_the_odometrys_path(made: Path, room_walk: Path) -> None:
     odom, online, kept = (load_trajectory(made / f"{name}.txt") for name in ("odometry", "online", "trajectory"))
     source = open_source(room_walk)
     assert len(odom) > 0.8 * source.frameset_count
@@ -62,7 +60,7 @@ def test_a_map_is_made_and_its_paths_are_those_of_the_odometry_until_a_loop_is_c
     assert (made.parent / "shown.rrd").stat().st_size > 10_000
 
 
-def test_the_way_is_found_in_a_saved_map(made: Path, room_walk: Path, tmp_path: Path) -> None:
+def test_slam_localises_in_a_saved_map(made: Path, room_walk: Path, tmp_path: Path) -> None:
     """From the middle of the walk, where the new odom frame has nothing to do with the map's."""
     done = slam(f"replay:{room_walk}?from_s=1.5&speed=0.3", "--map", made, "--out", tmp_path / "again")
     assert done.returncode == 0, done.stderr
@@ -78,7 +76,7 @@ def test_the_way_is_found_in_a_saved_map(made: Path, room_walk: Path, tmp_path: 
     assert np.linalg.norm(online.positions[0] - start) > 0.2
 
 
-def test_a_map_that_is_none_is_told_before_a_source_is_opened(tmp_path: Path) -> None:
+def test_slam_missing_map_is_refused_before_the_source_opens(tmp_path: Path) -> None:
     done = slam("replay:no-recording", "--map", tmp_path / "nowhere")
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
@@ -109,7 +107,7 @@ if __name__ == "__main__":
 
 @contextmanager
 def running(code: str, temporary: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """One that leads a group of processes, with a folder of its own for temporary files."""
+    """Run a process that leads a group, with a folder of its own for temporary files."""
     temporary.mkdir()
     process = subprocess.Popen(
         [sys.executable, "-c", code, "slam", *map(str, arguments)],
@@ -126,12 +124,12 @@ def running(code: str, temporary: Path, *arguments: object) -> Iterator[subproce
 
 
 def slam_of(process: subprocess.Popen[str]) -> int | None:
-    """The process in which its SLAM runs."""
+    """Return the id of the process in which the SLAM runs."""
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     return next((int(each) for each in children if "spawn_main" in Path(f"/proc/{each}/cmdline").read_text()), None)
 
 
-def test_an_odometry_whose_slam_is_killed_goes_on_to_its_end(room_walk: Path, tmp_path: Path) -> None:
+def test_slam_killed_leaves_the_odometry_running(room_walk: Path, tmp_path: Path) -> None:
     out, temporary = tmp_path / "map", tmp_path / "temporary"
     web = free_options()
     with running(_MAIN, temporary, f"replay:{room_walk}?speed=0.5", "--out", out, "--web", web.port) as process:
@@ -140,9 +138,9 @@ def test_an_odometry_whose_slam_is_killed_goes_on_to_its_end(room_walk: Path, tm
         killed = slam_of(process)
         assert killed is not None
         os.kill(killed, signal.SIGKILL)
-        told = process.stderr.read()
-        assert process.wait(SOON_S) == 3, told
-    (line,) = [line for line in told.splitlines() if line.startswith("graphvio: ")]
+        errors = process.stderr.read()
+        assert process.wait(SOON_S) == 3, errors
+    (line,) = [line for line in errors.splitlines() if line.startswith("graphvio: ")]
     assert "the SLAM failed (exit code -9)" in line
     assert "the odometry goes on" in line
     assert {path.name for path in out.iterdir()} == {"odometry.txt", "online.txt"}
@@ -152,19 +150,19 @@ def test_an_odometry_whose_slam_is_killed_goes_on_to_its_end(room_walk: Path, tm
         assert probe.connect_ex(("127.0.0.1", web.port)) != 0
 
 
-def test_what_is_mapped_before_the_source_fails_is_saved(room_walk: Path, tmp_path: Path) -> None:
+def test_slam_failing_source_saves_the_map(room_walk: Path, tmp_path: Path) -> None:
     out, temporary = tmp_path / "map", tmp_path / "temporary"
     with running(_FAILING, temporary, f"replay:{room_walk}?speed=0.5", "--out", out) as process:
-        _, told = process.communicate(timeout=SOON_S)
-        assert process.returncode == 2, told
-    assert told.splitlines()[-1] == "graphvio: the device is broken"
-    assert "Traceback" not in told
+        _, errors = process.communicate(timeout=SOON_S)
+        assert process.returncode == 2, errors
+    assert errors.splitlines()[-1] == "graphvio: the device is broken"
+    assert "Traceback" not in errors
     assert json.loads((out / "map.json").read_text())["places"] > 0
     assert len(load_trajectory(out / "odometry.txt")) > 3
     assert not list(temporary.iterdir())
 
 
-def test_ctrl_c_while_the_slam_starts_ends_both_without_a_word(room_walk: Path, tmp_path: Path) -> None:
+def test_slam_ctrl_c_at_initialisation_ends_both_silently(room_walk: Path, tmp_path: Path) -> None:
     out, temporary = tmp_path / "map", tmp_path / "temporary"
     with running(_MAIN, temporary, f"replay:{room_walk}", "--out", out) as process:
         end_s = time.monotonic() + SOON_S
@@ -173,15 +171,15 @@ def test_ctrl_c_while_the_slam_starts_ends_both_without_a_word(room_walk: Path, 
             assert time.monotonic() < end_s
             time.sleep(0.01)
         os.killpg(process.pid, signal.SIGINT)
-        _, told = process.communicate(timeout=SOON_S)
-        assert process.returncode == 130, told
-    assert not told
+        _, errors = process.communicate(timeout=SOON_S)
+        assert process.returncode == 130, errors
+    assert not errors
     assert not out.exists()
     assert not list(temporary.iterdir())
 
 
-def test_a_signal_to_both_processes_ends_it_with_the_map_saved(room_walk: Path, tmp_path: Path) -> None:
-    """As service managers send it."""
+def test_slam_signal_to_both_processes_saves_the_map(room_walk: Path, tmp_path: Path) -> None:
+    """Service managers send signals so."""
     command = [sys.executable, "-c", "from graphvio.cli import main; main()", "slam", f"replay:{room_walk}?speed=0.2"]
     process = subprocess.Popen(
         [*command, "--out", str(tmp_path / "map")], stderr=subprocess.PIPE, text=True, start_new_session=True
@@ -192,8 +190,8 @@ def test_a_signal_to_both_processes_ends_it_with_the_map_saved(room_walk: Path, 
             if line.startswith("tracking"):
                 os.killpg(process.pid, signal.SIGTERM)
                 break
-        rest = process.stderr.read()
-        assert process.wait(SOON_S) == 0, rest
+        remaining = process.stderr.read()
+        assert process.wait(SOON_S) == 0, remaining
     finally:
         process.kill()
     assert (tmp_path / "map/map.json").is_file()

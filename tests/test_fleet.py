@@ -135,7 +135,7 @@ def done(folder: Path, config: Config, cluster: Any) -> Done:
     return Done(out, outcomes, killer)
 
 
-def test_all_others_arrive_and_are_those_of_one_process(
+def test_fleet_killed_worker_leaves_equal_results(
     done: Done, folder: Path, config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert done.killer.interrupted
@@ -167,7 +167,7 @@ def rows(database: Path) -> dict[str, list[Any]]:
         return {name: sorted(map(repr, file.execute(f"SELECT * FROM {name}"))) for name in tables}
 
 
-def test_the_table_tells_of_every_session(done: Done) -> None:
+def test_fleet_table_has_every_session(done: Done) -> None:
     with (done.out / "summary.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
     assert tuple(table[0]) == COLUMNS
@@ -194,7 +194,7 @@ def command(folder: Path, *arguments: object) -> Result:
     return CliRunner().invoke(app, ["fleet", "optimize", *map(str, [*arguments, *common])], env={"COLUMNS": "160"})
 
 
-def test_again_does_only_what_is_missing(done: Done, folder: Path, cluster: Any, tmp_path: Path) -> None:
+def test_fleet_again_does_only_what_is_missing(done: Done, folder: Path, cluster: Any, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(done.out, out)
     shutil.copytree(folder / "sessions", tmp_path / "sessions", copy_function=os.link)
@@ -221,7 +221,7 @@ def test_again_does_only_what_is_missing(done: Done, folder: Path, cluster: Any,
         assert rows(out / name / "database.db") == rows(done.out / name / "database.db")
 
 
-def test_workers_on_this_machine_and_other_input(folder: Path, tmp_path: Path) -> None:
+def test_fleet_other_input_is_refused(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "sessions").mkdir()
     shutil.copytree(folder / "sound", tmp_path / "sessions" / CORRUPT)
     arguments = (tmp_path / "sessions", "--out", tmp_path / "out", "--workers", 1)
@@ -233,7 +233,9 @@ def test_workers_on_this_machine_and_other_input(folder: Path, tmp_path: Path) -
     assert "holds results of other input (different: loops)" in other.output
 
 
-def test_storage_need_not_be_local(done: Done, folder: Path, config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fleet_remote_storage_has_equal_results(
+    done: Done, folder: Path, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
     memory = fsspec.filesystem("memory")
     memory.put(f"{folder}/sessions/walk-00/", "/recordings/walk-00/", recursive=True)
     assert list_sessions("memory://recordings") == [Listed("walk-00", "memory://recordings/walk-00")]
@@ -250,9 +252,7 @@ def test_storage_need_not_be_local(done: Done, folder: Path, config: Config, mon
 
 
 @pytest.mark.parametrize("scheme", ["", "file://", "memory://"])
-def test_a_file_that_cannot_be_written_whole_is_absent(
-    scheme: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_storage_failed_write_keeps_the_old_file(scheme: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     storage = Storage(f"{scheme}{tmp_path}/results")
     storage.write("a/b.txt", b"old")
     source = tmp_path / "source"
@@ -272,7 +272,7 @@ def test_a_file_that_cannot_be_written_whole_is_absent(
     assert storage.read("absent") is None
 
 
-def test_what_can_be_listed(folder: Path, tmp_path: Path) -> None:
+def test_list_sessions_folders_and_lists(folder: Path, tmp_path: Path) -> None:
     names = [each.name for each in list_sessions(str(folder / "sessions"))]
     assert names == [f"walk-{number:02d}" for number in range(SESSIONS)]
     listed = tmp_path / "list.txt"

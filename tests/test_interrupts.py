@@ -1,4 +1,4 @@
-"""Ctrl-C at any moment: a line that says what is there, and exit code 130."""
+"""Ctrl-C at any moment: a line that says what was saved, and exit code 130."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def cold(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def interrupted_kernel(*_: Any, **__: Any) -> NoReturn:
-    """What numba makes of Ctrl-C in a kernel, a function farther out having failed on that in turn."""
+    """Raise what numba does at Ctrl-C in a kernel, after an outer function has failed on that in turn."""
     try:
         try:
             raise KeyboardInterrupt
@@ -46,7 +46,7 @@ def interrupted_kernel(*_: Any, **__: Any) -> NoReturn:
 
 
 def interrupted_import(*_: Any, **__: Any) -> NoReturn:
-    """What pybind11 makes of Ctrl-C while a library is loaded."""
+    """Raise what pybind11 does at Ctrl-C while a library is loaded."""
     try:
         raise KeyboardInterrupt
     except KeyboardInterrupt as cause:
@@ -54,7 +54,7 @@ def interrupted_import(*_: Any, **__: Any) -> NoReturn:
 
 
 def interrupted_extra(*_: Any, **__: Any) -> NoReturn:
-    """An optional one."""
+    """Raise what an optional library does."""
     try:
         interrupted_import()
     except ImportError:
@@ -69,7 +69,7 @@ def broken(*_: Any, **__: Any) -> NoReturn:
     raise SystemError("bad argument to internal function")
 
 
-def test_an_interrupted_kernel_is_an_interrupt() -> None:
+def test_interruptible_kernel_is_an_interrupt() -> None:
     with pytest.raises(KeyboardInterrupt), interruptible():
         interrupted_kernel()
     with pytest.raises(SystemError, match="bad argument"), interruptible():
@@ -77,14 +77,14 @@ def test_an_interrupted_kernel_is_an_interrupt() -> None:
 
 
 @pytest.mark.parametrize("load", [interrupted_import, interrupted_extra])
-def test_an_interrupted_import_is_an_interrupt(load: Callable[[], NoReturn]) -> None:
+def test_interruptible_import_is_an_interrupt(load: Callable[[], NoReturn]) -> None:
     with pytest.raises(KeyboardInterrupt), interruptible():
         load()
     with pytest.raises(MissingExtraError), interruptible():
         missing()
 
 
-def test_a_recording_that_is_interrupted_can_be_read(
+def test_record_interrupted_leaves_a_readable_session(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from graphvio.odometry import Odometry
@@ -122,7 +122,7 @@ def test_run_interrupted_says_where_its_results_are(
     assert str(tmp_path / "out") in done.stderr
 
 
-def test_an_interrupt_anywhere_else_is_no_traceback(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_main_interrupted_has_no_traceback(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("graphvio.sources.description.describe", interrupted_kernel)
     monkeypatch.setattr(sys, "argv", ["graphvio", "info", str(recording)])
     with pytest.raises(SystemExit) as ended:
@@ -130,7 +130,7 @@ def test_an_interrupt_anywhere_else_is_no_traceback(recording: Path, monkeypatch
     assert ended.value.code == 130
 
 
-def test_an_interrupt_is_held_back_once() -> None:
+def test_held_interrupt_second_is_raised() -> None:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with HeldInterrupt() as held:
@@ -161,7 +161,7 @@ main()
 """
 
 
-def test_a_real_interrupt_ends_a_recording(recording: Path, tmp_path: Path) -> None:
+def test_record_real_interrupt_ends_the_process(recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "walk.mcap"
     code = _RECORDER.format(source=str(recording), out=str(out))
     with subprocess.Popen(

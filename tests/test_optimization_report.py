@@ -17,7 +17,7 @@ import pytest
 from synthetic import two_pair_rig
 
 from graphvio.arrays import Float
-from graphvio.cli.optimize import _tell
+from graphvio.cli.optimize import print_summary
 from graphvio.config import Config
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3, se3_exp, se3_inverse, so3_exp
@@ -341,7 +341,7 @@ def test_write_report_incomplete_session_is_a_doubt(
 def test_cli_prints_medians_and_calibration(
     one: Optimization, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    _tell(replace(one, corrections=[correction(0.01, 0.0, -0.005)]), tmp_path)
+    print_summary(replace(one, corrections=[correction(0.01, 0.0, -0.005)]), tmp_path)
     output = capsys.readouterr().out
     assert re.search(r"^cost \S+ -> \S+; median error per motion \S+ -> \S+ sigmas$", output, re.MULTILINE)
     assert "pair 1: turned by 0.573 degrees (sigma 0.057: 10.0 sigmas)" in output

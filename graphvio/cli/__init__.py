@@ -1,4 +1,4 @@
-"""The command line: one module per command; what is heavy is imported inside the command."""
+"""The command line: one module per command, which imports heavy packages when it is called."""
 
 import sys
 from typing import NoReturn
@@ -8,22 +8,20 @@ import typer
 from graphvio.cli.calibrate import calibrate, calibrate_trajectories
 from graphvio.cli.compare import compare
 from graphvio.cli.doctor import doctor
-from graphvio.cli.dump_config import dump_config
 from graphvio.cli.evaluate import evaluate
 from graphvio.cli.fleet import fleet
-from graphvio.cli.info import info
+from graphvio.cli.info import dump_config, info
 from graphvio.cli.live import live
 from graphvio.cli.optimize import optimize
 from graphvio.cli.record import convert, record
-from graphvio.cli.run import EXIT_INTERRUPTED, run
+from graphvio.cli.run import run
 from graphvio.cli.serve import serve
+from graphvio.cli.shared import EXIT_BAD_INPUT, EXIT_INTERRUPTED, warn
 from graphvio.cli.simulate import simulate
 from graphvio.cli.slam import slam
 from graphvio.cli.view import view
 from graphvio.errors import GraphvioError
 from graphvio.runtime import interruptible
-
-EXIT_BAD_INPUT = 2
 
 app = typer.Typer(
     name="graphvio",
@@ -54,7 +52,7 @@ app.command()(doctor)
 
 
 def main() -> None:
-    """Entry point: a user's mistake becomes one line and exit code 2; ``--verbose`` shows the traceback."""
+    """Run the program: a user's mistake becomes one line and exit code 2; ``--verbose`` shows the traceback."""
     try:
         with interruptible():
             code = app(standalone_mode=False)
@@ -71,11 +69,11 @@ def main() -> None:
         message = " ".join(usage().split())
         if not message:  # no command was given, and the help has been shown
             sys.exit(EXIT_BAD_INPUT)
-        _refuse(f"{message}  (graphvio --help tells what there is)")
+        _refuse(f"{message}  (graphvio --help lists the commands)")
     else:
         sys.exit(code if isinstance(code, int) else 0)
 
 
 def _refuse(message: str) -> NoReturn:
-    print(f"graphvio: {message}", file=sys.stderr)
+    warn(message)
     sys.exit(EXIT_BAD_INPUT)

@@ -8,19 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.shared import EXIT_INCOMPLETE, names_of, open_recording, warn
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from rich.table import Table
 
-    from graphvio.arrays import Float
-    from graphvio.calibration.camera_motions import SeparateMotions
-    from graphvio.calibration.guide import Advice
     from graphvio.calibration.nuisances import ScaleMode
     from graphvio.calibration.result import Calibration
-
-EXIT_PARTIAL = 3
 
 
 def calibrate(
@@ -29,14 +25,15 @@ def calibrate(
     topics: options.Topics = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", help="Write the corrected rig here (.yaml), and all numbers beside it.", metavar="FILE"),
+        typer.Option("--out", help="Write the corrected rig here (.yaml), and all numbers next to it.", metavar="FILE"),
     ] = None,
     report: options.ReportFolder = None,
     correct_imu: Annotated[
         bool, typer.Option("--correct-imu", help="Also correct the rotation against the IMU and the time offset.")
     ] = False,
     guide: Annotated[
-        bool, typer.Option("--guide", help="Tell all along which motions are still needed, and when it is enough.")
+        bool,
+        typer.Option("--guide", help="Say while reading which motions are still needed."),
     ] = False,
     scale: options.Scale = "auto",
     config: options.ConfigName = "default",
@@ -49,10 +46,10 @@ def calibrate(
     """Find where a rig's stereo pairs are relative to each other, from a recording; they need not share a view.
 
     Turn the rig about two axes while you walk, in a place with texture; half a minute is enough. The rig file must be
-    right about each pair's own two cameras; where it has the pairs does not matter. Each pair is compared with the IMU,
-    too, if there is one.
+    right about each pair's own two cameras; where it has the pairs does not matter. Each pair is also compared with the
+    IMU, if there is one.
 
-    Ends with exit code 0; with 2 where nothing can be found; with 3 where the motions tell a part only.
+    Ends with exit code 0; with 2 where nothing can be determined; with 3 where the motions determine a part only.
 
     Examples:
 
@@ -62,25 +59,25 @@ def calibrate(
     """
     from graphvio.calibration.calibrate import calibrate_pairs
     from graphvio.calibration.report.document import write_document
-    from graphvio.cli.run import open_recording
+    from graphvio.cli.calibration_progress import CalibrationProgress
     from graphvio.config import Config
     from graphvio.errors import CalibrationError
     from graphvio.rig_files import save_rig
     from graphvio.runtime import use_one_opencv_thread
     from graphvio.warmup import warm_up
 
-    _check_places(out, report, [] if rig is None else [rig])
+    _check_outputs(out, report, [] if rig is None else [rig])
     settings = Config.load(config)
-    opened = open_recording(source, rig, settings, pairs=pairs, no_imu=False, from_s=from_s, to_s=to_s, topics=topics)
+    opened = open_recording(source, rig, settings, pairs=pairs, from_s=from_s, to_s=to_s, topics=topics)
     if correct_imu and (out is None or opened.rig.imu is None):
         raise CalibrationError("--correct-imu wants --out FILE to write the rig to, and a recording with an IMU")
     mode = _scale_mode(scale)
     use_one_opencv_thread()
     warm_up(opened.rig.with_pairs([0]).without_imu(), settings)
     names = [pair.name for pair in opened.rig.pairs]
-    with _Following(opened.frameset_count, names if guide else None) as following:
-        found = calibrate_pairs(opened, config=settings, seed=seed, scale_mode=mode, on_frameset=following.on_frameset)
-    _tell(found)
+    with CalibrationProgress(opened.frameset_count, names if guide else None) as progress:
+        found = calibrate_pairs(opened, config=settings, seed=seed, scale_mode=mode, on_frameset=progress.on_frameset)
+    _print_result(found)
     if out is not None:
         numbers = out.with_suffix(".calibration.yaml")
         write_document(found, numbers)
@@ -88,16 +85,17 @@ def calibrate(
             save_rig(found.calibrated_rig(correct_imu), out)
             typer.echo(f"wrote {out}, and all numbers to {numbers}")
         else:
-            typer.echo(f"graphvio: {out} is not written, only {numbers}: the motions tell a part only", err=True)
+            warn(f"{out} is not written, only {numbers}: the motions determine a part only")
     if report is not None:
-        _report(found, report, opened.name, following.framesets)
-    _end(found)
+        _write_report(found, report, opened.name, progress.framesets)
+    if not found.is_complete:
+        raise typer.Exit(EXIT_INCOMPLETE)
 
 
 def calibrate_trajectories(
     trajectories: Annotated[list[Path], typer.Argument(help="Two or more: TUM, EuRoC, or csv with TUM's columns.")],
     same_clock: Annotated[
-        bool, typer.Option("--same-clock", help="All stamps are of one clock: no offset is looked for.")
+        bool, typer.Option("--same-clock", help="All stamps are of one clock: no offset is estimated.")
     ] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Write all numbers here (.yaml).", metavar="FILE")] = None,
     report: options.ReportFolder = None,
@@ -121,84 +119,23 @@ def calibrate_trajectories(
     from graphvio.trajectory_files import load_trajectory
 
     mode = _scale_mode(scale)
-    _check_places(out, report, trajectories)
+    _check_outputs(out, report, trajectories)
     read = [load_trajectory(path) for path in trajectories]
-    names = _names(trajectories)
-    with _working("relating clocks, motions and cameras"):
+    names = names_of(trajectories)
+    with _working("calibrating clocks and cameras"):
         found = calibrate_all(read, names, same_clock=same_clock, seed=seed, scale_mode=mode)
-    _tell(found)
+    _print_result(found)
     if out is not None:
         write_document(found, out)
         typer.echo(f"wrote {out}")
     if report is not None:
-        _report(found, report, ", ".join(names), len(read[0]))
-    _end(found)
-
-
-class _Following:
-    """A bar on a terminal while the recording is read, or with a guide what to do next; Ctrl-C ends the recording."""
-
-    _GUIDE_EVERY = 20  # framesets
-    _PLAIN_EVERY = 100  # framesets, where there is no terminal
-
-    def __init__(self, total: int, guided: list[str] | None) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        from graphvio.calibration.guide import Guide
-
-        self.framesets = 0
-        self._total = total
-        self._console = Console(stderr=True)
-        columns = (BarColumn(20), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-        self._bar = Progress(*columns, console=self._console, transient=True)
-        self._task = self._bar.add_task("each pair alone", total=total)
-        self._guide = None if guided is None else Guide(guided)
-        self._was_enough = False
-        self._advice: Advice | None = None
-        self._interrupted = False
-
-    def __enter__(self) -> _Following:
-        from graphvio.runtime import on_interrupt
-
-        self._restore = on_interrupt(self._interrupt)
-        if self._console.is_terminal:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._restore()
-        if self._console.is_terminal:
-            self._bar.stop()
-        if self._advice is not None and not self._was_enough:
-            self._console.print(f"frameset {self.framesets}: {self._advice.text}", soft_wrap=True, highlight=False)
-
-    def on_frameset(self, number: int, separate: SeparateMotions) -> bool:
-        """Show how far it is; whether to end."""
-        self.framesets = number
-        self._bar.update(self._task, completed=number)
-        if number == self._total:
-            self._bar.update(self._task, description="all together")
-            self._restore()  # from here on Ctrl-C ends the command
-        if self._guide is not None and number % self._GUIDE_EVERY == 0:
-            self._show(self._guide.advise(separate.motions()), number)
-        return self._interrupted
-
-    def _show(self, advice: Advice, number: int) -> None:
-        self._advice = advice
-        self._bar.update(self._task, description=advice.text)
-        newly_enough = advice.is_enough and not self._was_enough
-        self._was_enough = advice.is_enough
-        if newly_enough or (not self._console.is_terminal and number % self._PLAIN_EVERY == 0):
-            self._console.print(f"frameset {number}: {advice.text}", soft_wrap=True, highlight=False)
-
-    def _interrupt(self) -> None:
-        self._interrupted = True
-        self._console.print(f"ended at frameset {self.framesets} of {self._total}", soft_wrap=True, highlight=False)
+        _write_report(found, report, ", ".join(names), len(read[0]))
+    if not found.is_complete:
+        raise typer.Exit(EXIT_INCOMPLETE)
 
 
 def _working(text: str) -> AbstractContextManager[object]:
-    """Shows on a terminal that something is going on."""
+    """Show in a terminal that work is in progress."""
     from contextlib import nullcontext
 
     from rich.console import Console
@@ -219,8 +156,8 @@ def _scale_mode(text: str) -> ScaleMode:
     raise ConfigError(f"--scale {text}: give one of {', '.join(get_args(ScaleMode))}")
 
 
-def _check_places(out: Path | None, report: Path | None, inputs: list[Path]) -> None:
-    """Refuse places that cannot or should not be written before minutes are spent."""
+def _check_outputs(out: Path | None, report: Path | None, inputs: list[Path]) -> None:
+    """Refuse outputs that cannot or should not be written, before minutes are spent."""
     import os
 
     from graphvio.errors import CalibrationError
@@ -238,17 +175,12 @@ def _check_places(out: Path | None, report: Path | None, inputs: list[Path]) -> 
             raise CalibrationError(f"--report {report}: cannot be made; name a folder elsewhere")
 
 
-def _names(paths: list[Path]) -> list[str]:
-    """Names of files, with their folders' where these are the same."""
-    stems = [path.stem for path in paths]
-    return stems if len(set(stems)) == len(stems) else [str(path) for path in paths]
-
-
-def _tell(found: Calibration) -> None:
+def _print_result(found: Calibration) -> None:
     from rich.console import Console
 
-    console = Console(soft_wrap=True)
-    console.print(_table(found))
+    from graphvio.calibration.pair_calibration import size_in_words
+
+    Console(soft_wrap=True).print(_table(found))
     for (i, j), each in found.places.pairwise.items():
         errors = each.frame_errors_m if len(each.frames) else each.alignment_errors_m
         fits = each.frame_inlier if len(each.frames) else each.inlier
@@ -259,10 +191,10 @@ def _tell(found: Calibration) -> None:
     for j in range(1, len(found.names)):
         in_file = found.compare_rig(j)
         if in_file is not None and not in_file.is_off:
-            typer.echo(f"the rig file has {found.names[j]} {_size(in_file.tangent)} away{in_file.reliability}")
+            typer.echo(f"the rig file has {found.names[j]} {size_in_words(in_file.tangent)} away{in_file.reliability}")
     for loop in found.places.loops:
         around = ", ".join(found.names[k] for k in loop.cameras)
-        typer.echo(f"around {around}: two at a time miss by {_size(loop.error)}")
+        typer.echo(f"around {around}: two at a time miss by {size_in_words(loop.error)}")
     for (i, j), clock in (found.clocks or {}).items():
         typer.echo(
             f"{found.names[i]} to {found.names[j]}: add {1e-9 * clock.relation.offset_ns:.6f} s to a stamp of "
@@ -270,13 +202,7 @@ def _tell(found: Calibration) -> None:
             f"{1e6 * clock.drift_sigma:.0f}) microseconds per second"
         )
     for warning in found.warnings:
-        typer.echo(f"graphvio: {warning}", err=True)
-
-
-def _size(apart: Float) -> str:
-    from graphvio.calibration.pair_calibration import size_in_words
-
-    return size_in_words(apart)
+        warn(warning)
 
 
 def _table(found: Calibration) -> Table:
@@ -301,14 +227,9 @@ def _with_sigma(value: float, sigma: float, known: bool) -> str:
     return f"{value:.{digits}f} ± {sigma:.{digits}f}" if known else "unknown"
 
 
-def _report(found: Calibration, folder: Path, source: str, count: int) -> None:
+def _write_report(found: Calibration, folder: Path, source: str, count: int) -> None:
     from graphvio.calibration.report.page import write_report
 
-    with _working("drawing the report"):
+    with _working("writing the report"):
         page = write_report(found, folder, source, count)
     typer.echo(f"report: {page}")
-
-
-def _end(found: Calibration) -> None:
-    if not found.is_complete:
-        raise typer.Exit(EXIT_PARTIAL)

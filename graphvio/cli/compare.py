@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.shared import EXIT_ABOVE_LIMIT, names_of, warn
 
 if TYPE_CHECKING:
     from graphvio.evaluation import Compared
-
-EXIT_ABOVE = 4
 
 
 def compare(
@@ -24,17 +23,17 @@ def compare(
         Path | None, typer.Option("--truth", help="True trajectory.  [default: the first result is the reference]")
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option("--plot", help="Draw all errors over time: .png, .pdf or .svg.", metavar="FILE")
+        Path | None, typer.Option("--plot", help="Plot all errors over time: .png, .pdf or .svg.", metavar="FILE")
     ] = None,
     smoothed: Annotated[
-        bool, typer.Option("--smoothed", help="Of result folders, take the poses as they left the window.")
+        bool, typer.Option("--smoothed", help="In result folders, use the poses as they left the window.")
     ] = False,
     max_ate: Annotated[
         float | None, typer.Option("--max-ate", help="Exit with code 4 if an ATE exceeds these metres.", min=0.0)
     ] = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Compare several results: ATE, RPE, drift and completion, and each one's ATE over the first one's.
+    """Compare several results: ATE, RPE, drift and completion, and the ratio of each ATE to the first one.
 
     Ends with exit code 4 where --max-ate is exceeded, or a result cannot be compared.
 
@@ -50,25 +49,25 @@ def compare(
     from graphvio.evaluation import compare as compare_all
     from graphvio.trajectory_files import load_trajectory
 
-    names, trajectories = _names(results), [load_trajectory(_file(path, smoothed)) for path in results]
+    names, trajectories = names_of(results), [load_trajectory(_file(path, smoothed)) for path in results]
     if truth is None and len(results) < 2:
         raise GraphvioError("one result and no truth: there is nothing to compare; give --truth FILE or more results")
     reference = load_trajectory(truth) if truth is not None else trajectories[0]
-    rest = slice(0 if truth is not None else 1, None)
-    compared = compare_all(names[rest], trajectories[rest], reference)
+    first = 0 if truth is not None else 1
+    compared = compare_all(names[first:], trajectories[first:], reference)
     Console(soft_wrap=True).print(_table(compared))
     for each in compared:
         if each.evaluation is None:
-            typer.echo(f"graphvio: {each.name}: {each.why_not}", err=True)
+            warn(f"{each.name}: {each.why_not}")
     if plot is not None:
         from graphvio.results.plotting import plot_comparison
 
         plot_comparison(plot, {each.name: each.evaluation for each in compared if each.evaluation is not None})
     above = [each.name for each in compared if max_ate is not None and each.ate_m > max_ate]
     if above:
-        typer.echo(f"graphvio: ATE above {max_ate:g} m: {', '.join(above)}", err=True)
+        warn(f"ATE above {max_ate:g} m: {', '.join(above)}")
     if above or any(each.evaluation is None for each in compared):
-        raise typer.Exit(EXIT_ABOVE)
+        raise typer.Exit(EXIT_ABOVE_LIMIT)
 
 
 def _file(path: Path, smoothed: bool) -> Path:
@@ -78,11 +77,6 @@ def _file(path: Path, smoothed: bool) -> Path:
     if optimized.is_file():
         return optimized
     return path / ("trajectory_smoothed.txt" if smoothed else "trajectory.txt")
-
-
-def _names(paths: list[Path]) -> list[str]:
-    names = [path.name if path.is_dir() else path.stem for path in paths]
-    return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
 
 def _table(compared: list[Compared]) -> object:

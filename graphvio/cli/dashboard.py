@@ -1,4 +1,4 @@
-"""What the terminal shows of a live run: a panel that is drawn over, or elsewhere a line every few seconds."""
+"""Display of a live run: a panel in a terminal, or elsewhere a line every few seconds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 from rich.text import Text
 
-from graphvio.cli.redrawn import Redrawn
+from graphvio.cli.shared import TerminalDisplay
 from graphvio.measurements.events import Event
 from graphvio.queues import BoundedQueue
 
@@ -23,12 +23,12 @@ _MESSAGES = 6
 _COLOURS = {"tracking": "green", "coasting": "yellow", "initialising": "cyan", "lost": "red"}
 
 
-class Dashboard(Redrawn):
-    """Draws figures; a context manager.
+class Dashboard(TerminalDisplay):
+    """Shows the figures, devices and events of a live run; a context manager.
 
     Args:
-        title: of the run.
-        events: to be shown as they come.
+        title: title of the panel.
+        events: events, which are shown as they come.
     """
 
     def __init__(self, title: str, events: BoundedQueue[Event]) -> None:
@@ -36,13 +36,13 @@ class Dashboard(Redrawn):
         self._title = title
         self._events = events
         self._messages: list[str] = []
-        self._told: dict[str, tuple[float, int]] = {}  # kind -> when it was told last, and how often it came since
+        self._shown: dict[str, tuple[float, int]] = {}  # kind -> time when last shown, and count since then
 
-    def draw(self, figures: Figures, devices: Sequence[DeviceHealth]) -> None:
-        """Show the newest, if it is time to."""
+    def show(self, figures: Figures, devices: Sequence[DeviceHealth]) -> None:
+        """Show the newest figures and events, at most at the refresh rate."""
         now = time.monotonic()
         while (event := self._events.get(0.0)) is not None:
-            self._tell(event, now)
+            self._show_event(event, now)
         if now < self._next_s:
             return
         if self._console.is_terminal:
@@ -50,20 +50,20 @@ class Dashboard(Redrawn):
             self._live.update(self._panel(figures, devices), refresh=True)
         else:
             self._next_s = now + _PLAIN_S
-            self._console.print(line_of(figures), soft_wrap=True, highlight=False)
+            self._print(line_of(figures))
 
-    def _tell(self, event: Event, now: float) -> None:
-        """Show a message; of those of one kind, one in a few seconds, and how many there were. Each device counts."""
+    def _show_event(self, event: Event, now: float) -> None:
+        """Show an event, of each kind (and device) one in a few seconds with the count of those left out."""
         kind = event.detail if event.kind.startswith("device_") else event.kind
-        last, passed_over = self._told.get(kind, (-_PLAIN_S, 0))
+        last, left_out = self._shown.get(kind, (-_PLAIN_S, 0))
         if now - last < _PLAIN_S:
-            self._told[kind] = last, passed_over + 1
+            self._shown[kind] = last, left_out + 1
             return
-        self._told[kind] = now, 0
-        more = f" (and {passed_over} more before)" if passed_over else ""
+        self._shown[kind] = now, 0
+        more = f" (and {left_out} more before)" if left_out else ""
         self._messages = [*self._messages, f"{event.kind}: {event.detail}{more}"][-_MESSAGES:]
         if not self._console.is_terminal:
-            self._console.print(self._messages[-1], soft_wrap=True, highlight=False, markup=False)
+            self._print(self._messages[-1])
 
     def _panel(self, figures: Figures, devices: Sequence[DeviceHealth]) -> Table:
         table = Table(title=self._title, show_header=False, expand=False)
@@ -74,16 +74,16 @@ class Dashboard(Redrawn):
         for name, value in rows_of(figures):
             table.add_row(name, value)
         for device in devices:
-            told = "connected" if device.connected else "lost"
+            state = "connected" if device.connected else "lost"
             lost = "".join(f", {kind} {count}" for kind, count in sorted(device.counts.items()))
-            table.add_row(device.name, f"{told}  {device.detail}{lost}")
+            table.add_row(device.name, f"{state}  {device.detail}{lost}")
         for message in self._messages:
             table.add_row("", Text(message, "yellow", no_wrap=True, overflow="ellipsis"))
         return table
 
 
 def rows_of(figures: Figures) -> list[tuple[str, str]]:
-    """Name and text of each row but the status."""
+    """Return name and text of each row but the status."""
     pairs = sorted(name.removesuffix("_points") for name in figures if name.endswith("_points"))
     rows = [
         (
@@ -114,20 +114,20 @@ def rows_of(figures: Figures) -> list[tuple[str, str]]:
     if "recorded_framesets" in figures:
         stopped = figures.get("recording_stopped")
         free = _number(figures, "disk_free_gb", ".1f")
-        told = f"{_number(figures, 'recorded_framesets', 'd')} framesets, {free} GB free"
-        rows.append(("recording", str(stopped) if stopped else told))
+        going_on = f"{_number(figures, 'recorded_framesets', 'd')} framesets, {free} GB free"
+        rows.append(("recording", str(stopped) if stopped else going_on))
     if figures.get("stuck"):
         rows.append(("stuck", str(figures["stuck"])))
     return rows
 
 
 def line_of(figures: Figures) -> str:
-    """All of it in one line."""
+    """Return all figures in one line."""
     return f"{figures.get('status', 'waiting'):<12} " + "  ".join(f"{name} {value}" for name, value in rows_of(figures))
 
 
 def summary_of(figures: Figures) -> str:
-    """What came of a run, and what was lost, in one line."""
+    """Return what a run estimated and what it lost, in one line."""
     kinds = ("skipped", "images_not", "results_not", "imu_lost")
     lost = "".join(f", {name} {count}" for name, count in figures.items() if name.startswith(kinds))
     return (

@@ -1,4 +1,4 @@
-"""``graphvio doctor``."""
+"""``graphvio doctor``: what is installed on this machine."""
 
 import os
 import platform
@@ -26,7 +26,7 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
     verbose: options.Verbose = False,
 ) -> None:
-    """Tell what graphvio finds on this machine: versions, cores, optional parts, compiled kernels.
+    """Show what graphvio finds on this machine: versions, cores, optional parts, compiled kernels.
 
     Examples:
 
@@ -62,13 +62,13 @@ def _table(findings: dict[str, Any]) -> Any:
     cache = findings["kernel_cache"]
     table.add_row("kernel cache", f"{escape(cache['folder'])}, {cache['files']} files, {cache['megabytes']:.1f} MB")
     modules = cache["compiled_modules"]
-    rest = "" if all(modules.values()) else "; the rest compiles when first used, which takes one to two minutes"
-    table.add_row("modules compiled", f"{sum(modules.values())} of {len(modules)}{rest}")
+    missing = "" if all(modules.values()) else "; the others compile when first used, which takes one to two minutes"
+    table.add_row("modules compiled", f"{sum(modules.values())} of {len(modules)}{missing}")
     return table
 
 
 def examine() -> dict[str, Any]:
-    """All findings, as JSON can hold them."""
+    """Return all findings, as JSON can hold them."""
     from graphvio.kernels import any_compiled_before, cache_root
     from graphvio.version import __version__
 
@@ -100,7 +100,7 @@ def examine() -> dict[str, Any]:
 
 
 def kernel_modules() -> list[str]:
-    """Names of graphvio's modules that hold kernels, found in their text: importing them would compile some."""
+    """Return the modules that hold kernels, found in their text: importing them would compile some."""
     import graphvio
 
     package = Path(graphvio.__file__).parent

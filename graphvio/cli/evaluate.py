@@ -1,4 +1,4 @@
-"""``graphvio evaluate``."""
+"""``graphvio evaluate``: one trajectory against the truth."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    trajectory: Annotated[Path, typer.Argument(help="Estimated trajectory, TUM or EuRoC (told apart by itself).")],
+    trajectory: Annotated[Path, typer.Argument(help="Estimated trajectory, TUM or EuRoC (detected).")],
     truth: Annotated[Path, typer.Argument(help="True trajectory, TUM or EuRoC.")],
     plot: Annotated[
-        Path | None, typer.Option(help="Draw both, and the error over time: .png, .pdf or .svg.", metavar="FILE")
+        Path | None, typer.Option(help="Plot both, and the error over time: .png, .pdf or .svg.", metavar="FILE")
     ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures here.", metavar="FILE")] = None,
     max_gap: Annotated[
-        float, typer.Option(help="Greatest interval of the truth that is interpolated, seconds.", min=0.0)
+        float, typer.Option(help="Longest gap of the truth that is interpolated, seconds.", min=0.0)
     ] = 0.25,
     verbose: options.Verbose = False,
 ) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, warn
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from graphvio.fleet.run import FleetProgress
 
 fleet = typer.Typer(help="Many sessions side by side, on this machine or on a Dask cluster.", no_args_is_help=True)
@@ -31,7 +34,7 @@ def optimize(
     out: Annotated[
         str,
         typer.Option(
-            "--out", help="Folder for the results, path or URL: new, or that of a run to go on with.", metavar="DIR"
+            "--out", help="Folder for the results, path or URL: new, or that of a run to continue.", metavar="DIR"
         ),
     ],
     scheduler: Annotated[
@@ -53,11 +56,11 @@ def optimize(
     no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
     verbose: options.Verbose = False,
 ) -> None:
-    """Optimise many recorded sessions, each by itself, and tell in a table how each went.
+    """Optimise many recorded sessions, each by itself, and write a table of all.
 
-    A session that cannot be done costs no other: it is tried three times, and then told in the table. Ends with exit
-    code 0; with 2 where the input cannot be used; with 3 where a session failed. Run again with the same --out, it does
-    what is missing.
+    A session that fails affects no other: it is tried three times, and then has its error in the table. Ends with exit
+    code 0; with 2 where the input cannot be used; with 3 where a session failed. When run again with the same --out, it
+    does what is missing.
 
     Examples:
 
@@ -67,7 +70,6 @@ def optimize(
     """
     import logging
 
-    from graphvio.cli.run import EXIT_INCOMPLETE, EXIT_INTERRUPTED
     from graphvio.config import Config
     from graphvio.errors import FleetError
     from graphvio.fleet.cluster import distributed
@@ -77,16 +79,17 @@ def optimize(
     from graphvio.rig_files import load_rig
 
     if scheduler is not None and workers is not None:
-        raise FleetError("--workers is for this machine, and --scheduler has its own: give one of them")
+        raise FleetError("--workers is for this machine, and a --scheduler has its own workers: give one of them")
     distributed()
     if not no_loops:
         colmap()
     settings = Config.load(config)
     loaded = None if rig is None else load_rig(rig)
     listed = list_sessions(sessions)
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is told below
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are printed below
     try:
-        with _Bar(len(listed)) as bar:
+        with _bars() as bars:
+            task = bars.add_task("0 tasks", total=len(listed))
             outcomes = optimize_fleet(
                 listed,
                 out,
@@ -95,41 +98,32 @@ def optimize(
                 with_loops=not no_loops,
                 scheduler=scheduler,
                 workers=workers,
-                on_progress=bar.show,
+                on_progress=lambda progress: bars.update(
+                    task, completed=progress.optimized + progress.failed, description=_description(progress)
+                ),
             )
     except KeyboardInterrupt:
-        typer.echo(f"graphvio: interrupted; the same command with --out {out} goes on from there", err=True)
+        warn(f"interrupted; the same command with --out {out} continues from there")
         raise typer.Exit(EXIT_INTERRUPTED) from None
     failed = [each for each in outcomes if each.error]
     for each in failed:
-        typer.echo(f"graphvio: {each.name} failed in {each.failed_in}: {each.error}", err=True)
+        warn(f"{each.name} failed in {each.failed_in}: {each.error}")
     typer.echo(f"{len(outcomes) - len(failed)} of {len(outcomes)} sessions optimised")
     typer.echo(f"results: {out}")
     if failed:
         raise typer.Exit(EXIT_INCOMPLETE)
 
 
-class _Bar:
-    """One bar for all sessions."""
+def _bars() -> Progress:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    def __init__(self, sessions: int) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("sessions, {task.description}"), TimeElapsedColumn())
+    return Progress(*columns, console=Console(stderr=True))
 
-        columns = (BarColumn(), MofNCompleteColumn(), TextColumn("sessions, {task.description}"), TimeElapsedColumn())
-        self._bars = Progress(*columns, console=Console(stderr=True))
-        self._task: Any = self._bars.add_task("0 tasks", total=sessions)
 
-    def __enter__(self) -> _Bar:
-        self._bars.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bars.stop()
-
-    def show(self, progress: FleetProgress) -> None:
-        """Draw how far everything is."""
-        texts = [f"{progress.tasks} tasks"]
-        texts += [f"{progress.failed} failed"] if progress.failed else []
-        texts += [progress.latest] if progress.latest else []
-        self._bars.update(self._task, completed=progress.optimized + progress.failed, description=", ".join(texts))
+def _description(progress: FleetProgress) -> str:
+    texts = [f"{progress.tasks} tasks"]
+    texts += [f"{progress.failed} failed"] if progress.failed else []
+    texts += [progress.latest] if progress.latest else []
+    return ", ".join(texts)

@@ -1,4 +1,4 @@
-"""``graphvio info``: what a session or bag holds."""
+"""``graphvio info`` and ``graphvio dump-config``: the contents of a session or bag, and the values of a profile."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from graphvio.cli import options
 
 if TYPE_CHECKING:
     from graphvio.sessions.stamps import Clock
-    from graphvio.sources.description import Description, Synchronisation, TopicDescription
+    from graphvio.sources.description import Synchronisation, TopicDescription
 
 
 def info(
     session: Annotated[Path, typer.Argument(help="Session (.mcap) or ROS bag (.bag, or a ROS 2 folder).")],
     verbose: options.Verbose = False,
 ) -> None:
-    """Tell what a session or bag holds: topics with their rates, gaps and jitter, how long, how large, what rig; and
-    how far clocks are to be trusted: stamps that go back or jump, how long after its stamp a message was recorded and
-    whether that drifts, and how well cameras are synchronised.
+    """Show the contents of a session or bag: duration, size, rig, and topics with their rates, gaps and jitter.
+
+    Also shows how far clocks can be trusted: stamps that go back or jump, the delay from a message's stamp to its
+    recording with its drift, and how well cameras are synchronised.
 
     Examples:
 
@@ -30,10 +31,7 @@ def info(
     """
     from graphvio.sources.description import describe
 
-    _tell(describe(session))
-
-
-def _tell(found: Description) -> None:
+    found = describe(session)
     typer.echo(
         f"{found.path}: {found.duration_s:.1f} s, {found.size_bytes / 1e6:.1f} MB"
         + ("" if found.is_whole else ", cut: its recording was not finished, or it is damaged")
@@ -48,28 +46,45 @@ def _tell(found: Description) -> None:
         typer.echo(_synchronised(each))
 
 
+def dump_config(
+    profile: Annotated[str, typer.Argument(help="Profile or YAML file.")] = "default",
+    verbose: options.Verbose = False,
+) -> None:
+    """Print all values of a configuration as YAML.
+
+    Examples:
+
+        graphvio dump-config > mine.yaml
+
+        graphvio dump-config paper
+    """
+    from graphvio.config import Config
+
+    typer.echo(Config.load(profile).to_yaml(), nl=False)
+
+
 def _regularity(topic: TopicDescription) -> str:
     if topic.rate_hz is None:
         return ""
-    told = f", {topic.rate_hz:.2f} Hz, jitter {topic.jitter_ms:.2f} ms, {topic.gaps} gaps, longest interval "
-    told += f"{topic.longest_ms:.1f} ms"
-    return told if topic.clock is None else told + _clock(topic.clock)
+    text = f", {topic.rate_hz:.2f} Hz, jitter {topic.jitter_ms:.2f} ms, {topic.gaps} gaps, longest interval "
+    text += f"{topic.longest_ms:.1f} ms"
+    return text if topic.clock is None else text + _clock(topic.clock)
 
 
 def _clock(clock: Clock) -> str:
-    told = f", recorded {clock.latency_ms:.2f} ms after their stamps"
+    text = f", recorded {clock.latency_ms:.2f} ms after their stamps"
     if clock.drift_ms_per_minute is not None:
-        told += f", drifting by {clock.drift_ms_per_minute:.2f} +- {clock.drift_sigma:.2f} ms a minute"
+        text += f", drifting by {clock.drift_ms_per_minute:.2f} +- {clock.drift_sigma:.2f} ms a minute"
     if clock.backward:
-        told += f", {clock.backward} stamps that repeat or go back"
+        text += f", {clock.backward} stamps that repeat or go back"
     if clock.jumps:
-        told += f", {clock.jumps} jumps of the stamps by a second or more"
-    return told
+        text += f", {clock.jumps} jumps of the stamps by a second or more"
+    return text
 
 
 def _synchronised(found: Synchronisation) -> str:
     what = f"{found.first} to {found.second}: "
     if found.offset is None:
-        return f"{what}no stamps belong together"
-    told = f"{what}{found.offset.matched} of {found.images} images, the second {found.offset.median_ms:.3f} ms later"
-    return f"{told} (median), {found.offset.largest_ms:.3f} ms apart at most"
+        return f"{what}no stamps match"
+    text = f"{what}{found.offset.matched} of {found.images} images, the second {found.offset.median_ms:.3f} ms later"
+    return f"{text} (median), {found.offset.largest_ms:.3f} ms apart at most"

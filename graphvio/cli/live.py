@@ -1,4 +1,4 @@
-"""``graphvio live``: the odometry on sensors, in real time."""
+"""``graphvio live``: the odometry on sensors in real time, with displays and services around it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.shared import EXIT_INCOMPLETE, check_session_name, warn
 
 if TYPE_CHECKING:
     from graphvio.cli.services import Services
     from graphvio.rig import Rig
     from graphvio.viewer import Viewer
-
-EXIT_STOPPED = 3
 
 
 def live(
@@ -24,23 +23,23 @@ def live(
         str | None,
         typer.Argument(help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator."),
     ] = None,
-    list_devices: Annotated[bool, typer.Option("--list", help="Show what is connected, and end.")] = False,
+    list_devices: Annotated[bool, typer.Option("--list", help="List the connected devices, and end.")] = False,
     rig: options.RigFile = None,
     config: options.ConfigName = "default",
     record: options.Record = None,
     png: options.Png = False,
-    view: Annotated[bool, typer.Option("--view", help="Watch it in the rerun viewer.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Show it in the rerun viewer.")] = False,
     serve: Annotated[
-        bool, typer.Option("--serve", help="Offer it to other programs of this machine, see graphvio serve.")
+        bool, typer.Option("--serve", help="Serve other programs of this machine, see graphvio serve.")
     ] = False,
     health_port: options.HealthPort = None,
     duration: options.Duration = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Run the odometry on live sensors until they end, or Ctrl-C or SIGTERM: what was recorded is whole then.
+    """Run the odometry on live sensors until they end, or Ctrl-C or SIGTERM, which leave a complete recording.
 
-    When there is no time for everything, fewer corners are followed, and then framesets are skipped, which is counted;
-    samples of the IMU never are. Ends with exit code 3 where the disk became full.
+    When processing falls behind, fewer corners are tracked, and then framesets are skipped, which is counted; IMU
+    samples never are. Ends with exit code 3 where the disk became full.
 
     Examples:
 
@@ -58,7 +57,7 @@ def live(
         _list()
         return
     if source is None:
-        raise typer.BadParameter("give a SOURCE, or --list to see what is connected")
+        raise typer.BadParameter("give a SOURCE, or --list to see the connected devices")
     run_live(
         source, rig, config, record=record, png=png, view=view, health_port=health_port, duration_s=duration,
         services=Services() if serve else None,
@@ -77,7 +76,19 @@ def run_live(
     duration_s: float | None,
     services: Services | None,
 ) -> None:
-    """Open a source, run the odometry on it with what is asked for around it, and save everything at the end."""
+    """Open a source, run the odometry on it with recording, viewer and services, and save everything at the end.
+
+    Args:
+        source: as `open_live_source` takes it.
+        rig: rig file, or None for the source's own.
+        config: profile or YAML file.
+        record: session to record, or None.
+        png: whether images are recorded as PNG.
+        view: whether the viewer's window opens.
+        health_port: port of metrics and liveness, or None.
+        duration_s: time after which the run ends, or None.
+        services: for other programs, or None.
+    """
     from time import monotonic
 
     from graphvio.cli.dashboard import Dashboard, line_of, summary_of
@@ -107,12 +118,12 @@ def run_live(
         services.check()
     with ExitStack() as stack:
         stack.callback(opened.close)
-        with sigterm_as_interrupt():  # nothing is there yet that would have to be saved
+        with sigterm_as_interrupt():  # nothing has to be saved yet
             used = opened.open()
             use_one_opencv_thread()
-            warm_up(used, settings)  # what sensors deliver meanwhile is not wanted
+            warm_up(used, settings)  # measurements that come meanwhile are not used
         signals = stack.enter_context(StopSignals())
-        recording = stack.enter_context(ExitStack())  # ends after the run, so that it has all that was made
+        recording = stack.enter_context(ExitStack())  # closed after the run, so that it is complete
         viewer = _viewer(stack, used, view, services)
         running = LiveOdometry(opened, used, settings, wants_keyframes=services is not None)
         stack.callback(running.stop)
@@ -125,7 +136,7 @@ def run_live(
         started = None if services is None else services.start(running, stack, lambda: signals.came)
         for line in () if started is None else started.lines:
             typer.echo(line, err=True)
-        if record is not None:  # last, so that no file is left behind by a port that is taken
+        if record is not None:  # last, so that a port in use leaves no file behind
             recorder = SessionRecorder(record, used, "png" if png else "raw", waits=not opened.is_realtime)
             recording.callback(recorder.close)
             running.add_output(recorder)
@@ -135,13 +146,13 @@ def run_live(
         try:
             with Dashboard(opened.name, running.events.subscribe(64)) as dashboard:
                 while not running.wait(0.1) and not signals.came and (until is None or monotonic() < until):
-                    dashboard.draw(running.status(), running.devices)
+                    dashboard.show(running.status(), running.devices)
                     if started is not None:
                         started.check()
             if signals.came:
-                typer.echo("stopping: what has come is worked on and saved", err=True)
+                typer.echo("stopping: measurements that have come are processed and saved", err=True)
             running.stop()
-        except Exception as error:  # what came until then is saved all the same
+        except Exception as error:  # raised after everything until then is saved
             failure = error
             with suppress(Exception):
                 running.stop()
@@ -152,44 +163,42 @@ def run_live(
     typer.echo(line_of(figures))
     typer.echo(summary_of(figures))
     if recorder is not None and record is not None:
-        is_whole = _tell_recorded(record, recorder.status()) and is_whole
+        is_whole = _print_recorded(record, recorder.status()) and is_whole
     if not is_whole:
-        raise typer.Exit(EXIT_STOPPED)
+        raise typer.Exit(EXIT_INCOMPLETE)
 
 
 def _check_recording(path: Path) -> None:
-    """Find out what cannot be recorded to, before anything is started."""
+    """Refuse a session that cannot be written, before sensors are started."""
     from graphvio.errors import SessionError
     from graphvio.sessions.storage import exists_error
 
-    if path.suffix != ".mcap":
-        raise SessionError(f"{path}: is recorded as MCAP, which is read by its name; name it .mcap")
+    check_session_name(path)
     if path.exists():
         raise exists_error(path)
     if not path.parent.is_dir():
         raise SessionError(f"{path}: {path.parent} is no folder; make it first")
 
 
-def _tell_recorded(path: Path, told: Mapping[str, float | int | str | None]) -> bool:
-    """What is in the recording; whether that is all."""
+def _print_recorded(path: Path, status: Mapping[str, float | int | str | None]) -> bool:
+    """Print the size of the recording, and return whether it is complete."""
     size = f"{path.stat().st_size / 1e6:.1f} MB, " if path.exists() else ""
-    typer.echo(f"{path}: {size}{told['recorded_framesets']} framesets")
-    if told["recording_stopped"]:
-        came = int(told["recorded_framesets"] or 0) + int(told["framesets_not_recorded"] or 0)
-        typer.echo(f"graphvio: {told['recording_stopped']}: {_readable(path)} framesets of {came}", err=True)
+    typer.echo(f"{path}: {size}{status['recorded_framesets']} framesets")
+    if status["recording_stopped"]:
+        came = int(status["recorded_framesets"] or 0) + int(status["framesets_not_recorded"] or 0)
+        warn(f"{status['recording_stopped']}: {_readable(path)} framesets of {came}")
         return False
-    if told["framesets_not_recorded"] or told["messages_not_recorded"]:
-        typer.echo(
-            f"graphvio: the disk was too slow; {told['framesets_not_recorded']} framesets and "
-            f"{told['messages_not_recorded']} samples, poses and messages were left out",
-            err=True,
+    if status["framesets_not_recorded"] or status["messages_not_recorded"]:
+        warn(
+            f"the disk was too slow; {status['framesets_not_recorded']} framesets and "
+            f"{status['messages_not_recorded']} samples, poses and messages were left out"
         )
         return False
     return True
 
 
 def _readable(path: Path) -> int:
-    """How many framesets of a recording that was cut can be read: what was under way to the disk is lost, too."""
+    """Count the framesets of a truncated recording that can be read."""
     from graphvio.errors import GraphvioError
     from graphvio.sources import open_source
 
@@ -200,7 +209,7 @@ def _readable(path: Path) -> int:
 
 
 def _viewer(stack: ExitStack, rig: Rig, view: bool, services: Services | None) -> Viewer | None:
-    """The viewer that is asked for, or None."""
+    """Open the viewer, if it is asked for, until the stack closes."""
     from graphvio.viewer import Viewer, WebOptions
 
     web = None if services is None or services.web_port is None else WebOptions(port=services.web_port)
@@ -211,7 +220,7 @@ def _viewer(stack: ExitStack, rig: Rig, view: bool, services: Services | None) -
 
 
 def _list() -> None:
-    """What is connected, and which libraries are missing."""
+    """List the connected devices of each kind, or the library that it lacks."""
     from graphvio.errors import GraphvioError
     from graphvio.live.sources import KINDS, kind_of
 

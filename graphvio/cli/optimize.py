@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.shared import (
+    EXIT_INCOMPLETE,
+    EXIT_INTERRUPTED,
+    MIN_COMPLETION,
+    open_recording,
+    stage_bars,
+    warn,
+)
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
     from graphvio.optimization.optimize import Optimization
 
 
@@ -29,7 +40,7 @@ def optimize(
         Path | None,
         typer.Option(
             "--out",
-            help="Folder for the results: new, or that of an interrupted run of the same, which goes on.  "
+            help="Folder for the results: new, or that of an interrupted run of the same, which is continued.  "
             "[default: results/NAME-optimized-N]",
             metavar="DIR",
         ),
@@ -39,17 +50,17 @@ def optimize(
     no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
     refine_calibration: Annotated[
         bool,
-        typer.Option("--refine-calibration", help="Find the pairs' places and the IMU's time offset, too."),
+        typer.Option("--refine-calibration", help="Also estimate the pairs' extrinsics and the IMU's time offset."),
     ] = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Find the best trajectory that all measurements of recorded sessions hold together.
+    """Optimise the trajectory of recorded sessions from all their measurements.
 
     Runs the odometry, finds places that are seen again, by any pair, and optimises everything as one graph. Several
-    sessions of one place are brought into one frame. What is interrupted goes on where it was when it is started again
-    with the same --out.
+    sessions of one place are brought into one frame. An interrupted run is continued by the same command with the same
+    --out.
 
     Ends with exit code 0; with 2 where the input cannot be used; with 3 where less than 90 % of a session's framesets
     have a pose (the results are written all the same); with 130 after Ctrl-C.
@@ -60,7 +71,6 @@ def optimize(
 
         graphvio optimize monday.mcap tuesday.mcap --out both
     """
-    from graphvio.cli.run import EXIT_INCOMPLETE, EXIT_INTERRUPTED, open_recording
     from graphvio.config import Config
     from graphvio.optimization.loops.database import colmap
     from graphvio.optimization.pipeline import optimize_sessions
@@ -82,67 +92,53 @@ def optimize(
     for source in opened:
         warm_up(source.rig, settings)
     try:
-        with interruptible(), _Stages() as stages:
+        with interruptible(), stage_bars() as bars:
             found = optimize_sessions(
                 opened,
                 folder,
                 settings,
                 with_loops=not no_loops,
                 calibrates=refine_calibration,
-                on_progress=stages.show,
+                on_progress=_show_stages(bars),
             )
     except KeyboardInterrupt:
-        typer.echo(f"graphvio: interrupted; the same command with --out {folder} goes on from there", err=True)
+        warn(f"interrupted; the same command with --out {folder} continues from there")
         raise typer.Exit(EXIT_INTERRUPTED) from None
-    complete = [_warn(folder / session.record.name / "odometry") for session in found.sessions]
-    _tell(found, folder)
+    complete = [_warn_of(folder / session.record.name / "odometry") for session in found.sessions]
+    print_summary(found, folder)
     if not all(complete):
         raise typer.Exit(EXIT_INCOMPLETE)
 
 
-class _Stages:
-    """A bar for each stage."""
+def _show_stages(bars: Progress) -> Callable[[str, float, float], None]:
+    """Return a function that shows how far a stage is, in a bar of its own."""
+    tasks: dict[str, TaskID] = {}
 
-    def __init__(self) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    def show(stage: str, done: float, total: float) -> None:
+        if stage not in tasks:
+            tasks[stage] = bars.add_task(stage, total=total)
+        bars.update(tasks[stage], completed=done, total=total)
 
-        columns = (TextColumn("{task.description:<28}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        self._bars = Progress(*columns, console=Console(stderr=True))
-        self._tasks: dict[str, Any] = {}
-
-    def __enter__(self) -> _Stages:
-        self._bars.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bars.stop()
-
-    def show(self, stage: str, done: float, total: float) -> None:
-        """Draw how far a stage is."""
-        if stage not in self._tasks:
-            self._tasks[stage] = self._bars.add_task(stage, total=total)
-        self._bars.update(self._tasks[stage], completed=done, total=total)
+    return show
 
 
-def _warn(odometry: Path) -> bool:
-    """Tell what the odometry found wrong in a session; whether most framesets have a pose."""
-    from graphvio.cli.run import LEAST_COMPLETION
-
+def _warn_of(odometry: Path) -> bool:
+    """Print the odometry's warnings on a session, and return whether most framesets have a pose."""
     summary = json.loads((odometry / "summary.json").read_text(encoding="utf-8"))
     for warning in summary["warnings"]:
-        typer.echo(f"graphvio: {warning}; try --refine-calibration, or graphvio calibrate", err=True)
+        warn(f"{warning}; try --refine-calibration, or graphvio calibrate")
     faults = ", ".join(f"{kind} {count}" for kind, count in sorted(summary["input_faults"].items()))
     if faults:
         typer.echo(f"faults of {odometry.parent.name}: {faults}")
-    is_complete = bool(summary["completion"] >= LEAST_COMPLETION)
+    is_complete = bool(summary["completion"] >= MIN_COMPLETION)
     if not is_complete:
         share = 100 * summary["completion"]
-        typer.echo(f"graphvio: only {share:.0f} % of the framesets have a pose; {odometry} tells why", err=True)
+        warn(f"only {share:.0f} % of the framesets have a pose; the events in {odometry} say why")
     return is_complete
 
 
-def _tell(found: Optimization, folder: Path) -> None:
+def print_summary(found: Optimization, folder: Path) -> None:
+    """Print loop closures, cost and refined calibration of an optimisation."""
     from graphvio.optimization.report.calibration import calibrations
     from graphvio.optimization.report.numbers import median_sigmas, rig_of
     from graphvio.optimization.report.page import plain
@@ -155,7 +151,7 @@ def _tell(found: Optimization, folder: Path) -> None:
     )
     frames = len(set(found.frames))
     if frames > 1:
-        typer.echo(f"graphvio: {frames} parts that no loop closures join, each in a frame of its own", err=True)
+        warn(f"{frames} parts that no loop closures join, each in a frame of its own")
     before, after = (median_sigmas(kinds.get("motion")) for kinds in (found.before, found.after))
     median = ""
     if before is not None and after is not None:

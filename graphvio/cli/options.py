@@ -44,7 +44,7 @@ Ros2Domain = Annotated[
 Duration = Annotated[float | None, typer.Option("--for", help="Stop after so many seconds.", metavar="SECONDS")]
 WebPort = Annotated[
     int | None,
-    typer.Option("--web", help="Let a browser of this machine watch, on this port and the next.", min=1, max=65534),
+    typer.Option("--web", help="Show it in a browser of this machine, on this port and the next.", min=1, max=65534),
 ]
 ReportFolder = Annotated[
     Path | None, typer.Option("--report", help="Folder for a report: page, pictures, all numbers.", metavar="DIR")

@@ -1,4 +1,4 @@
-"""``graphvio record`` and ``graphvio convert``: recordings on disk, with what the odometry made of them or without."""
+"""``graphvio record`` and ``graphvio convert``: sessions with the odometry's results, and other formats."""
 
 from __future__ import annotations
 
@@ -9,6 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.shared import (
+    EXIT_INCOMPLETE,
+    EXIT_INTERRUPTED,
+    check_session_name,
+    framesets_bar,
+    open_recording,
+    warn,
+)
 
 if TYPE_CHECKING:
     from graphvio.measurements.sensors import Measurement
@@ -17,8 +25,6 @@ if TYPE_CHECKING:
     from graphvio.sessions.writer import SessionWriter
     from graphvio.sources import Source
     from graphvio.trajectory import Trajectory
-
-EXIT_STOPPED = 3
 
 
 def record(
@@ -35,25 +41,22 @@ def record(
 ) -> None:
     """Run the odometry and record images, IMU, rig, poses and events as a session (MCAP, ROS 2 messages).
 
-    When the disk is full recording stops, the odometry goes on, and the exit code is 3. After Ctrl-C, which ends with
-    130, what was recorded until then can be read.
+    When the disk is full recording stops, the odometry goes on, and the exit code is 3. After Ctrl-C, with exit code
+    130, the session can be read until then.
 
     Example:
 
         graphvio record walk --out walk.mcap
     """
-    from graphvio.cli.run import EXIT_INTERRUPTED, open_recording
     from graphvio.config import Config
-    from graphvio.errors import SessionError
     from graphvio.odometry import Odometry
     from graphvio.runtime import use_one_opencv_thread
     from graphvio.sessions.writer import SessionWriter
     from graphvio.warmup import warm_up
 
-    if out.suffix != ".mcap":
-        raise SessionError(f"{out}: is recorded as MCAP, which is read by its name; name it .mcap")
+    check_session_name(out)
     settings = Config.load(config)
-    opened = open_recording(source, rig, settings, pairs=None, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
+    opened = open_recording(source, rig, settings, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
     use_one_opencv_thread()
     warm_up(opened.rig, settings)
     writer = SessionWriter(out, opened.rig, "png" if png else "raw")
@@ -61,7 +64,7 @@ def record(
     try:
         _write(opened, truth, writer, Odometry(opened.rig, settings))
     except KeyboardInterrupt:
-        typer.echo(f"graphvio: interrupted; what was recorded until then is in {out}, which can be read", err=True)
+        warn(f"interrupted; what was recorded until then is in {out}, which can be read")
         raise typer.Exit(EXIT_INTERRUPTED) from None
     typer.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {writer.poses} poses")
     _exit_if_stopped(writer)
@@ -70,7 +73,7 @@ def record(
 def convert(
     source: options.Source,
     out: Annotated[
-        Path, typer.Option("--out", help="What to write; new: NAME.mcap, NAME.bag, or a folder.", metavar="PATH")
+        Path, typer.Option("--out", help="Recording to write; new: NAME.mcap, NAME.bag, or a folder.", metavar="PATH")
     ],
     file_format: Annotated[
         str | None,
@@ -85,7 +88,7 @@ def convert(
 ) -> None:
     """Write a recording in another format: MCAP, a ROS 1 or ROS 2 bag, or the EuRoC/ASL layout.
 
-    Ends with exit code 3 where the disk became full, with a line that tells whether what was written can be read.
+    Ends with exit code 3 where the disk became full, with a line that says whether the result can be read.
 
     Examples:
 
@@ -97,12 +100,11 @@ def convert(
 
         graphvio convert walk --from 10 --to 20 --png --out piece.mcap
     """
-    from graphvio.cli.run import open_recording
     from graphvio.config import Config
     from graphvio.sessions.formats import format_of, open_writer
 
     known = format_of(out, file_format)
-    opened = open_recording(source, rig, Config(), pairs=None, no_imu=False, from_s=from_s, to_s=to_s, topics=topics)
+    opened = open_recording(source, rig, Config(), from_s=from_s, to_s=to_s, topics=topics)
     truth = _truth(opened, is_whole=from_s is None and to_s is None)
     writer = open_writer(out, opened.rig, known, "png" if png else "raw")
     _write(opened, truth, writer, None)
@@ -116,7 +118,7 @@ def convert(
 
 
 def _truth(opened: Source, is_whole: bool) -> Trajectory | None:
-    """The true trajectory of what is converted; one that cannot be read is told, and left out."""
+    """Load the true trajectory of a recording; one that cannot be read is left out with a warning."""
     from graphvio.errors import TrajectoryError
     from graphvio.trajectory_files import load_trajectory
 
@@ -125,24 +127,19 @@ def _truth(opened: Source, is_whole: bool) -> Trajectory | None:
     try:
         truth = load_trajectory(opened.truth)
     except TrajectoryError as error:
-        typer.echo(f"graphvio: the true trajectory is left out: {error}", err=True)
+        warn(f"the true trajectory is left out: {error}")
         return None
     return truth if is_whole else truth.around(opened.start_ns, opened.end_ns)
 
 
 def _write(opened: Source, truth: Trajectory | None, writer: RecordingWriter, odometry: Odometry | None) -> None:
     """Record measurements, truth and an odometry's results; without an odometry, stop when the disk is full."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
     from graphvio.measurements.sensors import FrameSet
     from graphvio.runtime import HeldInterrupt, interruptible
     from graphvio.sessions.writer import SessionWriter
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     poses = deque(zip(truth.stamps_ns.tolist(), truth.nav_T_body, strict=True) if truth is not None else ())
-    progress = Progress(*columns, console=Console(stderr=True), transient=True)
-    with interruptible(), HeldInterrupt() as held, writer, progress as bar:
+    with interruptible(), HeldInterrupt() as held, writer, framesets_bar() as bar:
         task = bar.add_task("framesets", total=opened.frameset_count)
         for measurement in opened:
             held.check()
@@ -174,5 +171,5 @@ def _advance(odometry: Odometry, measurement: Measurement, writer: SessionWriter
 
 def _exit_if_stopped(writer: RecordingWriter) -> None:
     if writer.stopped is not None:
-        typer.echo(f"graphvio: {writer.stopped}", err=True)
-        raise typer.Exit(EXIT_STOPPED)
+        warn(writer.stopped)
+        raise typer.Exit(EXIT_INCOMPLETE)

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
-from graphvio.cli.redrawn import Redrawn
+from graphvio.cli.shared import (
+    EXIT_INCOMPLETE,
+    EXIT_INTERRUPTED,
+    MIN_COMPLETION,
+    TerminalDisplay,
+    open_recording,
+    warn,
+)
 
 if TYPE_CHECKING:
-    from graphvio.config import Config
     from graphvio.pipeline import Progress
     from graphvio.results import Summary
-    from graphvio.rig import Rig
-    from graphvio.sources import Source
-
-EXIT_INCOMPLETE = 3
-EXIT_INTERRUPTED = 130
-LEAST_COMPLETION = 0.9
 
 
 def run(
@@ -34,7 +34,7 @@ def run(
     no_imu: options.NoImu = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
-    view: Annotated[bool, typer.Option("--view", help="Watch it in the rerun viewer.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Show it in the rerun viewer.")] = False,
     save_rrd: Annotated[
         Path | None, typer.Option("--save-rrd", help="Save what the viewer would show; needs no display.")
     ] = None,
@@ -79,67 +79,19 @@ def run(
             with interruptible():
                 summary = run_pipeline(opened, settings, writer, listeners)
         except KeyboardInterrupt:
-            typer.echo(f"graphvio: interrupted; what was estimated until then is in {folder}", err=True)
+            warn(f"interrupted; what was estimated until then is in {folder}")
             raise typer.Exit(EXIT_INTERRUPTED) from None
-    _tell(summary, folder)
-    if summary.completion < LEAST_COMPLETION:
-        typer.echo(
-            f"graphvio: only {100 * summary.completion:.0f} % of the framesets have a pose; "
-            f"{folder / 'events.jsonl'} tells when and why",
-            err=True,
+    _print_summary(summary, folder)
+    if summary.completion < MIN_COMPLETION:
+        warn(
+            f"only {100 * summary.completion:.0f} % of the framesets have a pose; "
+            f"{folder / 'events.jsonl'} says when and why"
         )
         raise typer.Exit(EXIT_INCOMPLETE)
 
 
-def open_recording(
-    source: Path,
-    rig: Path | None,
-    settings: Config,
-    *,
-    pairs: str | None,
-    no_imu: bool,
-    from_s: float | None,
-    to_s: float | None,
-    topics: str | None = None,
-) -> Source:
-    """A recording as the options of a command ask for it."""
-    from graphvio.rig_files import load_rig
-    from graphvio.sources import open_source
-
-    tolerance_ms = settings.timing.simultaneous_ms
-    loaded = None if rig is None else load_rig(rig)
-    mapped = _topics(topics)
-    opened = open_source(source, loaded, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
-    chosen = _choose(opened.rig, pairs, no_imu)
-    if chosen is opened.rig:
-        return opened
-    return open_source(source, chosen, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
-
-
-def _topics(text: str | None) -> dict[str, str]:
-    """Name of a camera or ``imu`` -> topic."""
-    from graphvio.errors import SourceError
-
-    pairs = [each.split("=") for each in (text or "").split(",") if each]
-    if any(len(pair) != 2 or not all(pair) for pair in pairs):
-        raise SourceError(f"--topics {text}: give NAME=TOPIC separated by commas, such as cam0=/left/image,imu=/imu")
-    return {name.strip(): topic.strip() for name, topic in pairs}
-
-
-def _choose(rig: Rig, pairs: str | None, no_imu: bool) -> Rig:
-    from graphvio.errors import RigError
-
-    if pairs is not None:
-        try:
-            indices = [int(text) for text in pairs.split(",")]
-        except ValueError:
-            raise RigError(f"--pairs {pairs}: give numbers separated by commas, such as 0,1") from None
-        rig = rig.with_pairs(indices)
-    return rig.without_imu() if no_imu else rig
-
-
-class _ProgressLine(Redrawn):
-    """One line that is drawn over on a terminal, and every few seconds a line of its own elsewhere."""
+class _ProgressLine(TerminalDisplay):
+    """One line that is refreshed in a terminal, and a new line every few seconds elsewhere."""
 
     _REFRESH_S = 0.1
     _PLAIN_S = 5.0
@@ -149,7 +101,7 @@ class _ProgressLine(Redrawn):
         self._period_s = self._REFRESH_S if self._console.is_terminal else self._PLAIN_S
 
     def show(self, progress: Progress) -> None:
-        """Draw the line, if it is time to."""
+        """Show the progress, at most at the refresh rate."""
         if progress.wall_s < self._next_s and progress.framesets < progress.total:
             return
         self._next_s = progress.wall_s + self._period_s
@@ -164,10 +116,10 @@ class _ProgressLine(Redrawn):
         if self._console.is_terminal:
             self._live.update(text, refresh=True)
         else:
-            self._console.print(text, soft_wrap=True, highlight=False)
+            self._print(text)
 
 
-def _tell(summary: Summary, folder: Path) -> None:
+def _print_summary(summary: Summary, folder: Path) -> None:
     evaluation = summary.evaluation
     typer.echo(
         f"{summary.estimated} of {summary.framesets} framesets estimated, {summary.path_length_m:.2f} m in "
@@ -183,7 +135,7 @@ def _tell(summary: Summary, folder: Path) -> None:
     if faults:
         typer.echo(f"faults of the recording: {faults}")
     for warning in summary.warnings:
-        typer.echo(f"graphvio: {warning}; graphvio calibrate finds where it is", err=True)
+        warn(f"{warning}; graphvio calibrate finds where it is")
     if summary.resets:
-        typer.echo(f"started anew {summary.resets} times: see {folder / 'events.jsonl'}")
+        typer.echo(f"reinitialised {summary.resets} times: see {folder / 'events.jsonl'}")
     typer.echo(f"results: {folder}")

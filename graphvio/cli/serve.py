@@ -25,7 +25,7 @@ def serve(
     key: Annotated[Path | None, typer.Option("--tls-key", help="PEM file of its private key.", metavar="FILE")] = None,
     token_file: Annotated[
         Path | None,
-        typer.Option("--token-file", help="What clients have to know, in a file only you can read.", metavar="FILE"),
+        typer.Option("--token-file", help="Secret of the clients, in a file only you can read.", metavar="FILE"),
     ] = None,
     ros2: options.Ros2Domain = None,
     web: options.WebPort = None,

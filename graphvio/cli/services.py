@@ -1,4 +1,4 @@
-"""What a live run offers to other programs: gRPC, ROS 2 topics, a page for browsers."""
+"""Services of a live run for other programs: gRPC, ROS 2 topics, a page for browsers."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
     from graphvio.slam.service.options import ServiceOptions
     from graphvio.slam.service.server import GrpcServer
 
-_SOON_S = 0.5  # readers that are done by then are not worth a word
+_SOON_S = 0.5  # readers that are done by then need no message
 
 
 @dataclass(frozen=True)
 class Started:
-    """Services that run.
+    """Running services.
 
     Attributes:
-        address: of gRPC.
-        lines: for people, one for each.
-        check: raises what has become of one that failed.
-        finish: waits for those that go on when the odometry has ended; whether they have done all they were to.
+        address: address of gRPC.
+        lines: lines to print, one for each service.
+        check: raises the error of a service that failed.
+        finish: waits for services that continue after the odometry, and returns whether they completed.
     """
 
     address: str
@@ -40,16 +40,16 @@ class Started:
 
 @dataclass(frozen=True)
 class Services:
-    """Which of them, and for whom.
+    """Choice of services, and who may use them.
 
     Attributes:
-        host: address for gRPC; others than this machine's own need TLS and a token.
-        port: for gRPC; None takes the usual one.
-        certificate: PEM file of the server.
-        key: its key.
-        token_file: holds what clients have to know.
-        ros2_domain: domain of the topics, or None for none.
-        web_port: of the page for browsers, or None for none.
+        host: address of gRPC; other addresses than this machine's own need TLS and a token.
+        port: port of gRPC; None takes the default.
+        certificate: PEM file of the server's certificate.
+        key: PEM file of its private key.
+        token_file: file with the clients' secret.
+        ros2_domain: domain of the ROS 2 topics, or None for none.
+        web_port: port of the page for browsers, or None for none.
     """
 
     host: str = "127.0.0.1"
@@ -61,14 +61,14 @@ class Services:
     web_port: int | None = None
 
     def settings(self, config: Config) -> Config:
-        """The configuration with keyframes that carry their images: clients choose what they are sent."""
+        """Return a configuration whose keyframes carry their images: clients choose what they are sent."""
         return replace(config, keyframes=replace(config.keyframes, images=True))
 
     def check(self) -> None:
-        """Find out what cannot be, before sensors are started.
+        """Refuse services that cannot run, before sensors are started.
 
         Raises:
-            ServiceError: if an address is taken or would be open to all, or files are missing or cannot be used.
+            ServiceError: if an address is in use or would be open to all, or files are missing or cannot be used.
             MissingExtraError: if a service's extra is not installed.
         """
         from graphvio.slam.service.server import check
@@ -78,15 +78,15 @@ class Services:
             from graphvio.ros2.publisher import Publisher  # noqa: F401
 
     def start(self, running: LiveOdometry, stack: ExitStack, is_stopped: Callable[[], bool] = lambda: False) -> Started:
-        """Offer an odometry that is about to run, until the stack ends.
+        """Serve an odometry that is about to run, until the stack closes.
 
         Args:
             running: the odometry.
-            stack: ends what is started.
-            is_stopped: whether the run is to stop, asked while something is waited for.
+            stack: closes the services.
+            is_stopped: returns whether the run is to stop; called while waiting.
 
         Raises:
-            KeyboardInterrupt: if it is to stop before all is there.
+            KeyboardInterrupt: if it is to stop before all services run.
             ServiceError: if an address cannot be used, or would be open to all.
             MissingExtraError: if a service's extra is not installed.
         """
@@ -111,10 +111,10 @@ class Services:
 
 @contextmanager
 def _until_read(server: GrpcServer) -> Iterator[GrpcServer]:
-    """Serve, and at the end of the odometry wait for those who still read."""
+    """Serve, and at the end of the odometry wait for clients that still read."""
     from graphvio.slam.service.server import READ_S
 
     with server:
         yield server
         if not server.drain(_SOON_S):
-            typer.echo(f"waiting for what gRPC's clients have not read yet, {READ_S:g} s at most", err=True)
+            typer.echo(f"waiting for gRPC clients that have not read everything, {READ_S:g} s at most", err=True)

@@ -1,4 +1,4 @@
-"""``graphvio simulate``: write a simulated recording with exact truth."""
+"""``graphvio simulate``: a simulated recording with exact truth."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.shared import framesets_bar
 
 
 def simulate(
@@ -19,14 +20,14 @@ def simulate(
     seed: Annotated[int, typer.Option("--seed", help="Of all noise: same seed, same bytes.")] = 0,
     rate: Annotated[float, typer.Option("--rate", help="Framesets per second.")] = 20.0,
     trigger_offset_ms: Annotated[
-        float, typer.Option("--trigger-offset-ms", help="Each pair is triggered so much after the one before.")
+        float, typer.Option("--trigger-offset-ms", help="Each pair is triggered so much after the previous one.")
     ] = 0.0,
     verbose: options.Verbose = False,
 ) -> None:
     """Simulate a walk with four cameras and an IMU, and write it in the EuRoC/ASL layout.
 
     The corridor has a door that opens in front, a crowd, a bend with blank walls and failing lamps. The loop goes once
-    around four corridors, through its start again, turns round and comes back past it.
+    around four corridors, passes its first position again, turns round and comes back past it.
 
     Examples:
 
@@ -34,13 +35,9 @@ def simulate(
 
         graphvio simulate corridor --out corridor --duration 40 --seed 1
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
     from graphvio.simulation import simulate as simulate_recording
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with framesets_bar() as bar:
         task = bar.add_task(f"rendering {name}", total=None)
         recording = simulate_recording(
             name,

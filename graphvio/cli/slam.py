@@ -1,4 +1,4 @@
-"""``graphvio slam``: the odometry with the reference SLAM behind it."""
+"""``graphvio slam``: the odometry with a small SLAM system behind it."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def slam(
     rig: options.RigFile = None,
     config: options.ConfigName = "default",
     saved_map: Annotated[
-        Path | None, typer.Option("--map", help="Saved map to find the way in, and to go on with.", metavar="DIR")
+        Path | None, typer.Option("--map", help="Saved map to localise in and to extend.", metavar="DIR")
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Save the map, and the trajectory in it.", metavar="DIR")
     ] = None,
-    view: Annotated[bool, typer.Option("--view", help="Watch both trajectories in the rerun viewer.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Show both trajectories in the rerun viewer.")] = False,
     ros2: options.Ros2Domain = None,
     web: options.WebPort = None,
     save_rrd: Annotated[
@@ -41,10 +41,10 @@ def slam(
     duration: options.Duration = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Run the odometry with a small SLAM system behind it, in a process of its own, that corrects its place in the map.
+    """Run the odometry with a small SLAM system in a process of its own, which corrects the pose in the map.
 
-    The SLAM recognises places, optimises a graph of them and sends corrections by gRPC, as any other would do. With
-    --map the rig finds its place in a saved map. When the SLAM fails, the odometry goes on; exit code 3 then.
+    The SLAM recognises places, optimises a graph of them and sends corrections by gRPC, as any other SLAM system would.
+    With --map the rig is localised in a saved map. When the SLAM fails, the odometry goes on; exit code 3 then.
 
     Examples:
 
@@ -60,7 +60,7 @@ def slam(
     if out is not None:
         check_target(out)
         if out.exists() and any(out.iterdir()) and (saved_map is None or out.resolve() != saved_map.resolve()):
-            raise MapError(f"{out}: holds a map already; name another folder, or go on with it by  --map {out}")
+            raise MapError(f"{out}: holds a map already; name another folder, or extend it by  --map {out}")
     if save_rrd is not None and save_rrd.exists():
         raise MapError(f"{save_rrd}: exists; name another file for --save-rrd")
     services = _WithMapping(
@@ -77,11 +77,11 @@ class _WithMapping(Services):
     """gRPC on this machine, ROS 2 topics where asked for, and the SLAM as a client of gRPC.
 
     Attributes:
-        saved_map: to begin with.
-        out: for the map.
-        view: open a window.
-        map_web_port: of the page for browsers.
-        save_rrd: for what is shown.
+        saved_map: folder of the map to extend, or None.
+        out: folder for the map, or None.
+        view: whether the viewer's window opens.
+        map_web_port: port of the page for browsers, or None.
+        save_rrd: file for the viewer's recording, or None.
     """
 
     saved_map: Path | None = None
@@ -91,15 +91,15 @@ class _WithMapping(Services):
     save_rrd: Path | None = None
 
     def start(self, running: LiveOdometry, stack: ExitStack, is_stopped: Callable[[], bool] = lambda: False) -> Started:
-        """Offer the odometry, and start the SLAM; see `Services.start`."""
+        """Serve the odometry, and start the SLAM; see `Services.start`."""
         from graphvio.cli.slam_process import SlamProcess
         from graphvio.live.outputs import PathOutput
         from graphvio.mapping.process import MappingTask
         from graphvio.viewer import WebOptions
 
-        offered = super().start(running, stack, is_stopped)
+        served = super().start(running, stack, is_stopped)
         task = MappingTask(
-            offered.address,
+            served.address,
             running.odometry.config,
             self.saved_map,
             self.out,
@@ -110,15 +110,15 @@ class _WithMapping(Services):
         path = PathOutput(lambda: running.map_T_odom)
         if self.out is not None:
             running.add_output(path)
-        beside = SlamProcess(task, path)
-        stack.callback(beside.close)
-        beside.wait_ready(is_stopped)
-        lines = list(offered.lines)
+        process = SlamProcess(task, path)
+        stack.callback(process.close)
+        process.wait_ready(is_stopped)
+        lines = list(served.lines)
         if self.map_web_port is not None:
             lines.append(f"browser: {WebOptions(port=self.map_web_port).url}")
 
         def check() -> None:
-            offered.check()
-            beside.check()
+            served.check()
+            process.check()
 
-        return replace(offered, lines=lines, check=check, finish=beside.finish)
+        return replace(served, lines=lines, check=check, finish=process.finish)

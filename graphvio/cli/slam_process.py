@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from graphvio.cli.shared import EXIT_BAD_INPUT, warn
 from graphvio.errors import GraphvioError, MapError, ServiceError
 from graphvio.runtime import stop_signals_blocked
 
@@ -20,18 +21,17 @@ if TYPE_CHECKING:
     from graphvio.live.outputs import PathOutput
     from graphvio.mapping.process import MappingTask
 
-EXIT_FAILED = 2
-_LOOK_S = 0.1
-_PATIENCE_S = 300.0  # for a SLAM that is behind when the odometry ends
+_POLL_S = 0.1
+_PATIENCE_S = 300.0  # until a SLAM that is behind has processed the last keyframes
 _PATHS = ("odometry.txt", "online.txt")
 
 
 class SlamProcess:
-    """Runs a task beside the odometry, which does not need it: when it fails, that is told, and the odometry goes on.
+    """The process of a SLAM: when it fails, a warning is printed and the odometry goes on.
 
     Args:
-        task: what to do; a folder to work in is made here, so that it goes even when the process is killed.
-        path: of the odometry, to be put beside the map.
+        task: task of the process; its working folder is made here, so that it is removed even if the process is killed.
+        path: path of the odometry, written next to the map.
 
     Raises:
         MapError: if there is no room for temporary files.
@@ -42,9 +42,9 @@ class SlamProcess:
 
         self._out = task.out
         self._path = path
-        self._is_told = False
+        self._is_reported = False
         context = get_context("spawn")
-        self._ready = context.Event()  # before signals are blocked: its helper process, once started, unblocks them
+        self._ready = context.Event()  # before signals are blocked: its helper process unblocks them
         with stop_signals_blocked():  # signals are for the odometry, with which the SLAM ends
             try:
                 self._folder = tempfile.mkdtemp(prefix="graphvio-map-")
@@ -55,64 +55,64 @@ class SlamProcess:
             self._process.start()
 
     def wait_ready(self, is_stopped: Callable[[], bool]) -> None:
-        """Wait until it takes keyframes: places that are seen before would be lost.
+        """Wait until the SLAM takes keyframes: earlier places would be lost.
 
         Raises:
-            KeyboardInterrupt: if the odometry is to stop before.
-            ServiceError: if it fails before.
+            KeyboardInterrupt: if the odometry is to stop earlier.
+            ServiceError: if the process fails earlier.
         """
-        while not self._ready.wait(_LOOK_S):
+        while not self._ready.wait(_POLL_S):
             if is_stopped():
                 raise KeyboardInterrupt
             if self._process.exitcode:
                 raise ServiceError(self._failure)
 
     def check(self) -> None:
-        """Tell, once, if it has failed."""
-        if self._process.exitcode and not self._is_told:
-            self._tell(f"{self._failure}; the odometry goes on without it")
+        """Warn, once, if the process has failed."""
+        if self._process.exitcode and not self._is_reported:
+            self._warn(f"{self._failure}; the odometry goes on without it")
 
     def finish(self) -> bool:
-        """Wait until it has worked on all keyframes and saved the map, and put the odometry's path beside it.
+        """Wait until all keyframes are processed and the map is saved, and write the odometry's path next to it.
 
         Returns:
-            Whether all of that was done; what was not is told.
+            Whether all of that was done; otherwise a warning is printed.
         """
         if self._process.is_alive():
-            typer.echo("waiting for the SLAM, which works on the last keyframes", err=True)
+            typer.echo("waiting for the SLAM, which processes the last keyframes", err=True)
         self._process.join(_PATIENCE_S)
         if self._process.exitcode is None:
-            self._tell(f"the SLAM is not done {_PATIENCE_S:g} s after the odometry; its map is not saved")
-        elif self._process.exitcode and not self._is_told:
-            self._tell(self._failure)
+            self._warn(f"the SLAM is not done {_PATIENCE_S:g} s after the odometry; its map is not saved")
+        elif self._process.exitcode and not self._is_reported:
+            self._warn(self._failure)
         is_done = self._process.exitcode == 0
         if self._out is None:
             return is_done
         try:
             self._write_path(self._out)
         except GraphvioError as error:
-            self._tell(str(error))
+            self._warn(str(error))
             return False
         paths = ", ".join(_PATHS)
         if is_done:
-            typer.echo(f"map: {self._out}; paths in it: {paths} as it was known, trajectory.txt as it is now")
+            typer.echo(f"map: {self._out}; paths in it: {paths} as estimated online, trajectory.txt as corrected")
         else:
-            typer.echo(f"{self._out}: has the paths {paths} as it was known")
+            typer.echo(f"{self._out}: has the paths {paths} as estimated online")
         return is_done
 
     def close(self) -> None:
-        """Kill it if it still runs, and remove its folder."""
+        """Kill the process if it still runs, and remove its folder."""
         self._process.kill()
         self._process.join()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     @property
     def _failure(self) -> str:
-        return f"the SLAM failed (exit code {self._process.exitcode}); what it said is above"
+        return f"the SLAM failed (exit code {self._process.exitcode}); its messages are above"
 
-    def _tell(self, line: str) -> None:
-        self._is_told = True
-        typer.echo(f"graphvio: {line}", err=True)
+    def _warn(self, message: str) -> None:
+        self._is_reported = True
+        warn(message)
 
     def _write_path(self, out: Path) -> None:
         try:
@@ -125,11 +125,11 @@ class SlamProcess:
 
 
 def _map(task: MappingTask, ready: Event) -> None:
-    """What the process does."""
+    """Run the task in the process."""
     from graphvio.mapping.process import run_mapping
 
     try:
         typer.echo(run_mapping(task, ready), err=True)
     except GraphvioError as error:
-        typer.echo(f"graphvio: mapping: {error}", err=True)
-        raise SystemExit(EXIT_FAILED) from None
+        warn(f"mapping: {error}")
+        raise SystemExit(EXIT_BAD_INPUT) from None

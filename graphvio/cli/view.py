@@ -1,4 +1,4 @@
-"""``graphvio view``."""
+"""``graphvio view``: a result folder in the viewer."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,0 +1,140 @@
+"""Parts that several commands share: exit codes, opening a recording, warnings, and progress in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from graphvio.config import Config
+    from graphvio.rig import Rig
+    from graphvio.sources import Source
+
+EXIT_BAD_INPUT = 2
+EXIT_INCOMPLETE = 3  # results are written, but not all that was asked for
+EXIT_ABOVE_LIMIT = 4
+EXIT_INTERRUPTED = 130
+MIN_COMPLETION = 0.9  # share of the framesets that have a pose
+
+
+def warn(message: str) -> None:
+    """Print a line to stderr."""
+    typer.echo(f"graphvio: {message}", err=True)
+
+
+def names_of(paths: Sequence[Path]) -> list[str]:
+    """Return the names of files and folders, or their paths where names repeat."""
+    names = [path.name if path.is_dir() else path.stem for path in paths]
+    return names if len(set(names)) == len(names) else [str(path) for path in paths]
+
+
+# ---------------------------------------------------------------------- recordings
+
+
+def open_recording(
+    source: Path,
+    rig: Path | None,
+    settings: Config,
+    *,
+    pairs: str | None = None,
+    no_imu: bool = False,
+    from_s: float | None,
+    to_s: float | None,
+    topics: str | None,
+) -> Source:
+    """Open a recording as the options of a command ask for it, see `graphvio.cli.options`."""
+    from graphvio.rig_files import load_rig
+    from graphvio.sources import open_source
+
+    tolerance_ms = settings.timing.simultaneous_ms
+    loaded = None if rig is None else load_rig(rig)
+    mapped = _topics(topics)
+    opened = open_source(source, loaded, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
+    chosen = _choose(opened.rig, pairs, no_imu)
+    if chosen is opened.rig:
+        return opened
+    return open_source(source, chosen, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
+
+
+def _topics(text: str | None) -> dict[str, str]:
+    """Name of a camera or ``imu`` -> topic."""
+    from graphvio.errors import SourceError
+
+    pairs = [each.split("=") for each in (text or "").split(",") if each]
+    if any(len(pair) != 2 or not all(pair) for pair in pairs):
+        raise SourceError(f"--topics {text}: give NAME=TOPIC separated by commas, such as cam0=/left/image,imu=/imu")
+    return {name.strip(): topic.strip() for name, topic in pairs}
+
+
+def _choose(rig: Rig, pairs: str | None, no_imu: bool) -> Rig:
+    from graphvio.errors import RigError
+
+    if pairs is not None:
+        try:
+            indices = [int(text) for text in pairs.split(",")]
+        except ValueError:
+            raise RigError(f"--pairs {pairs}: give numbers separated by commas, such as 0,1") from None
+        rig = rig.with_pairs(indices)
+    return rig.without_imu() if no_imu else rig
+
+
+def check_session_name(path: Path) -> None:
+    """Refuse a session that could not be read by its name.
+
+    Raises:
+        SessionError: if it does not end in .mcap.
+    """
+    from graphvio.errors import SessionError
+
+    if path.suffix != ".mcap":
+        raise SessionError(f"{path}: is recorded as MCAP, which is read by its name; name it .mcap")
+
+
+# ---------------------------------------------------------------------- the terminal
+
+
+def framesets_bar() -> Progress:
+    """Return a progress bar that disappears at its end: description, count and remaining time."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=Console(stderr=True), transient=True)
+
+
+def stage_bars() -> Progress:
+    """Return progress bars that stay, one for each stage: description, count and elapsed time."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description:<28}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=Console(stderr=True))
+
+
+class TerminalDisplay:
+    """A context manager around text on stderr that is refreshed in place, and printed line by line elsewhere."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.live import Live
+
+        self._console = Console(stderr=True)
+        self._live = Live(console=self._console, auto_refresh=False, transient=True)
+        self._next_s = 0.0
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+
+    def _print(self, line: str) -> None:
+        self._console.print(line, soft_wrap=True, highlight=False, markup=False)
