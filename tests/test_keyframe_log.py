@@ -1,4 +1,4 @@
-"""The newest keyframes, for readers that come, go and come back."""
+"""The log of the newest keyframes, and its readers."""
 
 import threading
 from collections.abc import Callable
@@ -36,7 +36,7 @@ def in_thread(work: Callable[[], object]) -> tuple[threading.Thread, list[object
     return thread, results
 
 
-def test_memory_is_bounded_and_the_oldest_go() -> None:
+def test_memory_is_bounded_by_dropping_the_oldest() -> None:
     log = filled(100, max_bytes=1000)
     assert (log.oldest_id, log.next_id) == (95, 100)
     log.close()
@@ -44,7 +44,7 @@ def test_memory_is_bounded_and_the_oldest_go() -> None:
     assert log._bytes == 1000
 
 
-def test_landmarks_count_as_images_do() -> None:
+def test_landmarks_count_as_images() -> None:
     whole, pixels = np.zeros(4, dtype=np.int64), np.zeros((4, 2))
     descriptors = np.zeros((4, 32), dtype=np.uint8)
     marks = Landmarks(whole, whole, np.zeros((4, 3)), np.zeros((4, 3, 3)), pixels, pixels, descriptors)
@@ -53,7 +53,7 @@ def test_landmarks_count_as_images_do() -> None:
     assert log._bytes == 200 + 8 * 4 * (1 + 1 + 3 + 9 + 2 + 2) + 4 * 32
 
 
-def test_the_newest_stays_however_large_it_is() -> None:
+def test_newest_keyframe_stays_whatever_its_size() -> None:
     log = filled(3, max_bytes=10)
     assert (log.oldest_id, log.next_id) == (2, 3)
     newest = log.read(0)
@@ -61,7 +61,7 @@ def test_the_newest_stays_however_large_it_is() -> None:
     assert newest.id == 2
 
 
-def test_a_reader_goes_on_where_it_was() -> None:
+def test_reader_resumes_at_an_id() -> None:
     log = filled(5)
     log.close()
     first = log.follow(0)
@@ -72,7 +72,7 @@ def test_a_reader_goes_on_where_it_was() -> None:
     assert next(log.follow(-3)).id == 0
 
 
-def test_ids_that_never_were_are_passed_over() -> None:
+def test_missing_ids_are_skipped() -> None:
     log = KeyframeLog()
     for number in (3, 4, 9, 11):
         log.add(keyframe(number))
@@ -81,7 +81,7 @@ def test_ids_that_never_were_are_passed_over() -> None:
     assert [each.id for each in log.follow(5)] == [9, 11]
 
 
-def test_an_empty_log_has_the_next_id() -> None:
+def test_empty_log_has_the_next_id() -> None:
     log = KeyframeLog()
     assert (log.oldest_id, log.next_id, log.is_closed) == (0, 0, False)
     assert log.read(0, timeout_s=0.0) is None
@@ -90,7 +90,7 @@ def test_an_empty_log_has_the_next_id() -> None:
     assert (log.oldest_id, log.next_id) == (7, 8)
 
 
-def test_a_reader_that_waits_gets_the_next_one() -> None:
+def test_waiting_reader_gets_the_next_keyframe() -> None:
     log = filled(2)
     thread, results = in_thread(lambda: log.read(2))
     assert thread.is_alive()
@@ -99,7 +99,7 @@ def test_a_reader_that_waits_gets_the_next_one() -> None:
     assert [each.id for each in results] == [2]  # type: ignore[attr-defined]
 
 
-def test_all_readers_get_all_that_is_kept() -> None:
+def test_all_readers_get_all_kept_keyframes() -> None:
     log = KeyframeLog()
     readers = [in_thread(lambda: [each.id for each in log.follow(0)]) for _ in range(4)]
     for number in range(500):
@@ -111,7 +111,7 @@ def test_all_readers_get_all_that_is_kept() -> None:
 
 
 @pytest.mark.parametrize("from_id", [0, 5])
-def test_closing_wakes_all_that_wait(from_id: int) -> None:
+def test_close_wakes_waiting_readers(from_id: int) -> None:
     log = KeyframeLog()
     waiting = [in_thread(lambda: log.read(from_id)) for _ in range(3)]
     log.close()

@@ -1,4 +1,4 @@
-"""Keyframes for a SLAM system and its corrections, from the odometry as it runs in a simulated room."""
+"""Keyframes and corrections of an odometry that runs in a simulated room."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -96,7 +96,7 @@ def until(measurements: list[Measurement], framesets: int) -> list[Measurement]:
 # ------------------------------------------------------------------ when they come, and their poses
 
 
-def test_each_reference_is_a_keyframe_and_ids_count(run: Run) -> None:
+def test_each_reference_is_a_keyframe_with_the_next_id(run: Run) -> None:
     references = [step.estimate for step in run.steps if step.estimate.stamp_ns in step.references]
     assert [k.stamp_ns for k in run.keyframes] == [e.stamp_ns for e in references]
     assert len(run.keyframes) >= 8
@@ -136,7 +136,7 @@ def test_motions_between_keyframes_are_within_their_covariance(
 
 
 def in_turns(measurements: list[Measurement]) -> list[Measurement]:
-    """Front and back images alternate, each at its own time."""
+    """Return measurements whose framesets have front and back images in turn."""
     made, count = list[Measurement](), 0
     for measurement in measurements:
         if isinstance(measurement, FrameSet):
@@ -145,8 +145,8 @@ def in_turns(measurements: list[Measurement]) -> list[Measurement]:
     return made
 
 
-def test_the_maps_drift_covers_what_odometry_drifts(run: Run, truth: Trajectory) -> None:
-    """Corrected once without error, odometry leads away from the truth by no more than is expected."""
+def test_drift_of_the_map_frame_covers_that_of_the_odometry(run: Run, truth: Trajectory) -> None:
+    """After one exact correction, the odometry's errors are consistent with the expected drift."""
     exact, squares = 1e-12 * np.eye(6), list[float]()
     first = run.keyframes[0]
     for keyframe in run.keyframes[1:]:
@@ -189,10 +189,10 @@ def test_keyframe_without_a_motion_has_the_covariance_of_its_pose(rig: Rig) -> N
     assert all(len(k.landmarks) == 0 for k in made)
 
 
-def test_where_the_window_is_rebuilt_a_keyframe_begins(
+def test_rebuilt_window_begins_with_a_keyframe(
     rig: Rig, measurements: list[Measurement], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is measured from there on is measured from there, and steps say so, too."""
+    """Later motions are measured from it, as steps report."""
 
     def fail(*_: object) -> None:
         patch.undo()
@@ -218,7 +218,7 @@ def test_where_the_window_is_rebuilt_a_keyframe_begins(
     np.testing.assert_array_equal(keyframes[1].relative_covariance, rebuilt.covariance)
 
 
-def test_a_start_in_motion_has_no_keyframe_until_it_is_known(rig: Rig, measurements: list[Measurement]) -> None:
+def test_no_keyframe_while_initialising_in_motion(rig: Rig, measurements: list[Measurement]) -> None:
     began = next(e.stamp_ns for e in measurements if isinstance(e, FrameSet)) + 2_000_000_000
     run = run_of(rig, [e for e in measurements if e.stamp_ns > began])
     statuses = [e.status for e in run.estimates]
@@ -230,7 +230,7 @@ def test_a_start_in_motion_has_no_keyframe_until_it_is_known(rig: Rig, measureme
     assert (run.keyframes[0].id, run.keyframes[0].previous_id) == (0, None)
 
 
-def test_a_break_of_the_epoch_breaks_the_chain_and_ends_the_map(rig: Rig, measurements: list[Measurement]) -> None:
+def test_new_epoch_begins_a_chain_and_resets_the_map(rig: Rig, measurements: list[Measurement]) -> None:
     begun, remaining = until(measurements, 50), measurements[len(until(measurements, 50)) :]
     odometry, keyframes, before = Odometry(rig), list[Keyframe](), list[Estimate]()
     front_end = FrontEnd(odometry)
@@ -263,7 +263,7 @@ def test_a_break_of_the_epoch_breaks_the_chain_and_ends_the_map(rig: Rig, measur
     odometry.finish()
 
 
-def test_what_is_lost_has_no_keyframe(rig: Rig, measurements: list[Measurement]) -> None:
+def test_lost_state_has_no_keyframe(rig: Rig, measurements: list[Measurement]) -> None:
     black = np.zeros((480, 640), dtype=np.uint8)
     framesets = [e for e in measurements if isinstance(e, FrameSet)][30:70]
     for k in range(10, 30):
@@ -279,7 +279,7 @@ def test_what_is_lost_has_no_keyframe(rig: Rig, measurements: list[Measurement])
 # ------------------------------------------------------------------ what is seen there
 
 
-def test_landmarks_are_where_the_simulator_has_them(run: Run, rig: Rig) -> None:
+def test_landmarks_are_at_their_true_positions(run: Run, rig: Rig) -> None:
     simulator = make_simulator("room", duration_s=5.0, seed=3)
     stamps, errors = simulator.stamps_ns.tolist(), list[Float]()
     for keyframe in (run.keyframes[0], run.keyframes[-1]):
@@ -305,7 +305,7 @@ def test_landmarks_are_where_the_simulator_has_them(run: Run, rig: Rig) -> None:
     assert np.median(squares) < 1.0
 
 
-def test_landmarks_covariances_are_those_of_their_errors() -> None:
+def test_covariances_of_landmarks_are_consistent() -> None:
     """Random points, seen with noise by both cameras of a pair, and triangulated."""
     rng, sigma_px, count, squares = np.random.default_rng(1), 0.3, 2000, list[Float]()
     rig = two_pair_rig()
@@ -333,7 +333,7 @@ def test_landmarks_covariances_are_those_of_their_errors() -> None:
     assert np.mean(np.concatenate(squares)) == pytest.approx(3.0, rel=0.05)
 
 
-def test_a_depth_that_is_hardly_known_makes_no_landmark(run: Run) -> None:
+def test_uncertain_depth_makes_no_landmark(run: Run) -> None:
     for keyframe in run.keyframes:
         spread = np.sqrt(np.linalg.eigvalsh(keyframe.landmarks.covariances)[:, -1])
         assert (spread < 0.4 * np.linalg.norm(keyframe.landmarks.points_body, axis=1)).all()
@@ -356,7 +356,7 @@ def test_landmarks_project_to_their_pixels_in_the_right_images(run: Run, rig: Ri
 
 
 @pytest.mark.parametrize("kind", ["orb", "sift"])
-def test_a_track_looks_alike_in_the_next_keyframe_and_unlike_others(kind: str, run: Run) -> None:
+def test_descriptors_match_their_track_in_the_next_keyframe(kind: str, run: Run) -> None:
     describe, found, total = describer(kind), 0, 0  # type: ignore[arg-type]
     assert describe is not None
     for before, now in zip(run.keyframes[:-1], run.keyframes[1:], strict=True):
@@ -377,7 +377,7 @@ def test_a_track_looks_alike_in_the_next_keyframe_and_unlike_others(kind: str, r
 
 
 @pytest.mark.parametrize(("kind", "width"), [("orb", 32), ("sift", 128)])
-def test_descriptors_turn_with_the_image(kind: str, width: int, run: Run) -> None:
+def test_descriptors_are_invariant_to_rotation(kind: str, width: int, run: Run) -> None:
     describe = describer(kind)  # type: ignore[arg-type]
     assert describe is not None
     keyframe = run.keyframes[-1]
@@ -397,7 +397,7 @@ def test_descriptors_turn_with_the_image(kind: str, width: int, run: Run) -> Non
 
 
 def distances(one: AnyArray, other: AnyArray, kind: str) -> Float:
-    """Of all descriptors (N, D) from all others (M, D): (N, M)."""
+    """Return the distances (N, M) of descriptors (N, D) from others (M, D)."""
     if kind == "orb":
         return np.asarray(
             np.unpackbits(np.bitwise_xor(one[:, None], other[None]), axis=2).sum(axis=2), dtype=np.float64
@@ -405,7 +405,7 @@ def distances(one: AnyArray, other: AnyArray, kind: str) -> Float:
     return np.asarray(np.linalg.norm(one[:, None].astype(np.float64) - other[None], axis=2))
 
 
-def test_corners_at_the_edge_have_descriptors_too() -> None:
+def test_corners_at_the_edge_have_descriptors() -> None:
     image: Image = np.random.default_rng(0).integers(0, 256, (60, 80), dtype=np.uint8)
     corners = np.array([[0.0, 0.0], [79.0, 0.0], [0.0, 59.0], [79.0, 59.0]])
     for kind in ("orb", "sift"):
@@ -416,7 +416,7 @@ def test_corners_at_the_edge_have_descriptors_too() -> None:
     assert describer("none") is None
 
 
-def test_images_come_only_where_they_are_asked_for(run: Run, rig: Rig, measurements: list[Measurement]) -> None:
+def test_keyframes_have_images_on_request_only(run: Run, rig: Rig, measurements: list[Measurement]) -> None:
     of = {e.stamp_ns: e.images for e in measurements if isinstance(e, FrameSet)}
     for keyframe in run.keyframes:
         assert set(keyframe.images) == {0, 1}
@@ -433,8 +433,8 @@ def test_images_come_only_where_they_are_asked_for(run: Run, rig: Rig, measureme
 # ------------------------------------------------------------------ threads, and what does not change
 
 
-def test_neither_listeners_nor_corrections_change_an_estimate(rig: Rig, measurements: list[Measurement]) -> None:
-    """With others that read, correct and ask in threads of their own all the while."""
+def test_subscribers_and_corrections_do_not_change_estimates(rig: Rig, measurements: list[Measurement]) -> None:
+    """With other threads that read, correct and predict at the same time."""
     measurements = until(measurements, 60)
     config = "motion: {keyframe_overlap: 0.9}\n"  # has many keyframes
     alone = Odometry(rig, Config.from_yaml(config))
@@ -447,7 +447,7 @@ def test_neither_listeners_nor_corrections_change_an_estimate(rig: Rig, measurem
     is_over, failures, moved = threading.Event(), list[BaseException](), list[bool]()
 
     def correct_all() -> None:
-        """Each keyframe at once, its neighbours by ten metres apart; and whatever comes late, too."""
+        """Correct all keyframes at once and again later, neighbours by ten metres apart."""
         for keyframe in front_end.keyframes():
             read.append(keyframe)
             for k in range(keyframe.id + 1):
@@ -498,7 +498,7 @@ def test_neither_listeners_nor_corrections_change_an_estimate(rig: Rig, measurem
         np.testing.assert_array_equal(pose, other_pose)
 
 
-def test_the_map_jumps_and_odom_does_not(rig: Rig, measurements: list[Measurement]) -> None:
+def test_correction_moves_map_and_not_odom(rig: Rig, measurements: list[Measurement]) -> None:
     predictions = list[Prediction]()
     config = Config.from_yaml("motion: {keyframe_overlap: 0.9}")
     odometry = Odometry(rig, config, on_prediction=predictions.append)
@@ -526,7 +526,7 @@ def test_the_map_jumps_and_odom_does_not(rig: Rig, measurements: list[Measuremen
     assert np.linalg.norm(steps, axis=1).max() < 0.02  # 1 cm a sample at twice the walking speed, and small corrections
 
 
-def test_an_iterator_may_come_late_and_ends_at_the_end(rig: Rig, measurements: list[Measurement]) -> None:
+def test_late_iterator_gets_the_kept_keyframes_and_ends(rig: Rig, measurements: list[Measurement]) -> None:
     odometry, keyframes = Odometry(rig), list[Keyframe]()
     front_end = FrontEnd(odometry)
     measurements = until(measurements, 50)
@@ -543,7 +543,7 @@ def test_an_iterator_may_come_late_and_ends_at_the_end(rig: Rig, measurements: l
     assert [k.id for k in front_end.keyframes(1)] == list(range(1, len(keyframes)))
 
 
-def test_corners_can_be_made_fewer_and_many_again(rig: Rig, measurements: list[Measurement]) -> None:
+def test_number_of_corners_can_be_reduced_and_restored(rig: Rig, measurements: list[Measurement]) -> None:
     odometry, counts, shares = Odometry(rig), list[int](), {20: 0.25, 45: 1.0}
     for measurement in until(measurements, 70):
         estimate = odometry.process(measurement)

@@ -26,13 +26,13 @@ SIGMAS = np.repeat([5e-3, 2e-2], 3)  # of corrections
 
 @dataclass
 class Chain:
-    """Keyframes, and where each truly is in the map."""
+    """Keyframes, and their true poses in the map."""
 
     keyframes: list[Keyframe]
     map_T_body: list[Float]
 
     def corrected(self, k: int, rng: np.random.Generator) -> tuple[int, Float, Float]:
-        """A correction of the k-th, with noise."""
+        """Return a noisy correction of the k-th keyframe."""
         return self.keyframes[k].id, self.map_T_body[k] @ se3_exp(SIGMAS * rng.standard_normal(6)), np.diag(SIGMAS**2)
 
 
@@ -79,7 +79,7 @@ def in_force(frame: MapFrame) -> Float:
 
 
 def covariance_at_the_end(keyframes: Sequence[Keyframe], corrected: Sequence[int]) -> Float:
-    """Of ``map_T_odom`` at the last keyframe (6, 6), by one system of normal equations over all keyframes."""
+    """Return the covariance (6, 6) of ``map_T_odom`` at the last keyframe, by the normal equations of all keyframes."""
     count = len(keyframes)
     information = np.zeros((6 * count, 6 * count))
     for k in range(count):
@@ -97,7 +97,7 @@ def covariance_at_the_end(keyframes: Sequence[Keyframe], corrected: Sequence[int
 # ------------------------------------------------------------------ what is believed
 
 
-def test_errors_in_the_map_are_as_large_as_drift_and_corrections_make_them() -> None:
+def test_errors_in_the_map_are_consistent() -> None:
     runs, count = 120, 20
     squares = []
     for number in range(runs):
@@ -130,7 +130,7 @@ def test_order_of_corrections_makes_no_difference(order: list[int], seed: int) -
     np.testing.assert_array_equal(in_any.map_T_odom, in_order.map_T_odom)
 
 
-def test_a_correction_counts_the_same_before_and_after_the_keyframes_that_follow() -> None:
+def test_late_correction_counts_as_an_early_one() -> None:
     rng = np.random.default_rng(5)
     walk = chain(rng, 30)
     corrections = [walk.corrected(k, rng) for k in (3, 10)]
@@ -145,7 +145,7 @@ def test_a_correction_counts_the_same_before_and_after_the_keyframes_that_follow
     np.testing.assert_array_equal(in_force(late), in_force(at_once))
 
 
-def test_the_first_correction_is_taken_as_it_is() -> None:
+def test_first_correction_is_accepted_unchanged() -> None:
     rng = np.random.default_rng(6)
     walk = chain(rng, 5)
     frame = frame_with(walk.keyframes, 0.9)
@@ -159,7 +159,7 @@ def test_the_first_correction_is_taken_as_it_is() -> None:
     np.testing.assert_allclose(in_force(frame) @ walk.keyframes[2].odom_T_body, anywhere, atol=1e-9)
 
 
-def test_a_second_correction_of_a_keyframe_takes_the_place_of_the_first() -> None:
+def test_second_correction_of_a_keyframe_replaces_the_first() -> None:
     rng = np.random.default_rng(7)
     walk = chain(rng, 10)
     first, old, new = walk.corrected(0, rng), walk.corrected(6, rng), walk.corrected(6, rng)
@@ -214,7 +214,7 @@ def test_correct_corrections_are_refused_at_the_configured_rate(earlier: tuple[i
     assert refused == pytest.approx(0.05, abs=3.0 * np.sqrt(0.05 * 0.95 / 400))
 
 
-def test_the_gate_is_where_the_probability_puts_it() -> None:
+def test_threshold_is_the_quantile_of_the_probability() -> None:
     accepted = 0
     for number in range(400):
         rng = np.random.default_rng([3, number])
@@ -227,7 +227,7 @@ def test_the_gate_is_where_the_probability_puts_it() -> None:
     assert accepted / 400 == pytest.approx(0.9, abs=3.0 * np.sqrt(0.09 / 400))
 
 
-def test_a_wrong_correction_is_refused_and_moves_nothing() -> None:
+def test_wrong_correction_is_refused_and_moves_nothing() -> None:
     rng = np.random.default_rng(9)
     walk = chain(rng, 12)
     frame = frame_with(walk.keyframes, 0.999)
@@ -246,7 +246,7 @@ def test_a_wrong_correction_is_refused_and_moves_nothing() -> None:
 @pytest.mark.parametrize(
     ("pattern", "moves"), [("AB" * 40, 0), ("AAABBB" * 20, 1), ("AABB" * 20, 0), ("A" + "B" * 60, 1), ("A" * 80, 0)]
 )
-def test_contradictory_corrections_do_not_take_turns(pattern: str, moves: int) -> None:
+def test_contradicting_corrections_do_not_alternate(pattern: str, moves: int) -> None:
     rng = np.random.default_rng(10)
     walk = chain(rng, len(pattern))
     frame = frame_with(walk.keyframes, 0.999)
@@ -287,7 +287,7 @@ def test_repeated_corrections_of_a_keyframe_count_once() -> None:
         assert frame.correct(keyframe_id, off @ pose, covariance).accepted == (k == 7)
 
 
-def test_an_epochs_map_ends_with_it() -> None:
+def test_new_epoch_resets_the_map() -> None:
     rng = np.random.default_rng(13)
     old, new = chain(rng, 4), chain(rng, 4, epoch=1, first_id=4)
     frame = frame_with(old.keyframes)
@@ -307,7 +307,7 @@ def test_an_epochs_map_ends_with_it() -> None:
     assert not frame.correct(99, np.eye(4), np.eye(6)).accepted
 
 
-def test_no_epoch_ever_gets_the_map_of_another() -> None:
+def test_no_epoch_gets_the_map_of_another() -> None:
     rng = np.random.default_rng(14)
     first, frame = chain(rng, 1).keyframes[0], MapFrame(SURE)
     epochs, wrong, is_over = 1000, [], threading.Event()
@@ -334,7 +334,7 @@ def test_no_epoch_ever_gets_the_map_of_another() -> None:
 # ------------------------------------------------------------------ what is kept
 
 
-def test_many_corrections_become_one_without_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_merged_corrections_lose_no_information(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(15)
     walk = chain(rng, 60)
     corrections = [walk.corrected(k, rng) for k in range(60) if k != 5]
@@ -357,7 +357,7 @@ def test_many_corrections_become_one_without_loss(monkeypatch: pytest.MonkeyPatc
     assert sum(each.is_many for each in merged._accepted) == 1
 
 
-def test_drift_since_a_keyframe_that_is_forgotten_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drift_since_a_dropped_keyframe_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(16)
     walk = chain(rng, 50)
     first, last = walk.corrected(0, rng), walk.corrected(49, rng)
@@ -388,7 +388,7 @@ def test_drift_since_a_keyframe_that_is_forgotten_is_known(monkeypatch: pytest.M
         (np.eye(4), [[1.0], [1.0, 2.0]], "not an array of numbers"),
     ],
 )
-def test_an_invalid_pose_or_covariance_raises(pose: Float, covariance: Float, message: str) -> None:
+def test_invalid_pose_or_covariance_raises(pose: Float, covariance: Float, message: str) -> None:
     frame = frame_with(chain(np.random.default_rng(17), 2).keyframes)
     with pytest.raises(MeasurementError, match=message):
         frame.correct(0, pose, covariance)

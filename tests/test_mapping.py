@@ -1,4 +1,4 @@
-"""The SLAM system on rendered images: loops, epochs, saved maps, and finding the way in them."""
+"""The SLAM system on rendered images: loops, epochs, saved maps, and sessions that are located in them."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ def count(mapper: Mapper, name: str) -> int:
 
 
 def far(poses: Float, truth: Float) -> Float:
-    """Metres (N,)."""
+    """Return the distances (N,) of positions, metres."""
     return np.asarray(np.linalg.norm((poses - truth)[:, :3, 3], axis=1))
 
 
-def test_a_round_is_closed(made: Made) -> None:
+def test_round_is_closed(made: Made) -> None:
     drift = far(made.front_end.odom_T_body, made.truth)
     found = made.mapper.trajectory
     assert len(found) == len(made.truth)
@@ -73,7 +73,7 @@ def test_a_round_is_closed(made: Made) -> None:
     assert summary["places_skipped"] == summary["corrections_refused"] == 0
 
 
-def test_corrections_are_as_good_as_they_say(made: Made) -> None:
+def test_corrections_are_consistent(made: Made) -> None:
     assert len(made.front_end.corrections) >= 3
     squares = []
     for number, pose, covariance in made.front_end.corrections:
@@ -87,7 +87,7 @@ def test_corrections_are_as_good_as_they_say(made: Made) -> None:
     assert all(np.sqrt(np.trace(covariance[:3, :3])) < 0.012 for _, _, covariance in made.front_end.corrections)
 
 
-def test_no_closure_that_is_used_is_wrong(made: Made) -> None:
+def test_used_closures_are_right(made: Made) -> None:
     row_of = {stamp: k for k, stamp in enumerate(made.mapper.trajectory.stamps_ns.tolist())}
     for closure, is_used in made.mapper.closures:
         one, other = (made.truth[row_of[end.stamp_ns]] for end in (closure.reference, closure.current))
@@ -95,7 +95,7 @@ def test_no_closure_that_is_used_is_wrong(made: Made) -> None:
         assert not is_used or np.linalg.norm(error[3:]) < 0.03
 
 
-def test_the_map_on_disk_is_whole(made: Made) -> None:
+def test_saved_map_is_complete(made: Made) -> None:
     header = json.loads((made.folder / "map.json").read_text())
     assert (header["format"], header["version"]) == ("graphvio map", 2)
     assert header["places"] == made.mapper.summary()["places"]
@@ -103,7 +103,7 @@ def test_the_map_on_disk_is_whole(made: Made) -> None:
 
 
 @pytest.mark.parametrize("first", [40, 112])
-def test_another_session_finds_its_way_in_the_map(made: Made, tmp_path: Path, first: int) -> None:
+def test_another_session_is_located_in_the_map(made: Made, tmp_path: Path, first: int) -> None:
     """From two places of the map; a third session would find both."""
     walk, truth = front_end(first, first + 49, seed=2, step=2, session=1)
     again = mapped(walk, made.folder, save=tmp_path / "both")
@@ -127,7 +127,7 @@ def test_another_session_finds_its_way_in_the_map(made: Made, tmp_path: Path, fi
 
 
 def test_nothing_is_corrected_before_three_places_agree(made: Made) -> None:
-    """The session's first places alone: the very first is recognised, and that is not enough."""
+    """The session's first places only: the first one is recognised, which is not enough."""
     walk, _ = front_end(40, 43, seed=2, step=2, session=1)
     again = mapped(walk, made.folder)
     assert count(again, "closures_found") > count(made.mapper, "closures_found")
@@ -136,8 +136,8 @@ def test_nothing_is_corrected_before_three_places_agree(made: Made) -> None:
     assert len(again.trajectory) == 0
 
 
-def test_a_new_epoch_is_found_in_the_map(tmp_path: Path) -> None:
-    """Its keyframes stay out of the trajectory until then; afterwards they are all in, whatever the odometry says."""
+def test_new_epoch_is_located_in_the_map(tmp_path: Path) -> None:
+    """Its keyframes are not in the trajectory until then; afterwards all of them are."""
     walk, truth = front_end(0, 200, seed=3, breaks={40}, kind=Refusing)
     mapper = mapped(walk)
     assert min(number for number, _, _ in walk.corrections if number >= 40) > 41  # three places must agree
@@ -151,7 +151,7 @@ def test_a_new_epoch_is_found_in_the_map(tmp_path: Path) -> None:
     assert len(load_trajectory(tmp_path / "map.txt")) == len(truth)
 
 
-def test_a_map_of_another_rig_is_refused(made: Made) -> None:
+def test_map_of_another_rig_raises(made: Made) -> None:
     walk, _ = front_end(0, 4, seed=0)
     left = walk.rig.pairs[0].left
     moved = replace(left, intrinsics=left.intrinsics + 1.0)
@@ -162,7 +162,7 @@ def test_a_map_of_another_rig_is_refused(made: Made) -> None:
 
 
 @pytest.mark.parametrize("name", ["map.npz", "closures.npz", "features.db"])
-def test_a_damaged_map_is_refused(copied: Path, name: str) -> None:
+def test_damaged_map_raises(copied: Path, name: str) -> None:
     data = bytearray((copied / name).read_bytes())
     data[len(data) // 2] ^= 0xFF
     (copied / name).write_bytes(data)
@@ -173,7 +173,7 @@ def test_a_damaged_map_is_refused(copied: Path, name: str) -> None:
         Mapper(front_end(0, 4, seed=0)[0], CONFIG, copied)
 
 
-def test_what_is_no_map_is_refused(copied: Path, tmp_path: Path) -> None:
+def test_folder_without_a_map_raises(copied: Path, tmp_path: Path) -> None:
     walk, _ = front_end(0, 4, seed=0)
     with pytest.raises(MapError, match=r"is no map, map.json is missing"):
         Mapper(walk, CONFIG, tmp_path)
@@ -186,7 +186,7 @@ def test_what_is_no_map_is_refused(copied: Path, tmp_path: Path) -> None:
         Mapper(walk, CONFIG, copied)
 
 
-def test_something_else_is_not_overwritten(tmp_path: Path) -> None:
+def test_other_files_are_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     with (
         Mapper(front_end(0, 4, seed=0)[0], CONFIG) as mapper,
@@ -196,7 +196,7 @@ def test_something_else_is_not_overwritten(tmp_path: Path) -> None:
     assert (tmp_path / "mine.txt").read_text() == "mine"
 
 
-def test_what_else_is_in_a_maps_folder_stays(tmp_path: Path) -> None:
+def test_other_files_in_a_maps_folder_stay(tmp_path: Path) -> None:
     mine = {"notes.txt": "mine", "online.txt": "an earlier path"}
     (tmp_path / "link").symlink_to(tmp_path / "map")
     with Mapper(front_end(0, 4, seed=0)[0], CONFIG) as mapper:
@@ -215,7 +215,7 @@ def test_what_else_is_in_a_maps_folder_stays(tmp_path: Path) -> None:
     assert (tmp_path / "link").is_symlink()
 
 
-def test_what_was_there_before_a_place_cannot_be_kept_is_saved(tmp_path: Path) -> None:
+def test_map_before_a_failure_can_be_saved(tmp_path: Path) -> None:
     work = tmp_path / "work"
     work.mkdir()
 
@@ -234,7 +234,7 @@ def test_what_was_there_before_a_place_cannot_be_kept_is_saved(tmp_path: Path) -
         assert again.summary()["places_of_map"] == 3
 
 
-def test_stop_ends_the_work_and_the_map_can_be_saved(tmp_path: Path) -> None:
+def test_stop_ends_run_and_the_map_can_be_saved(tmp_path: Path) -> None:
     walk, _ = front_end(0, 240, seed=1)
     with Mapper(walk, CONFIG) as mapper:
         mapper.run(lambda each: each.stop())
@@ -248,8 +248,8 @@ def test_stop_ends_the_work_and_the_map_can_be_saved(tmp_path: Path) -> None:
         assert again.summary()["places_of_map"] == 1
 
 
-def test_a_map_can_be_saved_while_it_is_made(tmp_path: Path) -> None:
-    """From another thread, again and again; each is whole."""
+def test_map_can_be_saved_during_run(tmp_path: Path) -> None:
+    """Repeatedly from another thread; each map is complete."""
     walk, _ = front_end(0, 60, seed=1)
     sizes: list[int] = []
     with Mapper(walk, CONFIG) as mapper:
@@ -265,7 +265,7 @@ def test_a_map_can_be_saved_while_it_is_made(tmp_path: Path) -> None:
     assert len(saved_map.load(tmp_path / "now", walk.rig).stamp_ns) == count(mapper, "places") > 3
 
 
-def test_an_empty_map_can_be_saved_and_used(tmp_path: Path) -> None:
+def test_empty_map_can_be_saved_and_used(tmp_path: Path) -> None:
     with Mapper(front_end(0, 4, seed=0)[0], CONFIG) as mapper:
         mapper.save(tmp_path / "empty")
         assert len(mapper.trajectory) == 0

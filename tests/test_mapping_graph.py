@@ -54,7 +54,7 @@ def worst_m(graph: PoseGraph, truth: Float) -> float:
     return float(np.linalg.norm((poses - truth)[:, :3, 3], axis=1).max())
 
 
-def test_chains_know_motions_as_the_solved_graph_does() -> None:
+def test_motions_of_chains_equal_those_of_the_solved_graph() -> None:
     truth, rng = circle(1.0, 30), np.random.default_rng(0)
     graph = PoseGraph(PROBABILITY)
     walked(graph, truth, rng)
@@ -68,7 +68,7 @@ def test_chains_know_motions_as_the_solved_graph_does() -> None:
     assert graph.chains.distance(edge) == pytest.approx(known.distance(edge), rel=1e-4)
 
 
-def test_a_covariance_that_says_nothing_is_uncertain_can_be_used() -> None:
+def test_covariance_of_zero_can_be_used() -> None:
     chains = Chains()
     chains.begin(np.eye(4))
     chains.add(np.eye(4), np.zeros((6, 6)))
@@ -92,7 +92,7 @@ def test_closures_remove_drift_consistently_with_the_covariance() -> None:
     assert 3.0 < np.mean(squares) < 10.0
 
 
-def test_a_closure_that_the_odometry_refutes_is_never_used() -> None:
+def test_closure_refuted_by_the_odometry_is_never_used() -> None:
     truth, rng = circle(1.5, 60), np.random.default_rng(4)
     graph = PoseGraph(PROBABILITY)
     walked(graph, truth, rng)
@@ -101,7 +101,7 @@ def test_a_closure_that_the_odometry_refutes_is_never_used() -> None:
     assert not graph.closures[0].is_used
 
 
-def test_a_wrong_closure_that_came_first_is_given_up() -> None:
+def test_wrong_first_closure_is_rejected_later() -> None:
     """The odometry does not refute it; five other closures do, one after the other."""
     truth, rng = circle(1.5, 60), np.random.default_rng(5)
     graph = PoseGraph(PROBABILITY)
@@ -114,8 +114,8 @@ def test_a_wrong_closure_that_came_first_is_given_up() -> None:
     assert np.linalg.norm((graph.pose(52) - truth[52])[:3, 3]) < 0.02
 
 
-def test_places_that_cannot_see_the_same_are_not_compared() -> None:
-    """As far as is known: another fragment may be anywhere."""
+def test_places_out_of_sight_are_not_compared() -> None:
+    """Another fragment may be anywhere."""
     truth, rng = np.tile(np.eye(4), (60, 1, 1)), np.random.default_rng(8)
     truth[:, 0, 3] = np.arange(60)
     graph = PoseGraph(PROBABILITY)
@@ -126,8 +126,8 @@ def test_places_that_cannot_see_the_same_are_not_compared() -> None:
     assert graph.may_see(0, 60)
 
 
-def test_a_fragment_is_joined_by_three_places_that_agree() -> None:
-    """Two places, be it with many closures, are too few; so are three of which one says something else."""
+def test_fragment_is_joined_by_three_places_that_agree() -> None:
+    """Two places, even with many closures, are too few; so are three of which one disagrees."""
     truth, rng = circle(1.5, 60), np.random.default_rng(6)
     graph = PoseGraph(PROBABILITY)
     walked(graph, truth[:40], rng)
@@ -149,7 +149,7 @@ def test_a_fragment_is_joined_by_three_places_that_agree() -> None:
     assert error @ np.linalg.solve(graph.covariance(50), error) < 25.0
 
 
-def test_a_joined_fragment_uses_single_closures() -> None:
+def test_joined_fragment_uses_single_closures() -> None:
     truth, rng = circle(1.5, 60), np.random.default_rng(7)
     graph = PoseGraph(PROBABILITY)
     walked(graph, truth[:40], rng)
@@ -162,7 +162,7 @@ def test_a_joined_fragment_uses_single_closures() -> None:
     assert not graph.add_closures([closure(truth, 16, 56, rng, np.array([0.0, 0.0, 0.4, 1.0, 0.0, 0.0]))])
 
 
-def test_votes_are_compared_in_the_solution_not_in_what_has_drifted() -> None:
+def test_votes_are_compared_in_the_solution() -> None:
     """The first session's two rounds lie metres apart by the odometry; another one sees places of both."""
     truth, rng = circle(3.0, 120), np.random.default_rng(9)
     graph = PoseGraph(PROBABILITY)

@@ -1,4 +1,4 @@
-"""Which keyframes are places, and what the chain of keyframes says of the way from one to the next."""
+"""Selection of places, and the motion from one to the next by the chain of keyframes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def chain(count: int, first_epoch: int = 0, begin: int = 0) -> list[Keyframe]:
 
 
 class Listed:
-    """A front-end of keyframes that are there already, and an error at their end, or none."""
+    """A front-end that yields given keyframes, and then raises an error, if any."""
 
     def __init__(self, keyframes: Sequence[Keyframe], failure: Exception | None = None) -> None:
         self._keyframes = keyframes
@@ -67,7 +67,7 @@ class Listed:
         raise AssertionError("nothing was recognised")
 
 
-def test_places_are_as_far_apart_as_asked_for() -> None:
+def test_places_are_as_far_apart_as_configured() -> None:
     chooser = PlaceChooser(0.4, 90.0)
     places = [each.keyframe.id for key in chain(13) if (each := chooser.add(key)[0]) is not None]
     assert places == [0, 3, 6, 9, 12]
@@ -97,7 +97,7 @@ def test_motion_and_covariance_follow_the_chain() -> None:
     np.testing.assert_allclose(white @ white.T / len(errors), np.eye(6), atol=0.25)
 
 
-def test_an_epoch_begins_a_fragment() -> None:
+def test_epoch_begins_a_fragment() -> None:
     chooser = PlaceChooser(0.4, 90.0)
     for key in chain(5):
         chooser.add(key)
@@ -129,8 +129,8 @@ def test_without_room_the_next_keyframe_is_the_place() -> None:
     np.testing.assert_allclose(place.previous_T_body, np.linalg.matrix_power(STEP, 4), atol=1e-12)
 
 
-def test_what_comes_too_fast_is_skipped_and_counted() -> None:
-    """Nobody works on places: eight wait, and all keyframes are still known."""
+def test_places_beyond_the_queue_are_skipped_and_counted() -> None:
+    """Without a consumer eight places wait, and all keyframes are still read."""
     front_end = Listed(chain(60))
     intake = Intake(front_end, OptimizationConfig(), lambda: 1.0)
     intake.start()
@@ -151,7 +151,7 @@ def test_failures_of_the_front_end_are_raised_after_the_last_place() -> None:
         intake.next()
 
 
-def test_keyframes_without_images_are_refused() -> None:
+def test_keyframes_without_images_raise() -> None:
     intake = Intake(Listed([replace(key, images={}) for key in chain(3)]), OptimizationConfig(), lambda: 1.0)
     intake.start()
     with pytest.raises(MapError, match="have no images"):
@@ -166,8 +166,8 @@ def test_lost_keyframes_are_counted() -> None:
     assert intake.lost == 7
 
 
-def test_a_moved_place_takes_its_keyframes_along() -> None:
-    """The second place was moved by 6 cm: those before it by their share of time, those behind it by all."""
+def test_keyframes_move_with_their_place() -> None:
+    """The second place is moved by 6 cm: keyframes before it in proportion to time, those after it by all."""
     chooser, keys, located = PlaceChooser(0.4, 90.0), chain(6), []
     for key in keys:
         chooser.add(key)

@@ -31,7 +31,7 @@ def run(address: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=ROOT, check=False)
 
 
-def test_the_client_of_the_page_runs_as_typed() -> None:
+def test_client_of_the_page_runs() -> None:
     odometry = served.SyntheticOdometry()
     odometry.keyframe_log.add(served.keyframe(0))
 
@@ -58,19 +58,19 @@ def test_the_client_of_the_page_runs_as_typed() -> None:
     np.testing.assert_array_equal(covariance, np.diag([1e-4] * 3 + [1e-2] * 3))
 
 
-def test_the_client_of_the_page_ends_with_one_line_where_nothing_is_served() -> None:
+def test_client_of_the_page_without_server_ends_with_one_line() -> None:
     done = run("127.0.0.1:9")
     assert done.returncode == 1
     assert done.stderr == "slam: 127.0.0.1:9: nothing listens there; is the service running, and the port right?\n"
 
 
-def test_other_pieces_of_code_on_the_page_can_be_parsed() -> None:
+def test_other_code_of_the_page_can_be_parsed() -> None:
     blocks = re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL)
     assert blocks
     assert all(ast.parse(block).body for block in blocks)
 
 
-def test_the_calls_of_the_page_are_those_of_the_proto() -> None:
+def test_calls_of_the_page_are_those_of_the_proto() -> None:
     proto = (ROOT / "graphvio/slam/service/graphvio.proto").read_text()
     assert re.findall(r"^\| `(\w+)` \| [^|]+ \|$", PAGE, re.MULTILINE)[-6:] == [
         call

@@ -1,4 +1,4 @@
-"""Whatever comes in at the port, the server answers those who ask properly, and grows by nothing."""
+"""Invalid input at the port: the server still answers valid requests, and leaks no resources."""
 
 import random
 import socket
@@ -68,7 +68,7 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
     return bytes(changed)
 
 
-def test_requests_of_random_and_mutated_bytes(server: GrpcServer, odometry: served.SyntheticOdometry) -> None:
+def test_random_and_mutated_requests_are_answered(server: GrpcServer, odometry: served.SyntheticOdometry) -> None:
     rng = random.Random(4)
     whole = {
         "Correct": messages.CorrectRequest(
@@ -97,7 +97,7 @@ def test_requests_of_random_and_mutated_bytes(server: GrpcServer, odometry: serv
         assert np.isfinite(np.linalg.cholesky(covariance)).all()
 
 
-def test_requests_that_are_too_large_are_refused_before_they_are_kept(server: GrpcServer) -> None:
+def test_requests_that_are_too_large_are_refused_unread(server: GrpcServer) -> None:
     options = [("grpc.max_send_message_length", -1)]
     huge = bytes(8 * MB)
     with grpc.insecure_channel(server.address, options) as channel:
@@ -113,14 +113,14 @@ def test_requests_that_are_too_large_are_refused_before_they_are_kept(server: Gr
         assert resident_bytes() - before < 60 * MB  # of 120 that came
 
 
-def test_metadata_that_is_too_large(server: GrpcServer) -> None:
+def test_metadata_that_is_too_large_is_refused(server: GrpcServer) -> None:
     with grpc.insecure_channel(server.address) as channel:
         with pytest.raises(grpc.RpcError) as caught:
             channel.unary_unary("/graphvio.v1.FrontEnd/GetInfo")(b"", metadata=(("x", "y" * 100_000),), timeout=20.0)
         assert caught.value.code() in (grpc.StatusCode.RESOURCE_EXHAUSTED, grpc.StatusCode.UNAVAILABLE)
 
 
-def test_garbage_at_the_port(server: GrpcServer) -> None:
+def test_garbage_at_the_port_is_ignored(server: GrpcServer) -> None:
     rng = random.Random(5)
     port = int(server.address.rpartition(":")[2])
     before = resident_bytes()
@@ -143,7 +143,7 @@ def test_garbage_at_the_port(server: GrpcServer) -> None:
     assert resident_bytes() - before < 100 * MB
 
 
-def test_connections_that_say_nothing_do_not_keep_others_out(server: GrpcServer) -> None:
+def test_silent_connections_do_not_keep_others_out(server: GrpcServer) -> None:
     port = int(server.address.rpartition(":")[2])
     silent = [socket.create_connection(("127.0.0.1", port), timeout=5.0) for _ in range(40)]
     with Client(server.address) as client:
@@ -152,7 +152,7 @@ def test_connections_that_say_nothing_do_not_keep_others_out(server: GrpcServer)
         connection.close()
 
 
-def test_strangers_that_take_all_connections_lose_them_in_seconds(server: GrpcServer) -> None:
+def test_idle_connections_are_closed_within_seconds(server: GrpcServer) -> None:
     port = int(server.address.rpartition(":")[2])
     silent = [socket.create_connection(("127.0.0.1", port), timeout=5.0) for _ in range(150)]
     with pytest.raises(ServiceError, match="it may have too many clients"):
@@ -169,7 +169,7 @@ def test_strangers_that_take_all_connections_lose_them_in_seconds(server: GrpcSe
         connection.close()
 
 
-def test_many_clients_that_come_and_go_leave_nothing(server: GrpcServer) -> None:
+def test_many_short_clients_leave_no_resources(server: GrpcServer) -> None:
     def come_and_go() -> None:
         for _ in range(15):
             with Client(server.address) as client:

@@ -28,7 +28,7 @@ DIAGNOSTICS = {"innovations", "rates", "pairs", "stage_ms", "vision_sigmas"}
 
 
 def assert_same(one: Any, other: Any, where: str = "") -> None:
-    """Field by field, to the last bit and with the same types of arrays."""
+    """Compare field by field, bit by bit and with the same types of arrays."""
     if isinstance(one, np.ndarray):
         assert isinstance(other, np.ndarray), where
         assert (one.dtype, one.shape) == (other.dtype, other.shape), where
@@ -50,18 +50,18 @@ def assert_same(one: Any, other: Any, where: str = "") -> None:
 
 
 def sent(message: Any) -> Any:
-    """As it is at the other end of a wire."""
+    """Return a message after a round trip."""
     return type(message).FromString(message.SerializeToString())
 
 
 @pytest.mark.parametrize("points", [0, 1, 300])
 @pytest.mark.parametrize("number", [0, 5])
-def test_a_keyframe_is_the_same_at_the_other_end(number: int, points: int) -> None:
+def test_keyframe_round_trip(number: int, points: int) -> None:
     keyframe = served.keyframe(number, epoch=3, points=points)
     assert_same(keyframe, convert.keyframe_of(sent(convert.keyframe_message(keyframe, True, True))))
 
 
-def test_images_and_descriptors_come_only_if_asked_for() -> None:
+def test_images_and_descriptors_are_sent_on_request_only() -> None:
     keyframe = served.keyframe(2)
     bare = convert.keyframe_of(sent(convert.keyframe_message(keyframe, False, False)))
     assert bare.images == {}
@@ -69,7 +69,7 @@ def test_images_and_descriptors_come_only_if_asked_for() -> None:
     assert_same(keyframe.landmarks.points_body, bare.landmarks.points_body)
 
 
-def test_landmarks_without_descriptors_and_views_of_larger_arrays() -> None:
+def test_landmarks_without_descriptors_and_of_views_round_trip() -> None:
     keyframe = served.keyframe(2)
     marks = replace(keyframe.landmarks, descriptors=np.zeros((7, 0), dtype=np.uint8))
     strided = replace(
@@ -85,7 +85,7 @@ def test_landmarks_without_descriptors_and_views_of_larger_arrays() -> None:
 
 
 @pytest.mark.parametrize("status", list(Status))
-def test_an_estimate_is_the_same_at_the_other_end(status: Status) -> None:
+def test_estimate_round_trip(status: Status) -> None:
     whole = replace(served.estimate(7, epoch=2), status=status)
     assert_same(whole, convert.estimate_of(sent(convert.estimate_message(whole))))
     bare = Estimate(served.START_NS, status, None, None)
@@ -97,7 +97,7 @@ def test_every_field_of_an_estimate_is_sent_or_a_diagnostic() -> None:
     assert {field.name for field in messages.Estimate.DESCRIPTOR.fields} == names - DIAGNOSTICS
 
 
-def test_results_and_figures_are_the_same_at_the_other_end() -> None:
+def test_results_and_figures_round_trip() -> None:
     for result in (
         CorrectionResult(True, "", None, 22.46, np.eye(4)),
         CorrectionResult(False, "off", 1 / 3, 22.46, None),
@@ -111,7 +111,7 @@ def test_results_and_figures_are_the_same_at_the_other_end() -> None:
     assert convert.status_of(sent(convert.status_message(numpys))) == {"a": 3, "b": 0.5, "c": 2.0**70, "d": 1}
 
 
-def test_the_rig_is_the_same_at_the_other_end_but_for_masks(tmp_path: Path) -> None:
+def test_rig_round_trip_without_masks(tmp_path: Path) -> None:
     mask = tmp_path / "mask.png"
     mask.write_bytes(b"")
     rig = served.rig(mask)
@@ -124,7 +124,7 @@ def test_the_rig_is_the_same_at_the_other_end_but_for_masks(tmp_path: Path) -> N
         assert same.mask is None
 
 
-def test_messages_with_arrays_of_a_wrong_size_are_refused_with_the_place() -> None:
+def test_arrays_of_wrong_size_raise_with_their_field() -> None:
     message = convert.keyframe_message(served.keyframe(2), True, True)
     del message.landmarks.points_body[-1]
     with pytest.raises(ServiceError, match="keyframe 2: points_body: has 20 values; it must have 21"):
@@ -139,7 +139,7 @@ def test_messages_with_arrays_of_a_wrong_size_are_refused_with_the_place() -> No
 
 @settings(deadline=None)
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=36, max_size=36))
-def test_whatever_the_numbers_are_a_check_ends_in_an_answer(numbers: list[float]) -> None:
+def test_checks_of_random_numbers_return_or_raise_service_errors(numbers: list[float]) -> None:
     for check, matrix in (
         (checked_pose, np.array(numbers[:16]).reshape(4, 4)),
         (checked_covariance, np.array(numbers).reshape(6, 6)),
@@ -152,7 +152,7 @@ def test_whatever_the_numbers_are_a_check_ends_in_an_answer(numbers: list[float]
         assert refusal == "" or refusal.startswith("matrix: ")
 
 
-def test_poses_and_covariances_are_checked() -> None:
+def test_invalid_poses_and_covariances_raise() -> None:
     good = served.pose(np.random.default_rng(0))
     mirrored, bent, shifted, huge = (good.copy() for _ in range(4))
     mirrored[:3, 0] *= -1.0
@@ -177,7 +177,7 @@ def test_poses_and_covariances_are_checked() -> None:
 
 
 def made_by() -> tuple[str, str]:
-    """Versions of grpcio-tools and protobuf that the committed code is of."""
+    """Return the versions of grpcio-tools and protobuf that generated the committed code."""
     grpc = re.search(r"GRPC_GENERATED_VERSION = '([\d.]+)'", (SERVICE / "graphvio_pb2_grpc.py").read_text())
     protobuf = re.search(r"Protobuf Python Version: ([\d.]+)", (SERVICE / "graphvio_pb2.py").read_text())
     assert grpc
@@ -185,7 +185,7 @@ def made_by() -> tuple[str, str]:
     return grpc[1], protobuf[1]
 
 
-def test_the_generated_code_is_that_of_the_proto(tmp_path: Path) -> None:
+def test_generated_code_matches_the_proto(tmp_path: Path) -> None:
     protoc = pytest.importorskip("grpc_tools.protoc")
     if version("grpcio-tools") != made_by()[0]:
         pytest.skip(f"grpcio-tools is {version('grpcio-tools')}; the committed code is of {made_by()[0]}")
@@ -207,14 +207,14 @@ def test_the_generated_code_is_that_of_the_proto(tmp_path: Path) -> None:
         assert made == (SERVICE / name).read_text(), f"{name} is old; run  scripts/generate_proto"
 
 
-def test_the_bounds_of_the_extra_are_those_of_the_generated_code() -> None:
+def test_bounds_of_the_extra_match_the_generated_code() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     grpc, protobuf = made_by()
     # A runtime may be of the generated code's major version, not older than it, or of the next one.
     assert extras["serve"] == [f"grpcio>={grpc},<2", f"protobuf>={protobuf},<{int(protobuf.split('.')[0]) + 2}"]
 
 
-def test_the_proto_says_something_of_every_call() -> None:
+def test_proto_has_a_comment_on_every_call() -> None:
     lines = (SERVICE / "graphvio.proto").read_text().splitlines()
     calls = [(before, line) for before, line in pairwise(lines) if line.startswith("  rpc ")]
     assert len(calls) == 6

@@ -1,4 +1,4 @@
-"""Who is let in: TLS, token, loopback. Certificates are made here."""
+"""Access to the service: TLS, token, loopback; with certificates made here."""
 
 import datetime
 import ipaddress
@@ -114,7 +114,7 @@ def at_home(server: GrpcServer) -> str:
     return f"127.0.0.1:{server.address.rpartition(':')[2]}"
 
 
-def test_with_tls_and_token_everything_works(secure: GrpcServer, files: Files) -> None:
+def test_all_calls_work_with_tls_and_token(secure: GrpcServer, files: Files) -> None:
     assert secure.address.startswith("0.0.0.0:")
     for address in (at_home(secure), at_home(secure).replace("127.0.0.1", "localhost")):
         with Client(address, files.ca, read_token(files.token)) as client:
@@ -122,7 +122,7 @@ def test_with_tls_and_token_everything_works(secure: GrpcServer, files: Files) -
             assert client.status() == {}
 
 
-def test_a_wrong_or_missing_token_is_refused_for_every_call(
+def test_wrong_or_missing_token_is_refused_for_every_call(
     secure: GrpcServer, files: Files, odometry: served.SyntheticOdometry
 ) -> None:
     for token in (None, TOKEN[:-1], TOKEN + "0", TOKEN.upper(), "x" * 4096):
@@ -141,7 +141,7 @@ def test_a_wrong_or_missing_token_is_refused_for_every_call(
     assert not odometry.corrections
 
 
-def test_strangers_that_open_calls_and_say_nothing_hold_no_thread(secure: GrpcServer, files: Files) -> None:
+def test_silent_calls_without_token_hold_no_thread(secure: GrpcServer, files: Files) -> None:
     credentials = grpc.ssl_channel_credentials(files.ca.read_bytes())
     silent = [
         grpc.secure_channel(at_home(secure), credentials, [("grpc.use_local_subchannel_pool", 1)]) for _ in range(10)
@@ -167,7 +167,7 @@ def test_strangers_that_open_calls_and_say_nothing_hold_no_thread(secure: GrpcSe
         channel.close()
 
 
-def test_a_token_on_the_loopback_without_tls(odometry: served.SyntheticOdometry, files: Files) -> None:
+def test_token_on_the_loopback_works_without_tls(odometry: served.SyntheticOdometry, files: Files) -> None:
     with GrpcServer(odometry, ServiceOptions(port=0, token_file=files.token)) as server:
         with Client(server.address, token=TOKEN) as client:
             assert client.info().next_keyframe_id == 1
@@ -183,7 +183,7 @@ def test_client_without_tls_or_with_wrong_certificate_raises(secure: GrpcServer,
         Client(address, files.other_ca, TOKEN)
 
 
-def test_a_name_that_the_certificate_does_not_have(odometry: served.SyntheticOdometry, files: Files) -> None:
+def test_name_missing_in_the_certificate_raises(odometry: served.SyntheticOdometry, files: Files) -> None:
     options = ServiceOptions("127.0.0.2", 0, files.certificate, files.key, files.token)
     with (
         GrpcServer(odometry, options) as server,
@@ -192,7 +192,7 @@ def test_a_name_that_the_certificate_does_not_have(odometry: served.SyntheticOdo
         Client(server.address, files.ca, TOKEN)
 
 
-def test_a_certificate_that_has_expired(odometry: served.SyntheticOdometry, files: Files) -> None:
+def test_expired_certificate_raises(odometry: served.SyntheticOdometry, files: Files) -> None:
     options = ServiceOptions("127.0.0.1", 0, files.expired, files.key, files.token)
     with (
         GrpcServer(odometry, options) as server,
@@ -201,7 +201,7 @@ def test_a_certificate_that_has_expired(odometry: served.SyntheticOdometry, file
         Client(server.address, files.ca, TOKEN)
 
 
-def test_client_with_tls_of_server_without_raises(odometry: served.SyntheticOdometry, files: Files) -> None:
+def test_client_with_tls_of_a_server_without_raises(odometry: served.SyntheticOdometry, files: Files) -> None:
     with (
         GrpcServer(odometry, ServiceOptions(port=0)) as server,
         pytest.raises(ServiceError, match="it does not use TLS, or is no graphvio service"),
@@ -209,26 +209,26 @@ def test_client_with_tls_of_server_without_raises(odometry: served.SyntheticOdom
         Client(server.address, files.ca)
 
 
-def test_a_token_is_never_sent_in_the_clear_through_a_network() -> None:
+def test_token_is_never_sent_unencrypted_through_a_network() -> None:
     with pytest.raises(ServiceError, match=r"robot:50551: the token would go through the network unencrypted"):
         Client("robot", token=TOKEN)
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.7", "robot", "128.0.0.1", "localhost.example.org", ""])
-def test_other_addresses_than_the_loopback_need_tls_and_a_token(host: str, files: Files) -> None:
+def test_public_addresses_need_tls_and_token(host: str, files: Files) -> None:
     whole = ServiceOptions(host, 0, files.certificate, files.key, files.token)
     for partial in ({"token_file": None}, {"certificate": None, "key": None}):
         with pytest.raises(ServiceError, match="can be reached from other machines, so it needs a TLS certificate"):
             replace(whole, **partial)  # type: ignore[arg-type]
 
 
-def test_what_is_the_loopback() -> None:
+def test_is_loopback() -> None:
     assert all(is_loopback(host) for host in ("127.0.0.1", "127.8.9.1", "::1", "localhost"))
     assert ServiceOptions("localhost", 7).address == "127.0.0.1:7"
     assert ServiceOptions("::1", 7).address == "[::1]:7"
 
 
-def test_options_that_make_no_sense(files: Files) -> None:
+def test_invalid_options_raise(files: Files) -> None:
     for options, text in (
         ({"port": -1}, "port -1 does not exist"),
         ({"port": 70000}, "port 70000 does not exist"),
@@ -242,7 +242,7 @@ def test_options_that_make_no_sense(files: Files) -> None:
             ServiceOptions(**options)
 
 
-def test_token_files_that_others_can_read_or_that_hold_none(tmp_path: Path) -> None:
+def test_public_and_invalid_token_files_raise(tmp_path: Path) -> None:
     file = tmp_path / "token"
     file.write_text(TOKEN)
     for mode in (0o640, 0o604, 0o620):
@@ -259,7 +259,7 @@ def test_token_files_that_others_can_read_or_that_hold_none(tmp_path: Path) -> N
         read_token(tmp_path / "absent")
 
 
-def test_certificates_that_cannot_be_used(odometry: served.SyntheticOdometry, files: Files, tmp_path: Path) -> None:
+def test_unusable_certificates_raise(odometry: served.SyntheticOdometry, files: Files, tmp_path: Path) -> None:
     def start(certificate: Path, key: Path) -> None:
         GrpcServer(odometry, ServiceOptions("0.0.0.0", 0, certificate, key, files.token)).start()
 
@@ -295,12 +295,12 @@ def test_certificates_that_cannot_be_used(odometry: served.SyntheticOdometry, fi
 
 
 @pytest.mark.parametrize("address", ["", ":1", "host:", "host:0", "host:65536", "host:x", "::1:7", "host:\uff11"])
-def test_what_is_no_address(address: str) -> None:
+def test_invalid_address_raises(address: str) -> None:
     with pytest.raises(ServiceError, match="is not an address; give HOST:PORT"):
         Client(address)
 
 
-def test_servers_that_are_not_there_or_something_else(tmp_path: Path) -> None:
+def test_absent_and_other_servers_raise(tmp_path: Path) -> None:
     import socket
 
     with socket.socket() as other:

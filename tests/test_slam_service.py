@@ -1,4 +1,4 @@
-"""A real server and real clients over sockets of the loopback; the odometry behind them is the test's."""
+"""A real server and real clients over sockets of the loopback, with a synthetic odometry."""
 
 import inspect
 import os
@@ -86,14 +86,14 @@ def test_front_end_and_client_have_the_interface_of_the_protocol() -> None:
             assert found.replace(parameters=common) == expected
 
 
-def test_the_client_is_a_front_end_with_the_rig_of_the_server(client: Client) -> None:
+def test_client_has_the_rig_of_the_server(client: Client) -> None:
     front_end: SlamFrontEnd = client
     assert front_end.rig.name == "synthetic"
     for camera, same in zip(served.rig().cameras, front_end.rig.cameras, strict=True):
         np.testing.assert_array_equal(camera.body_T_cam, same.body_T_cam)
 
 
-def test_info_has_the_ids_of_the_keyframes_that_are_kept(odometry: served.SyntheticOdometry, client: Client) -> None:
+def test_info_has_the_ids_of_the_kept_keyframes(odometry: served.SyntheticOdometry, client: Client) -> None:
     info = client.info()
     assert (info.epoch, info.oldest_keyframe_id, info.next_keyframe_id, info.has_ended) == (None, 0, 0, False)
     for number in range(3):
@@ -105,9 +105,7 @@ def test_info_has_the_ids_of_the_keyframes_that_are_kept(odometry: served.Synthe
     assert len(info.run_id) == 32
 
 
-def test_keyframes_come_whole_as_they_are_made_and_end_with_the_odometry(
-    odometry: served.SyntheticOdometry, client: Client
-) -> None:
+def test_keyframes_are_complete_and_end_with_the_odometry(odometry: served.SyntheticOdometry, client: Client) -> None:
     for number in range(3):
         odometry.keyframe_log.add(served.keyframe(number))
     stream = client.keyframes(1, with_images=True)
@@ -128,7 +126,7 @@ def test_keyframes_come_whole_as_they_are_made_and_end_with_the_odometry(
     assert undescribed.landmarks.descriptors.shape == (7, 0)
 
 
-def test_keyframes_that_are_no_longer_kept_are_passed_over_and_counted() -> None:
+def test_keyframes_no_longer_kept_are_skipped_and_counted() -> None:
     odometry = served.SyntheticOdometry(max_bytes=100_000)  # some eight of them
     for number in range(50):
         odometry.keyframe_log.add(served.keyframe(number))
@@ -145,7 +143,7 @@ def test_keyframes_that_are_no_longer_kept_are_passed_over_and_counted() -> None
         assert [update.gone for update in updates] == [oldest - 10] + [0] * (49 - oldest)
 
 
-def test_estimates_and_predictions_come_whole_with_the_correction_in_force(
+def test_estimates_and_predictions_have_the_correction_in_force(
     odometry: served.SyntheticOdometry, client: Client
 ) -> None:
     odometry.keyframe_log.add(served.keyframe(0, epoch=4))
@@ -174,7 +172,7 @@ def test_estimates_and_predictions_come_whole_with_the_correction_in_force(
     assert (without.state.epoch, without.map_T_odom) == (3, None)
 
 
-def test_events_and_figures(odometry: served.SyntheticOdometry, client: Client) -> None:
+def test_events_and_figures_arrive(odometry: served.SyntheticOdometry, client: Client) -> None:
     event = Event(served.START_NS, "vision_gated", "χ² = 31")
     got: list[Event] = []
     reader = in_thread(lambda: got.extend(client.events()))
@@ -187,9 +185,7 @@ def test_events_and_figures(odometry: served.SyntheticOdometry, client: Client) 
     assert client.status() == dict(sorted(odometry.figures.items()))
 
 
-def test_corrections_arrive_to_the_last_bit_and_are_answered(
-    odometry: served.SyntheticOdometry, client: Client
-) -> None:
+def test_corrections_arrive_bit_by_bit_and_are_answered(odometry: served.SyntheticOdometry, client: Client) -> None:
     rng = np.random.default_rng(3)
     near, covariance = served.pose(rng), served.covariance(rng)
     result = client.correct(5, near, covariance)
@@ -205,9 +201,7 @@ def test_corrections_arrive_to_the_last_bit_and_are_answered(
         assert_same(got[2], sent[2])
 
 
-def test_corrections_that_are_malformed_never_reach_the_odometry(
-    odometry: served.SyntheticOdometry, client: Client
-) -> None:
+def test_malformed_corrections_never_reach_the_odometry(odometry: served.SyntheticOdometry, client: Client) -> None:
     pose, covariance = np.eye(4), np.eye(6)
     nan, bent, negative = pose.copy(), pose.copy(), -covariance
     nan[0, 3], bent[0, 0] = np.nan, 1.1
@@ -227,7 +221,7 @@ def test_corrections_that_are_malformed_never_reach_the_odometry(
     assert not odometry.corrections
 
 
-def test_an_odometry_that_fails_is_reported_and_the_server_continues(
+def test_failing_odometry_is_reported_and_the_server_continues(
     odometry: served.SyntheticOdometry, client: Client, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(*_: object) -> None:
@@ -248,7 +242,7 @@ def test_an_odometry_that_fails_is_reported_and_the_server_continues(
     assert client.status() == {}
 
 
-def test_a_slow_client_gets_new_estimates_and_all_that_it_missed_are_counted(
+def test_slow_client_gets_new_estimates_and_the_number_of_missed_ones(
     odometry: served.SyntheticOdometry, client: Client
 ) -> None:
     stream = client.estimates()
@@ -280,7 +274,7 @@ def test_a_slow_client_gets_new_estimates_and_all_that_it_missed_are_counted(
 def test_publishing_never_waits_for_a_client_that_does_not_read(
     odometry: served.SyntheticOdometry, server: GrpcServer
 ) -> None:
-    """Structurally: with its stream's thread held up in the middle of sending, a whole run is published."""
+    """A whole run is published while the thread of the client's stream is blocked in sending."""
     with Client(server.address) as stalled:
         stream = stalled.keyframes(with_images=True)
         odometry.keyframe_log.add(served.keyframe(0))
@@ -305,9 +299,7 @@ def test_publishing_never_waits_for_a_client_that_does_not_read(
             assert next(other.keyframes(299)).id == 299
 
 
-def test_streams_end_with_their_client_and_with_the_iterator(
-    odometry: served.SyntheticOdometry, server: GrpcServer
-) -> None:
+def test_streams_end_with_their_client_and_iterator(odometry: served.SyntheticOdometry, server: GrpcServer) -> None:
     odometry.keyframe_log.add(served.keyframe(0))
     with Client(server.address) as client:
         stream = client.keyframes()
@@ -323,7 +315,7 @@ def test_streams_end_with_their_client_and_with_the_iterator(
         client.info()
 
 
-def test_closing_from_another_thread_ends_a_waiting_iterator(client: Client, server: GrpcServer) -> None:
+def test_close_from_another_thread_ends_a_waiting_iterator(client: Client, server: GrpcServer) -> None:
     reader = in_thread(lambda: list(client.keyframes()))
     until(lambda: server.open_streams, "no stream was opened")
     client.close()
@@ -331,7 +323,7 @@ def test_closing_from_another_thread_ends_a_waiting_iterator(client: Client, ser
     assert not reader.is_alive()
 
 
-def test_there_is_room_for_so_many_clients_and_others_are_still_answered(odometry: served.SyntheticOdometry) -> None:
+def test_clients_beyond_the_limit_get_no_streams_but_answers(odometry: served.SyntheticOdometry) -> None:
     odometry.keyframe_log.add(served.keyframe(0))
     with GrpcServer(odometry, replace(ANY_PORT, max_clients=2)) as server:
         clients = [Client(server.address) for _ in range(3)]
@@ -350,7 +342,7 @@ def test_there_is_room_for_so_many_clients_and_others_are_still_answered(odometr
             client.close()
 
 
-def test_keyframes_go_on_where_they_were_when_the_server_was_away(odometry: served.SyntheticOdometry) -> None:
+def test_keyframes_continue_after_an_absence_of_the_server(odometry: served.SyntheticOdometry) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -374,7 +366,7 @@ def test_keyframes_go_on_where_they_were_when_the_server_was_away(odometry: serv
 
 
 class CuttingProxy:
-    """Passes bytes on to a server, and cuts each connection after so many of them."""
+    """A proxy that cuts each connection after a number of bytes."""
 
     def __init__(self, port: int, cut_after: Iterator[int]) -> None:
         self._port = port
@@ -402,7 +394,7 @@ class CuttingProxy:
                 each.shutdown(socket.SHUT_RDWR)
 
 
-def test_connections_cut_within_messages_cost_no_keyframe_and_give_none_twice(
+def test_connections_cut_within_messages_lose_and_repeat_no_keyframe(
     odometry: served.SyntheticOdometry, server: GrpcServer
 ) -> None:
     for number in range(80):
@@ -418,7 +410,7 @@ def test_connections_cut_within_messages_cost_no_keyframe_and_give_none_twice(
         assert_same(keyframe, served.keyframe(number))
 
 
-def test_another_run_of_the_odometry_is_not_taken_for_the_same(odometry: served.SyntheticOdometry) -> None:
+def test_another_run_of_the_odometry_raises(odometry: served.SyntheticOdometry) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         options = ServiceOptions(port=free.getsockname()[1])
@@ -436,7 +428,7 @@ def test_another_run_of_the_odometry_is_not_taken_for_the_same(odometry: served.
                 client.correct(0, np.eye(4), np.eye(6))
 
 
-def test_patience_ends(odometry: served.SyntheticOdometry) -> None:
+def test_reconnecting_ends_after_the_patience(odometry: served.SyntheticOdometry) -> None:
     odometry.keyframe_log.add(served.keyframe(0))
     server = GrpcServer(odometry, ANY_PORT)
     server.start()
@@ -448,7 +440,7 @@ def test_patience_ends(odometry: served.SyntheticOdometry) -> None:
             next(stream)
 
 
-def test_what_is_left_of_an_odometry_that_has_ended_is_read_to_its_end(odometry: served.SyntheticOdometry) -> None:
+def test_keyframes_of_an_ended_odometry_are_read_to_the_end(odometry: served.SyntheticOdometry) -> None:
     for number in range(200):
         odometry.keyframe_log.add(served.keyframe(number))
     server = GrpcServer(odometry, ANY_PORT)
@@ -463,7 +455,7 @@ def test_what_is_left_of_an_odometry_that_has_ended_is_read_to_its_end(odometry:
         assert not stopper.is_alive()
 
 
-def test_what_waits_for_a_slow_reader_of_estimates_reaches_it_after_the_end(odometry: served.SyntheticOdometry) -> None:
+def test_waiting_estimates_reach_a_slow_reader_after_the_end(odometry: served.SyntheticOdometry) -> None:
     got: list[tuple[int, int]] = []
     may_go_on = threading.Event()
     published = 2_000
@@ -493,7 +485,7 @@ def test_what_waits_for_a_slow_reader_of_estimates_reaches_it_after_the_end(odom
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGSTOP")
-def test_a_reader_that_takes_nothing_does_not_hold_the_end(odometry: served.SyntheticOdometry) -> None:
+def test_stalled_reader_does_not_delay_the_end(odometry: served.SyntheticOdometry) -> None:
     for number in range(200):
         odometry.keyframe_log.add(served.keyframe(number))
     server = GrpcServer(odometry, replace(ANY_PORT, keepalive_s=3600.0))
@@ -531,7 +523,7 @@ def line_of(keyframe: Keyframe) -> str:
     return f"{keyframe.id} {float(keyframe.odom_T_body.sum()).hex()}"
 
 
-def test_a_client_that_is_killed_goes_on_without_a_missing_keyframe(
+def test_killed_client_resumes_without_a_missing_keyframe(
     odometry: served.SyntheticOdometry, server: GrpcServer
 ) -> None:
     count = 200
@@ -560,7 +552,7 @@ def test_a_client_that_is_killed_goes_on_without_a_missing_keyframe(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no SIGSTOP")
-def test_a_client_that_no_longer_answers_is_given_up(odometry: served.SyntheticOdometry) -> None:
+def test_client_that_no_longer_answers_is_disconnected(odometry: served.SyntheticOdometry) -> None:
     odometry.keyframe_log.add(served.keyframe(0))
     with GrpcServer(odometry, replace(ANY_PORT, keepalive_s=1.0)) as server:
         process = reader_process(server, 0)
@@ -574,7 +566,7 @@ def test_a_client_that_no_longer_answers_is_given_up(odometry: served.SyntheticO
             process.communicate()
 
 
-def test_a_port_that_is_taken_and_a_second_start(
+def test_port_in_use_and_second_start_raise(
     server: GrpcServer, odometry: served.SyntheticOdometry, capfd: pytest.CaptureFixture[str]
 ) -> None:
     port = int(server.address.rpartition(":")[2])
@@ -587,7 +579,7 @@ def test_a_port_that_is_taken_and_a_second_start(
         server.start()
 
 
-def test_a_program_with_open_streams_ends_though_nobody_stops_the_server() -> None:
+def test_program_with_open_streams_ends_without_stopping_the_server() -> None:
     code = """
 import served
 from graphvio.slam.client import Client
@@ -616,7 +608,7 @@ raise ValueError("the program's own failure")
     assert "the program's own failure" in done.stderr
 
 
-def test_the_pool_has_room_for_so_many_calls_and_ends_with_all_of_them_done() -> None:
+def test_pool_limits_threads_and_finishes_all_calls() -> None:
     pool = DaemonPool(3)
     may_end = threading.Event()
     begun = threading.Semaphore(0)
@@ -639,7 +631,7 @@ def test_the_pool_has_room_for_so_many_calls_and_ends_with_all_of_them_done() ->
         pool.submit(work, 0)
 
 
-def test_without_grpcio_the_remedy_is_named() -> None:
+def test_import_without_grpcio_names_the_extra() -> None:
     code = """
 import sys
 sys.modules["grpc"] = None

@@ -164,7 +164,7 @@ class Client:
         Args:
             rate: ``frame`` for an estimate at each frameset, ``imu`` for a prediction at each sample of the IMU.
         """
-        return self._estimates() if rate == "frame" else self._predictions()
+        return self._updates(messages.RATE_FRAME if rate == "frame" else messages.RATE_IMU)
 
     def events(self) -> Iterator[Event]:
         """Yield the odometry's events from now on until it has ended."""
@@ -200,24 +200,17 @@ class Client:
         """End all iterators and close the connection; thread-safe, and idempotent."""
         self._connection.close()
 
-    def _estimates(self) -> Iterator[Update[Estimate]]:
-        for update in self._updates(messages.RATE_FRAME):
-            yield Update(convert.estimate_of(update.estimate), _map_T_odom(update), update.missed)
-
-    def _predictions(self) -> Iterator[Update[Prediction]]:
-        for update in self._updates(messages.RATE_IMU):
-            yield Update(convert.prediction_of(update.prediction), _map_T_odom(update), update.missed)
-
-    def _updates(self, rate: int) -> Iterator[Any]:
+    def _updates(self, rate: int) -> Iterator[Update[Any]]:
         request = messages.StreamEstimatesRequest(rate=rate, run_id=self._run_id)
-        return self._connection.follow(self._connection.stub.StreamEstimates, lambda: request)
+        for update in self._connection.follow(self._connection.stub.StreamEstimates, lambda: request):
+            if rate == messages.RATE_FRAME:
+                state: Any = convert.estimate_of(update.estimate)
+            else:
+                state = convert.prediction_of(update.prediction)
+            yield Update(state, maybe_floats(update.map_T_odom, (4, 4), "map_T_odom"), update.missed)
 
     def _info(self) -> Any:
         return self._call("GetInfo", messages.GetInfoRequest())
 
     def _call(self, name: str, request: Any) -> Any:
         return self._connection.call(getattr(self._connection.stub, name), request)
-
-
-def _map_T_odom(update: Any) -> Float | None:
-    return maybe_floats(update.map_T_odom, (4, 4), "map_T_odom")

@@ -29,7 +29,7 @@ class FrontEnd:
         odometry: Feed it as usual; its configuration has the keyframes' settings.
 
     Attributes:
-        log: The newest keyframes; empty as long as nobody asked for any.
+        log: The newest keyframes; empty until keyframes are requested.
     """
 
     def __init__(self, odometry: Odometry) -> None:

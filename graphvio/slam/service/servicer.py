@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from graphvio.errors import GraphvioError, ServiceError
@@ -27,23 +28,17 @@ _log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
+@dataclass(eq=False)
 class Stream:
     """An open stream.
 
-    Args:
-        client: Address of its client.
-
     Attributes:
+        client: Address of its client.
         read_s: When its client last read a message, or opened it, by `time.monotonic`.
     """
 
-    def __init__(self, client: str) -> None:
-        self.client = client
-        self.read_s = time.monotonic()
-
-    def set_read(self) -> None:
-        """Note that the client has read a message."""
-        self.read_s = time.monotonic()
+    client: str
+    read_s: float = field(default_factory=time.monotonic)
 
 
 class StreamLimit:
@@ -152,7 +147,7 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
                 if keyframe is not None:
                     message = convert.keyframe_message(keyframe, request.with_images, request.with_descriptors)
                     yield messages.KeyframeUpdate(keyframe=message, gone=keyframe.id - next_id)
-                    stream.set_read()  # the next message is requested when the previous one has been sent
+                    stream.read_s = time.monotonic()  # asked for the next message: this one is sent
                     next_id = keyframe.id + 1
                 elif log.is_closed and log.next_id <= next_id:
                     return
@@ -198,7 +193,7 @@ class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
                 if item is not None:
                     missed = subscription.dropped()
                     yield item, missed - reported
-                    stream.set_read()
+                    stream.read_s = time.monotonic()
                     reported = missed
                 elif was_closed:
                     return
