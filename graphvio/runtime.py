@@ -202,7 +202,7 @@ def ignore_stop_signals() -> None:
 
 
 def ignore_interrupts() -> None:
-    """Leave Ctrl-C to the process that started this one, in the processes that this one starts as well."""
+    """Leave Ctrl-C to the process that started this one, and so do the processes that are started here."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

@@ -119,7 +119,7 @@ def test_live_one_lost_pair_leaves_other_tracking(room_walk: Path) -> None:
     assert figures["framesets"] == 100
 
 
-def test_live_long_outage_of_all_starts_new_epoch(room_walk: Path) -> None:
+def test_live_long_outage_of_all_begins_a_new_epoch(room_walk: Path) -> None:
     gone = "@1.5-4.7"
     estimates, events, _ = run_spec(
         f"simulator:room?recording={room_walk}&seed=3&speed=max&legs=1&unplug=front{gone},back{gone},imu{gone}"

@@ -375,7 +375,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], dict[str, int], int, int]] = {
     ),
     "IMU gap": (csv_edit("imu0", drop(slice(220, 250))), {"imu_gap": 1}, 10, ALL_SAMPLES - 30),
     "IMU small gap": (csv_edit("imu0", drop(slice(220, 224))), {}, 10, ALL_SAMPLES - 4),
-    "IMU starts late": (csv_edit("imu0", drop(slice(1, 221))), {"imu_begins_late": 1}, 10, ALL_SAMPLES - 220),
+    "IMU begins late": (csv_edit("imu0", drop(slice(1, 221))), {"imu_begins_late": 1}, 10, ALL_SAMPLES - 220),
     "IMU stops early": (csv_edit("imu0", drop(slice(251, None))), {"imu_stops_early": 1}, 10, 250),
     "IMU csv missing": (lambda w: (w / "mav0/imu0/data.csv").unlink(), {"imu_missing": 1}, 10, 0),
     "IMU csv empty": (

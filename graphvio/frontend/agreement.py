@@ -79,7 +79,7 @@ def agree(
         config: Configuration of the motion stage.
         rng: Source of random triples.
         misaligned: Pairs whose extrinsics have been corrected, which leaves them uncertain.
-        in_doubt: Whether the pairs contradicted each other a moment ago: less is then enough to tell them apart.
+        in_doubt: Whether the pairs contradicted each other a moment ago: a smaller distance then separates them.
     """
     everyone = observations.pairs
     own: dict[int, Refined] = {}

@@ -62,5 +62,5 @@ class FrozenImages:
 def _same(one: Image, other: Image) -> bool:
     if one is other:
         return True
-    middle = len(one) // 2  # one row nearly always tells
+    middle = len(one) // 2  # one row nearly always differs
     return bool(np.array_equal(one[middle], other[middle]) and np.array_equal(one, other))

@@ -140,7 +140,7 @@ class VisualFrontend:
 
         Args:
             frameset: Images of any subset of pairs.
-            predict: The back-end's prediction, which the search starts from.
+            predict: The back-end's prediction, from which the search begins.
 
         Raises:
             RigError: If an image does not fit the rig; nothing has changed then.

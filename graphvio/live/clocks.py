@@ -22,7 +22,7 @@ _CONFIRMED_PAUSE_NS = 1_000_000_000  # and longer if their stamps continue, whic
 
 _MAX_BACK_NS = 250_000_000  # a stamp that is farther behind its sensor's is of a clock that was set back
 _MAX_AHEAD_NS = 100_000_000  # of one sensor's stamps to the others'
-_GAP_NS = round((MAX_UNBRIDGED_S + 1.0) * 1e9)  # so that the odometry starts a new epoch
+_GAP_NS = round((MAX_UNBRIDGED_S + 1.0) * 1e9)  # so that the odometry begins a new epoch
 _RECENT = 3
 
 
@@ -186,7 +186,7 @@ class SharedClock:
     """The clock of all sensors whose stamps are used as they are, until it is set back.
 
     A host's clock may be set back by its administrator, and that of a bag when it is played again. From then on an
-    offset is added to stamps so that they continue four seconds after all before, and the odometry starts a new epoch.
+    offset is added to stamps so that they continue four seconds after all before, and the odometry begins a new epoch.
     Stamps that are still under way from before are late, and left out. Single wild stamps set nothing back.
 
     Args:

@@ -166,7 +166,7 @@ class SessionGraph:
                     accels = np.array([config.motion_angular_accel_sigma_rad_s2, config.motion_accel_sigma_m_s2])
                     self.add(constant_velocity(k - 1, k, motion, dt, dt, np.zeros(2), accels))
             if record.is_stationary[row] and record.with_imu[row]:
-                self._kind = "rest"  # the name in summary.json
+                self._kind = "zero_velocity"
                 self.add(zero_velocity(k))
 
     def _add_own_motions(self, session: int, first: int, nodes: Nodes) -> Int:

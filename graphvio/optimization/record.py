@@ -65,9 +65,6 @@ class Motions(NamedTuple):
         )
 
 
-_COLUMNS = {"is_stationary": "at_rest"}  # fields that have another name in files
-
-
 @dataclass(frozen=True, eq=False)
 class SessionRecord:
     """Estimates and measurements of a session's odometry, for F framesets with a pose.
@@ -118,7 +115,7 @@ class SessionRecord:
             if isinstance(value, tuple):
                 columns |= {f"{field.name}.{name}": part for name, part in value._asdict().items()}  # type: ignore[attr-defined]
             elif field.name != "name":
-                columns[_COLUMNS.get(field.name, field.name)] = value
+                columns[field.name] = value
         buffer = io.BytesIO()
         np.savez(buffer, **columns)
         return buffer.getvalue()
@@ -137,8 +134,7 @@ class SessionRecord:
                 kind: cls(*(columns.pop(f"{kind}.{name}") for name in cls._fields))
                 for kind, cls in (("motions", Motions), ("own", Motions), ("inertial", Inertial))
             }
-            renamed = {field: columns.pop(column) for field, column in _COLUMNS.items()}
-            return SessionRecord(**(columns | groups | renamed | {"name": str(columns["name"])}))
+            return SessionRecord(**(columns | groups | {"name": str(columns["name"])}))
         except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
             raise OptimizationError(f"{path}: is no record of a session ({error}); remove the file") from None
 

@@ -17,7 +17,7 @@ them has changed no number. Names of kinds of events count in the lines that end
 
 
 def main() -> int:
-    """Run what is asked for, and tell what differs from a file."""
+    """Run what is asked for, and report what differs from a file."""
     parser = argparse.ArgumentParser(prog="scripts/fingerprint", description=_DESCRIPTION)
     parser.add_argument("--write", type=Path, metavar="FILE", help="also write the lines to this file")
     parser.add_argument("--compare", type=Path, metavar="FILE", help="exit code 1 if a digest is not as in this file")

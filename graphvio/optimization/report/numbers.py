@@ -25,7 +25,7 @@ from graphvio.trajectory import Trajectory, travelled
 STAGES = ("online", "smoothed", "optimized")
 """Compared poses: as emitted, as the odometry's smoother left them, and optimised."""
 
-_KINDS = ("imu", "motion", "view", "rest", "walk", "start", "calibration", "loop")  # their order in the report
+_KINDS = ("imu", "motion", "view", "zero_velocity", "walk", "start", "calibration", "loop")  # their order in the report
 
 
 @dataclass(frozen=True)
