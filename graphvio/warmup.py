@@ -1,4 +1,4 @@
-"""Compiling, or loading from the cache, every kernel that the odometry uses, before the first image arrives."""
+"""Warm-up: compiles or loads from the cache every kernel of the odometry, before the first image arrives."""
 
 from __future__ import annotations
 
@@ -26,7 +26,12 @@ _POINTS = 20
 
 
 def warm_up(rig: Rig, config: Config) -> None:
-    """Call every kernel once on noise, with the array types of the real work."""
+    """Call every kernel once on noise, with the array types that the odometry uses.
+
+    Args:
+        rig: the rig, for its image size and its IMU.
+        config: configuration of all stages.
+    """
     rng = np.random.default_rng(0)
     pair = rig.pairs[0]
     width, height = pair.left.size_px
@@ -63,7 +68,7 @@ def warm_up(rig: Rig, config: Config) -> None:
 
 
 def _warm_up_imu(imu: Imu) -> None:
-    """The same for what the IMU's samples go through."""
+    """Call the kernels that process IMU samples."""
     buffer, up = ImuBuffer(1e3), np.array([0.0, 0.0, GRAVITY_M_S2])
     for stamp_ns in range(0, 40_000_000, 10_000_000):
         buffer.add(ImuSample(stamp_ns, np.zeros(3), up))

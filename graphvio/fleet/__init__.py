@@ -1,1 +1,15 @@
-"""Many sessions, each optimised by itself, side by side on Dask's workers."""
+"""Many sessions, each optimised by itself, in parallel on Dask's workers."""
+
+import logging
+
+from graphvio.runtime import ignore_interrupts, use_one_opencv_thread
+
+
+def dask_setup(worker: object) -> None:
+    """Set up a worker process of this machine; Dask calls it in modules that it preloads.
+
+    Interrupts are left to the process that started the workers, and warnings on recordings to the results.
+    """
+    ignore_interrupts()
+    use_one_opencv_thread()
+    logging.getLogger("graphvio").setLevel(logging.ERROR)

@@ -1,4 +1,4 @@
-"""Dask's workers: a cluster on this machine, or one that is there already."""
+"""Dask's workers: a cluster on this machine, or an existing one."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from graphvio.sources import open_source
 from graphvio.warmup import warm_up
 
 RETRIES = 2
-_CONNECT_S = 20.0
+_MAX_CONNECT_S = 20.0
 
 
 def distributed() -> Any:
-    """The library of that name.
+    """Import and return the library ``distributed``.
 
     Raises:
         MissingExtraError: if the extra ``fleet`` is not installed.
@@ -34,21 +34,21 @@ def distributed() -> Any:
 
 
 def default_workers() -> int:
-    """Processes of a cluster on this machine: one for two cores, and two at least.
+    """Return the number of processes for this machine: one for two cores, and at least two.
 
     The odometry keeps about two cores busy, a thread for each pair and one that decodes; the other stages keep one or
-    two. With two processes, one works while the other is started anew or waits for the disk.
+    two. With two processes, one works while the other is restarted or waits for the disk.
     """
     return max(2, (os.cpu_count() or 1) // 2)
 
 
 def compile_kernels(recordings: Sequence[str], rig: Rig | None, config: Config) -> None:
-    """Compile the odometry's kernels in this process, before there are several, which would all compile the same.
+    """Compile the odometry's kernels in this process, before several processes would all compile the same.
 
     Args:
-        recordings: paths and URLs; the first one that can be opened here tells the rig.
-        rig: of all recordings, or None.
-        config: of the odometry.
+        recordings: paths and URLs; without a rig, that of the first one that can be opened here is used.
+        rig: rig of all recordings, or None.
+        config: configuration of the odometry.
     """
     for recording in (Path(each) for each in recordings if rig is None):
         if recording.exists():
@@ -56,25 +56,28 @@ def compile_kernels(recordings: Sequence[str], rig: Rig | None, config: Config) 
                 rig = open_source(recording).rig
                 break
             except GraphvioError:
-                pass  # it is told when its turn comes
+                pass  # its own task reports the error
     warm_up(rig or default_rig(), config)
 
 
 @contextmanager
 def connected(scheduler: str | None, workers: int | None = None) -> Iterator[Any]:
-    """A client of Dask.
+    """Connect a client of Dask, and disconnect it at the end.
 
     Args:
-        scheduler: address of one that runs; None starts a cluster on this machine, and ends it.
-        workers: processes of such a cluster, of one thread each; None leaves the number to `default_workers`.
+        scheduler: address of a running scheduler; None takes a cluster on this machine for the time inside.
+        workers: processes of such a cluster, of one thread each; None takes `default_workers`.
+
+    Yields:
+        The client.
 
     Raises:
-        FleetError: if the scheduler cannot be reached, or the cluster not be started.
+        FleetError: if the scheduler cannot be reached, or the cluster cannot be started.
     """
     library = distributed()
     if scheduler is not None:
         try:
-            client = library.Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
+            client = library.Client(scheduler, timeout=_MAX_CONNECT_S, set_as_default=False)
         except (OSError, ValueError) as error:
             raise FleetError(f"{scheduler}: no Dask scheduler answers there ({error}); check the address") from None
         with client:
@@ -90,7 +93,7 @@ def connected(scheduler: str | None, workers: int | None = None) -> Iterator[Any
                 processes=True,
                 dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
-                preload=["graphvio.fleet.preload"],
+                preload=["graphvio.fleet"],
             )
         except (OSError, RuntimeError) as error:
             raise FleetError(f"workers cannot be started on this machine ({error})") from None

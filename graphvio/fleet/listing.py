@@ -1,4 +1,4 @@
-"""Which sessions there are: in a folder, or in a list."""
+"""Sessions in a folder, or in a list."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _FILES = (".mcap", ".bag")
 
 @dataclass(frozen=True)
 class Listed:
-    """A session of many.
+    """A session of a fleet run.
 
     Attributes:
-        name: of its folder of results; no other has it.
+        name: unique name, that of its folder of results.
         recording: absolute path, or URL.
     """
 
@@ -27,17 +27,16 @@ class Listed:
 
 
 def list_sessions(where: str) -> list[Listed]:
-    """The recordings in a folder, one level deep and sorted by name, or those that a text file lists, in its order.
+    """List the recordings in a folder, one level deep and sorted by name, or those of a text file, in its order.
 
-    A list has one path or URL a line; what is not absolute is relative to the list, and lines that begin with ``#`` are
-    comments. In folders that are not local, each folder is taken for a recording, and so is a file that ends in .mcap
-    or .bag.
+    A list has one path or URL per line; relative paths are relative to the list, and lines that begin with ``#`` are
+    comments. In remote folders each folder counts as a recording, and so does a file that ends in .mcap or .bag.
 
     Args:
         where: path or URL of the folder or list.
 
     Raises:
-        FleetError: if there is none, or it names none.
+        FleetError: if it does not exist, or has no recording.
     """
     local = local_path(where)
     try:
@@ -75,7 +74,7 @@ def _lines(text: str) -> list[str]:
 
 
 def _named(recordings: Iterable[str]) -> list[Listed]:
-    """With a number added to names that several have."""
+    """Name the recordings, with a number added to names that repeat."""
     made: dict[str, Listed] = {}
     for recording in recordings:
         path = PurePosixPath(recording)

@@ -1,4 +1,4 @@
-"""What tells that a stage of a session is finished: a small file that is written after all others of the stage."""
+"""Markers of finished stages: a small file, written after all others of a stage."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Marker:
     """A finished stage.
 
     Attributes:
-        stage: its name, such as ``odometry`` or ``features-0-of-2``.
-        inputs: what decided the results: name -> value.
-        files: names of what it left in the session's folder.
-        wall_s: time that it took, fetching and putting included.
-        figures: name -> value, of the session's health.
+        stage: name, such as ``odometry`` or ``features-0-of-2``.
+        inputs: name -> value, of all that determines the results.
+        files: names of its files in the session's folder.
+        wall_s: wall time, fetching and putting included.
+        figures: name -> value, for the table of sessions.
     """
 
     stage: str
@@ -32,7 +32,7 @@ class Marker:
     figures: Mapping[str, Any] = field(default_factory=dict)
 
     def write(self, storage: Storage) -> None:
-        """Put it into a session's folder.
+        """Write the marker into a session's folder.
 
         Raises:
             FleetError: if it cannot be written.
@@ -42,11 +42,11 @@ class Marker:
 
 
 def finished(storage: Storage, inputs: Mapping[str, str]) -> dict[str, Marker]:
-    """The stages of a session whose files are all there: name -> marker.
+    """Return the stages of a session whose files all exist: name -> marker.
 
     Args:
         storage: the session's folder.
-        inputs: what decides the results, as far as it is known.
+        inputs: name -> value, of all known values that determine the results.
 
     Raises:
         FleetError: if the folder cannot be read, or holds results of other inputs.
@@ -66,7 +66,7 @@ def finished(storage: Storage, inputs: Mapping[str, str]) -> dict[str, Marker]:
 
 
 def forget(storage: Storage, stage: str) -> None:
-    """Have a stage done again.
+    """Remove a stage's marker, so that the stage is done again.
 
     Raises:
         FleetError: if its marker cannot be removed.
@@ -75,12 +75,12 @@ def forget(storage: Storage, stage: str) -> None:
 
 
 def refuse_others(storage: Storage, markers: Iterable[Marker], inputs: Mapping[str, str]) -> None:
-    """Check that stages were made of the same.
+    """Check that stages were made from the same inputs.
 
     Args:
         storage: the session's folder.
-        markers: of its stages.
-        inputs: what decides the results, as far as it is known.
+        markers: markers of its stages.
+        inputs: name -> value, of all known values that determine the results.
 
     Raises:
         FleetError: if one was made of other inputs.
@@ -95,7 +95,7 @@ def refuse_others(storage: Storage, markers: Iterable[Marker], inputs: Mapping[s
 
 
 def _read(storage: Storage, name: str) -> Marker | None:
-    """None if it is damaged: the stage is then done again."""
+    """Read a marker, or return None if it is damaged: the stage is then done again."""
     try:
         return Marker(**json.loads(storage.read(name) or b""))
     except (ValueError, TypeError):

@@ -1,4 +1,4 @@
-"""Many sessions through all stages, by Dask's workers; one that fails costs the others nothing."""
+"""Many sessions through all stages, by Dask's workers; a failed session affects no other."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from graphvio.optimization.loops.database import colmap
 from graphvio.rig import Rig
 
 PLACES_PER_TASK = 200
-"""Places whose features one task extracts: some 80 m of a walk, and some ten seconds of work."""
+"""Places whose features one task extracts: about 80 m of a walk, and about ten seconds of work."""
 
-_PRIORITY = {tasks.ODOMETRY: 0, "features": 1, tasks.LOOPS: 2, tasks.GRAPH: 3}  # what was begun is finished first
+_PRIORITY = {tasks.ODOMETRY: 0, "features": 1, tasks.LOOPS: 2, tasks.GRAPH: 3}  # first what was begun
 
 
 @dataclass(frozen=True)
 class FleetProgress:
-    """How far everything is.
+    """Progress of a fleet run.
 
     Attributes:
-        sessions: in all.
-        optimized: whose results are there.
-        failed: that were given up.
-        tasks: that have ended since the start, well or not.
-        latest: the task that ended last: stage and session; empty before the first.
+        sessions: number of sessions.
+        optimized: sessions with results.
+        failed: sessions given up.
+        tasks: tasks that have ended in this run, failed ones included.
+        latest: stage and session of the task that ended last; empty before the first.
     """
 
     sessions: int
@@ -60,22 +60,22 @@ def optimize_fleet(
 ) -> list[Outcome]:
     """Optimise each session by itself, and write a table of all.
 
-    A task that fails, or whose worker dies, is done again up to twice; then its session is given up. What is finished
-    is not done again when the same is called again.
+    A task that fails, or whose worker dies, is done again up to twice; then its session is given up. When called again
+    with the same arguments, only missing stages are done.
 
     Args:
-        sessions: with unique names, of which each gets a folder of results.
+        sessions: sessions with unique names; each gets a folder of results.
         out: path or URL of the folder of all results.
-        config: of all stages.
-        rig: of all sessions; None takes the recordings' own.
-        with_loops: whether loop closures are looked for, which needs the extra ``maps``.
-        scheduler: address of a Dask scheduler; None works on this machine.
-        workers: processes on this machine.
-        places_per_task: whose features one task extracts, at most.
-        on_progress: called at the start and when a task has ended.
+        config: configuration of all stages.
+        rig: rig of all sessions; None takes the recordings' own.
+        with_loops: whether loop closures are searched, which needs the extra ``maps``.
+        scheduler: address of a Dask scheduler; None takes workers on this machine.
+        workers: processes on this machine; None takes `default_workers`.
+        places_per_task: maximum number of places whose features one task extracts.
+        on_progress: called at first and whenever a task has ended.
 
     Returns:
-        What became of each session, in their order.
+        The outcome of each session, in their order.
 
     Raises:
         FleetError: if the scheduler or the folder of results cannot be reached.
@@ -91,12 +91,12 @@ def optimize_fleet(
         for each in sessions
     ]
     fleet = _Fleet([_Session(job) for job in jobs], on_progress)
-    waiting = fleet.look()
+    waiting = fleet.find_unfinished()
     if waiting:
         if scheduler is None:
             compile_kernels([session.job.recording for session in waiting], rig, config)
         with connected(scheduler, workers) as client:
-            fleet.work(client, waiting)
+            fleet.run(client, waiting)
     outcomes = [each.outcome() for each in fleet.sessions]
     write_tables(outcomes, Storage(out))
     return outcomes
@@ -104,14 +104,14 @@ def optimize_fleet(
 
 @dataclass(eq=False)
 class _Session:
-    """One of them, as far as it is.
+    """Progress of one session.
 
     Attributes:
-        job: what is to be done.
-        markers: stage -> what is finished of it.
+        job: the session to optimise.
+        markers: stage -> marker, of finished stages.
         parts_left: tasks of features that have not ended.
-        failed_in: stage that it was given up in, or empty.
-        error: one line, or empty.
+        failed_in: stage in which it was given up, or empty.
+        error: its error in one line, or empty.
     """
 
     job: tasks.Job
@@ -148,8 +148,8 @@ class _Fleet:
         self._run = uuid.uuid4().hex[:8]
         self._of_future: dict[Any, tuple[_Session, str]] = {}
 
-    def look(self) -> list[_Session]:
-        """Find what earlier runs have finished; the sessions that are not are returned."""
+    def find_unfinished(self) -> list[_Session]:
+        """Read the markers of earlier runs, and return the sessions that are not finished."""
         waiting = []
         for session in self.sessions:
             try:
@@ -157,13 +157,13 @@ class _Fleet:
             except GraphvioError as error:
                 session.failed_in, session.error = tasks.ODOMETRY, _one_line(error)
             if not session.error and not session.is_optimized:
-                session.markers.pop(tasks.GRAPH, None)  # what it was made of is made anew
+                session.markers.pop(tasks.GRAPH, None)  # its inputs are made again
                 waiting.append(session)
-        self._tell("")
+        self._report("")
         return waiting
 
-    def work(self, client: Any, waiting: Sequence[_Session]) -> None:
-        """Do what is missing."""
+    def run(self, client: Any, waiting: Sequence[_Session]) -> None:
+        """Run the missing stages of the sessions."""
         first = [self._submit(client, session, tasks.ODOMETRY, tasks.odometry) for session in waiting]
         running = distributed().as_completed(first, loop=client.loop)
         try:
@@ -172,13 +172,13 @@ class _Fleet:
                 for following in self._after(client, session, stage, future):
                     running.add(following)
                 self._ended += 1
-                self._tell(f"{stage} of {session.job.name}")
+                self._report(f"{stage} of {session.job.name}")
         except BaseException:
             client.cancel(list(self._of_future), force=True)
             raise
 
     def _after(self, client: Any, session: _Session, stage: str, future: Any) -> list[Any]:
-        """Take what a task gave, and submit what can be done now."""
+        """Take the result of a task, and submit the tasks that can follow."""
         try:
             marker = future.result()
         except Exception as error:
@@ -219,7 +219,7 @@ class _Fleet:
         self._of_future[future] = session, stage
         return future
 
-    def _tell(self, latest: str) -> None:
+    def _report(self, latest: str) -> None:
         if self._on_progress is not None:
             optimized = sum(session.is_optimized for session in self.sessions)
             failed = sum(bool(session.error) for session in self.sessions)
@@ -227,10 +227,10 @@ class _Fleet:
 
 
 def _one_line(error: BaseException) -> str:
-    """What a task failed of, for a table."""
+    """Describe a task's error for the table."""
     library = distributed()
     if isinstance(error, library.KilledWorker):
-        text = "the workers that did it died, again and again: killed, or out of memory"
+        text = "its workers died each time: killed, or out of memory"
     elif isinstance(error, library.client.FutureCancelledError):
         text = "cancelled: the connection to the scheduler was lost, or the scheduler ended"
     elif isinstance(error, (GraphvioError, FleetError)):

@@ -1,4 +1,4 @@
-"""Files wherever fsspec reaches them: local folders, S3, GCS and others, by their paths or URLs."""
+"""Files that fsspec reaches: local folders, S3, GCS and others, by paths or URLs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _UNFINISHED = ".tmp"
 
 
 def file_system(url: str) -> tuple[Any, str]:
-    """The file system of a path or URL, and the path in it.
+    """Return the file system of a path or URL, and the path in it.
 
     Raises:
         FleetError: if the kind of URL is unknown, or what it needs is not installed.
@@ -35,17 +35,17 @@ def file_system(url: str) -> tuple[Any, str]:
 
 
 def local_path(url: str) -> Path | None:
-    """The path of a local file or folder, absolute; None if the URL is of something else."""
+    """Return the absolute path of a local file or folder, or None for other URLs."""
     files, path = file_system(url)
     protocol = (files.protocol,) if isinstance(files.protocol, str) else files.protocol
     return Path(path) if "file" in protocol else None
 
 
 class Storage:
-    """A folder of results, local or not.
+    """A folder of results, local or remote.
 
     Args:
-        url: path or URL; made when the first file is put there.
+        url: path or URL; created with its first file.
 
     Raises:
         FleetError: if it cannot be reached.
@@ -57,7 +57,7 @@ class Storage:
         self._local = local_path(self.url)
 
     def sizes(self) -> dict[str, int]:
-        """Name -> bytes, of all files in it and in folders below.
+        """Return name -> bytes, of all files in it and in folders below.
 
         Raises:
             FleetError: if it cannot be reached.
@@ -72,7 +72,7 @@ class Storage:
             return {path.removeprefix(root): int(info["size"]) for path, info in found.items()}
 
     def read(self, name: str) -> bytes | None:
-        """What a file holds; None if it is not there.
+        """Read a file, or return None if it does not exist.
 
         Raises:
             FleetError: if it cannot be reached.
@@ -84,17 +84,17 @@ class Storage:
                 return None
 
     def fetch(self, name: str, to: Path) -> None:
-        """Copy a file to a local place, whose folder is made.
+        """Copy a file to a local path, whose folder is made.
 
         Raises:
-            FleetError: if it cannot be read, or the copy not be written.
+            FleetError: if it cannot be read, or the copy cannot be written.
         """
         with self._reaching(name, "read"):
             to.parent.mkdir(parents=True, exist_ok=True)
             self._files.get_file(self._path(name), str(to))
 
     def put(self, path: Path, name: str) -> None:
-        """Copy a local file to here; it is whole or absent, whoever looks and whatever fails.
+        """Copy a local file into the folder; at any time it is complete or absent.
 
         Raises:
             FleetError: if it cannot be written.
@@ -102,7 +102,7 @@ class Storage:
         self._replace(name, lambda unfinished: self._files.put_file(str(path), unfinished))
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file that is whole or absent.
+        """Write a file; at any time it is complete or absent.
 
         Raises:
             FleetError: if it cannot be written.
@@ -110,7 +110,7 @@ class Storage:
         self._replace(name, lambda unfinished: self._files.pipe_file(unfinished, data))
 
     def remove(self, name: str) -> None:
-        """Remove a file, if it is there.
+        """Remove a file, if it exists.
 
         Raises:
             FleetError: if it cannot be removed.
@@ -119,7 +119,7 @@ class Storage:
             self._files.rm_file(self._path(name))
 
     def remove_unfinished(self) -> None:
-        """Remove what tasks have left that were broken off while they wrote."""
+        """Remove partial files of interrupted tasks."""
         for name in self.sizes():
             if name.endswith(_UNFINISHED):
                 self.remove(name)
@@ -155,7 +155,7 @@ class Storage:
         Path(unfinished).replace(self._path(name))
 
     def _discard(self, unfinished: str) -> None:
-        with suppress(Exception):  # it may not have been begun, or the disk be gone; what failed first is told
+        with suppress(Exception):  # it may not exist, or the disk be gone; the first error is raised
             self._files.rm_file(unfinished)
 
     @contextmanager
@@ -169,14 +169,14 @@ class Storage:
 
 
 def fetch_recording(url: str, scratch: Path) -> Path:
-    """A recording as a local path: where it is, or a copy in a folder that keeps the one that was fetched last.
+    """Return the local path of a recording, or of a copy in a folder that keeps the recording fetched last.
 
     Args:
         url: path or URL of a folder or file.
-        scratch: folder for the copy, of one thread at a time.
+        scratch: folder for the copy, used by one thread at a time.
 
     Raises:
-        FleetError: if it is not there, cannot be read or does not fit on the disk.
+        FleetError: if it does not exist, cannot be read or does not fit on the disk.
     """
     local = local_path(url)
     if local is not None:

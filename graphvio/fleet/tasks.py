@@ -1,7 +1,7 @@
-"""The stages of one session as tasks: each fetches what it needs, works in a folder of its own, and puts what it made.
+"""The stages of one session as tasks: each fetches its inputs, works in a folder of its own, and puts its results.
 
-A task that is finished already, by an earlier run or by a worker that was thought dead, gives what it gave then. What
-a task that was broken off has left is overwritten when it is done again, or removed when the session is finished.
+A task that is finished already, by an earlier run or by a worker that was taken for dead, returns the same marker.
+Partial results of an interrupted task are overwritten when it is done again, or removed when the session is finished.
 """
 
 from __future__ import annotations
@@ -44,13 +44,14 @@ class Job:
     """A session to optimise.
 
     Attributes:
-        name: of it.
+        name: session name.
         recording: path or URL.
-        results: path or URL of its folder.
-        config: of all stages.
-        rig: None takes the recording's own.
-        with_loops: whether loop closures are looked for.
-        places_per_task: whose features one task extracts, at most.
+        results: path or URL of its folder of results.
+        config: configuration of all stages.
+        rig: rig, or None for the recording's own.
+        with_loops: whether loop closures are searched.
+        places_per_task: maximum number of places whose features one task extracts.
+        version: version of graphvio.
     """
 
     name: str
@@ -64,7 +65,7 @@ class Job:
 
     @property
     def inputs(self) -> dict[str, str]:
-        """What decides the results, as far as it is known without opening the recording."""
+        """Name -> value, of all that determines the results and is known without opening the recording."""
         return {
             "recording": self.recording,
             "config": self.config.sha256(),
@@ -75,15 +76,15 @@ class Job:
 
 
 def features_stage(part: int, parts: int) -> str:
-    """Name of the stage that extracts the features of one part of the places."""
+    """Return the name of the stage that extracts the features of one part of the places."""
     return f"features-{part}-of-{parts}"
 
 
 def odometry(job: Job) -> Marker:
-    """Run the odometry; figures are those of its summary, and ``parts``: tasks for the features of all places.
+    """Run the odometry; its figures are those of the summary, and ``parts``, the number of tasks for features.
 
     Raises:
-        GraphvioError: if the recording cannot be read, or a file not be written.
+        GraphvioError: if the recording cannot be read, or a file cannot be written.
     """
 
     def work(task: _Task) -> dict[str, Any]:
@@ -109,7 +110,7 @@ def features(job: Job, part: int, parts: int) -> Marker:
     """Extract the features of one part of the places into a database of its own.
 
     Raises:
-        GraphvioError: if the recording cannot be read, or a file not be written.
+        GraphvioError: if the recording cannot be read, or a file cannot be written.
     """
 
     def work(task: _Task) -> dict[str, Any]:
@@ -130,7 +131,7 @@ def loops(job: Job, parts: int) -> Marker:
     """Join the databases of all parts, and find loop closures.
 
     Raises:
-        GraphvioError: if the recording cannot be read, or a file not be written.
+        GraphvioError: if the recording cannot be read, or a file cannot be written.
     """
 
     def work(task: _Task) -> dict[str, Any]:
@@ -152,7 +153,7 @@ def loops(job: Job, parts: int) -> Marker:
 
 
 def graph(job: Job) -> Marker:
-    """Optimise everything that is known of the session, and write the results.
+    """Optimise the session as one graph, and write the results.
 
     Raises:
         GraphvioError: if there is no unique solution, or a file cannot be written.
@@ -178,7 +179,7 @@ def graph(job: Job) -> Marker:
 
 @dataclass(eq=False)
 class _Task:
-    """A stage at work in a folder of its own."""
+    """A stage while it runs, in a folder of its own."""
 
     job: Job
     folder: Path
@@ -189,7 +190,7 @@ class _Task:
     fetched: set[str] = field(default_factory=set)
 
     def fetch(self, *stages: str) -> None:
-        """Get the files that earlier stages have left."""
+        """Fetch the files of earlier stages."""
         for stage in stages:
             if stage not in self.done:
                 raise FleetError(f"{self.job.results}: the files of {stage} are gone; run it again")
@@ -198,12 +199,12 @@ class _Task:
                 self.storage.fetch(name, self.folder / name)
 
     def record(self) -> SessionRecord:
-        """Of the odometry, fetched."""
+        """Load the odometry's record, which has been fetched."""
         return SessionRecord.load(self.folder / self.job.name / "record.npz")
 
 
 def _perform(job: Job, stage: str, work: Callable[[_Task], dict[str, Any]], changed: Sequence[str] = ()) -> Marker:
-    """Do the work, unless it is done, and put what it made, and those files that it fetched and changed."""
+    """Do the work, unless it is done, and put the new files and those of the fetched ones that it changed."""
     begun = perf_counter()
     if job.version != __version__:
         raise FleetError(f"this worker has graphvio {__version__}, and was asked by {job.version}; install one version")
@@ -230,7 +231,7 @@ def _perform(job: Job, stage: str, work: Callable[[_Task], dict[str, Any]], chan
 
 @contextmanager
 def _scratch() -> Iterator[tuple[Path, Path]]:
-    """A folder of this process that stays as long as its worker, if it is one, and one of this task alone.
+    """Return a folder that stays as long as the worker, if there is one, and a folder of this task alone.
 
     Raises:
         FleetError: if the disk is full.
@@ -258,7 +259,7 @@ def _part_name(part: int, parts: int) -> str:
 
 
 def _ate_m(trajectory: Path, truth: Path | None) -> float | None:
-    """Of the optimised trajectory, rmse; None without a truth that fits."""
+    """Compute the rmse of the optimised trajectory, or return None without a truth that matches."""
     if truth is None:
         return None
     try:
