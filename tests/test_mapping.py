@@ -190,7 +190,7 @@ def test_other_files_are_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     with (
         Mapper(front_end(0, 4, seed=0)[0], CONFIG) as mapper,
-        pytest.raises(MapError, match="something else than a map"),
+        pytest.raises(MapError, match="contains other files than a map"),
     ):
         mapper.save(tmp_path)
     assert (tmp_path / "mine.txt").read_text() == "mine"

@@ -23,28 +23,22 @@ class Intake:
         front_end: The front-end.
         settings: Distances between places.
         share: Returns, before each keyframe, the share of these distances that is sufficient now.
+
+    Attributes:
+        skipped: Number of keyframes that did not become places because too many waited.
+        lost: Number of keyframes that were lost: gaps in their ids.
     """
 
     def __init__(self, front_end: SlamFrontEnd, settings: OptimizationConfig, share: Callable[[], float]) -> None:
+        self.skipped = 0
+        self.lost = 0
         self._front_end = front_end
         self._share = share
         self._chooser = PlaceChooser(settings.place_distance_m, settings.place_angle_deg)
         self._lock = threading.Lock()
         self._waiting: BoundedQueue[NewPlace] = BoundedQueue(_MAX_WAITING, WhenFull.DROP_NEWEST)
         self._keyframes: list[KeyframeAtPlace] = []
-        self._skipped = 0
-        self._lost = 0
         self._failure: BaseException | None = None
-
-    @property
-    def skipped(self) -> int:
-        """Number of keyframes that did not become places because too many waited."""
-        return self._skipped
-
-    @property
-    def lost(self) -> int:
-        """Number of keyframes that were lost: gaps in their ids."""
-        return self._lost
 
     @property
     def waiting(self) -> int:
@@ -95,7 +89,7 @@ class Intake:
             with self._lock:
                 if self._waiting.is_closed:
                     return
-                self._lost += max(keyframe.id - (keyframe.id if expected is None else expected), 0)
+                self.lost += max(keyframe.id - (keyframe.id if expected is None else expected), 0)
                 expected = keyframe.id + 1
                 place, is_one = self._chooser.add(keyframe, self._share(), len(self._waiting) < _MAX_WAITING)
                 newest = self._chooser.newest()
@@ -103,4 +97,4 @@ class Intake:
                     self._keyframes.append(newest)
                 if place is not None:
                     self._waiting.put(place)
-                self._skipped += is_one and place is None
+                self.skipped += is_one and place is None

@@ -21,7 +21,7 @@ from graphvio.mapping.intake import Intake
 from graphvio.mapping.places import NewPlace, spread_keyframes
 from graphvio.mapping.pose_graph import PoseGraph
 from graphvio.mapping.recognition import Recognition
-from graphvio.mapping.store import PlaceStore
+from graphvio.mapping.store import DATABASE, PlaceStore, copy_database
 from graphvio.measurements.sensors import FrameSet
 from graphvio.optimization.loops.closures import LoopClosure, Place, closure_of
 from graphvio.optimization.loops.features import PlaceObserver
@@ -71,7 +71,7 @@ class Mapper:
         self._places: list[Place] = []
         if folder is not None:
             kept = saved_map.load(folder, self._rig)
-            saved_map.copy_files(folder, self._folder)
+            copy_database(folder / DATABASE, self._folder / DATABASE)
             self._graph, self._recognition, self._places = saved_map.restored(kept, self._config)
         self._first = len(self._places)  # first place of this session
         self._session = 1 + max((place.session for place in self._places), default=-1)

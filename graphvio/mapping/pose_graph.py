@@ -83,22 +83,20 @@ class PoseGraph:
     def __len__(self) -> int:
         return len(self._poses)
 
-    def begin(self, odom_T_body: Float) -> int:
-        """Add the first place of a fragment by its pose (4, 4) in odom; return its index."""
+    def begin(self, odom_T_body: Float) -> None:
+        """Add the first place of a fragment by its pose (4, 4) in odom."""
         self.chains.begin(odom_T_body)
         self._poses.append(odom_T_body)
         self._component.append(len(self._component))
         self._bounds.append(EXACT)
-        return len(self) - 1
 
-    def add(self, previous_T_body: Float, covariance: Float) -> int:
-        """Add a place to the last fragment by its motion (4, 4) from the previous place; return its index."""
+    def add(self, previous_T_body: Float, covariance: Float) -> None:
+        """Add a place to the last fragment by its motion (4, 4) from the previous place, with covariance (6, 6)."""
         self.chains.add(previous_T_body, covariance)
         pose, bound = composed(self._poses[-1], self._bounds[-1], previous_T_body, covariance)
         self._poses.append(pose)
         self._bounds.append(bound)
         self._marginals_of.pop(self._component[-1], None)
-        return len(self) - 1
 
     @property
     def component(self) -> list[int]:

@@ -24,7 +24,7 @@ from graphvio.errors import GraphvioError, MapError
 from graphvio.mapping.chains import Chains
 from graphvio.mapping.pose_graph import PoseGraph, TestedClosure
 from graphvio.mapping.recognition import Recognition
-from graphvio.mapping.store import DATABASE, PlaceStore, copy_database
+from graphvio.mapping.store import DATABASE, PlaceStore
 from graphvio.optimization.loops.closures import LoopClosure, Place, closures_to_bytes, load_closures
 from graphvio.optimization.solver import Edge
 from graphvio.rig import Rig
@@ -159,16 +159,7 @@ def check_target(folder: Path) -> None:
         MapError: If it contains other files.
     """
     if folder.exists() and not (folder / _HEADER).is_file() and (not folder.is_dir() or any(folder.iterdir())):
-        raise MapError(f"{folder}: holds something else than a map; name another folder")
-
-
-def copy_files(folder: Path, into: Path) -> None:
-    """Copy a map's features to a folder where more can be added.
-
-    Raises:
-        MapError: If they cannot be copied.
-    """
-    copy_database(folder / DATABASE, into / DATABASE)
+        raise MapError(f"{folder}: contains other files than a map; name another folder")
 
 
 def to_saved(graph: PoseGraph, recognition: Recognition, places: Sequence[Place]) -> SavedMap:
@@ -268,7 +259,7 @@ def _header(folder: Path) -> dict[str, dict[str, str]]:
     except (ValueError, KeyError, TypeError):
         raise MapError(f"{path}: is damaged; restore the map from a copy, or make a new one") from None
     if form != FORMAT:
-        raise MapError(f"{path}: is of something else than a map; give the folder that a map was saved in")
+        raise MapError(f"{path}: is not the header of a map; give the folder that a map was saved in")
     if version != VERSION:
         raise MapError(f"{folder}: is a map of version {version}, this graphvio reads {VERSION}; make a new map")
     return {"files": files}

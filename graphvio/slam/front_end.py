@@ -146,5 +146,5 @@ class FrontEnd:
         is_successive = previous.stamp_ns == new.previous_ns
         if is_successive and new.previous_T_body is not None and new.covariance is not None:
             return new.previous_T_body, new.covariance
-        # The state was reinitialised in between: the motion is no better known than the whole way until here.
+        # The state was reinitialised in between: the motion is as uncertain as the whole path until here.
         return se3_inverse(previous.odom_T_body) @ estimate.nav_T_body, estimate.covariance

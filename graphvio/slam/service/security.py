@@ -54,8 +54,8 @@ def server_credentials(options: ServiceOptions) -> Any | None:
     key = _read_private(options.key, "TLS key", stat.S_IRWXO)
     try:
         certificate = options.certificate.read_bytes()
-        # gRPC accepts anything here, and fails at each client.
-        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(options.certificate, options.key, password=_no_password)
+        # gRPC accepts anything here, and fails at each client. Without a password OpenSSL asks at the terminal.
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(options.certificate, options.key, password="")
     except (OSError, ssl.SSLError) as error:
         raise ServiceError(
             f"{options.certificate}, {options.key}: are no TLS certificate and key ({_reason(error)}); give PEM files "
@@ -141,10 +141,6 @@ def _read_private(path: Path, what: str, forbidden: int) -> bytes:
             return file.read(2**20)
     except OSError as error:
         raise ServiceError(f"{path}: the {what} cannot be read ({error.strerror}); check the path") from None
-
-
-def _no_password() -> str:
-    return ""  # else OpenSSL asks at the terminal
 
 
 def _reason(error: OSError | ssl.SSLError) -> str:
