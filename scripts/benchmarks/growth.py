@@ -64,7 +64,7 @@ def _hypotheses(report: Report, footage: Footage, config: Config) -> None:
     report.add(
         "#### Hypotheses",
         "Here all hypotheses are sampled (`motion.confidence` 1); with the default, sampling ends once one is correct "
-        "with that confidence, mostly after a batch or two. The reference is the same in each row; it shows how much "
+        "with this probability, mostly after a batch or two. The reference is the same in each row; it shows how much "
         "the load changed.",
     )
     report.table(["hypotheses a pair", *_HEAD], rows)

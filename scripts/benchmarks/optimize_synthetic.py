@@ -67,11 +67,10 @@ def add_hour(report: Report, minutes: Sequence[float]) -> None:
     report.add(
         "#### An hour",
         f"{LOOPS_AN_HOUR} closures an hour, {100 * FALSE_SHARE:.0f} % of them false and anywhere. *Time* is that of "
-        "`optimize()` by the clock, which other load lengthens; *processor* what it took of all cores. *Reference* is "
-        f"what the processor takes for a chain of as many states, blocks of {_BLOCK} variables, factored and solved in "
-        "plain numpy before and after it in the same process: where *ratio*, processor over reference, stays as it is, "
-        "the work is linear in the length. *Memory* is the most that the process held, sampling the session "
-        "included.",
+        "`optimize()` by the clock, which other load lengthens; *processor* that of all cores. *Reference* is the "
+        f"processor's time for a chain of as many states, blocks of {_BLOCK} variables, factored and solved in plain "
+        "numpy before and after it in the same process: where *ratio*, processor over reference, stays constant, the "
+        "work is linear in the length. *Memory* is the process's maximum, sampling the session included.",
     )
     report.table(
         ["minutes", "states", "right used", "false used", "ATE before, m", "after, m", "time, s", "processor, s",

@@ -56,7 +56,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def main(args: argparse.Namespace) -> None:
     """Run the campaign and report."""
     if args.runs < 1 or args.jobs < 1:
-        raise GraphvioError("--runs and --jobs want 1 or more")
+        raise GraphvioError("--runs and --jobs must be 1 or more")
     report = Report()
     report.add(machine(), "", f"`--runs {args.runs}`.", "", "#### Synthetic errors")
     low, high = chi2.ppf([0.025, 0.975], 6 * args.runs) / args.runs

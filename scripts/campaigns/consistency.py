@@ -54,7 +54,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def main(args: argparse.Namespace) -> None:
     """Run the campaign and report."""
     if args.seeds < 2 or args.rendered < 0 or args.jobs < 1 or args.duration < 20.0:
-        raise GraphvioError("--seeds wants 2 or more, --rendered 0, --jobs 1 and --duration 20 or more")
+        raise GraphvioError("--seeds must be 2 or more, --rendered 0, --jobs 1 and --duration 20 or more")
     templates = templates_of(args.data, _WHERE)
     synthetic, rendered = Squares(), Squares()
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:

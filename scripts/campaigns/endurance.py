@@ -47,7 +47,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def main(args: argparse.Namespace) -> None:
     """Run and report."""
     if args.minutes < 1.0:
-        raise GraphvioError("--minutes wants 1 or more")
+        raise GraphvioError("--minutes must be 1 or more")
     report = Report()
     report.add(
         machine(),

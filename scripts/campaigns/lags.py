@@ -39,7 +39,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def main(args: argparse.Namespace) -> None:
     """Run the campaign and report."""
     if args.seeds < 1 or args.jobs < 1 or args.duration < 6.0:
-        raise GraphvioError("--seeds and --jobs want 1 or more, --duration 6 or more")
+        raise GraphvioError("--seeds and --jobs must be 1 or more, --duration 6 or more")
     tracks: dict[str, list[dict[str, Track]]] = defaultdict(list)
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
         for seed, result in enumerate(pool.map(one_run, range(args.seeds), [args.duration] * args.seeds)):

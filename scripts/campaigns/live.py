@@ -69,7 +69,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def main(args: argparse.Namespace) -> None:
     """Run all cases and report."""
     if args.seconds < 15.0:
-        raise GraphvioError("--seconds wants 15 or more")
+        raise GraphvioError("--seconds must be 15 or more")
     folder = simulated(args.data, _SCENE)
     report = Report()
     report.add(machine(), "", f"`--seconds {args.seconds:g} --kills {args.kills}`")

@@ -54,7 +54,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def main(args: argparse.Namespace) -> None:
     """Run and report."""
     if args.draws < 1:
-        raise GraphvioError("--draws wants 1 or more")
+        raise GraphvioError("--draws must be 1 or more")
     source = open_source(simulated(args.data, _SCENE))
     report = Report()
     report.add(machine(), "", f"`--draws {args.draws}`: keyframes four a second, drift 10 mm and 0.02 deg after 1 m.")

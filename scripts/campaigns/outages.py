@@ -59,7 +59,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def main(args: argparse.Namespace) -> None:
     """Run all cases and report."""
     if args.jobs < 1:
-        raise GraphvioError("--jobs wants 1 or more")
+        raise GraphvioError("--jobs must be 1 or more")
     folder = simulated(args.data, _SCENE)
     report = Report()
     report.add(machine())

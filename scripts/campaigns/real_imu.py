@@ -52,7 +52,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def main(args: argparse.Namespace) -> None:
     """Run and report."""
     if args.seeds < 2:
-        raise GraphvioError("--seeds wants 2 or more")
+        raise GraphvioError("--seeds must be 2 or more")
     flight, imu, config = Flight.read(args.recording), Imu(), SmootherConfig()
     report = Report()
     report.add(machine(), "", f"`--seeds {args.seeds}`, {len(flight.intervals) / FRAMES_HZ:.0f} s of flight.")

@@ -50,7 +50,7 @@ def add_parser(subparsers: Subparsers) -> None:
 def main(args: argparse.Namespace) -> None:
     """Run and report."""
     if args.framesets < 100:
-        raise GraphvioError("--framesets wants 100 or more")
+        raise GraphvioError("--framesets must be 100 or more")
     folder = simulated(args.data, _SCENE)
     report = Report()
     how = "at the sensors' pace" if args.real_time else "as fast as possible"
