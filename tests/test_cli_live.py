@@ -383,7 +383,7 @@ def test_dashboard_repeated_events_are_shown_once() -> None:
 
 def test_dashboard_panel_has_devices_and_events() -> None:
     dashboard = Dashboard("walk", Broadcast[Event]().subscribe(1))
-    dashboard._show_event(Event(0, "stage_stuck", "output has worked on one thing"), 100.0)
+    dashboard._show_event(Event(0, "stage_stuck", "output has worked on one item"), 100.0)
     console = Console(record=True, file=open(os.devnull, "w"), width=150)  # noqa: PTH123, SIM115
     console.print(dashboard._panel(FIGURES, [DeviceHealth("front", False, "unplugged", {"dropped": 3})]))
     text = console.export_text()
