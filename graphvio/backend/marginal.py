@@ -100,7 +100,7 @@ class Marginal:
 def marginal_of_last(
     solution: gtsam.GaussianBayesTree, last: Sequence[int], dims: Mapping[int, int]
 ) -> Marginal | None:
-    """The marginal of the variables that were eliminated last, or None if some are not in a root.
+    """Return the marginal of the variables that were eliminated last, or None if some are not in a root.
 
     As a rule all states are tied to each other, and they are the lower corner of the one root; just after a start there
     may be several.

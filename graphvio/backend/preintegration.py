@@ -20,7 +20,7 @@ _INTEGRATION_SIGMA = 3e-5  # m/s^2-like noise that stands for the error of integ
 
 
 def preintegration_params(imu: Imu, noise_scale: float) -> gtsam.PreintegrationCombinedParams:
-    """gtsam's parameters for nav z up, with the rig's noise densities times a factor."""
+    """Return gtsam's parameters for nav z up, with the rig's noise densities times a factor."""
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_M_S2)
     params.setGyroscopeCovariance(np.eye(3) * (noise_scale * imu.gyro_noise_density) ** 2)
     params.setAccelerometerCovariance(np.eye(3) * (noise_scale * imu.accel_noise_density) ** 2)

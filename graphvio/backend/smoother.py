@@ -189,8 +189,10 @@ class Smoother:
         self._window.add(zero_velocity(self._index_of[self.latest_ns]))
 
     def excess_acceleration(self, motion: RelativeMotion) -> float | None:
-        """The acceleration, m/s^2, that a motion which ends in the newest state asks for over the newest step, if it is
-        surely more than the rig can have; None where it is not, or the state before the step was not seen."""
+        """Return the acceleration, m/s^2, that a motion asks for over the newest step, if the rig cannot have it.
+
+        None where it can, or vision did not constrain the state before that step.
+        """
         if len(self._stamps) < 2 or self._seen_ns != self._stamps[-2]:
             return None
         before, dt = self.pose(self._stamps[-2]), (self._stamps[-1] - self._stamps[-2]) * 1e-9

@@ -143,7 +143,7 @@ class CameraMotions:
         return self._shared.get(reference_ns, np.zeros((6, 6)))
 
     def _ancestors(self, stamp_ns: int) -> list[int]:
-        """An instant, its reference, the reference of that, and so on."""
+        """Return an instant, its reference, the reference of that, and so on."""
         line = [stamp_ns]
         while line[-1] in self._reference:
             line.append(self._reference[line[-1]])

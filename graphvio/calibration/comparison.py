@@ -80,7 +80,7 @@ def compare(pairs: PosePairs, paper: PaperSolution, graph: GraphSolution, disper
 
 
 def _influence_on_paper(pairs: PosePairs, paper: PaperSolution) -> Float:
-    """Derivatives (2 N, 6, 6) of the paper's solution by errors of all first motions, then of all second ones."""
+    """Return derivatives (2 N, 6, 6) of the paper's solution by errors of all first, then all second motions."""
     R = paper.left2_T_left1[:3, :3]
     t = -R.T @ paper.left2_T_left1[:3, 3]
     J = jacobians(PoseParts.of(pairs), R) * paper.inlier[:, None, None]
@@ -92,7 +92,7 @@ def _influence_on_paper(pairs: PosePairs, paper: PaperSolution) -> Float:
 
 
 def _influence_on_graph(pairs: PosePairs, graph: GraphSolution, determined: Float) -> Float:
-    """Derivatives (2 N, 6, 6) of the graph's solution, in the same order."""
+    """Return the derivatives (2 N, 6, 6) of the graph's solution, in the same order."""
     pose, chosen = graph.left2_T_left1, pairs.select(graph.inlier)
     known = determined @ information(chosen, pose) @ determined.T
     covariance = determined.T @ np.linalg.solve(known, determined)

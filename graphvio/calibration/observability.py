@@ -78,7 +78,7 @@ def observe(pairs: PosePairs, left2_T_left1: Float) -> Observability:
 
 @kernel
 def _noise_information(left2_T_left1: Float, motion_1: Float, covariance_1: Float, covariance_2: Float) -> Float:
-    """Expected information (6, 6) that the noise of the motions adds."""
+    """Return the expected information (6, 6) that the noise of the motions adds."""
     total = np.zeros((6, 6))
     adjoint = se3_adjoint(left2_T_left1)
     for k in range(len(motion_1)):

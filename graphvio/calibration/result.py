@@ -184,8 +184,11 @@ class Calibration:
         return self.places.pairwise[0, j].observability.undetermined
 
     def _apart(self, j: int, given: Float) -> tuple[Float, float, int]:
-        """Tangent (6,) from the calibration to another value in determined directions, squared Mahalanobis distance and
-        its degrees of freedom."""
+        """Compare with another value in the directions that the motions determine.
+
+        Returns:
+            Tangent (6,) from the calibration to the value, squared Mahalanobis distance, and its degrees of freedom.
+        """
         undetermined = self._undetermined(j)
         place = np.ascontiguousarray(self.places.left_T_left1[j])
         for _ in range(_NEARER):  # all poses along these directions are equally likely: take the nearest one

@@ -191,7 +191,7 @@ def _undetermined(found: Mapping[tuple[int, int], PairCalibration], count: int) 
 
 
 def _in_first_lengths(found: Mapping[tuple[int, int], PairCalibration], one: int, other: int) -> Float:
-    """Result ``left_other_T_left_one`` (4, 4) for two cameras alone, in lengths as the first camera measures them."""
+    """Calibrate ``left_other_T_left_one`` (4, 4) of two cameras alone, in lengths of the first camera."""
     place = np.array(found[one, other].left2_T_left1)
     if one and found[0, one].scale_estimated:
         place[:3, 3] *= np.exp(-found[0, one].scale.log_ratio)

@@ -31,8 +31,11 @@ class CornerConfig(Stage):
 
 @dataclass(frozen=True)
 class TrackingConfig(Stage):
-    """Temporal 2D-2D matching by Lucas-Kanade (section 3): each track is registered on the keyframe's patch at its
-    predicted place, and followed through pyramids from the previous frame where that fails."""
+    """Temporal 2D-2D matching by Lucas-Kanade (section 3).
+
+    Each track is registered on the keyframe's patch at its predicted place, and followed through pyramids from the
+    previous frame where that fails.
+    """
 
     window_px: int = 15
     """Side of the patch that is compared, odd (an even one counts as the next); also of the patches of registration on

@@ -145,7 +145,7 @@ def relative_errors(estimate: Trajectory, truth: Trajectory) -> tuple[dict[str, 
 
 
 def _pairs(along: Float, length: float) -> Int:
-    """Indices (N, 2) of poses ``length`` apart along an increasing measure (M,), one pair for each first pose."""
+    """Return indices (N, 2) of poses ``length`` apart along an increasing measure (M,), a pair for each first one."""
     goal = along + length
     after = np.clip(np.searchsorted(along, goal), 1, len(along) - 1)
     nearest = np.where(goal - along[after - 1] <= along[after] - goal, after - 1, after)

@@ -166,8 +166,10 @@ def combined(joint: Refined, motions: Sequence[Refined]) -> Refined:
 
 @kernel
 def _linearised(correction: Float, trusted: Float, pairs: Float, whiteners: Float) -> tuple[Float, Float]:
-    """Return whitened differences (N, 6) of a pair's corrected motions from the trusted ones, and their derivatives
-    (N, 6, 6) by one more correction from the left."""
+    """Return whitened differences (N, 6) of a pair's corrected motions from the trusted ones, and derivatives.
+
+    These (N, 6, 6) are by one more correction from the left.
+    """
     n = len(trusted)
     errors, derivatives = np.empty((n, 6)), np.empty((n, 6, 6))
     inverse = se3_inverse(correction)

@@ -180,8 +180,10 @@ class Estimation:
             self._meter.count("results_not_put_out")
 
     def _is_after_start(self, arrival_ns: int) -> bool:
-        """Whether a frameset does not wait for those before the first pose, which are held until the IMU has shown the
-        initial attitude, and then processed all at once."""
+        """Whether a frameset came after the first pose.
+
+        Framesets before it are held until the IMU has shown the initial attitude, and then processed all at once.
+        """
         return self._first_pose_ns is not None and arrival_ns > self._first_pose_ns + _START_NS
 
     def _is_limited(self, arrival_ns: int) -> bool:

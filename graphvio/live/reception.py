@@ -127,7 +127,7 @@ class Reception:
         return self._clocks.map(reading.clock, reading.stamp_ns, reading.arrival_ns)
 
     def _next_image(self, stage: Stage) -> tuple[CameraFrame, int] | None:
-        """The next image; None at the end. While none comes, framesets that have waited long enough go on."""
+        """Return the next image; None at the end. While none comes, framesets that have waited long enough go on."""
         while (item := self.images.get(_ROUND_S)) is None and not self.images.is_finished:
             if not self._source.is_realtime:
                 continue  # its images come when they are taken: time means nothing for them

@@ -137,8 +137,10 @@ class LiveOdometry:
         self._raise_failure()
 
     def _ends(self, stage: Stage) -> bool:
-        """Whether a stage ends; it may take long while it progresses, or those do that it waits for. Capture has to end
-        at once where it need not wait, as its source was closed."""
+        """Wait for a stage while it progresses, or those do that it waits for, and return whether it ended.
+
+        Capture has to end at once where it need not wait, as its source was closed.
+        """
         capture, *later = self._stages
         counted = later if not self._source.is_realtime else [stage] if stage is not capture else []
         done, since_s = -1, 0.0

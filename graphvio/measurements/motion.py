@@ -77,8 +77,7 @@ class RelativeMotion:
 
     @property
     def weakest_sigmas(self) -> tuple[float, float]:
-        """Standard deviations in the directions that are known least: of the rotation, radians, and the translation,
-        metres."""
+        """Standard deviations in the least known directions: of the rotation, rad, and the translation, m."""
         blocks = np.stack([self.covariance[:3, :3], self.covariance[3:, 3:]])
         rotation, translation = np.sqrt(np.linalg.eigvalsh(blocks)[:, -1])
         return float(rotation), float(translation)

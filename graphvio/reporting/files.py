@@ -10,8 +10,8 @@ def replace_file(path: Path, content: str | bytes) -> None:
     """Write a file under a temporary name, then rename it.
 
     Args:
-        path: file to write or replace.
-        text: its content.
+        path: File to write or replace.
+        content: Text or bytes.
 
     Raises:
         OSError: if it cannot be written; an existing file is then unchanged.

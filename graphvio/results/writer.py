@@ -278,7 +278,7 @@ def _csv(stamp_ns: int, values: Iterable[float]) -> str:
 
 
 def _report_line(stamp_ns: int, name: str, report: PairReport) -> str:
-    """A line of ``pairs.csv``; fields are empty where the report has None."""
+    """Return a line of ``pairs.csv``; fields are empty where the report has None."""
     line = io.StringIO()
     rms, own_rms = (None if px is None else _number(px) for px in (report.rms_px, report.own_rms_px))
     csv.writer(line, lineterminator="").writerow(

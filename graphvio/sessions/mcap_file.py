@@ -194,7 +194,7 @@ class McapFile:
             topic.places.append(Place(chunk, offset, channel, logged_ns))
 
     def _parsed(self, at: int) -> Any:
-        """The record at a position, as the library has it."""
+        """Return the record at a position, as the library has it."""
         opcode, record = _read_record(self._file, at, self._size)
         if opcode == Opcode.ATTACHMENT:  # the library does not verify these
             crc = int.from_bytes(record[-4:], "little")
@@ -203,7 +203,7 @@ class McapFile:
         return next(StreamReader(BytesIO(record), skip_magic=True, emit_chunks=True).records)
 
     def _chunk(self, at: int) -> bytes:
-        """The records of a chunk, unpacked."""
+        """Return the records of a chunk, unpacked."""
         if at in self._chunks:
             self._chunks.move_to_end(at)
             return self._chunks[at]

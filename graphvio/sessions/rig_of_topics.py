@@ -90,7 +90,7 @@ def stereo_topics(images: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 
 def _without_side(camera: str) -> str:
-    """A pair's name: that of its left camera without the side."""
+    """Return a pair's name: that of its left camera without the side."""
     parts = [part for part in camera.split("/") if part]
     others = [part for part in parts if not any(side in part for side in _WORDS)]
     return "-".join(others) or "-".join(parts)
@@ -103,7 +103,7 @@ def info_topics(image_topic: str) -> list[str]:
 
 
 def _info(messages: MessageReader, image_topic: str) -> Any:
-    """The calibration of a topic with images, or None."""
+    """Return the calibration of a topic with images, or None."""
     for name in info_topics(image_topic):
         topic = messages.topics.get(name)
         if topic is not None and topic.type_name == CAMERA_INFO and topic.places:
@@ -112,7 +112,7 @@ def _info(messages: MessageReader, image_topic: str) -> Any:
 
 
 def _first(messages: MessageReader, topic: Topic) -> Any:
-    """The first undamaged message of a topic."""
+    """Return the first undamaged message of a topic."""
     for place in topic.places[:-1]:
         try:
             return cdr.decode(messages.read(place), topic.type_name, messages.path)

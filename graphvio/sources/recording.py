@@ -142,7 +142,7 @@ class Recording:
         return _Decoded(int(self.stamps_ns[at]), images, faults, decode_ms)
 
     def _checked(self, item: _Decoded) -> dict[int, tuple[Image, Image]]:
-        """The images that have the rig's size."""
+        """Return the images that have the rig's size."""
         good = {}
         for number, images in item.images.items():
             pair = self.rig.pairs[number]
@@ -166,7 +166,7 @@ class Recording:
         return False
 
     def _cut_imu(self, table: ImuTable | None, offset_ns: int, is_whole: bool) -> ImuTable | None:
-        """The samples around the framesets, with their faults counted; None if there are none."""
+        """Return the samples around the framesets, with their faults counted; None if there are none."""
         begin, end = self.start_ns + offset_ns, self.end_ns + offset_ns
         if table is not None:
             first = int(np.searchsorted(table.stamps_ns, begin - _LEAD_NS))

@@ -114,7 +114,7 @@ class _Images:
 
 
 def _topic_of(store: Store, pair: str, side: str, camera: Camera) -> Topic:
-    """The topic of a camera's images: as graphvio names it, or with the camera's name in its own."""
+    """Return the topic of a camera's images: as graphvio names it, or with the camera's name in its own."""
     for name in (image_topic(pair, side, "raw"), image_topic(pair, side, "png"), camera.name):
         if name in store.topics:
             return store.topics[name]
@@ -127,7 +127,7 @@ def _topic_of(store: Store, pair: str, side: str, camera: Camera) -> Topic:
 
 
 def _read_imu(store: Store, chosen: Topic | None, faults: FaultLog) -> ImuTable | None:
-    """The samples of the chosen topic, or else of the first that has any."""
+    """Return the samples of the chosen topic, or else of the first that has any."""
     found = of_type(store.topics, IMU)
     if chosen is None and len(found) > 1:
         names = ", ".join(each.name for each in found)

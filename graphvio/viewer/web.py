@@ -117,7 +117,7 @@ class WebHost:
 
 
 def _program() -> list[str]:
-    """rerun's program rather than its Python launcher, which would end before it."""
+    """Find rerun's program; its Python launcher would end before it."""
     package = find_spec("rerun_cli")
     program = None if package is None or package.origin is None else Path(package.origin).with_name("rerun")
     return [str(program)] if program is not None and program.is_file() else [sys.executable, "-m", "rerun_cli"]
