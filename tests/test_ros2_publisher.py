@@ -198,7 +198,7 @@ def test_publisher_diagnostics_report_status(system: System) -> None:
         values = system.wait_for_diagnosis("graphvio: odometry", level, str(status))
         assert values == {"rate_hz": "19.875", "framesets": "7", "state": "tracking"}
     system.running.estimates.publish(replace(estimate(1), stamp_ns=-1))
-    system.wait_for_diagnosis("graphvio: publisher", 1, "no time that ROS messages hold")
+    system.wait_for_diagnosis("graphvio: publisher", 1, "which ROS messages can hold")
     system.running.estimates.close()
     system.wait_for_diagnosis("graphvio: odometry", 3, "the odometry has ended")
 

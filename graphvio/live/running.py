@@ -153,7 +153,7 @@ class LiveOdometry:
 
     @property
     def odometry(self) -> Odometry:
-        """The odometry, whose `predict`, `correct` and `map_T_body` may be called from any thread."""
+        """The odometry, whose `predict` may be called from any thread."""
         return self._odometry
 
     @property
