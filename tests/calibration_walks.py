@@ -58,8 +58,8 @@ def recorded(folder: Path, duration_s: float, course: Course | None = None, trig
     def write(cached: Path) -> None:
         write_recording(walk_simulator(duration_s, course, trigger_offset_ms), cached)
 
-    name = "circle" if course is None else course.__name__.replace("_", "-")
-    cached = rendered_once(f"calibration-{name}-{duration_s:g}-{trigger_offset_ms:g}", write)
+    name = "circle" if course is None else course.__name__
+    cached = rendered_once("walk", write, name, duration_s, trigger_offset_ms)
     shutil.copytree(cached, folder, dirs_exist_ok=True)
     return folder
 

@@ -19,23 +19,24 @@ def rendered_once(name: str, write: Callable[[Path], object], *options: object) 
     Nobody may write into it. It is kept in the user's cache, by the digest of the simulator's sources.
 
     Args:
-        name: Readable part of the folder's name.
+        name: Name of the folder.
         write: Renders into a folder that does not exist.
-        options: All that the recording depends on apart from the sources; their text is part of the key.
+        options: All that the recording depends on apart from the sources; recordings of one name differ in these.
     """
-    key = hashlib.sha256(source_digest("graphvio.simulation.recording").encode() + repr(options).encode())
+    sources = hashlib.sha256(source_digest("graphvio.simulation.recording").encode())
     for maker in _MAKERS:
-        key.update((_HERE / maker).read_bytes())
+        sources.update((_HERE / maker).read_bytes())
+    which = f"{name}-{hashlib.sha256(repr(options).encode()).hexdigest()[:8]}"
     cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "graphvio" / "test-recordings"
     cache.mkdir(parents=True, exist_ok=True)
-    folder = cache / f"{name}-{key.hexdigest()[:16]}"
-    with (cache / f"{name}.lock").open("w") as lock:
+    folder = cache / f"{which}.{sources.hexdigest()[:16]}" / name
+    with (cache / f"{which}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # whichever process comes first renders it for all
         if not folder.exists():
-            for outdated in cache.glob(f"{name}-*"):
+            for outdated in [path for path in cache.glob(f"{which}.*") if path.is_dir()]:
                 shutil.rmtree(outdated)
-            unfinished = folder.with_name(f".{folder.name}")
-            shutil.rmtree(unfinished, ignore_errors=True)
+            folder.parent.mkdir()
+            unfinished = folder.with_name(".unfinished")
             write(unfinished)
             unfinished.rename(folder)
     return folder

@@ -26,7 +26,7 @@ def corridor() -> Path:
     def write(folder: Path) -> None:
         write_recording(Simulator(scene, half_size_rig(), 0), folder)
 
-    return rendered_once("corridor-320x240", write, DURATION_S)
+    return rendered_once("corridor", write, "320x240", DURATION_S)
 
 
 @pytest.mark.parametrize(("pairs", "max_drift_percent"), [([0, 1], 0.2), ([0], 1.0), ([1], 1.0)])

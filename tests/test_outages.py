@@ -33,7 +33,7 @@ def walk_folder() -> Path:
     def write(folder: Path) -> None:
         write_recording(Simulator(build_scene("room", DURATION_S), half_size_rig(), 0), folder)
 
-    return rendered_once("room-320x240", write, DURATION_S)
+    return rendered_once("room", write, "320x240", DURATION_S)
 
 
 @pytest.fixture(scope="module")
