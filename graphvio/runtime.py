@@ -5,7 +5,8 @@ program that embeds graphvio makes those that suit it:
 
 - `use_one_opencv_thread`, since pairs are tracked in threads of their own, with which OpenCV's would compete;
 - `share_heap` before threads are started, where images pass through many threads for hours;
-- `interruptible` around calls that Ctrl-C should end, even while compiled code runs.
+- `interruptible` around calls that Ctrl-C should end, even while compiled code runs;
+- `StopSignals`, `HeldInterrupt`, `on_interrupt` and the functions below them, for loops that must end cleanly.
 
 Compiled kernels are cached in the folder that the environment variable ``GRAPHVIO_CACHE_DIR`` names, see
 `graphvio.kernels.cache_root`.
@@ -97,7 +98,7 @@ def on_interrupt(handler: Callable[[], None]) -> Callable[[], None]:
 
 
 class HeldInterrupt:
-    """Holds back Ctrl-C inside until `check`, so that nothing is left half written; a second one acts as ever.
+    """Holds back Ctrl-C inside until `check`, so that nothing is left half written; a second one has its usual effect.
 
     Outside of the main thread, and where Ctrl-C is ignored, nothing changes.
     """
@@ -138,7 +139,7 @@ class HeldInterrupt:
 
 
 class StopSignals:
-    """Takes note of the first Ctrl-C or SIGTERM inside, so that all can be saved; a second one acts as ever.
+    """Takes note of the first Ctrl-C or SIGTERM inside, so that all can be saved; a second one has its usual effect.
 
     Attributes:
         came: Whether one did.
@@ -191,10 +192,10 @@ def stop_signals_blocked() -> Iterator[None]:
 
 
 def ignore_stop_signals() -> None:
-    """Leave Ctrl-C and SIGTERM to the process that started this one.
+    """Let a handler that does nothing take Ctrl-C and SIGTERM: the parent process ends this one.
 
-    Processes that are started here are ended by them: they would inherit that signals are ignored or blocked, but they
-    do not inherit a handler that does nothing.
+    Ignored or blocked signals would be inherited by processes that are started here; handlers are not, so that signals
+    still end those.
     """
     for number in _STOP_SIGNALS:
         signal.signal(number, lambda *_: None)
@@ -202,7 +203,7 @@ def ignore_stop_signals() -> None:
 
 
 def ignore_interrupts() -> None:
-    """Leave Ctrl-C to the process that started this one, and so do the processes that are started here."""
+    """Ignore Ctrl-C here and in processes that are started from here: the parent process handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

@@ -32,7 +32,7 @@ def timed(stage: str) -> Callable[[Callable[Concatenate[T, P], R]], Callable[Con
             finally:
                 self.stage_ms[stage] = self.stage_ms.get(stage, 0.0) + 1e3 * (perf_counter() - start)
 
-        return measured  # type: ignore[return-value]  # `wraps` names its first argument
+        return measured  # type: ignore[return-value]  # wraps() loses the type of self
 
     return decorate
 

@@ -32,7 +32,7 @@ DOOR = transform([0.0, 0.05, 0.0], [0.08, 0.04, 0.0])
 OTHER_DOOR = transform([0.03, 0.0, -0.04], [-0.05, 0.06, 0.0])
 
 
-def judged(
+def agreement_of(
     seen: Observations,
     seed: int = 0,
     arrays: RigArrays = ARRAYS,
@@ -66,7 +66,7 @@ def distance(motion: Float, truth: Float) -> float:
 def test_pairs_that_see_one_world_agree() -> None:
     distances = []
     for seed in range(40):
-        agreement = judged(mixed((TRUTH, 80), (TRUTH, 80), seed), seed)
+        agreement = agreement_of(mixed((TRUTH, 80), (TRUTH, 80), seed), seed)
         assert len(agreement.hypotheses) == 1
         assert agreement.hypotheses[0].pairs == (0, 1)
         assert set(agreement.own) == {0, 1}
@@ -76,7 +76,7 @@ def test_pairs_that_see_one_world_agree() -> None:
 
 @pytest.mark.parametrize(("points", "first"), [((120, 60), 0), ((60, 120), 1)])
 def test_a_door_that_fills_one_view_is_a_side_of_its_own(points: tuple[int, int], first: int) -> None:
-    agreement = judged(mixed((TRUTH, points[0]), (DOOR, points[1])))
+    agreement = agreement_of(mixed((TRUTH, points[0]), (DOOR, points[1])))
     assert [side.pairs for side in agreement.hypotheses] == [(first,), (1 - first,)]
     for side in agreement.hypotheses:
         assert distance(side.refined.cur_T_ref, (TRUTH, DOOR)[side.pairs[0]]) < 5e-3
@@ -87,19 +87,22 @@ def test_a_door_that_fills_one_view_is_a_side_of_its_own(points: tuple[int, int]
 def test_of_sides_with_about_the_same_support_the_first_pair_comes_first() -> None:
     """Else an error of P_12 would have the sides change places again and again."""
     for points in ((100, 110), (110, 100)):
-        assert [side.pairs for side in judged(mixed((TRUTH, points[0]), (DOOR, points[1]))).hypotheses] == [(0,), (1,)]
+        assert [side.pairs for side in agreement_of(mixed((TRUTH, points[0]), (DOOR, points[1]))).hypotheses] == [
+            (0,),
+            (1,),
+        ]
 
 
 def test_pairs_that_contradicted_each_other_in_doubt_separate_sooner() -> None:
     off = transform([0.001, 0.0, 0.0], [0.0, 0.0, 0.0]) @ TRUTH  # between 2 and 5 sigma
     seen = mixed((TRUTH, 80), (off, 80))
-    usual, doubtful = judged(seen), judged(seen, in_doubt=True)
+    usual, doubtful = agreement_of(seen), agreement_of(seen, in_doubt=True)
     assert 12.6 < usual.max_distance < 40.0
     assert (len(usual.hypotheses), len(doubtful.hypotheses)) == (1, 2)
     assert not usual.contradicts
     assert not doubtful.contradicts  # or doubt would feed itself
-    assert judged(mixed((TRUTH, 80), (DOOR, 80)), in_doubt=True).contradicts
-    assert len(judged(mixed((TRUTH, 80), (TRUTH, 80)), in_doubt=True).hypotheses) == 1
+    assert agreement_of(mixed((TRUTH, 80), (DOOR, 80)), in_doubt=True).contradicts
+    assert len(agreement_of(mixed((TRUTH, 80), (TRUTH, 80)), in_doubt=True).hypotheses) == 1
 
 
 def test_consensus_set_has_pairs_that_all_agree() -> None:
@@ -135,16 +138,16 @@ PLACE = Misalignment(np.full(6, 0.01), 0.1**2 * np.eye(6), 100.0)  # corrected, 
 def test_what_is_not_known_of_a_pairs_place_is_in_its_motions_covariance() -> None:
     """Together with another pair, as a side of its own, and alone."""
     seen = mixed((TRUTH, 80), (TRUTH, 80))
-    exact, corrected = judged(seen), judged(seen, misaligned={1: PLACE})
+    exact, corrected = agreement_of(seen), agreement_of(seen, misaligned={1: PLACE})
     assert len(corrected.hypotheses) == 1
     weighed = corrected.hypotheses[0].refined
     trusted = corrected.own[0].cur_T_ref
     assert distance(weighed.cur_T_ref, trusted) < distance(exact.hypotheses[0].refined.cur_T_ref, trusted)
     assert np.trace(weighed.covariance) > 1.2 * np.trace(exact.hypotheses[0].refined.covariance)
     np.testing.assert_array_equal(corrected.own[1].covariance, exact.own[1].covariance)  # watching P_12 needs it bare
-    contradicted = judged(mixed((TRUTH, 80), (DOOR, 80)), misaligned={1: PLACE}).hypotheses[1]
+    contradicted = agreement_of(mixed((TRUTH, 80), (DOOR, 80)), misaligned={1: PLACE}).hypotheses[1]
     assert contradicted.pairs == (1,)
-    alone = judged(seen.of_pair(1), misaligned={1: PLACE}).hypotheses[0]
+    alone = agreement_of(seen.of_pair(1), misaligned={1: PLACE}).hypotheses[0]
     for side in (contradicted, alone):
         lever = 0.1 * np.linalg.norm(se3_adjoint(side.refined.cur_T_ref) - np.eye(6), axis=1)
         assert np.all(np.sqrt(np.diag(side.refined.covariance)) > lever)
@@ -153,22 +156,22 @@ def test_what_is_not_known_of_a_pairs_place_is_in_its_motions_covariance() -> No
 def test_an_error_of_p12_that_is_known_to_be_possible_is_no_contradiction() -> None:
     off = np.array([0.05, 0.0, -0.05, 0.0, 0.0, 0.0])
     seen = mixed((TRUTH, 80), (se3_exp(-off) @ TRUTH @ se3_exp(off), 80))
-    assert judged(seen).contradicts
-    assert not judged(seen, misaligned={1: PLACE}).contradicts
+    assert agreement_of(seen).contradicts
+    assert not agreement_of(seen, misaligned={1: PLACE}).contradicts
 
 
 def test_a_second_motion_of_all_pairs_is_not_mixed_with_what_the_pairs_say_alone() -> None:
     """Each view has a door of its own that outnumbers the world: the world's motion is nobody's, and stays itself."""
     world = mixed((TRUTH, 30), (TRUTH, 30), 3)
     seen = joined(world, mixed((DOOR, 40), (OTHER_DOOR, 40), 4))
-    sides = judged(seen, misaligned={1: Misalignment(np.zeros(6), 1e-8 * np.eye(6), 100.0)}).hypotheses
+    sides = agreement_of(seen, misaligned={1: Misalignment(np.zeros(6), 1e-8 * np.eye(6), 100.0)}).hypotheses
     assert sides[0].pairs == (0, 1)
     assert distance(sides[0].refined.cur_T_ref, TRUTH) < 5e-3
 
 
 def test_the_order_of_sides() -> None:
     def order(*sides: tuple[tuple[int, ...], int]) -> list[tuple[int, ...]]:
-        refined = judged(mixed((TRUTH, 60), (TRUTH, 60))).hypotheses[0].refined
+        refined = agreement_of(mixed((TRUTH, 60), (TRUTH, 60))).hypotheses[0].refined
         return [
             side.pairs
             for side in _in_order([MotionHypothesis(p, replace(refined, inlier=np.arange(200) < n)) for p, n in sides])
@@ -186,13 +189,13 @@ def test_points_that_are_hardly_off_are_no_second_motion() -> None:
         seen = seen_points(RIG, TRUTH, 100, np.random.default_rng(7), sigma_px=0.04)
         askew = np.arange(len(seen.pair)) % 4 == 0
         off = np.where(askew[:, None], np.array([shift_px, 0.0]) / RIG.pairs[0].left.focal_px, 0.0)
-        assert len(judged(seen._replace(left=seen.left + off, right=seen.right + off)).hypotheses) == motions
+        assert len(agreement_of(seen._replace(left=seen.left + off, right=seen.right + off)).hypotheses) == motions
 
 
 def test_people_who_walk_through_all_views_are_a_second_motion() -> None:
     world = seen_points(RIG, TRUTH, 80, np.random.default_rng(1), sigma_px=0.2)
     people = seen_points(RIG, DOOR, 30, np.random.default_rng(2), sigma_px=0.2)
-    agreement = judged(joined(world, people))
+    agreement = agreement_of(joined(world, people))
     assert len(agreement.hypotheses) == 2
     assert distance(agreement.hypotheses[0].refined.cur_T_ref, TRUTH) < 5e-3
     assert distance(agreement.hypotheses[1].refined.cur_T_ref, DOOR) < 1e-2
@@ -200,12 +203,12 @@ def test_people_who_walk_through_all_views_are_a_second_motion() -> None:
 
 def test_wrong_matches_are_no_second_motion() -> None:
     seen = seen_points(RIG, TRUTH, 80, np.random.default_rng(3), sigma_px=0.2, outlier_share=0.4)
-    assert len(judged(seen).hypotheses) == 1
+    assert len(agreement_of(seen).hypotheses) == 1
 
 
 def test_a_single_pair_has_nobody_to_contradict_it() -> None:
     seen = seen_points(RIG, TRUTH, 60, np.random.default_rng(4), sigma_px=0.2).of_pair(1)
-    agreement = judged(seen)
+    agreement = agreement_of(seen)
     assert len(agreement.hypotheses) == 1
     assert agreement.own == {}
 
@@ -215,7 +218,7 @@ def test_pair_report_has_the_pairs_own_error() -> None:
     quiet = seen_points(RIG, TRUTH, 200, np.random.default_rng(5), sigma_px=quiet_px).of_pair(0)
     loud = seen_points(RIG, TRUTH, 200, np.random.default_rng(6), sigma_px=loud_px).of_pair(1)
     seen = joined(quiet, loud)
-    agreement = judged(seen)
+    agreement = agreement_of(seen)
     assert len(agreement.hypotheses) == 1
     rows = {j: np.arange(200) for j in range(2)}
     frame = replace(PairFrame.empty(), ids=np.arange(200), ages=np.zeros(200, dtype=np.int64))
@@ -228,7 +231,7 @@ def test_pair_report_has_the_pairs_own_error() -> None:
 
 def test_a_pair_that_the_chosen_motion_does_not_explain_has_no_error_under_it() -> None:
     seen = mixed((TRUTH, 120), (DOOR, 60))
-    agreement = judged(seen)
+    agreement = agreement_of(seen)
     rows = {0: np.arange(120), 1: np.arange(60)}
     frame = replace(PairFrame.empty(), ids=np.arange(60), ages=np.zeros(60, dtype=np.int64))
     report = pair_reports({1: frame}, Correspondences(seen, rows, {0: 120, 1: 60}), agreement, {})[1]
@@ -244,7 +247,7 @@ def test_swapping_pairs_changes_only_their_names(second: Float, seed: int) -> No
     order = np.argsort(1 - seen.pair, kind="stable")
     columns: list[AnyArray] = [column[order] for column in seen]
     swapped = Observations(*columns)._replace(pair=1 - seen.pair[order])
-    first, again = judged(seen, seed), judged(swapped, seed, RigArrays.of(RIG.with_pairs([1, 0])))
+    first, again = agreement_of(seen, seed), agreement_of(swapped, seed, RigArrays.of(RIG.with_pairs([1, 0])))
     assert [side.pairs for side in again.hypotheses] == [
         tuple(sorted(1 - j for j in side.pairs)) for side in first.hypotheses
     ]
@@ -277,7 +280,7 @@ def measured(cur_T_ref: Float, inliers: int, sigma: float = 1e-4) -> RelativeMot
     return RelativeMotion(0, 50_000_000, se3_inverse(cur_T_ref), covariance, 0.3 * covariance, inliers)
 
 
-def judgement(
+def graded_motion(
     motions: Sequence[RelativeMotion],
     max_distance: float,
     frozen_since_ns: int | None,
@@ -288,7 +291,7 @@ def judgement(
 
 
 def test_a_good_motion_is_left_as_it_is() -> None:
-    motion, quality, reason = judgement([measured(TRUTH, 200)], 5.0, None, CONFIRMED)
+    motion, quality, reason = graded_motion([measured(TRUTH, 200)], 5.0, None, CONFIRMED)
     assert quality is Quality.GOOD
     assert reason == ""
     assert np.array_equal(motion.covariance, measured(TRUTH, 200).covariance)
@@ -296,7 +299,7 @@ def test_a_good_motion_is_left_as_it_is() -> None:
 
 def test_the_covariance_covers_the_rival() -> None:
     """Whichever of the two motions is right, its turn and its shift are each within about a sigma."""
-    motion, quality, reason = judgement([measured(TRUTH, 100), measured(DOOR, 80)], 0.0, None, CONFIRMED)
+    motion, quality, reason = graded_motion([measured(TRUTH, 100), measured(DOOR, 80)], 0.0, None, CONFIRMED)
     assert quality is Quality.WEAK
     assert "two motions are seen" in reason
     for right in (TRUTH, DOOR):
@@ -307,30 +310,31 @@ def test_the_covariance_covers_the_rival() -> None:
         np.ascontiguousarray(transform([0.02, -0.03, 0.06], [0.02, -0.06, 0.05]) @ motion.reference_T_current)
     )
     assert error @ np.linalg.solve(motion.covariance, error) < 6.0
-    few = judgement([measured(TRUTH, 200), measured(DOOR, 12)], 0.0, None, CONFIRMED)
+    few = graded_motion([measured(TRUTH, 200), measured(DOOR, 12)], 0.0, None, CONFIRMED)
     assert few[1] is Quality.GOOD  # somebody far away
 
 
 def test_few_points_are_believed_less_and_less() -> None:
     sigmas = [
-        np.sqrt(np.trace(judgement([measured(TRUTH, n)], 0.0, None, CONFIRMED)[0].covariance)) for n in (40, 29, 20, 12)
+        np.sqrt(np.trace(graded_motion([measured(TRUTH, n)], 0.0, None, CONFIRMED)[0].covariance))
+        for n in (40, 29, 20, 12)
     ]
     assert sigmas == sorted(sigmas)
     assert sigmas[0] < 1e-3
     assert sigmas[-1] > 0.03  # as far as a person walks in the time
-    assert judgement([measured(TRUTH, 20)], 0.0, None, CONFIRMED)[1:] == (Quality.WEAK, "only 20 points")
+    assert graded_motion([measured(TRUTH, 20)], 0.0, None, CONFIRMED)[1:] == (Quality.WEAK, "only 20 points")
 
 
 @pytest.mark.parametrize(("noise", "factor"), [(0.2, 1.0), (1.0, 1.0), (1.5, 2.25), (2.5, 6.25)])
 def test_errors_beyond_the_modelled_noise_count_twice(noise: float, factor: float) -> None:
-    motion, quality, reason = judgement([measured(TRUTH, 200)], 0.0, None, CONFIRMED, noise)
+    motion, quality, reason = graded_motion([measured(TRUTH, 200)], 0.0, None, CONFIRMED, noise)
     np.testing.assert_allclose(motion.covariance, factor * measured(TRUTH, 200).covariance)
     assert quality is (Quality.WEAK if noise > 2.0 else Quality.GOOD)
     assert ("2.5 times worse" in reason) == (noise > 2.0)
 
 
 def test_images_that_all_repeat_say_nothing_for_sure() -> None:
-    motion, quality, reason = judgement([measured(STILL, 300)], 0.0, -950_000_000, CONFIRMED)
+    motion, quality, reason = graded_motion([measured(STILL, 300)], 0.0, -950_000_000, CONFIRMED)
     assert quality is Quality.WEAK
     assert "repeats" in reason
     assert np.sqrt(motion.covariance[3, 3]) == pytest.approx(1.0, rel=0.01)  # a metre in a second
@@ -346,16 +350,18 @@ def test_weakest_sigmas_are_those_of_the_weakest_directions() -> None:
 
 def test_graded_distance_and_weak_directions_enlarge_the_covariance() -> None:
     base = np.trace(measured(TRUTH, 200).covariance)
-    assert np.trace(judgement([measured(TRUTH, 200)], 36.0, None, CONFIRMED)[0].covariance) == pytest.approx(3.0 * base)
+    assert np.trace(graded_motion([measured(TRUTH, 200)], 36.0, None, CONFIRMED)[0].covariance) == pytest.approx(
+        3.0 * base
+    )
     weak = replace(measured(TRUTH, 200), covariance=np.diag([1e-8] * 5 + [0.01]))
-    assert judgement([weak], 0.0, None, CONFIRMED)[1] is Quality.WEAK
+    assert graded_motion([weak], 0.0, None, CONFIRMED)[1] is Quality.WEAK
     random = random_transform(np.random.default_rng(0), 0.01, 0.01)
-    assert judgement([measured(random, 200)], 0.0, None, CONFIRMED)[1] is Quality.GOOD
+    assert graded_motion([measured(random, 200)], 0.0, None, CONFIRMED)[1] is Quality.GOOD
 
 
 def test_what_the_right_images_do_not_confirm_may_be_off_by_the_baseline() -> None:
     """As it is when the cables of left and right are swapped while the rig runs."""
-    motion, quality, reason = judgement([measured(TRUTH, 200)], 0.0, None, StereoShare(0.1, 0.12))
+    motion, quality, reason = graded_motion([measured(TRUTH, 200)], 0.0, None, StereoShare(0.1, 0.12))
     assert quality is Quality.WEAK
     assert reason == "only 10 % of the corners are found in the right images"
     sigmas = np.sqrt(np.diag(motion.covariance))
@@ -374,4 +380,4 @@ def test_the_share_that_stereo_confirms_is_that_of_all_corners() -> None:
     assert stereo_share({1: reference[1]}, current, [0.1, 0.2]).share == pytest.approx(0.08)
     assert stereo_share({**reference, 1: frame(0, 0)}, current, [0.1, 0.2]).share == pytest.approx(100 * 0.6 / 150)
     assert stereo_share({0: frame(0, 0)}, {0: frame(0, 0)}, [0.1, 0.2]).share == 0.0
-    assert judgement([measured(TRUTH, 200)], 0.0, None, StereoShare(0.13, 0.12))[1] is Quality.GOOD
+    assert graded_motion([measured(TRUTH, 200)], 0.0, None, StereoShare(0.13, 0.12))[1] is Quality.GOOD

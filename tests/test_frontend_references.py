@@ -44,7 +44,7 @@ def spent(reference: PairFrame, newest: PairFrame) -> bool:
     references = References(MotionConfig())
     references.replace({0: reference})
     correspondences = correspond({0: reference}, {0: newest})
-    return references.must_be_replaced({0: newest}, correspondences, explained(correspondences), contradicted=False)
+    return references.must_be_replaced({0: newest}, correspondences, explained(correspondences), is_contradicted=False)
 
 
 @pytest.mark.parametrize(("near_left", "expected"), [(30, False), (20, False), (8, True)])

@@ -13,7 +13,7 @@ PLACES = np.random.default_rng(0).uniform(0.0, 400.0, (60, 2))
 
 
 def detected(shifts_px: Float, noise_px: float = 0.05, explained: int = 60) -> list[bool]:
-    """GateResults on frames whose points have moved by so much (K,) along x."""
+    """Detections on frames whose points have moved by so much (K,) along x."""
     standstill, rng, detections = Standstill(), np.random.default_rng(1), []
     for k, shift in enumerate(shifts_px):
         pixels = PLACES + [shift, 0.0] + noise_px * rng.standard_normal((60, 2))

@@ -2,7 +2,7 @@
 
 `estimator` says what a state estimator does; `smoother_estimator` and `ekf.estimator` are the two that there are.
 `gating` tests innovations. `smoother` is the fixed-lag smoother over the factor graph of `window`, with the factors of
-`factors`, `preintegration` and `reference_views`; `initial_state` is what it is initialised with, and `initialisation`
-finds the first attitude. `inertial` buffers the IMU, `propagation` predicts at its rate, and `time_offset`
-estimates its offset.
+`factors`, `preintegration` and `reference_views`; `initial_state` has the states that both begin with, and
+`initialisation` finds the first attitude. `inertial` buffers the IMU, `propagation` predicts at its rate, and
+`time_offset` estimates its offset.
 """

@@ -19,8 +19,8 @@ class MeasurementUpdate:
 
     Attributes:
         motion: The relative motion that constrains the newest state, or None where there is none or it was gated.
-        needs_keyframe: Whether later motions have to be measured from the newest frameset, because the window holds no
-            state that they could be measured from otherwise.
+        needs_keyframe: Whether later motions have to be measured from the newest frameset, because no state is kept
+            that they could be measured from otherwise.
     """
 
     motion: RelativeMotion | None
@@ -51,7 +51,7 @@ class StateEstimator(Protocol):
         covariance: Covariance of the newest state.
         gate_results: Outcomes of the innovation tests since the last prediction, by the name of what was measured, see
             `graphvio.measurements.estimate.Estimate`.
-        initialisations: Number of initialisations and reinitialisations until now.
+        initialisations: Number of initialisations and reinitialisations until now; resets of velocities do not count.
     """
 
     epoch: int

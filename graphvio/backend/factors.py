@@ -52,7 +52,7 @@ def first_state(
 def constant_velocity(
     i: int, j: int, motion: Float, dt: float, after_s: float, rate_sigmas: Float, accel_sigmas: Float
 ) -> gtsam.NonlinearFactor:
-    """Predict constant velocity and angular rate up to white accelerations (eq. 11).
+    """Predict constant velocity and angular rate up to white accelerations (eq. 11 and 12).
 
     Args:
         i: a state.

@@ -1,4 +1,4 @@
-"""States that the smoother is initialised with: at first from the IMU, and again after each kind of break."""
+"""States that an estimator is initialised with: the first one, and one after each kind of break."""
 
 from __future__ import annotations
 

@@ -297,7 +297,7 @@ class Smoother:
         return k
 
     def _link_by_constant_velocity(self, i: int, j: int, motion: Float, dt: float) -> None:
-        """Tie two states by constant velocity and angular rate, eq. (11)."""
+        """Tie two states by constant velocity and angular rate, eq. (11) and (12)."""
         config = self._config
         after_s = (self.latest_ns - self._constrained_ns) * 1e-9
         accelerations = np.array([config.motion_angular_accel_sigma_rad_s2, config.motion_accel_sigma_m_s2])

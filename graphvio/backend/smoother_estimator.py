@@ -187,6 +187,7 @@ class SmootherEstimator:
     # ------------------------------------------------------------------ measurement update
 
     def _apply_motion(self, visual: VisualResult) -> MeasurementUpdate:
+        """Insert the motion if it passes the gate; reinitialise after lost, or once it was refused for too long."""
         smoother, motion = self._running, visual.motion
         if motion is None:
             return MeasurementUpdate(None)
@@ -207,7 +208,7 @@ class SmootherEstimator:
                 return MeasurementUpdate(motion, needs_keyframe=True)
             smoother.add_motion(motion)
             self._accepted += 1
-            self._clear_refused()
+            self._note_accepted()
             return MeasurementUpdate(motion)
         why = _exceedance(gate_result) if excess is None else f"asks for an acceleration of {excess:.0f} m/s^2"
         self._report(motion.stamp_ns, EventKind.VISION_GATED, f"{why}, {motion.inliers} inliers")
@@ -224,10 +225,10 @@ class SmootherEstimator:
     def _gate(self, visual: VisualResult) -> tuple[RelativeMotion, GateResult]:
         """Return the motion and its gate result; of contradicting hypotheses, the one that the prediction prefers."""
         assert visual.motion is not None
-        gated = [(self._running.gate(motion), motion) for motion in visual.alternatives]
-        gated.sort(key=lambda each: each[0].statistic)
-        if gated:
-            (likely, motion), (unlikely, _) = gated[:2]
+        tested = [(self._running.gate(motion), motion) for motion in visual.alternatives]
+        tested.sort(key=lambda each: each[0].statistic)
+        if tested:
+            (likely, motion), (unlikely, _) = tested[:2]
             if likely.accepted and not unlikely.accepted and likely.is_clear and unlikely.is_clear:
                 return motion, likely
         return visual.motion, self._running.gate(visual.motion)
@@ -309,9 +310,10 @@ class SmootherEstimator:
         self._status.note_initialisation(initial)
         self._tracked_ns = initial.stamp_ns
         self._sigma_m = self._rebuilt_sigma_m = 0.0
-        self._clear_refused()
+        self._note_accepted()
 
-    def _clear_refused(self) -> None:
+    def _note_accepted(self) -> None:
+        """Take note that vision is accepted: nothing is refused any more, and the estimate is not lost."""
         self._refused.clear()
         self._imu_failed = False
         self._status.is_lost = False

@@ -37,7 +37,7 @@ class InitialUncertainty:
         pose: (6, 6) covariance of the pose, tangent ``[rotation, translation]`` in body.
         velocity_m_s: standard deviation of each component.
         gyro_bias_rad_s: standard deviation of each component.
-        of_nav: (6, 6) More covariance of the pose that is reported but not estimated, such as the uncertainty of
+        of_nav: (6, 6) additional covariance of the pose that is reported but not estimated, such as the uncertainty of
             where an epoch begins: no later measurement can reduce it.
     """
 

@@ -124,7 +124,10 @@ def _consensus_sets(pairs: Sequence[int], apart: Mapping[tuple[int, int], float]
 
 
 def _in_order(hypotheses: list[MotionHypothesis]) -> list[MotionHypothesis]:
-    """Sort by support; but an error of P_12 refutes no pair, and changing between comparable ones would add it up."""
+    """Sort by support, but comparable ones by their lowest pair.
+
+    With wrong extrinsics several pairs are right, and alternating between them would accumulate the error.
+    """
     enough = _T.min_comparable_support * max(hypothesis.support for hypothesis in hypotheses)
     comparable = [hypothesis for hypothesis in hypotheses if hypothesis.support >= enough]
     others = [hypothesis for hypothesis in hypotheses if hypothesis.support < enough]
@@ -155,7 +158,7 @@ def _own_motion(
     if share >= _T.min_joint_share:
         return refine(rig, seen, joint.cur_T_ref, config, known=inlier)
     start = joint.cur_T_ref
-    if share < _T.min_searched_share:
+    if share < _T.max_searched_share:
         start = search(rig, seen, start, config, rng)
     return refine(rig, seen, start, config)
 

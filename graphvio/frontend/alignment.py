@@ -2,7 +2,7 @@
 
 With an error ``d`` of ``body_T_left`` (from the left, in body), a pair measures the motion ``exp(-d) M exp(d)`` where
 the rig's is M. Motions over whole keyframes, which share next to no noise, are collected, and d is their robust
-least-squares solution by Gauss-Newton: section 4 in small.
+least-squares solution by Gauss-Newton: as in section 4, for small errors.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Misalignment(NamedTuple):
     """An error of a pair's extrinsics.
 
     Attributes:
-        tangent: (6,) ``[rotation, translation]`` d: The true ``body_T_left`` is ``exp(d)`` times the assumed one.
+        tangent: (6,) ``[rotation, translation]`` d: the true ``body_T_left`` is ``exp(d)`` times the assumed one.
         covariance: (6, 6) of d.
         statistic: Chi-square (6 degrees of freedom) of d being zero.
     """
@@ -40,12 +40,12 @@ class Misalignment(NamedTuple):
     @property
     def is_significant(self) -> bool:
         """Whether chance explains it less than once in 10^9."""
-        return self.statistic > _T.significant
+        return self.statistic > _T.max_chance_distance
 
     def refutes(self, other: Misalignment) -> bool:
         """Whether the other error is significantly different."""
         apart = self.tangent - other.tangent
-        return float(apart @ np.linalg.solve(self.covariance, apart)) > _T.significant
+        return float(apart @ np.linalg.solve(self.covariance, apart)) > _T.max_chance_distance
 
 
 class PairAlignment:

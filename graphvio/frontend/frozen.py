@@ -26,7 +26,7 @@ class Frozen:
 
 
 class FrozenImages:
-    """Compares each image with the one before it, byte for byte: living sensors have noise."""
+    """Compares each image with the one before it, byte for byte: the noise of a sensor changes every image."""
 
     def __init__(self) -> None:
         self._last: dict[int, tuple[Image, Image]] = {}

@@ -59,7 +59,7 @@ class References:
         return groups[max(groups, key=lambda stamp_ns: (in_view(stamp_ns), stamp_ns))]
 
     def must_be_replaced(
-        self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined, contradicted: bool
+        self, frames: Mapping[int, PairFrame], correspondences: Correspondences, refined: Refined, is_contradicted: bool
     ) -> bool:
         """Decide whether the next motions are measured from the newest frames.
 
@@ -70,11 +70,11 @@ class References:
             frames: Newest frame of each pair.
             correspondences: Points of them that the references have, too.
             refined: The motion.
-            contradicted: Whether more than one motion is seen. Many short motions soonest show which one is right.
+            is_contradicted: Whether more than one motion is seen. Many short motions soonest show which one is right.
         """
         if self._config.reference == "previous":
             return True
-        if contradicted:
+        if is_contradicted:
             return True
         if any(j not in correspondences.rows for j in frames):
             return True  # a pair that came back takes part again from the next frameset on

@@ -19,9 +19,9 @@ class AgreementThresholds:
     Attributes:
         max_distance: Squared Mahalanobis distance of motions that agree: normal errors exceed it once in 2 million.
         max_distance_in_doubt: The same while the pairs contradicted each other a moment ago: once in 20.
-        doubt_ns: How long that lasts.
-        min_searched_share: Share of a pair's points that the joint motion explains; below, the pair searches its own.
-        min_joint_share: From this share on, the pair's own motion is next to the joint one.
+        doubt_ns: Time after a contradiction during which that holds.
+        max_searched_share: Share of a pair's points that the joint motion explains, below which it searches its own.
+        min_joint_share: From this share on, its own motion is refined from the joint one and its inliers.
         min_rival_points: Points of a second motion.
         min_unlike_px: Error of a point that may belong to it; less is a lens that is not quite known.
         min_unexplained_share: Share of all points that are unexplained, from which on a second motion is looked for.
@@ -32,7 +32,7 @@ class AgreementThresholds:
     max_distance: float = 40.0
     max_distance_in_doubt: float = 12.6
     doubt_ns: int = 1_000_000_000
-    min_searched_share: float = 0.5
+    max_searched_share: float = 0.5
     min_joint_share: float = 0.9
     min_rival_points: int = 12
     min_unlike_px: float = 1.0
@@ -75,7 +75,7 @@ class ReferenceThresholds:
     Attributes:
         min_points: Points that the motion explains.
         min_near_share: Share, of the configured overlap, of the near points that have to be still in view.
-        min_pair_share: The same of a single pair's points.
+        min_pair_share: Share, of the configured overlap, of a pair's tracks with depth that have to be usable points.
         max_absence_ns: A pair that was absent for longer is tracked from scratch.
     """
 
@@ -96,10 +96,10 @@ class AlignmentThresholds:
         cauchy_scale: Squared scale of the robust cost of a motion's squared Mahalanobis distance.
         max_outlier_share: Of the motions; with more, there is no common error.
         prior_sigmas: (6,) rad and m: decides only in directions that no motion shows.
-        significant: Chi-square that a right transform exceeds once in 10^9.
-        max_vague_share: Standard deviation over the size beyond which a size is not reported,
-        max_fine_rad: unless the standard deviation of an angle is no larger than this,
-        max_fine_m: or that of a distance.
+        max_chance_distance: Chi-square that a right transform exceeds once in 10^9.
+        max_vague_share: A size is reported where its standard deviation is at most this share of it.
+        max_fine_rad: Or, of an angle, where it is at most this.
+        max_fine_m: Or, of a distance, where it is at most this.
     """
 
     max_motions: int = 100
@@ -108,7 +108,7 @@ class AlignmentThresholds:
     cauchy_scale: float = 9.0
     max_outlier_share: float = 0.3
     prior_sigmas: np.ndarray[tuple[int], np.dtype[np.float64]] = field(default_factory=lambda: np.repeat([0.1, 0.2], 3))
-    significant: float = float(chi2.isf(1e-9, 6))
+    max_chance_distance: float = float(chi2.isf(1e-9, 6))
     max_vague_share: float = 0.25
     max_fine_rad: float = float(np.deg2rad(0.2))
     max_fine_m: float = 0.01
@@ -120,8 +120,8 @@ class StandstillThresholds:
 
     Attributes:
         max_median_px: Half of the points have not moved by more.
-        max_moved_px: And this share of them not by more than this.
-        min_unmoved_share: That share.
+        max_moved_px: Largest movement of a point that counts as unmoved.
+        min_unmoved_share: Share of the points that have to be unmoved.
         min_points: Fewer do not decide.
         min_duration_s: A slow motion does not show at once.
     """

@@ -164,7 +164,7 @@ class VisualFrontend:
 
     @timed("track")
     def _track(self, frameset: FrameSet, predict: MotionPredictor) -> _Seen:
-        """Track the corners of each pair that has living images, and match them left to right (section 2)."""
+        """Track the corners of each pair whose images are not repeated, and match them left to right (section 2)."""
         frozen = self._frozen.update(frameset)
         self._all_frozen = frozen.all_since_ns is not None
         for j in [j for j, frame in self._latest.items() if self._is_outdated(frame, frameset.stamp_ns)]:
@@ -212,7 +212,7 @@ class VisualFrontend:
 
     @timed("quality")
     def _grade(self, seen: _Seen, agreement: Agreement | None, reason: str) -> _Graded:
-        """Decide how far the motion can be trusted, and drop the tracks that it does not explain."""
+        """Decide how far the motion can be trusted, detect a standstill, and drop the tracks that are outliers."""
         if agreement is None:
             return _Graded(None, Quality.FAILED, reason)
         stereo = stereo_share(seen.reference, seen.frames, self._baselines_m)
@@ -306,7 +306,7 @@ class VisualFrontend:
         )
 
     def _own_motions(self, seen: _Seen, agreement: Agreement) -> dict[int, RelativeMotion]:
-        """Return each pair's own motion without the corrections in force; a single pair's is that of the rig."""
+        """Return each pair's own motion without the corrections in force; with a single pair, that is the rig's."""
         first = agreement.hypotheses[0]
         alone = {first.pairs[0]: first.refined} if len(self._rig.pairs) == 1 else {}
         motions = {}

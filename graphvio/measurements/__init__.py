@@ -1,1 +1,1 @@
-"""What stages hand each other: measurements, estimates and measurements."""
+"""What stages hand each other: measurements, motions, gate results, estimates and events."""

@@ -15,7 +15,7 @@ class Status(StrEnum):
     """What an estimate is based on."""
 
     INITIALISING = "initialising"
-    """Vision constrains the pose; attitude, velocity or biases are not known well yet."""
+    """There is no pose yet, or vision constrains it while attitude or velocity are not known well."""
     TRACKING = "tracking"
     """Vision constrains this frameset."""
     COASTING = "coasting"

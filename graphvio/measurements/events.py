@@ -50,7 +50,7 @@ class EventKind(StrEnum):
 
     # ---------------------------------------------------------------- state estimation
     VISION_GATED = "vision_gated"
-    """A measured motion failed the innovation test; it is left out."""
+    """A measured motion failed the innovation test, or asks for an impossible acceleration; it is left out."""
     GYRO_GATED = "gyro_gated"
     """The mean angular rate failed the paper's filter's innovation test; it is left out."""
     ACCELEROMETER_GATED = "accelerometer_gated"
@@ -60,7 +60,7 @@ class EventKind(StrEnum):
     MOTION_OVER_SEVERAL_STEPS = "motion_over_several_steps"
     """A motion does not start at the previous frameset, so that the paper's filter cannot use it; it is left out."""
     GATE_RESET = "gate_reset"
-    """Vision was gated for too long; the state is reinitialised from vision."""
+    """Vision was gated for too long; the smoother is reinitialised from vision, the filter's velocities are reset."""
     LOST = "lost"
     """The position is too uncertain to be reported."""
     NEW_EPOCH = "new_epoch"
@@ -68,7 +68,7 @@ class EventKind(StrEnum):
     TIME_JUMP = "time_jump"
     """Neither images nor IMU bridge a gap of time; a new epoch begins at the last pose."""
     WINDOW_REBUILT = "window_rebuilt"
-    """The smoother's equations have no unique solution; its window is rebuilt at the last state."""
+    """The smoother's equations have no unique solution; its window is rebuilt around the newest state."""
     NOT_INITIALISED = "not_initialised"
     """Some seconds after a start in motion, attitude or velocity are still uncertain; go on moving."""
     TIME_OFFSET_OFF = "time_offset_off"

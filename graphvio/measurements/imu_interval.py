@@ -11,7 +11,7 @@ from graphvio.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class ImuInterval:
-    """The IMU between two instants, as steps of constant rate and acceleration.
+    """The IMU between two instants, as steps of constant rate and specific force.
 
     Attributes:
         steps_s: (N,) durations of the steps.

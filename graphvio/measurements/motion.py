@@ -17,7 +17,7 @@ class Quality(StrEnum):
     GOOD = "good"
     """Its covariance is consistent."""
     WEAK = "weak"
-    """Pairs contradict each other, points are few, or a direction is hardly constrained; its covariance is enlarged."""
+    """Something speaks against it, as its reason says; its covariance is enlarged."""
     FAILED = "failed"
     """There is no motion."""
 
@@ -33,10 +33,11 @@ class PairReport:
         is_inlier: (N,) whether each of them is an inlier.
         ages: (N,) number of earlier frames that saw each of them.
         rejected: Check of tracking or stereo matching -> number of corners that failed it.
-        rms_px: RMS reprojection error of these under the chosen motion, per direction and without the share of the
-            points' own uncertainty; None where there are none.
+        rms_px: RMS reprojection error of the inliers under the chosen motion, per direction and without the share of
+            the points' own uncertainty; None where there are none.
         own_inliers: Points that the pair's own motion explains, or None where there is but one pair or too few points.
-        own_rms_px: Their RMS error under it, or None; much less than ``rms_px`` is a sign of wrong extrinsics.
+        own_rms_px: RMS error of the points that the pair's own motion explains, under that motion, or None; much less
+            than ``rms_px`` is a sign of wrong extrinsics.
     """
 
     points: int

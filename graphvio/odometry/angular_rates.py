@@ -23,7 +23,7 @@ class AngularRates:
             motion: measured motion that ends in the newest frameset, or None.
             interval: the IMU since the frameset before, or None.
             gyro_bias: (3,) rad/s.
-            fused: (3,) rad/s by the smoother, or None.
+            fused: (3,) rad/s by the state estimator, or None.
         """
         rates: dict[str, Float] = {}
         if interval is not None:

@@ -1,4 +1,4 @@
-"""The one place where estimates and steps are put together from what the stages return."""
+"""Estimates and keyframe data, put together from what the stages return."""
 
 from __future__ import annotations
 

@@ -135,6 +135,7 @@ class Odometry:
         estimates = []
         while (frameset := self._synchroniser.next_held()) is not None:
             estimates.append(self._estimate(frameset))
+        self._synchroniser.finish()
         self._estimator.finish()
         self._frontend.close()
         for on_finish in self._on_finish:
@@ -165,7 +166,7 @@ class Odometry:
 
     @property
     def rig_warnings(self) -> list[str]:
-        """What the motions until now refute of the rig: a sentence each, with its size and one standard deviation."""
+        """Where the motions contradict the rig: a sentence each, with the size and one standard deviation."""
         return self._vision_events.rig_warnings
 
     def limit_corners(self, share: float) -> None:
@@ -203,13 +204,14 @@ class Odometry:
         self.stage_ms = {}
         if self._must_wait_for_imu(frameset.stamp_ns):
             visual = self._frontend.process(frameset, self._estimator.motion_since)
-            return estimate_without_pose(frameset.stamp_ns, visual, visual.stage_ms)
+            self.stage_ms.update(visual.stage_ms)
+            return estimate_without_pose(frameset.stamp_ns, visual, self.stage_ms)
         predicted = self._predict(frameset.stamp_ns)
         visual = self._track(frameset, predicted)
         is_stationary = visual.is_stationary and self._imu_shows_standstill(predicted.interval)
-        gated = self._gate(visual, is_stationary)
-        status = self._update(predicted, visual, gated)
-        return self._publish(frameset, predicted, visual, is_stationary, gated, status)
+        applied = self._gate(visual, is_stationary)
+        status = self._update(predicted, visual, applied)
+        return self._publish(frameset, predicted, visual, is_stationary, applied, status)
 
     @timed("predict")
     def _predict(self, stamp_ns: int) -> _Predicted:
@@ -234,19 +236,19 @@ class Odometry:
     @timed("update")
     def _gate(self, visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
         """Test the innovations, and insert the measurements that pass (section 5)."""
-        gated = self._estimator.apply(visual, is_stationary)
-        if gated.needs_keyframe:
+        applied = self._estimator.apply(visual, is_stationary)
+        if applied.needs_keyframe:
             self._frontend.start_keyframe()
-        return gated
+        return applied
 
     @timed("update")
-    def _update(self, predicted: _Predicted, visual: VisualResult, gated: MeasurementUpdate) -> Status:
+    def _update(self, predicted: _Predicted, visual: VisualResult, applied: MeasurementUpdate) -> Status:
         """Solve for the state, and let the predictor and the time offset follow."""
         stamp_ns = predicted.stamp_ns
         previous_keyframe = set() if self._keyframe_ns is None else {self._keyframe_ns}
         update = self._estimator.update(
             stamp_ns,
-            is_constrained=predicted.is_initial or gated.motion is not None,
+            is_constrained=predicted.is_initial or applied.motion is not None,
             keep=self._frontend.reference_stamps_ns | previous_keyframe,
         )
         if update.needs_keyframe:
@@ -262,7 +264,7 @@ class Odometry:
         predicted: _Predicted,
         visual: VisualResult,
         is_stationary: bool,
-        gated: MeasurementUpdate,
+        applied: MeasurementUpdate,
         status: Status,
     ) -> Estimate:
         """Assemble the estimate, and hand the step to those who listen."""
@@ -275,15 +277,15 @@ class Odometry:
         if frameset.stamp_ns in references:
             keyframe = keyframe_of(frameset, self._frontend, estimator, self._keyframe_ns)
             self._keyframe_ns = frameset.stamp_ns
-        refused = visual.motion if visual.quality is Quality.GOOD else None
+        candidate = visual.motion if visual.quality is Quality.GOOD else None
         step = Step(
             estimate,
-            motion=refused if gated.motion is None else gated.motion,
-            used=gated.motion is not None,
+            motion=candidate if applied.motion is None else applied.motion,
+            used=applied.motion is not None,
             interval=interval,
             initialised=estimator.initialisations != predicted.initialisations,
             references=references,
-            own={} if gated.motion is None else visual.own,
+            own={} if applied.motion is None else visual.own,
             keyframe=keyframe,
         )
         for on_step in self._on_step:

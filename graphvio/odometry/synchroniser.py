@@ -113,6 +113,11 @@ class Synchroniser:
         """Return the oldest held frameset, due or not, or None."""
         return self._held.popleft() if self._held else None
 
+    def finish(self) -> None:
+        """Leave out what was not confirmed, as no measurement follows."""
+        self._sample_jumps.end()
+        self._frameset_jumps.end()
+
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
         """Return the IMU between two framesets' stamps, or None where it does not cover them."""
         return self._imu.interval(start_ns + self._offset_ns, end_ns + self._offset_ns)
@@ -172,7 +177,7 @@ class Synchroniser:
 
 
 class JumpGuard(Generic[Stamped]):
-    """Accepts a jump of the clock only when a second stamp confirms it, as one wild stamp must not stop time.
+    """Accepts a jump of the clock only when a second stamp confirms it: a single wrong stamp is left out.
 
     Args:
         kind: Kind of the event for a measurement that is left out.

@@ -50,7 +50,7 @@ class VisionEvents:
 
     @property
     def rig_warnings(self) -> list[str]:
-        """What the motions until now refute of the rig: a sentence each, with its size and one standard deviation."""
+        """Where the motions contradict the rig: a sentence each, with the size and one standard deviation."""
         return [self._warning(j, misalignment) for j, misalignment in sorted(self._misaligned.items())]
 
     def _warning(self, j: int, misalignment: Misalignment) -> str:

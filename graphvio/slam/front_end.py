@@ -22,8 +22,8 @@ from graphvio.slam.map_frame import MapFrame
 class FrontEnd:
     """Keyframes of a running odometry, and the map frame that a SLAM system corrects.
 
-    It subscribes to the odometry's steps; the odometry itself does not change by what it does. It has the interface of
-    `graphvio.slam.client.Client`, which reaches an odometry in another process.
+    It subscribes to the odometry's steps, and never changes its results. It implements
+    `graphvio.slam.interface.SlamFrontEnd`, as does `graphvio.slam.client.Client` for an odometry in another process.
 
     Args:
         odometry: Feed it as usual; its configuration has the keyframes' settings.

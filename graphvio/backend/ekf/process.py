@@ -25,7 +25,7 @@ def noise_sigmas(dt: float, accel_sigma_m_s2: float, angular_accel_sigma_rad_s2:
 
 
 def propagated(state: FilterState, dt: float) -> FilterState:
-    """Return the state after a time step in seconds, without noise (eq. 11)."""
+    """Return the state after a time step in seconds, without noise (eq. 11 and 12)."""
     return FilterState(
         state.position + state.nav_R_body @ state.velocity_body * dt,
         state.nav_R_body @ so3_exp(state.rate_body * dt),
