@@ -23,7 +23,7 @@ from graphvio.measurements.events import EventKind
 from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Reading, host_ns
 from graphvio.rig import Rig, StereoPair
 
-rs = pytest.importorskip("pyrealsense2")
+rs = pytest.importorskip("pyrealsense2", exc_type=ImportError)
 
 SIZE_PX = (64, 48)
 RIGHT_T_LEFT = se3(so3_exp(np.array([0.01, -0.02, 0.005])), np.array([-0.05, 0.001, 0.0]))

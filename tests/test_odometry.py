@@ -402,8 +402,8 @@ def test_a_wild_imu_sample_leaves_an_error_that_the_covariance_admits(
 @pytest.mark.parametrize("kind", [WindowError, RuntimeError, np.linalg.LinAlgError])
 @pytest.mark.parametrize(
     ("owner", "method"),
-    [(Window, "optimise"), (Window, "advance"), (Window, "joint_covariance"), (Window, "marginalise"), (Window, "add"),
-     (Smoother, "extend"), (Smoother, "test"), (Smoother, "state_covariance")],
+    [(Window, "optimize"), (Window, "advance"), (Window, "joint_covariance"), (Window, "marginalise"), (Window, "add"),
+     (Smoother, "extend"), (Smoother, "gate"), (Smoother, "state_covariance")],
 )  # fmt: skip
 def test_a_window_that_fails_is_rebuilt(
     odometry: Odometry,

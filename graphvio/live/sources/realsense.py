@@ -366,6 +366,10 @@ def _describe(device: Any) -> str:
 def _library() -> Any:
     try:
         import pyrealsense2
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingExtraError("pyrealsense2", "realsense", "a RealSense camera") from None
+    except ImportError as error:
+        raise SourceError(
+            f"realsense: pyrealsense2 cannot be loaded ({error}); its wheel needs libusb: apt install libusb-1.0-0"
+        ) from None
     return pyrealsense2
