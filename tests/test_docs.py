@@ -6,9 +6,11 @@ import sys
 from dataclasses import fields
 from pathlib import Path
 
+import list_events
 import plot_layers
 
 from graphvio.config import Config, profiles
+from graphvio.measurements.events import EventKind
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -22,6 +24,12 @@ def test_the_readmes_python_runs_as_typed(room_walk: Path, tmp_path: Path) -> No
     done = subprocess.run([sys.executable, "-c", blocks[0]], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("tracking") == 100
+
+
+def test_events_page_lists_every_kind() -> None:
+    text = (ROOT / "docs/events.md").read_text()
+    assert text == list_events.page()
+    assert [kind for kind in EventKind if f"| `{kind}` |" not in text] == []
 
 
 def test_every_configuration_value_is_documented() -> None:
