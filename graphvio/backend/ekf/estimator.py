@@ -125,12 +125,10 @@ class FilterEstimator:
         position = np.zeros(3)
         if self._filter is not None:
             self.epoch += 1
-            self._report(
-                stamp_ns, EventKind.IMU_CAME, f"the IMU has come: epoch {self.epoch} begins with gravity pointing down"
-            )
+            self._status.report_imu_came(stamp_ns, self.epoch)
             position = self.state().nav_T_body[:3, 3]
         elif self._rig.imu is not None and imu is None:
-            self._report(stamp_ns, EventKind.STARTED_WITHOUT_IMU, "no IMU samples came: vision alone from here")
+            self._status.report_no_imu(stamp_ns)
         initial = first_state_at(stamp_ns, position, imu, self._rig, self._config.initialisation)
         pose, uncertainty = initial.state.nav_T_body, initial.uncertainty
         estimates_bias = self._config.filter.bias == "estimated"
