@@ -3,18 +3,23 @@
 `simulate` writes a recording; `make_simulator` yields the same images, IMU samples and truth in memory.
 """
 
+from graphvio.simulation.calibration_error import CalibrationError
 from graphvio.simulation.default_rig import default_rig
 from graphvio.simulation.recording import SimulatedRecording, simulate, write_recording
+from graphvio.simulation.rig_change import RIG_CHANGES, rig_change
 from graphvio.simulation.scenes import SCENE_NAMES, build_scene
 from graphvio.simulation.simulator import Simulator, make_simulator
 
 __all__ = [
+    "RIG_CHANGES",
     "SCENE_NAMES",
+    "CalibrationError",
     "SimulatedRecording",
     "Simulator",
     "build_scene",
     "default_rig",
     "make_simulator",
+    "rig_change",
     "simulate",
     "write_recording",
 ]

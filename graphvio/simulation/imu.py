@@ -8,6 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.rig import Imu
+from graphvio.simulation.calibration_error import ImuError
 from graphvio.simulation.motion import Motion, MotionStates
 
 GRAVITY_MPS2 = 9.81
@@ -20,7 +21,8 @@ class ImuTrack:
     """IMU samples, and the truth at the same stamps.
 
     Attributes:
-        stamps_ns: (N,).
+        stamps_ns: (N,), on the IMU's clock.
+        true_stamps_ns: (N,), of the same instants on the cameras' clock.
         angular_velocity: (N, 3) rad/s, measured.
         linear_acceleration: (N, 3) m/s^2, measured specific force.
         gyro_bias: (N, 3) rad/s, true.
@@ -29,6 +31,7 @@ class ImuTrack:
     """
 
     stamps_ns: Int
+    true_stamps_ns: Int
     angular_velocity: Float
     linear_acceleration: Float
     gyro_bias: Float
@@ -50,18 +53,23 @@ def ideal_readings(states: MotionStates) -> tuple[Float, Float]:
     return states.angular_velocity, np.einsum("nij,nj->ni", body_R_world, force_world)
 
 
-def measure(motion: Motion, imu: Imu, times_s: Float, stamps_ns: Int, seed: int) -> ImuTrack:
+def measure(
+    motion: Motion, imu: Imu, times_s: Float, stamps_ns: Int, seed: int, error: ImuError | None = None
+) -> ImuTrack:
     """Sample the IMU along a motion, with white noise and random-walk biases.
 
     Args:
         motion: of the body.
-        imu: rate and noise densities.
+        imu: rate, noise densities and time offset.
         times_s: (N,) seconds since the start of the motion.
-        stamps_ns: (N,) stamps of these times.
+        stamps_ns: (N,) stamps of these times on the cameras' clock.
         seed: of the noise, the initial biases and their random walks.
+        error: scale and misalignment; None for none.
     """
     states = motion.at(times_s)
     rate, force = ideal_readings(states)
+    if error is not None:
+        rate, force = rate @ error.gyro_matrix.T, force @ error.accel_matrix.T
     random = np.random.default_rng(np.random.SeedSequence([seed, 1]))
     n, root = len(times_s), np.sqrt(imu.rate_hz)
 
@@ -75,4 +83,4 @@ def measure(motion: Motion, imu: Imu, times_s: Float, stamps_ns: Int, seed: int)
     gyro_noise = imu.gyro_noise_density * root * random.standard_normal((n, 3))
     accel_noise = imu.accel_noise_density * root * random.standard_normal((n, 3))
     measured = rate + gyro_bias + gyro_noise, force + accel_bias + accel_noise
-    return ImuTrack(stamps_ns, *measured, gyro_bias, accel_bias, states)
+    return ImuTrack(stamps_ns + imu.time_offset_ns, stamps_ns, *measured, gyro_bias, accel_bias, states)

@@ -1,4 +1,7 @@
-"""Writer of simulated recordings in the EuRoC/ASL layout, with graphvio's ``rig.yaml`` next to ``mav0``."""
+"""Writer of simulated recordings in the EuRoC/ASL layout, with graphvio's ``rig.yaml`` next to ``mav0``.
+
+Where that is wrong by a calibration error, ``rig-true.yaml`` next to it is right.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +17,16 @@ import numpy as np
 from graphvio.arrays import Float, Image
 from graphvio.errors import SourceError
 from graphvio.geometry import quat_wxyz_from_rotation
+from graphvio.rig import Rig
 from graphvio.rig_files import save_rig
 from graphvio.sessions import euroc_layout
 from graphvio.sessions.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
+from graphvio.simulation.calibration_error import CalibrationError, draw
+from graphvio.simulation.default_rig import default_rig
+from graphvio.simulation.rig_change import RigChange
 from graphvio.simulation.simulator import Simulator, make_simulator
+
+TRUE_RIG_FILE = "rig-true.yaml"
 
 Progress = Callable[[int, int], None]
 """Called with (framesets written, framesets in all)."""
@@ -57,6 +66,9 @@ def simulate(
     rate_hz: float | Sequence[float] = 20.0,
     stationary_s: float = 1.0,
     trigger_offset_ms: float = 0.0,
+    calibration_error: CalibrationError | None = None,
+    calibration_seed: int | None = None,
+    rig_change: RigChange | None = None,
     progress: Progress | None = None,
 ) -> SimulatedRecording:
     """Simulate a scene and write it as a recording.
@@ -69,6 +81,10 @@ def simulate(
         rate_hz: framesets per second; or one rate for each pair, the last one also for all pairs after it.
         stationary_s: initial standstill; 0 begins at walking speed.
         trigger_offset_ms: delay of each pair's triggers after those of the pair before it.
+        calibration_error: of the files that describe the cameras, and of the IMU's data; images are the same. None for
+            exact files.
+        calibration_seed: by which the error is sampled; None for ``seed``.
+        rig_change: of the true cameras during the walk, of which the files know nothing; None if they stay as they are.
         progress: called as the framesets are written.
 
     Raises:
@@ -76,6 +92,9 @@ def simulate(
     """
     out = Path(out)
     _require_empty(out)
+    sampled = None
+    if calibration_error is not None:
+        sampled = draw(default_rig(), calibration_error, seed if calibration_seed is None else calibration_seed)
     simulator = make_simulator(
         name,
         duration_s=duration_s,
@@ -83,12 +102,23 @@ def simulate(
         rate_hz=rate_hz,
         stationary_s=stationary_s,
         trigger_offset_ms=trigger_offset_ms,
+        rig=sampled.true_rig if sampled is not None else None,
+        imu_error=sampled.imu if sampled is not None else None,
+        rig_change=rig_change,
     )
-    return write_recording(simulator, out, progress)
+    return write_recording(simulator, out, progress, sampled.written_rig if sampled is not None else None)
 
 
-def write_recording(simulator: Simulator, out: Path, progress: Progress | None = None) -> SimulatedRecording:
+def write_recording(
+    simulator: Simulator, out: Path, progress: Progress | None = None, written_rig: Rig | None = None
+) -> SimulatedRecording:
     """Write what a simulator gives, on all cores.
+
+    Args:
+        simulator: of the recording.
+        out: folder to write; it must be empty or not exist.
+        progress: called as the framesets are written.
+        written_rig: what the files say about cameras and IMU, with the true rig in a file beside; None for the truth.
 
     Raises:
         SourceError: if the folder is not empty or an image cannot be written.
@@ -99,9 +129,11 @@ def write_recording(simulator: Simulator, out: Path, progress: Progress | None =
     for camera in cameras:
         (mav0 / camera.name / "data").mkdir(parents=True)
     stamps = simulator.stamps_ns
-    _write_sensors(simulator, mav0)
+    _write_sensors(simulator, written_rig if written_rig is not None else simulator.rig, mav0)
     _write_inertial(simulator, mav0)
-    save_rig(simulator.rig, out / "rig.yaml")
+    save_rig(written_rig if written_rig is not None else simulator.rig, out / "rig.yaml")
+    if written_rig is not None:
+        save_rig(simulator.rig, out / TRUE_RIG_FILE)
 
     def write(index: int) -> None:
         surfaces = simulator.surfaces(index)
@@ -155,8 +187,8 @@ def _write_image(path: Path, image: Image) -> None:
         raise SourceError(f"{path}: cannot be written ({error.strerror}); is the disk full?") from None
 
 
-def _write_sensors(simulator: Simulator, mav0: Path) -> None:
-    for number, camera in enumerate(simulator.rig.cameras):
+def _write_sensors(simulator: Simulator, rig: Rig, mav0: Path) -> None:
+    for number, camera in enumerate(rig.cameras):
         folder = mav0 / camera.name
         pair = number // 2
         text = euroc_layout.camera_yaml(camera, simulator.rates_hz[pair], f"simulated {camera.name}")
@@ -165,7 +197,8 @@ def _write_sensors(simulator: Simulator, mav0: Path) -> None:
         (folder / "data.csv").write_text("\n".join([euroc_layout.FRAME_HEADER, *rows, ""]))
     for name in (IMU_FOLDER, TRUTH_FOLDER):
         (mav0 / name).mkdir()
-    (mav0 / IMU_FOLDER / "sensor.yaml").write_text(euroc_layout.imu_yaml(simulator.imu, "simulated"))
+    imu = rig.imu if rig.imu is not None else simulator.imu
+    (mav0 / IMU_FOLDER / "sensor.yaml").write_text(euroc_layout.imu_yaml(imu, "simulated"))
     (mav0 / TRUTH_FOLDER / "sensor.yaml").write_text(euroc_layout.truth_yaml("exact truth of the simulation"))
     (mav0 / "body.yaml").write_text(f"comment: simulated walk, scene {simulator.scene.name}\n")
 
@@ -177,7 +210,7 @@ def _write_inertial(simulator: Simulator, mav0: Path) -> None:
     poses = track.states.world_T_body
     quaternions = np.array([quat_wxyz_from_rotation(np.ascontiguousarray(pose[:3, :3])) for pose in poses])
     truth = np.hstack([poses[:, :3, 3], quaternions, track.states.velocity, track.gyro_bias, track.accel_bias])
-    _write_table(mav0 / TRUTH_FOLDER / "data.csv", euroc_layout.STATE_HEADER, track.stamps_ns.tolist(), truth)
+    _write_table(mav0 / TRUTH_FOLDER / "data.csv", euroc_layout.STATE_HEADER, track.true_stamps_ns.tolist(), truth)
 
 
 def _write_table(path: Path, header: str, stamps: Sequence[int], values: Float) -> None:

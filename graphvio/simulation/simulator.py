@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -11,9 +11,11 @@ from graphvio.arrays import Float, Image, Int
 from graphvio.errors import SourceError
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Imu, Rig
+from graphvio.simulation.calibration_error import ImuError
 from graphvio.simulation.default_rig import default_rig
 from graphvio.simulation.imu import ImuTrack, measure
 from graphvio.simulation.renderer import CameraRays, Film, View
+from graphvio.simulation.rig_change import RigChange
 from graphvio.simulation.scenes import build_scene
 from graphvio.simulation.surfaces import Stage, Surfaces
 from graphvio.simulation.textures import Atlas, standard_atlas
@@ -21,6 +23,7 @@ from graphvio.simulation.world import Scene
 
 EPOCH_NS = 1_700_000_000_000_000_000
 _SENSITIVITIES = (1.45, 1.50, 1.42, 1.47)  # no two cameras are equally bright
+_KEPT_STAGES = 4  # of a rig that changes: about as many as threads render at once
 
 
 class Simulator:
@@ -28,11 +31,13 @@ class Simulator:
 
     Args:
         scene: world, motion and light.
-        rig: cameras and IMU; None for the default rig. A rig without an IMU is given the default IMU.
+        rig: true cameras and IMU; None for the default rig. A rig without an IMU is given the default IMU.
         seed: of all noise and biases. World and walk do not depend on it.
         rate_hz: framesets per second; or one rate for each pair, the last one also for all pairs after it.
         atlas: textures of the world; None for the standard textures.
         trigger_offset_ms: delay of each pair's triggers after those of the pair before it.
+        imu_error: scale and misalignment of the IMU; None for none.
+        rig_change: of the true cameras during the walk; None if they stay as they are.
 
     Attributes:
         rates_hz: of each pair, images per second.
@@ -49,6 +54,8 @@ class Simulator:
         rate_hz: float | Sequence[float] = 20.0,
         atlas: Atlas | None = None,
         trigger_offset_ms: float = 0.0,
+        imu_error: ImuError | None = None,
+        rig_change: RigChange | None = None,
     ) -> None:
         rates = list(rate_hz) if isinstance(rate_hz, Sequence) else [rate_hz]
         for rate in rates:
@@ -68,8 +75,9 @@ class Simulator:
         self.rates_hz = tuple((rates + [rates[-1]] * pairs)[:pairs])
         self._trigger_offset_ms = trigger_offset_ms
         self._stage = Stage(scene.world, atlas if atlas is not None else standard_atlas())
-        self._rays = [CameraRays(camera) for camera in self.rig.cameras]
-        self.films = [Film(r, _SENSITIVITIES[i % 4]) for i, r in enumerate(self._rays)]
+        self._imu_error, self._rig_change = imu_error, rig_change
+        self._rays_in = lru_cache(_KEPT_STAGES)(self._rays_of_stage)
+        self.films = [Film(rays, _SENSITIVITIES[i % 4]) for i, rays in enumerate(self._rays_in(0))]
 
     @cached_property
     def stamps_ns(self) -> Int:
@@ -100,7 +108,11 @@ class Simulator:
         imu = self.imu
         count = int(np.floor(self.scene.motion.duration_s * imu.rate_hz + 1e-9)) + 1
         stamps_ns = EPOCH_NS + np.round(np.arange(count) * (1e9 / imu.rate_hz)).astype(np.int64)
-        return measure(self.scene.motion, imu, self._seconds(stamps_ns), stamps_ns, self.seed)
+        return measure(self.scene.motion, imu, self._seconds(stamps_ns), stamps_ns, self.seed, self._imu_error)
+
+    def rig_at(self, index: int) -> Rig:
+        """Return the true rig at the time of a frameset."""
+        return self.rig if self._rig_change is None else self._rig_change.rig_in(self.rig, self._stage_at(index))
 
     def surfaces(self, index: int) -> Surfaces:
         """Return the surfaces of the world at the time of a frameset."""
@@ -115,8 +127,8 @@ class Simulator:
             surfaces: of this instant, if they are there already.
         """
         seen = surfaces if surfaces is not None else self.surfaces(index)
-        world_T_cam = self.world_T_body[index] @ self.rig.cameras[camera].body_T_cam
-        return self._rays[camera].render(seen, self._stage.atlas, world_T_cam)
+        rays = self._rays_in(self._stage_at(index))[camera]
+        return rays.render(seen, self._stage.atlas, self.world_T_body[index] @ rays.camera.body_T_cam)
 
     def image(self, index: int, camera: int, noisy: bool = True, surfaces: Surfaces | None = None) -> Image:
         """Render a grey image (H, W); see `view` for the arguments."""
@@ -132,6 +144,15 @@ class Simulator:
             for k in self.triggered(index)
         }
         return FrameSet(int(self.stamps_ns[index]), images)
+
+    def _stage_at(self, index: int) -> int:
+        if self._rig_change is None:
+            return 0
+        return self._rig_change.stage_at(float(self._seconds(self.stamps_ns[index])))
+
+    def _rays_of_stage(self, stage: int) -> list[CameraRays]:
+        rig = self.rig if self._rig_change is None else self._rig_change.rig_in(self.rig, stage)
+        return [CameraRays(camera) for camera in rig.cameras]
 
     @cached_property
     def _triggers(self) -> list[frozenset[int]]:
@@ -150,8 +171,11 @@ def make_simulator(
     rate_hz: float | Sequence[float] = 20.0,
     stationary_s: float = 1.0,
     trigger_offset_ms: float = 0.0,
+    rig: Rig | None = None,
+    imu_error: ImuError | None = None,
+    rig_change: RigChange | None = None,
 ) -> Simulator:
-    """Build a simulator of a scene by its name, with the default rig.
+    """Build a simulator of a scene by its name.
 
     Args:
         name: one of `graphvio.simulation.SCENE_NAMES`.
@@ -160,9 +184,20 @@ def make_simulator(
         rate_hz: see `Simulator`.
         stationary_s: initial standstill; 0 begins at walking speed.
         trigger_offset_ms: see `Simulator`.
+        rig: see `Simulator`.
+        imu_error: see `Simulator`.
+        rig_change: see `Simulator`.
 
     Raises:
         SourceError: if there is no such scene, or a value is impossible.
     """
     scene = build_scene(name, duration_s, stationary_s)
-    return Simulator(scene, seed=seed, rate_hz=rate_hz, trigger_offset_ms=trigger_offset_ms)
+    return Simulator(
+        scene,
+        rig,
+        seed,
+        rate_hz,
+        trigger_offset_ms=trigger_offset_ms,
+        imu_error=imu_error,
+        rig_change=rig_change,
+    )

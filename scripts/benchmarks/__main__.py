@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks import accuracy, backend, faults, frontend, optimize, slam
+from benchmarks import accuracy, backend, calibration_error, faults, frontend, optimize, slam
 from benchmarks.command_line import run_command_line
 
 if __name__ == "__main__":
@@ -10,7 +10,9 @@ if __name__ == "__main__":
         run_command_line(
             "scripts/benchmark",
             "Measures speed, accuracy and behaviour under faults. docs/benchmarks.md says what is compared.",
-            tuple(module.add_parser for module in (frontend, backend, accuracy, faults, optimize, slam)),
+            tuple(
+                module.add_parser for module in (frontend, backend, accuracy, calibration_error, faults, optimize, slam)
+            ),
             "Timings mean something only on a machine that does nothing else meanwhile.",
         )
     )

@@ -94,6 +94,7 @@ def _digest(scene: str, sources: tuple[Path, ...]) -> str:
     taken = ("cameras.py", "geometry.py", "kernels.py", "rig.py", "rig_files/native.py", "sessions/euroc_layout.py")
     scenes = package / "simulation" / "scenes"
     others = {scenes / f"{name}.py" for name in SCENE_NAMES if name != scene}
+    others.add(package / "simulation" / "calibration_error.py")  # of none of these recordings
     simulator = sorted(path for path in (package / "simulation").rglob("*.py") if path not in others)
     digest = hashlib.sha256()
     for path in [*(package / name for name in taken), *simulator, *sources]:

@@ -1,0 +1,273 @@
+"""Calibration errors as real ones are: what the files of a recording say about its sensors differs from the truth.
+
+Cameras keep their true calibration, with which images are rendered, and the files are wrong. The IMU's files say what
+they always say, and its data are wrong: by scale, misalignment, noise and a time offset.
+
+Each component is sampled from a random stream of its own. So a component by itself has the same error as among all
+others, and errors of another level have the same directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.errors import SourceError
+from graphvio.geometry import se3, se3_inverse, so3_exp, so3_log
+from graphvio.rig import Camera, Imu, Rig, StereoPair
+
+_STREAM = 3  # of the seed: 1 is the IMU's noise, 2 that of images
+
+
+@dataclass(frozen=True)
+class CalibrationError:
+    """Sizes of calibration errors; standard deviations, unless something else is said. The default is no error.
+
+    Attributes:
+        focal_percent: of a camera's focal length: fx and fy have one common factor.
+        principal_point_px: of cx and cy of each camera.
+        distortion_percent: of k1 and k2 of each camera, each in percent of itself.
+        left_right_deg: rotation of the right camera about its own centre, for each axis.
+        baseline_percent: length of the baseline.
+        cameras_in_body_deg: rotation of all cameras together, about body's origin, for each axis.
+        cameras_in_body_mm: translation of all cameras together, for each axis.
+        pair_transform_deg: rotation of each pair but the first, about its left camera, for each axis.
+        pair_transform_mm: translation of each pair but the first, for each axis.
+        time_offset_ms: magnitude of the IMU's time offset; only its sign is random.
+        imu_scale_percent: of each axis of gyro and accelerometer.
+        imu_misalignment_deg: off-diagonal elements of the matrices of gyro and accelerometer, as angles.
+        imu_noise_factor: white noise over the stated one; not random.
+
+    Raises:
+        SourceError: if a size is negative or not finite, or the noise would be zero.
+    """
+
+    focal_percent: float = 0.0
+    principal_point_px: float = 0.0
+    distortion_percent: float = 0.0
+    left_right_deg: float = 0.0
+    baseline_percent: float = 0.0
+    cameras_in_body_deg: float = 0.0
+    cameras_in_body_mm: float = 0.0
+    pair_transform_deg: float = 0.0
+    pair_transform_mm: float = 0.0
+    time_offset_ms: float = 0.0
+    imu_scale_percent: float = 0.0
+    imu_misalignment_deg: float = 0.0
+    imu_noise_factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not np.isfinite(value) or value < 0.0 or (name == "imu_noise_factor" and value == 0.0):
+                raise SourceError(f"calibration error: {name} is {value}; give a finite number that is not negative")
+
+    @staticmethod
+    def of_level(level: int) -> CalibrationError:
+        """Return the errors of one of `LEVELS`.
+
+        Raises:
+            SourceError: if there is no such level.
+        """
+        if level not in _LEVELS:
+            raise SourceError(f"there is no calibration error of level {level}; choose one of {_choices(LEVELS)}")
+        return _LEVELS[level]
+
+    def only(self, components: Sequence[str]) -> CalibrationError:
+        """Return the errors of some components alone.
+
+        Args:
+            components: some of `COMPONENTS`.
+
+        Raises:
+            SourceError: if there is no such component.
+        """
+        for name in components:
+            if name not in COMPONENTS:
+                raise SourceError(
+                    f"there is no component {name!r} of calibration errors; choose from {_choices(COMPONENTS)}"
+                )
+        return replace(CalibrationError(), **{f: getattr(self, f) for name in components for f in COMPONENTS[name]})
+
+
+COMPONENTS: dict[str, tuple[str, ...]] = {
+    "focal": ("focal_percent",),
+    "principal-point": ("principal_point_px",),
+    "distortion": ("distortion_percent",),
+    "left-right-rotation": ("left_right_deg",),
+    "baseline": ("baseline_percent",),
+    "cameras-in-body": ("cameras_in_body_deg", "cameras_in_body_mm"),
+    "pair-transform": ("pair_transform_deg", "pair_transform_mm"),
+    "time-offset": ("time_offset_ms",),
+    "imu-scale": ("imu_scale_percent",),
+    "imu-misalignment": ("imu_misalignment_deg",),
+    "imu-noise": ("imu_noise_factor",),
+}
+"""Component -> fields of `CalibrationError`."""
+
+
+def _level(
+    factor: float, time_offset_ms: float, scale_percent: float, misalignment_deg: float, noise: float
+) -> CalibrationError:
+    """Return the errors of a level: cameras have a multiple of those of level 2."""
+    return CalibrationError(
+        focal_percent=factor * 0.1,
+        principal_point_px=factor * 0.5,
+        distortion_percent=factor * 0.5,
+        left_right_deg=factor * 0.05,
+        baseline_percent=factor * 0.2,
+        cameras_in_body_deg=factor * 0.3,
+        cameras_in_body_mm=factor * 5.0,
+        pair_transform_deg=factor * 0.3,
+        pair_transform_mm=factor * 5.0,
+        time_offset_ms=time_offset_ms,
+        imu_scale_percent=scale_percent,
+        imu_misalignment_deg=misalignment_deg,
+        imu_noise_factor=noise,
+    )
+
+
+_LEVELS = {
+    1: _level(0.3, 0.5, 0.1, 0.05, 1.02),
+    2: _level(1.0, 2.0, 0.3, 0.15, 1.2),
+    3: _level(3.0, 8.0, 1.0, 0.5, 2.2),
+}
+LEVELS = tuple(_LEVELS)
+"""Levels of `CalibrationError.of_level`: a careful calibration, a usual one, and one of long ago."""
+
+
+@dataclass(frozen=True, eq=False)
+class ImuError:
+    """Errors of an IMU's data that no rig file can express.
+
+    Attributes:
+        gyro_matrix: (3, 3), by which the true angular velocity is multiplied.
+        accel_matrix: (3, 3), by which the true specific force is multiplied.
+    """
+
+    gyro_matrix: Float = field(default_factory=lambda: np.eye(3))
+    accel_matrix: Float = field(default_factory=lambda: np.eye(3))
+
+
+@dataclass(frozen=True, eq=False)
+class SampledError:
+    """A calibration error that was sampled.
+
+    Attributes:
+        written_rig: what the files say.
+        true_rig: with the true cameras, and the true noise and time offset of the IMU.
+        imu: other errors of the IMU's data.
+    """
+
+    written_rig: Rig
+    true_rig: Rig
+    imu: ImuError
+
+
+def draw(rig: Rig, error: CalibrationError, seed: int) -> SampledError:
+    """Draw a calibration error.
+
+    Args:
+        rig: with the true cameras, and the IMU as its files describe it.
+        error: sizes of the errors.
+        seed: the same seed gives the same error.
+
+    Raises:
+        SourceError: if the seed is negative.
+    """
+    if seed < 0:
+        raise SourceError(f"the seed {seed} of the calibration error is negative; give 0 or more")
+    normal = {
+        name: np.random.default_rng(np.random.SeedSequence([seed, _STREAM, number])).standard_normal
+        for number, name in enumerate(COMPONENTS)
+    }
+    focal = 1.0 + 0.01 * error.focal_percent * normal["focal"](len(rig.cameras))
+    centre_px = error.principal_point_px * normal["principal-point"]((len(rig.cameras), 2))
+    distortion = 1.0 + 0.01 * error.distortion_percent * normal["distortion"]((len(rig.cameras), 2))
+    turn = np.deg2rad(error.left_right_deg) * normal["left-right-rotation"]((len(rig.pairs), 3))
+    baseline = 1.0 + 0.01 * error.baseline_percent * normal["baseline"](len(rig.pairs))
+    in_body = _transform(normal["cameras-in-body"](6), error.cameras_in_body_deg, error.cameras_in_body_mm)
+    pairs = []
+    for j, pair in enumerate(rig.pairs):
+        moved = np.eye(4)
+        if j > 0:
+            moved = _transform(normal["pair-transform"](6), error.pair_transform_deg, error.pair_transform_mm)
+        left_T_right = se3_inverse(pair.right_T_left)
+        left_T_right = se3(left_T_right[:3, :3] @ so3_exp(turn[j]), baseline[j] * left_T_right[:3, 3])
+        body_T_left = in_body @ pair.left.body_T_cam @ moved
+        each = zip((pair.left, pair.right), (body_T_left, body_T_left @ left_T_right), strict=True)
+        left, right = (
+            _camera(camera, focal[i], centre_px[i], distortion[i], body_T_cam)
+            for i, (camera, body_T_cam) in enumerate(each, start=2 * j)
+        )
+        pairs.append(StereoPair(pair.name, left, right))
+    sign = 1.0 if normal["time-offset"]() > 0.0 else -1.0
+    imu = rig.imu if rig.imu is not None else Imu()
+    true_imu = replace(
+        imu,
+        gyro_noise_density=error.imu_noise_factor * imu.gyro_noise_density,
+        accel_noise_density=error.imu_noise_factor * imu.accel_noise_density,
+        time_offset_s=imu.time_offset_s + sign * 1e-3 * error.time_offset_ms,
+    )
+    scale = 0.01 * error.imu_scale_percent * normal["imu-scale"]((2, 3))
+    skewed = np.deg2rad(error.imu_misalignment_deg) * normal["imu-misalignment"]((2, 3, 3))
+    gyro, accel = (np.eye(3) + np.diag(scale[i]) + skewed[i] * (1.0 - np.eye(3)) for i in (0, 1))
+    return SampledError(replace(rig, pairs=tuple(pairs), imu=imu), replace(rig, imu=true_imu), ImuError(gyro, accel))
+
+
+def calibration_differences(rig: Rig, true_rig: Rig) -> dict[str, Float]:
+    """Return by how much a rig's calibration is off, in the terms in which `draw` makes errors.
+
+    Args:
+        rig: such as a file says, or estimated.
+        true_rig: of the same cameras.
+
+    Returns:
+        Name with unit, as in `CalibrationError` -> errors (K,) of all cameras, pairs and axes. Without an IMU in both
+        rigs there is no ``time_offset_ms``, and without a second pair nothing about it.
+    """
+    cameras = list(zip(rig.cameras, true_rig.cameras, strict=True))
+    ratios = np.array([camera.intrinsics[:2] / true.intrinsics[:2] for camera, true in cameras])
+    of_lens = [(camera.distortion[:2], true.distortion[:2]) for camera, true in cameras]
+    in_body = rig.pairs[0].left.body_T_cam @ true_rig.pairs[0].left.cam_T_body
+    turns, lengths, moves = [], [], []
+    for j, (pair, true) in enumerate(zip(rig.pairs, true_rig.pairs, strict=True)):
+        turns.append(so3_log(true.right_T_left[:3, :3] @ pair.right_T_left[:3, :3].T))
+        lengths.append(pair.baseline_m / true.baseline_m - 1.0)
+        if j > 0:
+            moves.append(true.left.cam_T_body @ se3_inverse(in_body) @ pair.left.body_T_cam)
+    found = {
+        "focal_percent": 100.0 * (ratios.mean(axis=1) - 1.0),
+        "principal_point_px": np.concatenate([camera.intrinsics[2:] - true.intrinsics[2:] for camera, true in cameras]),
+        "distortion_percent": np.concatenate([100.0 * (k - true)[true != 0] / true[true != 0] for k, true in of_lens]),
+        "left_right_deg": np.rad2deg(np.concatenate(turns)),
+        "baseline_percent": 100.0 * np.array(lengths),
+        "cameras_in_body_deg": np.rad2deg(so3_log(np.ascontiguousarray(in_body[:3, :3]))),
+        "cameras_in_body_mm": 1e3 * in_body[:3, 3],
+    }
+    if moves:
+        found["pair_transform_deg"] = np.rad2deg(
+            np.concatenate([so3_log(np.ascontiguousarray(moved[:3, :3])) for moved in moves])
+        )
+        found["pair_transform_mm"] = 1e3 * np.concatenate([moved[:3, 3] for moved in moves])
+    if rig.imu is not None and true_rig.imu is not None:
+        found["time_offset_ms"] = 1e3 * np.array([rig.imu.time_offset_s - true_rig.imu.time_offset_s])
+    return found
+
+
+def _camera(camera: Camera, focal: float, centre_px: Float, distortion: Float, body_T_cam: Float) -> Camera:
+    intrinsics, lens = camera.intrinsics.copy(), camera.distortion.copy()
+    intrinsics[:2] *= focal
+    intrinsics[2:] += centre_px
+    lens[:2] *= distortion
+    return replace(camera, intrinsics=intrinsics, distortion=lens, body_T_cam=body_T_cam)
+
+
+def _transform(normal: Float, angle_deg: float, shift_mm: float) -> Float:
+    return se3(so3_exp(np.deg2rad(angle_deg) * normal[:3]), 1e-3 * shift_mm * normal[3:])
+
+
+def _choices(names: object) -> str:
+    return ", ".join(map(str, names))  # type: ignore[call-overload]

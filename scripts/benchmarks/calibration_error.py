@@ -1,0 +1,286 @@
+"""``scripts/benchmark calibration-error``: accuracy when the calibration files are as wrong as real ones."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+import yaml
+
+from benchmarks.calibration_runs import CalibrationOutcome, WronglyCalibrated
+from benchmarks.recordings import add_data_option, simulated
+from benchmarks.report import Report, log_progress, machine, writing
+from graphvio.config import Config
+from graphvio.errors import GraphvioError
+from graphvio.simulation import SCENE_NAMES
+from graphvio.simulation.calibration_error import COMPONENTS, LEVELS, CalibrationError
+
+EXACT = 0
+"""The level of exact files."""
+_SCENES = ("room", "corridor", "stairs", "calibration")
+_BOTH = "both"
+_PAIRS = {_BOTH: (0, 1), "front": (0,), "back": (1,)}
+_OUT = Path("results") / "benchmarks" / "calibration-error.csv"
+
+
+@dataclass(frozen=True)
+class _Case:
+    """One run: the columns of the CSV file by which it is found again."""
+
+    scene: str
+    duration_s: str
+    level: int
+    components: str
+    seed: int
+    config: str
+    pairs: str
+    imu: str
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        return tuple(str(value) for value in vars(self).values())
+
+
+_FIGURES = ("ate_cm", "epochs", "posed_percent", "frameset_ms", "before", "after")
+_HEAD = (*_Case.__dataclass_fields__, *_FIGURES)
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand."""
+    parser = subparsers.add_parser(
+        "calibration-error",
+        help="accuracy when the calibration files are as wrong as real ones",
+        description="Runs simulated scenes with exact files and with calibration errors sampled at each level; images "
+        "are rendered once. Prints each run as it ends, and tables at the end, also after Ctrl-C.",
+        epilog="Example: scripts/benchmark calibration-error --scenes room --levels 2 --seeds 3 --pairs both "
+        "--components focal left-right-rotation",
+    )
+    parser.add_argument(
+        "--scenes", nargs="+", default=list(_SCENES), metavar="NAME", help=f"default: {' '.join(_SCENES)}"
+    )
+    parser.add_argument("--levels", nargs="*", type=int, default=list(LEVELS), metavar="N", help="default: all")
+    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="number of draws (default: 5)")
+    parser.add_argument("--first-seed", type=int, default=0, metavar="N", help="of the first draw (default: 0)")
+    parser.add_argument(
+        "--components", nargs="+", metavar="NAME", help=f"only these errors, together: {', '.join(COMPONENTS)}"
+    )
+    parser.add_argument("--duration", type=float, metavar="S", help="only so much of each walk")
+    parser.add_argument("--pairs", nargs="+", choices=list(_PAIRS), default=list(_PAIRS), help="default: all three")
+    imu = parser.add_mutually_exclusive_group()
+    imu.add_argument("--no-imu", action="store_true", help="only runs without the IMU")
+    imu.add_argument("--imu", action="store_true", help="only runs with the IMU")
+    parser.add_argument("--no-exact", action="store_true", help="leave out the runs with exact files")
+    parser.add_argument("--config", default="default", metavar="NAME", help="profile or YAML file (default: default)")
+    parser.add_argument(
+        "--set", nargs="+", default=[], metavar="KEY=VALUE", help="values of the configuration: stage.name=value"
+    )
+    parser.add_argument("--out", type=Path, default=_OUT, metavar="CSV", help=f"results are added (default: {_OUT})")
+    parser.add_argument("--resume", action="store_true", help="take runs with the same settings from that file")
+    add_data_option(parser)
+    parser.set_defaults(run=run_all)
+
+
+def run_all(args: argparse.Namespace) -> None:
+    """Measure and report."""
+    for scene in args.scenes:
+        if scene not in SCENE_NAMES:
+            raise GraphvioError(f"there is no scene {scene!r}; choose from {', '.join(SCENE_NAMES)}")
+    if args.seeds < 1 or args.first_seed < 0:
+        raise GraphvioError("--seeds must be at least 1, and --first-seed not negative")
+    levels = [*([] if args.no_exact else [EXACT]), *args.levels]
+    errors = {level: _error(level, args.components) for level in levels}
+    config = _config(args.config, args.set)
+    report = Report()
+    report.add(machine())
+    results: dict[_Case, CalibrationOutcome] = {}
+    known = _load(args.out) if args.resume else {}
+    try:
+        for scene in args.scenes:
+            folder = simulated(args.data, scene, args.duration)
+            for level, seed in _draws(levels, args.first_seed, args.seeds):
+                cases = list(_cases(args, scene, level, seed))
+                results |= {case: known[case.key] for case in cases if case.key in known}
+                missing = [case for case in cases if case.key not in known]
+                if not missing:
+                    continue
+                walk = WronglyCalibrated(folder, scene, args.duration, errors[level], seed)
+                for case in missing:
+                    results[case] = walk.run(config, _PAIRS[case.pairs], case.imu == "yes")
+                    _append(args.out, case, results[case])
+                    print(_line(case, results[case]), flush=True)
+    except KeyboardInterrupt:
+        log_progress("interrupted; the tables show what was done")
+    _tables(report, results)
+
+
+def _error(level: int, components: Sequence[str] | None) -> CalibrationError:
+    error = CalibrationError() if level == EXACT else CalibrationError.of_level(level)
+    return error if components is None else error.only(components)
+
+
+def _config(profile: str, assignments: Sequence[str]) -> Config:
+    """Load a profile and change some values."""
+    values = yaml.safe_load(Config.load(profile).to_yaml())
+    for assignment in assignments:
+        name, equals, value = assignment.partition("=")
+        *stages, last = name.split(".")
+        if not equals or not last:
+            raise GraphvioError(f"--set {assignment}: give stage.name=value, such as smoother.lag_s=3")
+        inner = values
+        for stage in stages:
+            inner = inner.setdefault(stage, {})
+        inner[last] = yaml.safe_load(value)
+    return Config.from_yaml(yaml.safe_dump(values), "--set")
+
+
+def _draws(levels: Sequence[int], first_seed: int, seeds: int) -> Iterator[tuple[int, int]]:
+    """Yield level and seed of each draw; exact files have only one."""
+    for level in levels:
+        for seed in range(first_seed, first_seed + (1 if level == EXACT else seeds)):
+            yield level, 0 if level == EXACT else seed
+
+
+def _cases(args: argparse.Namespace, scene: str, level: int, seed: int) -> Iterator[_Case]:
+    duration = "whole" if args.duration is None else f"{args.duration:g}"
+    components = "all" if args.components is None or level == EXACT else " ".join(sorted(args.components))
+    config = " ".join([args.config, *sorted(args.set)])
+    for imu in ("yes", "no"):
+        if (imu == "yes" and args.no_imu) or (imu == "no" and args.imu):
+            continue
+        for pairs in args.pairs:
+            yield _Case(scene, duration, level, components, seed, config, pairs, imu)
+
+
+def _line(case: _Case, outcome: CalibrationOutcome) -> str:
+    draw = "exact files" if case.level == EXACT else f"level {case.level}, {case.components}, seed {case.seed}"
+    posed = "" if outcome.posed_percent > 99.0 else f", {outcome.posed_percent:.0f} % with pose"
+    epochs = "" if outcome.epochs == 1 else f", {outcome.epochs} epochs"
+    return (
+        f"{case.scene}, {draw}: {case.pairs}, {'with' if case.imu == 'yes' else 'without'} IMU: "
+        f"ATE {100 * outcome.ate_m:.2f} cm{epochs}{posed}, {outcome.frameset_ms:.1f} ms a frameset"
+    )
+
+
+def _tables(report: Report, results: dict[_Case, CalibrationOutcome]) -> None:
+    """Print the accuracy of each scene and level, and the errors of the parameters before and after."""
+    groups = list(dict.fromkeys((case.scene, case.level, case.imu) for case in results))
+    rows, parameter_rows = [], []
+    for scene, level, imu in groups:
+        ates = {
+            pairs: {
+                case.seed: outcome.ate_m
+                for case, outcome in results.items()
+                if (case.scene, case.level, case.imu, case.pairs) == (scene, level, imu, pairs)
+            }
+            for pairs in _PAIRS
+        }
+        exact = {
+            case.pairs: outcome.ate_m
+            for case, outcome in results.items()
+            if (case.scene, case.level, case.imu) == (scene, EXACT, imu)
+        }
+        single = {seed: min(ates["front"][seed], ates["back"][seed]) for seed in ates["front"] if seed in ates["back"]}
+        against_single = [ates[_BOTH][seed] / single[seed] for seed in ates[_BOTH] if seed in single]
+        cells = [_two(ates[pairs].values(), _cm) for pairs in _PAIRS]
+        ratio = _ratio(median(ates[_BOTH].values()) / exact[_BOTH]) if ates[_BOTH] and _BOTH in exact else "-"
+        count = max(len(each) for each in ates.values())
+        rows.append([scene, _name(level), imu, f"{count}", *cells, ratio, _two(against_single, _ratio)])
+        both = [
+            outcome
+            for case, outcome in results.items()
+            if (case.scene, case.level, case.imu, case.pairs) == (scene, level, imu, _BOTH)
+        ]
+        if level != EXACT and both:
+            parameter_rows.append([scene, _name(level), imu, *(_before_after(both, name) for name in _PARAMETERS)])
+    if not rows:
+        return
+    report.add("#### Accuracy", "ATE in cm, median / worst of the draws; ratios are of medians, then of each draw.")
+    head = ["scene", "level", "IMU", "draws", *_PAIRS, "both / exact files", "both / better single"]
+    report.table(head, rows)
+    if parameter_rows:
+        report.add(
+            "#### Calibration parameters",
+            "Rms errors of the files -> of the rig that the odometry estimated with both pairs; medians of the draws.",
+        )
+        report.table(["scene", "level", "IMU", *_PARAMETERS.values()], parameter_rows)
+
+
+_PARAMETERS = {
+    "focal_percent": "f, %",
+    "principal_point_px": "c, px",
+    "distortion_percent": "k, %",
+    "left_right_deg": "left-right, deg",
+    "baseline_percent": "baseline, %",
+    "pair_transform_deg": "P_12, deg",
+    "pair_transform_mm": "P_12, mm",
+    "cameras_in_body_deg": "in body, deg",
+    "cameras_in_body_mm": "in body, mm",
+    "time_offset_ms": "offset, ms",
+}
+
+
+def _before_after(outcomes: Sequence[CalibrationOutcome], name: str) -> str:
+    before = [outcome.before[name] for outcome in outcomes if name in outcome.before]
+    after = [outcome.after[name] for outcome in outcomes if name in outcome.after]
+    return f"{_figure(before)} -> {_figure(after)}" if before else "-"
+
+
+def _figure(values: Sequence[float]) -> str:
+    return f"{median(values):.2g}" if values else "-"
+
+
+def _two(values: object, form: Callable[[float], str]) -> str:
+    each = list(values)  # type: ignore[call-overload]
+    return f"{form(median(each))} / {form(max(each))}" if each else "-"
+
+
+def _cm(metres: float) -> str:
+    return f"{100 * metres:.2f}"
+
+
+def _ratio(value: float) -> str:
+    return f"{value:.2f}"
+
+
+def _name(level: int) -> str:
+    return "exact" if level == EXACT else f"{level}"
+
+
+def _append(path: Path, case: _Case, outcome: CalibrationOutcome) -> None:
+    with writing(path):
+        is_new = not path.exists()
+        with path.open("a", newline="") as file:
+            writer = csv.writer(file)
+            if is_new:
+                writer.writerow(_HEAD)
+            before, after = (
+                json.dumps({k: round(v, 6) for k, v in e.items()}) for e in (outcome.before, outcome.after)
+            )
+            figures = (outcome.epochs, f"{outcome.posed_percent:.2f}", f"{outcome.frameset_ms:.2f}")
+            writer.writerow([*case.key, f"{100 * outcome.ate_m:.4f}", *figures, before, after])
+
+
+def _load(path: Path) -> dict[tuple[str, ...], CalibrationOutcome]:
+    """Return the runs in a CSV file, by their settings; of equal ones the last."""
+    if not path.exists():
+        return {}
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    if rows and tuple(rows[0]) != _HEAD:
+        raise GraphvioError(f"{path}: has other columns than this benchmark writes; name another file with --out")
+    return {
+        tuple(row[name] for name in _Case.__dataclass_fields__): CalibrationOutcome(
+            ate_m=0.01 * float(row["ate_cm"]),
+            epochs=int(row["epochs"]),
+            posed_percent=float(row["posed_percent"]),
+            frameset_ms=float(row["frameset_ms"]),
+            before=json.loads(row["before"]),
+            after=json.loads(row["after"]),
+        )
+        for row in rows
+    }

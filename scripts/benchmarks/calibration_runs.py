@@ -1,0 +1,117 @@
+"""One run of the odometry with a wrong calibration, on images that were rendered once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.config import Config
+from graphvio.errors import GraphvioError, TrajectoryError
+from graphvio.evaluation import evaluate
+from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
+from graphvio.odometry import Odometry
+from graphvio.rig import Rig
+from graphvio.simulation import make_simulator
+from graphvio.simulation.calibration_error import CalibrationError, SampledError, calibration_differences, draw
+from graphvio.sources import open_source
+from graphvio.sources.sequencer import merge
+from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
+from graphvio.warmup import warm_up
+
+
+@dataclass(frozen=True)
+class CalibrationOutcome:
+    """Result of a run.
+
+    Attributes:
+        ate_m: rmse of the causal positions after alignment, all epochs as one; infinite where there are none.
+        epochs: how many there were.
+        posed_percent: framesets that have a pose.
+        frameset_ms: mean wall time of a frameset, with its decoding.
+        before: parameter with unit -> rms of its errors in the files.
+        after: the same of the rig that the odometry estimated; empty if it estimates none.
+    """
+
+    ate_m: float
+    epochs: int
+    posed_percent: float
+    frameset_ms: float
+    before: dict[str, float] = field(default_factory=dict)
+    after: dict[str, float] = field(default_factory=dict)
+
+
+class WronglyCalibrated:
+    """A rendered scene whose files are as wrong as sampled.
+
+    Args:
+        folder: of the recording with exact files.
+        scene: its name.
+        duration_s: of the recording; None for the whole walk.
+        error: sizes of the errors.
+        seed: by which they are sampled.
+    """
+
+    def __init__(self, folder: Path, scene: str, duration_s: float | None, error: CalibrationError, seed: int) -> None:
+        self._folder = folder
+        exact = open_source(folder)
+        self.sampled: SampledError = draw(exact.rig, error, seed)
+        if exact.truth is None:
+            raise GraphvioError(f"{folder}: holds no true trajectory; remove it, so that it is rendered again")
+        self._truth = load_trajectory(exact.truth)
+        simulator = make_simulator(scene, duration_s=duration_s, rig=self.sampled.true_rig, imu_error=self.sampled.imu)
+        track = simulator.imu_track
+        self._samples = [
+            ImuSample(int(stamp), rate, force)
+            for stamp, rate, force in zip(
+                track.stamps_ns, track.angular_velocity, track.linear_acceleration, strict=True
+            )
+        ]
+
+    def run(self, config: Config, pairs: tuple[int, ...], imu: bool) -> CalibrationOutcome:
+        """Run the odometry with some of the pairs, with or without the IMU."""
+        written, true = (_selected(rig, pairs, imu) for rig in (self.sampled.written_rig, self.sampled.true_rig))
+        warm_up(written, config)
+        odometry = Odometry(written, config)
+        begin = perf_counter()
+        estimates = [e for e in map(odometry.process, self._measurements(written)) if e is not None]
+        estimates += odometry.finish()
+        wall_s = perf_counter() - begin
+        posed = [e for e in estimates if e.nav_T_body is not None]
+        poses: Float = np.array([e.nav_T_body for e in posed]).reshape(-1, 4, 4)
+        try:
+            estimated = Trajectory(np.array([e.stamp_ns for e in posed], dtype=np.int64), poses)
+            ate_m = evaluate(estimated, self._truth).ate_position_m.rmse
+        except TrajectoryError:
+            ate_m = np.inf
+        refined = getattr(odometry, "refined_rig", None)
+        return CalibrationOutcome(
+            ate_m=ate_m,
+            epochs=len({e.epoch for e in posed}),
+            posed_percent=100.0 * len(posed) / max(len(estimates), 1),
+            frameset_ms=1e3 * wall_s / max(len(estimates), 1),
+            before=_rms(written, true),
+            after=_rms(refined, true) if refined is not None else {},
+        )
+
+    def _measurements(self, rig: Rig) -> Iterator[Measurement]:
+        """Merge the images on disk with the samples in memory."""
+        source = open_source(self._folder, rig.without_imu())
+        framesets = (measurement for measurement in source if isinstance(measurement, FrameSet))
+        if rig.imu is None:
+            return framesets
+        return merge(self._samples, framesets, rig.imu.time_offset_ns)
+
+
+def _selected(rig: Rig, pairs: tuple[int, ...], imu: bool) -> Rig:
+    chosen = rig.with_pairs(pairs)
+    return chosen if imu else chosen.without_imu()
+
+
+def _rms(rig: Rig, true_rig: Rig) -> dict[str, float]:
+    return {name: float(np.sqrt(np.mean(e**2))) for name, e in calibration_differences(rig, true_rig).items()}
