@@ -22,9 +22,42 @@ def simulate(
     trigger_offset_ms: Annotated[
         float, typer.Option("--trigger-offset-ms", help="Each pair is triggered so much after the previous one.")
     ] = 0.0,
+    calibration_error: Annotated[
+        int | None,
+        typer.Option(
+            "--calibration-error",
+            help="Files are as wrong as by a calibration that is careful (1), usual (2) or of long ago (3).  "
+            "[default: exact]",
+            metavar="LEVEL",
+        ),
+    ] = None,
+    calibration_component: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--calibration-component",
+            help="Only this error, and others that are named so: focal, principal-point, distortion, "
+            "left-right-rotation, baseline, cameras-in-body, pair-transform, time-offset, imu-scale, imu-misalignment "
+            "or imu-noise.  [default: all]",
+            metavar="NAME",
+        ),
+    ] = None,
+    calibration_seed: Annotated[
+        int | None, typer.Option("--calibration-seed", help="Of the calibration error.  [default: that of --seed]")
+    ] = None,
+    rig_change: Annotated[
+        str | None,
+        typer.Option(
+            "--rig-change",
+            help="What happens to the true cameras on the way: thermal, a slow drift, or knock, in the middle.  "
+            "[default: nothing]",
+            metavar="NAME",
+        ),
+    ] = None,
     verbose: options.Verbose = False,
 ) -> None:
     """Simulate a walk with four cameras and an IMU, and write it in the EuRoC/ASL layout.
+
+    With a calibration error the true rig is in rig-true.yaml next to rig.yaml; images are the same.
 
     The corridor has a door that opens in front, a crowd, a bend with blank walls and failing lamps. The loop goes once
     around four corridors, passes its first position again, turns round and comes back past it.
@@ -34,9 +67,17 @@ def simulate(
         graphvio simulate room --out room
 
         graphvio simulate corridor --out corridor --duration 40 --seed 1
+
+        graphvio simulate room --out room --calibration-error 2
     """
+    from graphvio.simulation import CalibrationError
     from graphvio.simulation import simulate as simulate_recording
 
+    error = None
+    if calibration_error is not None:
+        error = CalibrationError.of_level(calibration_error, calibration_component)
+    elif calibration_component or calibration_seed is not None:
+        raise typer.BadParameter("--calibration-component and --calibration-seed need --calibration-error LEVEL")
     with framesets_bar() as bar:
         task = bar.add_task(f"rendering {name}", total=None)
         recording = simulate_recording(
@@ -46,6 +87,9 @@ def simulate(
             seed=seed,
             rate_hz=rate,
             trigger_offset_ms=trigger_offset_ms,
+            calibration_error=error,
+            calibration_seed=calibration_seed,
+            rig_change=rig_change,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     typer.echo(

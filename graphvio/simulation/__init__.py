@@ -6,7 +6,7 @@
 from graphvio.simulation.calibration_error import CalibrationError
 from graphvio.simulation.default_rig import default_rig
 from graphvio.simulation.recording import SimulatedRecording, simulate, write_recording
-from graphvio.simulation.rig_change import RIG_CHANGES, rig_change
+from graphvio.simulation.rig_change import RIG_CHANGES
 from graphvio.simulation.scenes import SCENE_NAMES, build_scene
 from graphvio.simulation.simulator import Simulator, make_simulator
 
@@ -19,7 +19,6 @@ __all__ = [
     "build_scene",
     "default_rig",
     "make_simulator",
-    "rig_change",
     "simulate",
     "write_recording",
 ]

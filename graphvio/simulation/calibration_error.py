@@ -65,31 +65,27 @@ class CalibrationError:
                 raise SourceError(f"calibration error: {name} is {value}; give a finite number that is not negative")
 
     @staticmethod
-    def of_level(level: int) -> CalibrationError:
+    def of_level(level: int, components: Sequence[str] | None = None) -> CalibrationError:
         """Return the errors of one of `LEVELS`.
 
+        Args:
+            level: one of them.
+            components: only these, some of `COMPONENTS`; None for all.
+
         Raises:
-            SourceError: if there is no such level.
+            SourceError: if there is no such level or component.
         """
         if level not in _LEVELS:
-            raise SourceError(f"there is no calibration error of level {level}; choose one of {_choices(LEVELS)}")
-        return _LEVELS[level]
-
-    def only(self, components: Sequence[str]) -> CalibrationError:
-        """Return the errors of some components alone.
-
-        Args:
-            components: some of `COMPONENTS`.
-
-        Raises:
-            SourceError: if there is no such component.
-        """
+            raise SourceError(
+                f"there is no calibration error of level {level}; choose from {', '.join(map(str, LEVELS))}"
+            )
+        if components is None:
+            return _LEVELS[level]
         for name in components:
             if name not in COMPONENTS:
-                raise SourceError(
-                    f"there is no component {name!r} of calibration errors; choose from {_choices(COMPONENTS)}"
-                )
-        return replace(CalibrationError(), **{f: getattr(self, f) for name in components for f in COMPONENTS[name]})
+                raise SourceError(f"no calibration error has the name {name!r}; choose from {', '.join(COMPONENTS)}")
+        kept = [each for name in components for each in COMPONENTS[name]]
+        return CalibrationError(**{name: getattr(_LEVELS[level], name) for name in kept})
 
 
 COMPONENTS: dict[str, tuple[str, ...]] = {
@@ -267,7 +263,3 @@ def _camera(camera: Camera, focal: float, centre_px: Float, distortion: Float, b
 
 def _transform(normal: Float, angle_deg: float, shift_mm: float) -> Float:
     return se3(so3_exp(np.deg2rad(angle_deg) * normal[:3]), 1e-3 * shift_mm * normal[3:])
-
-
-def _choices(names: object) -> str:
-    return ", ".join(map(str, names))  # type: ignore[call-overload]

@@ -23,7 +23,7 @@ from graphvio.sessions import euroc_layout
 from graphvio.sessions.euroc_layout import IMU_FOLDER, TRUTH_FOLDER
 from graphvio.simulation.calibration_error import CalibrationError, draw
 from graphvio.simulation.default_rig import default_rig
-from graphvio.simulation.rig_change import RigChange
+from graphvio.simulation.rig_change import RIG_CHANGES
 from graphvio.simulation.simulator import Simulator, make_simulator
 
 TRUE_RIG_FILE = "rig-true.yaml"
@@ -68,7 +68,7 @@ def simulate(
     trigger_offset_ms: float = 0.0,
     calibration_error: CalibrationError | None = None,
     calibration_seed: int | None = None,
-    rig_change: RigChange | None = None,
+    rig_change: str | None = None,
     progress: Progress | None = None,
 ) -> SimulatedRecording:
     """Simulate a scene and write it as a recording.
@@ -84,14 +84,17 @@ def simulate(
         calibration_error: of the files that describe the cameras, and of the IMU's data; images are the same. None for
             exact files.
         calibration_seed: by which the error is sampled; None for ``seed``.
-        rig_change: of the true cameras during the walk, of which the files know nothing; None if they stay as they are.
+        rig_change: one of `graphvio.simulation.RIG_CHANGES`, of the true cameras during the walk, which the files know
+            nothing of; None if they stay as they are.
         progress: called as the framesets are written.
 
     Raises:
-        SourceError: if there is no such scene, a value is impossible, or the folder is not empty.
+        SourceError: if there is no such scene or change, a value is impossible, or the folder is not empty.
     """
     out = Path(out)
     _require_empty(out)
+    if rig_change is not None and rig_change not in RIG_CHANGES:
+        raise SourceError(f"there is no change {rig_change!r} of the rig; choose from {', '.join(RIG_CHANGES)}")
     sampled = None
     if calibration_error is not None:
         sampled = draw(default_rig(), calibration_error, seed if calibration_seed is None else calibration_seed)
@@ -104,7 +107,7 @@ def simulate(
         trigger_offset_ms=trigger_offset_ms,
         rig=sampled.true_rig if sampled is not None else None,
         imu_error=sampled.imu if sampled is not None else None,
-        rig_change=rig_change,
+        rig_change=RIG_CHANGES[rig_change] if rig_change is not None else None,
     )
     return write_recording(simulator, out, progress, sampled.written_rig if sampled is not None else None)
 

@@ -76,7 +76,7 @@ class Simulator:
         self._trigger_offset_ms = trigger_offset_ms
         self._stage = Stage(scene.world, atlas if atlas is not None else standard_atlas())
         self._imu_error, self._rig_change = imu_error, rig_change
-        self._rays_in = lru_cache(_KEPT_STAGES)(self._rays_of_stage)
+        self._rays_in = lru_cache(_KEPT_STAGES)(self._rays_of)
         self.films = [Film(rays, _SENSITIVITIES[i % 4]) for i, rays in enumerate(self._rays_in(0))]
 
     @cached_property
@@ -112,7 +112,7 @@ class Simulator:
 
     def rig_at(self, index: int) -> Rig:
         """Return the true rig at the time of a frameset."""
-        return self.rig if self._rig_change is None else self._rig_change.rig_in(self.rig, self._stage_at(index))
+        return self._rig_in(self._rig_stage(index))
 
     def surfaces(self, index: int) -> Surfaces:
         """Return the surfaces of the world at the time of a frameset."""
@@ -127,7 +127,7 @@ class Simulator:
             surfaces: of this instant, if they are there already.
         """
         seen = surfaces if surfaces is not None else self.surfaces(index)
-        rays = self._rays_in(self._stage_at(index))[camera]
+        rays = self._rays_in(self._rig_stage(index))[camera]
         return rays.render(seen, self._stage.atlas, self.world_T_body[index] @ rays.camera.body_T_cam)
 
     def image(self, index: int, camera: int, noisy: bool = True, surfaces: Surfaces | None = None) -> Image:
@@ -145,14 +145,16 @@ class Simulator:
         }
         return FrameSet(int(self.stamps_ns[index]), images)
 
-    def _stage_at(self, index: int) -> int:
+    def _rig_stage(self, index: int) -> int:
         if self._rig_change is None:
             return 0
-        return self._rig_change.stage_at(float(self._seconds(self.stamps_ns[index])))
+        return self._rig_change.stage_at(float(self._seconds(self.stamps_ns[index])), self.scene.motion.duration_s)
 
-    def _rays_of_stage(self, stage: int) -> list[CameraRays]:
-        rig = self.rig if self._rig_change is None else self._rig_change.rig_in(self.rig, stage)
-        return [CameraRays(camera) for camera in rig.cameras]
+    def _rig_in(self, stage: int) -> Rig:
+        return self.rig if self._rig_change is None else self._rig_change.rig_in(self.rig, stage)
+
+    def _rays_of(self, stage: int) -> list[CameraRays]:
+        return [CameraRays(camera) for camera in self._rig_in(stage).cameras]
 
     @cached_property
     def _triggers(self) -> list[frozenset[int]]:

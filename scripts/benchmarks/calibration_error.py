@@ -17,7 +17,7 @@ from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import Report, log_progress, machine, writing
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
-from graphvio.simulation import SCENE_NAMES
+from graphvio.simulation import RIG_CHANGES, SCENE_NAMES
 from graphvio.simulation.calibration_error import COMPONENTS, LEVELS, CalibrationError
 
 EXACT = 0
@@ -34,6 +34,7 @@ class _Case:
 
     scene: str
     duration_s: str
+    rig_change: str
     level: int
     components: str
     seed: int
@@ -69,6 +70,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--components", nargs="+", metavar="NAME", help=f"only these errors, together: {', '.join(COMPONENTS)}"
     )
+    parser.add_argument(
+        "--rig-change", choices=list(RIG_CHANGES), help="the true cameras change on the way (default: they do not)"
+    )
     parser.add_argument("--duration", type=float, metavar="S", help="only so much of each walk")
     parser.add_argument("--pairs", nargs="+", choices=list(_PAIRS), default=list(_PAIRS), help="default: all three")
     imu = parser.add_mutually_exclusive_group()
@@ -81,6 +85,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--out", type=Path, default=_OUT, metavar="CSV", help=f"results are added (default: {_OUT})")
     parser.add_argument("--resume", action="store_true", help="take runs with the same settings from that file")
+    parser.add_argument("--docs", action="store_true", help="put the tables into docs/benchmarks.md")
+    parser.add_argument(
+        "--recordings",
+        type=Path,
+        metavar="DIR",
+        help="take the recordings DIR/SCENE of graphvio simulate, instead of rendering for this state of the simulator",
+    )
     add_data_option(parser)
     parser.set_defaults(run=run_all)
 
@@ -101,14 +112,14 @@ def run_all(args: argparse.Namespace) -> None:
     known = _load(args.out) if args.resume else {}
     try:
         for scene in args.scenes:
-            folder = simulated(args.data, scene, args.duration)
+            folder = _rendered(args, scene)
             for level, seed in _draws(levels, args.first_seed, args.seeds):
                 cases = list(_cases(args, scene, level, seed))
                 results |= {case: known[case.key] for case in cases if case.key in known}
                 missing = [case for case in cases if case.key not in known]
                 if not missing:
                     continue
-                walk = WronglyCalibrated(folder, scene, args.duration, errors[level], seed)
+                walk = WronglyCalibrated(folder, scene, args.duration, args.rig_change, errors[level], seed)
                 for case in missing:
                     results[case] = walk.run(config, _PAIRS[case.pairs], case.imu == "yes")
                     _append(args.out, case, results[case])
@@ -116,11 +127,23 @@ def run_all(args: argparse.Namespace) -> None:
     except KeyboardInterrupt:
         log_progress("interrupted; the tables show what was done")
     _tables(report, results)
+    if args.docs:
+        report.save_to_docs("calibration-error")
+
+
+def _rendered(args: argparse.Namespace, scene: str) -> Path:
+    """Return the folder of a scene's recording with exact files."""
+    if args.recordings is None:
+        return simulated(args.data, scene, args.duration, args.rig_change)
+    folder: Path = args.recordings / (scene if args.rig_change is None else f"{scene}-{args.rig_change}")
+    if not folder.is_dir():
+        change = "" if args.rig_change is None else f" --rig-change {args.rig_change}"
+        raise GraphvioError(f"{folder}: is not there; make it by  graphvio simulate {scene} --out {folder}{change}")
+    return folder
 
 
 def _error(level: int, components: Sequence[str] | None) -> CalibrationError:
-    error = CalibrationError() if level == EXACT else CalibrationError.of_level(level)
-    return error if components is None else error.only(components)
+    return CalibrationError() if level == EXACT else CalibrationError.of_level(level, components)
 
 
 def _config(profile: str, assignments: Sequence[str]) -> Config:
@@ -153,15 +176,16 @@ def _cases(args: argparse.Namespace, scene: str, level: int, seed: int) -> Itera
         if (imu == "yes" and args.no_imu) or (imu == "no" and args.imu):
             continue
         for pairs in args.pairs:
-            yield _Case(scene, duration, level, components, seed, config, pairs, imu)
+            yield _Case(scene, duration, args.rig_change or "none", level, components, seed, config, pairs, imu)
 
 
 def _line(case: _Case, outcome: CalibrationOutcome) -> str:
     draw = "exact files" if case.level == EXACT else f"level {case.level}, {case.components}, seed {case.seed}"
     posed = "" if outcome.posed_percent > 99.0 else f", {outcome.posed_percent:.0f} % with pose"
     epochs = "" if outcome.epochs == 1 else f", {outcome.epochs} epochs"
+    change = "" if case.rig_change == "none" else f", {case.rig_change}"
     return (
-        f"{case.scene}, {draw}: {case.pairs}, {'with' if case.imu == 'yes' else 'without'} IMU: "
+        f"{case.scene}{change}, {draw}: {case.pairs}, {'with' if case.imu == 'yes' else 'without'} IMU: "
         f"ATE {100 * outcome.ate_m:.2f} cm{epochs}{posed}, {outcome.frameset_ms:.1f} ms a frameset"
     )
 

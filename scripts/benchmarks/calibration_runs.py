@@ -16,8 +16,8 @@ from graphvio.evaluation import evaluate
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig
-from graphvio.simulation import make_simulator
-from graphvio.simulation.calibration_error import CalibrationError, SampledError, calibration_differences, draw
+from graphvio.simulation import RIG_CHANGES, make_simulator
+from graphvio.simulation.calibration_error import CalibrationError, calibration_differences, draw
 from graphvio.sources import open_source
 from graphvio.sources.sequencer import merge
 from graphvio.trajectory import Trajectory
@@ -34,7 +34,7 @@ class CalibrationOutcome:
         epochs: how many there were.
         posed_percent: framesets that have a pose.
         frameset_ms: mean wall time of a frameset, with its decoding.
-        before: parameter with unit -> rms of its errors in the files.
+        before: parameter with unit -> rms of its errors in the files, against the true rig at the end.
         after: the same of the rig that the odometry estimated; empty if it estimates none.
     """
 
@@ -47,24 +47,38 @@ class CalibrationOutcome:
 
 
 class WronglyCalibrated:
-    """A rendered scene whose files are as wrong as sampled.
+    """A rendered scene whose files have a calibration error.
 
     Args:
         folder: of the recording with exact files.
         scene: its name.
-        duration_s: of the recording; None for the whole walk.
+        duration_s: only so much of it; None for the whole walk.
+        rig_change: with which it was rendered, one of `graphvio.simulation.RIG_CHANGES`, or None.
         error: sizes of the errors.
         seed: by which they are sampled.
     """
 
-    def __init__(self, folder: Path, scene: str, duration_s: float | None, error: CalibrationError, seed: int) -> None:
-        self._folder = folder
+    def __init__(
+        self,
+        folder: Path,
+        scene: str,
+        duration_s: float | None,
+        rig_change: str | None,
+        error: CalibrationError,
+        seed: int,
+    ) -> None:
+        self._folder, self._duration_s = folder, duration_s
         exact = open_source(folder)
-        self.sampled: SampledError = draw(exact.rig, error, seed)
         if exact.truth is None:
             raise GraphvioError(f"{folder}: holds no true trajectory; remove it, so that it is rendered again")
         self._truth = load_trajectory(exact.truth)
-        simulator = make_simulator(scene, duration_s=duration_s, rig=self.sampled.true_rig, imu_error=self.sampled.imu)
+        sampled = draw(exact.rig, error, seed)
+        self._written_rig = sampled.written_rig
+        change = RIG_CHANGES[rig_change] if rig_change is not None else None
+        simulator = make_simulator(
+            scene, duration_s=duration_s, rig=sampled.true_rig, imu_error=sampled.imu, rig_change=change
+        )
+        self._true_rig = simulator.rig_at(-1)
         track = simulator.imu_track
         self._samples = [
             ImuSample(int(stamp), rate, force)
@@ -75,7 +89,7 @@ class WronglyCalibrated:
 
     def run(self, config: Config, pairs: tuple[int, ...], imu: bool) -> CalibrationOutcome:
         """Run the odometry with some of the pairs, with or without the IMU."""
-        written, true = (_selected(rig, pairs, imu) for rig in (self.sampled.written_rig, self.sampled.true_rig))
+        written, true = (_selected(rig, pairs, imu) for rig in (self._written_rig, self._true_rig))
         warm_up(written, config)
         odometry = Odometry(written, config)
         begin = perf_counter()
@@ -101,7 +115,7 @@ class WronglyCalibrated:
 
     def _measurements(self, rig: Rig) -> Iterator[Measurement]:
         """Merge the images on disk with the samples in memory."""
-        source = open_source(self._folder, rig.without_imu())
+        source = open_source(self._folder, rig.without_imu(), to_s=self._duration_s)
         framesets = (measurement for measurement in source if isinstance(measurement, FrameSet))
         if rig.imu is None:
             return framesets

@@ -36,19 +36,26 @@ def add_data_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def simulated(data: Path, scene: str, duration_s: float | None = None) -> Path:
+def simulated(data: Path, scene: str, duration_s: float | None = None, rig_change: str | None = None) -> Path:
     """The folder of a simulated recording, which is made if it is missing.
 
     Args:
         data: folder of all recordings.
         scene: one of `graphvio.simulation.SCENE_NAMES`.
         duration_s: only so much of the walk; None for all of it.
+        rig_change: one of `graphvio.simulation.RIG_CHANGES`; None if the true cameras stay as they are.
 
     Raises:
         GraphvioError: if it cannot be made.
     """
-    length = "whole" if duration_s is None else f"{duration_s:g}s"
-    return rendered_once(data, scene, length, lambda folder: simulate(scene, folder, duration_s=duration_s))
+    variant = "whole" if duration_s is None else f"{duration_s:g}s"
+    if rig_change is not None:
+        variant += f"-{rig_change}"
+
+    def render(folder: Path) -> None:
+        simulate(scene, folder, duration_s=duration_s, rig_change=rig_change)
+
+    return rendered_once(data, scene, variant, render)
 
 
 def rendered_once(data: Path, scene: str, variant: str, render: Callable[[Path], object], *sources: Path) -> Path:
