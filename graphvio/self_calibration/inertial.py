@@ -1,0 +1,230 @@
+"""Inertial errors between the keyframes of a window, and their normal equations.
+
+Poses are ``nav_T_body``, perturbed on the right: ``R Exp(r)``, ``p + R t``. Gravity is a free vector, (0, 0, -9.81)
+where nav's z is exactly up: the window finds the vertical, and a prior must hold its norm. Biases, matrices and the
+time offset of the IMU are the same in the whole window, see `graphvio.self_calibration.imu_model`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.geometry import so3_exp, so3_log, so3_right_jacobian_inverse
+from graphvio.kernels import kernel, put
+from graphvio.self_calibration.imu_model import PARAMETERS, TIME_OFFSET
+from graphvio.self_calibration.preintegration import Preintegrated, covering_samples, integrate_samples
+
+POSE, VELOCITY, GRAVITY = 6, 3, 3
+_VELOCITY_I, _POSE_J, _VELOCITY_J, _GRAVITY_AT, _PARAMETERS_AT = 6, 9, 15, 18, 21
+_COLUMNS = _PARAMETERS_AT + PARAMETERS
+
+
+class InertialSamples(NamedTuple):
+    """IMU samples of a window of K keyframes.
+
+    Attributes:
+        stamps_ns: (N,) increasing, of the IMU's clock; from before the first keyframe to after the last one.
+        readings: (N, 6) gyro, rad/s, and accelerometer, m/s^2, frame body.
+        keyframes_ns: (K,) stamps of the keyframes, of the cameras' clock.
+        noise_densities: (2,) white noise of gyro, rad/s/sqrt(Hz), and of accelerometer, m/s^2/sqrt(Hz).
+        max_gap_ns: between samples of one interval.
+    """
+
+    stamps_ns: Int
+    readings: Float
+    keyframes_ns: Int
+    noise_densities: Float
+    max_gap_ns: int
+
+
+class InertialStates(NamedTuple):
+    """Unknowns of a window of K keyframes.
+
+    Attributes:
+        poses: (K, 4, 4) ``nav_T_body``.
+        velocities: (K, 3) m/s, frame nav.
+        gravity: (3,) m/s^2, frame nav, downwards.
+        parameters: (25,) of the IMU, see `graphvio.self_calibration.imu_model`.
+    """
+
+    poses: Float
+    velocities: Float
+    gravity: Float
+    parameters: Float
+
+    def moved(self, step: Float) -> InertialStates:
+        """Return the states after a step (9 K + 28,) ``[poses, velocities, gravity, parameters]``."""
+        n = len(self.poses)
+        poses = self.poses.copy()
+        for pose, of_pose in zip(poses, step[: POSE * n].reshape(n, POSE), strict=True):
+            pose[:3, 3] += pose[:3, :3] @ of_pose[3:]
+            pose[:3, :3] = pose[:3, :3] @ so3_exp(of_pose[:3].copy())
+        velocities, gravity, parameters = np.split(step[POSE * n :], [VELOCITY * n, VELOCITY * n + GRAVITY])
+        return InertialStates(
+            poses,
+            self.velocities + velocities.reshape(n, VELOCITY),
+            self.gravity + gravity,
+            self.parameters + parameters,
+        )
+
+
+class InertialEquations(NamedTuple):
+    """Normal equations of a window's inertial errors; a step is ``-solve(hessian, gradient)``.
+
+    Attributes:
+        hessian: (9 K + 28, 9 K + 28) over ``[poses 6 K, velocities 3 K, gravity 3, parameters 25]``.
+        gradient: (9 K + 28,).
+        cost: half of the sum of ``errors2``.
+        errors2: (K - 1,) squared whitened error of each interval, of 9 dimensions; NaN where the samples do not cover
+            it, which leaves it out of all sums.
+    """
+
+    hessian: Float
+    gradient: Float
+    cost: float
+    errors2: Float
+
+    @property
+    def skipped(self) -> int:
+        """Number of intervals that the samples do not cover."""
+        return int(np.isnan(self.errors2).sum())
+
+
+@kernel
+def inertial_residual(
+    nav_T_i: Float, velocity_i: Float, nav_T_j: Float, velocity_j: Float, gravity: Float, preintegrated: Preintegrated
+) -> tuple[Float, Float]:
+    """Compute the error of two successive states against the IMU between them, and its derivatives.
+
+    Args:
+        nav_T_i: (4, 4) pose of body at the start.
+        velocity_i: (3,) m/s, frame nav.
+        nav_T_j: (4, 4) at the end.
+        velocity_j: (3,).
+        gravity: (3,) m/s^2, frame nav, downwards.
+        preintegrated: the IMU, by the parameters at which to linearise.
+
+    Returns:
+        Error (9,) ``[rotation, velocity, position]``, whose covariance is the preintegrated one, and its derivative
+        (9, 46) by ``[pose i 6, velocity i 3, pose j 6, velocity j 3, gravity 3, parameters 25]``.
+    """
+    dt = preintegrated.duration_s
+    i_R_nav = nav_T_i[:3, :3].T.copy()
+    i_R_j = i_R_nav @ nav_T_j[:3, :3].copy()
+    off = preintegrated.rotation.T.copy() @ i_R_j
+    by_rotation = so3_log(off)
+    by_velocity = i_R_nav @ (velocity_j - velocity_i - dt * gravity)
+    by_position = i_R_nav @ (nav_T_j[:3, 3] - nav_T_i[:3, 3] - dt * velocity_i - 0.5 * dt * dt * gravity)
+    inverse = so3_right_jacobian_inverse(by_rotation)
+    by_first, by_imu = -inverse @ i_R_j.T.copy(), -inverse @ off.T.copy()
+    error, jacobian = np.empty(9), np.zeros((9, _COLUMNS))
+    for r in range(3):
+        error[r] = by_rotation[r]
+        error[3 + r] = by_velocity[r] - preintegrated.velocity[r]
+        error[6 + r] = by_position[r] - preintegrated.position[r]
+        jacobian[6 + r, 3 + r] = -1.0
+        for c in range(3):
+            jacobian[r, c], jacobian[r, _POSE_J + c] = by_first[r, c], inverse[r, c]
+            jacobian[6 + r, _POSE_J + 3 + c] = i_R_j[r, c]
+            jacobian[3 + r, _VELOCITY_I + c], jacobian[3 + r, _VELOCITY_J + c] = -i_R_nav[r, c], i_R_nav[r, c]
+            jacobian[6 + r, _VELOCITY_I + c] = -dt * i_R_nav[r, c]
+            jacobian[3 + r, _GRAVITY_AT + c] = -dt * i_R_nav[r, c]
+            jacobian[6 + r, _GRAVITY_AT + c] = -0.5 * dt * dt * i_R_nav[r, c]
+        for c in range(PARAMETERS):
+            at = _PARAMETERS_AT + c
+            for k in range(3):
+                jacobian[r, at] += by_imu[r, k] * preintegrated.jacobian[k, c]
+            jacobian[3 + r, at] = -preintegrated.jacobian[3 + r, c]
+            jacobian[6 + r, at] = -preintegrated.jacobian[6 + r, c]
+    _put_skew(by_velocity, jacobian[3:6, :3])
+    _put_skew(by_position, jacobian[6:9, :3])
+    return error, jacobian
+
+
+@kernel
+def _put_skew(v: Float, out: Float) -> None:
+    """Fill the matrix (3, 3) of the cross product; the diagonal stays."""
+    out[0, 1], out[0, 2], out[1, 2] = -v[2], v[1], -v[0]
+    out[1, 0], out[2, 0], out[2, 1] = v[2], -v[1], v[0]
+
+
+@kernel
+def whitener_of(covariance: Float) -> Float:
+    """Return the inverse (N, N) of a covariance's lower Cholesky factor: it makes errors independent, of variance 1."""
+    n = len(covariance)
+    lower, inverse = np.zeros((n, n)), np.zeros((n, n))
+    for r in range(n):
+        for c in range(r + 1):
+            total = covariance[r, c]
+            for k in range(c):
+                total -= lower[r, k] * lower[c, k]
+            lower[r, c] = np.sqrt(total) if c == r else total / lower[c, c]
+    for r in range(n):
+        inverse[r, r] = 1.0 / lower[r, r]
+        for c in range(r):
+            total = 0.0
+            for k in range(c, r):
+                total -= lower[r, k] * inverse[k, c]
+            inverse[r, c] = total * inverse[r, r]
+    return inverse
+
+
+@kernel
+def inertial_equations(samples: InertialSamples, states: InertialStates) -> InertialEquations:
+    """Linearise the inertial errors of all intervals of a window, with the IMU integrated by the states' parameters."""
+    n = len(states.poses)
+    size = 9 * n + GRAVITY + PARAMETERS
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    errors2, cost = np.full(max(n - 1, 0), np.nan), 0.0
+    columns, row = np.empty(_COLUMNS, dtype=np.int64), np.empty(_COLUMNS)
+    for i in range(n - 1):
+        start_ns, end_ns = samples.keyframes_ns[i], samples.keyframes_ns[i + 1]
+        first, last = covering_samples(
+            samples.stamps_ns, start_ns, end_ns, states.parameters[TIME_OFFSET], samples.max_gap_ns
+        )
+        if last < 0:
+            continue
+        preintegrated = integrate_samples(
+            samples.stamps_ns, samples.readings, first, last, start_ns, end_ns, states.parameters,
+            samples.noise_densities,
+        )  # fmt: skip
+        error, jacobian = inertial_residual(
+            states.poses[i], states.velocities[i], states.poses[i + 1], states.velocities[i + 1], states.gravity,
+            preintegrated,
+        )  # fmt: skip
+        _put_columns(n, i, columns)
+        whitener, error2 = whitener_of(preintegrated.covariance), 0.0
+        for r in range(9):
+            put(row, np.zeros(_COLUMNS))
+            whitened = 0.0
+            for k in range(r + 1):
+                whitened += whitener[r, k] * error[k]
+                for c in range(_COLUMNS):
+                    row[c] += whitener[r, k] * jacobian[k, c]
+            error2 += whitened * whitened
+            for c in range(_COLUMNS):
+                gradient[columns[c]] += row[c] * whitened
+                for d in range(c, _COLUMNS):
+                    one, other = min(columns[c], columns[d]), max(columns[c], columns[d])
+                    hessian[one, other] += row[c] * row[d]
+        errors2[i] = error2
+        cost += 0.5 * error2
+    for c in range(size):
+        for d in range(c):
+            hessian[c, d] = hessian[d, c]
+    return InertialEquations(hessian, gradient, cost, errors2)
+
+
+@kernel
+def _put_columns(n_keyframes: int, i: int, columns: Int) -> None:
+    """Fill where the columns (46,) of `inertial_residual` are in the window's equations."""
+    for c in range(POSE):
+        columns[c], columns[_POSE_J + c] = POSE * i + c, POSE * (i + 1) + c
+    for c in range(VELOCITY):
+        at = POSE * n_keyframes + VELOCITY * i + c
+        columns[_VELOCITY_I + c], columns[_VELOCITY_J + c] = at, at + VELOCITY
+    for c in range(GRAVITY + PARAMETERS):
+        columns[_GRAVITY_AT + c] = 9 * n_keyframes + c
