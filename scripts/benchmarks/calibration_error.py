@@ -3,52 +3,26 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
 import yaml
 
+from benchmarks.calibration_cases import EXACT, Case, append_outcome, load_outcomes
 from benchmarks.calibration_runs import CalibrationOutcome, WronglyCalibrated
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import Report, log_progress, machine, writing
+from benchmarks.report import Report, log_progress, machine
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.simulation import RIG_CHANGES, SCENE_NAMES
 from graphvio.simulation.calibration_error import COMPONENTS, LEVELS, CalibrationError
 
-EXACT = 0
-"""The level of exact files."""
 _SCENES = ("room", "corridor", "stairs", "calibration")
 _BOTH = "both"
 _PAIRS = {_BOTH: (0, 1), "front": (0,), "back": (1,)}
+_ROUNDING = 1e-6
 _OUT = Path("results") / "benchmarks" / "calibration-error.csv"
-
-
-@dataclass(frozen=True)
-class _Case:
-    """One run: the columns of the CSV file by which it is found again."""
-
-    scene: str
-    duration_s: str
-    rig_change: str
-    level: int
-    components: str
-    seed: int
-    config: str
-    pairs: str
-    imu: str
-
-    @property
-    def key(self) -> tuple[str, ...]:
-        return tuple(str(value) for value in vars(self).values())
-
-
-_FIGURES = ("ate_cm", "epochs", "posed_percent", "frameset_ms", "before", "after")
-_HEAD = (*_Case.__dataclass_fields__, *_FIGURES)
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -108,8 +82,8 @@ def run_all(args: argparse.Namespace) -> None:
     config = _config(args.config, args.set)
     report = Report()
     report.add(machine())
-    results: dict[_Case, CalibrationOutcome] = {}
-    known = _load(args.out) if args.resume else {}
+    results: dict[Case, CalibrationOutcome] = {}
+    known = load_outcomes(args.out) if args.resume else {}
     try:
         for scene in args.scenes:
             folder = _rendered(args, scene)
@@ -122,10 +96,11 @@ def run_all(args: argparse.Namespace) -> None:
                 walk = WronglyCalibrated(folder, scene, args.duration, args.rig_change, errors[level], seed)
                 for case in missing:
                     results[case] = walk.run(config, _PAIRS[case.pairs], case.imu == "yes")
-                    _append(args.out, case, results[case])
+                    append_outcome(args.out, case, results[case])
                     print(_line(case, results[case]), flush=True)
     except KeyboardInterrupt:
         log_progress("interrupted; the tables show what was done")
+        args.docs = False
     _tables(report, results)
     if args.docs:
         report.save_to_docs("calibration-error")
@@ -151,13 +126,10 @@ def _config(profile: str, assignments: Sequence[str]) -> Config:
     values = yaml.safe_load(Config.load(profile).to_yaml())
     for assignment in assignments:
         name, equals, value = assignment.partition("=")
-        *stages, last = name.split(".")
-        if not equals or not last:
+        stage, dot, key = name.partition(".")
+        if not (equals and dot and stage and key):
             raise GraphvioError(f"--set {assignment}: give stage.name=value, such as smoother.lag_s=3")
-        inner = values
-        for stage in stages:
-            inner = inner.setdefault(stage, {})
-        inner[last] = yaml.safe_load(value)
+        values.setdefault(stage, {})[key] = yaml.safe_load(value)
     return Config.from_yaml(yaml.safe_dump(values), "--set")
 
 
@@ -168,7 +140,7 @@ def _draws(levels: Sequence[int], first_seed: int, seeds: int) -> Iterator[tuple
             yield level, 0 if level == EXACT else seed
 
 
-def _cases(args: argparse.Namespace, scene: str, level: int, seed: int) -> Iterator[_Case]:
+def _cases(args: argparse.Namespace, scene: str, level: int, seed: int) -> Iterator[Case]:
     duration = "whole" if args.duration is None else f"{args.duration:g}"
     components = "all" if args.components is None or level == EXACT else " ".join(sorted(args.components))
     config = " ".join([args.config, *sorted(args.set)])
@@ -176,10 +148,10 @@ def _cases(args: argparse.Namespace, scene: str, level: int, seed: int) -> Itera
         if (imu == "yes" and args.no_imu) or (imu == "no" and args.imu):
             continue
         for pairs in args.pairs:
-            yield _Case(scene, duration, args.rig_change or "none", level, components, seed, config, pairs, imu)
+            yield Case(scene, duration, args.rig_change or "none", level, components, seed, config, pairs, imu)
 
 
-def _line(case: _Case, outcome: CalibrationOutcome) -> str:
+def _line(case: Case, outcome: CalibrationOutcome) -> str:
     draw = "exact files" if case.level == EXACT else f"level {case.level}, {case.components}, seed {case.seed}"
     posed = "" if outcome.posed_percent > 99.0 else f", {outcome.posed_percent:.0f} % with pose"
     epochs = "" if outcome.epochs == 1 else f", {outcome.epochs} epochs"
@@ -190,7 +162,7 @@ def _line(case: _Case, outcome: CalibrationOutcome) -> str:
     )
 
 
-def _tables(report: Report, results: dict[_Case, CalibrationOutcome]) -> None:
+def _tables(report: Report, results: dict[Case, CalibrationOutcome]) -> None:
     """Print the accuracy of each scene and level, and the errors of the parameters before and after."""
     groups = list(dict.fromkeys((case.scene, case.level, case.imu) for case in results))
     rows, parameter_rows = [], []
@@ -219,7 +191,7 @@ def _tables(report: Report, results: dict[_Case, CalibrationOutcome]) -> None:
             for case, outcome in results.items()
             if (case.scene, case.level, case.imu, case.pairs) == (scene, level, imu, _BOTH)
         ]
-        if level != EXACT and both:
+        if any(error > _ROUNDING for outcome in both for error in outcome.before.values()):
             parameter_rows.append([scene, _name(level), imu, *(_before_after(both, name) for name in _PARAMETERS)])
     if not rows:
         return
@@ -273,38 +245,3 @@ def _ratio(value: float) -> str:
 
 def _name(level: int) -> str:
     return "exact" if level == EXACT else f"{level}"
-
-
-def _append(path: Path, case: _Case, outcome: CalibrationOutcome) -> None:
-    with writing(path):
-        is_new = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.writer(file)
-            if is_new:
-                writer.writerow(_HEAD)
-            before, after = (
-                json.dumps({k: round(v, 6) for k, v in e.items()}) for e in (outcome.before, outcome.after)
-            )
-            figures = (outcome.epochs, f"{outcome.posed_percent:.2f}", f"{outcome.frameset_ms:.2f}")
-            writer.writerow([*case.key, f"{100 * outcome.ate_m:.4f}", *figures, before, after])
-
-
-def _load(path: Path) -> dict[tuple[str, ...], CalibrationOutcome]:
-    """Return the runs in a CSV file, by their settings; of equal ones the last."""
-    if not path.exists():
-        return {}
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    if rows and tuple(rows[0]) != _HEAD:
-        raise GraphvioError(f"{path}: has other columns than this benchmark writes; name another file with --out")
-    return {
-        tuple(row[name] for name in _Case.__dataclass_fields__): CalibrationOutcome(
-            ate_m=0.01 * float(row["ate_cm"]),
-            epochs=int(row["epochs"]),
-            posed_percent=float(row["posed_percent"]),
-            frameset_ms=float(row["frameset_ms"]),
-            before=json.loads(row["before"]),
-            after=json.loads(row["after"]),
-        )
-        for row in rows
-    }

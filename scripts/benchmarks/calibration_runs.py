@@ -35,7 +35,7 @@ class CalibrationOutcome:
         posed_percent: framesets that have a pose.
         frameset_ms: mean wall time of a frameset, with its decoding.
         before: parameter with unit -> rms of its errors in the files, against the true rig at the end.
-        after: the same of the rig that the odometry estimated; empty if it estimates none.
+        after: the same of what the odometry estimated; nothing of what it does not estimate.
     """
 
     ate_m: float
@@ -103,14 +103,18 @@ class WronglyCalibrated:
             ate_m = evaluate(estimated, self._truth).ate_position_m.rmse
         except TrajectoryError:
             ate_m = np.inf
-        refined = getattr(odometry, "refined_rig", None)
+        refined: Rig | None = getattr(odometry, "refined_rig", None)
+        after = _rms(refined, true) if refined is not None else {}
+        offset_s = estimates[-1].time_offset_s if estimates else None
+        if offset_s is not None and true.imu is not None:
+            after["time_offset_ms"] = 1e3 * abs(offset_s - true.imu.time_offset_s)
         return CalibrationOutcome(
             ate_m=ate_m,
             epochs=len({e.epoch for e in posed}),
             posed_percent=100.0 * len(posed) / max(len(estimates), 1),
             frameset_ms=1e3 * wall_s / max(len(estimates), 1),
             before=_rms(written, true),
-            after=_rms(refined, true) if refined is not None else {},
+            after=after,
         )
 
     def _measurements(self, rig: Rig) -> Iterator[Measurement]:

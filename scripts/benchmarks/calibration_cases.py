@@ -1,0 +1,98 @@
+"""The cases of the calibration-error benchmark and their results, in a CSV file from which it can go on."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.calibration_runs import CalibrationOutcome
+from benchmarks.report import writing
+from graphvio.errors import GraphvioError
+
+EXACT = 0
+"""The level of exact files."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run: the columns of the CSV file by which it is found again.
+
+    Attributes:
+        scene: name.
+        duration_s: of the recording, or ``whole``.
+        rig_change: of the true rig, or ``none``.
+        level: of the calibration error, or `EXACT`.
+        components: of the calibration error, or ``all``.
+        seed: by which it was sampled.
+        config: profile, and the values that were set.
+        pairs: which took part.
+        imu: ``yes`` or ``no``.
+    """
+
+    scene: str
+    duration_s: str
+    rig_change: str
+    level: int
+    components: str
+    seed: int
+    config: str
+    pairs: str
+    imu: str
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """The values as texts."""
+        return tuple(str(value) for value in vars(self).values())
+
+
+_SETTINGS = tuple(Case.__dataclass_fields__)
+_FIGURES = ("ate_cm", "epochs", "posed_percent", "frameset_ms", "before", "after")
+
+
+def append_outcome(path: Path, case: Case, outcome: CalibrationOutcome) -> None:
+    """Add a run to a CSV file, which is made if it is missing.
+
+    Raises:
+        GraphvioError: if it cannot be written.
+    """
+    with writing(path):
+        is_new = not path.exists()
+        with path.open("a", newline="") as file:
+            writer = csv.writer(file)
+            if is_new:
+                writer.writerow((*_SETTINGS, *_FIGURES))
+            figures = (f"{100 * outcome.ate_m:.4f}", outcome.epochs, f"{outcome.posed_percent:.2f}")
+            writer.writerow(
+                [*case.key, *figures, f"{outcome.frameset_ms:.2f}", _json(outcome.before), _json(outcome.after)]
+            )
+
+
+def load_outcomes(path: Path) -> dict[tuple[str, ...], CalibrationOutcome]:
+    """Return the runs in a CSV file by `Case.key`; of equal ones the last.
+
+    Raises:
+        GraphvioError: if the file has other columns.
+    """
+    if not path.exists():
+        return {}
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    if rows and tuple(rows[0]) != (*_SETTINGS, *_FIGURES):
+        raise GraphvioError(f"{path}: has other columns than this benchmark writes; name another file with --out")
+    return {
+        tuple(row[name] for name in _SETTINGS): CalibrationOutcome(
+            ate_m=0.01 * float(row["ate_cm"]),
+            epochs=int(row["epochs"]),
+            posed_percent=float(row["posed_percent"]),
+            frameset_ms=float(row["frameset_ms"]),
+            before=json.loads(row["before"]),
+            after=json.loads(row["after"]),
+        )
+        for row in rows
+    }
+
+
+def _json(errors: dict[str, float]) -> str:
+    return json.dumps({name: round(error, 6) for name, error in errors.items()})
