@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import median
 
@@ -164,39 +164,26 @@ def _line(case: Case, outcome: CalibrationOutcome) -> str:
 
 def _tables(report: Report, results: dict[Case, CalibrationOutcome]) -> None:
     """Print the accuracy of each scene and level, and the errors of the parameters before and after."""
-    groups = list(dict.fromkeys((case.scene, case.level, case.imu) for case in results))
+    by_group: dict[tuple[str, int, str], dict[str, dict[int, CalibrationOutcome]]] = {}
+    for case, outcome in results.items():
+        of_pairs = by_group.setdefault((case.scene, case.level, case.imu), {pairs: {} for pairs in _PAIRS})
+        of_pairs[case.pairs][case.seed] = outcome
     rows, parameter_rows = [], []
-    for scene, level, imu in groups:
-        ates = {
-            pairs: {
-                case.seed: outcome.ate_m
-                for case, outcome in results.items()
-                if (case.scene, case.level, case.imu, case.pairs) == (scene, level, imu, pairs)
-            }
-            for pairs in _PAIRS
-        }
-        exact = {
-            case.pairs: outcome.ate_m
-            for case, outcome in results.items()
-            if (case.scene, case.level, case.imu) == (scene, EXACT, imu)
-        }
-        single = {seed: min(ates["front"][seed], ates["back"][seed]) for seed in ates["front"] if seed in ates["back"]}
-        against_single = [ates[_BOTH][seed] / single[seed] for seed in ates[_BOTH] if seed in single]
-        cells = [_two(ates[pairs].values(), _cm) for pairs in _PAIRS]
-        ratio = _ratio(median(ates[_BOTH].values()) / exact[_BOTH]) if ates[_BOTH] and _BOTH in exact else "-"
-        count = max(len(each) for each in ates.values())
-        rows.append([scene, _name(level), imu, f"{count}", *cells, ratio, _two(against_single, _ratio)])
-        both = [
-            outcome
-            for case, outcome in results.items()
-            if (case.scene, case.level, case.imu, case.pairs) == (scene, level, imu, _BOTH)
-        ]
+    for (scene, level, imu), runs in by_group.items():
+        here = [scene, "exact" if level == EXACT else f"{level}", imu]
+        exact = by_group.get((scene, EXACT, imu))
+        rows.append([*here, *_accuracy_cells(runs, exact[_BOTH].get(0) if exact is not None else None)])
+        both = list(runs[_BOTH].values())
         if any(error > _ROUNDING for outcome in both for error in outcome.before.values()):
-            parameter_rows.append([scene, _name(level), imu, *(_before_after(both, name) for name in _PARAMETERS)])
+            parameter_rows.append([*here, *(_before_after(both, name) for name in _PARAMETERS)])
     if not rows:
         return
-    report.add("#### Accuracy", "ATE in cm, median / worst of the draws; ratios are of medians, then of each draw.")
-    head = ["scene", "level", "IMU", "draws", *_PAIRS, "both / exact files", "both / better single"]
+    report.add(
+        "#### Accuracy",
+        "ATE in cm and ratio to the better single pair: median / worst of the draws. Ratio to the exact files: of the "
+        "medians. With pose: framesets of the worst draw, by all pairs.",
+    )
+    head = ["scene", "level", "IMU", "draws", *_PAIRS, "both / exact files", "both / better single", "with pose, %"]
     report.table(head, rows)
     if parameter_rows:
         report.add(
@@ -204,6 +191,26 @@ def _tables(report: Report, results: dict[Case, CalibrationOutcome]) -> None:
             "Rms errors of the files -> of the rig that the odometry estimated with both pairs; medians of the draws.",
         )
         report.table(["scene", "level", "IMU", *_PARAMETERS.values()], parameter_rows)
+
+
+def _accuracy_cells(runs: dict[str, dict[int, CalibrationOutcome]], exact: CalibrationOutcome | None) -> list[str]:
+    """The cells of a row from the number of draws on, by the runs of each choice of pairs and seed."""
+    both, front, back = (runs[pairs] for pairs in _PAIRS)
+    against_exact = "-"
+    if both and exact is not None:
+        against_exact = f"{median(run.ate_m for run in both.values()) / exact.ate_m:.2f}"
+    against_single = [
+        run.ate_m / min(front[seed].ate_m, back[seed].ate_m)
+        for seed, run in both.items()
+        if seed in front and seed in back
+    ]
+    return [
+        f"{max(len(each) for each in runs.values())}",
+        *(_median_and_worst([100 * run.ate_m for run in each.values()]) for each in (both, front, back)),
+        against_exact,
+        _median_and_worst(against_single),
+        f"{min(run.posed_percent for run in both.values()):.0f}" if both else "-",
+    ]
 
 
 _PARAMETERS = {
@@ -230,18 +237,5 @@ def _figure(values: Sequence[float]) -> str:
     return f"{median(values):.2g}" if values else "-"
 
 
-def _two(values: object, form: Callable[[float], str]) -> str:
-    each = list(values)  # type: ignore[call-overload]
-    return f"{form(median(each))} / {form(max(each))}" if each else "-"
-
-
-def _cm(metres: float) -> str:
-    return f"{100 * metres:.2f}"
-
-
-def _ratio(value: float) -> str:
-    return f"{value:.2f}"
-
-
-def _name(level: int) -> str:
-    return "exact" if level == EXACT else f"{level}"
+def _median_and_worst(values: Sequence[float]) -> str:
+    return f"{median(values):.2f} / {max(values):.2f}" if values else "-"
