@@ -234,7 +234,7 @@ def _before_after(outcomes: Sequence[CalibrationOutcome], name: str) -> str:
 
 
 def _figure(values: Sequence[float]) -> str:
-    return f"{median(values):.2g}" if values else "-"
+    return f"{round(median(values), 6):.2g}" if values else "-"
 
 
 def _median_and_worst(values: Sequence[float]) -> str:
