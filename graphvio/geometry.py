@@ -224,7 +224,10 @@ def _left_coupling(phi: Float, rho: Float) -> Float:
     return 0.5 * r + c1 * (pr + rp + prp) + c2 * (p @ pr + rp @ p - 3.0 * prp) + c3 * (prp @ p + p @ prp)
 
 
+@kernel
 def interpolate(a_T_b0: Float, a_T_b1: Float, fraction: float) -> Float:
     """Interpolate between two poses (4, 4): position on the chord, rotation at a constant rate; fraction 0 to 1."""
-    rotation = so3_exp(fraction * so3_log(a_T_b0[:3, :3].T @ a_T_b1[:3, :3]))
-    return se3(a_T_b0[:3, :3] @ rotation, (1.0 - fraction) * a_T_b0[:3, 3] + fraction * a_T_b1[:3, 3])
+    R_0, R_1 = np.ascontiguousarray(a_T_b0[:3, :3]), np.ascontiguousarray(a_T_b1[:3, :3])
+    return se3(
+        R_0 @ so3_exp(fraction * so3_log(R_0.T @ R_1)), (1.0 - fraction) * a_T_b0[:3, 3] + fraction * a_T_b1[:3, 3]
+    )

@@ -9,6 +9,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Int
 from graphvio.errors import TrajectoryError
 from graphvio.geometry import interpolate
+from graphvio.kernels import kernel, put
 
 _NS_PER_S = 1_000_000_000
 
@@ -103,14 +104,22 @@ class Trajectory:
         lower = np.maximum(upper - 1, 0)
         gap_ns = self.stamps_ns[upper] - self.stamps_ns[lower]
         known = equal | (inside & (gap_ns <= round(max_gap_s * _NS_PER_S)))
-        poses = np.empty((int(known.sum()), 4, 4))
-        for row, k in enumerate(np.flatnonzero(known)):
-            if equal[k]:
-                poses[row] = self.nav_T_body[after[k]]
-                continue
-            fraction = float(stamps[k] - self.stamps_ns[lower[k]]) / float(gap_ns[k])
-            poses[row] = interpolate(self.nav_T_body[lower[k]], self.nav_T_body[upper[k]], fraction)
-        return Trajectory(stamps[known], poses), known
+        poses = np.empty((len(stamps), 4, 4))
+        poses[equal] = self.nav_T_body[after[equal]]
+        between = known & ~equal
+        lower, upper = lower[between], upper[between]
+        fractions = (stamps[between] - self.stamps_ns[lower]) / gap_ns[between]
+        poses[between] = _interpolated(self.nav_T_body, lower, upper, fractions)
+        return Trajectory(stamps[known], poses[known]), known
+
+
+@kernel
+def _interpolated(nav_T_body: Float, lower: Int, upper: Int, fractions: Float) -> Float:
+    """Interpolate (M, 4, 4) between rows ``lower`` and ``upper`` of poses (N, 4, 4)."""
+    poses = np.empty((len(lower), 4, 4))
+    for row in range(len(lower)):
+        put(poses[row], interpolate(nav_T_body[lower[row]], nav_T_body[upper[row]], fractions[row]))
+    return poses
 
 
 def travelled(positions: Float) -> Float:

@@ -90,7 +90,9 @@ def straight(time_s: float) -> Float:
     return moved
 
 
-def motions(walk: Walk, to_camera: Float, rng: np.random.Generator, moved: Float | None = None) -> CameraMotions:
+def motions(
+    walk: Walk, to_camera: Float, rng: np.random.Generator, moved: Float | None = None, period_ns: int = PERIOD_NS
+) -> CameraMotions:
     """Motions that a camera on the walk measures from frame to frame.
 
     Args:
@@ -98,11 +100,12 @@ def motions(walk: Walk, to_camera: Float, rng: np.random.Generator, moved: Float
         to_camera: pose of the camera in the first one.
         rng: source of errors.
         moved: pose in the first camera from the middle of the walk on, if it was moved on the rig.
+        period_ns: between frames, of a walk of the same duration.
     """
-    stamps = [k * PERIOD_NS for k in range(FRAMES)]
+    stamps = list(range(0, FRAMES * PERIOD_NS, period_ns))
     measured = []
-    for k in range(1, FRAMES):
-        place = to_camera if moved is None or k < FRAMES // 2 else moved
+    for k in range(1, len(stamps)):
+        place = to_camera if moved is None or k < len(stamps) // 2 else moved
         one, other = (walk(stamps[i] * 1e-9) @ place for i in (k - 1, k))
         motion = np.linalg.inv(one) @ other @ se3_exp(SIGMAS * rng.standard_normal(6))
         measured.append(RelativeMotion(stamps[k - 1], stamps[k], motion, np.diag(SIGMAS**2), np.zeros((6, 6)), 200))

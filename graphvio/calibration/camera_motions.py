@@ -112,11 +112,19 @@ class CameraMotions:
         )
 
     def _between_own(self, start_ns: int, end_ns: int) -> tuple[Float, Float] | None:
-        above_start, above_end = self._ancestors(start_ns), self._ancestors(end_ns)
-        common = next((stamp for stamp in above_end if stamp in set(above_start)), None)
-        if common is None:
-            return None
-        ups, downs = above_start[: above_start.index(common)], above_end[: above_end.index(common)]
+        ups: list[int] = []
+        downs: list[int] = []
+        up, down = start_ns, end_ns
+        while up != down:  # a reference is earlier than what is measured from it: the later of both goes back
+            path, later = (ups, up) if up > down else (downs, down)
+            if later not in self._reference:
+                return None
+            path.append(later)
+            if up > down:
+                up = self._reference[later]
+            else:
+                down = self._reference[later]
+        common = up
         motion, covariance = np.eye(4), np.zeros((6, 6))
         for i, stamp in enumerate(ups):
             if i:  # from the reference to itself as seen
@@ -141,13 +149,6 @@ class CameraMotions:
 
     def _shared_of(self, reference_ns: int) -> Float:
         return self._shared.get(reference_ns, np.zeros((6, 6)))
-
-    def _ancestors(self, stamp_ns: int) -> list[int]:
-        """Return an instant, its reference, the reference of that, and so on."""
-        line = [stamp_ns]
-        while line[-1] in self._reference:
-            line.append(self._reference[line[-1]])
-        return line
 
 
 class _Placed(NamedTuple):

@@ -150,10 +150,15 @@ def whitened(
 @kernel
 def error_of(left2_T_left1: Float, motion_1: Float, motion_2: Float) -> tuple[Float, Float]:
     """Compute the error (6,) of a pose pair in left2 at the end, and its derivative (6, 6) by the tangent in left1."""
-    seen = left2_T_left1 @ motion_1 @ se3_inverse(left2_T_left1)
-    error = se3_log(se3_inverse(motion_2) @ seen)
+    error = _error(left2_T_left1, motion_1, motion_2)
     by_tangent = se3_adjoint(left2_T_left1) @ (se3_adjoint(se3_inverse(motion_1)) - np.eye(6))
     return error, se3_right_jacobian_inverse(error) @ by_tangent
+
+
+@kernel
+def _error(left2_T_left1: Float, motion_1: Float, motion_2: Float) -> Float:
+    seen = left2_T_left1 @ motion_1 @ se3_inverse(left2_T_left1)
+    return se3_log(se3_inverse(motion_2) @ seen)
 
 
 @kernel
@@ -161,8 +166,7 @@ def errors_of(left2_T_left1: Float, motions_1: Float, motions_2: Float) -> Float
     """Compute the errors (N, 6) of N pose pairs, see `error_of`."""
     errors = np.empty((len(motions_1), 6))
     for i in range(len(motions_1)):
-        error, _ = error_of(left2_T_left1, motions_1[i], motions_2[i])
-        put(errors[i], error)
+        put(errors[i], _error(left2_T_left1, motions_1[i], motions_2[i]))
     return errors
 
 
