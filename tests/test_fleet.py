@@ -87,7 +87,10 @@ def config(folder: Path) -> Config:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0") as made:
+    undrawn = str(Path(__file__).with_name("undrawn.py"))
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", preload=[undrawn]
+    ) as made:
         yield made
 
 
