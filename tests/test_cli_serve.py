@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import graphvio
 
 from graphvio.cli.shared import EXIT_INTERRUPTED
 from graphvio.errors import ServiceError
@@ -110,21 +111,19 @@ def test_serve_second_ctrl_c_does_not_wait_for_readers(room_walk: Path) -> None:
     ],
 )
 def test_serve_wrong_option_is_one_line(room_walk: Path, arguments: tuple[str, ...], expected: str) -> None:
-    process = serve(f"replay:{room_walk}", *arguments)
-    _, errors = process.communicate(timeout=SOON_S)
-    assert process.returncode == 2
-    assert expected in errors
-    assert len(errors.strip().splitlines()) == 1
+    done = graphvio("serve", f"replay:{room_walk}", *arguments)
+    assert done.returncode == 2
+    assert expected in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_serve_wrong_keys_or_port_leave_no_recording(room_walk: Path, tmp_path: Path) -> None:
     def refusal(*arguments: object) -> str:
-        process = serve(f"replay:{room_walk}", *arguments, "--record", tmp_path / "walk.mcap")
-        _, errors = process.communicate(timeout=SOON_S)
-        assert process.returncode == 2
-        assert len(errors.strip().splitlines()) == 1
+        done = graphvio("serve", f"replay:{room_walk}", *arguments, "--record", tmp_path / "walk.mcap")
+        assert done.returncode == 2
+        assert len(done.stderr.strip().splitlines()) == 1
         assert not (tmp_path / "walk.mcap").exists()
-        return errors
+        return done.stderr
 
     for name in ("server.pem", "server.key", "token"):
         (tmp_path / name).write_text("short\n")

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import free_options
+from command_line import graphvio
 from ros2_loopback import URI, free_domain
 
 from graphvio import load_trajectory, open_source
@@ -77,7 +78,7 @@ def test_slam_localises_in_a_saved_map(made: Path, room_walk: Path, tmp_path: Pa
 
 
 def test_slam_missing_map_is_refused_before_the_source_opens(tmp_path: Path) -> None:
-    done = slam("replay:no-recording", "--map", tmp_path / "nowhere")
+    done = graphvio("slam", "replay:no-recording", "--map", tmp_path / "nowhere")
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"graphvio: {tmp_path / 'nowhere'}: is no map")

@@ -136,6 +136,7 @@ class System:
 @pytest.fixture
 def system(monkeypatch: pytest.MonkeyPatch) -> Iterator[System]:
     monkeypatch.setenv("CYCLONEDDS_URI", URI)
+    monkeypatch.setattr("graphvio.ros2.publisher._PERIOD_S", 0.1)  # of what tests wait for
     made = System(free_domain())
     yield made
     made.close()
