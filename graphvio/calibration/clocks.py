@@ -29,17 +29,11 @@ _NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True)
 class ClockRelation:
-    """Offset and drift between the clocks of two trajectories.
+    """Offset and drift between the clocks of two trajectories."""
 
-    Attributes:
-        offset_ns: add it to a stamp of the first to get the second's of the same instant, at `at_ns`.
-        drift: rate at which the offset grows, seconds per second.
-        at_ns: an instant in the middle, by the first clock.
-    """
-
-    offset_ns: int
-    drift: float
-    at_ns: int
+    offset_ns: int  # add it to a stamp of the first to get the second's of the same instant, at `at_ns`
+    drift: float  # rate at which the offset grows, seconds per second
+    at_ns: int  # an instant in the middle, by the first clock
 
     def of(self, stamps_ns: Int) -> Int:
         """Convert stamps (N,) of the first clock to the second."""
@@ -75,15 +69,10 @@ def first_relation(one: Trajectory, other: Trajectory, same_clock: bool) -> Cloc
 
 
 class ClockOffset(NamedTuple):
-    """The offset between two clocks.
+    """The offset between two clocks."""
 
-    Attributes:
-        offset_ns: add it to a stamp of the first clock to get that of the second one at the same instant.
-        correlation: of the angular speeds at that offset, at most 1.
-    """
-
-    offset_ns: int
-    correlation: float
+    offset_ns: int  # add it to a stamp of the first clock to get that of the second one at the same instant
+    correlation: float  # of the angular speeds at that offset, at most 1
 
 
 def find_offset(one: Trajectory, other: Trajectory) -> ClockOffset:

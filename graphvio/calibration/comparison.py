@@ -25,19 +25,12 @@ _LINEARISATION = 0.1  # error of the first-order propagation, in the solution's 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two solutions of one calibration, in the directions that the motions determine.
+    """Two solutions of one calibration, in the directions that the motions determine."""
 
-    Attributes:
-        difference: (6,) tangent from the graph's solution to the paper's, ``[rotation, translation]`` in left1.
-        covariance: (6, 6) of the difference due to the noise of the motions.
-        determined: (K, 6) orthonormal directions in which they are compared.
-        paper_covariance: (6, 6) of the paper's solution, which does not weight the motions, due to the same noise.
-    """
-
-    difference: Float
-    covariance: Float
-    determined: Float
-    paper_covariance: Float
+    difference: Float  # (6,) tangent from the graph's solution to the paper's, ``[rotation, translation]`` in left1
+    covariance: Float  # (6, 6) of the difference due to the noise of the motions
+    determined: Float  # (K, 6) orthonormal directions in which they are compared
+    paper_covariance: Float  # (6, 6) of the paper's solution, which does not weight the motions, due to the same noise
 
     @property
     def statistic(self) -> float:

@@ -29,17 +29,11 @@ _MAX_STEP = 0.5  # radians and metres: from few motions the first steps may lead
 
 
 class Consensus(NamedTuple):
-    """A solution that most pose pairs agree on.
+    """A solution that most pose pairs agree on."""
 
-    Attributes:
-        left2_T_left1: (4, 4).
-        nuisances: (M,) values of the nuisance variables.
-        squares: (N,) squared Mahalanobis distances of all pose pairs' errors.
-    """
-
-    left2_T_left1: Float
-    nuisances: Float
-    squares: Float
+    left2_T_left1: Float  # (4, 4)
+    nuisances: Float  # (M,) values of the nuisance variables
+    squares: Float  # (N,) squared Mahalanobis distances of all pose pairs' errors
 
     @property
     def inlier(self) -> Bool:

@@ -24,26 +24,17 @@ _HELD_SIGMA = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class GraphSolution:
-    """The graph's solution.
+    """The graph's solution."""
 
-    Attributes:
-        left2_T_left1: (4, 4), the paper's P_12.
-        covariance: (6, 6) of left2_T_left1, tangent ``[rotation, translation]`` in left1; very large in directions
-            that the motions do not determine.
-        inlier: (N,) pose pairs that are not outliers.
-        squares: (N,) squared Mahalanobis distances of all pose pairs' errors, 6 degrees of freedom each.
-        observability: of left2_T_left1 from the inliers.
-        nuisances: (M,) values of the nuisance variables.
-        nuisance_covariance: (M, M) of these.
-    """
-
-    left2_T_left1: Float
+    left2_T_left1: Float  # (4, 4), the paper's P_12
+    # (6, 6) of left2_T_left1, tangent ``[rotation, translation]`` in left1; very large in directions that the motions
+    # do not determine
     covariance: Float
-    inlier: Bool
-    squares: Float
-    observability: Observability
-    nuisances: Float
-    nuisance_covariance: Float
+    inlier: Bool  # (N,) pose pairs that are not outliers
+    squares: Float  # (N,) squared Mahalanobis distances of all pose pairs' errors, 6 degrees of freedom each
+    observability: Observability  # of left2_T_left1 from the inliers
+    nuisances: Float  # (M,) values of the nuisance variables
+    nuisance_covariance: Float  # (M, M) of these
 
 
 def solve(pairs: PosePairs, start: Float, nuisances: Nuisances | None = None) -> GraphSolution:

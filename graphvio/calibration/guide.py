@@ -24,21 +24,13 @@ _INITIAL_ADVICE = "turn the rig about two axes, one after the other, by 30 degre
 
 @dataclass(frozen=True)
 class Advice:
-    """Accuracy so far of the pair whose pose is least accurate.
+    """Accuracy so far of the pair whose pose is least accurate."""
 
-    Attributes:
-        name: of the pair.
-        motions: number of its motions.
-        rotation_sigma_deg: largest over all directions; infinite without a solution.
-        translation_sigma_m: largest over all directions; infinite without a solution.
-        missing: a sentence on what to do; empty if only more of the same is needed.
-    """
-
-    name: str
-    motions: int
-    rotation_sigma_deg: float
-    translation_sigma_m: float
-    missing: str
+    name: str  # of the pair
+    motions: int  # number of its motions
+    rotation_sigma_deg: float  # largest over all directions; infinite without a solution
+    translation_sigma_m: float  # largest over all directions; infinite without a solution
+    missing: str  # a sentence on what to do; empty if only more of the same is needed
 
     @property
     def is_enough(self) -> bool:

@@ -36,25 +36,15 @@ _NS_PER_S = 1e9
 
 @dataclass(frozen=True, eq=False)
 class ImuAlignment:
-    """Rotation and time offset of a left camera against the IMU.
+    """Rotation and time offset of a left camera against the IMU."""
 
-    Attributes:
-        body_R_left: (3, 3).
-        misrotation: (3,) rotation vector, radians in body, from the rig's rotation to this one.
-        covariance: (3, 3) of misrotation.
-        time_offset_s: add it to the camera's stamps to get the IMU's.
-        time_offset_sigma_s: standard deviation of time_offset_s.
-        rig_time_offset_s: time offset in the rig.
-        gyro_bias: (3,) rad/s.
-    """
-
-    body_R_left: Float
-    misrotation: Float
-    covariance: Float
-    time_offset_s: float
-    time_offset_sigma_s: float
-    rig_time_offset_s: float
-    gyro_bias: Float
+    body_R_left: Float  # (3, 3)
+    misrotation: Float  # (3,) rotation vector, radians in body, from the rig's rotation to this one
+    covariance: Float  # (3, 3) of misrotation
+    time_offset_s: float  # add it to the camera's stamps to get the IMU's
+    time_offset_sigma_s: float  # standard deviation of time_offset_s
+    rig_time_offset_s: float  # time offset in the rig
+    gyro_bias: Float  # (3,) rad/s
 
     @property
     def is_turned(self) -> bool:

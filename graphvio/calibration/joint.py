@@ -30,15 +30,10 @@ _AGREEING = 0.5  # share of the other cameras that a motion must agree with
 
 @dataclass(frozen=True, eq=False)
 class JointSolution:
-    """Poses of the first camera in each of J cameras.
+    """Poses of the first camera in each of J cameras."""
 
-    Attributes:
-        left_T_left1: (J, 4, 4) pose of the first left camera in each; the first is the identity.
-        covariance: (6 (J - 1), 6 (J - 1)) of the others, tangents ``[rotation, translation]`` in left1.
-    """
-
-    left_T_left1: Float
-    covariance: Float
+    left_T_left1: Float  # (J, 4, 4) pose of the first left camera in each; the first is the identity
+    covariance: Float  # (6 (J - 1), 6 (J - 1)) of the others, tangents ``[rotation, translation]`` in left1
 
     def between(self, one: int, other: int) -> Float:
         """Return ``left_other_T_left_one`` (4, 4)."""

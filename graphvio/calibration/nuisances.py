@@ -21,15 +21,10 @@ _LOG_RATIO_SIGMA = 0.1  # a priori
 
 
 class Nuisances(NamedTuple):
-    """Nuisance variables on which the errors of pose pairs depend linearly: a clock offset, a scale.
+    """Nuisance variables on which the errors of pose pairs depend linearly: a clock offset, a scale."""
 
-    Attributes:
-        derivatives: (N, 6, M) of the errors, see `consistency.error_of`.
-        sigmas: (M,) a-priori standard deviations around zero.
-    """
-
-    derivatives: Float
-    sigmas: Float
+    derivatives: Float  # (N, 6, M) of the errors, see `consistency.error_of`
+    sigmas: Float  # (M,) a-priori standard deviations around zero
 
     @staticmethod
     def none(count: int) -> Nuisances:
@@ -52,15 +47,10 @@ class Nuisances(NamedTuple):
 
 @dataclass(frozen=True)
 class ScaleCheck:
-    """Ratio of the second camera's lengths to the first's.
+    """Ratio of the second camera's lengths to the first's."""
 
-    Attributes:
-        log_ratio: natural logarithm, so 0.01 where the second measures 1 % longer.
-        sigma: standard deviation of log_ratio.
-    """
-
-    log_ratio: float
-    sigma: float
+    log_ratio: float  # natural logarithm, so 0.01 where the second measures 1 % longer
+    sigma: float  # standard deviation of log_ratio
 
     @property
     def is_wrong(self) -> bool:

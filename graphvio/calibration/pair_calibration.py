@@ -29,33 +29,19 @@ _SCALE_ROUNDS = 3
 
 @dataclass(frozen=True, eq=False)
 class PairCalibration:
-    """The relative pose of two pairs, and how it was found.
+    """The relative pose of two pairs, and how it was found."""
 
-    Attributes:
-        solution: the graph's.
-        pairs: N pose pairs that it was found from.
-        frames: M pose pairs from each instant to the next, as the paper's.
-        paper_left2_T_left1: (4, 4) by the paper's method.
-        comparison: of both methods.
-        dispersion: factor on the solution's covariance, see `validation.dispersion`.
-        scale: ratio of the lengths that both measure.
-        scale_estimated: whether lengths of the second pair were corrected by it.
-        nuisances: variables that were estimated, too.
-        floor: (6, 6) covariance of systematic errors, which is part of `covariance`.
-        seed: of the random triples, and of the bootstrap.
-    """
-
-    solution: GraphSolution
-    pairs: PosePairs
-    frames: PosePairs
-    paper_left2_T_left1: Float
-    comparison: Comparison
-    dispersion: float
-    scale: ScaleCheck
-    scale_estimated: bool
-    nuisances: Nuisances
-    floor: Float
-    seed: int
+    solution: GraphSolution  # the graph's
+    pairs: PosePairs  # N pose pairs that it was found from
+    frames: PosePairs  # M pose pairs from each instant to the next, as the paper's
+    paper_left2_T_left1: Float  # (4, 4) by the paper's method
+    comparison: Comparison  # of both methods
+    dispersion: float  # factor on the solution's covariance, see `validation.dispersion`
+    scale: ScaleCheck  # ratio of the lengths that both measure
+    scale_estimated: bool  # whether lengths of the second pair were corrected by it
+    nuisances: Nuisances  # variables that were estimated, too
+    floor: Float  # (6, 6) covariance of systematic errors, which is part of `covariance`
+    seed: int  # of the random triples, and of the bootstrap
 
     @property
     def left2_T_left1(self) -> Float:

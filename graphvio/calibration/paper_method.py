@@ -54,15 +54,10 @@ class PoseParts(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PaperSolution:
-    """The result of the paper's method.
+    """The result of the paper's method."""
 
-    Attributes:
-        left2_T_left1: (4, 4), the paper's P_12.
-        inlier: (N,) pose pairs that the refinement used.
-    """
-
-    left2_T_left1: Float
-    inlier: Bool
+    left2_T_left1: Float  # (4, 4), the paper's P_12
+    inlier: Bool  # (N,) pose pairs that the refinement used
 
 
 def calibrate(pairs: PosePairs, seed: int = 0) -> PaperSolution:

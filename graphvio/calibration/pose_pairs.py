@@ -21,24 +21,16 @@ class PosePairs:
     A motion is the pose of the left camera at the end in its frame at the start, the inverse of the paper's
     ``P_j(t_k, t_k+1)``, which maps points.
 
-    Attributes:
-        start_ns: (N,) int64.
-        end_ns: (N,) int64.
-        motion_1: (N, 4, 4) of the first pair's left camera.
-        covariance_1: (N, 6, 6) of motion_1, tangent ``[rotation, translation]`` in the frame at its end.
-        motion_2: (N, 4, 4) of the second pair's left camera.
-        covariance_2: (N, 6, 6) of motion_2, in the same way.
-
     Raises:
         CalibrationError: if the shapes disagree, or a value is not finite.
     """
 
-    start_ns: Int
-    end_ns: Int
-    motion_1: Float
-    covariance_1: Float
-    motion_2: Float
-    covariance_2: Float
+    start_ns: Int  # (N,) int64
+    end_ns: Int  # (N,) int64
+    motion_1: Float  # (N, 4, 4) of the first pair's left camera
+    covariance_1: Float  # (N, 6, 6) of motion_1, tangent ``[rotation, translation]`` in the frame at its end
+    motion_2: Float  # (N, 4, 4) of the second pair's left camera
+    covariance_2: Float  # (N, 6, 6) of motion_2, in the same way
 
     def __post_init__(self) -> None:
         count = len(self.start_ns)

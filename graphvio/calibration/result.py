@@ -29,21 +29,13 @@ _SWAPPED = 0.2  # distance of the rig's inverse over that of the rig's value
 
 @dataclass(frozen=True, eq=False)
 class RigComparison:
-    """A pair's pose in the rig file against the calibration, in the directions that the motions determine.
+    """A pair's pose in the rig file against the calibration, in the directions that the motions determine."""
 
-    Attributes:
-        tangent: (6,) from the calibration to the file's ``left2_T_left1``, ``[rotation, translation]`` in left1.
-        sigmas: its significance, as a number of standard deviations of one normal variable.
-        is_off: whether chance does not explain it.
-        is_swapped: whether the file would be right if both pairs changed places.
-        is_partial: whether the motions determine only a part of the pose, so that sigmas are approximate.
-    """
-
-    tangent: Float
-    sigmas: float
-    is_off: bool
-    is_swapped: bool
-    is_partial: bool = False
+    tangent: Float  # (6,) from the calibration to the file's ``left2_T_left1``, ``[rotation, translation]`` in left1
+    sigmas: float  # its significance, as a number of standard deviations of one normal variable
+    is_off: bool  # whether chance does not explain it
+    is_swapped: bool  # whether the file would be right if both pairs changed places
+    is_partial: bool = False  # whether the motions determine only a part of the pose, so that sigmas are approximate
 
     @property
     def reliability(self) -> str:
@@ -63,38 +55,23 @@ class RigComparison:
 
 @dataclass(frozen=True, eq=False)
 class PoseSummary:
-    """A pose as three values each of offset and rotation, their standard deviations, and whether they are determined.
+    """A pose as three values each of offset and rotation, their standard deviations, and whether they are determined."""
 
-    Attributes:
-        offset_m: (3,) position of the first left camera in another one's axes.
-        offset_sigmas_m: (3,).
-        offset_known: (3,).
-        turn_rad: (3,) rotation vector of the first left camera in the other one.
-        turn_sigmas_rad: (3,).
-        turn_known: (3,).
-    """
-
-    offset_m: Float
-    offset_sigmas_m: Float
-    offset_known: Bool
-    turn_rad: Float
-    turn_sigmas_rad: Float
-    turn_known: Bool
+    offset_m: Float  # (3,) position of the first left camera in another one's axes
+    offset_sigmas_m: Float  # (3,)
+    offset_known: Bool  # (3,)
+    turn_rad: Float  # (3,) rotation vector of the first left camera in the other one
+    turn_sigmas_rad: Float  # (3,)
+    turn_known: Bool  # (3,)
 
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """A camera's clock relative to another one's.
+    """A camera's clock relative to another one's."""
 
-    Attributes:
-        relation: offset and drift.
-        offset_sigma_s: standard deviation of the offset.
-        drift_sigma: standard deviation of the drift, seconds per second.
-    """
-
-    relation: ClockRelation
-    offset_sigma_s: float
-    drift_sigma: float
+    relation: ClockRelation  # offset and drift
+    offset_sigma_s: float  # standard deviation of the offset
+    drift_sigma: float  # standard deviation of the drift, seconds per second
 
     @property
     def drifts(self) -> bool:

@@ -27,25 +27,15 @@ Between = Callable[[int, int], "tuple[Float, Float] | None"]
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Motions of J cameras over N segments, which may overlap.
+    """Motions of J cameras over N segments, which may overlap."""
 
-    Attributes:
-        start_ns: (N,) int64.
-        end_ns: (N,) int64.
-        first: (N,) index of the instant at which each begins.
-        last: (N,) index of the instant at which it ends.
-        motions: (N, J, 4, 4) pose of each camera at the end in its frame at the start.
-        covariances: (N, J, 6, 6), tangent in the frame at the end.
-        known: (N, J) whether the motion was measured.
-    """
-
-    start_ns: Int
-    end_ns: Int
-    first: Int
-    last: Int
-    motions: Float
-    covariances: Float
-    known: Bool
+    start_ns: Int  # (N,) int64
+    end_ns: Int  # (N,) int64
+    first: Int  # (N,) index of the instant at which each begins
+    last: Int  # (N,) index of the instant at which it ends
+    motions: Float  # (N, J, 4, 4) pose of each camera at the end in its frame at the start
+    covariances: Float  # (N, J, 6, 6), tangent in the frame at the end
+    known: Bool  # (N, J) whether the motion was measured
 
     def __len__(self) -> int:
         return len(self.start_ns)

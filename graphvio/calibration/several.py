@@ -22,17 +22,11 @@ _CHANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Results for two cameras at a time, chained around three cameras; without errors the chain is the identity.
+    """Results for two cameras at a time, chained around three cameras; without errors the chain is the identity."""
 
-    Attributes:
-        cameras: their indices.
-        error: (6,) tangent ``[rotation, translation]`` in the first of the three.
-        covariance: (6, 6) of the error, if the three results were independent.
-    """
-
-    cameras: tuple[int, int, int]
-    error: Float
-    covariance: Float
+    cameras: tuple[int, int, int]  # their indices
+    error: Float  # (6,) tangent ``[rotation, translation]`` in the first of the three
+    covariance: Float  # (6, 6) of the error, if the three results were independent
 
     @property
     def statistic(self) -> float:
@@ -42,24 +36,16 @@ class Loop:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """The poses of all cameras relative to the first.
+    """The poses of all cameras relative to the first."""
 
-    Attributes:
-        left_T_left1: (J, 4, 4) pose of the first left camera in each; the first is the identity.
-        covariance: (6 (J - 1), 6 (J - 1)) of the others, tangents ``[rotation, translation]`` in left1.
-        pairwise: (first, second) -> result for these two alone.
-        loops: of three cameras; empty for two cameras.
-        distances: (first, second) -> squared Mahalanobis distance (6 degrees of freedom) of the result for all cameras
-            from that for these two alone, by the latter's covariance.
-        warnings: sentences.
-    """
-
-    left_T_left1: Float
-    covariance: Float
-    pairwise: Mapping[tuple[int, int], PairCalibration]
-    loops: tuple[Loop, ...]
+    left_T_left1: Float  # (J, 4, 4) pose of the first left camera in each; the first is the identity
+    covariance: Float  # (6 (J - 1), 6 (J - 1)) of the others, tangents ``[rotation, translation]`` in left1
+    pairwise: Mapping[tuple[int, int], PairCalibration]  # (first, second) -> result for these two alone
+    loops: tuple[Loop, ...]  # of three cameras; empty for two cameras
+    # (first, second) -> squared Mahalanobis distance (6 degrees of freedom) of the result for all cameras from that for
+    # these two alone, by the latter's covariance
     distances: Mapping[tuple[int, int], float]
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...]  # sentences
 
 
 def pairwise(

@@ -55,17 +55,11 @@ def segments_of(trajectories: Sequence[Trajectory], clocks: Sequence[ClockRelati
 
 @dataclass(frozen=True, eq=False)
 class TwoTrajectories:
-    """Segments of two trajectories, ready for calibration.
+    """Segments of two trajectories, ready for calibration."""
 
-    Attributes:
-        segments: with covariances estimated from residuals.
-        clock: refined together with the relative pose.
-        nuisances: corrections of its offset, seconds, and drift; None for one clock.
-    """
-
-    segments: Segments
-    clock: ClockRelation
-    nuisances: Nuisances | None
+    segments: Segments  # with covariances estimated from residuals
+    clock: ClockRelation  # refined together with the relative pose
+    nuisances: Nuisances | None  # corrections of its offset, seconds, and drift; None for one clock
 
 
 def aligned(one: Trajectory, other: Trajectory, same_clock: bool = False, seed: int = 0) -> TwoTrajectories:

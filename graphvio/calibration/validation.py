@@ -31,19 +31,12 @@ _NS_PER_S = 1e9
 
 @dataclass(frozen=True, eq=False)
 class Halves:
-    """Solutions from a recording's first and second half.
+    """Solutions from a recording's first and second half."""
 
-    Attributes:
-        own_m: mean alignment error of inliers by the half's own solution, first and second half.
-        crossed_m: by the other half's solution.
-        difference: (6,) tangent from the first half's solution to the second's.
-        covariance: (6, 6) of the difference, if the cameras did not move on the rig.
-    """
-
-    own_m: tuple[float, float]
-    crossed_m: tuple[float, float]
-    difference: Float
-    covariance: Float
+    own_m: tuple[float, float]  # mean alignment error of inliers by the half's own solution, first and second half
+    crossed_m: tuple[float, float]  # by the other half's solution
+    difference: Float  # (6,) tangent from the first half's solution to the second's
+    covariance: Float  # (6, 6) of the difference, if the cameras did not move on the rig
 
     @property
     def statistic(self) -> float:
@@ -57,17 +50,11 @@ class Halves:
 
 
 class Grown(NamedTuple):
-    """The solution from the beginning of a recording.
+    """The solution from the beginning of a recording."""
 
-    Attributes:
-        end_ns: end of the part that is used.
-        left2_T_left1: (4, 4).
-        covariance: (6, 6) of left2_T_left1.
-    """
-
-    end_ns: int
-    left2_T_left1: Float
-    covariance: Float
+    end_ns: int  # end of the part that is used
+    left2_T_left1: Float  # (4, 4)
+    covariance: Float  # (6, 6) of left2_T_left1
 
 
 def halves(

@@ -23,42 +23,26 @@ _SOON_S = 0.5  # readers that are done by then need no message
 
 @dataclass(frozen=True)
 class Started:
-    """Running services.
+    """Running services."""
 
-    Attributes:
-        address: address of gRPC.
-        lines: lines to print, one for each service.
-        check: raises the error of a service that failed.
-        finish: waits for services that continue after the odometry, and returns whether they completed.
-    """
-
-    address: str
-    lines: Sequence[str]
-    check: Callable[[], None] = lambda: None
+    address: str  # address of gRPC
+    lines: Sequence[str]  # lines to print, one for each service
+    check: Callable[[], None] = lambda: None  # raises the error of a service that failed
+    # waits for services that continue after the odometry, and returns whether they completed
     finish: Callable[[], bool] = lambda: True
 
 
 @dataclass(frozen=True)
 class Services:
-    """Choice of services, and who may use them.
+    """Choice of services, and who may use them."""
 
-    Attributes:
-        host: address of gRPC; other addresses than this machine's own need TLS and a token.
-        port: port of gRPC; None takes the default.
-        certificate: PEM file of the server's certificate.
-        key: PEM file of its private key.
-        token_file: file with the clients' secret.
-        ros2_domain: domain of the ROS 2 topics, or None for none.
-        web_port: port of the page for browsers, or None for none.
-    """
-
-    host: str = "127.0.0.1"
-    port: int | None = None
-    certificate: Path | None = None
-    key: Path | None = None
-    token_file: Path | None = None
-    ros2_domain: int | None = None
-    web_port: int | None = None
+    host: str = "127.0.0.1"  # address of gRPC; other addresses than this machine's own need TLS and a token
+    port: int | None = None  # port of gRPC; None takes the default
+    certificate: Path | None = None  # PEM file of the server's certificate
+    key: Path | None = None  # PEM file of its private key
+    token_file: Path | None = None  # file with the clients' secret
+    ros2_domain: int | None = None  # domain of the ROS 2 topics, or None for none
+    web_port: int | None = None  # port of the page for browsers, or None for none
 
     def settings(self, config: Config) -> Config:
         """Return a configuration whose keyframes carry their images: clients choose what they are sent."""

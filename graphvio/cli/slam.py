@@ -74,21 +74,13 @@ def slam(
 
 @dataclass(frozen=True)
 class _WithMapping(Services):
-    """gRPC on this machine, ROS 2 topics where asked for, and the SLAM as a client of gRPC.
+    """gRPC on this machine, ROS 2 topics where asked for, and the SLAM as a client of gRPC."""
 
-    Attributes:
-        saved_map: folder of the map to extend, or None.
-        out: folder for the map, or None.
-        view: whether the viewer's window opens.
-        map_web_port: port of the page for browsers, or None.
-        save_rrd: file for the viewer's recording, or None.
-    """
-
-    saved_map: Path | None = None
-    out: Path | None = None
-    view: bool = False
-    map_web_port: int | None = None
-    save_rrd: Path | None = None
+    saved_map: Path | None = None  # folder of the map to extend, or None
+    out: Path | None = None  # folder for the map, or None
+    view: bool = False  # whether the viewer's window opens
+    map_web_port: int | None = None  # port of the page for browsers, or None
+    save_rrd: Path | None = None  # file for the viewer's recording, or None
 
     def start(self, running: LiveOdometry, stack: ExitStack, is_stopped: Callable[[], bool] = lambda: False) -> Started:
         """Serve the odometry, and start the SLAM; see `Services.start`."""

@@ -41,21 +41,13 @@ class Stats:
 
 @dataclass(frozen=True)
 class RelativeError:
-    """Relative pose error (RPE) over one distance or duration.
+    """Relative pose error (RPE) over one distance or duration."""
 
-    Attributes:
-        pairs: number of motions.
-        position_m: metres.
-        rotation_deg: degrees.
-        percent: mean position error in percent of the distance; None for a duration.
-        deg_per_m: mean rotation error by distance; None for a duration.
-    """
-
-    pairs: int
-    position_m: Stats
-    rotation_deg: Stats
-    percent: float | None
-    deg_per_m: float | None
+    pairs: int  # number of motions
+    position_m: Stats  # metres
+    rotation_deg: Stats  # degrees
+    percent: float | None  # mean position error in percent of the distance; None for a duration
+    deg_per_m: float | None  # mean rotation error by distance; None for a duration
 
 
 def umeyama_se3(source: Float, target: Float) -> Float:

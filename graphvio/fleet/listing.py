@@ -15,15 +15,10 @@ _FILES = (".mcap", ".bag")
 
 @dataclass(frozen=True)
 class Listed:
-    """A session of a fleet run.
+    """A session of a fleet run."""
 
-    Attributes:
-        name: unique name, that of its folder of results.
-        recording: absolute path, or URL.
-    """
-
-    name: str
-    recording: str
+    name: str  # unique name, that of its folder of results
+    recording: str  # absolute path, or URL
 
 
 def list_sessions(where: str) -> list[Listed]:

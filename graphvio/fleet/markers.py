@@ -15,21 +15,13 @@ _FOLDER = "stages"
 
 @dataclass(frozen=True)
 class Marker:
-    """A finished stage.
+    """A finished stage."""
 
-    Attributes:
-        stage: name, such as ``odometry`` or ``features-0-of-2``.
-        inputs: name -> value, of all that determines the results.
-        files: names of its files in the session's folder.
-        wall_s: wall time, fetching and putting included.
-        figures: name -> value, for the table of sessions.
-    """
-
-    stage: str
-    inputs: Mapping[str, str]
-    files: Sequence[str]
-    wall_s: float
-    figures: Mapping[str, Any] = field(default_factory=dict)
+    stage: str  # name, such as ``odometry`` or ``features-0-of-2``
+    inputs: Mapping[str, str]  # name -> value, of all that determines the results
+    files: Sequence[str]  # names of its files in the session's folder
+    wall_s: float  # wall time, fetching and putting included
+    figures: Mapping[str, Any] = field(default_factory=dict)  # name -> value, for the table of sessions
 
     def write(self, storage: Storage) -> None:
         """Write the marker into a session's folder.

@@ -26,21 +26,13 @@ _PRIORITY = {tasks.ODOMETRY: 0, "features": 1, tasks.LOOPS: 2, tasks.GRAPH: 3}  
 
 @dataclass(frozen=True)
 class FleetProgress:
-    """Progress of a fleet run.
+    """Progress of a fleet run."""
 
-    Attributes:
-        sessions: number of sessions.
-        optimized: sessions with results.
-        failed: sessions given up.
-        tasks: tasks that have ended in this run, failed ones included.
-        latest: stage and session of the task that ended last; empty before the first.
-    """
-
-    sessions: int
-    optimized: int
-    failed: int
-    tasks: int
-    latest: str
+    sessions: int  # number of sessions
+    optimized: int  # sessions with results
+    failed: int  # sessions given up
+    tasks: int  # tasks that have ended in this run, failed ones included
+    latest: str  # stage and session of the task that ended last; empty before the first
 
 
 Progress = Callable[[FleetProgress], None]
@@ -104,21 +96,13 @@ def optimize_fleet(
 
 @dataclass(eq=False)
 class _Session:
-    """Progress of one session.
+    """Progress of one session."""
 
-    Attributes:
-        job: the session to optimise.
-        markers: stage -> marker, of finished stages.
-        parts_left: tasks of features that have not ended.
-        failed_in: stage in which it was given up, or empty.
-        error: its error in one line, or empty.
-    """
-
-    job: tasks.Job
-    markers: dict[str, Marker] = field(default_factory=dict)
-    parts_left: int = 0
-    failed_in: str = ""
-    error: str = ""
+    job: tasks.Job  # the session to optimise
+    markers: dict[str, Marker] = field(default_factory=dict)  # stage -> marker, of finished stages
+    parts_left: int = 0  # tasks of features that have not ended
+    failed_in: str = ""  # stage in which it was given up, or empty
+    error: str = ""  # its error in one line, or empty
 
     @property
     def parts(self) -> int:

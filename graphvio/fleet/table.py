@@ -21,23 +21,14 @@ COLUMNS = ("name", "status", *FIGURES, *(f"{stage}_wall_s" for stage in STAGES),
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of one session: its figures, or the stage and error that it failed with.
+    """The result of one session: its figures, or the stage and error that it failed with."""
 
-    Attributes:
-        name: session name.
-        recording: path or URL.
-        figures: name -> value or None, of the finished stages.
-        wall_s: stage -> wall time of its tasks, in the run that executed them.
-        failed_in: stage that failed, or empty.
-        error: its error in one line, or empty.
-    """
-
-    name: str
-    recording: str
-    figures: Mapping[str, Any]
-    wall_s: Mapping[str, float]
-    failed_in: str
-    error: str
+    name: str  # session name
+    recording: str  # path or URL
+    figures: Mapping[str, Any]  # name -> value or None, of the finished stages
+    wall_s: Mapping[str, float]  # stage -> wall time of its tasks, in the run that executed them
+    failed_in: str  # stage that failed, or empty
+    error: str  # its error in one line, or empty
 
     @property
     def status(self) -> str:

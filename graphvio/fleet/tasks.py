@@ -41,27 +41,16 @@ _STATE = "stages.json"  # of a folder that one process works in from the first s
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A session to optimise.
+    """A session to optimise."""
 
-    Attributes:
-        name: session name.
-        recording: path or URL.
-        results: path or URL of its folder of results.
-        config: configuration of all stages.
-        rig: rig, or None for the recording's own.
-        with_loops: whether loop closures are searched.
-        places_per_task: maximum number of places whose features one task extracts.
-        version: version of graphvio.
-    """
-
-    name: str
-    recording: str
-    results: str
-    config: Config
-    rig: Rig | None
-    with_loops: bool
-    places_per_task: int
-    version: str = __version__
+    name: str  # session name
+    recording: str  # path or URL
+    results: str  # path or URL of its folder of results
+    config: Config  # configuration of all stages
+    rig: Rig | None  # rig, or None for the recording's own
+    with_loops: bool  # whether loop closures are searched
+    places_per_task: int  # maximum number of places whose features one task extracts
+    version: str = __version__  # version of graphvio
 
     @property
     def inputs(self) -> dict[str, str]:

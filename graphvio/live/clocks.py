@@ -130,17 +130,11 @@ class ClockMap:
 
 @dataclass(frozen=True, slots=True)
 class _Knot:
-    """From a stamp on, the map approaches a line.
+    """From a stamp on, the map approaches a line."""
 
-    Attributes:
-        start: stamp since the map's origin, ns.
-        error: of the map there, relative to the line, ns.
-        line: delay over stamp, both since the origin, ns.
-    """
-
-    start: int
-    error: float
-    line: Line
+    start: int  # stamp since the map's origin, ns
+    error: float  # of the map there, relative to the line, ns
+    line: Line  # delay over stamp, both since the origin, ns
 
     def delay(self, at: int) -> float:
         """Return what to add to a stamp, on top of the map's offset, ns."""
@@ -242,17 +236,11 @@ class SharedClock:
 
 @dataclass(slots=True)
 class _Sensor:
-    """The state of one sensor of a shared clock.
+    """The state of one sensor of a shared clock."""
 
-    Attributes:
-        setting: of the clock: how many times it had been set back.
-        recent_ns: its newest stamps.
-        behind: how many in a row were too early.
-    """
-
-    setting: int
-    recent_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))
-    behind: int = 0
+    setting: int  # of the clock: how many times it had been set back
+    recent_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_RECENT))  # its newest stamps
+    behind: int = 0  # how many in a row were too early
 
     @property
     def typical_ns(self) -> int:

@@ -28,21 +28,13 @@ _MARGIN_PX = 1.0
 
 @dataclass(frozen=True, eq=False)
 class FittedLens:
-    """A lens with one of graphvio's models.
+    """A lens with one of graphvio's models."""
 
-    Attributes:
-        model: its name.
-        intrinsics: (4,), pixels.
-        distortion: (5,).
-        error_px: maximum difference between the models, by which images are resampled.
-        maps: for `corrected`, or None where the model is exact.
-    """
-
-    model: str
-    intrinsics: Float
-    distortion: Float
-    error_px: float = 0.0
-    maps: tuple[AnyArray, AnyArray] | None = None
+    model: str  # its name
+    intrinsics: Float  # (4,), pixels
+    distortion: Float  # (5,)
+    error_px: float = 0.0  # maximum difference between the models, by which images are resampled
+    maps: tuple[AnyArray, AnyArray] | None = None  # for `corrected`, or None where the model is exact
 
     def corrected(self, image: Image) -> Image:
         """Return the image (height, width) that this lens would have made."""

@@ -12,15 +12,10 @@ from graphvio.rig import Rig
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """A device that is connected.
+    """A device that is connected."""
 
-    Attributes:
-        spec: what to write for SOURCE on the command line.
-        description: one line for people.
-    """
-
-    spec: str
-    description: str
+    spec: str  # what to write for SOURCE on the command line
+    description: str  # one line for people
 
 
 class LiveSource(Protocol):

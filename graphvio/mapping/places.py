@@ -15,32 +15,21 @@ from graphvio.trajectory import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class NewPlace:
-    """A keyframe that was selected as a place.
+    """A keyframe that was selected as a place."""
 
-    Attributes:
-        keyframe: The keyframe.
-        previous_T_body: (4, 4) motion from the previous place, or None for the first place of a fragment.
-        covariance: (6, 6) of the motion, tangent ``[rotation, translation]`` in body at this place, or None with it.
-    """
-
-    keyframe: Keyframe
-    previous_T_body: Float | None
+    keyframe: Keyframe  # the keyframe
+    previous_T_body: Float | None  # (4, 4) motion from the previous place, or None for the first place of a fragment
+    # (6, 6) of the motion, tangent ``[rotation, translation]`` in body at this place, or None with it
     covariance: Float | None
 
 
 @dataclass(frozen=True, eq=False)
 class KeyframeAtPlace:
-    """A keyframe's pose relative to the last place before it.
+    """A keyframe's pose relative to the last place before it."""
 
-    Attributes:
-        stamp_ns: Stamp of the keyframe.
-        place: Index of the place.
-        place_T_body: (4, 4) by the odometry; closures move the place.
-    """
-
-    stamp_ns: int
-    place: int
-    place_T_body: Float
+    stamp_ns: int  # stamp of the keyframe
+    place: int  # index of the place
+    place_T_body: Float  # (4, 4) by the odometry; closures move the place
 
 
 class PlaceChooser:

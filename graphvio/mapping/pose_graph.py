@@ -34,19 +34,12 @@ _MAX_ROUNDS = 3  # in which rejected closures are used that the solution agrees 
 
 @dataclass(eq=False)
 class TestedClosure:
-    """A closure between two places of the graph, whose rows are the places' indices.
+    """A closure between two places of the graph, whose rows are the places' indices."""
 
-    Attributes:
-        closure: The closure as it was found.
-        edge: The closure as a factor.
-        is_used: Whether the solution uses it.
-        is_refuted: Whether it contradicts the odometry alone.
-    """
-
-    closure: LoopClosure
-    edge: Edge
-    is_used: bool = False
-    is_refuted: bool = False
+    closure: LoopClosure  # the closure as it was found
+    edge: Edge  # the closure as a factor
+    is_used: bool = False  # whether the solution uses it
+    is_refuted: bool = False  # whether it contradicts the odometry alone
 
 
 class PoseGraph:

@@ -30,26 +30,16 @@ _VIEWED_EVERY = 3  # places
 
 @dataclass(frozen=True)
 class MappingTask:
-    """Options of the process.
+    """Options of the process."""
 
-    Attributes:
-        address: Address of the odometry's service.
-        config: Configuration of the odometry, with the settings of places and closures.
-        map: Folder of a saved map to begin with, or None.
-        out: Folder for the new map, or None.
-        view: Open rerun's window.
-        web_port: Port of the view in a browser, or None.
-        save_rrd: File for the viewer's data, or None.
-        folder: Empty folder for temporary files, removed at the end; None for one in the system's folder.
-    """
-
-    address: str
-    config: Config
-    map: Path | None = None
-    out: Path | None = None
-    view: bool = False
-    web_port: int | None = None
-    save_rrd: Path | None = None
+    address: str  # address of the odometry's service
+    config: Config  # configuration of the odometry, with the settings of places and closures
+    map: Path | None = None  # folder of a saved map to begin with, or None
+    out: Path | None = None  # folder for the new map, or None
+    view: bool = False  # open rerun's window
+    web_port: int | None = None  # port of the view in a browser, or None
+    save_rrd: Path | None = None  # file for the viewer's data, or None
+    # empty folder for temporary files, removed at the end; None for one in the system's folder
     folder: Path | None = None
 
 

@@ -35,25 +35,15 @@ _THREADS = 2
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:
-    """A reconstruction on disk.
+    """A reconstruction on disk."""
 
-    Attributes:
-        folder: of the files.
-        frame: number of the optimisation's frame that is COLMAP's world.
-        places: number of framesets, COLMAP's frames.
-        images: number of images.
-        points: number of triangulated points.
-        observations: number over all points.
-        reprojection_error_px: mean over the observations; NaN without any.
-    """
-
-    folder: Path
-    frame: int
-    places: int
-    images: int
-    points: int
-    observations: int
-    reprojection_error_px: float
+    folder: Path  # of the files
+    frame: int  # number of the optimisation's frame that is COLMAP's world
+    places: int  # number of framesets, COLMAP's frames
+    images: int  # number of images
+    points: int  # number of triangulated points
+    observations: int  # number over all points
+    reprojection_error_px: float  # mean over the observations; NaN without any
 
 
 def export(

@@ -43,15 +43,10 @@ class KnownMotions(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """Fragments in common frames.
+    """Fragments in common frames."""
 
-    Attributes:
-        frames: ``frame_T_nav`` (4, 4) of each fragment.
-        component: for each fragment, the fragment whose nav frame is its frame.
-    """
-
-    frames: list[Float]
-    component: list[int]
+    frames: list[Float]  # ``frame_T_nav`` (4, 4) of each fragment
+    component: list[int]  # for each fragment, the fragment whose nav frame is its frame
 
 
 def join_fragments(fragments: Sequence[range], poses: Float, edges: Sequence[Edge], inliers: Sequence[int]) -> Joined:

@@ -39,20 +39,14 @@ def d(session: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class RigCorrection:
-    """Corrections of a session's rig file.
+    """Corrections of a session's rig file."""
 
-    Attributes:
-        pairs: pair -> correction (4, 4), by which its ``body_T_left`` is multiplied from the left.
-        covariances: pair -> covariance (6, 6) of the correction, tangent ``[rotation, translation]``; zero for the
-            first pair without an IMU.
-        offset_s: added to the IMU's time offset.
-        offset_sigma_s: its standard deviation, or None without an IMU.
-    """
-
-    pairs: dict[int, Float]
+    pairs: dict[int, Float]  # pair -> correction (4, 4), by which its ``body_T_left`` is multiplied from the left
+    # pair -> covariance (6, 6) of the correction, tangent ``[rotation, translation]``; zero for the first pair without
+    # an IMU
     covariances: dict[int, Float]
-    offset_s: float
-    offset_sigma_s: float | None
+    offset_s: float  # added to the IMU's time offset
+    offset_sigma_s: float | None  # its standard deviation, or None without an IMU
 
     def corrected(self, rig: Rig) -> Rig:
         """Return the rig with these corrections."""

@@ -31,21 +31,13 @@ _ORIGIN_SIGMA = 1e-4  # radians and metres: without an IMU, the first pose of an
 
 @dataclass(frozen=True, eq=False)
 class Fragment:
-    """An epoch of a session, whose poses share a frame.
+    """An epoch of a session, whose poses share a frame."""
 
-    Attributes:
-        session: number of the session.
-        epoch: of the session.
-        states: numbered through all sessions.
-        start: the rig at the first state.
-        with_imu: whether the first state has a velocity and biases.
-    """
-
-    session: int
-    epoch: int
-    states: range
-    start: RigState
-    with_imu: bool
+    session: int  # number of the session
+    epoch: int  # of the session
+    states: range  # numbered through all sessions
+    start: RigState  # the rig at the first state
+    with_imu: bool  # whether the first state has a velocity and biases
 
 
 class SessionGraph:

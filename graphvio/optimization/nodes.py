@@ -15,17 +15,11 @@ from graphvio.optimization.record import SessionRecord
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """The N states of a session's graph.
+    """The N states of a session's graph."""
 
-    Attributes:
-        record: of the session.
-        rows: (N,) rows of their framesets, increasing.
-        motions: (M,) indices of the record's motions that begin and end at states.
-    """
-
-    record: SessionRecord
-    rows: Int
-    motions: Int
+    record: SessionRecord  # of the session
+    rows: Int  # (N,) rows of their framesets, increasing
+    motions: Int  # (M,) indices of the record's motions that begin and end at states
 
     @property
     def stamps_ns(self) -> Int:

@@ -29,20 +29,13 @@ Progress = Callable[[str, int, float], None]
 
 @dataclass(frozen=True, eq=False)
 class OptimizedSession:
-    """The solution of one session.
+    """The solution of one session."""
 
-    Attributes:
-        nodes: states of the graph.
-        nav_T_body: (F, 4, 4) of all framesets, in the frame that ``frame`` gives.
-        covariance: (N, 6, 6) of the states' poses relative to the origin of their frame, tangent
-            ``[rotation, translation]`` in body.
-        frame: (F,) number of each frameset's frame; 0 is that of the first session's first.
-    """
-
-    nodes: Nodes
-    nav_T_body: Float
+    nodes: Nodes  # states of the graph
+    nav_T_body: Float  # (F, 4, 4) of all framesets, in the frame that ``frame`` gives
+    # (N, 6, 6) of the states' poses relative to the origin of their frame, tangent ``[rotation, translation]`` in body
     covariance: Float
-    frame: Int
+    frame: Int  # (F,) number of each frameset's frame; 0 is that of the first session's first
 
     @property
     def record(self) -> SessionRecord:
@@ -52,50 +45,31 @@ class OptimizedSession:
 
 @dataclass(frozen=True, eq=False)
 class JudgedLoop:
-    """A loop closure and whether it is used.
+    """A loop closure and whether it is used."""
 
-    Attributes:
-        closure: as it was found.
-        refusal: why it is not used, or empty.
-        distance: squared Mahalanobis distance from the solution, 6 degrees of freedom; of a refused one, with the
-            solution's covariance. NaN between parts that are not joined.
-    """
-
-    closure: LoopClosure
-    refusal: str
+    closure: LoopClosure  # as it was found
+    refusal: str  # why it is not used, or empty
+    # squared Mahalanobis distance from the solution, 6 degrees of freedom; of a refused one, with the solution's
+    # covariance. NaN between parts that are not joined.
     distance: float
 
 
 @dataclass(frozen=True, eq=False)
 class Optimization:
-    """The solution of all sessions.
+    """The solution of all sessions."""
 
-    Attributes:
-        sessions: in the given order.
-        loops: all given loop closures.
-        fragments: epochs of all sessions.
-        frames: number of each fragment's frame.
-        before: kind of factor -> residuals of the odometry's states.
-        after: kind of factor -> residuals of the solution.
-        graph: with the loop closures that are used.
-        values: the solution.
-        edges: the loop closures that are used, as edges.
-        graph_alone: without loop closures, each fragment in its own frame.
-        alone: solution of ``graph_alone``.
-        corrections: of each session's rig file, or None where the calibration is not estimated.
-    """
-
-    sessions: Sequence[OptimizedSession]
-    loops: Sequence[JudgedLoop]
-    fragments: Sequence[Fragment]
-    frames: Sequence[int]
-    before: dict[str, Residuals]
-    after: dict[str, Residuals]
-    graph: gtsam.NonlinearFactorGraph
-    values: gtsam.Values
-    edges: Sequence[Edge]
-    graph_alone: gtsam.NonlinearFactorGraph
-    alone: gtsam.Values
+    sessions: Sequence[OptimizedSession]  # in the given order
+    loops: Sequence[JudgedLoop]  # all given loop closures
+    fragments: Sequence[Fragment]  # epochs of all sessions
+    frames: Sequence[int]  # number of each fragment's frame
+    before: dict[str, Residuals]  # kind of factor -> residuals of the odometry's states
+    after: dict[str, Residuals]  # kind of factor -> residuals of the solution
+    graph: gtsam.NonlinearFactorGraph  # with the loop closures that are used
+    values: gtsam.Values  # the solution
+    edges: Sequence[Edge]  # the loop closures that are used, as edges
+    graph_alone: gtsam.NonlinearFactorGraph  # without loop closures, each fragment in its own frame
+    alone: gtsam.Values  # solution of ``graph_alone``
+    # of each session's rig file, or None where the calibration is not estimated
     corrections: Sequence[RigCorrection | None]
 
     @property

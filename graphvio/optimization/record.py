@@ -19,39 +19,23 @@ from graphvio.odometry.step import Step
 
 
 class Inertial(NamedTuple):
-    """The IMU in N steps of constant angular velocity and specific force.
+    """The IMU in N steps of constant angular velocity and specific force."""
 
-    Attributes:
-        begins: (F + 1,) the steps from frameset i - 1 to i are rows ``begins[i]`` to ``begins[i + 1]``.
-        covers: (F,) whether they cover all of that time and can be trusted.
-        steps_s: (N,) durations.
-        values: (N, 6) angular velocity, rad/s, and specific force, m/s^2, in body.
-    """
-
-    begins: Int
-    covers: Bool
-    steps_s: Float
-    values: Float
+    begins: Int  # (F + 1,) the steps from frameset i - 1 to i are rows ``begins[i]`` to ``begins[i + 1]``
+    covers: Bool  # (F,) whether they cover all of that time and can be trusted
+    steps_s: Float  # (N,) durations
+    values: Float  # (N, 6) angular velocity, rad/s, and specific force, m/s^2, in body
 
 
 class Motions(NamedTuple):
-    """M measured motions, ordered by the framesets in which they end.
+    """M measured motions, ordered by the framesets in which they end."""
 
-    Attributes:
-        reference: (M,) row of the frameset that each is measured from.
-        row: (M,) row of the frameset in which it ends.
-        reference_T_current: (M, 4, 4) of body.
-        covariance: (M, 6, 6) tangent ``[rotation, translation]`` in body at its end.
-        shared_covariance: (M, 6, 6) its part that all motions from one reference share, same tangent.
-        inliers: (M,) number of points.
-    """
-
-    reference: Int
-    row: Int
-    reference_T_current: Float
-    covariance: Float
-    shared_covariance: Float
-    inliers: Int
+    reference: Int  # (M,) row of the frameset that each is measured from
+    row: Int  # (M,) row of the frameset in which it ends
+    reference_T_current: Float  # (M, 4, 4) of body
+    covariance: Float  # (M, 6, 6) tangent ``[rotation, translation]`` in body at its end
+    shared_covariance: Float  # (M, 6, 6) its part that all motions from one reference share, same tangent
+    inliers: Int  # (M,) number of points
 
     def at(self, k: int, stamps_ns: Int) -> RelativeMotion:
         """Return motion k."""

@@ -31,19 +31,12 @@ def gtsam_errors(message: str) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A relative pose between two states, from a loop closure or a chain of other measurements.
+    """A relative pose between two states, from a loop closure or a chain of other measurements."""
 
-    Attributes:
-        first: state that it is measured from.
-        second: state in which it ends.
-        first_T_second: (4, 4) of body.
-        covariance: (6, 6), tangent ``[rotation, translation]`` in body at the second.
-    """
-
-    first: int
-    second: int
-    first_T_second: Float
-    covariance: Float
+    first: int  # state that it is measured from
+    second: int  # state in which it ends
+    first_T_second: Float  # (4, 4) of body
+    covariance: Float  # (6, 6), tangent ``[rotation, translation]`` in body at the second
 
     def factor(self) -> gtsam.NonlinearFactor:
         """Return the edge as a factor."""
@@ -54,15 +47,10 @@ class Edge:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residuals of the factors of one kind.
+    """Residuals of the factors of one kind."""
 
-    Attributes:
-        distances: (N,) squared Mahalanobis distances.
-        dimensions: of all their errors.
-    """
-
-    distances: Float
-    dimensions: int
+    distances: Float  # (N,) squared Mahalanobis distances
+    dimensions: int  # of all their errors
 
     @property
     def per_dimension(self) -> float:

@@ -30,17 +30,11 @@ class Percentiles:
 
 @dataclass(frozen=True)
 class PairMedians:
-    """Medians over the reports of one pair that have the figure; None where none has.
+    """Medians over the reports of one pair that have the figure; None where none has."""
 
-    Attributes:
-        inliers: points that the selected motion explains.
-        rms_px: their rms reprojection error under that motion, pixels.
-        own_rms_px: rms reprojection error of the pair's points under its own motion, pixels.
-    """
-
-    inliers: float | None
-    rms_px: float | None
-    own_rms_px: float | None
+    inliers: float | None  # points that the selected motion explains
+    rms_px: float | None  # their rms reprojection error under that motion, pixels
+    own_rms_px: float | None  # rms reprojection error of the pair's points under its own motion, pixels
 
     @staticmethod
     def of(figures: Mapping[str, Sequence[float]]) -> PairMedians:

@@ -23,17 +23,11 @@ _DEFAULTS = {f.name: f.default for f in fields(Imu)}
 
 @dataclass(frozen=True)
 class Section:
-    """A mapping in a YAML file.
+    """A mapping in a YAML file."""
 
-    Attributes:
-        values: of the mapping.
-        file: that contains it.
-        key: of the mapping in the file, empty at the top level.
-    """
-
-    values: Mapping[str, Any]
-    file: Path
-    key: str = ""
+    values: Mapping[str, Any]  # of the mapping
+    file: Path  # that contains it
+    key: str = ""  # of the mapping in the file, empty at the top level
 
     def where(self, key: str) -> str:
         """Format file and full key for messages."""

@@ -23,19 +23,12 @@ _MAX_NORM_ERROR: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Outcomes:
-    """Outcomes of the corrections so far.
+    """Outcomes of the corrections so far."""
 
-    Attributes:
-        accepted: number of accepted ones.
-        refused: number of refused ones.
-        is_refused: whether the newest one was.
-        newest: outcome of the newest one, one line for people.
-    """
-
-    accepted: int = 0
-    refused: int = 0
-    is_refused: bool = False
-    newest: str = "none received"
+    accepted: int = 0  # number of accepted ones
+    refused: int = 0  # number of refused ones
+    is_refused: bool = False  # whether the newest one was
+    newest: str = "none received"  # outcome of the newest one, one line for people
 
 
 class Corrections:

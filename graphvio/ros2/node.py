@@ -33,15 +33,10 @@ def domain_of(text: str | None) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Publication:
-    """A topic that another participant publishes.
+    """A topic that another participant publishes."""
 
-    Attributes:
-        topic: such as ``/imu``.
-        type_name: such as ``sensor_msgs/msg/Imu``.
-    """
-
-    topic: str
-    type_name: str
+    topic: str  # such as ``/imu``
+    type_name: str  # such as ``sensor_msgs/msg/Imu``
 
 
 class Reader:

@@ -48,17 +48,11 @@ def ros_topic(dds_name: str) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """A quality of service, as in ROS 2 (`rmw_qos_profiles.h`).
+    """A quality of service, as in ROS 2 (`rmw_qos_profiles.h`)."""
 
-    Attributes:
-        depth: how many of the newest samples are kept.
-        is_reliable: whether lost samples are sent again.
-        is_latched: whether late readers receive the kept samples, too (transient local).
-    """
-
-    depth: int = 10
-    is_reliable: bool = True
-    is_latched: bool = False
+    depth: int = 10  # how many of the newest samples are kept
+    is_reliable: bool = True  # whether lost samples are sent again
+    is_latched: bool = False  # whether late readers receive the kept samples, too (transient local)
 
     def dds(self, type_name: str) -> Any:
         """Return the policies of an endpoint; a writer never waits for slow readers.

@@ -23,36 +23,23 @@ _NS_PER_MS, _NS_PER_MINUTE = 1e6, 60e9
 
 @dataclass(frozen=True)
 class Clock:
-    """Comparison of the stamps of one topic's headers with the times of recording.
+    """Comparison of the stamps of one topic's headers with the times of recording."""
 
-    Attributes:
-        backward: messages whose stamp is not after that of the message before.
-        jumps: messages whose stamp advanced a second or more differently from the recorder's clock.
-        latency_ms: median time from stamp to recording.
-        drift_ms_per_minute: growth of the latency; None if the recording is too short, or both clocks are the same.
-        drift_sigma: standard deviation of the drift, or None.
-    """
-
-    backward: int
-    jumps: int
-    latency_ms: float
+    backward: int  # messages whose stamp is not after that of the message before
+    jumps: int  # messages whose stamp advanced a second or more differently from the recorder's clock
+    latency_ms: float  # median time from stamp to recording
+    # growth of the latency; None if the recording is too short, or both clocks are the same
     drift_ms_per_minute: float | None
-    drift_sigma: float | None
+    drift_sigma: float | None  # standard deviation of the drift, or None
 
 
 @dataclass(frozen=True)
 class Offset:
-    """Comparison of the stamps of two topics.
+    """Comparison of the stamps of two topics."""
 
-    Attributes:
-        matched: messages of the first that have one of the second within half their interval.
-        median_ms: median of the second's stamp less the first's.
-        largest_ms: largest absolute difference.
-    """
-
-    matched: int
-    median_ms: float
-    largest_ms: float
+    matched: int  # messages of the first that have one of the second within half their interval
+    median_ms: float  # median of the second's stamp less the first's
+    largest_ms: float  # largest absolute difference
 
 
 def header_stamps(store: Store, topic: Topic) -> Int:

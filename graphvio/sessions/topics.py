@@ -20,39 +20,24 @@ TRUTH_TOPIC = "/ground_truth"
 
 
 class Place(NamedTuple):
-    """Position of a message in a file.
+    """Position of a message in a file."""
 
-    Attributes:
-        chunk: byte of the file at which the message's chunk begins, -1 if it is in none; of bags, the connection.
-        offset: byte of the message in the unpacked chunk, or in the file; of bags, its row or time.
-        channel: number of the message's channel, -1 if unknown.
-        logged_ns: time of its recording, -1 if unknown.
-    """
-
-    chunk: int
-    offset: int
-    channel: int = -1
-    logged_ns: int = -1
+    chunk: int  # byte of the file at which the message's chunk begins, -1 if it is in none; of bags, the connection
+    offset: int  # byte of the message in the unpacked chunk, or in the file; of bags, its row or time
+    channel: int = -1  # number of the message's channel, -1 if unknown
+    logged_ns: int = -1  # time of its recording, -1 if unknown
 
 
 @dataclass
 class Topic:
-    """Messages of one topic, in the order of the file.
+    """Messages of one topic, in the order of the file."""
 
-    Attributes:
-        name: such as ``/imu``.
-        type_name: such as ``sensor_msgs/msg/Imu``.
-        encoding: of its messages, ``cdr`` for ROS 2.
-        logged_ns: time of recording of each message.
-        places: position of each message.
-        header_ns: stamps of their headers if the reader decodes them, otherwise empty.
-    """
-
-    name: str
-    type_name: str
-    encoding: str
-    logged_ns: list[int] = field(default_factory=list)
-    places: list[Place] = field(default_factory=list)
+    name: str  # such as ``/imu``
+    type_name: str  # such as ``sensor_msgs/msg/Imu``
+    encoding: str  # of its messages, ``cdr`` for ROS 2
+    logged_ns: list[int] = field(default_factory=list)  # time of recording of each message
+    places: list[Place] = field(default_factory=list)  # position of each message
+    # stamps of their headers if the reader decodes them, otherwise empty
     header_ns: list[int] = field(default_factory=list)
 
     @property

@@ -36,23 +36,14 @@ class _Passed:
 
 @dataclass(frozen=True, eq=False)
 class _Correction:
-    """``map_T_odom`` by one correction, or by several fused ones.
+    """``map_T_odom`` by one correction, or by several fused ones."""
 
-    Attributes:
-        epoch: Epoch of the keyframe.
-        keyframe_id: Id of the keyframe.
-        map_T_odom: (4, 4).
-        covariance: (6, 6), tangent in odom.
-        drift: Covariance (6, 6) of the drift up to the keyframe, which may be dropped sooner than the correction.
-        is_many: Whether it represents several corrections.
-    """
-
-    epoch: int
-    keyframe_id: int
-    map_T_odom: Float
-    covariance: Float
-    drift: Float
-    is_many: bool = False
+    epoch: int  # epoch of the keyframe
+    keyframe_id: int  # id of the keyframe
+    map_T_odom: Float  # (4, 4)
+    covariance: Float  # (6, 6), tangent in odom
+    drift: Float  # covariance (6, 6) of the drift up to the keyframe, which may be dropped sooner than the correction
+    is_many: bool = False  # whether it represents several corrections
 
 
 class MapFrame:

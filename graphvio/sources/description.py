@@ -23,26 +23,16 @@ _NS_PER_MS, _NS_PER_S = 1e6, 1e9
 
 @dataclass(frozen=True)
 class TopicDescription:
-    """Messages of one topic; values are None if there are too few messages.
+    """Messages of one topic; values are None if there are too few messages."""
 
-    Attributes:
-        name: of the topic.
-        type_name: of its messages.
-        messages: how many.
-        rate_hz: by the median interval of the times of recording.
-        jitter_ms: standard deviation of the intervals without gaps.
-        gaps: number of intervals longer than one and a half median ones.
-        longest_ms: longest interval.
-        clock: stamps of the headers and times of recording compared; None also for messages without header.
-    """
-
-    name: str
-    type_name: str
-    messages: int
-    rate_hz: float | None = None
-    jitter_ms: float | None = None
-    gaps: int | None = None
-    longest_ms: float | None = None
+    name: str  # of the topic
+    type_name: str  # of its messages
+    messages: int  # how many
+    rate_hz: float | None = None  # by the median interval of the times of recording
+    jitter_ms: float | None = None  # standard deviation of the intervals without gaps
+    gaps: int | None = None  # number of intervals longer than one and a half median ones
+    longest_ms: float | None = None  # longest interval
+    # stamps of the headers and times of recording compared; None also for messages without header
     clock: Clock | None = None
 
     @property
@@ -53,47 +43,29 @@ class TopicDescription:
 
 @dataclass(frozen=True)
 class Synchronisation:
-    """Comparison of the stamps of two cameras' images.
+    """Comparison of the stamps of two cameras' images."""
 
-    Attributes:
-        first: camera, such as ``pair0 left``.
-        second: camera.
-        offset: of the second's stamps to the first's, or None if none belong together.
-        images: number of the first's.
-    """
-
-    first: str
-    second: str
-    offset: Offset | None
-    images: int
+    first: str  # camera, such as ``pair0 left``
+    second: str  # camera
+    offset: Offset | None  # of the second's stamps to the first's, or None if none belong together
+    images: int  # number of the first's
 
 
 @dataclass(frozen=True)
 class Description:
-    """Description of a session or bag.
+    """Description of a session or bag."""
 
-    Attributes:
-        path: of the file or folder.
-        size_bytes: of the file or folder.
-        duration_s: from the first to the last message.
-        library: that wrote it, or empty.
-        is_whole: whether its writing was finished.
-        damaged: number of damaged chunks and other records among those that were read; of the chunks of graphvio's own
-            sessions that is the first only.
-        rig: one line about the rig in it, or why that is not usable; empty if there is none.
-        topics: by name.
-        synchronisation: left and right of each pair, then the first pair and each other one, of the pairs that
-            topics' names show.
-    """
-
-    path: Path
-    size_bytes: int
-    duration_s: float
-    library: str
-    is_whole: bool
+    path: Path  # of the file or folder
+    size_bytes: int  # of the file or folder
+    duration_s: float  # from the first to the last message
+    library: str  # that wrote it, or empty
+    is_whole: bool  # whether its writing was finished
+    # number of damaged chunks and other records among those that were read; of the chunks of graphvio's own sessions
+    # that is the first only
     damaged: int
-    rig: str
-    topics: tuple[TopicDescription, ...]
+    rig: str  # one line about the rig in it, or why that is not usable; empty if there is none
+    topics: tuple[TopicDescription, ...]  # by name
+    # left and right of each pair, then the first pair and each other one, of the pairs that topics' names show
     synchronisation: tuple[Synchronisation, ...]
 
 

@@ -32,17 +32,11 @@ class ImageSequence(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ImageFiles:
-    """Image files in one folder.
+    """Image files in one folder."""
 
-    Attributes:
-        folder: that holds them.
-        stamps_ns: (N,) increasing.
-        names: of the files.
-    """
-
-    folder: Path
-    stamps_ns: Int
-    names: Sequence[str]
+    folder: Path  # that holds them
+    stamps_ns: Int  # (N,) increasing
+    names: Sequence[str]  # of the files
 
     def read(self, row: int) -> Image:
         """Return the image of a row: see `ImageSequence`."""
@@ -51,16 +45,9 @@ class ImageFiles:
 
 @dataclass(frozen=True, eq=False)
 class Index:
-    """Content of a recording.
+    """Content of a recording."""
 
-    Attributes:
-        name: of the recording.
-        images: camera name -> its images.
-        imu: samples, or None if there are none.
-        truth: file with the true trajectory, or None.
-    """
-
-    name: str
-    images: Mapping[str, ImageSequence]
-    imu: ImuTable | None = None
-    truth: Path | None = None
+    name: str  # of the recording
+    images: Mapping[str, ImageSequence]  # camera name -> its images
+    imu: ImuTable | None = None  # samples, or None if there are none
+    truth: Path | None = None  # file with the true trajectory, or None

@@ -22,32 +22,20 @@ Rows = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class PairIndex:
-    """Left and right images of one pair that belong together.
+    """Left and right images of one pair that belong together."""
 
-    Attributes:
-        stamps_ns: (N,) of the left images, increasing.
-        rows: (N, 2) rows of the left and the right image in their cameras' indexes.
-        left_alone: (L,) stamps of left images without a right one.
-        right_alone: (R,) stamps of right images without a left one.
-    """
-
-    stamps_ns: Int
-    rows: Rows
-    left_alone: Int
-    right_alone: Int
+    stamps_ns: Int  # (N,) of the left images, increasing
+    rows: Rows  # (N, 2) rows of the left and the right image in their cameras' indexes
+    left_alone: Int  # (L,) stamps of left images without a right one
+    right_alone: Int  # (R,) stamps of right images without a left one
 
 
 @dataclass(frozen=True, eq=False)
 class FramesetIndex:
-    """Framesets of a recording.
+    """Framesets of a recording."""
 
-    Attributes:
-        stamps_ns: (F,) increasing, camera clock.
-        rows: (F, P, 2) rows of the left and right image of each pair, -1 where the pair has none.
-    """
-
-    stamps_ns: Int
-    rows: Rows
+    stamps_ns: Int  # (F,) increasing, camera clock
+    rows: Rows  # (F, P, 2) rows of the left and right image of each pair, -1 where the pair has none
 
 
 def match_sides(left_ns: Int, right_ns: Int, tolerance_ns: int = TOLERANCE_NS) -> PairIndex:

@@ -24,15 +24,10 @@ _MAX_OUTLIERS = 2
 
 @dataclass(frozen=True, eq=False)
 class ImuTable:
-    """Samples of an IMU.
+    """Samples of an IMU."""
 
-    Attributes:
-        stamps_ns: (N,) increasing, IMU clock.
-        values: (N, 6) angular velocity, rad/s, then specific force, m/s^2; frame body.
-    """
-
-    stamps_ns: Int
-    values: Float
+    stamps_ns: Int  # (N,) increasing, IMU clock
+    values: Float  # (N, 6) angular velocity, rad/s, then specific force, m/s^2; frame body
 
 
 def read_imu_csv(path: Path, faults: FaultLog) -> ImuTable:

@@ -29,16 +29,12 @@ _SCRIPT = 'trap : TERM; "$@" & read -r _; kill -TERM 0; wait'
 class WebOptions:
     """Ports and memory of the server, which listens on this machine only; use an SSH tunnel for both ports elsewhere.
 
-    Attributes:
-        port: of the page; its data is on the next one, ``data_port``.
-        memory_mb: data kept for browsers that connect later; the oldest is dropped.
-
     Raises:
         GraphvioError: if a value is out of range.
     """
 
-    port: int = 9090
-    memory_mb: int = 512
+    port: int = 9090  # of the page; its data is on the next one, ``data_port``
+    memory_mb: int = 512  # data kept for browsers that connect later; the oldest is dropped
 
     def __post_init__(self) -> None:
         if not 1 <= self.port <= 65534:

@@ -253,25 +253,15 @@ def _find(sysfs: Path, name: str) -> Path:
 
 @dataclass(frozen=True)
 class ScanElement:
-    """One channel of a scan; in sysfs ``[be|le]:[s|u]BITS/STORAGE[XREPEAT]>>SHIFT``.
+    """One channel of a scan; in sysfs ``[be|le]:[s|u]BITS/STORAGE[XREPEAT]>>SHIFT``."""
 
-    Attributes:
-        name: such as ``in_anglvel_x``.
-        index: its order in the scan.
-        is_signed: two's complement.
-        bits: number of valid bits.
-        storage_bytes: its size, to a multiple of which it is aligned.
-        shift: to the right, before the valid bits are taken.
-        is_big_endian: byte order.
-    """
-
-    name: str
-    index: int
-    is_signed: bool
-    bits: int
-    storage_bytes: int
-    shift: int
-    is_big_endian: bool
+    name: str  # such as ``in_anglvel_x``
+    index: int  # its order in the scan
+    is_signed: bool  # two's complement
+    bits: int  # number of valid bits
+    storage_bytes: int  # its size, to a multiple of which it is aligned
+    shift: int  # to the right, before the valid bits are taken
+    is_big_endian: bool  # byte order
 
     @staticmethod
     def parse(name: str, index: str, kind: str) -> ScanElement:

@@ -17,17 +17,11 @@ KINDS = ("v4l2", "realsense", "oak", "ros2", "replay", "simulator")
 
 @dataclass(frozen=True)
 class SourceSpec:
-    """``KIND[:WHAT][?KEY=VALUE[&KEY=VALUE]]``, such as ``realsense:0123,4567?rate_hz=30``.
+    """``KIND[:WHAT][?KEY=VALUE[&KEY=VALUE]]``, such as ``realsense:0123,4567?rate_hz=30``."""
 
-    Attributes:
-        kind: of source, one of `KINDS`.
-        what: device, devices separated by commas, path or name; may be empty.
-        options: of the source.
-    """
-
-    kind: str
-    what: str = ""
-    options: Mapping[str, str] = field(default_factory=dict)
+    kind: str  # of source, one of `KINDS`
+    what: str = ""  # device, devices separated by commas, path or name; may be empty
+    options: Mapping[str, str] = field(default_factory=dict)  # of the source
 
     @staticmethod
     def parse(text: str) -> SourceSpec:

@@ -48,25 +48,15 @@ def list_devices() -> Sequence[DeviceInfo]:
 
 @dataclass(frozen=True)
 class StreamSettings:
-    """Settings of a camera's streams.
+    """Settings of a camera's streams."""
 
-    Attributes:
-        size_px: (width, height).
-        fps: images a second.
-        imu_hz: rate of the IMU, or None to leave it off.
-        exposure_us: exposure time, with `iso`, or None for automatic exposure.
-        iso: sensitivity.
-        is_lens_fitted: whether images are corrected where graphvio does not have the factory's lens model.
-        is_imu_guessed: whether the pose of an IMU without calibration is taken to be the left camera's.
-    """
-
-    size_px: tuple[int, int]
-    fps: float
-    imu_hz: int | None
-    exposure_us: int | None = None
-    iso: int = 400
-    is_lens_fitted: bool = True
-    is_imu_guessed: bool = False
+    size_px: tuple[int, int]  # (width, height)
+    fps: float  # images a second
+    imu_hz: int | None  # rate of the IMU, or None to leave it off
+    exposure_us: int | None = None  # exposure time, with `iso`, or None for automatic exposure
+    iso: int = 400  # sensitivity
+    is_lens_fitted: bool = True  # whether images are corrected where graphvio does not have the factory's lens model
+    is_imu_guessed: bool = False  # whether the pose of an IMU without calibration is taken to be the left camera's
 
 
 class Connection(Protocol):

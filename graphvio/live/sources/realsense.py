@@ -92,25 +92,15 @@ class ContextBus:
 
 @dataclass(frozen=True)
 class StreamSettings:
-    """Settings of a camera's streams.
+    """Settings of a camera's streams."""
 
-    Attributes:
-        size_px: (width, height).
-        fps: images a second.
-        gyro_hz: rate of the gyro, or None to leave the IMU off.
-        accel_hz: minimum rate of the accelerometer.
-        exposure_us: exposure time, or None for automatic exposure.
-        gain: in the device's units, or None.
-        sync: one of ``none``, ``master`` and ``slave``.
-    """
-
-    size_px: tuple[int, int]
-    fps: int
-    gyro_hz: int | None
-    accel_hz: int
-    exposure_us: float | None
-    gain: float | None
-    sync: str = "none"
+    size_px: tuple[int, int]  # (width, height)
+    fps: int  # images a second
+    gyro_hz: int | None  # rate of the gyro, or None to leave the IMU off
+    accel_hz: int  # minimum rate of the accelerometer
+    exposure_us: float | None  # exposure time, or None for automatic exposure
+    gain: float | None  # in the device's units, or None
+    sync: str = "none"  # one of ``none``, ``master`` and ``slave``
 
 
 def list_devices() -> Sequence[DeviceInfo]:

@@ -31,18 +31,13 @@ class Outage:
 
 @dataclass(frozen=True)
 class DeviceFaults:
-    """Faults of a rig's devices: each pair is one, and the IMU is one.
+    """Faults of a rig's devices: each pair is one, and the IMU is one."""
 
-    Attributes:
-        drift_ppm: of the first device's clock; those of the others are smaller, of alternating sign. None gives all
-            devices one clock.
-        jitter_ms: mean of the exponentially distributed delay of a reading on its way to the host.
-        outages: of the devices.
-    """
-
+    # of the first device's clock; those of the others are smaller, of alternating sign. None gives all devices one
+    # clock.
     drift_ppm: float | None = None
-    jitter_ms: float = 0.0
-    outages: tuple[Outage, ...] = ()
+    jitter_ms: float = 0.0  # mean of the exponentially distributed delay of a reading on its way to the host
+    outages: tuple[Outage, ...] = ()  # of the devices
 
     @staticmethod
     def parse(options: Mapping[str, str], rig_devices: tuple[str, ...]) -> DeviceFaults:

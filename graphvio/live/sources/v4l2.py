@@ -48,21 +48,13 @@ _Part = tuple[str, slice, slice]  # a camera's name, and the rows and columns of
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """Settings of a device.
+    """Settings of a device."""
 
-    Attributes:
-        size_px: (width, height) of the whole image, of both cameras where they are side by side.
-        fps: images a second, or None for the driver's choice.
-        pixel_format: ``MJPG``, ``YUYV``, ``UYVY`` or ``GREY``.
-        exposure_us: exposure time, or None for automatic exposure.
-        gain: in the driver's units, or None.
-    """
-
-    size_px: tuple[int, int]
-    fps: float | None = None
-    pixel_format: str = "MJPG"
-    exposure_us: float | None = None
-    gain: float | None = None
+    size_px: tuple[int, int]  # (width, height) of the whole image, of both cameras where they are side by side
+    fps: float | None = None  # images a second, or None for the driver's choice
+    pixel_format: str = "MJPG"  # ``MJPG``, ``YUYV``, ``UYVY`` or ``GREY``
+    exposure_us: float | None = None  # exposure time, or None for automatic exposure
+    gain: float | None = None  # in the driver's units, or None
 
 
 class Capture(Protocol):

@@ -21,40 +21,24 @@ _INDEPENDENT_POINTS = 10  # errors of a lens's calibration are correlated across
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A keyframe whose images are searched for loop closures.
+    """A keyframe whose images are searched for loop closures."""
 
-    Attributes:
-        session: number of the session.
-        row: of the frameset in the session's record.
-        stamp_ns: of the frameset.
-    """
-
-    session: int
-    row: int
-    stamp_ns: int
+    session: int  # number of the session
+    row: int  # of the frameset in the session's record
+    stamp_ns: int  # of the frameset
 
 
 @dataclass(frozen=True, eq=False)
 class LoopClosure:
-    """The relative pose of two places that see the same points.
+    """The relative pose of two places that see the same points."""
 
-    Attributes:
-        reference: the earlier place.
-        current: the later one.
-        reference_T_current: (4, 4) of body.
-        covariance: (6, 6), tangent ``[rotation, translation]`` in body at the current place.
-        inliers: number of points.
-        pairs: (pair at the reference, pair at the current place) that saw the same points.
-        is_registered: whether patches were registered, not only features matched.
-    """
-
-    reference: Place
-    current: Place
-    reference_T_current: Float
-    covariance: Float
-    inliers: int
-    pairs: tuple[tuple[int, int], ...]
-    is_registered: bool
+    reference: Place  # the earlier place
+    current: Place  # the later one
+    reference_T_current: Float  # (4, 4) of body
+    covariance: Float  # (6, 6), tangent ``[rotation, translation]`` in body at the current place
+    inliers: int  # number of points
+    pairs: tuple[tuple[int, int], ...]  # (pair at the reference, pair at the current place) that saw the same points
+    is_registered: bool  # whether patches were registered, not only features matched
 
 
 def closure_of(earlier: Place, later: Place, found: Resection) -> LoopClosure:

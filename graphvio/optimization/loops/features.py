@@ -24,19 +24,12 @@ _MAX_PENDING = 4  # places that are processed at a time
 
 @dataclass(frozen=True, eq=False)
 class PairFeatures:
-    """The features of one pair's images at a place.
+    """The features of one pair's images at a place."""
 
-    Attributes:
-        left: (K, 2) pixels in the left image.
-        descriptors: (K, 128) uint8, of the features in the left image.
-        right: (M, 2) pixels in the right image of those with a stereo match.
-        in_right: (M,) their indices among the K.
-    """
-
-    left: Float
-    descriptors: AnyArray
-    right: Float
-    in_right: Int
+    left: Float  # (K, 2) pixels in the left image
+    descriptors: AnyArray  # (K, 128) uint8, of the features in the left image
+    right: Float  # (M, 2) pixels in the right image of those with a stereo match
+    in_right: Int  # (M,) their indices among the K
 
     @property
     def rows(self) -> Int:

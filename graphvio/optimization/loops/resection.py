@@ -34,21 +34,13 @@ _MIN_REGISTERED = 30
 
 @dataclass(frozen=True, eq=False)
 class Resection:
-    """A motion between two places.
+    """A motion between two places."""
 
-    Attributes:
-        cur_T_ref: (4, 4) of body.
-        covariance: (6, 6), tangent ``[rotation, translation]`` in body at the current place.
-        inliers: number of points.
-        pairs: (pair at the reference, pair at the current place) that saw the same points.
-        is_registered: whether patches were registered, not only features matched.
-    """
-
-    cur_T_ref: Float
-    covariance: Float
-    inliers: int
-    pairs: tuple[tuple[int, int], ...]
-    is_registered: bool
+    cur_T_ref: Float  # (4, 4) of body
+    covariance: Float  # (6, 6), tangent ``[rotation, translation]`` in body at the current place
+    inliers: int  # number of points
+    pairs: tuple[tuple[int, int], ...]  # (pair at the reference, pair at the current place) that saw the same points
+    is_registered: bool  # whether patches were registered, not only features matched
 
 
 def resect_features(

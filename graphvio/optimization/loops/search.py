@@ -23,19 +23,12 @@ from graphvio.sources import Source
 
 @dataclass(frozen=True, eq=False)
 class SessionInput:
-    """A session to search.
+    """A session to search."""
 
-    Attributes:
-        name: of the session, unique.
-        source: of its images.
-        rig: of the cameras.
-        places: in the order of time.
-    """
-
-    name: str
-    source: Source
-    rig: Rig
-    places: Sequence[Place]
+    name: str  # of the session, unique
+    source: Source  # of its images
+    rig: Rig  # of the cameras
+    places: Sequence[Place]  # in the order of time
 
 
 def find_loops(

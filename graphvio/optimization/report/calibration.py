@@ -24,30 +24,19 @@ _FIXED = 1e-7  # radians and metres: no measurement is that good
 
 @dataclass(frozen=True)
 class PairCorrection:
-    """The correction of a pair's extrinsics.
+    """The correction of a pair's extrinsics."""
 
-    Attributes:
-        pair: number of the pair.
-        name: of the pair, or empty.
-        is_held: whether it is not estimated: without an IMU, the first pair defines body.
-        of: point whose displacement is given: the pair's ``left camera``, or ``body's origin`` moved with the pair if
-            the rig is unknown.
-        angle_deg: of the rotation.
-        angle_sigma_deg: its standard deviation, largest over all axes.
-        distance_m: displacement.
-        distance_sigma_m: its standard deviation, largest over all directions.
-        squared_distance: Mahalanobis, of rotation and translation, 6 degrees of freedom; None if held.
-    """
-
-    pair: int
-    name: str
-    is_held: bool
+    pair: int  # number of the pair
+    name: str  # of the pair, or empty
+    is_held: bool  # whether it is not estimated: without an IMU, the first pair defines body
+    # point whose displacement is given: the pair's ``left camera``, or ``body's origin`` moved with the pair if the rig
+    # is unknown
     of: str
-    angle_deg: float
-    angle_sigma_deg: float
-    distance_m: float
-    distance_sigma_m: float
-    squared_distance: float | None
+    angle_deg: float  # of the rotation
+    angle_sigma_deg: float  # its standard deviation, largest over all axes
+    distance_m: float  # displacement
+    distance_sigma_m: float  # its standard deviation, largest over all directions
+    squared_distance: float | None  # mahalanobis, of rotation and translation, 6 degrees of freedom; None if held
 
     @property
     def title(self) -> str:

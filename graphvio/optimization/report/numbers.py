@@ -30,23 +30,14 @@ _KINDS = ("imu", "motion", "view", "zero_velocity", "walk", "start", "calibratio
 
 @dataclass(frozen=True)
 class Part:
-    """An epoch of a session, and the frame that it is in.
+    """An epoch of a session, and the frame that it is in."""
 
-    Attributes:
-        session: number of the session.
-        epoch: of the session.
-        frame: number of the frame.
-        framesets: in the epoch.
-        begin_s: its first pose, in seconds since the session's first pose.
-        end_s: its last pose, likewise.
-    """
-
-    session: int
-    epoch: int
-    frame: int
-    framesets: int
-    begin_s: float
-    end_s: float
+    session: int  # number of the session
+    epoch: int  # of the session
+    frame: int  # number of the frame
+    framesets: int  # in the epoch
+    begin_s: float  # its first pose, in seconds since the session's first pose
+    end_s: float  # its last pose, likewise
 
 
 @dataclass(frozen=True)
@@ -82,41 +73,23 @@ class Spread:
 
 @dataclass(frozen=True, eq=False)
 class SessionNumbers:
-    """Numbers of one session.
+    """Numbers of one session."""
 
-    Attributes:
-        name: of the session.
-        framesets: that have a pose.
-        completion: their share of those that could have one; None if unknown.
-        states: of the graph.
-        duration_s: from the first pose to the last.
-        length_m: along the optimised positions.
-        accuracy: ATE by stage, or None.
-        no_accuracy: why there is no ATE, or empty.
-        online: (F, 4, 4) online poses in the optimised frames.
-        moved_m: (F,) distance between online and optimised positions.
-        moved_deg: (F,) angle between online and optimised rotations.
-        sigma_m: (N,) of the states' positions, all axes combined.
-        sigma_deg: (N,) of the states' rotations, all axes combined.
-        online_sigma_m: (F,) of the online positions.
-        online_sigma_deg: (F,) of the online rotations.
-    """
-
-    name: str
-    framesets: int
-    completion: float | None
-    states: int
-    duration_s: float
-    length_m: float
-    accuracy: Mapping[str, Accuracy] | None
-    no_accuracy: str
-    online: Float
-    moved_m: Float
-    moved_deg: Float
-    sigma_m: Float
-    sigma_deg: Float
-    online_sigma_m: Float
-    online_sigma_deg: Float
+    name: str  # of the session
+    framesets: int  # that have a pose
+    completion: float | None  # their share of those that could have one; None if unknown
+    states: int  # of the graph
+    duration_s: float  # from the first pose to the last
+    length_m: float  # along the optimised positions
+    accuracy: Mapping[str, Accuracy] | None  # ATE by stage, or None
+    no_accuracy: str  # why there is no ATE, or empty
+    online: Float  # (F, 4, 4) online poses in the optimised frames
+    moved_m: Float  # (F,) distance between online and optimised positions
+    moved_deg: Float  # (F,) angle between online and optimised rotations
+    sigma_m: Float  # (N,) of the states' positions, all axes combined
+    sigma_deg: Float  # (N,) of the states' rotations, all axes combined
+    online_sigma_m: Float  # (F,) of the online positions
+    online_sigma_deg: Float  # (F,) of the online rotations
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,27 +103,16 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """Numbers of an optimisation.
+    """Numbers of an optimisation."""
 
-    Attributes:
-        sessions: in the order of the optimisation.
-        parts: epochs of all sessions.
-        kinds: of factors.
-        used: number of loop closures that are used.
-        refused: number of loop closures that are refused.
-        loop_errors: errors of the used loop closures, by stage.
-        calibrations: of each session; None where the calibration was not estimated.
-        unknowns: dimension of the solution.
-    """
-
-    sessions: Sequence[SessionNumbers]
-    parts: Sequence[Part]
-    kinds: Sequence[Kind]
-    used: int
-    refused: int
-    loop_errors: Mapping[str, Spread]
-    calibrations: Sequence[SessionCalibration | None]
-    unknowns: int
+    sessions: Sequence[SessionNumbers]  # in the order of the optimisation
+    parts: Sequence[Part]  # epochs of all sessions
+    kinds: Sequence[Kind]  # of factors
+    used: int  # number of loop closures that are used
+    refused: int  # number of loop closures that are refused
+    loop_errors: Mapping[str, Spread]  # errors of the used loop closures, by stage
+    calibrations: Sequence[SessionCalibration | None]  # of each session; None where the calibration was not estimated
+    unknowns: int  # dimension of the solution
 
     @property
     def frames(self) -> int:
