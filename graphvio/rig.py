@@ -19,7 +19,7 @@ from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
 _ROTATION_TOLERANCE = 1e-3
 _ROUNDING = 1e-14
@@ -240,6 +240,11 @@ class Rig:
     def without_imu(self) -> Rig:
         """Drop the IMU."""
         return replace(self, imu=None)
+
+    def with_cameras(self, change: Callable[[Camera], Camera]) -> Rig:
+        """Replace each camera by what a function makes of it."""
+        pairs = [replace(pair, left=change(pair.left), right=change(pair.right)) for pair in self.pairs]
+        return replace(self, pairs=tuple(pairs))
 
 
 def as_written(camera: Camera, body_T_cam: Float) -> Camera:

@@ -120,8 +120,8 @@ def test_candidates_are_images_of_the_same_place() -> None:
         return np.asarray(np.clip(again / lengths * 512.0, 0.0, 255.0), dtype=np.uint8)
 
     images = [look(place) for place in places] + [look(place) for place in places]
-    words = vocabulary(images, 0)
-    assert np.array_equal(words, vocabulary(images, 0))
+    words = vocabulary(images, len(images), 0)
+    assert np.array_equal(words, vocabulary(images, len(images), 0))
     vectors = np.array([describe(image, words) for image in images])
     found = candidates(vectors, np.arange(24), lambda earlier, later: True, 1)
     best = {later: earlier for earlier, later in found}

@@ -60,14 +60,12 @@ class CameraMotions:
         return len(self._edge)
 
     def between(self, start_ns: int, end_ns: int) -> tuple[Float, Float] | None:
-        """Chain motions from one instant to a later one.
+        """Chain motions from one instant to a later one; None where none connect the two.
+
+        The covariance (6, 6) of the motion (4, 4) has the tangent in the camera's frame at the end.
 
         An instant between two of the camera's own, such as that of a pair that is triggered at other times, is
         interpolated.
-
-        Returns:
-            Motion (4, 4) and its covariance (6, 6), tangent in the camera's frame at the end; None where no motions
-            connect the two.
         """
         start, end = self._placed(start_ns), self._placed(end_ns)
         if start is None or end is None:
@@ -174,12 +172,7 @@ def _carried(covariance: Float, start_T_end: Float) -> Float:
 
 
 class SeparateMotions:
-    """Visual odometry of every pair of a rig by itself, independent of the poses of the pairs in the rig file.
-
-    Args:
-        rig: of the framesets; of its extrinsics only those within a pair matter.
-        config: of the front-ends.
-    """
+    """Visual odometry of every pair of a rig by itself, independent of the poses of the pairs in the rig file."""
 
     def __init__(self, rig: Rig, config: Config) -> None:
         self._rig = rig

@@ -46,12 +46,7 @@ class ClockRelation:
 
 
 def first_relation(one: Trajectory, other: Trajectory, same_clock: bool) -> ClockRelation:
-    """Estimate the offset from the angular speeds; the drift is zero.
-
-    Args:
-        one: first trajectory.
-        other: second trajectory.
-        same_clock: take the offset as zero.
+    """Estimate the offset from the angular speeds, or take it as zero for one clock; the drift is zero.
 
     Raises:
         CalibrationError: if no unique offset is found, or the trajectories do not overlap in time.

@@ -50,13 +50,9 @@ class Comparison:
 
 
 def compare(pairs: PosePairs, paper: PaperSolution, graph: GraphSolution, dispersion: float = 1.0) -> Comparison:
-    """Compare two solutions for the same N pose pairs.
+    """Compare two solutions for the same N pose pairs, whose motions' covariances are scaled by the dispersion.
 
-    Args:
-        pairs: the pose pairs.
-        paper: the paper's solution.
-        graph: the graph's, where nuisance variables are about zero.
-        dispersion: factor on the covariances of the motions.
+    The graph's nuisance variables must be about zero.
     """
     by_paper = _influence_on_paper(pairs, paper)
     determined = null_space(graph.observability.undetermined).T if not graph.observability.is_complete else np.eye(6)

@@ -51,11 +51,7 @@ class Advice:
 
 
 class Guide:
-    """Follows a recording and gives advice.
-
-    Args:
-        names: of the pairs; each one's pose relative to the first is estimated.
-    """
+    """Follows a recording of pairs with these names and gives advice on each one's pose relative to the first."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
@@ -64,11 +60,7 @@ class Guide:
         self._until_ns: int | None = None
 
     def advise(self, motions: Sequence[CameraMotions]) -> Advice:
-        """Return what to do next.
-
-        Args:
-            motions: all that each pair has measured up to now.
-        """
+        """Return what to do next, after all motions that each pair has measured up to now."""
         self._take(motions)
         advice = [self._advice(j) for j in range(1, len(self._names))]
         return max(advice, key=lambda each: (bool(each.missing), each.translation_sigma_m, each.rotation_sigma_deg))

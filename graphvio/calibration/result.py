@@ -55,7 +55,7 @@ class RigComparison:
 
 @dataclass(frozen=True, eq=False)
 class PoseSummary:
-    """A pose as three values each of offset and rotation, their standard deviations, and whether they are determined."""
+    """A pose as three values each of offset and rotation, with their sigmas, and whether they are determined."""
 
     offset_m: Float  # (3,) position of the first left camera in another one's axes
     offset_sigmas_m: Float  # (3,)
@@ -161,11 +161,7 @@ class Calibration:
         return self.places.pairwise[0, j].observability.undetermined
 
     def _apart(self, j: int, given: Float) -> tuple[Float, float, int]:
-        """Compare with another value in the directions that the motions determine.
-
-        Returns:
-            Tangent (6,) from the calibration to the value, squared Mahalanobis distance, and its degrees of freedom.
-        """
+        """Return tangent (6,) to another value where determined, squared Mahalanobis distance, degrees of freedom."""
         undetermined = self._undetermined(j)
         place = np.ascontiguousarray(self.places.left_T_left1[j])
         for _ in range(_NEARER):  # all poses along these directions are equally likely: take the nearest one

@@ -69,12 +69,7 @@ class Segments:
 
 
 def all_segments(stamps_ns: Sequence[int], betweens: Sequence[Between]) -> Segments:
-    """List segments of several lengths from every instant, where the first and at least one other motion are known.
-
-    Args:
-        stamps_ns: T instants in order.
-        betweens: measured motion of each of J cameras.
-    """
+    """List segments of several lengths from T instants, where the first and at least one other motion are known."""
     stamps = np.array(stamps_ns, dtype=np.int64)
     ends, measured = [], []
     for i, j in zip(*(each.tolist() for each in segment_ends(stamps)), strict=True):
@@ -110,11 +105,7 @@ def segment_ends(stamps_ns: Int) -> tuple[Int, Int]:
 
 
 def of_one_length(segments: Segments) -> list[int]:
-    """Choose segments of about a third of a second, one after the other, for a first solution.
-
-    Returns:
-        Indices of the segments.
-    """
+    """Return indices of segments of about a third of a second, one after the other, for a first solution."""
     duration = (segments.end_ns - segments.start_ns) / _NS_PER_S
     nearest: dict[int, int] = {}
     for row, i in enumerate(segments.first.tolist()):
@@ -130,30 +121,16 @@ def of_one_length(segments: Segments) -> list[int]:
 
 
 def information_gains(pairs: PosePairs, left2_T_left1: Float, covariance: Float) -> Float:
-    """Compute by how much each pose pair lowers the logarithm of the solution's uncertainty volume, to first order.
+    """Compute by how much each of N pose pairs lowers the logarithm of the solution's uncertainty volume, (N,).
 
-    Args:
-        pairs: N pose pairs.
-        left2_T_left1: approximate solution (4, 4).
-        covariance: (6, 6) of that solution.
-
-    Returns:
-        Gains (N,).
+    To first order, about an approximate solution (4, 4) with its covariance (6, 6).
     """
     _, jacobians = whitened(pairs, left2_T_left1)
     return np.asarray(np.einsum("nki,ij,nkj->n", jacobians, covariance, jacobians))
 
 
 def most_informative(segments: Segments, gains: Float) -> list[int]:
-    """Choose segments that do not overlap and have the largest sum of gains, by dynamic programming over the instants.
-
-    Args:
-        segments: N to choose from.
-        gains: (N,).
-
-    Returns:
-        Indices of the chosen segments in order of time.
-    """
+    """Return indices, in order of time, of the segments that do not overlap with the largest sum of gains (N,)."""
     ending: dict[int, list[int]] = {}
     for row, j in enumerate(segments.last.tolist()):
         ending.setdefault(j, []).append(row)

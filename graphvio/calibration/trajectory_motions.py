@@ -35,12 +35,7 @@ _NS_PER_S = 1_000_000_000
 
 
 def segments_of(trajectories: Sequence[Trajectory], clocks: Sequence[ClockRelation]) -> Segments:
-    """List segments of J trajectories, with initial covariances that are all the same.
-
-    Args:
-        trajectories: of the cameras.
-        clocks: of all but the first, relative to the first.
-    """
+    """List segments of J trajectories, with equal initial covariances; clocks are relative to that of the first."""
     stamps = _thinned(trajectories[0].stamps_ns)
     sampled = [_at(trajectories[0], stamps)]
     sampled += [_at(each, clock.of(stamps)) for each, clock in zip(trajectories[1:], clocks, strict=True)]
@@ -93,12 +88,7 @@ def aligned(one: Trajectory, other: Trajectory, same_clock: bool = False, seed: 
 
 
 def of_all(trajectories: Sequence[Trajectory], two: Mapping[tuple[int, int], TwoTrajectories]) -> Segments:
-    """List segments of J trajectories by the clock of the first, each with the mean of its noise in pairwise results.
-
-    Args:
-        trajectories: of the cameras.
-        two: (first, second) -> pairwise result; with all (0, j).
-    """
+    """List segments of J trajectories by the clock of the first, each with the mean of its noise in pairwise ones."""
     segments = segments_of(trajectories, [two[0, j].clock for j in range(1, len(trajectories))])
     length = _length_classes(segments)
     noise: dict[tuple[int, int], list[Float]] = {}  # camera, length -> covariances

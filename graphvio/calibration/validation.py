@@ -60,7 +60,7 @@ class Grown(NamedTuple):
 def halves(
     pairs: PosePairs, solution: GraphSolution, factor: float, nuisances: Nuisances, floor: Float
 ) -> Halves | None:
-    """Solve for each half alone.
+    """Solve for each half alone; None where one does not determine the pose.
 
     Args:
         pairs: N pose pairs.
@@ -68,9 +68,6 @@ def halves(
         factor: on the covariances of both solutions.
         nuisances: variables that are estimated, too.
         floor: (6, 6) covariance of systematic errors of each solution.
-
-    Returns:
-        The comparison; None where a half does not determine the pose.
     """
     middle = np.median(pairs.end_ns)
     parts = [np.flatnonzero(pairs.end_ns <= middle), np.flatnonzero(pairs.end_ns > middle)]

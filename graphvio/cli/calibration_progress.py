@@ -11,12 +11,7 @@ from graphvio.runtime import on_interrupt
 
 
 class CalibrationProgress:
-    """Progress bar while a recording is read, with a guide's advice if there is one; Ctrl-C ends the recording.
-
-    Args:
-        total: framesets of the recording.
-        guided: names of the pairs for the guide, or None without.
-    """
+    """Progress bar while a recording is read, with a guide's advice if there is one; Ctrl-C ends the recording."""
 
     _GUIDE_EVERY = 20  # framesets
     _PLAIN_EVERY = 100  # framesets, where there is no terminal

@@ -24,12 +24,7 @@ _COLOURS = {"tracking": "green", "coasting": "yellow", "initialising": "cyan", "
 
 
 class Dashboard(TerminalDisplay):
-    """Shows the figures, devices and events of a live run; a context manager.
-
-    Args:
-        title: title of the panel.
-        events: events, which are shown as they come.
-    """
+    """Shows the figures, devices and events of a live run; a context manager."""
 
     def __init__(self, title: str, events: BoundedQueue[Event]) -> None:
         super().__init__()

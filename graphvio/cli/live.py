@@ -76,19 +76,7 @@ def run_live(
     duration_s: float | None,
     services: Services | None,
 ) -> None:
-    """Open a source, run the odometry on it with recording, viewer and services, and save everything at the end.
-
-    Args:
-        source: as `open_live_source` takes it.
-        rig: rig file, or None for the source's own.
-        config: profile or YAML file.
-        record: session to record, or None.
-        png: whether images are recorded as PNG.
-        view: whether the viewer's window opens.
-        health_port: port of metrics and liveness, or None.
-        duration_s: time after which the run ends, or None.
-        services: for other programs, or None.
-    """
+    """Open a source, run the odometry on it with recording, viewer and services, and save everything at the end."""
     from time import monotonic
 
     from graphvio.cli.dashboard import Dashboard, line_of, summary_of

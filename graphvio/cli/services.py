@@ -49,12 +49,7 @@ class Services:
         return replace(config, keyframes=replace(config.keyframes, images=True))
 
     def check(self) -> None:
-        """Refuse services that cannot run, before sensors are started.
-
-        Raises:
-            ServiceError: if an address is in use or would be open to all, or files are missing or cannot be used.
-            MissingExtraError: if a service's extra is not installed.
-        """
+        """Raise the error of a service that cannot run, before sensors are started."""
         from graphvio.slam.service.server import check
 
         check(self._options())
@@ -62,18 +57,7 @@ class Services:
             from graphvio.ros2.publisher import Publisher  # noqa: F401
 
     def start(self, running: LiveOdometry, stack: ExitStack, is_stopped: Callable[[], bool] = lambda: False) -> Started:
-        """Serve an odometry that is about to run, until the stack closes.
-
-        Args:
-            running: the odometry.
-            stack: closes the services.
-            is_stopped: returns whether the run is to stop; called while waiting.
-
-        Raises:
-            KeyboardInterrupt: if it is to stop before all services run.
-            ServiceError: if an address cannot be used, or would be open to all.
-            MissingExtraError: if a service's extra is not installed.
-        """
+        """Serve an odometry until the stack closes; a `KeyboardInterrupt` where the run is to stop before that."""
         from graphvio.slam.service.server import GrpcServer
 
         address = stack.enter_context(_until_read(GrpcServer(running, self._options()))).address

@@ -84,11 +84,7 @@ def _choose(rig: Rig, pairs: str | None, no_imu: bool) -> Rig:
 
 
 def check_session_name(path: Path) -> None:
-    """Refuse a session that could not be read by its name.
-
-    Raises:
-        SessionError: if it does not end in .mcap.
-    """
+    """Refuse a session that could not be read by its name."""
     from graphvio.errors import SessionError
 
     if path.suffix != ".mcap":

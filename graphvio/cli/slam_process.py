@@ -32,9 +32,6 @@ class SlamProcess:
     Args:
         task: task of the process; its working folder is made here, so that it is removed even if the process is killed.
         path: path of the odometry, written next to the map.
-
-    Raises:
-        MapError: if there is no room for temporary files.
     """
 
     def __init__(self, task: MappingTask, path: PathOutput) -> None:
@@ -73,11 +70,7 @@ class SlamProcess:
             self._warn(f"{self._failure}; the odometry goes on without it")
 
     def finish(self) -> bool:
-        """Wait until all keyframes are processed and the map is saved, and write the odometry's path next to it.
-
-        Returns:
-            Whether all of that was done; otherwise a warning is printed.
-        """
+        """Wait for the saved map, and write the odometry's path next to it; returns whether all of that was done."""
         if self._process.is_alive():
             typer.echo("waiting for the SLAM, which processes the last keyframes", err=True)
         self._process.join(_PATIENCE_S)

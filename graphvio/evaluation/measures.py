@@ -102,14 +102,9 @@ def angle_between(first: Float, second: Float) -> Float:
 
 
 def relative_errors(estimate: Trajectory, truth: Trajectory) -> tuple[dict[str, RelativeError], Float]:
-    """Compute relative errors of poses of equal stamps.
+    """Compute relative errors of N poses of equal stamps: RPE by name of the distance, and those of KITTI's segments.
 
-    Args:
-        estimate: N poses.
-        truth: N poses.
-
-    Returns:
-        RPE by name of the distance, and percent and degrees per metre (M, 2) of all KITTI segments.
+    The latter are percent and degrees per metre (M, 2).
     """
     seconds = (truth.stamps_ns - truth.stamps_ns[0]) / _NS_PER_S
     distances = truth.distances

@@ -21,11 +21,7 @@ _MAX_CONNECT_S = 20.0
 
 
 def distributed() -> Any:
-    """Import and return the library ``distributed``.
-
-    Raises:
-        MissingExtraError: if the extra ``fleet`` is not installed.
-    """
+    """Import and return the library ``distributed``."""
     try:
         import distributed
     except ImportError:
@@ -45,10 +41,7 @@ def default_workers() -> int:
 def compile_kernels(recordings: Sequence[str], rig: Rig | None, config: Config) -> None:
     """Compile the odometry's kernels in this process, before several processes would all compile the same.
 
-    Args:
-        recordings: paths and URLs; without a rig, that of the first one that can be opened here is used.
-        rig: rig of all recordings, or None.
-        config: configuration of the odometry.
+    Without a rig, that of the first recording that can be opened here is used.
     """
     for recording in (Path(each) for each in recordings if rig is None):
         if recording.exists():
@@ -67,9 +60,6 @@ def connected(scheduler: str | None, workers: int | None = None) -> Iterator[Any
     Args:
         scheduler: address of a running scheduler; None takes a cluster on this machine for the time inside.
         workers: processes of such a cluster, of one thread each; None takes `default_workers`.
-
-    Yields:
-        The client.
 
     Raises:
         FleetError: if the scheduler cannot be reached, or the cluster cannot be started.

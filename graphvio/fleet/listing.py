@@ -27,9 +27,6 @@ def list_sessions(where: str) -> list[Listed]:
     A list has one path or URL per line; relative paths are relative to the list, and lines that begin with ``#`` are
     comments. In remote folders each folder counts as a recording, and so does a file that ends in .mcap or .bag.
 
-    Args:
-        where: path or URL of the folder or list.
-
     Raises:
         FleetError: if it does not exist, or has no recording.
     """

@@ -24,21 +24,13 @@ class Marker:
     figures: Mapping[str, Any] = field(default_factory=dict)  # name -> value, for the table of sessions
 
     def write(self, storage: Storage) -> None:
-        """Write the marker into a session's folder.
-
-        Raises:
-            FleetError: if it cannot be written.
-        """
+        """Write the marker into a session's folder."""
         text = json.dumps(asdict(self), indent=2, allow_nan=False) + "\n"
         storage.write(_name(self.stage), text.encode())
 
 
 def finished(storage: Storage, inputs: Mapping[str, str]) -> dict[str, Marker]:
-    """Return the stages of a session whose files all exist: name -> marker.
-
-    Args:
-        storage: the session's folder.
-        inputs: name -> value, of all known values that determine the results.
+    """Return the stages of a session whose files all exist, of the inputs that are known: name -> marker.
 
     Raises:
         FleetError: if the folder cannot be read, or holds results of other inputs.
@@ -58,25 +50,12 @@ def finished(storage: Storage, inputs: Mapping[str, str]) -> dict[str, Marker]:
 
 
 def forget(storage: Storage, stage: str) -> None:
-    """Remove a stage's marker, so that the stage is done again.
-
-    Raises:
-        FleetError: if its marker cannot be removed.
-    """
+    """Remove a stage's marker, so that the stage is done again."""
     storage.remove(_name(stage))
 
 
 def refuse_others(storage: Storage, markers: Iterable[Marker], inputs: Mapping[str, str]) -> None:
-    """Check that stages were made from the same inputs.
-
-    Args:
-        storage: the session's folder.
-        markers: markers of its stages.
-        inputs: name -> value, of all known values that determine the results.
-
-    Raises:
-        FleetError: if one was made of other inputs.
-    """
+    """Raise a `FleetError` unless stages were made from the same inputs."""
     for marker in markers:
         differing = [key for key, value in inputs.items() if marker.inputs.get(key) != value]
         if differing:

@@ -42,14 +42,7 @@ def local_path(url: str) -> Path | None:
 
 
 class Storage:
-    """A folder of results, local or remote.
-
-    Args:
-        url: path or URL; created with its first file.
-
-    Raises:
-        FleetError: if it cannot be reached.
-    """
+    """A folder of results, local or remote, made with its first file; a `FleetError` says what cannot be reached."""
 
     def __init__(self, url: str) -> None:
         self.url = url.rstrip("/")
@@ -57,11 +50,7 @@ class Storage:
         self._local = local_path(self.url)
 
     def sizes(self) -> dict[str, int]:
-        """Return name -> bytes, of all files in it and in folders below.
-
-        Raises:
-            FleetError: if it cannot be reached.
-        """
+        """Return name -> bytes, of all files in it and in folders below."""
         with self._reaching(self.url, "read"):
             self._files.invalidate_cache()
             try:
@@ -72,11 +61,7 @@ class Storage:
             return {path.removeprefix(root): int(info["size"]) for path, info in found.items()}
 
     def read(self, name: str) -> bytes | None:
-        """Read a file, or return None if it does not exist.
-
-        Raises:
-            FleetError: if it cannot be reached.
-        """
+        """Read a file, or return None if it does not exist."""
         with self._reaching(name, "read"):
             try:
                 return bytes(self._files.cat_file(self._path(name)))
@@ -84,37 +69,21 @@ class Storage:
                 return None
 
     def fetch(self, name: str, to: Path) -> None:
-        """Copy a file to a local path, whose folder is made.
-
-        Raises:
-            FleetError: if it cannot be read, or the copy cannot be written.
-        """
+        """Copy a file to a local path, whose folder is made."""
         with self._reaching(name, "read"):
             to.parent.mkdir(parents=True, exist_ok=True)
             self._files.get_file(self._path(name), str(to))
 
     def put(self, path: Path, name: str) -> None:
-        """Copy a local file into the folder; at any time it is complete or absent.
-
-        Raises:
-            FleetError: if it cannot be written.
-        """
+        """Copy a local file into the folder; at any time it is complete or absent."""
         self._replace(name, lambda unfinished: self._files.put_file(str(path), unfinished))
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file; at any time it is complete or absent.
-
-        Raises:
-            FleetError: if it cannot be written.
-        """
+        """Write a file; at any time it is complete or absent."""
         self._replace(name, lambda unfinished: self._files.pipe_file(unfinished, data))
 
     def remove(self, name: str) -> None:
-        """Remove a file, if it exists.
-
-        Raises:
-            FleetError: if it cannot be removed.
-        """
+        """Remove a file, if it exists."""
         with self._reaching(name, "removed"), suppress(FileNotFoundError):
             self._files.rm_file(self._path(name))
 
@@ -129,34 +98,26 @@ class Storage:
 
     def _replace(self, name: str, fill: Callable[[str], None]) -> None:
         """Fill a file under another name, and move it."""
-        unfinished = self._unfinished(name)
+        path = self._path(name)
+        folder, _, file = path.rpartition("/")
+        unfinished = f"{folder}/.{file}.{uuid.uuid4().hex[:8]}{_UNFINISHED}"
         with self._reaching(name, "written"):
             try:
-                self._make_folder(name)
+                self._files.makedirs(folder, exist_ok=True)
                 fill(unfinished)
-                self._move(unfinished, name)
+                self._move(unfinished, path)
             except BaseException:
-                self._discard(unfinished)
+                with suppress(Exception):  # it may not exist, or the disk be gone; the first error is raised
+                    self._files.rm_file(unfinished)
                 raise
 
-    def _unfinished(self, name: str) -> str:
-        folder, _, file = self._path(name).rpartition("/")
-        return f"{folder}/.{file}.{uuid.uuid4().hex[:8]}{_UNFINISHED}"
-
-    def _make_folder(self, name: str) -> None:
-        self._files.makedirs(self._path(name).rpartition("/")[0], exist_ok=True)
-
-    def _move(self, unfinished: str, name: str) -> None:
+    def _move(self, unfinished: str, path: str) -> None:
         if self._local is None:
-            self._files.mv(unfinished, self._path(name))
+            self._files.mv(unfinished, path)
             return
-        with Path(unfinished).open("rb") as file:
-            os.fsync(file.fileno())
-        Path(unfinished).replace(self._path(name))
-
-    def _discard(self, unfinished: str) -> None:
-        with suppress(Exception):  # it may not exist, or the disk be gone; the first error is raised
-            self._files.rm_file(unfinished)
+        with Path(unfinished).open("rb") as copy:
+            os.fsync(copy.fileno())
+        Path(unfinished).replace(path)
 
     @contextmanager
     def _reaching(self, name: str, what: str) -> Iterator[None]:
@@ -170,10 +131,6 @@ class Storage:
 
 def fetch_recording(url: str, scratch: Path) -> Path:
     """Return the local path of a recording, or of a copy in a folder that keeps the recording fetched last.
-
-    Args:
-        url: path or URL of a folder or file.
-        scratch: folder for the copy, used by one thread at a time.
 
     Raises:
         FleetError: if it does not exist, cannot be read or does not fit on the disk.

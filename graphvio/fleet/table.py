@@ -37,15 +37,7 @@ class Outcome:
 
 
 def write_tables(outcomes: Sequence[Outcome], storage: Storage) -> None:
-    """Write ``summary.csv`` and ``summary.html``, each whole or not at all.
-
-    Args:
-        outcomes: one per row, in order.
-        storage: results folder.
-
-    Raises:
-        FleetError: if they cannot be written.
-    """
+    """Write ``summary.csv`` and ``summary.html``, each whole or not at all."""
     rows = [_row(outcome) for outcome in outcomes]
     storage.write("summary.csv", _csv(rows).encode())
     storage.write("summary.html", render("fleet/summary.html", rows=rows, columns=COLUMNS).encode())

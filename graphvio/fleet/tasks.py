@@ -70,11 +70,7 @@ def features_stage(part: int, parts: int) -> str:
 
 
 def odometry(job: Job) -> Marker:
-    """Run the odometry; its figures are those of the summary, and ``parts``, the number of tasks for features.
-
-    Raises:
-        GraphvioError: if the recording cannot be read, or a file cannot be written.
-    """
+    """Run the odometry; its figures are those of the summary, and ``parts``, the number of tasks for features."""
 
     def work(task: _Task) -> dict[str, Any]:
         record = task.stages.record(0)
@@ -96,11 +92,7 @@ def odometry(job: Job) -> Marker:
 
 
 def features(job: Job, part: int, parts: int) -> Marker:
-    """Extract the features of one part of the places into a database of its own.
-
-    Raises:
-        GraphvioError: if the recording cannot be read, or a file cannot be written.
-    """
+    """Extract the features of one part of the places into a database of its own."""
 
     def work(task: _Task) -> dict[str, Any]:
         task.fetch(ODOMETRY)
@@ -117,11 +109,7 @@ def features(job: Job, part: int, parts: int) -> Marker:
 
 
 def loops(job: Job, parts: int) -> Marker:
-    """Join the databases of all parts, and find loop closures.
-
-    Raises:
-        GraphvioError: if the recording cannot be read, or a file cannot be written.
-    """
+    """Join the databases of all parts, and find loop closures."""
 
     def work(task: _Task) -> dict[str, Any]:
         task.fetch(ODOMETRY, *(features_stage(part, parts) for part in range(parts)))
@@ -142,11 +130,7 @@ def loops(job: Job, parts: int) -> Marker:
 
 
 def graph(job: Job) -> Marker:
-    """Optimise the session as one graph, and write the results.
-
-    Raises:
-        GraphvioError: if there is no unique solution, or a file cannot be written.
-    """
+    """Optimise the session as one graph, and write the results."""
 
     def work(task: _Task) -> dict[str, Any]:
         task.fetch(ODOMETRY, *([LOOPS] if job.with_loops else []))
@@ -220,11 +204,7 @@ def _perform(job: Job, stage: str, work: Callable[[_Task], dict[str, Any]], chan
 
 @contextmanager
 def _scratch() -> Iterator[tuple[Path, Path]]:
-    """Return a folder that stays as long as the worker, if there is one, and a folder of this task alone.
-
-    Raises:
-        FleetError: if the disk is full.
-    """
+    """Return a folder that stays as long as the worker, if there is one, and a folder of this task alone."""
     try:
         with tempfile.TemporaryDirectory(prefix="graphvio-", dir=_worker_folder()) as own:
             scratch = Path(own) / "session"

@@ -60,15 +60,7 @@ class ClockMap:
         self._may_have_restarted = True
 
     def map(self, stamp_ns: int, arrival_ns: int) -> int | None:
-        """Map a stamp to the host's time.
-
-        Args:
-            stamp_ns: by the device, of any of its sensors.
-            arrival_ns: host time of its arrival.
-
-        Returns:
-            The host's time, or None if the stamp is implausible.
-        """
+        """Map the stamp of a message that arrived at a host time to the host's time; None if it is implausible."""
         if not self._knots:
             self._start(stamp_ns, arrival_ns)
         late_ns = arrival_ns - self._mapped(stamp_ns)
@@ -193,15 +185,7 @@ class SharedClock:
         self._sensors: dict[str, _Sensor] = {}
 
     def map(self, sensor: str, stamp_ns: int) -> int | None:
-        """Return the stamp to be used.
-
-        Args:
-            sensor: that was stamped; stamps of one sensor are in order, but for few.
-            stamp_ns: as it came.
-
-        Returns:
-            The stamp with the offset in force, or None if it is implausible.
-        """
+        """Return the stamp of a sensor, in order but for few, with the offset in force; None if it is implausible."""
         latest = len(self._offsets_ns) - 1
         own = self._sensors.setdefault(sensor, _Sensor(latest))
         if own.setting < latest and stamp_ns + self._offsets_ns[latest] <= self._newest_ns(latest) + _MAX_AHEAD_NS:

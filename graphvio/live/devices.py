@@ -47,11 +47,7 @@ class Counts:
 
 
 class Mailbox:
-    """Queue of readings of several devices for one reader; those that wait too long are dropped, except notices.
-
-    Args:
-        max_age_ns: of readings that wait, relative to the newest one.
-    """
+    """Queue of readings of several devices for one reader; those that wait too long are dropped, except notices."""
 
     def __init__(self, max_age_ns: int = _MAX_AGE_NS) -> None:
         self._max_age_ns = max_age_ns

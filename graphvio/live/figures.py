@@ -99,13 +99,7 @@ class Meter:
 
 
 def run_figures(meter: Meter, latest: Estimate | None, now_ns: int) -> Figures:
-    """Return the figures of the counts and of the newest estimate.
-
-    Args:
-        meter: of the run.
-        latest: newest estimate, or None.
-        now_ns: host time.
-    """
+    """Return the figures of the counts and of the newest estimate."""
     counts = meter.counts
     kinds = ("images", "imu_samples", "framesets", "estimates", "skipped_late")
     found: Figures = {

@@ -53,9 +53,6 @@ def fit_rational(intrinsics: Float, coefficients: Float, size_px: tuple[int, int
         size_px: (width, height) of the image.
         where: for messages.
 
-    Returns:
-        The fitted lens.
-
     Raises:
         RigError: if neither is near enough.
     """

@@ -15,11 +15,7 @@ _NEWEST_SHARE = 0.1  # in running means
 
 
 class LoadControl:
-    """Decides how many corners are tracked and which framesets are skipped, from its inputs alone.
-
-    Args:
-        max_latency_ms: from a frameset's arrival to its estimate.
-    """
+    """Decides how many corners are tracked and which framesets are skipped, from its inputs alone."""
 
     def __init__(self, max_latency_ms: float) -> None:
         self._limit_ms = max_latency_ms

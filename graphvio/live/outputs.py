@@ -34,11 +34,7 @@ class Output:
 
 
 class ViewOutput(Output):
-    """Shows a live run; images are left out where the viewer has no time for them.
-
-    Args:
-        viewer: open.
-    """
+    """Shows a live run; images are left out where the viewer has no time for them."""
 
     def __init__(self, viewer: Viewer) -> None:
         self._viewer = viewer
@@ -83,9 +79,6 @@ class PathOutput(Output):
 
     def write(self, folder: Path) -> None:
         """Write ``odometry.txt``, and ``online.txt`` with the poses in the map, if there are any.
-
-        Args:
-            folder: of the files.
 
         Raises:
             TrajectoryError: if a file cannot be written.

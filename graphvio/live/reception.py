@@ -157,13 +157,9 @@ class SampleOrder:
         self._steps_ns: deque[int] = deque(maxlen=_PERIODS)
 
     def add(self, sample: ImuSample) -> list[ImuSample]:
-        """Take a sample.
+        """Take a sample, and return those that go on, in order.
 
-        Args:
-            sample: as it came. One that is older than those that went on goes on, too: the odometry reports it.
-
-        Returns:
-            The samples that go on, in order.
+        One that is older than those that went on goes on, too: the odometry reports it.
         """
         if self._given_ns is not None and sample.stamp_ns <= self._given_ns:
             return [sample]

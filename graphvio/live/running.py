@@ -100,13 +100,7 @@ class LiveOdometry:
         self._watchdog.start()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait for the end of the source.
-
-        Args:
-            timeout_s: how long to wait; None waits for the end.
-
-        Returns:
-            Whether the run has ended.
+        """Wait for the end of the source, or a time, and return whether the run has ended.
 
         Raises:
             GraphvioError: that ended a stage.

@@ -1,4 +1,4 @@
-"""Options of a live source as sizes, numbers, choices and names."""
+"""Options of a live source as sizes, numbers, choices and names; a `SourceError` says what is wrong with a value."""
 
 from __future__ import annotations
 
@@ -13,11 +13,7 @@ _SIZE = re.compile(r"([1-9]\d{1,4})x([1-9]\d{1,4})")
 
 
 def size_of(spec: SourceSpec, key: str) -> tuple[int, int] | None:
-    """Return a size ``WIDTHxHEIGHT`` in pixels, or None where it is not given.
-
-    Raises:
-        SourceError: if it is not a size.
-    """
+    """Return a size ``WIDTHxHEIGHT`` in pixels, or None where it is not given."""
     text = spec.options.get(key)
     if text is None:
         return None
@@ -28,11 +24,7 @@ def size_of(spec: SourceSpec, key: str) -> tuple[int, int] | None:
 
 
 def number_of(spec: SourceSpec, key: str, minimum: float, maximum: float) -> float | None:
-    """Return a number in a range, or None where it is not given.
-
-    Raises:
-        SourceError: if it is not a number, or out of range.
-    """
+    """Return a number in a range, or None where it is not given."""
     text = spec.options.get(key)
     if text is None:
         return None
@@ -46,11 +38,7 @@ def number_of(spec: SourceSpec, key: str, minimum: float, maximum: float) -> flo
 
 
 def whole_number_of(spec: SourceSpec, key: str, minimum: int, maximum: int) -> int | None:
-    """Return a whole number in a range, or None where it is not given.
-
-    Raises:
-        SourceError: if it is not a whole number, or out of range.
-    """
+    """Return a whole number in a range, or None where it is not given."""
     value = number_of(spec, key, minimum, maximum)
     if value is not None and not value.is_integer():
         raise SourceError(f"{spec.kind}: {key} is {spec.options[key]!r}; write a whole number")
@@ -58,11 +46,7 @@ def whole_number_of(spec: SourceSpec, key: str, minimum: int, maximum: int) -> i
 
 
 def choice_of(spec: SourceSpec, key: str, choices: Sequence[str]) -> str:
-    """Return one of several words, the first where none is given.
-
-    Raises:
-        SourceError: if it is none of them.
-    """
+    """Return one of several words, the first where none is given."""
     text = spec.options.get(key, choices[0])
     if text not in choices:
         raise SourceError(f"{spec.kind}: {key} is {text!r}; choose one of {', '.join(choices)}")
@@ -70,11 +54,7 @@ def choice_of(spec: SourceSpec, key: str, choices: Sequence[str]) -> str:
 
 
 def names_of(spec: SourceSpec) -> list[str]:
-    """Return the devices that a spec names, separated by commas.
-
-    Raises:
-        SourceError: if one is named twice or a name is empty.
-    """
+    """Return the devices that a spec names, separated by commas."""
     if not spec.what:
         return []
     names = spec.what.split(",")

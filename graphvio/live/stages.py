@@ -22,10 +22,6 @@ class Stage:
         body: runs until there is nothing more to do; works on each item inside of `working`.
         on_failure: called in the thread with an error that ended the body.
         at_end: called in the thread after the body, and after ``on_failure``.
-
-    Attributes:
-        name: of the stage.
-        failure: error that ended the body, or None.
     """
 
     def __init__(

@@ -11,7 +11,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.backend.factors import x
 from graphvio.backend.noise import gaussian
-from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
+from graphvio.geometry import se3_adjoint, se3_inverse
 from graphvio.optimization.solver import Edge
 
 EXACT: Final = 1e-12 * np.eye(6)
@@ -75,9 +75,7 @@ class Chains:
 
     def distance(self, edge: Edge) -> float:
         """Return the squared Mahalanobis distance of a closure within a fragment, 6 degrees of freedom."""
-        relative, covariance = self.motion(edge.first, edge.second)
-        error = se3_log(se3_inverse(relative) @ edge.first_T_second)
-        return float(error @ np.linalg.solve(covariance + edge.covariance, error))
+        return edge.distance(*self.motion(edge.first, edge.second))
 
     def add_to(self, graph: gtsam.NonlinearFactorGraph, fragment: int) -> None:
         """Add a fragment's motions as factors to a graph whose variables are the places' indices."""
@@ -91,14 +89,7 @@ class Chains:
 
     @staticmethod
     def of(first_places: Sequence[int], first_poses: Float, motions: Float, covariances: Float) -> Chains:
-        """Restore chains from their motions.
-
-        Args:
-            first_places: First place of each of F fragments.
-            first_poses: (F, 4, 4) poses of these.
-            motions: (N, 4, 4) motions of all places; those of the first places are not used.
-            covariances: (N, 6, 6) covariances of the motions.
-        """
+        """Restore chains of F fragments from their first poses (F, 4, 4) and all N places' motions and covariances."""
         chains = Chains()
         for n, (motion, covariance) in enumerate(zip(motions, covariances, strict=True)):
             if n in first_places:

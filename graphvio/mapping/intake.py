@@ -17,12 +17,8 @@ _MAX_WAITING = 8  # places, with their images
 class Intake:
     """Reads a front-end's keyframes in a thread of its own, so that the front-end never waits.
 
-    While too many places wait, no keyframe becomes a place: the map gets coarser, but does not fall behind.
-
-    Args:
-        front_end: The front-end.
-        settings: Distances between places.
-        share: Returns, before each keyframe, the share of these distances that is sufficient now.
+    While too many places wait, no keyframe becomes a place: the map gets coarser, but does not fall behind. ``share``
+    is asked before each keyframe for the share of the distances between places that is sufficient now.
 
     Attributes:
         skipped: Number of keyframes that did not become places because too many waited.
@@ -60,10 +56,7 @@ class Intake:
         self._waiting.abandon()
 
     def next(self) -> NewPlace | None:
-        """Wait for the next place.
-
-        Returns:
-            The place, or None after the last one.
+        """Wait for the next place; None after the last one.
 
         Raises:
             GraphvioError: The front-end's error, after all places before it; a MapError if keyframes have no images.

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -91,16 +90,11 @@ class Mapper:
     def __enter__(self) -> Mapper:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def run(self, on_place: Callable[[Mapper], None] | None = None) -> None:
-        """Process places until the front-end's keyframes end, or `stop` is called.
-
-        Args:
-            on_place: Called after each place, in this thread.
+        """Process places until the front-end's keyframes end, or `stop` is called; ``on_place`` is called after each.
 
         Raises:
             GraphvioError: If the front-end fails, or a place cannot be stored. The map until then can be saved.
@@ -134,13 +128,6 @@ class Mapper:
             saved_map.save(
                 saved_map.to_saved(self._graph, self._recognition, self._places), self._store, self._rig, Path(folder)
             )
-
-    @property
-    def is_localised(self) -> bool:
-        """Whether the newest place is located in the map's frame."""
-        with self._lock:
-            newest = len(self._graph) - 1
-            return newest >= self._first and self._graph.is_in_map(newest)
 
     @property
     def trajectory(self) -> Trajectory:

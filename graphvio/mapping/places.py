@@ -33,12 +33,7 @@ class KeyframeAtPlace:
 
 
 class PlaceChooser:
-    """Selects places in a chain of keyframes.
-
-    Args:
-        distance_m: Minimal distance from the previous place,
-        angle_deg: or minimal rotation.
-    """
+    """Selects places in a chain of keyframes, at a minimal distance or rotation from the previous place."""
 
     def __init__(self, distance_m: float, angle_deg: float) -> None:
         self._distance_m = distance_m
@@ -50,15 +45,12 @@ class PlaceChooser:
         self._covariance = np.zeros((6, 6))
 
     def add(self, keyframe: Keyframe, share: float = 1.0, has_room: bool = True) -> tuple[NewPlace | None, bool]:
-        """Add the next keyframe.
+        """Add the next keyframe; returns the place, if it is one, and whether it qualifies, with or without room.
 
         Args:
             keyframe: The keyframe; ids increase.
             share: Sufficient share of distance and angle: less than one for denser places.
             has_room: Whether a place can be queued; if not, the next keyframe can become one.
-
-        Returns:
-            The place, or None; and whether the keyframe qualifies as a place, with or without room.
         """
         last = self._last
         self._last = keyframe
@@ -129,13 +121,9 @@ def spread_keyframes(
 ) -> Trajectory:
     """Return the trajectory of all keyframes, given the places' poses.
 
-    Between two places the odometry's chain is kept, and its error at the second place is distributed over time.
-
-    Args:
-        keyframes: The keyframes in the order of time.
-        poses: (4, 4) poses of the places processed so far; None for those that are not in the map.
-        motions: (4, 4) motion by the odometry from the previous place to each place.
-        begins: First places of the fragments.
+    Between two places the odometry's chain is kept, and its error at the second place is distributed over time. A pose
+    is None where the place is not in the map, a motion that from the previous place; ``begins`` are the fragments'
+    first places.
     """
     stamp_of: dict[int, int] = {}
     for each in keyframes:

@@ -117,13 +117,7 @@ class PoseGraph:
         return bool(distance_m <= _MAX_SIGHT_M + _SIGHT_SIGMAS * sigma_m)
 
     def add_closures(self, found: Sequence[LoopClosure]) -> bool:
-        """Test and add closures.
-
-        Args:
-            found: Closures; rows of their places are indices of the graph's places.
-
-        Returns:
-            Whether the solution has changed.
+        """Test and add closures, whose rows are the graph's places; returns whether the solution has changed.
 
         Raises:
             OptimizationError: If the graph cannot be solved.

@@ -46,14 +46,7 @@ class MappingTask:
 def run_mapping(task: MappingTask, ready: Event) -> str:
     """Map until the odometry ends, and save the map; to be called in a process of its own, which then ignores signals.
 
-    After a failure, the map until then is saved.
-
-    Args:
-        task: Options.
-        ready: Set when keyframes may come.
-
-    Returns:
-        The summary, in one line.
+    After a failure, the map until then is saved. ``ready`` is set when keyframes may come. Returns a summary in a line.
 
     Raises:
         GraphvioError: If the odometry cannot be reached, or the map cannot be used or written.
@@ -76,11 +69,7 @@ def run_mapping(task: MappingTask, ready: Event) -> str:
 
 
 class ClientWithImages:
-    """A client as a front-end whose keyframes have images, as the mapper needs them.
-
-    Args:
-        client: The client.
-    """
+    """A client as a front-end whose keyframes have images, as the mapper needs them."""
 
     def __init__(self, client: Client) -> None:
         self.rig = client.rig

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -15,13 +14,7 @@ _MAX_PLACES = 256  # and learnt again when their number has doubled, up to these
 
 
 class Recognition:
-    """Places as vectors of visual words.
-
-    Args:
-        seed: Seed of the vocabulary's clustering.
-        words: (W, 128) vocabulary of an earlier map, or None.
-        learnt_from: Number of places from which it was learnt.
-    """
+    """Places as vectors of visual words; ``words`` (W, 128) were learnt from so many places of an earlier map."""
 
     def __init__(self, seed: int, words: AnyArray | None = None, learnt_from: int = 0) -> None:
         self.words = np.zeros((0, 128), dtype=np.float32) if words is None else words
@@ -57,26 +50,16 @@ class Recognition:
             self._rows += 1
 
     def learn(self, descriptors: Callable[[int, int], AnyArray]) -> None:
-        """Learn the vocabulary from all places, and describe them by it.
-
-        Args:
-            descriptors: Returns the descriptors of a place's index and pair.
-        """
+        """Learn the vocabulary from all places' descriptors, given by place and pair, and describe them by it."""
         images = [(place, j) for place, pairs in enumerate(self._pairs) for j in pairs]
-        self.words = vocabulary(_LazyDescriptors(images, descriptors), self._seed)
+        self.words = vocabulary((descriptors(*image) for image in images), len(images), self._seed)
         self.learnt_from = len(self)
         self._vectors = np.zeros((self._rows, self.words.size), dtype=np.float32)
         for row, image in enumerate(images):
             self._vectors[row] = describe(descriptors(*image), self.words)
 
     def similar(self, place: int, may: Callable[[int], bool], max_count: int) -> list[int]:
-        """Return the earlier places that are most similar to a place.
-
-        Args:
-            place: Index of the place.
-            may: Whether an earlier place may be compared with it.
-            max_count: Maximal number of places.
-        """
+        """Return the earlier places that are most similar to a place, of those that may be compared with it."""
         if not place or not self.words.size or not self._pairs[place]:
             return []
         # First rows of places without an image belong to other places.
@@ -95,17 +78,3 @@ class Recognition:
     def vectors(self, place: int) -> AnyArray:
         """Return the vectors (P, D) of a place's images."""
         return self._vectors[self._first_rows[place] : self._first_rows[place] + len(self._pairs[place])]
-
-
-class _LazyDescriptors(Sequence[AnyArray]):
-    """Descriptors of images, read on access."""
-
-    def __init__(self, images: Sequence[tuple[int, int]], descriptors: Callable[[int, int], AnyArray]) -> None:
-        self._images = images
-        self._descriptors = descriptors
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def __getitem__(self, k: Any) -> Any:
-        return self._descriptors(*self._images[k])

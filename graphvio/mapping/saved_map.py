@@ -83,11 +83,7 @@ class SavedMap:
 
 
 def save(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
-    """Write a map atomically; an older map is replaced, other files in the folder stay.
-
-    Raises:
-        MapError: If the folder contains other files but no map, or cannot be written.
-    """
+    """Write a map atomically; an older map is replaced, other files in the folder stay."""
     check_target(folder)
     folder = folder.resolve()  # what is replaced is a folder, not a link to it
     try:
@@ -110,20 +106,12 @@ def save(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
 
 
 def check_map(folder: Path) -> None:
-    """Check that a folder contains a map of this version; `load` checks its rig and digests.
-
-    Raises:
-        MapError: If it does not.
-    """
+    """Raise a `MapError` unless a folder contains a map of this version; `load` checks its rig and digests."""
     _header(folder)
 
 
 def load(folder: Path, rig: Rig) -> SavedMap:
     """Read a map.
-
-    Args:
-        folder: Folder of the map.
-        rig: The rig; that of the map must be the same.
 
     Raises:
         MapError: If the folder contains no map, one of another version or rig, or a damaged one.
@@ -153,11 +141,7 @@ def load(folder: Path, rig: Rig) -> SavedMap:
 
 
 def check_target(folder: Path) -> None:
-    """Check that a map may be written to a folder: it is new or empty, or contains a map.
-
-    Raises:
-        MapError: If it contains other files.
-    """
+    """Raise a `MapError` unless a map may be written to a folder: it is new or empty, or contains a map."""
     if folder.exists() and not (folder / _HEADER).is_file() and (not folder.is_dir() or any(folder.iterdir())):
         raise MapError(f"{folder}: contains other files than a map; name another folder")
 
@@ -222,7 +206,7 @@ def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
     columns["vectors"] = kept.vectors.astype(np.float16)  # sufficient for their ranking
     np.savez(folder / _PLACES, **columns)
     (folder / _CLOSURES).write_bytes(closures_to_bytes(kept.closures))
-    save_rig(_without_masks(rig), folder / _RIG)
+    save_rig(rig.with_cameras(lambda camera: replace(camera, mask=None)), folder / _RIG)  # refers to no other files
     header = {
         "format": FORMAT,
         "version": VERSION,
@@ -236,11 +220,7 @@ def _write(kept: SavedMap, store: PlaceStore, rig: Rig, folder: Path) -> None:
 
 
 def _move_others(folder: Path, into: Path) -> None:
-    """Move the files that do not belong to a map.
-
-    Raises:
-        MapError: If that fails.
-    """
+    """Move the files that do not belong to a map."""
     for path in folder.iterdir():
         if path.name not in _OWN:
             try:
@@ -285,11 +265,3 @@ def _difference(rig: Rig, other: Rig) -> str:
             if not np.allclose(getattr(one, what), getattr(two, what), rtol=_RIG_TOLERANCE, atol=_RIG_TOLERANCE):
                 return f"{what} of {one.name} differ"
     return ""
-
-
-def _without_masks(rig: Rig) -> Rig:
-    """Return the rig without masks, so that its file refers to no others."""
-    pairs = tuple(
-        replace(pair, left=replace(pair.left, mask=None), right=replace(pair.right, mask=None)) for pair in rig.pairs
-    )
-    return replace(rig, pairs=pairs)

@@ -29,10 +29,6 @@ _MIN_FREE_BYTES = 20_000_000  # for a place: COLMAP aborts the process when the 
 class PlaceStore:
     """COLMAP's database of the places' features, and the images of the places that were added in this session.
 
-    Args:
-        folder: Folder of the database and the images; missing files are created.
-        rig: The rig of all places.
-
     Raises:
         OptimizationError: If the database cannot be opened.
         MissingExtraError: If the extra ``maps`` is not installed.
@@ -45,16 +41,7 @@ class PlaceStore:
         self._lock = threading.Lock()
 
     def add(self, session: str, frameset: FrameSet, seen: Mapping[int, PairFeatures]) -> None:
-        """Store a place.
-
-        Args:
-            session: Name of the session.
-            frameset: Images of the place.
-            seen: Pair index -> features of its left image.
-
-        Raises:
-            MapError: If it cannot be written; the stored images are then deleted.
-        """
+        """Store a place; if it cannot be written, its session's images are deleted, and a `MapError` is raised."""
         try:
             if shutil.disk_usage(self._folder).free < _MIN_FREE_BYTES:
                 raise OSError(ENOSPC, os.strerror(ENOSPC))
@@ -82,26 +69,18 @@ class PlaceStore:
         return image_name(session, self._rig.pairs[j].left.name, stamp_ns)
 
     def copy_to(self, folder: Path) -> None:
-        """Copy the database, complete as it is now, to another folder.
-
-        Raises:
-            MapError: If it cannot be written.
-        """
+        """Copy the database, complete as it is now, to another folder."""
         with self._lock:
             copy_database(self._folder / DATABASE, folder / DATABASE)
 
     def close(self) -> None:
         """Close the database."""
         with self._lock:
-            self._database.__exit__(None, None, None)
+            self._database.close()
 
 
 def copy_database(source: Path, target: Path) -> None:
-    """Copy a database that may be open: its file alone may lack the last changes.
-
-    Raises:
-        MapError: If it cannot be copied.
-    """
+    """Copy a database that may be open: its file alone may lack the last changes."""
     try:
         with closing(sqlite3.connect(source)) as one, closing(sqlite3.connect(target)) as other:
             one.backup(other)

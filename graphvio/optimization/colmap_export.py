@@ -54,7 +54,7 @@ def export(
     config: Config,
     on_progress: Progress = lambda *_: None,
 ) -> list[ColmapModel]:
-    """Write the images as ``images/SESSION/CAMERA/STAMP.png``, and models as ``sparse/0``, ``sparse/1`` ...
+    """Write images as ``images/SESSION/CAMERA/STAMP.png``, and the returned models as ``sparse/0``, ``sparse/1`` ...
 
     Each frame of the optimisation becomes a model, as COLMAP does for unconnected ones; that with most places comes
     first. Models of an earlier export are removed.
@@ -66,9 +66,6 @@ def export(
         folder: to write to, made if missing.
         config: gives the seed.
         on_progress: called after each item.
-
-    Returns:
-        The models, in the order of their folders.
 
     Raises:
         OptimizationError: if none of the places is in the database, or a file cannot be written.

@@ -104,7 +104,10 @@ def consistent(
     odometry: KnownMotions,
     probability: float,
 ) -> tuple[Bool, Float]:
-    """Select the loop closures that are consistent with the odometry and with each other.
+    """Return which loop closures (L,) are consistent with the odometry and with each other, and squared distances (L,).
+
+    A distance, with 6 degrees of freedom, is that from the odometry, or between fragments from their joined transform;
+    NaN where they are not joined.
 
     If many are wrong, the initial solution with all of them is far from the truth, and graduated non-convexity does not
     always converge: closures that contradict the odometry are therefore rejected first.
@@ -116,10 +119,6 @@ def consistent(
         edges: L loop closures.
         odometry: motions of the solution without loop closures.
         probability: quantile of the chi-square distribution at which a closure is rejected.
-
-    Returns:
-        Whether each is consistent (L,), and its squared distance (L,), 6 degrees of freedom, from the odometry, or
-        between fragments from their joined transform; NaN where they are not joined.
     """
     of = fragment_of(fragments)
     component = np.array(joined.component)[of]

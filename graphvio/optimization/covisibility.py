@@ -41,14 +41,7 @@ def verify_matches(
     database: FeatureDatabase,
     on_progress: Callable[[int, int], None] = lambda *_: None,
 ) -> None:
-    """Match neighbouring places, and verify all matches between places by the optimised poses.
-
-    Args:
-        optimization: of the sessions, in the same order.
-        sessions: whose places are in the database.
-        database: to write; images that were matched before are not matched again.
-        on_progress: called with the number of finished pairs of images and of all.
-    """
+    """Match neighbouring places that were not matched before, and verify all matches by the optimised poses."""
     pairs = {each.names: each for each in _neighbours(optimization, sessions, database)}
     pairs |= {each.names: each for each in _loops(optimization, sessions, database)}
     lefts = {

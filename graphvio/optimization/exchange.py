@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from errno import ENOSPC
-from itertools import combinations_with_replacement
 from pathlib import Path
 
 import gtsam
@@ -16,10 +15,8 @@ from graphvio.geometry import se3_inverse
 from graphvio.optimization.graph import poses_of
 from graphvio.optimization.optimize import Optimization, OptimizedSession
 from graphvio.optimization.solver import Edge, Marginals
+from graphvio.results.writer import COVARIANCE_HEADER, covariance_row
 from graphvio.trajectory_files import tum_line
-
-_TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
-_UPPER = np.triu_indices(6)
 
 
 def trajectory_text(session: OptimizedSession) -> str:
@@ -39,11 +36,8 @@ def frames_text(session: OptimizedSession) -> str:
 
 def covariance_text(session: OptimizedSession) -> str:
     """Return the upper triangles of the states' covariances, tangent ``[rotation, translation]`` in body, as CSV."""
-    header = ",".join(["stamp_ns", *(f"{one}_{other}" for one, other in combinations_with_replacement(_TANGENT, 2))])
-    lines = [header]
-    for stamp, covariance in zip(session.nodes.stamps_ns.tolist(), session.covariance, strict=True):
-        lines.append(",".join([str(stamp), *(f"{value:.9e}" for value in covariance[_UPPER])]))
-    return "\n".join(lines) + "\n"
+    rows = map(covariance_row, session.nodes.stamps_ns.tolist(), session.covariance)
+    return "\n".join([COVARIANCE_HEADER, *rows]) + "\n"
 
 
 def write_g2o(optimization: Optimization, path: Path) -> None:
@@ -52,10 +46,6 @@ def write_g2o(optimization: Optimization, path: Path) -> None:
     Its edges are the measured motions with their covariances, but with the relative poses of the solution without loop
     closures, which the IMU contributes to; one from the previous state where no motion ends in a state; and the loop
     closures.
-
-    Args:
-        optimization: to write.
-        path: of the file; it is whole or absent.
 
     Raises:
         OptimizationError: if the file cannot be written.

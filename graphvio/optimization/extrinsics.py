@@ -77,15 +77,9 @@ def unknowns(session: int, pairs: int, with_imu: bool) -> Iterator[tuple[int, An
 def own_motion(
     session: int, pair: int, i: int, j: int, motion: RelativeMotion, twists: tuple[Float, Float] | None
 ) -> gtsam.NoiseModelFactor:
-    """Return the factor of a motion between two states that a single pair measured.
+    """Return the factor of a pair's motion of body, by the rig file's extrinsics, from state ``i`` to ``j``.
 
-    Args:
-        session: number of the session.
-        pair: number of the pair.
-        i: state that the motion is measured from.
-        j: state in which it ends.
-        motion: of body, by the rig file's extrinsics.
-        twists: (6,) angular and linear velocity of body at both states; None without an IMU.
+    ``twists`` are body's angular and linear velocities (6,) at both states; None without an IMU.
     """
     keys = [x(i), x(j), c(session, pair)] + ([] if twists is None else [d(session)])
     return gtsam.CustomFactor(gaussian(motion.covariance), keys, _error(motion.reference_T_current, twists))

@@ -86,12 +86,7 @@ class SessionGraph:
     def complete(
         self, roots: Iterable[int], edges: Iterable[Edge] = ()
     ) -> tuple[gtsam.NonlinearFactorGraph, dict[str, list[int]]]:
-        """Return the graph with loop closures and with priors that define its frames, and its factors by kind.
-
-        Args:
-            roots: fragments whose first pose defines a frame; loop closures join the others to these.
-            edges: loop closures.
-        """
+        """Return the graph with loop closures, and its factors by kind; the first poses of ``roots`` define frames."""
         graph, kinds = gtsam.NonlinearFactorGraph(self._graph), dict(self._kinds)
         chosen = frozenset(roots)
         priors = [

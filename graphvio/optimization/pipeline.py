@@ -84,15 +84,7 @@ def _sessions(sources: Sequence[Source]) -> list[Session]:
 
 
 class Stages:
-    """The stages of an optimisation, to be run one by one, possibly on different machines.
-
-    Args:
-        sessions: one or several.
-        out: see `optimize_sessions`.
-        config: of all stages.
-        with_loops: see `optimize_sessions`.
-        calibrates: see `optimize_sessions`.
-        on_progress: see `optimize_sessions`.
+    """The stages of `optimize_sessions`, which see, to be run one by one, possibly on different machines.
 
     Attributes:
         inputs: name -> value of everything that determines the results.

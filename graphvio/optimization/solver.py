@@ -44,6 +44,11 @@ class Edge:
             x(self.first), x(self.second), gtsam.Pose3(self.first_T_second), gaussian(self.covariance)
         )
 
+    def distance(self, first_T_second: Float, covariance: Float) -> float:
+        """Return the squared Mahalanobis distance from an independent motion (4, 4), covariance (6, 6) at its end."""
+        error = se3_log(se3_inverse(first_T_second) @ self.first_T_second)
+        return float(error @ np.linalg.solve(covariance + self.covariance, error))
+
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
@@ -61,13 +66,7 @@ class Residuals:
 def residuals(
     graph: gtsam.NonlinearFactorGraph, kinds: Mapping[str, Sequence[int]], values: gtsam.Values
 ) -> dict[str, Residuals]:
-    """Compute the residuals of some values.
-
-    Args:
-        graph: of factors.
-        kinds: kind -> indices of its factors in the graph.
-        values: of all variables.
-    """
+    """Compute the residuals of values, by kind, given the indices of each kind's factors in the graph."""
     found = {}
     for kind, indices in kinds.items():
         factors = [graph.at(index) for index in indices]
@@ -79,12 +78,7 @@ def residuals(
 def solve(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, on_progress: Callable[[int, float], None] = lambda *_: None
 ) -> gtsam.Values:
-    """Minimise the cost by Levenberg-Marquardt until it converges.
-
-    Args:
-        graph: of factors.
-        values: initial ones.
-        on_progress: called with the number of the iteration and the cost.
+    """Minimise the cost by Levenberg-Marquardt until it converges; ``on_progress`` takes iteration and cost.
 
     Raises:
         OptimizationError: if there is no unique solution.
@@ -106,14 +100,10 @@ def solve(
 
 
 class Marginals:
-    """Covariances of a graph's solution.
+    """Covariances of the values that solve a graph.
 
     The variables are eliminated by nested dissection: the tree of a long chain is flat then, and the covariance of two
     states of an hour takes as long as that of two of a minute.
-
-    Args:
-        graph: of factors.
-        values: its solution.
 
     Raises:
         OptimizationError: if a variable is not constrained.
@@ -143,6 +133,4 @@ class Marginals:
 
     def distance(self, edge: Edge) -> float:
         """Return the squared Mahalanobis distance, 6 degrees of freedom, of an edge that is not in the graph."""
-        relative, covariance = self.motion(edge.first, edge.second)
-        error = se3_log(se3_inverse(relative) @ edge.first_T_second)
-        return float(error @ np.linalg.solve(covariance + edge.covariance, error))
+        return edge.distance(*self.motion(edge.first, edge.second))

@@ -48,20 +48,12 @@ class Workspace:
         return stage in self._finished and all((self.folder / name).is_file() for name in self._finished[stage])
 
     def finish(self, stage: str, *files: str) -> None:
-        """Record that a stage is finished and has written these files.
-
-        Raises:
-            OptimizationError: if the folder cannot be written.
-        """
+        """Record that a stage is finished and has written these files."""
         self._finished[stage] = list(files)
         self._save()
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, which is whole or absent.
-
-        Raises:
-            OptimizationError: if it cannot be written.
-        """
+        """Write a file, which is whole or absent."""
         path = self.folder / name
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

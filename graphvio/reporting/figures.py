@@ -13,9 +13,9 @@ BLUE, RED, GREEN, GREY = "#1f5fbf", "#d62728", "#2ca02c", "#777777"
 GRID: dict[str, Any] = {"color": "#e2e2e2", "linewidth": 0.6}
 
 
-def empty_figure(width_in: float, height_in: float) -> Figure:
+def empty_figure(width_in: float, height_in: float, dpi: int = DPI) -> Figure:
     """Create a white figure without axes."""
-    figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
+    figure = Figure(figsize=(width_in, height_in), dpi=dpi, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 

@@ -84,11 +84,6 @@ def plot_run(
 def plot_evaluation(path: Path, evaluation: Evaluation, name: str = "") -> None:
     """Plot the aligned estimate over the truth in plan and side view, and both errors over time.
 
-    Args:
-        path: image file; its suffix chooses the format.
-        evaluation: plotted in the truth's frame.
-        name: start of the title.
-
     Raises:
         GraphvioError: if the file cannot be written.
     """
@@ -117,11 +112,7 @@ def plot_evaluation(path: Path, evaluation: Evaluation, name: str = "") -> None:
 
 
 def plot_comparison(path: Path, evaluations: Mapping[str, Evaluation]) -> None:
-    """Plot the errors of several results over time.
-
-    Args:
-        path: image file; its suffix chooses the format.
-        evaluations: by name, all against the same truth.
+    """Plot the errors of several results, by name, against the same truth over time; the suffix chooses the format.
 
     Raises:
         GraphvioError: if the file cannot be written.
@@ -147,12 +138,9 @@ def plot_comparison(path: Path, evaluations: Mapping[str, Evaluation]) -> None:
 
 
 def _new_figure(width_in: float, height_in: float) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from graphvio.reporting.figures import empty_figure
 
-    figure = Figure(figsize=(width_in, height_in), dpi=_DPI, facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
+    return empty_figure(width_in, height_in, _DPI)
 
 
 def _truth_in_nav(truth: Trajectory, evaluation: Evaluation) -> Float:

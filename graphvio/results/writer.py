@@ -26,6 +26,7 @@ from graphvio.evaluation import Evaluation, evaluate
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
 from graphvio.measurements.motion import PairReport
+from graphvio.reporting.files import replace_file
 from graphvio.results.plotting import plot_run
 from graphvio.results.summary import PairMedians, Percentiles, Summary, epoch_intervals, path_length
 from graphvio.rig import Rig
@@ -35,7 +36,8 @@ from graphvio.trajectory_files import load_trajectory, tum_line
 from graphvio.version import __version__
 
 _TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
-_COVARIANCE_HEADER = ",".join(["stamp_ns", *(f"{a}_{b}" for a, b in combinations_with_replacement(_TANGENT, 2))])
+COVARIANCE_HEADER = ",".join(["stamp_ns", *(f"{a}_{b}" for a, b in combinations_with_replacement(_TANGENT, 2))])
+"""Columns of `covariance_row`."""
 _BIAS_HEADER = "stamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
 _PAIRS_HEADER = "stamp_ns,pair,points,inliers,rms_px,own_inliers,own_rms_px"
 _UPPER = np.triu_indices(6)
@@ -102,7 +104,7 @@ class ResultWriter:
             save_rig(rig, self.folder / "rig.yaml")
             for name, header in (
                 ("trajectory.txt", ""),
-                ("covariance.csv", _COVARIANCE_HEADER),
+                ("covariance.csv", COVARIANCE_HEADER),
                 ("imu_bias.csv", _BIAS_HEADER),
                 ("pairs.csv", _PAIRS_HEADER),
                 ("events.jsonl", ""),
@@ -156,7 +158,7 @@ class ResultWriter:
             return
         self._write("trajectory.txt", tum_line(stamp, estimate.nav_T_body))
         if estimate.covariance is not None:
-            self._write("covariance.csv", _csv(stamp, np.asarray(estimate.covariance)[_UPPER]))
+            self._write("covariance.csv", covariance_row(stamp, estimate.covariance))
         self._stamps.append(stamp)
         self._epochs.append(estimate.epoch)
         self._pose_status.append(str(estimate.status))
@@ -265,12 +267,15 @@ class ResultWriter:
 
     def _write_at_once(self, name: str, text: str) -> None:
         """Write a file that is either complete or absent."""
-        unfinished = self.folder / f".{name}.tmp"
         try:
-            unfinished.write_text(text, encoding="utf-8", newline="\n")
-            unfinished.replace(self.folder / name)
+            replace_file(self.folder / name, text)
         except OSError as error:
             raise _cannot_write(self.folder / name, error) from None
+
+
+def covariance_row(stamp_ns: int, covariance: Float) -> str:
+    """Return stamp and upper triangle of a covariance (6, 6) as a line of CSV, see `COVARIANCE_HEADER`."""
+    return _csv(stamp_ns, np.asarray(covariance)[_UPPER])
 
 
 def _csv(stamp_ns: int, values: Iterable[float]) -> str:

@@ -84,10 +84,6 @@ def cameras_of(document: Section) -> list[Camera]:
 def imu_of(path: Path, time_offset_s: float) -> Imu:
     """Read the IMU in Kalibr's ``imu.yaml``, flat or under ``imu0``.
 
-    Args:
-        path: of the file.
-        time_offset_s: from the camera chain.
-
     Raises:
         RigError: if a noise value is missing, or body is not the IMU's frame.
     """

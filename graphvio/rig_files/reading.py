@@ -103,11 +103,7 @@ class Section:
         return self.array(key, (4, 4))
 
     def noise(self, rate_key: str, keys: Mapping[str, str]) -> dict[str, float]:
-        """Get rate and noise densities of an IMU by the names of `graphvio.rig.Imu`.
-
-        Args:
-            rate_key: key of the rate.
-            keys: name in `graphvio.rig.Imu` -> key in this file, for all four densities.
+        """Get rate and noise densities of an IMU, whose keys are given by the names of `graphvio.rig.Imu`.
 
         Raises:
             RigError: if one is missing; the message has graphvio's defaults, ready to be pasted.
@@ -134,11 +130,7 @@ def read_yaml(path: Path) -> Section:
 
 
 def parse_yaml(text: str, path: Path) -> Section:
-    """Parse the text of a YAML file, see `read_yaml`.
-
-    Raises:
-        RigError: if it is no mapping.
-    """
+    """Parse the text of a YAML file, see `read_yaml`."""
     text = re.sub(r"^%.*$", "", text, flags=re.MULTILINE)  # OpenCV's `%YAML:1.0` is no valid directive
     text = text.replace("!!opencv-matrix", "")
     try:
@@ -156,11 +148,7 @@ def parse_yaml(text: str, path: Path) -> Section:
 
 
 def read_text(path: Path) -> str:
-    """Read a text file.
-
-    Raises:
-        RigError: if it cannot be read as text.
-    """
+    """Read a text file."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -182,10 +170,6 @@ def named(path: Path) -> Iterator[None]:
 
 def consecutive_pairs(cameras: list[Camera], path: Path) -> tuple[StereoPair, ...]:
     """Form pairs (0, 1), (2, 3) and so on.
-
-    Args:
-        cameras: in the order of their numbers.
-        path: of their file, for messages.
 
     Raises:
         RigError: if there is no camera, or their number is odd.

@@ -32,11 +32,7 @@ class Outcomes:
 
 
 class Corrections:
-    """Passes corrections to the odometry; keyframes may be added in another thread.
-
-    Args:
-        served: the odometry.
-    """
+    """Passes corrections to the odometry; keyframes may be added in another thread."""
 
     def __init__(self, served: Served) -> None:
         self._served = served

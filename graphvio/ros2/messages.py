@@ -31,11 +31,7 @@ class Level(IntEnum):
 
 
 class ThinnedPath:
-    """Poses of the whole path: when they become too many, every second one is removed, and of later ones, too.
-
-    Args:
-        max_poses: how many are kept.
-    """
+    """Poses of the whole path: when they become too many, every second one is removed, and of later ones, too."""
 
     def __init__(self, max_poses: int) -> None:
         self._max_poses = max_poses
@@ -65,12 +61,7 @@ class ThinnedPath:
 
 
 def landmarks(keyframe: Keyframe, body: str) -> Any:
-    """Make a ``sensor_msgs/PointCloud2`` of a keyframe's landmarks, with their tracks' identities.
-
-    Args:
-        keyframe: whose landmarks are in frame body.
-        body: name of that frame in ROS.
-    """
+    """Make a ``sensor_msgs/PointCloud2`` of a keyframe's landmarks in ROS's frame ``body``, with their identities."""
     marks = keyframe.landmarks
     points = np.zeros(len(marks), dtype=_POINT)
     for k, axis in enumerate("xyz"):

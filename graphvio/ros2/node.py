@@ -104,9 +104,6 @@ class Writer:
 class Node:
     """A participant of a domain.
 
-    Args:
-        domain: see `domain_of`.
-
     Raises:
         SourceError: if no network can be used.
         MissingExtraError: if the extra ``ros2`` is not installed.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any, Final
 
 from graphvio.errors import GraphvioError, ServiceError
@@ -118,13 +117,9 @@ class Publisher:
         self._node.leave()
 
     def __enter__(self) -> Publisher:
-        """Return the publisher."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the publisher."""
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _run(self, name: str, task: Callable[[], None]) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from graphvio.arrays import Float
 from graphvio.errors import RigError, SessionError
-from graphvio.rig import Camera, Rig
+from graphvio.rig import Rig
 from graphvio.ros2.node import Node, Publication, Reader
 from graphvio.ros2.wire import SENSOR_DATA, TF_STATIC_READER
 from graphvio.sessions import cdr
@@ -43,17 +43,10 @@ def listen_for_rig(
     imu: str | None,
     wait: Callable[[float], bool],
 ) -> tuple[Rig, dict[str, str]]:
-    """Receive the rig of the stereo pairs that are published.
+    """Receive the rig of the stereo pairs that are published, and the topic with the images for each of its cameras.
 
-    Args:
-        node: takes part in the domain.
-        published: all publications of the domain.
-        cameras: name -> topic with its images, of the cameras to use; all cameras if it is empty.
-        imu: topic of the IMU, or None without one.
-        wait: sleeps for so many seconds; returns False when the time is over.
-
-    Returns:
-        The rig, and the topic with the images for each of its cameras.
+    Only the cameras given as name -> topic are used, or all if none is; ``wait`` sleeps for so many seconds, and
+    returns False when the time is over.
 
     Raises:
         RigError: if the messages received within the time do not make a rig.
@@ -122,9 +115,4 @@ def _rename_cameras(rig: Rig, cameras: Mapping[str, str]) -> tuple[Rig, dict[str
     unused = sorted(set(cameras.values()) - set(topics.values()))
     if unused:
         raise RigError(f"{rig.name}: {unused[0]} belongs to no stereo pair; give a rig of your own")
-
-    def renamed(camera: Camera) -> Camera:
-        return replace(camera, name=names.get(camera.name, camera.name))
-
-    pairs = tuple(replace(pair, left=renamed(pair.left), right=renamed(pair.right)) for pair in rig.pairs)
-    return replace(rig, pairs=pairs), topics
+    return rig.with_cameras(lambda camera: replace(camera, name=names.get(camera.name, camera.name))), topics

@@ -27,14 +27,7 @@ _MAX_LEVER_M: Final = 0.005
 
 
 class SensorTopic:
-    """The topic of a sensor: its readings, its publishers and its losses.
-
-    Args:
-        node: takes part in the domain.
-        name: of the topic.
-        types: of all topics that are published.
-        camera: its name in the rig; None for the IMU.
-        is_reliable: whether lost samples are to be sent again.
+    """The topic of a camera, by its name in the rig, or with None of the IMU: its readings, publishers and losses.
 
     Attributes:
         frame: of the newest sample of the IMU.
@@ -108,12 +101,7 @@ class SensorTopic:
 
 
 class BodyRotation:
-    """Rotates IMU samples into body, by the transforms between the frames.
-
-    Args:
-        body: name of the body's frame.
-        transforms: see `graphvio.sessions.rig_of_topics.transforms_in`.
-    """
+    """Rotates IMU samples into body, by transforms as of `graphvio.sessions.rig_of_topics.transforms_in`."""
 
     def __init__(self, body: str, transforms: dict[tuple[str, str], Float]) -> None:
         self._body, self._transforms = body, transforms

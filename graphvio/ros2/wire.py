@@ -11,11 +11,7 @@ from graphvio.sessions import cdr
 
 
 def require_dds() -> None:
-    """Check that ``cyclonedds`` can be imported.
-
-    Raises:
-        MissingExtraError: if the extra ``ros2`` is not installed.
-    """
+    """Check that ``cyclonedds`` can be imported."""
     try:
         import cyclonedds  # noqa: F401
     except ImportError:

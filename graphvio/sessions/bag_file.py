@@ -20,16 +20,10 @@ except ImportError:
 
 
 class BagFile:
-    """A bag: see `graphvio.sessions.store.Store`. Its messages are read as those of ROS 2.
+    """A bag, ``NAME.bag`` or the folder of a ROS 2 bag: see `graphvio.sessions.store.Store`.
 
-    The whole bag is read once for the stamps of its messages' headers; messages are read again when they are wanted.
-
-    Args:
-        path: ``NAME.bag``, or the folder of a ROS 2 bag.
-        is_wanted: whether a topic is read.
-
-    Raises:
-        SessionError: if it cannot be read.
+    Its messages are read as those of ROS 2, of the topics that are wanted. The whole bag is read once for the stamps of
+    its messages' headers; messages are read again when they are wanted.
     """
 
     def __init__(self, path: Path, is_wanted: Callable[[str], bool] = lambda topic: True) -> None:
@@ -52,11 +46,7 @@ class BagFile:
             raise SessionError(f"{path}: cannot be read as a bag ({str(error) or type(error).__name__})") from None
 
     def read(self, place: Place) -> bytes:
-        """Return a message as CDR.
-
-        Raises:
-            SessionError: if it cannot be read any more.
-        """
+        """Return a message as CDR."""
         connection = self._connections[place.chunk]
         with self._lock:
             data = next((raw for _, _, raw in self._found(connection, place)), None)

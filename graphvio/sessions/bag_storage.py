@@ -35,7 +35,7 @@ _LATCHED = Qos(  # the quality of service of ROS 2 that corresponds to a latched
 
 
 class _Bag:
-    """Common part of bags of ROS 1 and ROS 2: see `Storage`."""
+    """Common part of bags of ROS 1 and ROS 2: see `Storage`; a `SessionError` where the target exists."""
 
     has_attachments = False
     is_readable_when_cut = False
@@ -67,14 +67,7 @@ class _Bag:
 
 
 class Ros1Storage(_Bag):
-    """A ROS 1 bag; it cannot be read without the index at its end.
-
-    Args:
-        path: of the file, which must not exist.
-
-    Raises:
-        SessionError: if the file exists or cannot be created.
-    """
+    """A ROS 1 bag; it cannot be read without the index at its end."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, lambda: rosbag1.Writer(path))
@@ -93,14 +86,7 @@ class Ros1Storage(_Bag):
 
 
 class Ros2Storage(_Bag):
-    """A ROS 2 bag: a folder with an SQLite file, which holds its messages once it is finished.
-
-    Args:
-        path: of the folder, which must not exist.
-
-    Raises:
-        SessionError: if the folder exists or cannot be created.
-    """
+    """A ROS 2 bag: a folder with an SQLite file, which holds its messages once it is finished."""
 
     def __init__(self, path: Path) -> None:
         sqlite = rosbag2.StoragePlugin.SQLITE3

@@ -9,14 +9,7 @@ from graphvio.errors import MissingExtraError, SessionError
 
 
 def typestore(name: str) -> Any:
-    """Return the types of a ROS distribution.
-
-    Args:
-        name: of the distribution, as in rosbags' ``Stores``.
-
-    Raises:
-        MissingExtraError: if the extra ``sessions`` is not installed.
-    """
+    """Return the types of a ROS distribution, by its name in rosbags' ``Stores``."""
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
@@ -26,11 +19,7 @@ def typestore(name: str) -> Any:
 
 @cache
 def types() -> Any:
-    """Return the types of ROS 2 (Humble).
-
-    Raises:
-        MissingExtraError: if the extra ``sessions`` is not installed.
-    """
+    """Return the types of ROS 2 (Humble)."""
     return typestore("ROS2_HUMBLE")
 
 
@@ -52,12 +41,7 @@ def encode(message: Any) -> bytes:
 
 
 def decode(data: bytes, type_name: str, where: object = "a message") -> Any:
-    """Decode a message from CDR; its arrays are views of the data.
-
-    Args:
-        data: CDR of the message.
-        type_name: such as ``sensor_msgs/msg/Image``.
-        where: the message is from, for errors.
+    """Decode a message from CDR; its arrays are views of the data. ``where`` it is from is for errors.
 
     Raises:
         SessionError: if it is damaged.

@@ -29,15 +29,7 @@ _PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # noise hardly compresses any b
 
 
 def write_image(path: Path, image: Image) -> None:
-    """Write an image as PNG.
-
-    Args:
-        path: of the file.
-        image: (height, width) uint8.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
+    """Write an image as PNG."""
     is_encoded, png = cv2.imencode(".png", image, _PNG_OPTIONS)
     if not is_encoded:
         raise OSError(errno.EINVAL, "the image cannot be encoded", str(path))

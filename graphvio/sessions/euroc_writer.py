@@ -150,11 +150,8 @@ class EurocWriter:
 def _renamed(rig: Rig) -> Rig:
     if all(re.fullmatch(r"cam\d+", camera.name) for camera in rig.cameras):
         return rig
-    pairs = tuple(
-        replace(pair, left=replace(pair.left, name=f"cam{2 * k}"), right=replace(pair.right, name=f"cam{2 * k + 1}"))
-        for k, pair in enumerate(rig.pairs)
-    )
-    return replace(rig, pairs=pairs)
+    names = {camera.name: f"cam{k}" for k, camera in enumerate(rig.cameras)}
+    return rig.with_cameras(lambda camera: replace(camera, name=names[camera.name]))
 
 
 def _rate_hz(stamps_ns: list[int]) -> float:

@@ -51,10 +51,6 @@ class RecordingWriter(Protocol):
 def format_of(path: Path, asked: str | None) -> str:
     """Return the format, one of `FORMATS`, in which a path is written.
 
-    Args:
-        path: a file ``NAME.mcap`` or ``NAME.bag``, or a folder.
-        asked: the format, or None to go by the name.
-
     Raises:
         SessionError: if the name does not show the format, or contradicts it.
     """

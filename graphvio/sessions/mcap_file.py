@@ -40,9 +40,6 @@ _DAMAGE = (McapError, struct.error, ValueError, IndexError, OverflowError, Memor
 class McapFile:
     """An MCAP file: see `graphvio.sessions.store.Store`.
 
-    Args:
-        path: of the file.
-
     Raises:
         SessionError: if it cannot be read or is no MCAP file.
     """
@@ -70,11 +67,7 @@ class McapFile:
             raise SessionError(f"{path}: cannot be read ({error.strerror}); check the path") from None
 
     def read(self, place: Place) -> bytes:
-        """Return a message.
-
-        Raises:
-            SessionError: if it, or its chunk, is damaged.
-        """
+        """Return a message."""
         try:
             with self._lock:
                 if place.chunk < 0:

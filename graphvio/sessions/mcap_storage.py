@@ -21,15 +21,7 @@ _ENCODING, _SCHEMA_ENCODING, _PROFILE = "cdr", "ros2msg", "ros2"
 
 
 class McapStorage:
-    """An MCAP file with ROS 2 messages.
-
-    Args:
-        path: of the file, which must not exist.
-
-    Raises:
-        SessionError: if the file exists or cannot be created.
-        MissingExtraError: if the extra ``sessions`` is not installed.
-    """
+    """An MCAP file with ROS 2 messages."""
 
     has_attachments = True
     is_readable_when_cut = True

@@ -183,11 +183,6 @@ def pose_stamped(stamp_ns: int, frame: str, frame_T_body: Float) -> Any:
     return make(POSE, header=header(stamp_ns, frame), pose=_pose(frame_T_body))
 
 
-def true_pose(stamp_ns: int, world_T_body: Float) -> Any:
-    """Return the message of a pose (4, 4) of the true trajectory."""
-    return pose_stamped(stamp_ns, WORLD, world_T_body)
-
-
 def pose_of(message: Any) -> Float:
     """Return the pose (4, 4) in a ``PoseStamped``, a ``PoseWithCovarianceStamped`` or an ``Odometry``."""
     pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
@@ -234,17 +229,13 @@ def _fixed_axes(a_T_body: Float) -> Float:
 
 
 def _pose(a_T_body: Float) -> Any:
-    return make("geometry_msgs/msg/Pose", position=_point(a_T_body[:3, 3]), orientation=_quaternion(a_T_body[:3, :3]))
+    position, orientation = _vector(a_T_body[:3, 3], "Point"), _quaternion(a_T_body[:3, :3])
+    return make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
 
 
-def _vector(values: Float) -> Any:
+def _vector(values: Float, kind: str = "Vector3") -> Any:
     x, y, z = map(float, values)
-    return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-
-
-def _point(values: Float) -> Any:
-    x, y, z = map(float, values)
-    return make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
 
 
 def _quaternion(rotation: Float) -> Any:

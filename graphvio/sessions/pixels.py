@@ -28,10 +28,6 @@ _GREY, _GREY_16 = ("mono8", "8UC1"), ("mono16", "16UC1")
 def grey(message: Any, where: str) -> Image:
     """Convert a ``sensor_msgs/Image`` or ``CompressedImage`` to grey (height, width) uint8.
 
-    Args:
-        message: as decoded.
-        where: the message is from, for errors.
-
     Raises:
         ImageError: if it is damaged, or its encoding is not known.
     """

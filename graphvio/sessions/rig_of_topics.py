@@ -28,10 +28,6 @@ def rig_of_topics(messages: MessageReader, name: str) -> Rig | None:
     name. Without a transform to the right camera, the fourth column of its projection gives the baseline. Body is the
     frame of the IMU, or of the first left camera.
 
-    Args:
-        messages: to read from.
-        name: of the rig.
-
     Raises:
         RigError: if transforms are missing, or a camera is of an unknown kind.
         SessionError: if a message is damaged.
@@ -68,9 +64,6 @@ def stereo_topics(images: Iterable[str]) -> dict[str, tuple[str, str]]:
 
     Their names differ in one part only. Of several topics of a camera, such as raw and compressed or raw and rectified,
     one is used: see `preference`.
-
-    Args:
-        images: names of topics with images.
     """
     names = sorted(images)
     made: dict[tuple[str, str], tuple[str, str]] = {}
@@ -165,13 +158,7 @@ def transforms_in(message: Any) -> dict[tuple[str, str], Float]:
 
 
 def path_between(transforms: dict[tuple[str, str], Float], start: str, end: str) -> Float | None:
-    """Return ``start_T_end`` (4, 4) along transforms, or None if no path leads there.
-
-    Args:
-        transforms: (parent, child) -> ``parent_T_child``, as of `transforms_in`.
-        start: frame.
-        end: frame.
-    """
+    """Return ``start_T_end`` (4, 4) along transforms as of `transforms_in`, or None if no path leads there."""
     start, end = start.lstrip("/"), end.lstrip("/")
     reached = {start: np.eye(4)}
     waiting = [start]

@@ -14,11 +14,7 @@ _OLD_LEVELS = {10: 1, 20: 2, 30: 4, 40: 8, 50: 16}
 
 @cache
 def types() -> Any:
-    """Return the types of ROS 1 (Noetic), with that of ``tf_static``.
-
-    Raises:
-        MissingExtraError: if the extra ``sessions`` is not installed.
-    """
+    """Return the types of ROS 1 (Noetic), with that of ``tf_static``."""
     made = cdr.typestore("ROS1_NOETIC")
     from rosbags.typesys import get_types_from_msg
 
@@ -45,12 +41,7 @@ def modern(message: Any) -> Any:
 
 
 def encode(message: Any, number: int) -> bytes:
-    """Serialise a ROS 2 message as that of ROS 1.
-
-    Args:
-        message: of a type that graphvio writes.
-        number: of the message in its topic, for the headers.
-    """
+    """Serialise a ROS 2 message as that of ROS 1, with its number in the topic for the headers."""
     old = _old_log(message, number) if message.__msgtype__ == LOG else _old(message, number)
     return bytes(types().serialize_ros1(old, old.__msgtype__))
 

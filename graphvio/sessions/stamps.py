@@ -72,12 +72,7 @@ def all_header_stamps(store: Store, topics: Iterable[Topic]) -> dict[str, Int]:
 
 
 def compare_clocks(header_ns: Int, logged_ns: Int) -> Clock:
-    """Compare stamps with the times of recording.
-
-    Args:
-        header_ns: (N,) stamps in the order of recording, N > 0.
-        logged_ns: (N,) times of recording.
-    """
+    """Compare stamps (N,), N > 0, in the order of recording, with the times of recording (N,)."""
     late_ns = logged_ns - header_ns
     drift, sigma = _drift(header_ns, late_ns)
     return Clock(

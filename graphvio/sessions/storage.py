@@ -9,7 +9,7 @@ from graphvio.errors import SessionError
 
 
 class Storage(Protocol):
-    """A file or folder to which messages are written by topic.
+    """A file or folder to which messages are written by topic; an `OSError` where it cannot be written.
 
     Attributes:
         path: of the file or folder.
@@ -22,38 +22,16 @@ class Storage(Protocol):
     is_readable_when_cut: bool
 
     def attach(self, name: str, text: str) -> None:
-        """Store a text before all messages, if it `has_attachments`.
-
-        Raises:
-            OSError: if it cannot be written.
-        """
+        """Store a text before all messages, if it `has_attachments`."""
 
     def write(self, topic: str, stamp_ns: int, message: Any, is_latched: bool) -> None:
-        """Store a ROS 2 message.
-
-        Args:
-            topic: of the message.
-            stamp_ns: time of recording.
-            message: of rosbags' types.
-            is_latched: whether late subscribers to the topic still get its last message.
-
-        Raises:
-            OSError: if it cannot be written.
-        """
+        """Store a ROS 2 message of rosbags' types; late subscribers still get the last one of a latched topic."""
 
     def finish(self) -> None:
-        """Write the end of the file.
-
-        Raises:
-            OSError: if it cannot be written.
-        """
+        """Write the end of the file."""
 
     def close(self) -> None:
-        """Close the file, finished or not.
-
-        Raises:
-            OSError: if the last bytes cannot be written.
-        """
+        """Close the file, finished or not."""
 
 
 def exists_error(path: Path) -> SessionError:

@@ -47,14 +47,9 @@ class Topic:
 
 
 class MessageReader(Protocol):
-    """Messages by topic, of a file or of a running system.
+    """Messages by topic, of a file or of a running system."""
 
-    Attributes:
-        path: the file, or a name for messages.
-        topics: name -> topic.
-    """
-
-    path: Path
+    path: Path  # the file, or a name for messages
     topics: dict[str, Topic]
 
     def read(self, place: Place) -> bytes:
@@ -94,9 +89,7 @@ def preference(topic: str) -> tuple[int, bool, str]:
 def camera_of(topic: str, sides: tuple[str, ...]) -> str:
     """Return the common beginning of the topics with one camera's images: all before ``image_raw`` and the like.
 
-    Args:
-        topic: with images.
-        sides: words that distinguish cameras; if one is in the last part, as in ``image_left``, that part is kept.
+    If a word of ``sides`` is in the last part, as in ``image_left``, that part is kept.
     """
     parts = topic.split("/")
     for number, part in enumerate(parts):

@@ -102,7 +102,8 @@ class SessionWriter:
 
     def add_true_pose(self, stamp_ns: int, world_T_body: Float) -> None:
         """Record a pose ``world_T_body`` (4, 4) of the true trajectory."""
-        self._guarded(lambda: self._add(TRUTH_TOPIC, stamp_ns, messages.true_pose(stamp_ns, world_T_body)))
+        message = messages.pose_stamped(stamp_ns, messages.WORLD, world_T_body)
+        self._guarded(lambda: self._add(TRUTH_TOPIC, stamp_ns, message))
 
     def add_event(self, event: Event) -> None:
         """Record an event; if it is not within the recording's time, at the nearer end of that."""

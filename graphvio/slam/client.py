@@ -173,17 +173,9 @@ class Client:
             yield Event(update.stamp_ns, update.kind, update.detail)
 
     def correct(self, keyframe_id: int, map_T_body: Float, covariance: Float) -> CorrectionResult:
-        """Correct where a keyframe is in the map.
+        """Correct where a keyframe is in the map, see `SlamFrontEnd.correct`.
 
         It is not repeated after a lost connection: whether it arrived is then unknown.
-
-        Args:
-            keyframe_id: Id of a keyframe of the newest epoch.
-            map_T_body: (4, 4) pose of body in the map.
-            covariance: (6, 6), tangent ``[rotation, translation]`` in body.
-
-        Returns:
-            Whether it was accepted; a correction that fails the innovation test raises nothing.
 
         Raises:
             ServiceError: Also if the correction is malformed, or the server meanwhile serves another run.

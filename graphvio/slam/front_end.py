@@ -56,11 +56,7 @@ class FrontEnd:
         self._callbacks.append(callback)
 
     def keyframes(self, from_id: int = 0) -> Iterator[Keyframe]:
-        """Yield keyframes as they come until the odometry is finished; for a thread of its own.
-
-        Args:
-            from_id: Where to begin, or to go on. Ids that are skipped were no longer kept, see `KeyframeLog`.
-        """
+        """Yield keyframes until the odometry is finished, see `SlamFrontEnd.keyframes`; for a thread of its own."""
         self._is_wanted = True
         return self.log.follow(from_id)
 

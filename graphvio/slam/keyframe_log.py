@@ -15,11 +15,7 @@ _MAX_BYTES = 256 * 2**20
 
 
 class KeyframeLog:
-    """Keyframes in the order of their ids; the oldest are dropped beyond a limit of memory. Thread-safe.
-
-    Args:
-        max_bytes: Maximal size of the landmarks and images that are kept.
-    """
+    """Keyframes in the order of their ids; the oldest are dropped beyond a limit of memory. Thread-safe."""
 
     def __init__(self, max_bytes: int = _MAX_BYTES) -> None:
         self._max_bytes = max_bytes
@@ -52,15 +48,7 @@ class KeyframeLog:
             self._changed.notify_all()
 
     def read(self, from_id: int, timeout_s: float | None = None) -> Keyframe | None:
-        """Wait for the first keyframe that is kept, from an id on.
-
-        Args:
-            from_id: Id of the keyframe; if it has been dropped, the oldest one that is kept is returned.
-            timeout_s: Maximal time to wait, or None for no limit.
-
-        Returns:
-            The keyframe; None after the timeout, or when the log is closed and no keyframe is left.
-        """
+        """Wait for the first keyframe that is kept, from an id on; None after the timeout, or where none will come."""
         until = None if timeout_s is None else time.monotonic() + timeout_s
         with self._changed:
             while self._next_id <= from_id and not self._is_closed:

@@ -98,15 +98,8 @@ class MapFrame:
         """Fuse a correction of where a keyframe is in the map, or refuse it.
 
         A correction that fails the innovation test is refused, until several refused ones in a row agree with each
-        other. Each time this takes twice as many, so that two contradicting sources do not alternate.
-
-        Args:
-            keyframe_id: Id of a keyframe of the newest epoch; a second correction of a keyframe replaces the first.
-            map_T_body: (4, 4) pose of body in the map.
-            covariance: (6, 6), tangent ``[rotation, translation]`` in body.
-
-        Returns:
-            Whether it was accepted, and the test's figures.
+        other. Each time this takes twice as many, so that two contradicting sources do not alternate. A second
+        correction of a keyframe replaces the first.
 
         Raises:
             MeasurementError: If the pose is not rigid, or the covariance is not positive definite.

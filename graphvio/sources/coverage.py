@@ -20,15 +20,7 @@ _IMU_GAP_PERIODS = 5.0
 def count_image_faults(
     rig: Rig, pairs: Sequence[PairIndex], framesets: FramesetIndex, tolerance_ns: int, faults: FaultLog
 ) -> None:
-    """Count images without partner, framesets without a pair, and gaps, in the time of the framesets.
-
-    Args:
-        rig: of the pairs.
-        pairs: images of each pair of the rig, of the whole recording.
-        framesets: that are read.
-        tolerance_ns: with which left and right images were matched.
-        faults: to count in.
-    """
+    """Count images without partner, framesets without a pair, and gaps, in the time of the framesets."""
     begin_ns, end_ns = int(framesets.stamps_ns[0]), int(framesets.stamps_ns[-1])
     gaps: list[tuple[int, int, str]] = []
     for number, (pair, index) in enumerate(zip(rig.pairs, pairs, strict=True)):
@@ -57,14 +49,7 @@ def count_image_faults(
 
 
 def count_imu_faults(stamps_ns: Int, begin_ns: int, end_ns: int, faults: FaultLog) -> None:
-    """Count gaps of the IMU, and whether its samples begin late or stop early.
-
-    Args:
-        stamps_ns: (N,) of the samples, increasing, IMU clock; N > 0.
-        begin_ns: instant of the first frameset, IMU clock.
-        end_ns: instant of the last frameset, IMU clock.
-        faults: to count in.
-    """
+    """Count gaps of the IMU's samples (N,), N > 0, and whether they begin late or stop early; on the IMU's clock."""
     period = int(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0
     if stamps_ns[0] > begin_ns + period:
         detail = f"the first sample comes {_ms(int(stamps_ns[0]) - begin_ns)} after the first frameset"

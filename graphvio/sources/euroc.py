@@ -24,16 +24,7 @@ def matches(path: Path) -> bool:
 
 
 def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
-    """Index the cameras of a rig, and the IMU if it has one.
-
-    Args:
-        path: folder of the recording, or its ``mav0``.
-        rig: whose cameras are looked for.
-        faults: to count in.
-
-    Raises:
-        SourceError: if a camera of the rig has no folder or no images here.
-    """
+    """Index the cameras of a rig, and the IMU if it has one."""
     root = sensors_folder(path)
     if root is None:
         raise SourceError(f"{path}: holds no cam0, cam1, ...; give an EuRoC/ASL recording")

@@ -28,14 +28,7 @@ class FaultLog:
         self._logged: set[str] = set()
 
     def add(self, kind: EventKind, stamp_ns: int, detail: str, times: int = 1) -> None:
-        """Count a fault.
-
-        Args:
-            kind: of the fault.
-            stamp_ns: when it came first.
-            detail: where it came first, one line.
-            times: how many there are; nothing is counted if there is none.
-        """
+        """Count a fault, where it came first in one line; nothing is counted if there is none."""
         if times <= 0:
             return
         first = kind not in self.counts

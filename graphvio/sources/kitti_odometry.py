@@ -19,16 +19,7 @@ def matches(path: Path) -> bool:
 
 
 def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
-    """Index the cameras of a rig; the images of row i are the i-th of each folder.
-
-    Args:
-        path: folder of the sequence.
-        rig: whose cameras are looked for.
-        faults: to count in.
-
-    Raises:
-        SourceError: if the times or the images of a camera of the rig are missing.
-    """
+    """Index the cameras of a rig; the images of row i are the i-th of each folder."""
     times = path / "times.txt"
     if not times.is_file():
         raise SourceError(f"{times}: is missing; it comes with KITTI's calibration files: put it there")

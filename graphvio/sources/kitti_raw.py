@@ -24,16 +24,7 @@ def matches(path: Path) -> bool:
 
 
 def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
-    """Index the cameras of a rig.
-
-    Args:
-        path: folder of the drive.
-        rig: whose cameras are looked for.
-        faults: to count in.
-
-    Raises:
-        SourceError: if the stamps or the images of a camera of the rig are missing.
-    """
+    """Index the cameras of a rig."""
     images = {}
     for pair in rig.pairs:
         stamps_ns, rows = read_times(path / pair.left.name / "timestamps.txt", _utc_ns, faults)

@@ -39,13 +39,7 @@ class FramesetIndex:
 
 
 def match_sides(left_ns: Int, right_ns: Int, tolerance_ns: int = TOLERANCE_NS) -> PairIndex:
-    """Match left and right images of a pair by stamp.
-
-    Args:
-        left_ns: (N,) stamps of the left images, increasing.
-        right_ns: (M,) stamps of the right images, increasing.
-        tolerance_ns: largest difference of stamps of one instant.
-    """
+    """Match left and right images of a pair by their stamps (N,) and (M,), which increase."""
     if np.array_equal(left_ns, right_ns):
         rows = np.repeat(np.arange(len(left_ns), dtype=np.int32)[:, None], 2, axis=1)
         nothing = np.zeros(0, dtype=np.int64)
@@ -73,14 +67,10 @@ def match_sides(left_ns: Int, right_ns: Int, tolerance_ns: int = TOLERANCE_NS) -
 
 
 def group_pairs(pairs: Sequence[PairIndex], tolerance_ns: int = TOLERANCE_NS) -> FramesetIndex:
-    """Join pairs of the same instant to framesets.
+    """Join pairs, at least one, of the same instant to framesets.
 
     A frameset has the stamp of the first of its pairs; or of the earliest, if the next frameset would otherwise be
     within the tolerance of this one.
-
-    Args:
-        pairs: images of each pair, at least one pair.
-        tolerance_ns: largest difference of stamps of one instant.
     """
     count = len(pairs)
     first = pairs[0].stamps_ns

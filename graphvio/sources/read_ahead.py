@@ -19,12 +19,6 @@ def read_ahead(
 
     An exception of ``work`` is raised where its result is due. The threads end when the iterator is exhausted, closed
     or collected.
-
-    Args:
-        work: called in the threads.
-        items: its arguments.
-        depth: how many results are prepared ahead at most.
-        threads: how many threads prepare them.
     """
     waiting: deque[Future[R]] = deque()
     pool = ThreadPoolExecutor(threads, thread_name_prefix="graphvio-read")

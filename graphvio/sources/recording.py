@@ -35,15 +35,7 @@ class _Decoded:
 
 
 class Recording:
-    """A recording as a `graphvio.sources.base.Source`.
-
-    Args:
-        index: with images of every camera of the rig.
-        rig: decides which pairs are read, and whether the IMU is.
-        faults: to count in.
-        from_s: where to begin, seconds after the first frameset.
-        to_s: where to end (inclusive), on the same scale.
-        tolerance_ns: images whose stamps differ by no more are of one instant.
+    """A recording as a `graphvio.sources.base.Source`; arguments are those of `open_source`.
 
     Raises:
         SourceError: if no frameset is left.

@@ -30,12 +30,7 @@ LAYOUT = "sessions and bags: NAME.mcap, NAME.bag, a folder with metadata.yaml"
 
 
 def rig_in(store: Store) -> Rig | None:
-    """Return the rig that is stored in a session, or that its messages describe; None if there is none.
-
-    Raises:
-        RigError: if it is not usable.
-        SessionError: if it is damaged.
-    """
+    """Return the rig that is stored in a session, or that its messages describe; None if there is none."""
     damaged = SessionError(f"{store.path}: the rig in it is damaged; copy the file again, or give a rig of your own")
     attached = store.attachments.get(RIG_ATTACHMENT)
     if attached is not None:
@@ -52,17 +47,7 @@ def rig_in(store: Store) -> Rig | None:
 
 
 def read_index(store: Store, rig: Rig, faults: FaultLog, topics: Mapping[str, str]) -> Index:
-    """Index the cameras of a rig, and the IMU if it has one.
-
-    Args:
-        store: the session or bag.
-        rig: whose cameras are looked for.
-        faults: to count in.
-        topics: name of a camera, or ``imu`` -> its topic, where topics have other names.
-
-    Raises:
-        SourceError: if a camera of the rig has no images in it.
-    """
+    """Index the cameras of a rig, and the IMU if it has one; ``topics`` gives those with other names by camera."""
     chosen = {name: _named(store, topic) for name, topic in topics.items()}
     unknown = set(chosen) - {camera.name for camera in rig.cameras} - {_IMU_NAME}
     if unknown:

@@ -31,12 +31,7 @@ class ImuTable:
 
 
 def read_imu_csv(path: Path, faults: FaultLog) -> ImuTable:
-    """Read EuRoC's ``imu0/data.csv``.
-
-    Args:
-        path: of the file.
-        faults: counts the rows that are dropped: no samples, repeated or out of order.
-    """
+    """Read EuRoC's ``imu0/data.csv``; rows that are no samples, repeated or out of order are dropped and counted."""
     table = _read_fast(path)
     if table is None:
         table = _read_tolerant(path, faults)
@@ -55,15 +50,7 @@ def read_imu_csv(path: Path, faults: FaultLog) -> ImuTable:
 
 
 def read_frame_csv(path: Path, faults: FaultLog) -> tuple[Int, list[str]]:
-    """Read EuRoC's ``cam0/data.csv``.
-
-    Args:
-        path: of the file.
-        faults: counts the rows that are dropped.
-
-    Returns:
-        Stamps (N,), increasing, and names of the images.
-    """
+    """Read EuRoC's ``cam0/data.csv``: stamps (N,), increasing, and names of the images."""
     stamps: list[int] = []
     names: list[str] = []
     for number, cells in _rows(path):
@@ -79,18 +66,9 @@ def read_frame_csv(path: Path, faults: FaultLog) -> tuple[Int, list[str]]:
 
 
 def read_times(path: Path, parse: Callable[[str], int | None], faults: FaultLog) -> tuple[Int, list[int]]:
-    """Read a file with the time of a frame in each line.
+    """Read a file with the time of a frame in each line: stamps (N,), increasing, and their lines, from 0.
 
-    Args:
-        path: of the file.
-        parse: returns the nanoseconds of a line, or None if it is no time.
-        faults: counts the lines that are dropped.
-
-    Returns:
-        Stamps (N,), increasing, and their lines, from 0.
-
-    Raises:
-        SourceError: if the file cannot be read.
+    ``parse`` returns the nanoseconds of a line, or None if it is no time.
     """
     lines: list[int] = []
     stamps: list[int] = []
@@ -127,20 +105,11 @@ def decimal_ns(text: str, unit_ns: int) -> int | None:
 
 
 def clean_stamps(stamps_ns: Int, sensor: Literal["imu", "frame"], path: Path, faults: FaultLog) -> Bool:
-    """Return which rows to keep so that stamps increase and the fewest rows are dropped.
+    """Return which rows (N,) to keep so that stamps increase and the fewest rows are dropped; those are counted.
 
     The longest increasing subsequence is kept. So one stamp far in the future costs one row, not all that follow it; of
     equal stamps the first is kept. Of these, one or two rows that lie hours from all others are dropped, such as the
     stamp 0 of a driver that has no time yet.
-
-    Args:
-        stamps_ns: (N,) in the order of the file.
-        sensor: whose rows they are.
-        path: of the file, for messages.
-        faults: counts the dropped rows as duplicate, backward or outlier.
-
-    Returns:
-        (N,) true for rows to keep.
     """
     increasing = np.ones(len(stamps_ns), dtype=np.bool_)
     if (np.diff(stamps_ns) <= 0).any():
@@ -235,11 +204,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Read the lines of a text file with any line ends; bytes that are no text spoil only their line.
-
-    Raises:
-        SourceError: if the file cannot be read.
-    """
+    """Read the lines of a text file with any line ends; bytes that are no text spoil only their line."""
     try:
         return path.read_text(encoding="utf-8-sig", errors="replace").split("\n")
     except OSError as error:

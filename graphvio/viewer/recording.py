@@ -62,12 +62,6 @@ _XYZ_COLOURS = [(220, 70, 60), (60, 170, 75), (70, 110, 230)]
 class Recording:
     """A stream to rerun's window, browsers, a file or several of these; methods are called by one thread.
 
-    Args:
-        rig: cameras to be logged.
-        spawn: open a window.
-        save: file to write, or None.
-        web: how to serve browsers, or None.
-
     Raises:
         GraphvioError: if browsers cannot be served.
         OSError, RuntimeError: by rerun, if the file or the window cannot be opened.

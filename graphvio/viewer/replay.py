@@ -47,11 +47,7 @@ def replay(folder: Path, *, spawn: bool = False, save: Path | None = None) -> No
 
 
 def read_estimates(folder: Path) -> Iterator[Estimate]:
-    """Read the estimates that have a pose from the files of a result folder; their status is not saved.
-
-    Raises:
-        GraphvioError: if a file is damaged.
-    """
+    """Read the estimates that have a pose from the files of a result folder; their status is not saved."""
     trajectory = load_trajectory(folder / "trajectory.txt")
     covariances = {stamp: _symmetric(upper) for stamp, upper in _read_rows(folder / "covariance.csv", 21)}
     biases = dict(_read_rows(folder / "imu_bias.csv", 6))

@@ -63,9 +63,6 @@ class WebOptions:
 class WebHost:
     """The server process; ends by `close`, or with this process.
 
-    Args:
-        options: ports and memory.
-
     Raises:
         GraphvioError: if a port is taken, or rerun does not start.
     """

@@ -90,7 +90,7 @@ def _views(run: Optimized, config: Config) -> _Views:
 
 
 def _by_vlad(views: _Views, words: int, seed: int) -> Float:
-    centres = vocabulary(views.descriptors, seed, words)
+    centres = vocabulary(views.descriptors, len(views.descriptors), seed, words)
     vectors = np.array([describe(rows, centres) for rows in views.descriptors])
     return np.asarray(vectors @ vectors.T, dtype=np.float64)
 

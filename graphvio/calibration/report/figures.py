@@ -80,13 +80,7 @@ def turning(each: PairCalibration) -> Figure:
 
 
 def growth(each: PairCalibration, count: int, unit: str) -> Figure:
-    """Plot the change of the result, with its sigmas, as the recording grew, relative to the final result.
-
-    Args:
-        each: the calibration.
-        count: number of framesets or poses of the whole recording.
-        unit: "framesets" or "poses".
-    """
+    """Plot the change of the result, with its sigmas, as the recording grew to its count of framesets or poses."""
     figure = empty_figure(6.4, 5.0)
     panels = [figure.add_axes((0.13, bottom, 0.83, 0.38)) for bottom in (0.57, 0.1)]
     begin, end = int(each.pairs.start_ns[0]), int(each.pairs.end_ns[-1])

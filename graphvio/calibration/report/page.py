@@ -28,9 +28,6 @@ def write_report(found: Calibration, folder: Path, source: str, count: int) -> P
         source: name of what was calibrated, for the title.
         count: number of framesets used, or of the first trajectory's poses.
 
-    Returns:
-        Path of the page.
-
     Raises:
         CalibrationError: if the folder cannot be written.
     """
@@ -60,13 +57,7 @@ def _pictures(each: PairCalibration, count: int, unit: str) -> dict[str, bytes]:
 
 
 def page(found: Calibration, pictures: dict[tuple[int, int], dict[str, bytes]], source: str) -> str:
-    """Render the page.
-
-    Args:
-        found: the calibration.
-        pictures: (first, second) -> name -> PNG.
-        source: name of what was calibrated, for the title.
-    """
+    """Render the page of what was calibrated, with PNGs by name of (first, second)."""
     has_rig = found.rig is not None
     return render(
         "calibration/report/page.html",

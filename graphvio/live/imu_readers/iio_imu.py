@@ -289,9 +289,6 @@ class ScanElement:
 class ScanFormat:
     """Layout of the enabled elements in a scan: each is aligned to its own size.
 
-    Args:
-        elements: enabled.
-
     Attributes:
         dtype: of a whole scan, with a field for each element.
     """

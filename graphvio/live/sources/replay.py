@@ -31,12 +31,7 @@ def list_devices() -> Sequence[DeviceInfo]:
 
 
 def open_source(spec: SourceSpec, rig: Rig | None) -> Replay:
-    """Open a recording by its path; see `SourceKind.open_source`.
-
-    Raises:
-        SourceError: if it cannot be read, or an option is not valid.
-        RigError: if no rig is given and the recording has none.
-    """
+    """Open a recording by its path; see `SourceKind.open_source`."""
     check_options(spec, _OPTIONS)
     if not spec.what:
         raise SourceError("replay: names no recording; write replay:FOLDER or replay:FILE")
@@ -79,11 +74,7 @@ class Replay:
 
 
 class Pace:
-    """Waits until measurements are due.
-
-    Args:
-        speed: factor of the recording's time; None does not wait.
-    """
+    """Waits until measurements are due by a factor of the recording's time; with None it does not wait."""
 
     def __init__(self, speed: float | None) -> None:
         self._speed = speed
@@ -109,11 +100,7 @@ class Pace:
 
 
 def speed_of(spec: SourceSpec) -> float | None:
-    """Return the option ``speed``: a factor such as ``2``, 1 where it is not given, or None for ``max``.
-
-    Raises:
-        SourceError: if it is neither.
-    """
+    """Return the option ``speed``: a factor such as ``2``, 1 where it is not given, or None for ``max``."""
     if spec.options.get("speed") == "max":
         return None
     return number_of(spec, "speed", 0.01, 100.0) or 1.0

@@ -43,10 +43,6 @@ class DeviceFaults:
     def parse(options: Mapping[str, str], rig_devices: tuple[str, ...]) -> DeviceFaults:
         """Parse options such as ``drift_ppm=100``, ``jitter_ms=2`` and ``unplug=back@5-8,imu@20-21``.
 
-        Args:
-            options: of a source.
-            rig_devices: names of the devices.
-
         Raises:
             SourceError: if a device is not there, or a value is not valid.
         """
@@ -82,15 +78,7 @@ def devices_of(rig: Rig) -> tuple[str, ...]:
 def with_faults(
     readings: Iterable[Reading], rig: Rig, faults: DeviceFaults, start_ns: int, seed: int
 ) -> Iterator[Reading]:
-    """Apply faults to readings.
-
-    Args:
-        readings: stamped by one clock.
-        rig: of the readings.
-        faults: to apply.
-        start_ns: stamp from which outages count.
-        seed: of the jitter.
-    """
+    """Apply faults to readings of one clock, whose outages count from the stamp ``start_ns``."""
     devices = devices_of(rig)
     device_of = {camera.name: pair.name for pair in rig.pairs for camera in (pair.left, pair.right)}
     rng, number = np.random.default_rng(seed), count()

@@ -48,11 +48,7 @@ def list_devices() -> Sequence[DeviceInfo]:
 
 
 def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
-    """Make a source of a scene by its name, ``room`` by default; see `SourceKind.open_source`.
-
-    Raises:
-        SourceError: if there is no such scene, or an option is not valid.
-    """
+    """Make a source of a scene by its name, ``room`` by default; see `SourceKind.open_source`."""
     check_options(spec, _OPTIONS)
     scene = spec.what or "room"
     if scene not in SCENE_NAMES:

@@ -111,11 +111,6 @@ def open_v4l2(path: str, settings: CaptureSettings) -> Capture:
 def set_up(capture: Adjustable, path: str, settings: CaptureSettings) -> None:
     """Apply settings to a capture.
 
-    Args:
-        capture: of a device.
-        path: of the device, for messages.
-        settings: to apply.
-
     Raises:
         SourceError: if the driver refuses or changes one.
     """

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -62,9 +61,6 @@ def colmap_camera(camera: Camera, number: int) -> Any:
 class FeatureDatabase:
     """The database of one or several sessions; a context manager that closes it.
 
-    Args:
-        path: of the file, made if missing.
-
     Raises:
         OptimizationError: if it cannot be opened.
         MissingExtraError: if the extra ``maps`` is not installed.
@@ -82,9 +78,11 @@ class FeatureDatabase:
     def __enter__(self) -> FeatureDatabase:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
         self._file.close()
 
     @property
@@ -117,11 +115,7 @@ class FeatureDatabase:
         return found.rig_id, dict(zip(names, [found.ref_sensor_id.id, *others], strict=True))
 
     def add_rig(self, rig: Rig) -> tuple[int, dict[str, int]]:
-        """Add a rig, with its first camera as COLMAP's reference sensor.
-
-        Returns:
-            Number of the rig, and camera name -> number.
-        """
+        """Add a rig, with its first camera as COLMAP's reference sensor; returns its number, and camera -> number."""
         numbers = {camera.name: self._file.write_camera(colmap_camera(camera, 0)) for camera in rig.cameras}
         return self._file.write_rig(self._rig(rig, numbers)), numbers
 
@@ -176,14 +170,7 @@ class FeatureDatabase:
         return np.asarray(self._file.read_descriptors(self._ids[name]).data, dtype=np.uint8).reshape(-1, 128)
 
     def add_matches(self, first: str, second: str, matches: Int, geometry: Any = None) -> None:
-        """Add matches of two images.
-
-        Args:
-            first: name of the first image.
-            second: name of the second image.
-            matches: (M, 2) features of the first and the second image.
-            geometry: two-view geometry that verifies matches; None if all are verified, as those of a stereo pair.
-        """
+        """Add matches (M, 2) of two images, verified by a geometry; None where all are, as those of a stereo pair."""
         one, other = self._ids[first], self._ids[second]
         rows = np.ascontiguousarray(matches, dtype=np.uint32).reshape(-1, 2)
         self._file.write_matches(one, other, rows)
@@ -224,11 +211,7 @@ class FeatureDatabase:
             self._file.write_two_view_geometry(one, other, geometry)
 
     def model(self, rigs: Mapping[int, Float]) -> Any:
-        """Return a reconstruction without points, with the database's numbers.
-
-        Args:
-            rigs: number of the frame -> (4, 4) reference camera from world.
-        """
+        """Return a reconstruction without points of frames, given as number -> (4, 4) reference camera from world."""
         file, made = self._file, self._colmap.Reconstruction()
         frames = [frame for frame in file.read_all_frames() if frame.frame_id in rigs]
         of_frames = {frame.rig_id for frame in frames}

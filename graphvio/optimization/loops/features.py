@@ -38,12 +38,7 @@ class PairFeatures:
 
 
 class PlaceObserver:
-    """Extracts the features of a place's images and matches them in stereo, in any thread.
-
-    Args:
-        rig: of the cameras.
-        config: of this stage and of the stereo matching.
-    """
+    """Extracts the features of a place's images and matches them in stereo, in any thread."""
 
     def __init__(self, rig: Rig, config: Config) -> None:
         self._rig = rig
@@ -98,15 +93,6 @@ def extract_places(
     """Extract the features of a session's places into the database.
 
     Places that are in the database already are skipped, so that an interrupted run can be continued.
-
-    Args:
-        source: of the images.
-        rig: of the cameras.
-        session: name of the session, unique in the database.
-        stamps_ns: of the places.
-        database: to write.
-        config: of this stage and of the stereo matching.
-        on_progress: called with the number of finished places.
     """
     observer = PlaceObserver(rig, config)
 
@@ -132,15 +118,7 @@ def _is_there(database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int) 
 def store_place(
     database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int, seen: Mapping[int, PairFeatures]
 ) -> None:
-    """Write the features of a place to the database, all or nothing.
-
-    Args:
-        database: to write.
-        rig: of the cameras.
-        session: name of the session, unique in the database.
-        stamp_ns: of the place.
-        seen: pair index -> features.
-    """
+    """Write the features of a place to the database, all or nothing."""
     names = {
         camera.name: image_name(session, camera.name, stamp_ns)
         for j in seen
@@ -162,13 +140,6 @@ def merge_places(
     """Copy places from one database to another.
 
     Parts that are copied in the order of time give the same rows as `extract_places` for all places at once.
-
-    Args:
-        part: to read.
-        whole: to write.
-        session: name of the session.
-        rig: of the cameras.
-        stamps_ns: of the places, in the order of time; those that the part does not hold are skipped.
     """
     for stamp_ns in stamps_ns:
         seen = {}

@@ -18,14 +18,9 @@ _MIN_LENGTH = 1e-12  # of the normal of an epipolar plane; two views from one po
 
 
 def alike(first: AnyArray, second: AnyArray) -> Int:
-    """Match descriptors that are each other's nearest and pass the ratio test, as COLMAP's matcher on the CPU does.
+    """Match descriptors (K, 128) and (L, 128), uint8, as COLMAP's matcher on the CPU does; returns rows (M, 2) of both.
 
-    Args:
-        first: (K, 128) uint8.
-        second: (L, 128) uint8.
-
-    Returns:
-        Rows (M, 2) of the first and the second.
+    Matches are each other's nearest, and pass the ratio test.
     """
     if not len(first) or not len(second):
         return np.zeros((0, 2), dtype=np.int64)
@@ -50,13 +45,7 @@ def _best(products: AnyArray) -> tuple[Int, Bool]:
 
 
 def estimated_geometry(cameras: tuple[Camera, Camera], pixels: tuple[Float, Float], rows: Int) -> Any:
-    """Estimate COLMAP's two-view geometry by RANSAC.
-
-    Args:
-        cameras: of the two images.
-        pixels: features (K, 2) and (L, 2).
-        rows: matches (M, 2).
-    """
+    """Estimate COLMAP's two-view geometry from matches (M, 2) of features (K, 2) and (L, 2), by RANSAC."""
     first, second = (colmap_camera(camera, 1) for camera in cameras)
     one, other = (each + CENTRE_PX for each in pixels)
     options = colmap().TwoViewGeometryOptions()

@@ -16,11 +16,7 @@ _PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # higher levels hardly compress
 
 
 def write_image(path: Path, image: Image) -> None:
-    """Write a PNG file, which is whole or absent.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
+    """Write a PNG file, which is whole or absent."""
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.tmp")  # renamed without fsync: there are thousands
     _, encoded = cv2.imencode(".png", image, _PNG_OPTIONS)
@@ -29,11 +25,7 @@ def write_image(path: Path, image: Image) -> None:
 
 
 def write_place(folder: Path, rig: Rig, session: str, frameset: FrameSet) -> None:
-    """Write all images of a frameset.
-
-    Raises:
-        OSError: if one cannot be written.
-    """
+    """Write all images of a frameset."""
     for j, images in frameset.images.items():
         pair = rig.pairs[j]
         for camera, image in zip((pair.left, pair.right), images, strict=True):

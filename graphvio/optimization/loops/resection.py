@@ -51,7 +51,7 @@ def resect_features(
     config: Config,
     seed: Sequence[int],
 ) -> Resection | None:
-    """Estimate the motion between two places from matched features.
+    """Estimate the motion between two places from matched features; None if they do not support one.
 
     Args:
         rig: of the pairs.
@@ -60,9 +60,6 @@ def resect_features(
         matches: (a, b) -> matches (M, 2) of a's features at the reference and b's at the current place.
         config: of the motion.
         seed: of RANSAC.
-
-    Returns:
-        The motion, or None if the matches do not support one.
     """
     crossings = sorted(matches)
     observations = _observations(reference, current, [(pair, matches[pair]) for pair in crossings])
@@ -82,16 +79,8 @@ def register_patches(
 ) -> Resection:  # fmt: skip
     """Refine a motion by registering the patches of pairs that see the same points at both places.
 
-    Args:
-        observers: of the rig's pairs.
-        found: motion by features.
-        reference: pair index -> its features with depth at the reference.
-        images: of the reference and of the current place.
-        config: of the motion.
-        seed: of RANSAC.
-
-    Returns:
-        The refined motion, or the given one if too few patches can be registered.
+    Returns the given motion if too few patches can be registered. Arguments are those of `resect_features`, and the
+    images of the reference and of the current place.
     """
     then, now = images
     pairs = sorted({a for a, b in found.pairs if a == b and a in then.images and a in now.images})

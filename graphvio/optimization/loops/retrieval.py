@@ -6,7 +6,7 @@ H. Jegou, M. Douze, C. Schmid, P. Perez, *Aggregating local descriptors into a c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 
 import cv2
@@ -20,16 +20,17 @@ _ITERATIONS = 15
 _LENGTH = 512.0  # of COLMAP's descriptors
 
 
-def vocabulary(descriptors: Sequence[AnyArray], seed: int, max_words: int = _WORDS) -> AnyArray:
+def vocabulary(descriptors: Iterable[AnyArray], images: int, seed: int, max_words: int = _WORDS) -> AnyArray:
     """Cluster descriptors to words (W, 128) by k-means.
 
     Args:
-        descriptors: (K, 128) uint8, of each of N images.
+        descriptors: (K, 128) uint8, of each image; iterated once, as those of an hour may not fit in memory.
+        images: their number.
         seed: of the sample and of the initial words.
         max_words: number of words, if there are as many descriptors.
     """
     rng = np.random.default_rng(seed)
-    each = max(1, _SAMPLE // max(1, len(descriptors)))
+    each = max(1, _SAMPLE // max(1, images))
     chosen = [rows[rng.choice(len(rows), min(each, len(rows)), replace=False)] for rows in descriptors if len(rows)]
     if not chosen:
         return np.zeros((0, 128), dtype=np.float32)
@@ -73,7 +74,7 @@ def describe(descriptors: AnyArray, words: AnyArray) -> AnyArray:
 def most_similar(
     own: AnyArray, vectors: AnyArray, firsts: Int, may: Callable[[int], bool], count: int
 ) -> list[tuple[float, int]]:
-    """Find the places that are most similar to a place, by their most similar images.
+    """Return similarity and index of the places most similar to a place, by their most similar images.
 
     Args:
         own: (K, D) vectors of the place's images.
@@ -81,9 +82,6 @@ def most_similar(
         firsts: (P,) first row of each known place.
         may: whether a known place may be returned, given its index.
         count: maximum number of places.
-
-    Returns:
-        Similarity and index of known places, the most similar first.
     """
     by_place = np.maximum.reduceat(np.max(own @ vectors.T, axis=0), firsts)
     found: list[tuple[float, int]] = []
@@ -96,16 +94,13 @@ def most_similar(
 
 
 def candidates(vectors: AnyArray, place: Int, may: Callable[[int, int], bool], count: int) -> list[tuple[int, int]]:
-    """Find the most similar earlier places of each place.
+    """Return pairs (earlier, later) of each place and the earlier ones most similar to it, the most similar first.
 
     Args:
         vectors: (N, D) of images, of length one.
         place: (N,) number of each image's place, in order.
         may: whether an earlier and a later place may be compared.
         count: maximum number of candidates of a place.
-
-    Returns:
-        Pairs (earlier, later) of places, the most similar first.
     """
     found: list[tuple[float, int, int]] = []
     numbers, firsts = np.unique(place, return_index=True)

@@ -39,11 +39,8 @@ def find_loops(
 ) -> list[LoopClosure]:
     """Find loop closures between places that are far apart in time or of different sessions.
 
-    Args:
-        sessions: whose places are in the database.
-        database: of features; verified matches are added to it.
-        config: of the search and the motion.
-        on_progress: called with the number of finished candidates and of all.
+    The places are in the database already; verified matches are added to it. ``on_progress`` is called with the number
+    of finished candidates and of all.
     """
     places = [place for session in sessions for place in session.places]
     images = _described(sessions, places, database, config.motion.seed)
@@ -80,20 +77,6 @@ class _Images:
         return len(self.names)
 
 
-class _Descriptors(Sequence[AnyArray]):
-    """Descriptors of images, read on access, as those of an hour may not fit in memory."""
-
-    def __init__(self, database: FeatureDatabase, names: Sequence[str]) -> None:
-        self._database = database
-        self._names = names
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-    def __getitem__(self, k: Any) -> Any:
-        return self._database.descriptors(self._names[k])
-
-
 def _described(
     sessions: Sequence[SessionInput], places: Sequence[Place], database: FeatureDatabase, seed: int
 ) -> _Images:
@@ -104,11 +87,10 @@ def _described(
     ]
     listed = [each for each in listed if each[2] in database.names]
     names = [each[2] for each in listed]
-    descriptors = _Descriptors(database, names)
-    words = vocabulary(descriptors, seed)
+    words = vocabulary(map(database.descriptors, names), len(names), seed)
     vectors = np.zeros((len(names), words.size), dtype=np.float32)
-    for k, rows in enumerate(descriptors):
-        vectors[k] = describe(rows, words)
+    for k, name in enumerate(names):
+        vectors[k] = describe(database.descriptors(name), words)
     return _Images(
         np.array([each[0] for each in listed], dtype=np.int64),
         np.array([each[1] for each in listed], dtype=np.int64),

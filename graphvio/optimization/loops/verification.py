@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -41,100 +42,65 @@ class View(Protocol):
         """Return the place's images, of the pairs whose images still exist."""
 
 
+@dataclass(frozen=True, eq=False)
 class StoredView:
-    """A place in a database.
+    """A place in a database, which is read under a lock."""
 
-    Args:
-        rig: that took the images.
-        session: name of the session in the database.
-        stamp_ns: of the place.
-        database: of features.
-        lock: held while the database is read.
-        frameset_at: reads the images.
-    """
-
-    def __init__(
-        self, rig: Rig, session: str, stamp_ns: int, database: FeatureDatabase, lock: threading.Lock,
-        frameset_at: Callable[[int], FrameSet],
-    ) -> None:  # fmt: skip
-        self._rig = rig
-        self._session = session
-        self._stamp_ns = stamp_ns
-        self._database = database
-        self._lock = lock
-        self._frameset_at = frameset_at
-
-    @property
-    def rig(self) -> Rig:
-        """See `View`."""
-        return self._rig
+    rig: Rig
+    session: str
+    stamp_ns: int
+    database: FeatureDatabase
+    lock: threading.Lock
+    frameset_at: Callable[[int], FrameSet]
 
     def name(self, j: int) -> str:
         """Return the name of pair j's left image in the database."""
-        return image_name(self._session, self._rig.pairs[j].left.name, self._stamp_ns)
+        return image_name(self.session, self.rig.pairs[j].left.name, self.stamp_ns)
 
     def features(self, j: int) -> tuple[Float, AnyArray]:
         """See `View`."""
         name = self.name(j)
-        with self._lock:
-            return self._database.pixels(name), self._database.descriptors(name)
+        with self.lock:
+            return self.database.pixels(name), self.database.descriptors(name)
 
     def frame(self, j: int) -> PairFrame:
         """See `View`."""
-        pair, left = self._rig.pairs[j], self.name(j)
-        right = image_name(self._session, pair.right.name, self._stamp_ns)
-        with self._lock:
-            pixels, in_right = self._database.pixels(left), self._database.pixels(right)
-            rows = self._database.matches(left, right)
-        return frame_of(pair, self._stamp_ns, pixels, in_right, rows)
+        pair, left = self.rig.pairs[j], self.name(j)
+        right = image_name(self.session, pair.right.name, self.stamp_ns)
+        with self.lock:
+            pixels, in_right = self.database.pixels(left), self.database.pixels(right)
+            rows = self.database.matches(left, right)
+        return frame_of(pair, self.stamp_ns, pixels, in_right, rows)
 
     def frameset(self) -> FrameSet:
         """See `View`."""
-        return self._frameset_at(self._stamp_ns)
+        return self.frameset_at(self.stamp_ns)
 
 
+@dataclass(frozen=True, eq=False)
 class FreshView:
-    """A place in memory.
+    """A place in memory."""
 
-    Args:
-        rig: that took the images.
-        frameset: of the place.
-        seen: pair index -> features.
-    """
-
-    def __init__(self, rig: Rig, frameset: FrameSet, seen: Mapping[int, PairFeatures]) -> None:
-        self._rig = rig
-        self._frameset = frameset
-        self._seen = seen
-
-    @property
-    def rig(self) -> Rig:
-        """See `View`."""
-        return self._rig
+    rig: Rig
+    images: FrameSet
+    seen: Mapping[int, PairFeatures]  # by pair
 
     def features(self, j: int) -> tuple[Float, AnyArray]:
         """See `View`."""
-        return self._seen[j].left, self._seen[j].descriptors
+        return self.seen[j].left, self.seen[j].descriptors
 
     def frame(self, j: int) -> PairFrame:
         """See `View`."""
-        seen = self._seen[j]
-        return frame_of(self._rig.pairs[j], self._frameset.stamp_ns, seen.left, seen.right, seen.rows)
+        seen = self.seen[j]
+        return frame_of(self.rig.pairs[j], self.images.stamp_ns, seen.left, seen.right, seen.rows)
 
     def frameset(self) -> FrameSet:
         """See `View`."""
-        return self._frameset
+        return self.images
 
 
 def crossings(pairs: Int, vectors: AnyArray, other_pairs: Int, other_vectors: AnyArray) -> list[tuple[int, int]]:
-    """Return the pairs (a, b) whose images of two places are most similar, the most similar first.
-
-    Args:
-        pairs: (P,) of the earlier place's images.
-        vectors: (P, D) their VLAD vectors.
-        other_pairs: (Q,) of the later place's images.
-        other_vectors: (Q, D) their VLAD vectors.
-    """
+    """Return the pairs (a, b) whose images of two places are most similar, by their VLAD vectors (P, D) and (Q, D)."""
     similar = vectors @ other_vectors.T
     ranked = sorted((-float(similar[i, k]), i, k) for i in range(len(pairs)) for k in range(len(other_pairs)))[
         :_MAX_CROSSINGS
@@ -146,7 +112,7 @@ def verified(
     earlier: View, later: View, tried: Sequence[tuple[int, int]], observers: Sequence[PairObserver] | None,
     config: Config, seed: Sequence[int], on_matched: Callable[[int, int, Int, Any], None] | None = None,
 ) -> Resection | None:  # fmt: skip
-    """Estimate the motion between two places that may be the same.
+    """Estimate the motion between two places that may be the same; None if they have too little in common.
 
     Args:
         earlier: place whose points are used.
@@ -156,9 +122,6 @@ def verified(
         config: of the search and the motion.
         seed: of RANSAC.
         on_matched: called with a, b, their matches (M, 2), and the two-view geometry that verifies them.
-
-    Returns:
-        The motion, or None if the places have too little in common.
     """
     matches = {}
     for a, b in tried:

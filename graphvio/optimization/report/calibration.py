@@ -126,15 +126,7 @@ class SessionCalibration:
 
 
 def calibrations(found: Optimization, rigs: Sequence[Rig | None]) -> list[SessionCalibration | None]:
-    """Compare the estimated calibration of each session with its rig file.
-
-    Args:
-        found: the optimisation.
-        rigs: of each session by its file, or None if unknown.
-
-    Returns:
-        The corrections of each session; None where the calibration was not estimated.
-    """
+    """Compare the calibration of each session, where it was estimated, with its rig file, if that is known."""
     corrections: Sequence[RigCorrection | None] = found.corrections or [None] * len(found.sessions)
     return [
         None if correction is None else _session(session.record.name, correction, rig)

@@ -43,13 +43,7 @@ class _Line:
 
 
 def plot_map(found: Optimization, numbers: Numbers, frame: int) -> Figure:
-    """Plot online poses on the left and optimised ones on the right; plan (x, y) above, side view (x, z) below.
-
-    Args:
-        found: the optimisation.
-        numbers: of it.
-        frame: number of the frame.
-    """
+    """Plot online poses on the left and optimised ones on the right; plan (x, y) above, side view (x, z) below."""
     lines = list(_lines(found, numbers, frame))
     points = np.concatenate([column[line.inside] for line in lines for column in line.columns])
     figure, panels = _panels(points, _LEGEND_ROW_IN * -(-_labels(found, lines) // _PER_ROW))

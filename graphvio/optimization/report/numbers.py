@@ -149,16 +149,7 @@ def median_sigmas(residuals: Residuals | None) -> float | None:
 
 
 def numbers_of(found: Optimization, truths: Sequence[Trajectory | None], folder: Path) -> Numbers:
-    """Compute all numbers of a report.
-
-    Args:
-        found: the optimisation.
-        truths: true trajectory of each session, or None.
-        folder: of the optimisation's results; the odometry's may be in ``NAME/odometry``.
-
-    Raises:
-        OptimizationError: if the number of truths is not that of the sessions.
-    """
+    """Compute all numbers of a report, with the odometry's results in ``folder/NAME/odometry`` if they are there."""
     if len(truths) != len(found.sessions):
         raise OptimizationError(
             f"report: {len(truths)} truths for {len(found.sessions)} sessions; give None for one that has none"
@@ -203,15 +194,9 @@ def seconds(session: OptimizedSession) -> Float:
 
 
 def loop_errors(found: Optimization, stage: str) -> Float:
-    """Compute by how much each loop closure differs from the poses of a stage.
+    """Compute by how much each loop closure differs from the poses of a stage: (L, 2) in metres and degrees.
 
-    Args:
-        found: the optimisation.
-        stage: one of `STAGES`.
-
-    Returns:
-        Errors (L, 2) in metres and degrees; NaN where the poses share no frame: before the optimisation, those of
-        different epochs or sessions.
+    NaN where the poses share no frame: before the optimisation, those of different epochs or sessions.
     """
     errors = np.full((len(found.loops), 2), np.nan)
     for number, loop in enumerate(found.loops):

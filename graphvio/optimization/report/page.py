@@ -24,14 +24,7 @@ _MIN_COMPLETION = 0.9
 
 
 def page(found: Optimization, numbers: Numbers, maps: Mapping[int, bytes], pictures: Mapping[str, bytes]) -> str:
-    """Render the page.
-
-    Args:
-        found: the optimisation.
-        numbers: of it.
-        maps: frame -> PNG; not all frames need one.
-        pictures: name -> PNG: ``residuals``, ``moved`` and ``sigmas``.
-    """
+    """Render the page with its PNGs: maps by frame, not of all, and ``residuals``, ``moved`` and ``sigmas``."""
     return render(
         "optimization/report/page.html",
         found=found,

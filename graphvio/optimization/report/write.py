@@ -30,15 +30,12 @@ _MAX_MAPS = 6
 
 
 def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory | None]) -> Path:
-    """Write the page with its figures embedded, and all numbers as JSON; each file is whole or absent.
+    """Write all numbers as JSON, and the page with its figures, whose path is returned; each file is whole or absent.
 
     Args:
         found: the optimisation.
         folder: where to write, made if missing; the odometry's results may be in ``NAME/odometry``.
         truths: true trajectory of each session, poses of body in any frame; or None.
-
-    Returns:
-        Path of the page.
 
     Raises:
         OptimizationError: if the number of truths is not that of the sessions, or the folder cannot be written.

@@ -11,6 +11,5 @@ except ModuleNotFoundError as error:
     raise MissingExtraError("grpcio and protobuf", "serve", "serving keyframes, or using such a service") from None
 
 from graphvio.slam.service import graphvio_pb2 as messages
-from graphvio.slam.service import graphvio_pb2_grpc as stubs
 
-__all__ = ["grpc", "messages", "stubs"]
+__all__ = ["grpc", "messages"]

@@ -19,16 +19,7 @@ def packed(array: AnyArray | None) -> list[float]:
 
 
 def floats(values: Sequence[float], shape: tuple[int, ...], what: str) -> Float:
-    """Return an array of a shape from a list of values.
-
-    Args:
-        values: Values, row by row.
-        shape: Shape of the array.
-        what: Name of the field, for the error message.
-
-    Raises:
-        ServiceError: If the number of values does not match the shape.
-    """
+    """Return an array of a shape from its values row by row; raises a ServiceError if their number is another."""
     _check_count(len(values), shape, what)
     return np.array(values, dtype=np.float64).reshape(shape)
 
@@ -39,21 +30,13 @@ def maybe_floats(values: Sequence[float], shape: tuple[int, ...], what: str) -> 
 
 
 def whole_numbers(values: Sequence[int], what: str, count: int) -> Int:
-    """Return an int64 array (count,); arguments as of `floats`.
-
-    Raises:
-        ServiceError: If the number of values is another.
-    """
+    """Return an int64 array (count,); arguments and error as of `floats`."""
     _check_count(len(values), (count,), what)
     return np.array(values, dtype=np.int64)
 
 
 def byte_rows(data: bytes, shape: tuple[int, int], what: str) -> AnyArray:
-    """Return a uint8 array, such as an image; arguments as of `floats`.
-
-    Raises:
-        ServiceError: If the number of bytes does not match the shape.
-    """
+    """Return a uint8 array, such as an image; arguments and error as of `floats`."""
     _check_count(len(data), shape, what)
     return np.frombuffer(data, dtype=np.uint8).reshape(shape).copy()
 

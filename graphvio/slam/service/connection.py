@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from graphvio.errors import ServiceError
-from graphvio.slam.service import grpc, stubs
+from graphvio.slam.service import grpc
+from graphvio.slam.service.calls import Stub
 from graphvio.slam.service.options import DEFAULT_PORT, RUN_KEY, is_loopback
 from graphvio.slam.service.security import bearer
 
@@ -25,13 +26,6 @@ _TOO_LARGE = "larger than max"
 
 class Connection:
     """A connection to a server, which reopens broken streams.
-
-    Args:
-        address: ``HOST:PORT``, or ``HOST`` with the default port.
-        ca: PEM file of the trusted certificates, or None for no TLS.
-        token: The server's token, or None.
-        timeout_s: Timeout of a call.
-        patience_s: How long a broken stream is retried.
 
     Raises:
         ServiceError: If the address is invalid, the certificates cannot be read, or the token would be sent
@@ -58,14 +52,10 @@ class Connection:
             self._channel = grpc.insecure_channel(self.address, options)
         else:
             self._channel = grpc.secure_channel(self.address, grpc.ssl_channel_credentials(self._ca), options)
-        self.stub = stubs.FrontEndStub(self._channel)
+        self.stub: Any = Stub(self._channel)
 
     def call(self, method: Any, request: Any) -> Any:
         """Return the server's answer to a request.
-
-        Args:
-            method: Method of `stub`.
-            request: Its message.
 
         Raises:
             ServiceError: If the call fails.
@@ -78,10 +68,6 @@ class Connection:
 
     def follow(self, method: Any, next_request: Callable[[], Any]) -> Iterator[Any]:
         """Yield the messages of a stream until the server ends it; reopen it when it breaks.
-
-        Args:
-            method: Method of `stub`.
-            next_request: Returns the request with which the stream is opened again.
 
         Raises:
             ServiceError: If the server refuses, or does not return within ``patience_s``.
@@ -206,13 +192,7 @@ def _read_certificates(path: Path) -> bytes:
 
 
 def _why_unreachable(host: str, port: int, ca: bytes | None) -> str:
-    """Connect without gRPC, whose messages name no remedy, and return what is wrong and what to do.
-
-    Args:
-        host: Host of the server.
-        port: Port of the server.
-        ca: Trusted certificates in PEM, or None without TLS.
-    """
+    """Connect without gRPC, whose messages name no remedy, and return what is wrong and what to do."""
     try:
         with socket.create_connection((host, port), _DIAGNOSIS_S) as connection:
             return _why_no_service(connection, host, ca)

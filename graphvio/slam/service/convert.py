@@ -15,7 +15,7 @@ from graphvio.errors import ServiceError
 from graphvio.measurements.estimate import Estimate, Prediction, Status
 from graphvio.measurements.events import Event
 from graphvio.measurements.motion import Quality
-from graphvio.rig import Camera, Rig, StereoPair, as_written
+from graphvio.rig import Rig, as_written
 from graphvio.rig_files import native
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
 from graphvio.slam.service import messages
@@ -32,8 +32,8 @@ Value = float | int | str | None
 
 def rig_text(rig: Rig) -> str:
     """Return the text of a ``rig.yaml`` without masks, which are files on the server's machine."""
-    pairs = tuple(StereoPair(pair.name, _bare(pair.left), _bare(pair.right)) for pair in rig.pairs)
-    return native.to_text(replace(rig, pairs=pairs), Path("/"))
+    bare = rig.with_cameras(lambda camera: as_written(replace(camera, mask=None), camera.body_T_cam))
+    return native.to_text(bare, Path("/"))
 
 
 def rig_of(text: str, origin: str) -> Rig:
@@ -43,10 +43,6 @@ def rig_of(text: str, origin: str) -> Rig:
         RigError: If this version of graphvio cannot read it.
     """
     return native.parse(text, Path(origin))
-
-
-def _bare(camera: Camera) -> Camera:
-    return as_written(replace(camera, mask=None), camera.body_T_cam)
 
 
 def estimate_message(estimate: Estimate) -> Any:

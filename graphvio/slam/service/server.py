@@ -13,7 +13,8 @@ from typing import Any, Self
 
 from graphvio.errors import ServiceError
 from graphvio.slam.interface import Served
-from graphvio.slam.service import grpc, stubs
+from graphvio.slam.service import grpc
+from graphvio.slam.service.calls import handlers
 from graphvio.slam.service.options import ServiceOptions
 from graphvio.slam.service.security import MalformedInterceptor, read_token, server_credentials, token_interceptor
 from graphvio.slam.service.servicer import STREAMS_OF_A_CLIENT, Servicer, StreamLimit
@@ -103,7 +104,8 @@ class GrpcServer:
             maximum_concurrent_rpcs=threads + _MAX_WAITING_CALLS,
         )
         self._stopping = threading.Event()
-        stubs.add_FrontEndServicer_to_server(Servicer(self._served, self._run_id, self._limit, self._stopping), server)
+        servicer = Servicer(self._served, self._run_id, self._limit, self._stopping)
+        server.add_generic_rpc_handlers((handlers(servicer),))
         try:
             if credentials is None:
                 self._port = server.add_insecure_port(options.address)
@@ -119,10 +121,7 @@ class GrpcServer:
         self._server, self._pool = server, pool
 
     def drain(self, timeout_s: float = READ_S) -> bool:
-        """Wait until clients have read the streams of an odometry that has ended.
-
-        Args:
-            timeout_s: Maximal time to wait. It ends sooner when no message of any stream is read for 5 s.
+        """Wait until clients have read the streams of an odometry that has ended, while any message is read within 5 s.
 
         Returns:
             Whether all streams have been read to their end.
@@ -135,11 +134,7 @@ class GrpcServer:
         return not self.open_streams
 
     def stop(self, grace_s: float = READ_S) -> None:
-        """Stop the server and end all streams; idempotent.
-
-        Args:
-            grace_s: Maximal time to read the streams of an odometry that has ended, see `drain`.
-        """
+        """Stop the server and end all streams; idempotent."""
         if self._server is None or self._pool is None:
             return
         if self._served.keyframe_log.is_closed:
@@ -172,11 +167,7 @@ def _transport(options: ServiceOptions) -> list[tuple[str, int]]:
 
 
 def _check_address(options: ServiceOptions) -> None:
-    """Check that the address can be bound: gRPC would write lines of its own to the terminal if not.
-
-    Raises:
-        ServiceError: If the address is in use or not this machine's.
-    """
+    """Check that the address can be bound: gRPC would write lines of its own to the terminal if not."""
     try:
         found = socket.getaddrinfo(options.bare_host, options.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         for family, kind, protocol, _, address in found:
@@ -199,9 +190,6 @@ class DaemonPool(Executor):
     """A `concurrent.futures.ThreadPoolExecutor` of daemon threads.
 
     A program waits for the standard one's threads when it ends; with an open stream it would wait forever.
-
-    Args:
-        max_threads: Maximal number of threads; they are started on demand.
     """
 
     def __init__(self, max_threads: int) -> None:
@@ -213,11 +201,7 @@ class DaemonPool(Executor):
         self._is_shut = False
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Call a function in one of the threads; see `concurrent.futures.Executor.submit`.
-
-        Raises:
-            RuntimeError: After `shutdown`.
-        """
+        """Call a function in one of the threads; see `concurrent.futures.Executor.submit`."""
         future: Future[Any] = Future()
 
         def run() -> None:

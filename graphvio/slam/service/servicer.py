@@ -15,7 +15,7 @@ from graphvio.measurements.estimate import Estimate, Prediction
 from graphvio.queues import BoundedQueue, Broadcast
 from graphvio.slam.interface import Served, map_of_epoch, newest_epoch
 from graphvio.slam.keyframe_log import KeyframeLog
-from graphvio.slam.service import convert, grpc, messages, stubs
+from graphvio.slam.service import convert, grpc, messages
 from graphvio.slam.service.arrays import checked_covariance, checked_pose, floats, packed
 from graphvio.slam.service.options import RUN_KEY
 from graphvio.version import __version__
@@ -42,11 +42,7 @@ class Stream:
 
 
 class StreamLimit:
-    """The open streams, whose number is limited by client and in total.
-
-    Args:
-        max_clients: Maximal number of clients with open streams.
-    """
+    """The open streams, whose number is limited by client and in total."""
 
     def __init__(self, max_clients: int) -> None:
         self._max_clients = max_clients
@@ -65,11 +61,7 @@ class StreamLimit:
             return any(stream.read_s > since_s for stream in self._streams)
 
     def enter(self, client: str) -> Stream:
-        """Add a stream of a client.
-
-        Raises:
-            ServiceError: If the limits are reached.
-        """
+        """Add a stream of a client."""
         with self._lock:
             clients = {stream.client for stream in self._streams}
             if client not in clients and len(clients) >= self._max_clients:
@@ -88,15 +80,8 @@ class StreamLimit:
             self._streams.remove(stream)
 
 
-class Servicer(stubs.FrontEndServicer):  # type: ignore[misc]
-    """Answers the calls to one odometry.
-
-    Args:
-        served: The odometry.
-        run_id: Unique name of its run.
-        limit: Limit of streams.
-        stopping: Set when streams must end though the odometry continues.
-    """
+class Servicer:
+    """Answers the calls to one odometry; ``stopping`` is set when streams must end though it continues."""
 
     def __init__(self, served: Served, run_id: str, limit: StreamLimit, stopping: threading.Event) -> None:
         self._served = served
