@@ -15,7 +15,13 @@ def _empty_file(path: Path, *_: Any, **__: Any) -> None:
     path.write_bytes(b"")
 
 
-for _plot in ("plot_map", "plot_residuals", "plot_moved", "plot_sigmas"):
-    setattr(figures, _plot, _nothing)
-write.png = _nothing
-writer.plot_run = _empty_file
+for _module, _name, _instead in (
+    (figures, "plot_map", _nothing),
+    (figures, "plot_residuals", _nothing),
+    (figures, "plot_moved", _nothing),
+    (figures, "plot_sigmas", _nothing),
+    (write, "png", _nothing),
+    (writer, "plot_run", _empty_file),
+):
+    assert hasattr(_module, _name)
+    setattr(_module, _name, _instead)
