@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from recordings import START_NS, frame_stamps, half_size_rig, small_rig, write_euroc, write_rows
+from rendered import rendered_once
 
 from graphvio import Estimate, FrameSet, ImuSample, Odometry, Status, open_source
 from graphvio.config import Config
@@ -23,6 +24,7 @@ from graphvio.simulation import Simulator, build_scene, write_recording
 from graphvio.sources.matching import TOLERANCE_NS, PairIndex, group_pairs, match_sides
 from graphvio.sources.sequencer import merge
 from graphvio.trajectory import Trajectory
+from graphvio.trajectory_files import load_trajectory
 
 pytestmark = pytest.mark.heavy
 
@@ -217,14 +219,15 @@ def test_pairs_of_one_instant_that_come_separately_are_joined_while_held(
 
 @cache
 def walk(rates: float | tuple[float, ...], offset_ms: float) -> tuple[Rig, list[FrameSet], list[ImuSample], Trajectory]:
-    simulator = small_simulator(rates, offset_ms)
-    track = simulator.imu_track
-    samples = [
-        ImuSample(int(stamp), rate, force)
-        for stamp, rate, force in zip(track.stamps_ns, track.angular_velocity, track.linear_acceleration, strict=True)
-    ]
-    framesets = [simulator.frameset(index) for index in range(len(simulator.stamps_ns))]
-    return simulator.rig, framesets, samples, Trajectory(simulator.stamps_ns, simulator.world_T_body)
+    def write(folder: Path) -> None:
+        write_recording(small_simulator(rates, offset_ms), folder)
+
+    source = open_source(rendered_once("unsynchronised", write, rates, offset_ms, DURATION_S))
+    assert source.truth is not None
+    measurements = list(source)
+    framesets = [each for each in measurements if isinstance(each, FrameSet)]
+    samples = [each for each in measurements if isinstance(each, ImuSample)]
+    return source.rig, framesets, samples, load_trajectory(source.truth)
 
 
 def feed(rig: Rig, measurements: Iterable[Measurement]) -> Iterator[Estimate]:
