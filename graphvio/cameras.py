@@ -59,6 +59,31 @@ def distort(model: int, distortion: Float, x: float, y: float) -> tuple[float, f
 
 
 @kernel
+def distortion_basis(model: int, x: float, y: float) -> Float:
+    """Compute the derivatives (5, 2) of the distorted normalised coordinates of (x, y) by the coefficients.
+
+    Both models are linear in these.
+    """
+    basis = np.zeros((5, 2))
+    r2 = x * x + y * y
+    if model == RADIAL_TANGENTIAL:
+        basis[0, 0], basis[0, 1] = x * r2, y * r2
+        basis[1, 0], basis[1, 1] = x * r2 * r2, y * r2 * r2
+        basis[2, 0], basis[2, 1] = 2.0 * x * y, r2 + 2.0 * y * y
+        basis[3, 0], basis[3, 1] = r2 + 2.0 * x * x, 2.0 * x * y
+        basis[4, 0], basis[4, 1] = x * r2 * r2 * r2, y * r2 * r2 * r2
+        return basis
+    r = np.sqrt(r2)
+    if r > 1e-8:
+        theta = np.arctan(r)
+        power, t2 = theta / r, theta * theta
+        for i in range(4):
+            power *= t2
+            basis[i, 0], basis[i, 1] = x * power, y * power
+    return basis
+
+
+@kernel
 def undistort(model: int, distortion: Float, xd: float, yd: float) -> tuple[float, float, bool]:
     """Find the normalised coordinates whose distortion is (xd, yd), by Newton's method; False where there are none."""
     x, y = xd, yd

@@ -319,7 +319,7 @@ def test_covariances_of_landmarks_are_consistent() -> None:
         held, covariances, _ = triangulate(seen[0], seen[1], pair.right_T_left, float(focal[0]), float(focal[1]))
         whole = np.arange(count)
         frame = PairFrame(
-            0, whole, whole, seen[0], seen[0], seen[1], held, covariances, np.zeros((count, 2)),
+            0, whole, whole, seen[0], seen[0], seen[1], seen[1], held, covariances, np.zeros((count, 2)),
             np.ones(count, dtype=bool), whole,
         )  # fmt: skip
         black = np.zeros((480, 640), dtype=np.uint8)

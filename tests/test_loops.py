@@ -33,11 +33,11 @@ def frame(pair: StereoPair, points: Float, stamp_ns: int, rng: np.random.Generat
         pixels, inside = camera.project(in_camera)
         pixels = np.where(inside[:, None], pixels, 100.0) + PIXEL_SIGMA * rng.standard_normal(pixels.shape)
         seen.append((pixels, camera.unproject(pixels)[0], inside))
-    (pixels, left, in_left), (_, right, in_right) = seen
+    (pixels, left, in_left), (right_pixels, right, in_right) = seen
     triangulated, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
     none = np.zeros(len(points), dtype=np.int64)
     return PairFrame(
-        stamp_ns, np.arange(len(points)), none, pixels, left, right, triangulated, covariances,
+        stamp_ns, np.arange(len(points)), none, pixels, left, right, right_pixels, triangulated, covariances,
         np.zeros((len(points), 2)), in_left & in_right, none,
     )  # fmt: skip
 

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from graphvio.config.stages import (
+    CalibrationConfig,
     CornerConfig,
     FilterConfig,
     FusionConfig,
@@ -35,6 +36,7 @@ class Config:
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     initialisation: InitialisationConfig = field(default_factory=InitialisationConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     smoother: SmootherConfig = field(default_factory=SmootherConfig)

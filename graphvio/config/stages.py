@@ -102,6 +102,14 @@ class MotionConfig(Stage):
 
 
 @dataclass(frozen=True)
+class CalibrationConfig(Stage):
+    """Estimation of the rig's calibration while it runs."""
+
+    online: bool = True
+    """Whether the calibration is estimated and corrected during the run; else the rig file's is used as it is."""
+
+
+@dataclass(frozen=True)
 class InitialisationConfig(Stage):
     """The first pose: tilt from the accelerometer, while stationary or in motion."""
 

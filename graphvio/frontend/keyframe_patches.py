@@ -38,7 +38,17 @@ class KeyframePatches:
 
     def take(self, frame: PairFrame, image: Image) -> None:
         """Take the patches of a frame's tracks, from its left image (height, width)."""
-        self._frame, self._image = frame, packed(image)
+        self._image = packed(image)
+        self._place(frame)
+
+    def recalibrate(self, pair: StereoPair) -> None:
+        """Take another calibration of the cameras."""
+        self._pair = pair
+        self._place(self._frame.recalibrated(pair))
+
+    def _place(self, frame: PairFrame) -> None:
+        """Place the patches in space, by a frame's tracks."""
+        self._frame = frame
         pixels = around(frame.pixels, self._step_px)
         self._rays = self._pair.left.unproject(pixels.reshape(-1, 2))[0].reshape(pixels.shape)
         right = self._pair.right

@@ -27,6 +27,7 @@ class StereoMatches:
 
     Attributes:
         right: (N, 2) normalised coordinates in the right image.
+        right_pixels: (N, 2) the same, in pixels.
         points: (N, 3) ``[x, y, 1/Z]`` in the left camera's frame.
         covariances: (N, 3, 3) of ``points``, for a pixel noise of 1 px.
         slopes: (N, 2) derivative of the shift along the epipolar line by the left pixel.
@@ -35,6 +36,7 @@ class StereoMatches:
     """
 
     right: Float
+    right_pixels: Float
     points: Float
     covariances: Float
     slopes: Float
@@ -50,6 +52,10 @@ class StereoMatcher:
         self._config = config
         self._allowed = allowed_right
         self._packed_right = np.zeros(allowed_right.shape, dtype=np.uint32)
+
+    def recalibrate(self, pair: StereoPair) -> None:
+        """Take another calibration of the cameras from now on."""
+        self._pair = pair
 
     def match(
         self,
@@ -89,7 +95,7 @@ class StereoMatcher:
         sigma = np.sqrt(covariances[:, 2, 2]) * self._config.motion.pixel_sigma_px
         in_range = (points[:, 2] <= 1.0 / settings.min_depth_m) & (points[:, 2] >= -3.0 * sigma)
         good = passes(good, in_range, "depth_range", rejected)
-        return StereoMatches(normalised, points, covariances, slopes, good, rejected)
+        return StereoMatches(normalised, matched_px, points, covariances, slopes, good, rejected)
 
     def _search(
         self, left: Pyramid, right: Pyramid, pixels: Float, rays: Float, inverse_depths: Float, slopes: Float,

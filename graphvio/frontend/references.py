@@ -12,6 +12,7 @@ from graphvio.frontend.observations import Correspondences
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracks import PairFrame, common_rows
+from graphvio.rig import Rig
 
 _T = THRESHOLDS.reference
 
@@ -35,6 +36,10 @@ class References:
     def replace(self, frames: Mapping[int, PairFrame]) -> None:
         """Take frames as their pairs' references from now on."""
         self._frames.update(frames)
+
+    def recalibrate(self, rig: Rig) -> None:
+        """Take another calibration of the rig: the references' points are triangulated anew."""
+        self._frames = {j: frame.recalibrated(rig.pairs[j]) for j, frame in self._frames.items()}
 
     def clear(self) -> None:
         """Forget all."""

@@ -93,6 +93,13 @@ class PairTracker:
         self._last = self._last.extended(replace(new, stage_ms=watch.stage_ms))
         return self._last
 
+    def recalibrate(self, pair: StereoPair) -> None:
+        """Take another calibration of the cameras from now on."""
+        self._pair = pair
+        self._matcher.recalibrate(pair)
+        self._patches.recalibrate(pair)
+        self._last = self._last.recalibrated(pair)
+
     def limit_corners(self, share: float) -> None:
         """Use only a share of the image's cells, and so of the corners, from now on."""
         self._cell_px = round(self._config.corners.cell_px(self._pair.left.size_px[0]) / np.sqrt(share))
@@ -187,6 +194,7 @@ class PairTracker:
             pixels=pixels,
             left=rays,
             right=matches.right,
+            right_pixels=matches.right_pixels,
             points=matches.points,
             covariances=matches.covariances,
             slopes=matches.slopes,

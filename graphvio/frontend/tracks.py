@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
+from graphvio.frontend.stereo import triangulate
 from graphvio.kernels import kernel
+from graphvio.rig import StereoPair
 
 _NEAR_SIGMAS = 10.0  # a depth that is known to a tenth
 
@@ -25,6 +27,7 @@ class PairFrame:
         pixels: (N, 2) in the left image.
         left: (N, 2) normalised coordinates in the left image.
         right: (N, 2) the same in the right image; meaningful where ``has_depth``.
+        right_pixels: (N, 2) in the right image; meaningful where ``has_depth``.
         points: (N, 3) ``[x, y, 1/Z]`` in the left camera's frame, see `graphvio.frontend.stereo`.
         covariances: (N, 3, 3) of ``points``, for a pixel noise of 1 px.
         slopes: (N, 2) of the right patch, see `graphvio.frontend.slanted`; meaningful where ``has_depth``.
@@ -40,6 +43,7 @@ class PairFrame:
     pixels: Float
     left: Float
     right: Float
+    right_pixels: Float
     points: Float
     covariances: Float
     slopes: Float
@@ -70,6 +74,16 @@ class PairFrame:
             stage_ms=_added(self.stage_ms, other.stage_ms),
         )
 
+    def recalibrated(self, pair: StereoPair) -> PairFrame:
+        """Return the frame as another calibration of its cameras has it: the same pixels, triangulated anew."""
+        left, has_ray = pair.left.unproject(self.pixels)
+        right, in_right = pair.right.unproject(self.right_pixels)
+        points, covariances, _ = triangulate(
+            left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px
+        )
+        has_depth = self.has_depth & has_ray & in_right
+        return replace(self, left=left, right=right, points=points, covariances=covariances, has_depth=has_depth)
+
     @staticmethod
     def empty(stamp_ns: int = 0) -> PairFrame:
         """Return a frame without tracks."""
@@ -81,6 +95,7 @@ class PairFrame:
             pixels=np.zeros((0, 2)),
             left=np.zeros((0, 2)),
             right=np.zeros((0, 2)),
+            right_pixels=np.zeros((0, 2)),
             points=np.zeros((0, 3)),
             covariances=np.zeros((0, 3, 3)),
             slopes=np.zeros((0, 2)),

@@ -121,6 +121,19 @@ class VisualFrontend:
         for tracker in self._trackers:
             tracker.limit_corners(share)
 
+    def recalibrate(self, rig: Rig) -> None:
+        """Take another calibration of the same cameras from the next frameset on.
+
+        Points of the references are triangulated anew, so that a motion is measured with one calibration.
+        """
+        self._rig = rig
+        self._arrays = RigArrays.of(rig)
+        self._baselines_m = [pair.baseline_m for pair in rig.pairs]
+        for tracker, pair in zip(self._trackers, rig.pairs, strict=True):
+            tracker.recalibrate(pair)
+        self._references.recalibrate(rig)
+        self._latest = {j: frame.recalibrated(rig.pairs[j]) for j, frame in self._latest.items()}
+
     def start_keyframe(self) -> None:
         """Measure the next motions from the newest frameset."""
         self._references.clear()
@@ -249,7 +262,8 @@ class VisualFrontend:
         if not self._references.must_be_replaced(seen.frames, seen.correspondences, refined, is_contradicted):
             return {}, {}
         own = self._own_motions(seen, agreement)
-        self._learn_alignments(agreement)
+        if not self._config.calibration.online:
+            self._learn_alignments(agreement)
         return self._refer_to(seen.frames), own
 
     # ------------------------------------------------------------------ parts of these steps

@@ -30,6 +30,9 @@ from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.odometry.time_offset_correction import TimeOffsetCorrection
 from graphvio.odometry.vision_events import VisionEvents
 from graphvio.rig import Rig
+from graphvio.self_calibration.online import SelfCalibration
+from graphvio.self_calibration.prior import CalibrationSigmas
+from graphvio.self_calibration.window import View
 from graphvio.timing import timed
 
 
@@ -70,6 +73,7 @@ class Odometry:
         self._estimator: StateEstimator = estimator(rig, self.config, self.report)
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._time_offset = TimeOffsetCorrection(rig, self.config, self._synchroniser, self.report)
+        self._self_calibration = SelfCalibration(rig, CalibrationSigmas()) if self.config.calibration.online else None
         self._vision_events = VisionEvents(rig, self.report)
         self._rates = AngularRates()
         self._on_prediction = on_prediction
@@ -138,6 +142,8 @@ class Odometry:
         self._synchroniser.finish()
         self._estimator.finish()
         self._frontend.close()
+        if self._self_calibration is not None:
+            self._self_calibration.close()
         for on_finish in self._on_finish:
             on_finish()
         self._finished = True
@@ -206,6 +212,7 @@ class Odometry:
             visual = self._frontend.process(frameset, self._estimator.motion_since)
             self.stage_ms.update(visual.stage_ms)
             return estimate_without_pose(frameset.stamp_ns, visual, self.stage_ms)
+        self._recalibrate()
         predicted = self._predict(frameset.stamp_ns)
         visual = self._track(frameset, predicted)
         is_stationary = visual.is_stationary and self._imu_shows_standstill(predicted.interval)
@@ -290,7 +297,24 @@ class Odometry:
         )
         for on_step in self._on_step:
             on_step(step)
+        self._calibrate(estimate)
         return estimate
+
+    def _recalibrate(self) -> None:
+        """Take the calibration that has come into force."""
+        rig = None if self._self_calibration is None else self._self_calibration.take_rig()
+        if rig is not None:
+            self._frontend.recalibrate(rig)
+
+    def _calibrate(self, estimate: Estimate) -> None:
+        if self._self_calibration is None or estimate.nav_T_body is None:
+            return
+        frames = self._frontend.frames_at(estimate.stamp_ns)
+        views = {
+            j: View(frame.ids, frame.pixels, frame.right_pixels, frame.has_depth, frame.points[:, 2])
+            for j, frame in frames.items()
+        }
+        self._self_calibration.observe(estimate.stamp_ns, estimate.nav_T_body, views)
 
     # ------------------------------------------------------------------ the IMU's part
 

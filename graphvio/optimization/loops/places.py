@@ -71,6 +71,7 @@ class PairObserver:
             pixels=np.ascontiguousarray(pixels),
             left=rays,
             right=matches.right,
+            right_pixels=matches.right_pixels,
             points=matches.points,
             covariances=matches.covariances,
             slopes=matches.slopes,

@@ -161,13 +161,14 @@ def frame_of(pair: StereoPair, stamp_ns: int, pixels: Float, in_right: Float, ro
     """Return a frame of features (K, 2) of a left image, with depth where rows (M, 2) match the right one's."""
     n = len(pixels)
     left, has_ray = pair.left.unproject(pixels)
-    right = np.zeros((n, 2))
+    right, right_pixels = np.zeros((n, 2)), np.zeros((n, 2))
+    right_pixels[rows[:, 0]] = in_right[rows[:, 1]]
     right[rows[:, 0]], seen = pair.right.unproject(in_right[rows[:, 1]])
     has_depth = np.zeros(n, dtype=bool)
     has_depth[rows[:, 0]] = seen
     points, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
     none = np.zeros(n, dtype=np.int64)
     return PairFrame(
-        stamp_ns, np.arange(n), none, pixels, left, right, points, covariances, np.zeros((n, 2)), has_depth & has_ray,
-        none,
+        stamp_ns, np.arange(n), none, pixels, left, right, right_pixels, points, covariances, np.zeros((n, 2)),
+        has_depth & has_ray, none,
     )  # fmt: skip

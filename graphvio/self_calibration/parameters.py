@@ -1,0 +1,94 @@
+"""Calibration of a rig as one vector of parameters: its layout, its prior, and rigs that differ by such a vector.
+
+A vector is the difference from the nominal rig, that of the rig file. Rotations are rotation vectors: that of the right
+camera turns the left camera's frame, ``right_R_left Exp(r)``; that of a pair turns it in body, ``Exp(r) body_R_left``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.geometry import so3_exp
+from graphvio.rig import Camera, Rig, StereoPair
+
+INTRINSICS, DISTORTION, ROTATION, TRANSLATION = 4, 5, 3, 3
+CAMERA = INTRINSICS + DISTORTION
+LEFT, RIGHT, STEREO, BODY = 0, CAMERA, 2 * CAMERA, 2 * CAMERA + 6
+PAIR = BODY + 6
+"""Number of parameters of a pair: left camera, right camera, ``right_T_left``, ``body_T_left``."""
+
+
+class RigCalibration(NamedTuple):
+    """Calibration of P pairs, as kernels take it; index 0 of two is the left camera, 1 the right one.
+
+    Attributes:
+        models: (P, 2) numbers of the camera models.
+        intrinsics: (P, 2, 4) ``[fx, fy, cx, cy]``, pixels.
+        distortion: (P, 2, 5).
+        right_T_left: (P, 4, 4).
+        body_T_left: (P, 4, 4).
+    """
+
+    models: Int
+    intrinsics: Float
+    distortion: Float
+    right_T_left: Float
+    body_T_left: Float
+
+    @staticmethod
+    def of(rig: Rig) -> RigCalibration:
+        """Collect the arrays of a rig."""
+        cameras = [(pair.left, pair.right) for pair in rig.pairs]
+        return RigCalibration(
+            np.array([[camera.model_number for camera in both] for both in cameras], dtype=np.int64),
+            np.array([[camera.intrinsics for camera in both] for both in cameras]),
+            np.array([[camera.distortion for camera in both] for both in cameras]),
+            np.array([pair.right_T_left for pair in rig.pairs]),
+            np.array([pair.left.body_T_cam for pair in rig.pairs]),
+        )
+
+    def moved(self, difference: Float) -> RigCalibration:
+        """Return the calibration that differs from this one by a vector (P * PAIR,)."""
+        each = difference.reshape(-1, PAIR)
+        right_T_left, body_T_left = self.right_T_left.copy(), self.body_T_left.copy()
+        for j, of_pair in enumerate(each):
+            stereo, body = of_pair[STEREO:BODY], of_pair[BODY:]
+            right_T_left[j, :3, :3] = right_T_left[j, :3, :3] @ so3_exp(stereo[:3].copy())
+            right_T_left[j, :3, 3] += stereo[3:]
+            body_T_left[j, :3, :3] = so3_exp(body[:3].copy()) @ body_T_left[j, :3, :3]
+            body_T_left[j, :3, 3] += body[3:]
+        cameras = each[:, :STEREO].reshape(-1, 2, CAMERA)
+        return RigCalibration(
+            self.models,
+            self.intrinsics + cameras[:, :, :INTRINSICS],
+            self.distortion + cameras[:, :, INTRINSICS:],
+            right_T_left,
+            body_T_left,
+        )
+
+    def applied_to(self, rig: Rig) -> Rig:
+        """Return a rig of the same cameras with this calibration."""
+        pairs = []
+        for j, pair in enumerate(rig.pairs):
+            body_T_left = self.body_T_left[j]
+            body_T_right = body_T_left @ np.linalg.inv(self.right_T_left[j])
+            pairs.append(
+                StereoPair(
+                    pair.name,
+                    self._camera(pair.left, j, 0, body_T_left),
+                    self._camera(pair.right, j, 1, body_T_right),
+                )
+            )
+        return replace(rig, pairs=tuple(pairs))
+
+    def _camera(self, camera: Camera, j: int, which: int, body_T_cam: Float) -> Camera:
+        return replace(
+            camera,
+            intrinsics=self.intrinsics[j, which],
+            distortion=self.distortion[j, which],
+            body_T_cam=body_T_cam,
+        )
