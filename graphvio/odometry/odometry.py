@@ -30,6 +30,7 @@ from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.odometry.time_offset_correction import TimeOffsetCorrection
 from graphvio.odometry.vision_events import VisionEvents
 from graphvio.rig import Rig
+from graphvio.self_calibration.imu_correction import ImuCorrection
 from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.prior import CalibrationSigmas
 from graphvio.self_calibration.window import View
@@ -74,6 +75,7 @@ class Odometry:
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._time_offset = TimeOffsetCorrection(rig, self.config, self._synchroniser, self.report)
         self._self_calibration = SelfCalibration(rig, CalibrationSigmas()) if self.config.calibration.online else None
+        self._imu_correction = ImuCorrection()
         self._vision_events = VisionEvents(rig, self.report)
         self._rates = AngularRates()
         self._on_prediction = on_prediction
@@ -104,8 +106,10 @@ class Odometry:
             raise MeasurementError("the odometry has been finished; make a new one for more measurements")
         measurement = checked_measurement(measurement)
         if isinstance(measurement, ImuSample):
-            for sample in self._synchroniser.add_sample(measurement):
+            for sample in self._synchroniser.add_sample(self._imu_correction.correct(measurement)):
                 self._propagate(sample)
+            if self._self_calibration is not None and self.rig.imu is not None:
+                self._self_calibration.add_sample(measurement.stamp_ns - self.rig.imu.time_offset_ns, measurement.angular_velocity, measurement.linear_acceleration)
         else:
             self._synchroniser.add_frameset(measurement)
         return self.process_due()
@@ -174,6 +178,11 @@ class Odometry:
     def rig_warnings(self) -> list[str]:
         """Where the motions contradict the rig: a sentence each, with the size and one standard deviation."""
         return self._vision_events.rig_warnings
+
+    @property
+    def refined_rig(self) -> Rig | None:
+        """The rig with the calibration as it is known now, or None where the calibration is not estimated."""
+        return None if self._self_calibration is None else self._self_calibration.refined_rig
 
     def limit_corners(self, share: float) -> None:
         """Follow fewer corners from now on, where real time demands it; from the thread that calls `process`.
@@ -305,6 +314,10 @@ class Odometry:
         rig = None if self._self_calibration is None else self._self_calibration.take_rig()
         if rig is not None:
             self._frontend.recalibrate(rig)
+            if self.rig.imu is not None:
+                wanted = self.rig.imu.time_offset_s + self._self_calibration.time_offset_s
+                self._synchroniser.shift_imu(wanted - self._synchroniser.time_offset_s)
+                self._imu_correction.set(*self._self_calibration.imu_matrices)
 
     def _calibrate(self, estimate: Estimate) -> None:
         if self._self_calibration is None or estimate.nav_T_body is None:

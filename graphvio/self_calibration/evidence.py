@@ -1,4 +1,4 @@
-"""What the images say of the calibration, and how wrong they say that the rig file is."""
+"""What the measurements say of the calibration, and how wrong they say that the rig file is."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import Float
+from graphvio.arrays import Bool, Float
 
-_SCALES = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0)
-"""Factors on the file's standard deviations that are compared; and 0, the file is exact."""
+EXACT = 1e-3
+"""Factor on the file's standard deviations of a file that is as good as exact."""
+_FACTORS = (EXACT, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0)
 
 
 class Gaussian(NamedTuple):
@@ -34,11 +35,28 @@ class Gaussian(NamedTuple):
         return float(0.5 * off @ self.information @ off)
 
 
+class FilePrior(NamedTuple):
+    """What is known of the calibration from the rig file, up to a common factor on its standard deviations.
+
+    Attributes:
+        covariance: (C, C) of the differences from the file, for a factor of 1.
+        is_of_file: (C,) whether the factor applies; it does not to biases, which no file has.
+    """
+
+    covariance: Float
+    is_of_file: Bool
+
+    def with_factor(self, factor: float) -> Float:
+        """Return the covariance (C, C) for a factor."""
+        factors = np.where(self.is_of_file, factor, 1.0)
+        return np.asarray(self.covariance * factors * factors[:, None])
+
+
 class Evidence(NamedTuple):
     """A normal likelihood of the difference x, ``exp(-x^T information x / 2 + vector^T x)``.
 
     Attributes:
-        information: (C, C), singular where the images do not say anything.
+        information: (C, C), singular where nothing was measured.
         vector: (C,).
     """
 
@@ -47,12 +65,12 @@ class Evidence(NamedTuple):
 
     @staticmethod
     def none(size: int) -> Evidence:
-        """Return the likelihood of no images."""
+        """Return the likelihood of no measurements."""
         return Evidence(np.zeros((size, size)), np.zeros(size))
 
-    def given(self, file_covariance: Float, scale: float) -> Gaussian:
-        """Return the posterior, where the rig file is wrong by a factor times its stated standard deviations."""
-        information = self.information + np.linalg.inv(file_covariance) / scale**2
+    def given(self, prior: FilePrior, factor: float) -> Gaussian:
+        """Return the posterior, where the rig file is wrong by a factor times its standard deviations."""
+        information = self.information + np.linalg.inv(prior.with_factor(factor))
         return Gaussian(np.linalg.solve(information, self.vector), information)
 
     def forgotten(self, walk: Float) -> Evidence:
@@ -68,20 +86,22 @@ class Evidence(NamedTuple):
             self.vector + posterior.information @ posterior.mean - prior.information @ prior.mean,
         )
 
-    def file_scale(self, file_covariance: Float) -> tuple[float, float]:
+    def file_factor(self, prior: FilePrior) -> tuple[float, float]:
         """Return by which factor the rig file's errors exceed its standard deviations, by maximum likelihood.
 
         The calibration itself is integrated out (type II maximum likelihood; J. O. Berger, *Statistical decision theory
         and Bayesian analysis*, 1985, section 3.5).
 
         Returns:
-            The factor, 0 where an exact file explains the images best; and twice the logarithm of its likelihood over
-            that of an exact file.
+            The factor, `EXACT` where an exact file explains the measurements best; and twice the logarithm of its
+            likelihood over that of an exact file.
         """
-        best = 0.0, 0.0
-        for scale in _SCALES:
-            information = self.information + np.linalg.inv(file_covariance) / scale**2
+        likelihoods = []
+        for factor in _FACTORS:
+            covariance = prior.with_factor(factor)
+            information = self.information + np.linalg.inv(covariance)
             fit = self.vector @ np.linalg.solve(information, self.vector)
-            volume = np.linalg.slogdet(scale**2 * file_covariance @ information)[1]
-            best = max(best, (scale, float(fit - volume)), key=lambda each: each[1])
-        return best
+            volume = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1]
+            likelihoods.append(float(fit - volume))
+        best = int(np.argmax(likelihoods))
+        return _FACTORS[best], likelihoods[best] - likelihoods[0]

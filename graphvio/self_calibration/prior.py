@@ -8,10 +8,13 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.rig import Rig
+from graphvio.self_calibration.evidence import FilePrior
+from graphvio.self_calibration.imu_model import ACCEL_BIAS, ACCEL_MATRIX, GYRO_BIAS, GYRO_MATRIX, PARAMETERS, TIME_OFFSET
 from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR, STEREO
 
 _MIN_DISTORTION = 0.005  # of a coefficient, from which its standard deviation is a share of it
 _MIN_SIGMA = 1e-9
+GYRO_BIAS_RAD_S, ACCEL_BIAS_M_S2 = 0.02, 0.1
 
 
 @dataclass(frozen=True)
@@ -46,8 +49,30 @@ class CalibrationSigmas:
     imu_scale_share: float = 0.003
     imu_misalignment_deg: float = 0.15
 
-    def covariance(self, rig: Rig) -> Float:
-        """Return the covariance (C, C) of the rig's parameters, see `graphvio.self_calibration.parameters`."""
+    def prior(self, rig: Rig) -> FilePrior:
+        """Return the prior of all parameters of a rig: of its pairs, and of its IMU if there is one."""
+        cameras = self._of_pairs(rig)
+        n = len(cameras)
+        if rig.imu is None:
+            return FilePrior(cameras, np.ones(n, dtype=bool))
+        covariance, is_of_file = np.zeros((n + PARAMETERS, n + PARAMETERS)), np.ones(n + PARAMETERS, dtype=bool)
+        covariance[:n, :n] = cameras
+        covariance[n:, n:] = np.diag(self._of_imu() ** 2)
+        is_of_file[n : n + GYRO_MATRIX] = False
+        return FilePrior(covariance, is_of_file)
+
+    def _of_imu(self) -> Float:
+        """Return the standard deviations of the IMU's parameters, see `graphvio.self_calibration.imu_model`."""
+        sigmas = np.empty(PARAMETERS)
+        sigmas[GYRO_BIAS:ACCEL_BIAS], sigmas[ACCEL_BIAS:GYRO_MATRIX] = GYRO_BIAS_RAD_S, ACCEL_BIAS_M_S2
+        matrix = np.full((3, 3), np.deg2rad(self.imu_misalignment_deg))
+        np.fill_diagonal(matrix, self.imu_scale_share)
+        sigmas[GYRO_MATRIX:ACCEL_MATRIX] = sigmas[ACCEL_MATRIX:TIME_OFFSET] = matrix.ravel()
+        sigmas[TIME_OFFSET] = self.time_offset_s
+        return sigmas
+
+    def _of_pairs(self, rig: Rig) -> Float:
+        """Return the covariance of the pairs' parameters, see `graphvio.self_calibration.parameters`."""
         n_pairs = len(rig.pairs)
         covariance = np.zeros((n_pairs * PAIR, n_pairs * PAIR))
         for j, pair in enumerate(rig.pairs):

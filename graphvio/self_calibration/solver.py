@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt over poses, landmarks and calibration of a window, and what it says of the calibration."""
+"""Levenberg-Marquardt over the states of a window and the calibration, and what it says of the calibration."""
 
 from __future__ import annotations
 
@@ -6,128 +6,211 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import Float
+from graphvio.arrays import Float, Int
 from graphvio.geometry import so3_exp
 from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landmarks, landmarks_after, total_cost
 from graphvio.self_calibration.evidence import Gaussian
-from graphvio.self_calibration.parameters import RigCalibration
+from graphvio.self_calibration.imu_model import PARAMETERS
+from graphvio.self_calibration.inertial import InertialSamples, InertialStates, inertial_equations
+from graphvio.self_calibration.linear import eliminated, solve_symmetric
+from graphvio.self_calibration.parameters import PAIR, RigCalibration
 
 _ROBUST_SCALE = 2.5  # of the Cauchy cost, in standard deviations
-_MAX_STEPS = 8
-_CONVERGED = 0.01  # standard deviations of the prior
+_MAX_STEPS = 6
+_CONVERGED = 0.05  # standard deviations of the prior
 _LOOSE_POSE_SIGMAS = np.repeat([np.deg2rad(5.0), 0.3], 3)  # keeps poses that no track constrains
+_LOOSE_VELOCITY_SIGMA, _LOOSE_GRAVITY_SIGMA = 5.0, 3.0
 _FIXED = 1e-9
+GRAVITY_M_S2 = 9.81
+_GRAVITY_NORM_SIGMA = 5e-3
 
 
-class Solution(NamedTuple):
-    """A bundle adjustment's result.
+class States(NamedTuple):
+    """Unknowns of a window beside the calibration: K keyframes and L landmarks.
 
     Attributes:
-        poses: (K, 4, 4) ``odom_T_body``.
+        poses: (K, 4, 4) ``odom_T_body``; the first one stays.
+        velocities: (K, 3) m/s, frame odom.
+        gravity: (3,) m/s^2, frame odom.
         landmarks: (L, 3).
-        calibration: posterior of the difference from the nominal calibration.
-        errors2: (N, 2) squared whitened errors, NaN where there is no right image.
     """
 
     poses: Float
+    velocities: Float
+    gravity: Float
     landmarks: Float
+
+
+class Window(NamedTuple):
+    """Measurements of a window.
+
+    Attributes:
+        tracks: of all pairs.
+        sigma_px: noise of a corner's position.
+        samples: of the IMU, or None.
+    """
+
+    tracks: Tracks
+    sigma_px: float
+    samples: InertialSamples | None
+
+
+class Solution(NamedTuple):
+    """A window's adjustment.
+
+    Attributes:
+        states: adjusted.
+        calibration: posterior of the difference from the nominal calibration.
+        errors2: (N, 2) squared whitened errors of the tracks, NaN where there is no right image.
+        imu_errors2: (K - 1,) squared whitened errors of the IMU, of 9 dimensions, NaN where there is none.
+    """
+
+    states: States
     calibration: Gaussian
     errors2: Float
+    imu_errors2: Float
+
+
+class _Linearised(NamedTuple):
+    hessian: Float
+    gradient: Float
+    cost: float
+    errors2: Float
+    imu_errors2: Float
 
 
 def solve(
-    poses: Float,
-    landmarks: Float,
-    tracks: Tracks,
-    nominal: RigCalibration,
-    difference: Float,
-    prior: Gaussian,
-    sigma_px: float,
-    max_steps: int = _MAX_STEPS,
+    window: Window, states: States, nominal: RigCalibration, difference: Float, prior: Gaussian
 ) -> Solution:
     """Adjust a window.
 
     Args:
-        poses: (K, 4, 4) ``odom_T_body``, initial; the first one stays.
-        landmarks: (L, 3) initial.
-        tracks: of these.
+        window: measurements.
+        states: initial.
         nominal: calibration of the rig file.
-        difference: (C,) initial difference from it.
+        difference: (C,) initial difference from it: of the pairs, and with an IMU also of its parameters.
         prior: of that difference.
-        sigma_px: noise of a corner's position.
-        max_steps: of the minimisation.
     """
-    n_poses, first_poses = 6 * len(poses), poses
-    pose_information = np.tile(1.0 / _LOOSE_POSE_SIGMAS**2, len(poses))
-    pose_information[:6] = 1.0 / _FIXED**2
-    pose_offsets = np.zeros(n_poses)
-    eliminated = Eliminated.empty(tracks)
-    prior_sigmas = np.sqrt(np.diag(prior.covariance))
-
-    def cost_of(poses: Float, landmarks: Float, difference: Float, offsets: Float) -> tuple[float, Float]:
-        data, errors2 = total_cost(poses, nominal.moved(difference), landmarks, tracks, sigma_px, _ROBUST_SCALE)
-        return data + prior.cost(difference) + 0.5 * float(pose_information @ offsets**2), errors2
-
-    cost, errors2 = cost_of(poses, landmarks, difference, pose_offsets)
+    first = states
+    found = Eliminated.empty(window.tracks)
+    sigmas = np.sqrt(np.diag(prior.covariance))
     damping = 1e-6
-    for _ in range(max_steps):
-        hessian, gradient = _normal_equations(
-            poses, landmarks, tracks, nominal, difference, prior, sigma_px, pose_information, pose_offsets, damping,
-            eliminated,
-        )  # fmt: skip
-        damped = hessian + damping * np.diag(np.diag(hessian))
-        step = -np.linalg.solve(damped, gradient)
-        new_poses, new_offsets = _moved(poses, step), pose_offsets + step[:n_poses]
-        new_landmarks = landmarks_after(landmarks, tracks, eliminated, step, len(poses))
-        new_difference = difference + step[n_poses:]
-        new_cost, new_errors2 = cost_of(new_poses, new_landmarks, new_difference, new_offsets)
-        if new_cost <= cost:
-            gained = cost - new_cost
-            poses, landmarks, difference, pose_offsets = new_poses, new_landmarks, new_difference, new_offsets
-            cost, errors2 = new_cost, new_errors2
-            damping = max(damping * 0.1, 1e-9)
-            if np.abs(step[n_poses:] / prior_sigmas).max() < _CONVERGED and gained < 0.5:
+    at = _linearise(window, states, first, nominal, difference, prior, damping, found)
+    calibration = slice(6 * len(states.poses), 6 * len(states.poses) + len(difference))
+    for _ in range(_MAX_STEPS):
+        damped = at.hessian + damping * np.diag(np.diag(at.hessian))
+        step = -solve_symmetric(damped, at.gradient)
+        moved = _moved(states, window.tracks, found, step, len(difference))
+        changed = difference + step[calibration]
+        kept = found
+        found = Eliminated.empty(window.tracks)
+        damping = max(0.1 * damping, 1e-9)
+        new = _linearise(window, moved, first, nominal, changed, prior, damping, found)
+        if new.cost <= at.cost:
+            states, difference, at = moved, changed, new
+            if np.abs(step[calibration] / sigmas).max() < _CONVERGED:
                 break
         else:
-            damping = max(10.0 * damping, 1e-4)
-    hessian, _ = _normal_equations(
-        poses, landmarks, tracks, nominal, difference, prior, sigma_px, pose_information, pose_offsets, 0.0, eliminated
+            found, damping = kept, max(100.0 * damping, 1e-4)
+    return Solution(
+        states, Gaussian(difference, _marginal(at.hessian, calibration)), at.errors2, at.imu_errors2
     )
-    pp, pc, cc = hessian[:n_poses, :n_poses], hessian[:n_poses, n_poses:], hessian[n_poses:, n_poses:]
-    information = cc - pc.T @ np.linalg.solve(pp, pc)
-    return Solution(poses, landmarks, Gaussian(difference, 0.5 * (information + information.T)), errors2)
 
 
-def _normal_equations(
-    poses: Float,
-    landmarks: Float,
-    tracks: Tracks,
+def _linearise(
+    window: Window,
+    states: States,
+    first: States,
     nominal: RigCalibration,
     difference: Float,
     prior: Gaussian,
-    sigma_px: float,
-    pose_information: Float,
-    pose_offsets: Float,
     damping: float,
-    eliminated: Eliminated,
-) -> tuple[Float, Float]:
-    n_poses = 6 * len(poses)
-    size = n_poses + len(difference)
+    found: Eliminated,
+) -> _Linearised:
+    """Return the normal equations of ``[poses 6 K, calibration C, velocities 3 K, gravity 3]``, landmarks eliminated."""
+    n, c, n_cameras = len(states.poses), len(difference), PAIR * len(nominal.models)
+    size = 6 * n + c + (3 * n + 3 if window.samples is not None else 0)
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    cameras = slice(0, 6 * n + n_cameras)
+    visual_hessian, visual_gradient = np.zeros((cameras.stop, cameras.stop)), np.zeros(cameras.stop)
+    moved = nominal.moved(difference[:n_cameras])
+    cost, errors2 = total_cost(
+        states.poses, moved, states.landmarks, window.tracks, window.sigma_px, _ROBUST_SCALE
+    )
     eliminate_landmarks(
-        poses, nominal.moved(difference), landmarks, tracks, sigma_px, _ROBUST_SCALE, damping, hessian, gradient,
-        eliminated,
+        states.poses, moved, states.landmarks, window.tracks, window.sigma_px, _ROBUST_SCALE, damping,
+        visual_hessian, visual_gradient, found,
     )  # fmt: skip
-    hessian[n_poses:, n_poses:] += prior.information
-    gradient[n_poses:] += prior.information @ (difference - prior.mean)
-    hessian[np.arange(n_poses), np.arange(n_poses)] += pose_information
-    gradient[:n_poses] += pose_information * pose_offsets
-    return hessian, gradient
+    hessian[cameras, cameras], gradient[cameras] = visual_hessian, visual_gradient
+    calibration = slice(6 * n, 6 * n + c)
+    hessian[calibration, calibration] += prior.information
+    gradient[calibration] += prior.information @ (difference - prior.mean)
+    cost += prior.cost(difference)
+    weights = np.tile(1.0 / _LOOSE_POSE_SIGMAS**2, n)
+    weights[:6] = 1.0 / _FIXED**2
+    offsets = np.zeros((n, 6))
+    offsets[:, 3:] = states.poses[:, :3, 3] - first.poses[:, :3, 3]
+    poses = np.arange(6 * n)
+    hessian[poses, poses] += weights
+    gradient[poses[6:]] += (weights * offsets.ravel())[6:]
+    cost += 0.5 * float(weights[6:] @ offsets.ravel()[6:] ** 2)
+    imu_errors2 = np.zeros(0)
+    if window.samples is not None:
+        inertial = inertial_equations(
+            window.samples, InertialStates(states.poses, states.velocities, states.gravity, difference[n_cameras:])
+        )
+        columns = _inertial_columns(n, c, n_cameras)
+        hessian[np.ix_(columns, columns)] += inertial.hessian
+        gradient[columns] += inertial.gradient
+        cost += inertial.cost + _add_loose(states, first, hessian, gradient, 6 * n + c)
+        imu_errors2 = inertial.errors2
+    return _Linearised(hessian, gradient, cost, errors2, imu_errors2)
 
 
-def _moved(poses: Float, step: Float) -> Float:
-    moved = poses.copy()
-    for k, of_pose in enumerate(step[: 6 * len(poses)].reshape(-1, 6)):
-        moved[k, :3, 3] += poses[k, :3, :3] @ of_pose[3:]
-        moved[k, :3, :3] = poses[k, :3, :3] @ so3_exp(of_pose[:3].copy())
-    return moved
+def _inertial_columns(n: int, c: int, n_cameras: int) -> Int:
+    """Return where ``[poses, velocities, gravity, parameters]`` of K keyframes are among a window's unknowns."""
+    after = 6 * n + c
+    return np.concatenate(
+        [np.arange(6 * n), np.arange(after, after + 3 * n + 3), 6 * n + n_cameras + np.arange(PARAMETERS)]
+    )
+
+
+def _add_loose(states: States, first: States, hessian: Float, gradient: Float, at: int) -> float:
+    """Add what is known of velocities and gravity beforehand: next to nothing but gravity's norm. Returns the cost."""
+    velocities = np.arange(at, at + states.velocities.size)
+    off = (states.velocities - first.velocities).ravel()
+    hessian[velocities, velocities] += 1.0 / _LOOSE_VELOCITY_SIGMA**2
+    gradient[velocities] += off / _LOOSE_VELOCITY_SIGMA**2
+    gravity = np.arange(velocities[-1] + 1, velocities[-1] + 4)
+    turned = states.gravity - first.gravity
+    norm = float(np.linalg.norm(states.gravity))
+    along, excess = states.gravity / norm, norm - GRAVITY_M_S2
+    hessian[gravity, gravity] += 1.0 / _LOOSE_GRAVITY_SIGMA**2
+    hessian[np.ix_(gravity, gravity)] += np.outer(along, along) / _GRAVITY_NORM_SIGMA**2
+    gradient[gravity] += turned / _LOOSE_GRAVITY_SIGMA**2 + along * excess / _GRAVITY_NORM_SIGMA**2
+    return float(
+        0.5 * off @ off / _LOOSE_VELOCITY_SIGMA**2
+        + 0.5 * turned @ turned / _LOOSE_GRAVITY_SIGMA**2
+        + 0.5 * (excess / _GRAVITY_NORM_SIGMA) ** 2
+    )
+
+
+def _moved(states: States, tracks: Tracks, eliminated: Eliminated, step: Float, n_calibration: int) -> States:
+    """Return the states after a step; the landmarks follow from it."""
+    n = len(states.poses)
+    poses = states.poses.copy()
+    for k, of_pose in enumerate(step[: 6 * n].reshape(n, 6)):
+        poses[k, :3, 3] += states.poses[k, :3, :3] @ of_pose[3:]
+        poses[k, :3, :3] = states.poses[k, :3, :3] @ so3_exp(of_pose[:3].copy())
+    landmarks = landmarks_after(states.landmarks, tracks, eliminated, step, n)
+    rest = step[6 * n + n_calibration :]
+    if not len(rest):
+        return states._replace(poses=poses, landmarks=landmarks)
+    return States(poses, states.velocities + rest[: 3 * n].reshape(n, 3), states.gravity + rest[3 * n :], landmarks)
+
+
+def _marginal(hessian: Float, kept: slice) -> Float:
+    """Return the information of some unknowns, the others eliminated."""
+    unknowns = np.arange(len(hessian))
+    order = np.concatenate([unknowns[: kept.start], unknowns[kept.stop :], unknowns[kept]])
+    return eliminated(hessian[np.ix_(order, order)], kept.stop - kept.start)
