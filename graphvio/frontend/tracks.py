@@ -78,9 +78,7 @@ class PairFrame:
         """Return the frame as another calibration of its cameras has it: the same pixels, triangulated anew."""
         left, has_ray = pair.left.unproject(self.pixels)
         right, in_right = pair.right.unproject(self.right_pixels)
-        points, covariances, _ = triangulate(
-            left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px
-        )
+        points, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
         has_depth = self.has_depth & has_ray & in_right
         return replace(self, left=left, right=right, points=points, covariances=covariances, has_depth=has_depth)
 

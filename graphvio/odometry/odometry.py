@@ -25,15 +25,12 @@ from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement, checked_measurement
 from graphvio.odometry.angular_rates import AngularRates
 from graphvio.odometry.assembly import estimate_of, estimate_without_pose, keyframe_of
+from graphvio.odometry.online_calibration import OnlineCalibration
 from graphvio.odometry.step import Step
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.odometry.time_offset_correction import TimeOffsetCorrection
 from graphvio.odometry.vision_events import VisionEvents
 from graphvio.rig import Rig
-from graphvio.self_calibration.imu_correction import ImuCorrection
-from graphvio.self_calibration.online import SelfCalibration
-from graphvio.self_calibration.prior import CalibrationSigmas
-from graphvio.self_calibration.window import View
 from graphvio.timing import timed
 
 
@@ -74,8 +71,7 @@ class Odometry:
         self._estimator: StateEstimator = estimator(rig, self.config, self.report)
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._time_offset = TimeOffsetCorrection(rig, self.config, self._synchroniser, self.report)
-        self._self_calibration = SelfCalibration(rig, CalibrationSigmas()) if self.config.calibration.online else None
-        self._imu_correction = ImuCorrection()
+        self._calibration = OnlineCalibration(rig, self.config, self._frontend, self._synchroniser, self.report)
         self._vision_events = VisionEvents(rig, self.report)
         self._rates = AngularRates()
         self._on_prediction = on_prediction
@@ -106,10 +102,9 @@ class Odometry:
             raise MeasurementError("the odometry has been finished; make a new one for more measurements")
         measurement = checked_measurement(measurement)
         if isinstance(measurement, ImuSample):
-            for sample in self._synchroniser.add_sample(self._imu_correction.correct(measurement)):
-                self._propagate(sample)
-            if self._self_calibration is not None and self.rig.imu is not None:
-                self._self_calibration.add_sample(measurement.stamp_ns - self.rig.imu.time_offset_ns, measurement.angular_velocity, measurement.linear_acceleration)
+            for sample in self._synchroniser.add_sample(measurement):
+                self._calibration.add_sample(sample)
+                self._propagate(self._synchroniser.corrected(sample))
         else:
             self._synchroniser.add_frameset(measurement)
         return self.process_due()
@@ -146,8 +141,7 @@ class Odometry:
         self._synchroniser.finish()
         self._estimator.finish()
         self._frontend.close()
-        if self._self_calibration is not None:
-            self._self_calibration.close()
+        self._calibration.close()
         for on_finish in self._on_finish:
             on_finish()
         self._finished = True
@@ -182,7 +176,8 @@ class Odometry:
     @property
     def refined_rig(self) -> Rig | None:
         """The rig with the calibration as it is known now, or None where the calibration is not estimated."""
-        return None if self._self_calibration is None else self._self_calibration.refined_rig
+        estimate = self._calibration.estimate
+        return None if estimate is None else estimate.rig
 
     def limit_corners(self, share: float) -> None:
         """Follow fewer corners from now on, where real time demands it; from the thread that calls `process`.
@@ -221,7 +216,7 @@ class Odometry:
             visual = self._frontend.process(frameset, self._estimator.motion_since)
             self.stage_ms.update(visual.stage_ms)
             return estimate_without_pose(frameset.stamp_ns, visual, self.stage_ms)
-        self._recalibrate()
+        self._calibration.update()
         predicted = self._predict(frameset.stamp_ns)
         visual = self._track(frameset, predicted)
         is_stationary = visual.is_stationary and self._imu_shows_standstill(predicted.interval)
@@ -306,28 +301,8 @@ class Odometry:
         )
         for on_step in self._on_step:
             on_step(step)
-        self._calibrate(estimate)
+        self._calibration.add(estimate)
         return estimate
-
-    def _recalibrate(self) -> None:
-        """Take the calibration that has come into force."""
-        rig = None if self._self_calibration is None else self._self_calibration.take_rig()
-        if rig is not None:
-            self._frontend.recalibrate(rig)
-            if self.rig.imu is not None:
-                wanted = self.rig.imu.time_offset_s + self._self_calibration.time_offset_s
-                self._synchroniser.shift_imu(wanted - self._synchroniser.time_offset_s)
-                self._imu_correction.set(*self._self_calibration.imu_matrices)
-
-    def _calibrate(self, estimate: Estimate) -> None:
-        if self._self_calibration is None or estimate.nav_T_body is None:
-            return
-        frames = self._frontend.frames_at(estimate.stamp_ns)
-        views = {
-            j: View(frame.ids, frame.pixels, frame.right_pixels, frame.has_depth, frame.points[:, 2])
-            for j, frame in frames.items()
-        }
-        self._self_calibration.observe(estimate.stamp_ns, estimate.nav_T_body, views)
 
     # ------------------------------------------------------------------ the IMU's part
 

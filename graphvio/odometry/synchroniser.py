@@ -6,6 +6,8 @@ from collections import deque
 from dataclasses import replace
 from typing import Generic, Protocol, TypeVar
 
+import numpy as np
+
 from graphvio.arrays import Float, Int
 from graphvio.backend.inertial import ImuBuffer
 from graphvio.config import Config
@@ -13,6 +15,7 @@ from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.sensors import FrameSet, ImuSample
 from graphvio.rig import Rig
+from graphvio.self_calibration.imu_correction import ImuCorrection
 
 _MIN_INTERVAL_NS = 1_000_000  # framesets that are closer are of one instant
 _MAX_SILENT_WAITS = 2.0  # an IMU so far behind is not waited for until it goes on
@@ -37,6 +40,9 @@ class Synchroniser:
         rig: Has the number of pairs, and the time offset of an IMU if there is one.
         config: Says how long framesets wait for the IMU.
         report: Receives an event for each measurement that is left out.
+
+    Attributes:
+        imu_correction: Applied to all readings that are returned from now on.
     """
 
     def __init__(self, rig: Rig, config: Config, report: Report) -> None:
@@ -46,6 +52,7 @@ class Synchroniser:
         self._timing = config.timing
         self._initialisation = config.initialisation
         self._report = report
+        self.imu_correction = ImuCorrection()
         self._imu = ImuBuffer(config.timing.max_imu_gap_ms)
         self._held: deque[FrameSet] = deque()
         self._newest_ns: int | None = None
@@ -53,15 +60,20 @@ class Synchroniser:
         self._frameset_jumps: JumpGuard[FrameSet] = JumpGuard(EventKind.FRAMESET_FUTURE_STAMP, report)
 
     def add_sample(self, sample: ImuSample) -> list[ImuSample]:
-        """Take an IMU sample, and return the samples that are usable now, with stamps on the framesets' clock."""
+        """Take an IMU sample, and return the samples that are usable now, as they were measured."""
         usable = []
         for confirmed in self._sample_jumps.confirm(sample):
             fault = self._imu.add(confirmed)
             if fault:
                 self._report(confirmed.stamp_ns, fault, "sample left out")
             else:
-                usable.append(replace(confirmed, stamp_ns=confirmed.stamp_ns - self._offset_ns))
+                usable.append(confirmed)
         return usable
+
+    def corrected(self, sample: ImuSample) -> ImuSample:
+        """Return a usable sample with its readings corrected and its stamp on the framesets' clock."""
+        values = self.imu_correction.applied(np.concatenate([sample.angular_velocity, sample.linear_acceleration]))
+        return ImuSample(sample.stamp_ns - self._offset_ns, values[:3], values[3:])
 
     def add_frameset(self, frameset: FrameSet) -> None:
         """Take a frameset that is newer than those before it.
@@ -120,12 +132,13 @@ class Synchroniser:
 
     def interval(self, start_ns: int, end_ns: int) -> ImuInterval | None:
         """Return the IMU between two framesets' stamps, or None where it does not cover them."""
-        return self._imu.interval(start_ns + self._offset_ns, end_ns + self._offset_ns)
+        interval = self._imu.interval(start_ns + self._offset_ns, end_ns + self._offset_ns)
+        return None if interval is None else self.imu_correction.applied_to(interval)
 
     def samples_since(self, stamp_ns: int) -> tuple[Int, Float]:
         """Return the IMU from a frameset's stamp on, stamps on the framesets' clock; see `ImuBuffer.since`."""
         stamps, values = self._imu.since(stamp_ns + self._offset_ns)
-        return stamps - self._offset_ns, values
+        return stamps - self._offset_ns, self.imu_correction.applied(values)
 
     def initial_interval(self, stamp_ns: int) -> tuple[ImuInterval, float] | None:
         """Return the IMU around a frameset and the frameset's place in it in seconds, once it is long enough."""
@@ -136,7 +149,7 @@ class Synchroniser:
         for end_ns in (at_ns, at_ns + min_ns):
             found = self._imu.segment(at_ns - window_ns, end_ns)
             if found is not None and found[0].steps_s.sum() >= 0.95e-9 * min_ns:
-                return found[0], (at_ns - found[1]) * 1e-9
+                return self.imu_correction.applied_to(found[0]), (at_ns - found[1]) * 1e-9
         return None
 
     def shift_imu(self, seconds: float) -> None:

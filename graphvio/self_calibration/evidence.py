@@ -71,7 +71,7 @@ class Evidence(NamedTuple):
     def given(self, prior: FilePrior, factor: float) -> Gaussian:
         """Return the posterior, where the rig file is wrong by a factor times its standard deviations."""
         information = self.information + np.linalg.inv(prior.with_factor(factor))
-        return Gaussian(np.linalg.solve(information, self.vector), information)
+        return Gaussian(np.asarray(np.linalg.solve(information, self.vector)), np.asarray(information))
 
     def forgotten(self, walk: Float) -> Evidence:
         """Return the likelihood after a random walk of the calibration with a covariance (C, C)."""

@@ -1,45 +1,57 @@
-"""IMU samples as a calibrated IMU would measure them."""
+"""IMU readings as a calibrated IMU would measure them."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.measurements.sensors import ImuSample
-
-_AVERAGED = 100  # samples
+from graphvio.measurements.imu_interval import ImuInterval
 
 
+@dataclass(frozen=True, eq=False)
 class ImuCorrection:
-    """Multiplies readings by the matrices of gyro and accelerometer.
+    """Matrices that readings of gyro and accelerometer are multiplied by.
 
-    Biases are left to the state estimator. It must not see them jump when the matrices change: the accelerometer's
-    matrix therefore multiplies the difference from the mean specific force of the first samples, which is about that of
-    gravity, and the rest remains a part of the bias.
+    Biases are left to the state estimator, which must not see them jump when the matrices change. The accelerometer's
+    matrix therefore multiplies the difference from a fixed force, which is about that of gravity in body; the rest of
+    its effect remains a part of the bias.
+
+    Attributes:
+        gyro: (3, 3) error of the gyro's matrix, ``I + gyro``.
+        accel: (3, 3) the same of the accelerometer.
+        fixed_force: (3,) m/s^2, body.
     """
 
-    def __init__(self) -> None:
-        self._gyro: Float = np.zeros((3, 3))
-        self._accel: Float = np.zeros((3, 3))
-        self._mean_force: Float = np.zeros(3)
-        self._averaged = 0
+    gyro: Float = field(default_factory=lambda: np.zeros((3, 3)))
+    accel: Float = field(default_factory=lambda: np.zeros((3, 3)))
+    fixed_force: Float = field(default_factory=lambda: np.zeros(3))
 
-    def set(self, gyro: Float, accel: Float) -> None:
-        """Take errors (3, 3) of the matrices of gyro and accelerometer from now on."""
-        self._gyro, self._accel = gyro, accel
+    def applied(self, readings: Float) -> Float:
+        """Return corrected readings (..., 6) ``[angular velocity, specific force]``."""
+        if self._is_none:
+            return readings
+        rate, force = readings[..., :3], readings[..., 3:]
+        return np.concatenate([self._rate(rate), self._force(force)], axis=-1)
 
-    def correct(self, sample: ImuSample) -> ImuSample:
-        """Return the corrected sample."""
-        if self._averaged < _AVERAGED:
-            self._averaged += 1
-            self._mean_force = self._mean_force + (sample.linear_acceleration - self._mean_force) / self._averaged
-        if not self._gyro.any() and not self._accel.any():
-            return sample
-        rate, force = sample.angular_velocity, sample.linear_acceleration
+    def applied_to(self, interval: ImuInterval) -> ImuInterval:
+        """Return an interval with corrected readings."""
+        if self._is_none:
+            return interval
         return replace(
-            sample,
-            angular_velocity=rate + self._gyro @ rate,
-            linear_acceleration=force + self._accel @ (force - self._mean_force),
+            interval,
+            angular_velocity=self._rate(interval.angular_velocity),
+            linear_acceleration=self._force(interval.linear_acceleration),
         )
+
+    @cached_property
+    def _is_none(self) -> bool:
+        return not self.gyro.any() and not self.accel.any()
+
+    def _rate(self, rate: Float) -> Float:
+        return rate + rate @ self.gyro.T
+
+    def _force(self, force: Float) -> Float:
+        return force + (force - self.fixed_force) @ self.accel.T

@@ -31,7 +31,7 @@ def cholesky(matrix: Float) -> Float:
 
 @kernel
 def solve_lower(lower: Float, right: Float) -> Float:
-    """Solve ``lower X = right`` for the transpose of X: right (M, N) and the result (M, N) have a vector in each row."""
+    """Solve ``lower x = right`` for each row of right (M, N), with a lower triangle (N, N); returns (M, N)."""
     solved = right.copy()
     for m in range(len(right)):
         for r in range(len(lower)):
@@ -43,7 +43,7 @@ def solve_lower(lower: Float, right: Float) -> Float:
 def solve_symmetric(matrix: Float, right: Float) -> Float:
     """Solve ``matrix x = right`` (N,) with a positive definite matrix (N, N)."""
     lower = cholesky(matrix)
-    x = solve_lower(lower, right.reshape(1, -1))[0]
+    x: Float = solve_lower(lower, right.reshape(1, -1))[0]
     upper = lower.T.copy()
     for r in range(len(lower) - 1, -1, -1):
         x[r] = (x[r] - _dot(upper[r, r + 1 :], x[r + 1 :])) / lower[r, r]

@@ -9,7 +9,14 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.rig import Rig
 from graphvio.self_calibration.evidence import FilePrior
-from graphvio.self_calibration.imu_model import ACCEL_BIAS, ACCEL_MATRIX, GYRO_BIAS, GYRO_MATRIX, PARAMETERS, TIME_OFFSET
+from graphvio.self_calibration.imu_model import (
+    ACCEL_BIAS,
+    ACCEL_MATRIX,
+    GYRO_BIAS,
+    GYRO_MATRIX,
+    PARAMETERS,
+    TIME_OFFSET,
+)
 from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR, STEREO
 
 _MIN_DISTORTION = 0.005  # of a coefficient, from which its standard deviation is a share of it

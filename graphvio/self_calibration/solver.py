@@ -79,9 +79,7 @@ class _Linearised(NamedTuple):
     imu_errors2: Float
 
 
-def solve(
-    window: Window, states: States, nominal: RigCalibration, difference: Float, prior: Gaussian
-) -> Solution:
+def solve(window: Window, states: States, nominal: RigCalibration, difference: Float, prior: Gaussian) -> Solution:
     """Adjust a window.
 
     Args:
@@ -112,9 +110,7 @@ def solve(
                 break
         else:
             found, damping = kept, max(100.0 * damping, 1e-4)
-    return Solution(
-        states, Gaussian(difference, _marginal(at.hessian, calibration)), at.errors2, at.imu_errors2
-    )
+    return Solution(states, Gaussian(difference, _marginal(at.hessian, calibration)), at.errors2, at.imu_errors2)
 
 
 def _linearise(
@@ -127,16 +123,14 @@ def _linearise(
     damping: float,
     found: Eliminated,
 ) -> _Linearised:
-    """Return the normal equations of ``[poses 6 K, calibration C, velocities 3 K, gravity 3]``, landmarks eliminated."""
+    """Linearise over ``[poses 6 K, calibration C, velocities 3 K, gravity 3]``, with the landmarks eliminated."""
     n, c, n_cameras = len(states.poses), len(difference), PAIR * len(nominal.models)
     size = 6 * n + c + (3 * n + 3 if window.samples is not None else 0)
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
     cameras = slice(0, 6 * n + n_cameras)
     visual_hessian, visual_gradient = np.zeros((cameras.stop, cameras.stop)), np.zeros(cameras.stop)
     moved = nominal.moved(difference[:n_cameras])
-    cost, errors2 = total_cost(
-        states.poses, moved, states.landmarks, window.tracks, window.sigma_px, _ROBUST_SCALE
-    )
+    cost, errors2 = total_cost(states.poses, moved, states.landmarks, window.tracks, window.sigma_px, _ROBUST_SCALE)
     eliminate_landmarks(
         states.poses, moved, states.landmarks, window.tracks, window.sigma_px, _ROBUST_SCALE, damping,
         visual_hessian, visual_gradient, found,

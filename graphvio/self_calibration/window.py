@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -47,7 +48,7 @@ class Keyframe(NamedTuple):
 
 
 def choose_tracks(
-    keyframes: list[Keyframe], poses: Float, calibration: RigCalibration, max_tracks: int
+    keyframes: Sequence[Keyframe], poses: Float, calibration: RigCalibration, max_tracks: int
 ) -> tuple[Tracks, Float]:
     """Choose tracks that were matched left to right, the longest of each pair, and where their landmarks are.
 
@@ -83,7 +84,7 @@ def choose_tracks(
     starts = np.flatnonzero(np.r_[True, (np.diff(ids) != 0) | (np.diff(pair_of_rows) != 0)])
     bounds = np.r_[starts, len(ids)]
     pair = pair_of_rows[starts]
-    first = np.array([start + int(np.argmax(has_right[start:end])) for start, end in zip(bounds, bounds[1:])])
+    first = np.array([start + int(np.argmax(has_right[start:end])) for start, end in pairwise(bounds)])
     landmarks = np.empty((len(starts), 3))
     for j in np.unique(pair):
         of_pair = pair == j
@@ -94,6 +95,14 @@ def choose_tracks(
     landmarks[:, 2] = np.maximum(inverse_depths[first], 0.0)
     odom_T_landmark = poses[keyframe[first]] @ calibration.body_T_left[pair]
     return Tracks(pair, odom_T_landmark, bounds, keyframe, left_px, right_px, has_right), landmarks
+
+
+def median_displacement_px(then: View, now: View) -> float:
+    """Return the median displacement of the tracks common to two views; infinite where there are none."""
+    _, at_then, at_now = np.intersect1d(then.ids, now.ids, assume_unique=True, return_indices=True)
+    if not len(at_then):
+        return float("inf")
+    return float(np.median(np.linalg.norm(now.left_px[at_now] - then.left_px[at_then], axis=1)))
 
 
 @kernel

@@ -1,0 +1,87 @@
+"""Estimation of the calibration during the run, and what follows from it for the other stages."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.config import Config
+from graphvio.frontend.visual import VisualFrontend
+from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.events import Report
+from graphvio.measurements.sensors import ImuSample
+from graphvio.odometry.synchroniser import Synchroniser
+from graphvio.rig import Rig
+from graphvio.self_calibration.estimate import CalibrationEstimate
+from graphvio.self_calibration.imu_correction import ImuCorrection
+from graphvio.self_calibration.online import SelfCalibration
+from graphvio.self_calibration.prior import CalibrationSigmas
+from graphvio.self_calibration.window import View
+
+_AVERAGED = 100  # samples, whose mean specific force is about that of gravity
+
+
+class OnlineCalibration:
+    """Brings the self-calibration and the stages that use its results together; does nothing where it is off.
+
+    Args:
+        rig: of the rig file.
+        config: says whether the calibration is estimated.
+        frontend: has the tracks, and takes corrected cameras.
+        synchroniser: takes a corrected time offset.
+        report: receives events.
+    """
+
+    def __init__(
+        self, rig: Rig, config: Config, frontend: VisualFrontend, synchroniser: Synchroniser, report: Report
+    ) -> None:
+        self._rig = rig
+        self._frontend = frontend
+        self._synchroniser = synchroniser
+        self._report = report
+        self._corrects_time_offset = rig.imu is not None and not config.fusion.estimate_time_offset
+        self._mean_force: Float = np.zeros(3)  # of the first samples
+        self._averaged = 0
+        self._calibration = SelfCalibration(rig, CalibrationSigmas()) if config.calibration.online else None
+
+    @property
+    def estimate(self) -> CalibrationEstimate | None:
+        """What is known of the calibration now, or None where it is not estimated."""
+        return None if self._calibration is None else self._calibration.estimate
+
+    def add_sample(self, sample: ImuSample) -> None:
+        """Take an IMU sample as it was measured."""
+        if self._calibration is None:
+            return
+        self._calibration.add_sample(sample)
+        if self._averaged < _AVERAGED:
+            self._averaged += 1
+            self._mean_force = self._mean_force + (sample.linear_acceleration - self._mean_force) / self._averaged
+
+    def update(self) -> None:
+        """Let the other stages use the calibration that comes into force with this frameset."""
+        if self._calibration is None or not self._calibration.update():
+            return
+        estimate = self._calibration.estimate
+        self._frontend.recalibrate(estimate.rig)
+        if self._rig.imu is None:
+            return
+        self._synchroniser.imu_correction = ImuCorrection(*estimate.imu_matrices, self._mean_force)
+        if self._corrects_time_offset:
+            wanted_s = self._rig.imu.time_offset_s + estimate.time_offset_s
+            self._synchroniser.shift_imu(wanted_s - self._synchroniser.time_offset_s)
+
+    def add(self, estimate: Estimate) -> None:
+        """Take a frameset's estimate, and the tracks that belong to it."""
+        if self._calibration is None or estimate.nav_T_body is None:
+            return
+        views = {
+            j: View(frame.ids, frame.pixels, frame.right_pixels, frame.has_depth, frame.points[:, 2])
+            for j, frame in self._frontend.frames_at(estimate.stamp_ns).items()
+        }
+        self._calibration.add_frameset(estimate.stamp_ns, estimate.nav_T_body, views)
+
+    def close(self) -> None:
+        """End the thread."""
+        if self._calibration is not None:
+            self._calibration.close()

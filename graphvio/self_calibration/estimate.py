@@ -1,0 +1,75 @@
+"""What is known of a rig's calibration at one moment of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.rig import Rig
+from graphvio.self_calibration.evidence import EXACT, Gaussian
+from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_OFFSET
+from graphvio.self_calibration.parameters import PAIR, RigCalibration
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationEstimate:
+    """The calibration of a rig, as the rig file and the measurements have it.
+
+    Attributes:
+        file_rig: the rig of the file.
+        posterior: of the difference from it, see `graphvio.self_calibration.parameters`.
+        file_factor: by which factor the file's errors exceed their standard deviations, `EXACT` for an exact file.
+        log_bayes_factor: twice the logarithm of the odds of that factor against an exact file; above 10 it is very
+            strong evidence (R. E. Kass, A. E. Raftery, *Bayes factors*, 1995).
+    """
+
+    file_rig: Rig
+    posterior: Gaussian
+    file_factor: float = EXACT
+    log_bayes_factor: float = 0.0
+
+    @property
+    def is_file_exact(self) -> bool:
+        """Whether the measurements say nothing against the rig file, which then stays in force."""
+        return self.file_factor == EXACT
+
+    @property
+    def difference(self) -> Float:
+        """Difference (C,) from the rig file that is in force: the posterior's mean, or zero for an exact file."""
+        return np.zeros_like(self.posterior.mean) if self.is_file_exact else self.posterior.mean
+
+    @cached_property
+    def sigmas(self) -> Float:
+        """Standard deviations (C,) of the difference."""
+        return np.sqrt(np.diag(self.posterior.covariance))
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The rig with the calibration that is in force; the matrices of the IMU are not a part of it."""
+        if self.is_file_exact:
+            return self.file_rig
+        moved = RigCalibration.of(self.file_rig).moved(self.difference[: self._n_of_pairs])
+        rig = moved.applied_to(self.file_rig)
+        if rig.imu is None:
+            return rig
+        return replace(rig, imu=replace(rig.imu, time_offset_s=rig.imu.time_offset_s + self.time_offset_s))
+
+    @property
+    def time_offset_s(self) -> float:
+        """Difference of the IMU's time offset from the rig file's; 0 without an IMU."""
+        return 0.0 if self.file_rig.imu is None else float(self.difference[self._n_of_pairs + TIME_OFFSET])
+
+    @property
+    def imu_matrices(self) -> tuple[Float, Float]:
+        """Errors (3, 3) of the matrices of gyro and accelerometer, see `graphvio.self_calibration.imu_model`."""
+        if self.file_rig.imu is None:
+            return np.zeros((3, 3)), np.zeros((3, 3))
+        of_imu = self.difference[self._n_of_pairs :]
+        return of_imu[GYRO_MATRIX:ACCEL_MATRIX].reshape(3, 3), of_imu[ACCEL_MATRIX:TIME_OFFSET].reshape(3, 3)
+
+    @property
+    def _n_of_pairs(self) -> int:
+        return PAIR * len(self.file_rig.pairs)
