@@ -20,6 +20,7 @@ from graphvio.frontend.tracks import common_rows
 from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, so3_log
 from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Imu, Rig
+from graphvio.self_calibration.online import adjust_nothing
 from graphvio.slam.landmarks import orientations
 
 _POINTS = 20
@@ -65,6 +66,8 @@ def warm_up(rig: Rig, config: Config) -> None:
         se3_adjoint(pose)
         so3_log(pose[:3, :3].copy(order="K"))
     _warm_up_imu(rig.imu or Imu())
+    if config.calibration.online:
+        adjust_nothing(rig)
 
 
 def _warm_up_imu(imu: Imu) -> None:

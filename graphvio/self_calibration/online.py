@@ -191,6 +191,21 @@ def _adjusted(
     return _Adjusted(prior, solve(Window(tracks, sigma_px, samples), states, nominal, difference, prior), is_full)
 
 
+def adjust_nothing(rig: Rig) -> None:
+    """Adjust two keyframes that see one point, to compile or load the kernels."""
+    stamps_ns, point = (0, 100_000_000), np.full((1, 2), 100.0)
+    seen = View(np.zeros(1, dtype=np.int64), point, point, np.ones(1, dtype=bool), np.ones(1))
+    calibration = SelfCalibration(rig, CalibrationSigmas())
+    keyframes = tuple(Keyframe(stamp_ns, np.eye(4), {0: seen}) for stamp_ns in stamps_ns)
+    for stamp_ns in (-10_000_000, *stamps_ns, 110_000_000) if rig.imu is not None else ():
+        calibration.add_sample(ImuSample(stamp_ns, np.zeros(3), np.array([0.0, 0.0, GRAVITY_M_S2])))
+    prior = calibration.estimate.posterior
+    _adjusted(
+        keyframes, calibration._samples_of(keyframes), calibration._nominal, prior.mean, prior, _FIRST_SIGMA_PX, False
+    )
+    calibration.close()
+
+
 def _walk_per_second(file_covariance: Float, rig: Rig) -> Float:
     """Return the covariance (C, C) of what the calibration changes in one second, by heat and the like."""
     walk = _WALK**2 * file_covariance
