@@ -17,6 +17,7 @@ from graphvio.measurements.sensors import FrameSet
 from graphvio.odometry import Odometry
 from graphvio.odometry.step import Step
 from graphvio.results import ResultWriter, Summary
+from graphvio.self_calibration.findings import described
 from graphvio.sources import Source
 
 RESETS = (
@@ -137,6 +138,8 @@ class _Run:
             awaited=self._framesets - self._before_start,
             resets=self._resets,
             warnings=self._odometry.rig_warnings,
+            calibration=described(self._odometry.calibration_findings),
+            refined_rig=self._odometry.refined_rig,
             truth=self._source.truth,
         )
 
@@ -149,6 +152,7 @@ class _Run:
 
     def _add_estimate(self, estimate: Estimate) -> None:
         self._writer.add(estimate)
+        self._writer.add_calibration(estimate.stamp_ns, self._odometry.calibration)
         self._before_start += estimate.status is Status.INITIALISING and estimate.nav_T_body is None
         self._collect()
         frameset = self._pending.pop(estimate.stamp_ns, None)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from graphvio.arrays import Bool, Float
+from graphvio.calibration_sigmas import FACTORY, CalibrationSigmas
 from graphvio.cameras import MODEL_NAMES, project_points, unproject_pixels
 from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
@@ -193,6 +194,7 @@ class Rig:
         pairs: at least one.
         imu: None for vision only.
         name: used in messages and results.
+        calibration_sigmas: how far the calibration is known.
 
     Raises:
         RigError: if there is no pair, or two cameras or pairs share a name.
@@ -201,6 +203,7 @@ class Rig:
     pairs: tuple[StereoPair, ...]
     imu: Imu | None = None
     name: str = "rig"
+    calibration_sigmas: CalibrationSigmas = FACTORY
 
     def __post_init__(self) -> None:
         _set(self, "pairs", tuple(self.pairs))

@@ -18,7 +18,6 @@ from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gauss
 from graphvio.self_calibration.linear import eliminated, solve_symmetric
 from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.parameters import BODY, PAIR, STEREO, RigCalibration
-from graphvio.self_calibration.prior import CalibrationSigmas
 from graphvio.simulation.calibration_error import CalibrationError, draw
 from graphvio.simulation.default_rig import default_rig
 
@@ -195,7 +194,7 @@ def difference(written: Rig, true: Rig) -> Float:
 @pytest.mark.parametrize("level", [1, 2, 3])
 def test_self_calibration_in_a_walk_finds_what_the_cameras_show(level: int) -> None:
     written, true, _ = sampled(level, 0)
-    found = calibrated(SelfCalibration(written, CalibrationSigmas()), Walk(true), 20.0).estimate
+    found = calibrated(SelfCalibration(written), Walk(true), 20.0).estimate
     assert found.file_factor == pytest.approx({1: 0.3, 2: 1.0, 3: 3.0}[level], rel=0.7)
     for pair, exact in zip(found.rig.pairs, true.pairs, strict=True):
         off = so3_log(np.ascontiguousarray(pair.right_T_left[:3, :3] @ exact.right_T_left[:3, :3].T))
@@ -216,7 +215,7 @@ def test_self_calibration_errors_are_consistent_with_its_covariance() -> None:
     normalised = []
     for seed in range(8):
         written, true, _ = sampled(2, seed)
-        found = calibrated(SelfCalibration(written, CalibrationSigmas()), Walk(true, seed=seed), 6.0).estimate
+        found = calibrated(SelfCalibration(written), Walk(true, seed=seed), 6.0).estimate
         off = found.posterior.mean - difference(written, true)
         normalised.append(off @ found.posterior.information @ off)
     dimension = 2 * PAIR
@@ -226,7 +225,7 @@ def test_self_calibration_errors_are_consistent_with_its_covariance() -> None:
 def test_self_calibration_of_exact_files_leaves_them_alone() -> None:
     rig = default_rig()
     for seed in range(3):
-        calibration = calibrated(SelfCalibration(rig, CalibrationSigmas()), Walk(rig, seed=seed), 8.0)
+        calibration = calibrated(SelfCalibration(rig), Walk(rig, seed=seed), 8.0)
         assert calibration.estimate.is_file_exact
         assert calibration.estimate.rig is rig
         assert not calibration.estimate.difference.any()
@@ -236,16 +235,14 @@ def test_self_calibration_at_rest_learns_nothing_more_than_the_first_frameset_sh
     written, true, _ = sampled(2, 1)
     sigmas = []
     for duration_s in (1.0, 60.0):
-        calibration = SelfCalibration(written, CalibrationSigmas())
+        calibration = SelfCalibration(written)
         sigmas.append(calibrated(calibration, Walk(true, speed=0.0), duration_s).estimate.sigmas)
     assert sigmas[1] == pytest.approx(sigmas[0], rel=1e-9)
 
 
 def test_self_calibration_repeats_to_the_bit() -> None:
     written, true, _ = sampled(2, 2)
-    first, second = (
-        calibrated(SelfCalibration(written, CalibrationSigmas()), Walk(true), 5.0).estimate.posterior for _ in range(2)
-    )
+    first, second = (calibrated(SelfCalibration(written), Walk(true), 5.0).estimate.posterior for _ in range(2))
     assert np.array_equal(first.mean, second.mean)
     assert np.array_equal(first.information, second.information)
 
@@ -258,7 +255,7 @@ def test_self_calibration_with_imu_finds_time_offset_and_cameras_in_body() -> No
     offset_ns = error.true_rig.imu.time_offset_ns
     samples = [replace(sample, stamp_ns=sample.stamp_ns + offset_ns) for sample in walk.samples(15.0)]
     walk.samples = lambda _: samples  # type: ignore[method-assign, assignment]
-    found = calibrated(SelfCalibration(error.written_rig, CalibrationSigmas()), walk, 15.0).estimate
+    found = calibrated(SelfCalibration(error.written_rig), walk, 15.0).estimate
     assert found.rig.imu is not None
     assert found.rig.imu.time_offset_s == pytest.approx(offset_ns * 1e-9, abs=2e-4)
     before, after, true = (rig.pairs[0].left.body_T_cam for rig in (error.written_rig, found.rig, error.true_rig))

@@ -134,6 +134,8 @@ def _print_summary(summary: Summary, folder: Path) -> None:
     faults = ", ".join(f"{kind} {count}" for kind, count in sorted(summary.input_faults.items()))
     if faults:
         typer.echo(f"faults of the recording: {faults}")
+    for sentence in summary.calibration:
+        typer.echo(sentence)
     for warning in summary.warnings:
         warn(f"{warning}; graphvio calibrate finds where it is")
     if summary.resets:

@@ -45,6 +45,8 @@ class EventKind(StrEnum):
     """A motion is uncertain beyond what its residuals show; its covariance is enlarged."""
     CAMERA_FROZEN = "camera_frozen"
     """A camera repeats its image while others do not; its pair is left out until the image changes."""
+    CALIBRATION_CORRECTED = "calibration_corrected"
+    """The images contradict the rig file beyond doubt; the calibration is corrected from now on."""
     EXTRINSICS_OFF = "extrinsics_off"
     """The pairs' motions contradict the rig's transform between them; it is corrected for this run."""
 

@@ -31,6 +31,8 @@ from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.odometry.time_offset_correction import TimeOffsetCorrection
 from graphvio.odometry.vision_events import VisionEvents
 from graphvio.rig import Rig
+from graphvio.self_calibration.estimate import CalibrationEstimate
+from graphvio.self_calibration.findings import Finding
 from graphvio.timing import timed
 
 
@@ -171,7 +173,18 @@ class Odometry:
     @property
     def rig_warnings(self) -> list[str]:
         """Where the motions contradict the rig: a sentence each, with the size and one standard deviation."""
-        return self._vision_events.rig_warnings
+        off = [f"{finding}; corrected for this run" for finding in self.calibration_findings if finding.is_significant]
+        return self._vision_events.rig_warnings + off
+
+    @property
+    def calibration(self) -> CalibrationEstimate | None:
+        """What is known of the calibration now, or None where it is not estimated."""
+        return self._calibration.estimate
+
+    @property
+    def calibration_findings(self) -> list[Finding]:
+        """What is known of each part of the calibration; empty where it is not estimated."""
+        return self._calibration.findings
 
     @property
     def refined_rig(self) -> Rig | None:
@@ -216,7 +229,7 @@ class Odometry:
             visual = self._frontend.process(frameset, self._estimator.motion_since)
             self.stage_ms.update(visual.stage_ms)
             return estimate_without_pose(frameset.stamp_ns, visual, self.stage_ms)
-        self._calibration.update()
+        self._calibration.update(frameset.stamp_ns)
         predicted = self._predict(frameset.stamp_ns)
         visual = self._track(frameset, predicted)
         is_stationary = visual.is_stationary and self._imu_shows_standstill(predicted.interval)

@@ -8,14 +8,14 @@ from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.measurements.estimate import Estimate
-from graphvio.measurements.events import Report
+from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.sensors import ImuSample
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
+from graphvio.self_calibration.findings import Finding
 from graphvio.self_calibration.imu_correction import ImuCorrection
 from graphvio.self_calibration.online import SelfCalibration
-from graphvio.self_calibration.prior import CalibrationSigmas
 from graphvio.self_calibration.window import View
 
 _AVERAGED = 100  # samples, whose mean specific force is about that of gravity
@@ -42,12 +42,19 @@ class OnlineCalibration:
         self._corrects_time_offset = rig.imu is not None and not config.fusion.estimate_time_offset
         self._mean_force: Float = np.zeros(3)  # of the first samples
         self._averaged = 0
-        self._calibration = SelfCalibration(rig, CalibrationSigmas()) if config.calibration.online else None
+        self._is_reported = False
+        self._reported: set[str] = set()
+        self._calibration = SelfCalibration(rig) if config.calibration.online else None
 
     @property
     def estimate(self) -> CalibrationEstimate | None:
         """What is known of the calibration now, or None where it is not estimated."""
         return None if self._calibration is None else self._calibration.estimate
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What is known of each part of the calibration; empty where it is not estimated."""
+        return [] if self._calibration is None else self._calibration.findings()
 
     def add_sample(self, sample: ImuSample) -> None:
         """Take an IMU sample as it was measured."""
@@ -58,11 +65,23 @@ class OnlineCalibration:
             self._averaged += 1
             self._mean_force = self._mean_force + (sample.linear_acceleration - self._mean_force) / self._averaged
 
-    def update(self) -> None:
+    def update(self, stamp_ns: int) -> None:
         """Let the other stages use the calibration that comes into force with this frameset."""
         if self._calibration is None or not self._calibration.update():
             return
         estimate = self._calibration.estimate
+        if not estimate.is_file_exact and not self._is_reported:
+            self._is_reported = True
+            self._report(
+                stamp_ns,
+                EventKind.CALIBRATION_CORRECTED,
+                f"the images contradict the rig file (its errors are {estimate.file_factor:.1g} times its standard "
+                "deviations): the calibration is corrected from now on",
+            )
+        for finding in self._calibration.findings():
+            if finding.is_significant and " against " in finding.part and finding.part not in self._reported:
+                self._reported.add(finding.part)
+                self._report(stamp_ns, EventKind.EXTRINSICS_OFF, f"{finding}; corrected for this run")
         self._frontend.recalibrate(estimate.rig)
         if self._rig.imu is None:
             return

@@ -60,6 +60,7 @@ class Summary:
         resets: number of times that the estimator was reinitialised.
         events: kind -> count, of all events in ``events.jsonl``.
         warnings: what to correct before the next run, such as a rig file that the motions contradict.
+        calibration: sentences on what the self-calibration found, and what the recording did not show.
         status: status -> number of estimates.
         pair_medians: name of the pair -> its medians.
         pair_rejected: name of the pair -> test of tracking or stereo matching -> corners and tracks rejected by it.
@@ -85,6 +86,7 @@ class Summary:
     resets: int
     events: Mapping[str, int]
     warnings: Sequence[str]
+    calibration: Sequence[str]
     status: Mapping[str, int]
     pair_medians: Mapping[str, PairMedians]
     pair_rejected: Mapping[str, Mapping[str, int]]

@@ -31,6 +31,8 @@ from graphvio.results.plotting import plot_run
 from graphvio.results.summary import PairMedians, Percentiles, Summary, epoch_intervals, path_length
 from graphvio.rig import Rig
 from graphvio.rig_files import save_rig
+from graphvio.self_calibration.estimate import CalibrationEstimate
+from graphvio.self_calibration.parameters import parameter_names
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory, tum_line
 from graphvio.version import __version__
@@ -39,6 +41,7 @@ _TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
 COVARIANCE_HEADER = ",".join(["stamp_ns", *(f"{a}_{b}" for a, b in combinations_with_replacement(_TANGENT, 2))])
 """Columns of `covariance_row`."""
 _BIAS_HEADER = "stamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
+_CALIBRATION_HEADER = "stamp_ns,parameter,difference,sigma"
 _PAIRS_HEADER = "stamp_ns,pair,points,inliers,rms_px,own_inliers,own_rms_px"
 _UPPER = np.triu_indices(6)
 _NS_PER_S = 1e9
@@ -82,6 +85,7 @@ class ResultWriter:
         self._config_sha256 = hashlib.sha256(config_yaml.encode()).hexdigest()
         self._first_ns: int | None = None
         self._last_ns = 0
+        self._calibration: CalibrationEstimate | None = None
         self._time_offset: tuple[float | None, float | None] = (None, None)
         self._stage_ms: dict[str, array[float]] = {}
         self._pair_names = [pair.name for pair in rig.pairs]
@@ -108,6 +112,7 @@ class ResultWriter:
                 ("imu_bias.csv", _BIAS_HEADER),
                 ("pairs.csv", _PAIRS_HEADER),
                 ("events.jsonl", ""),
+                ("calibration.csv", _CALIBRATION_HEADER),
             ):
                 self._files[name] = (self.folder / name).open("x", encoding="utf-8", newline="\n")
                 if header:
@@ -164,6 +169,20 @@ class ResultWriter:
         self._pose_status.append(str(estimate.status))
         self._poses.extend(np.asarray(estimate.nav_T_body, dtype=np.float64).ravel())
 
+    def add_calibration(self, stamp_ns: int, estimate: CalibrationEstimate | None) -> None:
+        """Append the calibration where it has changed since the last call; None where it is not estimated.
+
+        Raises:
+            GraphvioError: if a file cannot be written.
+        """
+        if estimate is None or estimate is self._calibration:
+            return
+        self._calibration = estimate
+        names = parameter_names(estimate.file_rig)
+        rows = zip(names, estimate.difference, estimate.sigmas, strict=True)
+        lines = [f"{stamp_ns},{name},{_number(value)},{_number(sigma)}" for name, value, sigma in rows]
+        self._write("calibration.csv", "\n".join(lines))
+
     def add_event(self, event: Event) -> None:
         """Append one line to ``events.jsonl``.
 
@@ -184,6 +203,8 @@ class ResultWriter:
         awaited: int,
         resets: int,
         warnings: Sequence[str] = (),
+        calibration: Sequence[str] = (),
+        refined_rig: Rig | None = None,
         truth: Path | None = None,
     ) -> Summary:
         """Write the smoothed trajectory, the summary and the plot.
@@ -197,6 +218,8 @@ class ResultWriter:
             awaited: number of framesets that could have had a pose: those since the IMU's first sample.
             resets: number of times that the estimator was reinitialised.
             warnings: what to correct before the next run.
+            calibration: sentences on what the self-calibration found.
+            refined_rig: written to ``rig-refined.yaml``.
             truth: trajectory file or session to evaluate against; if that fails, the summary has the reason.
 
         Raises:
@@ -223,6 +246,7 @@ class ResultWriter:
             resets=resets,
             events=dict(self._events),
             warnings=list(warnings),
+            calibration=list(calibration),
             status=dict(self._status),
             pair_medians={name: PairMedians.of(figures) for name, figures in self._pair_figures.items()},
             pair_rejected={name: dict(sorted(counts.items())) for name, counts in self._pair_rejected.items()},
@@ -235,6 +259,8 @@ class ResultWriter:
             evaluation_error=evaluation_error,
         )
         lines = (f"{tum_line(int(stamp), np.asarray(pose))}\n" for stamp, pose in smoothed)
+        if refined_rig is not None:
+            save_rig(refined_rig, self.folder / "rig-refined.yaml")
         self._write_at_once("trajectory_smoothed.txt", "".join(lines))
         self._write_at_once("summary.json", json.dumps(asdict(summary), indent=2, allow_nan=False) + "\n")
         plot_run(

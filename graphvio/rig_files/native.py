@@ -6,8 +6,10 @@ The format is documented with a full example in ``docs/data-contract.md``.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import fields
 from pathlib import Path
 
+from graphvio.calibration_sigmas import FACTORY, LEVELS, CalibrationSigmas
 from graphvio.errors import RigError
 from graphvio.rig import Camera, Imu, Rig, StereoPair, as_written
 from graphvio.rig_files.reading import NOISE_KEYS, Section, named, parse_yaml, read_text
@@ -16,7 +18,7 @@ VERSION = 1
 VERSION_KEY = "graphvio_rig"
 FILE_NAME = "rig.yaml"
 
-_RIG_KEYS = (VERSION_KEY, "name", "imu", "pairs")
+_RIG_KEYS = (VERSION_KEY, "name", "calibration_sigmas", "imu", "pairs")
 _IMU_KEYS = ("rate_hz", *NOISE_KEYS, "time_offset_s")
 _PAIR_KEYS = ("name", "left", "right")
 _CAMERA_KEYS = ("name", "model", "size_px", "intrinsics", "distortion", "body_T_cam", "mask")
@@ -57,7 +59,7 @@ def parse(text: str, path: Path) -> Rig:
         pairs = tuple(_pair(document.nested(value, f"pairs[{i}]"), i) for i, value in enumerate(given))
         imu = _imu(document.section("imu")) if document.values.get("imu") is not None else None
         name = document.text("name") if document.values.get("name") is not None else path.stem
-        return Rig(pairs, imu, name)
+        return Rig(pairs, imu, name, _sigmas(document))
 
 
 def save_rig(rig: Rig, path: str | Path) -> None:
@@ -80,6 +82,9 @@ def to_text(rig: Rig, folder: Path) -> str:
         f"{VERSION_KEY}: {VERSION}",
         f"name: {_quoted(rig.name)}",
     ]
+    if rig.calibration_sigmas != FACTORY:
+        lines.append("calibration_sigmas:")
+        lines += [f"  {name}: {_number(value)}" for name, value in vars(rig.calibration_sigmas).items()]
     if rig.imu is not None:
         lines += [
             "imu:",
@@ -97,6 +102,23 @@ def to_text(rig: Rig, folder: Path) -> str:
             lines.append(f"    {side}:")
             lines += [f"      {line}" for line in _camera_lines(camera, folder)]
     return "\n".join(lines) + "\n"
+
+
+def _sigmas(document: Section) -> CalibrationSigmas:
+    """Read the standard deviations of the calibration: a level's name, or values by name."""
+    given = document.values.get("calibration_sigmas")
+    if given is None:
+        return FACTORY
+    if isinstance(given, str):
+        if given not in LEVELS:
+            raise RigError(
+                f"{document.where('calibration_sigmas')}: there is no level {given!r}; use one of "
+                f"{', '.join(LEVELS)}, or a mapping of values"
+            )
+        return LEVELS[given]
+    section, names = document.section("calibration_sigmas"), [field.name for field in fields(CalibrationSigmas)]
+    section.only(names)
+    return CalibrationSigmas(**{name: section.number(name, getattr(FACTORY, name)) for name in names})
 
 
 def _pair(section: Section, index: int) -> StereoPair:

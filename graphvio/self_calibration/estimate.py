@@ -12,6 +12,7 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.evidence import EXACT, Gaussian
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_OFFSET
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
+from graphvio.self_calibration.prior import refined_sigmas
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +54,7 @@ class CalibrationEstimate:
             return self.file_rig
         moved = RigCalibration.of(self.file_rig).moved(self.difference[: self._n_of_pairs])
         rig = moved.applied_to(self.file_rig)
+        rig = replace(rig, calibration_sigmas=refined_sigmas(rig, self.posterior))
         if rig.imu is None:
             return rig
         return replace(rig, imu=replace(rig.imu, time_offset_s=rig.imu.time_offset_s + self.time_offset_s))

@@ -19,10 +19,11 @@ from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import EXACT, Evidence, Gaussian
+from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.imu_model import GYRO_BIAS, GYRO_MATRIX
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
-from graphvio.self_calibration.prior import CalibrationSigmas
+from graphvio.self_calibration.prior import file_prior
 from graphvio.self_calibration.solver import GRAVITY_M_S2, Solution, States, Window, solve
 from graphvio.self_calibration.window import Keyframe, View, choose_tracks, median_displacement_px
 
@@ -54,17 +55,16 @@ class SelfCalibration:
     """Estimates how the calibration of a rig differs from its rig file.
 
     Args:
-        rig: from the rig file.
-        sigmas: how far it is known.
+        rig: from the rig file, with how far its calibration is known.
 
     Attributes:
         estimate: what is known now.
     """
 
-    def __init__(self, rig: Rig, sigmas: CalibrationSigmas) -> None:
+    def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._nominal = RigCalibration.of(rig)
-        self._prior = sigmas.prior(rig)
+        self._prior = file_prior(rig)
         self._walk = _walk_per_second(self._prior.covariance, rig)
         self._evidence = Evidence.none(len(self._walk))  # of the full windows
         self.estimate = CalibrationEstimate(rig, self._evidence.given(self._prior, 1.0))
@@ -81,6 +81,10 @@ class SelfCalibration:
     def close(self) -> None:
         """End the thread."""
         self._worker.shutdown()
+
+    def findings(self) -> list[Finding]:
+        """Return what is known of each part of the calibration."""
+        return findings(self.estimate, np.sqrt(np.diag(self._prior.covariance)))
 
     def add_sample(self, sample: ImuSample) -> None:
         """Take an IMU sample as it was measured, in time order."""
@@ -195,7 +199,7 @@ def adjust_nothing(rig: Rig) -> None:
     """Adjust two keyframes that see one point, to compile or load the kernels."""
     stamps_ns, point = (0, 100_000_000), np.full((1, 2), 100.0)
     seen = View(np.zeros(1, dtype=np.int64), point, point, np.ones(1, dtype=bool), np.ones(1))
-    calibration = SelfCalibration(rig, CalibrationSigmas())
+    calibration = SelfCalibration(rig)
     keyframes = tuple(Keyframe(stamp_ns, np.eye(4), {0: seen}) for stamp_ns in stamps_ns)
     for stamp_ns in (-10_000_000, *stamps_ns, 110_000_000) if rig.imu is not None else ():
         calibration.add_sample(ImuSample(stamp_ns, np.zeros(3), np.array([0.0, 0.0, GRAVITY_M_S2])))

@@ -22,6 +22,25 @@ PAIR = BODY + 6
 """Number of parameters of a pair: left camera, right camera, ``right_T_left``, ``body_T_left``."""
 
 
+_CAMERA_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "d1", "d2", "d3", "d4", "d5")
+_AXES = tuple("xyz")
+_MATRIX = tuple(f"{row}{column}" for row in _AXES for column in _AXES)
+
+
+def parameter_names(rig: Rig) -> list[str]:
+    """Return the names of a rig's parameters, in their order: of its pairs, and of its IMU if there is one."""
+    names = []
+    for pair in rig.pairs:
+        names += [f"{camera.name}.{name}" for camera in (pair.left, pair.right) for name in _CAMERA_NAMES]
+        for transform in ("right_T_left", "body_T_left"):
+            names += [f"{pair.name}.{transform}.{kind}{axis}" for kind in ("r", "t") for axis in _AXES]
+    if rig.imu is not None:
+        names += [f"imu.{sensor}_bias.{axis}" for sensor in ("gyro", "accel") for axis in _AXES]
+        names += [f"imu.{sensor}_matrix.{element}" for sensor in ("gyro", "accel") for element in _MATRIX]
+        names.append("imu.time_offset_s")
+    return names
+
+
 class RigCalibration(NamedTuple):
     """Calibration of P pairs, as kernels take it; index 0 of two is the left camera, 1 the right one.
 

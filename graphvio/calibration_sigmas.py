@@ -1,0 +1,59 @@
+"""How far a rig file's calibration is known: standard deviations, and named levels of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from graphvio.errors import RigError
+
+
+@dataclass(frozen=True)
+class CalibrationSigmas:
+    """Standard deviations of a rig file's calibration.
+
+    Attributes:
+        focal_share: of each focal length, as a share of it.
+        principal_point_px: of each coordinate of a principal point.
+        distortion_share: of each distortion coefficient, as a share of it.
+        stereo_rotation_deg: of left to right, about each axis.
+        stereo_baseline_share: of the translation left to right, each coordinate, as a share of the baseline.
+        body_rotation_deg: of all cameras together in body, about each axis.
+        body_translation_m: of all cameras together in body, each coordinate.
+        pair_rotation_deg: of each pair relative to the first one, about each axis.
+        pair_translation_m: of each pair relative to the first one, each coordinate.
+        time_offset_s: of the IMU's time offset.
+        imu_scale_share: of the scale of each axis of gyro and accelerometer.
+        imu_misalignment_deg: of each axis of gyro and accelerometer.
+
+    Raises:
+        RigError: if a value is not positive and finite.
+    """
+
+    focal_share: float = 0.001
+    principal_point_px: float = 0.5
+    distortion_share: float = 0.005
+    stereo_rotation_deg: float = 0.05
+    stereo_baseline_share: float = 0.002
+    body_rotation_deg: float = 0.3
+    body_translation_m: float = 0.005
+    pair_rotation_deg: float = 0.3
+    pair_translation_m: float = 0.005
+    time_offset_s: float = 0.002
+    imu_scale_share: float = 0.003
+    imu_misalignment_deg: float = 0.15
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not np.isfinite(value) or value <= 0.0:
+                raise RigError(f"calibration_sigmas: {name} is {value}; give a positive standard deviation")
+
+    def scaled(self, factor: float) -> CalibrationSigmas:
+        """Return all standard deviations times a factor."""
+        return CalibrationSigmas(**{name: factor * value for name, value in vars(self).items()})
+
+
+FACTORY = CalibrationSigmas()
+LEVELS = {"kalibr": FACTORY.scaled(0.3), "factory": FACTORY, "cad": FACTORY.scaled(5.0)}
+"""Levels by name: a careful calibration with a target, that of a factory some months ago, drawings."""

@@ -1,0 +1,116 @@
+"""What the self-calibration found, part by part, in terms of the rig file: differences, certainty, significance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri
+
+from graphvio.arrays import Float
+from graphvio.self_calibration.estimate import CalibrationEstimate
+from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_OFFSET
+from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR, STEREO
+
+_FIVE_SIGMA = 5.7e-7  # probability of a normal variable beyond 5 standard deviations
+_OBSERVED = 0.5  # of the prior's standard deviation
+_TURN = "turn about two axes near textured surfaces"
+_DEPTHS = "walk past things at many distances, and let them move across the image"
+_SCALE = "accelerate: walk briskly with turns, or shake the rig"
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """One part of the calibration, such as the rotation from left to right of a pair.
+
+    Attributes:
+        part: what it is, such as ``pair front, left to right``.
+        unit: of the difference.
+        difference: (N,) from the rig file.
+        sigmas: (N,) of it.
+        file_sigmas: (N,) of the rig file.
+        is_significant: whether the file is wrong in it beyond 5 sigma, and by more than what is left of effects that
+            the covariance does not have.
+        motion: which motion would show it.
+    """
+
+    part: str
+    unit: str
+    difference: Float
+    sigmas: Float
+    file_sigmas: Float
+    is_significant: bool
+    motion: str
+
+    @property
+    def is_observed(self) -> bool:
+        """Whether the measurements said more of it than the rig file."""
+        return bool((self.sigmas < _OBSERVED * self.file_sigmas).any())
+
+    def __str__(self) -> str:
+        size, sigma = float(np.linalg.norm(self.difference)), float(np.sqrt(np.mean(self.sigmas**2)))
+        return f"{self.part}: {size:.3g} {self.unit} from the rig file (sigma {sigma:.2g})"
+
+
+def findings(estimate: CalibrationEstimate, file_sigmas: Float) -> list[Finding]:
+    """Return all parts of a calibration.
+
+    Args:
+        estimate: of the calibration.
+        file_sigmas: (C,) standard deviations of the rig file's values.
+    """
+    covariance = estimate.posterior.covariance
+    found = []
+    for part, unit, scale, rows, floor, motion in _parts(estimate):
+        difference = scale * (rows @ estimate.difference)
+        of_part = scale**2 * rows @ covariance @ rows.T
+        of_file = np.abs(scale) * np.sqrt((rows**2) @ file_sigmas**2)
+        uncertain = of_part + floor**2 * np.eye(len(difference))
+        distance = float(difference @ np.linalg.solve(uncertain, difference))
+        is_significant = distance > float(chdtri(len(difference), _FIVE_SIGMA))
+        found.append(Finding(part, unit, difference, np.sqrt(np.diag(of_part)), of_file, is_significant, motion))
+    return found
+
+
+def described(found: list[Finding]) -> list[str]:
+    """Return sentences for a person: what differs from the rig file, and what the motion did not show."""
+    if not found:
+        return []
+    wrong = [str(finding) for finding in found if finding.is_significant]
+    sentences = [f"calibration corrected: {'; '.join(wrong)}"] if wrong else ["calibration: as in the rig file"]
+    for motion in dict.fromkeys(finding.motion for finding in found):
+        hidden = [finding.part for finding in found if finding.motion == motion and not finding.is_observed]
+        if hidden:
+            sentences.append(f"not shown by this recording: {'; '.join(hidden)} (to show it, {motion})")
+    return sentences
+
+
+def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Float, float, str]]:
+    """Yield name, unit, factor to it, rows (N, C) of the difference, smallest error in the unit, and motion."""
+    rig, whole = estimate.file_rig, np.eye(len(estimate.difference))
+    deg = float(np.rad2deg(1.0))
+    for j, pair in enumerate(rig.pairs):
+        at = j * PAIR
+        for camera, start in ((pair.left, at), (pair.right, at + CAMERA)):
+            focal = 100.0 / camera.focal_px
+            yield f"{camera.name}, focal lengths", "%", focal, whole[start : start + 2], 0.05, _DEPTHS
+            rows = whole[start + 2 : start + INTRINSICS]
+            yield f"{camera.name}, principal point", "px", 1.0, rows, 0.3, _DEPTHS
+        stereo, body = at + STEREO, at + BODY
+        name = f"pair {pair.name}"
+        yield f"{name}, rotation left to right", "deg", deg, whole[stereo : stereo + 3], 0.005, _DEPTHS
+        yield f"{name}, translation left to right", "mm", 1e3, whole[stereo + 3 : body], 0.1, _SCALE
+        if j > 0:
+            first = whole[BODY:PAIR]
+            relative = whole[body : body + 6] - first
+            yield f"{name}, rotation against {rig.pairs[0].name}", "deg", deg, relative[:3], 0.03, _TURN
+            yield f"{name}, translation against {rig.pairs[0].name}", "mm", 1e3, relative[3:], 3.0, _TURN
+    if rig.imu is None:
+        return
+    at = PAIR * len(rig.pairs)
+    yield "cameras to IMU, rotation", "deg", deg, whole[BODY : BODY + 3], 0.1, _TURN
+    yield "cameras to IMU, translation", "mm", 1e3, whole[BODY + 3 : PAIR], 3.0, _TURN
+    yield "IMU, time offset", "ms", 1e3, whole[at + TIME_OFFSET : at + TIME_OFFSET + 1], 0.2, _TURN
+    yield "IMU, gyro's scale", "%", 100.0, whole[at + GYRO_MATRIX : at + ACCEL_MATRIX : 4], 0.1, _TURN
+    yield "IMU, accelerometer's scale", "%", 100.0, whole[at + ACCEL_MATRIX : at + TIME_OFFSET : 4], 0.1, _SCALE
