@@ -27,6 +27,7 @@ def frame(stamp_ns: int, inverse_depths: Float, first_id: int = 0) -> PairFrame:
         pixels=np.zeros((n, 2)),
         left=np.zeros((n, 2)),
         right=np.zeros((n, 2)),
+        right_pixels=np.zeros((n, 2)),
         points=np.column_stack([np.zeros((n, 2)), inverse_depths]),
         covariances=covariances,
         slopes=np.zeros((n, 2)),

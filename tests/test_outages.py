@@ -356,7 +356,8 @@ def test_an_unknown_time_offset_is_found(walk_folder: Path, measurements: list[M
     ]
     shifted.sort(key=lambda e: (e.stamp_ns, isinstance(e, FrameSet)))
     config = Config.from_yaml("fusion: {estimate_time_offset: true}")
-    ignored, found = outcome(walk_folder, shifted), outcome(walk_folder, shifted, config)
+    as_written = Config.from_yaml("calibration: {online: false}")
+    ignored, found = outcome(walk_folder, shifted, as_written), outcome(walk_folder, shifted, config)
     assert all(e.time_offset_s is None for e in ignored.estimates)
     found_estimates = [(e.time_offset_s, e.time_offset_sigma_s) for e in found.between(6.0, 10.0)]
     for offset_s, sigma_s in found_estimates:

@@ -39,6 +39,12 @@ class InertialSamples(NamedTuple):
     noise_densities: Float
     max_gap_ns: int
 
+    def without(self, intervals: Int) -> InertialSamples:
+        """Return the samples without those of some intervals between keyframes, which are then not covered."""
+        interval = np.searchsorted(self.keyframes_ns, self.stamps_ns, side="right") - 1
+        kept = ~np.isin(interval, intervals)
+        return self._replace(stamps_ns=self.stamps_ns[kept], readings=self.readings[kept])
+
 
 class InertialStates(NamedTuple):
     """Unknowns of a window of K keyframes.

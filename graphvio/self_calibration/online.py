@@ -36,12 +36,14 @@ _MAX_TRACKS = 150  # of each pair
 _FIRST_SIGMA_PX = 0.15
 _MIN_SIGMA_PX = 0.06
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: observations of one track are correlated
-_MIN_KEYFRAMES_OF_NOISE = 3
+_MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
 _RAYLEIGH_MEDIAN = 1.1774  # of the norm of two standard normal variables
+_MIN_LOG_BAYES_FACTOR = 100.0  # against exact files; good ones that are not exact reach hundreds with the first image
 _WALK = 0.01  # in one second, as a share of the prior's standard deviations
 _MAX_WALK_S = 10.0  # in a window
 _IMU_NOISE_FACTOR = 2.0  # on the stated densities, since biases walk within a window, too
 _MAX_IMU_GAP_NS = 50_000_000
+_MAX_IMU_ERROR2 = 100.0  # squared whitened error of an interval, of 9 dimensions
 _MARGIN_NS = 50_000_000  # of IMU samples before a window
 
 
@@ -119,11 +121,16 @@ class SelfCalibration:
         evidence = self._evidence.with_window(prior, solution.calibration)
         if is_full:
             self._evidence = evidence
-        if len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE:
+        if (
+            len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE
+            and len(solution.errors2) >= _MIN_OBSERVATIONS_OF_NOISE
+        ):
             noise = float(np.sqrt(np.nanmedian(solution.errors2))) / _RAYLEIGH_MEDIAN * self._sigma_px
             self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
         was_exact = self.estimate.is_file_exact
         factor, log_bayes_factor = evidence.file_factor(self._prior)
+        if was_exact and log_bayes_factor < _MIN_LOG_BAYES_FACTOR:
+            factor = EXACT
         posterior = evidence.given(self._prior, 1.0 if factor == EXACT else factor)
         self.estimate = CalibrationEstimate(self._rig, posterior, factor, log_bayes_factor)
         return not (was_exact and self.estimate.is_file_exact)
@@ -192,7 +199,12 @@ def _adjusted(
     positions = poses[:, :3, 3]
     velocities = np.gradient(positions, stamps_s, axis=0) if len(poses) > 1 else np.zeros_like(positions)
     states = States(poses, velocities, np.array([0.0, 0.0, -GRAVITY_M_S2]), landmarks)
-    return _Adjusted(prior, solve(Window(tracks, sigma_px, samples), states, nominal, difference, prior), is_full)
+    solution = solve(Window(tracks, sigma_px, samples), states, nominal, difference, prior)
+    if samples is not None and (solution.imu_errors2 > _MAX_IMU_ERROR2).any():
+        # A sample that is wild, or an axis that sticks, is not the IMU's calibration.
+        believed = samples.without(np.flatnonzero(solution.imu_errors2 > _MAX_IMU_ERROR2))
+        solution = solve(Window(tracks, sigma_px, believed), states, nominal, difference, prior)
+    return _Adjusted(prior, solution, is_full)
 
 
 def adjust_nothing(rig: Rig) -> None:

@@ -74,7 +74,8 @@ def choose_tracks(
         order = np.lexsort((columns[0], ids))
         rows = _longest(ids[order], columns[3][order], max_tracks)
         chosen = order[rows]
-        parts.append((j, ids[chosen], *(column[chosen] for column in columns)))
+        if len(chosen):
+            parts.append((j, ids[chosen], *(column[chosen] for column in columns)))
     if not parts:
         return _NOTHING, np.zeros((0, 3))
     pair_of_rows = np.concatenate([np.full(len(part[1]), part[0]) for part in parts])
