@@ -106,7 +106,8 @@ class CalibrationConfig(Stage):
     """Estimation of the rig's calibration while it runs."""
 
     online: bool = True
-    """Whether the calibration is estimated and corrected during the run; else the rig file's is used as it is."""
+    """Whether the calibration is estimated and corrected during the run, for which ``motion.reference`` must be
+    ``keyframe``; else the rig file's is used as it is, and only a wrong transform between pairs is corrected."""
 
 
 @dataclass(frozen=True)

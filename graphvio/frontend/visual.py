@@ -262,7 +262,7 @@ class VisualFrontend:
         if not self._references.must_be_replaced(seen.frames, seen.correspondences, refined, is_contradicted):
             return {}, {}
         own = self._own_motions(seen, agreement)
-        if not self._config.calibration.online:
+        if not self._config.calibration.online or self._config.motion.reference == "previous":
             self._learn_alignments(agreement)
         return self._refer_to(seen.frames), own
 

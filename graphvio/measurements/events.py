@@ -47,6 +47,8 @@ class EventKind(StrEnum):
     """A camera repeats its image while others do not; its pair is left out until the image changes."""
     CALIBRATION_CORRECTED = "calibration_corrected"
     """The images contradict the rig file beyond doubt; the calibration is corrected from now on."""
+    CALIBRATION_CHANGED = "calibration_changed"
+    """For some time the images contradict the calibration that was known, as after a knock; it is estimated again."""
     EXTRINSICS_OFF = "extrinsics_off"
     """The pairs' motions contradict the rig's transform between them; it is corrected for this run."""
 

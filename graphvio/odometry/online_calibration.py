@@ -7,8 +7,9 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.frontend.visual import VisualFrontend
-from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.events import EventKind, Report
+from graphvio.measurements.motion import Quality
 from graphvio.measurements.sensors import ImuSample
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
@@ -44,7 +45,9 @@ class OnlineCalibration:
         self._averaged = 0
         self._is_reported = False
         self._reported: set[str] = set()
-        self._calibration = SelfCalibration(rig) if config.calibration.online else None
+        # Tracks that are followed from frame to frame drift, all alike, and would be taken for an error of the cameras.
+        is_possible = config.motion.reference == "keyframe"
+        self._calibration = SelfCalibration(rig) if config.calibration.online and is_possible else None
 
     @property
     def estimate(self) -> CalibrationEstimate | None:
@@ -67,7 +70,15 @@ class OnlineCalibration:
 
     def update(self, stamp_ns: int) -> None:
         """Let the other stages use the calibration that comes into force with this frameset."""
-        if self._calibration is None or not self._calibration.update():
+        if self._calibration is None:
+            return
+        restarts = self._calibration.restarts
+        has_changed = self._calibration.update()
+        if self._calibration.restarts > restarts:
+            self._report(
+                stamp_ns, EventKind.CALIBRATION_CHANGED, "the images contradict what was known: it is estimated anew"
+            )
+        if not has_changed:
             return
         estimate = self._calibration.estimate
         if not estimate.is_file_exact and not self._is_reported:
@@ -75,8 +86,8 @@ class OnlineCalibration:
             self._report(
                 stamp_ns,
                 EventKind.CALIBRATION_CORRECTED,
-                f"the images contradict the rig file (its errors are {estimate.file_factor:.1g} times its standard "
-                "deviations): the calibration is corrected from now on",
+                f"the images contradict the rig file (its errors are {estimate.file_factors.max():.1g} times its "
+                "standard deviations): the calibration is corrected from now on",
             )
         for finding in self._calibration.findings():
             if finding.is_significant and " against " in finding.part and finding.part not in self._reported:
@@ -94,11 +105,13 @@ class OnlineCalibration:
         """Take a frameset's estimate, and the tracks that belong to it."""
         if self._calibration is None or estimate.nav_T_body is None:
             return
+        if estimate.status not in (Status.TRACKING, Status.INITIALISING) or estimate.vision is Quality.FAILED:
+            return
         views = {
             j: View(frame.ids, frame.pixels, frame.right_pixels, frame.has_depth, frame.points[:, 2])
             for j, frame in self._frontend.frames_at(estimate.stamp_ns).items()
         }
-        self._calibration.add_frameset(estimate.stamp_ns, estimate.nav_T_body, views)
+        self._calibration.add_frameset(estimate.stamp_ns, estimate.nav_T_body, views, estimate.vision is Quality.WEAK)
 
     def close(self) -> None:
         """End the thread."""

@@ -21,26 +21,24 @@ class CalibrationEstimate:
 
     Attributes:
         file_rig: the rig of the file.
-        posterior: of the difference from it, see `graphvio.self_calibration.parameters`.
-        file_factor: by which factor the file's errors exceed their standard deviations, `EXACT` for an exact file.
-        log_bayes_factor: twice the logarithm of the odds of that factor against an exact file; above 10 it is very
+        posterior: of the difference from it if no part of the file is exact, see `graphvio.self_calibration.parameters`.
+        difference: (C,) that is in force, with zero for what is exact.
+        file_factors: (G,) by which factors the file's errors exceed their standard deviations: of cameras and left to
+            right, and of the places of pairs and the IMU. `EXACT` where the file is as good as exact.
+        log_bayes_factor: twice the logarithm of the odds of these factors against an exact file; above 10 it is very
             strong evidence (R. E. Kass, A. E. Raftery, *Bayes factors*, 1995).
     """
 
     file_rig: Rig
     posterior: Gaussian
-    file_factor: float = EXACT
+    difference: Float
+    file_factors: Float
     log_bayes_factor: float = 0.0
 
     @property
     def is_file_exact(self) -> bool:
         """Whether the measurements say nothing against the rig file, which then stays in force."""
-        return self.file_factor == EXACT
-
-    @property
-    def difference(self) -> Float:
-        """Difference (C,) from the rig file that is in force: the posterior's mean, or zero for an exact file."""
-        return np.zeros_like(self.posterior.mean) if self.is_file_exact else self.posterior.mean
+        return bool((self.file_factors == EXACT).all())
 
     @cached_property
     def sigmas(self) -> Float:

@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float
+from graphvio.arrays import Float, Int
 
 EXACT = 1e-3
 """Factor on the file's standard deviations of a file that is as good as exact."""
+_SWEEPS = 3
 _FACTORS = (EXACT, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0)
 
 
@@ -36,20 +37,25 @@ class Gaussian(NamedTuple):
 
 
 class FilePrior(NamedTuple):
-    """What is known of the calibration from the rig file, up to a common factor on its standard deviations.
+    """What is known of the calibration from the rig file, up to a factor on the standard deviations of each group.
 
     Attributes:
-        covariance: (C, C) of the differences from the file, for a factor of 1.
-        is_of_file: (C,) whether the factor applies; it does not to biases, which no file has.
+        covariance: (C, C) of the differences from the file, for factors of 1.
+        group: (C,) index of the factor of each parameter, or -1 where none applies: no file has biases.
     """
 
     covariance: Float
-    is_of_file: Bool
+    group: Int
 
-    def with_factor(self, factor: float) -> Float:
-        """Return the covariance (C, C) for a factor."""
-        factors = np.where(self.is_of_file, factor, 1.0)
-        return np.asarray(self.covariance * factors * factors[:, None])
+    @property
+    def n_groups(self) -> int:
+        """Number of factors."""
+        return int(self.group.max()) + 1
+
+    def with_factors(self, factors: Float) -> Float:
+        """Return the covariance (C, C) for the groups' factors (G,)."""
+        each = np.append(factors, 1.0)[self.group]
+        return np.asarray(self.covariance * each * each[:, None])
 
 
 class Evidence(NamedTuple):
@@ -68,9 +74,9 @@ class Evidence(NamedTuple):
         """Return the likelihood of no measurements."""
         return Evidence(np.zeros((size, size)), np.zeros(size))
 
-    def given(self, prior: FilePrior, factor: float) -> Gaussian:
-        """Return the posterior, where the rig file is wrong by a factor times its standard deviations."""
-        information = self.information + np.linalg.inv(prior.with_factor(factor))
+    def given(self, prior: FilePrior, factors: Float) -> Gaussian:
+        """Return the posterior, where the rig file is wrong by factors (G,) times its standard deviations."""
+        information = self.information + np.linalg.inv(prior.with_factors(factors))
         return Gaussian(np.asarray(np.linalg.solve(information, self.vector)), np.asarray(information))
 
     def forgotten(self, walk: Float) -> Evidence:
@@ -86,22 +92,40 @@ class Evidence(NamedTuple):
             self.vector + posterior.information @ posterior.mean - prior.information @ prior.mean,
         )
 
-    def file_factor(self, prior: FilePrior) -> tuple[float, float]:
-        """Return by which factor the rig file's errors exceed its standard deviations, by maximum likelihood.
+    def file_factors(self, prior: FilePrior, min_gains: Float) -> tuple[Float, float]:
+        """Return by which factors the rig file's errors exceed its standard deviations, by maximum likelihood.
 
-        The calibration itself is integrated out (type II maximum likelihood; J. O. Berger, *Statistical decision theory
-        and Bayesian analysis*, 1985, section 3.5).
+        The calibration itself is integrated out (type II maximum likelihood; D. J. C. MacKay, *Bayesian interpolation*,
+        1992), and one group after the other is varied.
+
+        Args:
+            prior: of the calibration.
+            min_gains: (G,) twice the logarithm of the likelihood ratio from which a group of the file is not exact.
 
         Returns:
-            The factor, `EXACT` where an exact file explains the measurements best; and twice the logarithm of its
-            likelihood over that of an exact file.
+            The factors (G,), `EXACT` for a group that is as good as exact; and twice the logarithm of their likelihood
+            over that of an exact file.
         """
-        likelihoods = []
-        for factor in _FACTORS:
-            covariance = prior.with_factor(factor)
-            information = self.information + np.linalg.inv(covariance)
-            fit = self.vector @ np.linalg.solve(information, self.vector)
-            volume = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1]
-            likelihoods.append(float(fit - volume))
-        best = int(np.argmax(likelihoods))
-        return _FACTORS[best], likelihoods[best] - likelihoods[0]
+        factors = np.full(prior.n_groups, EXACT)
+        exact = best = self._likelihood(prior, factors)
+        for _ in range(_SWEEPS):
+            before = factors.copy()
+            for group in range(prior.n_groups):
+                likelihoods = []
+                for factor in _FACTORS:
+                    factors[group] = factor
+                    likelihoods.append(self._likelihood(prior, factors))
+                found = int(np.argmax(likelihoods))
+                if likelihoods[found] - likelihoods[0] < min_gains[group]:
+                    found = 0
+                factors[group], best = _FACTORS[found], likelihoods[found]
+            if np.array_equal(factors, before):
+                break
+        return factors, best - exact
+
+    def _likelihood(self, prior: FilePrior, factors: Float) -> float:
+        """Return twice the logarithm of the marginal likelihood of factors, up to a constant."""
+        covariance = prior.with_factors(factors)
+        information = self.information + np.linalg.inv(covariance)
+        fit = self.vector @ np.linalg.solve(information, self.vector)
+        return float(fit - np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(information)[1])

@@ -34,11 +34,15 @@ _DELAYS_FRAMESETS = (2, 8)  # until a result comes into force, in the first wind
 _MIN_DISPLACEMENT_PX = 8.0  # median of a pair's tracks since the keyframe before: at rest there are no keyframes
 _MAX_TRACKS = 150  # of each pair
 _FIRST_SIGMA_PX = 0.15
-_MIN_SIGMA_PX = 0.06
+_MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show in residuals
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: observations of one track are correlated
 _MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
 _RAYLEIGH_MEDIAN = 1.1774  # of the norm of two standard normal variables
-_MIN_LOG_BAYES_FACTOR = 100.0  # against exact files; good ones that are not exact reach hundreds with the first image
+_MIN_LOG_BAYES_FACTORS = np.array([200.0, 30.0])
+"""Against exact files, of cameras and of places. Cameras that are not exact reach hundreds with the first image."""
+_MAX_MEAN_INNOVATION = 3.0  # squared, of each parameter; 1 where all errors are as modelled
+_MIN_AGREEING = 3  # keyframes whose pairs agreed, from which contradictions are the scene's
+_MAX_REFUSED = 3  # full windows
 _WALK = 0.01  # in one second, as a share of the prior's standard deviations
 _MAX_WALK_S = 10.0  # in a window
 _IMU_NOISE_FACTOR = 2.0  # on the stated densities, since biases walk within a window, too
@@ -50,6 +54,8 @@ _MARGIN_NS = 50_000_000  # of IMU samples before a window
 class _Adjusted(NamedTuple):
     prior: Gaussian
     solution: Solution
+    evidence: Evidence
+    estimate: CalibrationEstimate
     is_full: bool
 
 
@@ -61,6 +67,8 @@ class SelfCalibration:
 
     Attributes:
         estimate: what is known now.
+        has_full_window: whether it is based on a full window at least.
+        restarts: how often what was known has been forgotten, since later windows contradicted it.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -69,7 +77,14 @@ class SelfCalibration:
         self._prior = file_prior(rig)
         self._walk = _walk_per_second(self._prior.covariance, rig)
         self._evidence = Evidence.none(len(self._walk))  # of the full windows
-        self.estimate = CalibrationEstimate(rig, self._evidence.given(self._prior, 1.0))
+        n_groups = self._prior.n_groups
+        posterior = self._evidence.given(self._prior, np.ones(n_groups))
+        exact = np.full(n_groups, EXACT)
+        self.estimate = CalibrationEstimate(rig, posterior, np.zeros_like(posterior.mean), exact)
+        self.has_full_window = False
+        self.restarts = 0
+        self._agreeing = 0  # keyframes
+        self._refused = 0  # full windows, one after the other
         self._sigma_px = _FIRST_SIGMA_PX
         self._samples: deque[ImuSample] = deque()
         self._keyframes: list[Keyframe] = []
@@ -92,16 +107,21 @@ class SelfCalibration:
         """Take an IMU sample as it was measured, in time order."""
         self._samples.append(sample)
 
-    def add_frameset(self, stamp_ns: int, odom_T_body: Float, views: Mapping[int, View]) -> None:
+    def add_frameset(
+        self, stamp_ns: int, odom_T_body: Float, views: Mapping[int, View], are_contradicting: bool = False
+    ) -> None:
         """Take what the pairs see at a frameset.
 
         Args:
             stamp_ns: of the frameset.
             odom_T_body: (4, 4) its estimated pose.
             views: pair index -> tracks.
+            are_contradicting: whether the pairs' motions contradict each other. It is the calibration if they always
+                did, and the scene if they once agreed.
         """
-        if not self._is_keyframe(stamp_ns, views):
+        if not self._is_keyframe(stamp_ns, views) or (are_contradicting and self._trusts_calibration):
             return
+        self._agreeing += not are_contradicting
         self._last = Keyframe(stamp_ns, odom_T_body, views)
         self._keyframes.append(self._last)
         sizes = [size for size in _ADJUSTED_AT[self._is_later] if size > self._adjusted_at]
@@ -117,10 +137,13 @@ class SelfCalibration:
         self._due_in -= 1
         if self._pending is None or self._due_in > 0:
             return False
-        (prior, solution, is_full), self._pending = self._pending.result(), None
-        evidence = self._evidence.with_window(prior, solution.calibration)
+        adjusted, self._pending = self._pending.result(), None
+        prior, solution, evidence, is_full = adjusted.prior, adjusted.solution, adjusted.evidence, adjusted.is_full
+        if self.has_full_window and not _agree(prior, solution.calibration):
+            self._refuse(is_full)
+            return False
         if is_full:
-            self._evidence = evidence
+            self._evidence, self.has_full_window, self._refused = evidence, True, 0
         if (
             len(solution.states.poses) >= _MIN_KEYFRAMES_OF_NOISE
             and len(solution.errors2) >= _MIN_OBSERVATIONS_OF_NOISE
@@ -128,12 +151,21 @@ class SelfCalibration:
             noise = float(np.sqrt(np.nanmedian(solution.errors2))) / _RAYLEIGH_MEDIAN * self._sigma_px
             self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
         was_exact = self.estimate.is_file_exact
-        factor, log_bayes_factor = evidence.file_factor(self._prior)
-        if was_exact and log_bayes_factor < _MIN_LOG_BAYES_FACTOR:
-            factor = EXACT
-        posterior = evidence.given(self._prior, 1.0 if factor == EXACT else factor)
-        self.estimate = CalibrationEstimate(self._rig, posterior, factor, log_bayes_factor)
+        self.estimate = adjusted.estimate
         return not (was_exact and self.estimate.is_file_exact)
+
+    @property
+    def _trusts_calibration(self) -> bool:
+        if self.has_full_window:
+            return True
+        return self.estimate.is_file_exact and self._agreeing >= _MIN_AGREEING
+
+    def _refuse(self, is_full: bool) -> None:
+        """Leave a window out that contradicts those before it; after several, these are forgotten: it was a knock."""
+        self._refused += is_full
+        if self._refused >= _MAX_REFUSED:
+            self._evidence, self.has_full_window, self._refused = Evidence.none(len(self._walk)), False, 0
+            self.restarts += 1
 
     def _is_keyframe(self, stamp_ns: int, views: Mapping[int, View]) -> bool:
         """Whether the images have moved, and time has passed, since the last keyframe."""
@@ -156,12 +188,26 @@ class SelfCalibration:
             self._keyframes, self._adjusted_at, self._is_later = [], 0, 1
             duration_s = min((window[-1].stamp_ns - window[0].stamp_ns) * 1e-9, _MAX_WALK_S)
             self._evidence = self._evidence.forgotten(duration_s * self._walk)
-        factor = 1.0 if self.estimate.is_file_exact else self.estimate.file_factor
-        prior = self._evidence.given(self._prior, factor)
+        prior = self._evidence.given(self._prior, _assumed(self.estimate.file_factors))
         samples, difference = self._samples_of(window), self.estimate.posterior.mean
-        self._pending = self._worker.submit(
-            _adjusted, window, samples, self._nominal, difference, prior, self._sigma_px, is_full
-        )
+        self._pending = self._worker.submit(self._adjust, window, samples, difference, prior, is_full)
+
+    def _adjust(
+        self,
+        window: tuple[Keyframe, ...],
+        samples: InertialSamples | None,
+        difference: Float,
+        prior: Gaussian,
+        is_full: bool,
+    ) -> _Adjusted:
+        """Adjust a window; what is read here does not change while an adjustment is pending."""
+        solution = adjusted(window, samples, self._nominal, difference, prior, self._sigma_px)
+        evidence = self._evidence.with_window(prior, solution.calibration)
+        factors, log_bayes_factor = evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS)
+        posterior = evidence.given(self._prior, _assumed(factors))
+        in_force = evidence.given(self._prior, factors).mean if (factors != EXACT).any() else np.zeros_like(difference)
+        estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor)
+        return _Adjusted(prior, solution, evidence, estimate, is_full)
 
     def _samples_of(self, window: tuple[Keyframe, ...]) -> InertialSamples | None:
         """Return the IMU over a window, or None where there is none; older samples are forgotten."""
@@ -182,15 +228,14 @@ class SelfCalibration:
         )
 
 
-def _adjusted(
+def adjusted(
     keyframes: tuple[Keyframe, ...],
     samples: InertialSamples | None,
     nominal: RigCalibration,
     difference: Float,
     prior: Gaussian,
     sigma_px: float,
-    is_full: bool,
-) -> _Adjusted:
+) -> Solution:
     """Adjust a window, beginning at the odometry's poses and at a difference from the nominal calibration."""
     poses = np.array([keyframe.odom_T_body for keyframe in keyframes])
     stamps_s = np.array([(keyframe.stamp_ns - keyframes[0].stamp_ns) * 1e-9 for keyframe in keyframes])
@@ -204,7 +249,7 @@ def _adjusted(
         # A sample that is wild, or an axis that sticks, is not the IMU's calibration.
         believed = samples.without(np.flatnonzero(solution.imu_errors2 > _MAX_IMU_ERROR2))
         solution = solve(Window(tracks, sigma_px, believed), states, nominal, difference, prior)
-    return _Adjusted(prior, solution, is_full)
+    return solution
 
 
 def adjust_nothing(rig: Rig) -> None:
@@ -216,10 +261,19 @@ def adjust_nothing(rig: Rig) -> None:
     for stamp_ns in (-10_000_000, *stamps_ns, 110_000_000) if rig.imu is not None else ():
         calibration.add_sample(ImuSample(stamp_ns, np.zeros(3), np.array([0.0, 0.0, GRAVITY_M_S2])))
     prior = calibration.estimate.posterior
-    _adjusted(
-        keyframes, calibration._samples_of(keyframes), calibration._nominal, prior.mean, prior, _FIRST_SIGMA_PX, False
-    )
+    adjusted(keyframes, calibration._samples_of(keyframes), calibration._nominal, prior.mean, prior, _FIRST_SIGMA_PX)
     calibration.close()
+
+
+def _assumed(factors: Float) -> Float:
+    """Return the factors without those of exact parts, which may yet turn out to be wrong."""
+    return np.where(factors == EXACT, 1.0, factors)
+
+
+def _agree(prior: Gaussian, posterior: Gaussian) -> bool:
+    """Whether a window fits what was known before it, with a margin for errors that are not modelled."""
+    change = posterior.mean - prior.mean
+    return float(change @ prior.information @ change) < _MAX_MEAN_INNOVATION * len(change)
 
 
 def _walk_per_second(file_covariance: Float, rig: Rig) -> Float:

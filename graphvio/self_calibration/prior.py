@@ -23,17 +23,26 @@ _MIN_SIGMA = 1e-9
 _GYRO_BIAS_SIGMA_RAD_S, _ACCEL_BIAS_SIGMA_M_S2 = 0.02, 0.1
 
 
+_CAMERAS, _PLACES, _NO_GROUP = 0, 1, -1  # groups of parameters whose errors have a common factor
+
+
 def file_prior(rig: Rig) -> FilePrior:
-    """Return the prior of all parameters of a rig, of its pairs and its IMU, by its `CalibrationSigmas`."""
+    """Return the prior of all parameters of a rig, of its pairs and its IMU, by its `CalibrationSigmas`.
+
+    Cameras and left to right are one group, the places of the pairs and the IMU another one.
+    """
     of_pairs = _covariance_of_pairs(rig)
     n = len(of_pairs)
+    group = np.full(n, _CAMERAS)
+    group.reshape(-1, PAIR)[:, BODY:] = _PLACES
     if rig.imu is None:
-        return FilePrior(of_pairs, np.ones(n, dtype=bool))
-    covariance, is_of_file = np.zeros((n + PARAMETERS, n + PARAMETERS)), np.ones(n + PARAMETERS, dtype=bool)
+        return FilePrior(of_pairs, group)
+    covariance = np.zeros((n + PARAMETERS, n + PARAMETERS))
     covariance[:n, :n] = of_pairs
     covariance[n:, n:] = np.diag(_sigmas_of_imu(rig.calibration_sigmas) ** 2)
-    is_of_file[n : n + GYRO_MATRIX] = False
-    return FilePrior(covariance, is_of_file)
+    of_imu = np.full(PARAMETERS, _PLACES)
+    of_imu[:GYRO_MATRIX] = _NO_GROUP
+    return FilePrior(covariance, np.concatenate([group, of_imu]))
 
 
 def refined_sigmas(rig: Rig, posterior: Gaussian) -> CalibrationSigmas:
