@@ -231,7 +231,7 @@ def test_self_calibration_of_exact_files_leaves_them_alone() -> None:
         assert not calibration.estimate.difference.any()
 
 
-def test_self_calibration_at_rest_learns_nothing_more_than_the_first_frameset_shows() -> None:
+def test_self_calibration_at_a_standstill_learns_nothing_more_than_the_first_frameset_shows() -> None:
     written, true, _ = sampled(2, 1)
     sigmas = []
     for duration_s in (1.0, 60.0):

@@ -31,7 +31,9 @@ _WINDOW = 16  # keyframes
 _ADJUSTED_AT = ((1, 3, 6, 10, _WINDOW), (_WINDOW // 2, _WINDOW))  # keyframes, in the first window and later
 _INTERVALS_S = (0.1, 0.25)  # at least, between keyframes, in the first window and later
 _DELAYS_FRAMESETS = (2, 8)  # until a result comes into force, in the first window and later
-_MIN_DISPLACEMENT_PX = 8.0  # median of a pair's tracks since the keyframe before: at rest there are no keyframes
+_MIN_DISPLACEMENT_PX = (
+    8.0  # median of a pair's tracks since the keyframe before: at a standstill there are no keyframes
+)
 _MAX_TRACKS = 150  # of each pair
 _FIRST_SIGMA_PX = 0.15
 _MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show in residuals

@@ -197,10 +197,12 @@ def _moved(states: States, tracks: Tracks, eliminated: Eliminated, step: Float, 
         poses[k, :3, 3] += states.poses[k, :3, :3] @ of_pose[3:]
         poses[k, :3, :3] = states.poses[k, :3, :3] @ so3_exp(of_pose[:3].copy())
     landmarks = landmarks_after(states.landmarks, tracks, eliminated, step, n)
-    rest = step[6 * n + n_calibration :]
-    if not len(rest):
+    inertial = step[6 * n + n_calibration :]
+    if not len(inertial):
         return states._replace(poses=poses, landmarks=landmarks)
-    return States(poses, states.velocities + rest[: 3 * n].reshape(n, 3), states.gravity + rest[3 * n :], landmarks)
+    return States(
+        poses, states.velocities + inertial[: 3 * n].reshape(n, 3), states.gravity + inertial[3 * n :], landmarks
+    )
 
 
 def _marginal(hessian: Float, kept: slice) -> Float:

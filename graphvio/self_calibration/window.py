@@ -82,11 +82,11 @@ def choose_tracks(
     ids, keyframe, left_px, right_px, has_right, inverse_depths = (
         np.concatenate([part[field] for part in parts]) for field in range(1, 7)
     )
-    starts = np.flatnonzero(np.r_[True, (np.diff(ids) != 0) | (np.diff(pair_of_rows) != 0)])
-    bounds = np.r_[starts, len(ids)]
-    pair = pair_of_rows[starts]
+    firsts = np.flatnonzero(np.r_[True, (np.diff(ids) != 0) | (np.diff(pair_of_rows) != 0)])
+    bounds = np.r_[firsts, len(ids)]
+    pair = pair_of_rows[firsts]
     first = np.array([start + int(np.argmax(has_right[start:end])) for start, end in pairwise(bounds)])
-    landmarks = np.empty((len(starts), 3))
+    landmarks = np.empty((len(firsts), 3))
     for j in np.unique(pair):
         of_pair = pair == j
         landmarks[of_pair, :2], _ = unproject_pixels(
