@@ -75,7 +75,7 @@ class PairFrame:
         )
 
     def recalibrated(self, pair: StereoPair) -> PairFrame:
-        """Return the frame as another calibration of its cameras has it: the same pixels, triangulated anew."""
+        """Return the frame as another calibration of its cameras has it: the same pixels, triangulated again."""
         left, has_ray = pair.left.unproject(self.pixels)
         right, in_right = pair.right.unproject(self.right_pixels)
         points, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)

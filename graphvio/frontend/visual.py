@@ -124,7 +124,7 @@ class VisualFrontend:
     def recalibrate(self, rig: Rig) -> None:
         """Take another calibration of the same cameras from the next frameset on.
 
-        Points of the references are triangulated anew, so that a motion is measured with one calibration.
+        Points of the references are triangulated again, so that a motion is measured with one calibration.
         """
         self._rig = rig
         self._arrays = RigArrays.of(rig)

@@ -76,7 +76,7 @@ class OnlineCalibration:
         has_changed = self._calibration.update()
         if self._calibration.restarts > restarts:
             self._report(
-                stamp_ns, EventKind.CALIBRATION_CHANGED, "the images contradict what was known: it is estimated anew"
+                stamp_ns, EventKind.CALIBRATION_CHANGED, "the images contradict what was known: it is estimated again"
             )
         if not has_changed:
             return

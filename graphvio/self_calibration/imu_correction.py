@@ -16,7 +16,7 @@ class ImuCorrection:
     """Matrices that readings of gyro and accelerometer are multiplied by.
 
     Biases are left to the state estimator, which must not see them jump when the matrices change. The accelerometer's
-    matrix therefore multiplies the difference from a fixed force, which is about that of gravity in body; the rest of
+    matrix therefore multiplies the difference from a fixed force, which is about that of gravity in body; what remains of
     its effect remains a part of the bias.
 
     Attributes:
