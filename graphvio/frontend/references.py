@@ -38,7 +38,7 @@ class References:
         self._frames.update(frames)
 
     def recalibrate(self, rig: Rig) -> None:
-        """Take another calibration of the rig: the references' points are triangulated anew."""
+        """Take another calibration of the rig: the references' points are triangulated again."""
         self._frames = {j: frame.recalibrated(rig.pairs[j]) for j, frame in self._frames.items()}
 
     def clear(self) -> None:

@@ -16,8 +16,8 @@ class ImuCorrection:
     """Matrices that readings of gyro and accelerometer are multiplied by.
 
     Biases are left to the state estimator, which must not see them jump when the matrices change. The accelerometer's
-    matrix therefore multiplies the difference from a fixed force, which is about that of gravity in body; what remains of
-    its effect remains a part of the bias.
+    matrix therefore multiplies the difference from a fixed force, about that of gravity in body; what is left of its
+    effect stays a part of the bias.
 
     Attributes:
         gyro: (3, 3) error of the gyro's matrix, ``I + gyro``.
