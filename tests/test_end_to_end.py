@@ -14,7 +14,7 @@ import pytest
 from command_line import Ran, graphvio, graphvio_alone
 from recordings import REAL_DATA
 
-from graphvio import FrameSet, open_source
+from graphvio import FrameSet, load_rig, open_source
 from graphvio.trajectory_files import load_trajectory
 
 pytestmark = pytest.mark.heavy
@@ -99,7 +99,9 @@ def test_run_is_complete_accurate_and_repeatable(room_walk: Path, tmp_path: Path
     assert names == {
         "trajectory.txt", "trajectory_smoothed.txt", "covariance.csv", "imu_bias.csv", "pairs.csv",
         "events.jsonl", "config.yaml", "rig.yaml", "summary.json", "trajectory.png",
+        "calibration.csv", "rig-refined.yaml",
     }  # fmt: skip
+    assert load_rig(tmp_path / "a/rig-refined.yaml").pairs[0].name == load_rig(tmp_path / "a/rig.yaml").pairs[0].name
     assert summary["completion"] == 1.0
     assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.01
     assert {"predict", "track", "stereo", "motion", "update"} <= set(summary["stage_ms"])

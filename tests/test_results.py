@@ -104,6 +104,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_writer_writes_all_files(folder: Path) -> None:
     assert sorted(file.name for file in folder.iterdir()) == [
+        "calibration.csv",
         "config.yaml",
         "covariance.csv",
         "events.jsonl",

@@ -1,6 +1,7 @@
 """Self-calibration on tracks without images: what it finds, how certain it is, and what it must leave alone."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,13 +9,17 @@ from scipy.stats import chi2
 from walked_views import Walk, calibrated
 
 from graphvio.arrays import Float
+from graphvio.calibration_sigmas import LEVELS
 from graphvio.cameras import MODEL_NAMES
+from graphvio.errors import RigError
 from graphvio.geometry import se3_exp, so3_exp, so3_log
 from graphvio.rig import Camera, Rig, StereoPair
+from graphvio.rig_files import load_rig, save_rig
 from graphvio.self_calibration.bundle import _COLUMNS as COLUMNS
 from graphvio.self_calibration.bundle import _ERROR_AT as ERROR_AT
 from graphvio.self_calibration.bundle import Eliminated, Tracks, _observe, eliminate_landmarks, total_cost
 from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
+from graphvio.self_calibration.findings import described
 from graphvio.self_calibration.linear import eliminated, solve_symmetric
 from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.parameters import BODY, PAIR, STEREO, RigCalibration
@@ -264,3 +269,42 @@ def test_self_calibration_with_imu_finds_time_offset_and_cameras_in_body() -> No
         return float(np.rad2deg(np.linalg.norm(so3_log(np.ascontiguousarray(body_T_cam[:3, :3] @ true[:3, :3].T)))))
 
     assert angle_deg(after) < 0.3 * angle_deg(before)
+
+
+# ---------------------------------------------------------------- what users see
+
+
+def test_findings_name_what_is_wrong_and_only_that() -> None:
+    error = draw(default_rig(), CalibrationError.of_level(3, ["left-right-rotation"]), 1)
+    written, true = error.written_rig.without_imu(), error.true_rig.without_imu()
+    wrong = calibrated(SelfCalibration(written), Walk(true), 10.0).findings()
+    assert {finding.part for finding in wrong if finding.is_significant} == {
+        f"pair {name}, rotation left to right" for name in ("front", "back")
+    }
+    exact = calibrated(SelfCalibration(true), Walk(true), 10.0).findings()
+    assert not any(finding.is_significant for finding in exact)
+    assert described(exact)[0] == "calibration: as in the rig file"
+    assert any("baseline" in line or "translation left to right" in line for line in described(exact))
+
+
+def test_refined_rig_with_its_sigmas_is_a_rig_file(tmp_path: Path) -> None:
+    written, true, _ = sampled(2, 0)
+    refined = calibrated(SelfCalibration(written), Walk(true), 10.0).estimate.rig
+    assert refined.calibration_sigmas.stereo_rotation_deg < written.calibration_sigmas.stereo_rotation_deg
+    save_rig(refined, tmp_path / "rig.yaml")
+    assert load_rig(tmp_path / "rig.yaml").calibration_sigmas == refined.calibration_sigmas
+
+
+def test_calibration_sigmas_in_a_rig_file_are_checked(tmp_path: Path) -> None:
+    save_rig(default_rig(), tmp_path / "rig.yaml")
+    text = (tmp_path / "rig.yaml").read_text()
+    for added, message in (
+        ("calibration_sigmas: factry", "there is no level 'factry'"),
+        ("calibration_sigmas: {focal_shar: 0.1}", "focal_share"),
+        ("calibration_sigmas: {focal_share: -0.1}", "positive"),
+    ):
+        (tmp_path / "wrong.yaml").write_text(f"{text}{added}\n")
+        with pytest.raises(RigError, match=message):
+            load_rig(tmp_path / "wrong.yaml")
+    (tmp_path / "named.yaml").write_text(f"{text}calibration_sigmas: kalibr\n")
+    assert load_rig(tmp_path / "named.yaml").calibration_sigmas == LEVELS["kalibr"]

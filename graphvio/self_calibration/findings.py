@@ -45,8 +45,8 @@ class Finding:
 
     @property
     def is_observed(self) -> bool:
-        """Whether the measurements said more of it than the rig file."""
-        return bool((self.sigmas < _OBSERVED * self.file_sigmas).any())
+        """Whether the measurements said more of all of it than the rig file."""
+        return bool((self.sigmas < _OBSERVED * self.file_sigmas).all())
 
     def __str__(self) -> str:
         size, sigma = float(np.linalg.norm(self.difference)), float(np.sqrt(np.mean(self.sigmas**2)))
