@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from graphvio.config import Config
+from graphvio.config.stages import CalibrationConfig
 from graphvio.errors import TrajectoryError
 from graphvio.optimization.colmap_export import export
 from graphvio.optimization.exchange import covariance_text, frames_text, trajectory_text, write_g2o
@@ -129,8 +130,10 @@ class Stages:
                 on_smoothed=recorder.add_smoothed,
                 on_progress=lambda progress: self._on_progress(stage, progress.framesets, progress.total),
             )
-            with ResultWriter(folder, session.source.rig, self._config.to_yaml()) as writer:
-                run(session.source, self._config, writer, [listener])
+            # All motions of a session must be measured with one calibration, that of the rig file.
+            config = replace(self._config, calibration=CalibrationConfig(online=False))
+            with ResultWriter(folder, session.source.rig, config.to_yaml()) as writer:
+                run(session.source, config, writer, [listener])
             self._space.write(name, recorder.record().to_bytes())
             self._space.finish(stage, name, f"{session.name}/odometry/summary.json")
         return SessionRecord.load(self._space.folder / name)
