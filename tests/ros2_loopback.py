@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import socket
 import subprocess
 import sys
 import time
@@ -25,9 +26,21 @@ PERIOD_NS = 50_000_000
 IMU_PERIOD_NS = 5_000_000
 
 
+_taken: list[socket.socket] = []
+
+
 def free_domain() -> int:
-    """A domain that hardly anybody else uses at this moment."""
-    return random.SystemRandom().randint(100, 230)
+    """A domain that no other test on this machine uses while this process lives: each holds a port in token of it."""
+    for domain in random.SystemRandom().sample(range(100, 231), 131):
+        token = socket.socket()
+        try:
+            token.bind(("127.0.0.1", 20_000 + domain))
+        except OSError:
+            token.close()
+            continue
+        _taken.append(token)
+        return domain
+    raise RuntimeError("all ROS 2 domains from 100 to 230 are in use by tests")
 
 
 def until(holds: Callable[[], bool], seconds: float = 20.0) -> bool:

@@ -101,12 +101,16 @@ def test_command_wrong_rig_is_corrected(walk: Path, tmp_path: Path) -> None:
     save_rig(with_wrong_place(rig, 3.0, 0.05), wrong)
     ran = command("run", walk, "--rig", wrong, "--out", tmp_path / "results")
     assert ran.exit_code == 0
-    size = r"pair back is ([\d.]+) \(\+- ([\d.]+)\) deg and ([\d.]+) \(\+- ([\d.]+)\) cm from where the rig"
-    match = re.search(size, ran.stderr)
-    assert match is not None, ran.stderr
-    degrees, degrees_sigma, cm, cm_sigma = map(float, match.groups())
-    assert abs(degrees - 3.0) < 4.0 * degrees_sigma < 1.0
-    assert abs(cm - 5.3) < 4.0 * cm_sigma < 4.0
+    found = {}
+    for part, unit in (("rotation", "deg"), ("translation", "mm")):
+        match = re.search(rf"pair back, {part} against front: ([\d.]+) {unit} from .* \(sigma ([\d.]+)\)", ran.stderr)
+        assert match is not None, ran.stderr
+        found[part] = (float(match[1]), float(match[2]))
+    left, wrong_left = (each.pairs[1].left.body_T_cam for each in (rig, load_rig(wrong)))
+    mm = 1e3 * float(np.linalg.norm(left[:3, 3] - wrong_left[:3, 3]))
+    for part, expected, max_sigma in (("rotation", 3.0, 0.05), ("translation", mm, 5.0)):
+        value, sigma = found[part]
+        assert abs(value - expected) < 4.0 * sigma < 4.0 * max_sigma
     done = command("calibrate", walk, "--rig", wrong, "--out", out, "--report", report)
     assert done.exit_code == 0, done.output
     assert re.search(r"the rig has back (2\.9|3\.0)\d+ degrees and 5\d\.\d mm from where it is", done.stderr)
