@@ -99,7 +99,7 @@ def test_run_is_complete_accurate_and_repeatable(room_walk: Path, tmp_path: Path
     assert names == {
         "trajectory.txt", "trajectory_smoothed.txt", "covariance.csv", "imu_bias.csv", "pairs.csv",
         "events.jsonl", "config.yaml", "rig.yaml", "summary.json", "trajectory.png",
-        "calibration.csv", "rig-refined.yaml",
+        "calibration.csv", "calibration.png", "rig-refined.yaml",
     }  # fmt: skip
     assert load_rig(tmp_path / "a/rig-refined.yaml").pairs[0].name == load_rig(tmp_path / "a/rig.yaml").pairs[0].name
     assert summary["completion"] == 1.0

@@ -11,6 +11,8 @@
 | ``config.yaml``, ``rig.yaml`` | as used |
 | ``summary.json`` | see `Summary` |
 | ``trajectory.png`` | plan and side view |
+| ``calibration.csv``, ``calibration.png`` | the calibration over time, as differences from the rig file |
+| ``rig-refined.yaml`` | the rig with the calibration as it was known at the end |
 """
 
 from graphvio.results.summary import PairMedians, Percentiles, Summary

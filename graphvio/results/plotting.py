@@ -78,7 +78,7 @@ def plot_run(
         _mark_lost(axes, trajectory, lost_ns, z)
         _mark_ends(axes, positions, breaks, z)
     _title(figure, plan, _run_title(name, trajectory, breaks, evaluation))
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_evaluation(path: Path, evaluation: Evaluation, name: str = "") -> None:
@@ -108,7 +108,7 @@ def plot_evaluation(path: Path, evaluation: Evaluation, name: str = "") -> None:
         if row == 0:
             axes.set_xlabel("time, s")
     _title(figure, plan, f"{name}{': ' if name else ''}{_figures(evaluation)}")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_comparison(path: Path, evaluations: Mapping[str, Evaluation]) -> None:
@@ -118,7 +118,7 @@ def plot_comparison(path: Path, evaluations: Mapping[str, Evaluation]) -> None:
         GraphvioError: if the file cannot be written.
     """
     head_in = 0.5 + 0.22 * len(evaluations)
-    figure = _new_figure(9.0, 5.6 + head_in)
+    figure = new_figure(9.0, 5.6 + head_in)
     share = 5.6 / (5.6 + head_in)
     panels = [figure.add_axes((0.1, share * bottom, 0.87, share * 0.42)) for bottom in (0.56, 0.09)]
     begin = min((int(each.stamps_ns[0]) for each in evaluations.values()), default=0)
@@ -134,10 +134,11 @@ def plot_comparison(path: Path, evaluations: Mapping[str, Evaluation]) -> None:
     if evaluations:
         options = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.02), "borderaxespad": 0.0, "frameon": False}
         panels[0].legend(fontsize=9, title="rmse after alignment", title_fontsize=9, alignment="left", **options)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-def _new_figure(width_in: float, height_in: float) -> Figure:
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Create a white figure without axes."""
     from graphvio.reporting.figures import empty_figure
 
     return empty_figure(width_in, height_in, _DPI)
@@ -214,7 +215,7 @@ def _maps(first: Float, second: Float | None, series: bool) -> tuple[Figure, Axe
     side_room = max(side_height, _MIN_SERIES_HEIGHT_IN - plan_height - _GAP_IN) if series else side_height
     total_width = max(_MARGIN_LEFT_IN + width + right + _MARGIN_RIGHT_IN, 6.5)
     total_height = _MARGIN_BOTTOM_IN + side_room + _GAP_IN + plan_height + _MARGIN_TOP_IN
-    figure = _new_figure(total_width, total_height)
+    figure = new_figure(total_width, total_height)
 
     def place(bottom_in: float, height_in: float) -> Any:
         left, bottom = _MARGIN_LEFT_IN / total_width, bottom_in / total_height
@@ -267,7 +268,12 @@ def _title(figure: Figure, plan: Any, text: str) -> None:
         )
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure; the suffix chooses the format.
+
+    Raises:
+        GraphvioError: if the file cannot be written.
+    """
     try:
         figure.savefig(path, metadata={"Software": None} if path.suffix.lower() == ".png" else None)
     except OSError as error:

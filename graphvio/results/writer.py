@@ -1,6 +1,6 @@
 """Writes a result folder during a run.
 
-All files but the summary, the smoothed trajectory and the plot grow line by line and are flushed at once, so that an
+All files but the summary, the smoothed trajectory and the plots grow line by line and are flushed at once, so that an
 interrupted run leaves its results until then. Equal input gives an equal ``trajectory.txt``, byte by byte.
 """
 
@@ -27,6 +27,7 @@ from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
 from graphvio.measurements.motion import PairReport
 from graphvio.reporting.files import replace_file
+from graphvio.results.calibration_plot import CalibrationHistory
 from graphvio.results.plotting import plot_run
 from graphvio.results.summary import PairMedians, Percentiles, Summary, epoch_intervals, path_length
 from graphvio.rig import Rig
@@ -86,6 +87,7 @@ class ResultWriter:
         self._first_ns: int | None = None
         self._last_ns = 0
         self._calibration: CalibrationEstimate | None = None
+        self._calibrations = CalibrationHistory()
         self._time_offset: tuple[float | None, float | None] = (None, None)
         self._stage_ms: dict[str, array[float]] = {}
         self._pair_names = [pair.name for pair in rig.pairs]
@@ -178,6 +180,7 @@ class ResultWriter:
         if estimate is None or estimate is self._calibration:
             return
         self._calibration = estimate
+        self._calibrations.add(stamp_ns, estimate)
         names = parameter_names(estimate.file_rig)
         rows = zip(names, estimate.difference, estimate.sigmas, strict=True)
         lines = [f"{stamp_ns},{name},{_number(value)},{_number(sigma)}" for name, value, sigma in rows]
@@ -207,7 +210,7 @@ class ResultWriter:
         refined_rig: Rig | None = None,
         truth: Path | None = None,
     ) -> Summary:
-        """Write the smoothed trajectory, the summary and the plot.
+        """Write the smoothed trajectory, the summary and the plots.
 
         Args:
             wall_s: processing time of the whole run.
@@ -273,6 +276,8 @@ class ResultWriter:
             evaluation=evaluation,
             name=self.folder.name,
         )
+        if self._calibration is not None:
+            self._calibrations.plot(self.folder / "calibration.png", self._last_ns, self.folder.name)
         return summary
 
     def _add_report(self, stamp_ns: int, name: str, report: PairReport) -> None:
