@@ -438,3 +438,25 @@ def test_a_window_that_fails_is_rebuilt(
     assert estimates[-1].status is Status.TRACKING
     steps = np.diff([e.nav_T_body[:3, 3] for e in estimates if e.nav_T_body is not None], axis=0)
     assert np.linalg.norm(steps, axis=1).max() < 0.12
+
+
+def test_an_imus_matrices_are_applied_to_its_samples(room_walk: Path, measurements: list[Measurement]) -> None:
+    rig, gyro, accel = open_source(room_walk).rig, np.diag([1.01, 0.98, 1.02]), np.eye(3) + 0.01 * np.eye(3, k=1)
+    assert rig.imu is not None
+    imu = replace(rig.imu, gyro_matrix=tuple(gyro.ravel().tolist()), accel_matrix=tuple(accel.ravel().tolist()))
+    skewed = [
+        each
+        if isinstance(each, FrameSet)
+        else replace(
+            each,
+            angular_velocity=np.asarray(np.linalg.inv(gyro) @ each.angular_velocity),
+            linear_acceleration=np.asarray(np.linalg.inv(accel) @ each.linear_acceleration),
+        )
+        for each in measurements[:250]
+    ]
+    expected = feed(Odometry(rig), measurements[:250])
+    found = feed(Odometry(replace(rig, imu=imu)), skewed)
+    assert any(estimate.nav_T_body is not None for estimate in expected)
+    for one, other in zip(found, expected, strict=True):
+        if other.nav_T_body is not None:
+            assert one.nav_T_body == pytest.approx(other.nav_T_body, abs=1e-6)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,14 +65,14 @@ def test_save_rig_then_load_rig_returns_equal_rig(tmp_path: Path, pairs: int, im
 
 
 @given(
-    numbers=st.lists(st.floats(1e-9, 1e3), min_size=5, max_size=5),
+    numbers=st.tuples(*[st.floats(1e-9, 1e3)] * 5),
     offset_s=st.floats(-1, 1),
     xi=st.lists(st.floats(-2, 2), min_size=6, max_size=6),
     name=st.text(min_size=1, max_size=12),
 )
 def test_save_rig_then_load_rig_with_any_values_returns_equal_rig(
     tmp_path_factory: pytest.TempPathFactory,
-    numbers: list[float],
+    numbers: tuple[float, float, float, float, float],
     offset_s: float,
     xi: list[float],
     name: str,
@@ -90,9 +91,26 @@ def test_save_rig_then_load_rig_with_any_values_returns_equal_rig(
         )
         for side, pose in (("l", body_T_left), ("r", body_T_right))
     )
-    rig = Rig((StereoPair(name, left, right),), Imu(*[*numbers, offset_s]), name)
+    rig = Rig((StereoPair(name, left, right),), Imu(*numbers, offset_s), name)
     save_rig(rig, path)
     assert_same(rig, load_rig(path))
+
+
+def test_save_rig_keeps_the_matrices_of_the_imu(tmp_path: Path) -> None:
+    matrix = (1.01, 0.001, -0.002, 0.0, 0.99, 0.003, 0.0, 0.0, 1.005)
+    rig = replace(small_rig(1), imu=Imu(gyro_matrix=matrix))
+    save_rig(rig, tmp_path / "rig.yaml")
+    loaded = load_rig(tmp_path / "rig.yaml")
+    assert loaded.imu == rig.imu
+    assert loaded.imu is not None
+    assert loaded.imu.matrices[0] == pytest.approx(np.reshape(matrix, (3, 3)), abs=0.0)
+    assert "gyro_matrix" not in (edited(tmp_path, lambda _: None)).read_text()
+
+
+@pytest.mark.parametrize("matrix", [[[1.0, 0.0], [0.0, 1.0]], [[2.0, 0, 0], [0, 1, 0], [0, 0, 1]], "identity"])
+def test_load_rig_with_an_invalid_matrix_of_the_imu_names_it(tmp_path: Path, matrix: object) -> None:
+    with pytest.raises(RigError, match="accel_matrix"):
+        load_rig(edited(tmp_path, lambda d: d["imu"].update(accel_matrix=matrix)))
 
 
 def test_with_pairs_selects_pairs_in_order() -> None:

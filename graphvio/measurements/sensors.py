@@ -14,6 +14,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Image
 from graphvio.errors import MeasurementError
+from graphvio.rig import Imu
 
 _LARGEST_STAMP = 2**62  # differences of two stamps are int64, too
 
@@ -49,6 +50,12 @@ class FrameSet:
 
 
 Measurement = ImuSample | FrameSet
+
+
+def calibrated_sample(sample: ImuSample, imu: Imu) -> ImuSample:
+    """Return a sample multiplied by the IMU's matrices."""
+    gyro, accel = imu.matrices
+    return ImuSample(sample.stamp_ns, gyro @ sample.angular_velocity, accel @ sample.linear_acceleration)
 
 
 def checked_measurement(measurement: Measurement) -> Measurement:

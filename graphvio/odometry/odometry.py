@@ -22,7 +22,7 @@ from graphvio.measurements.estimate import Estimate, Prediction, Status
 from graphvio.measurements.events import Event, EventKind
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import Quality, VisualResult
-from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement, checked_measurement
+from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement, calibrated_sample, checked_measurement
 from graphvio.odometry.angular_rates import AngularRates
 from graphvio.odometry.assembly import estimate_of, estimate_without_pose, keyframe_of
 from graphvio.odometry.online_calibration import OnlineCalibration
@@ -104,6 +104,8 @@ class Odometry:
             raise MeasurementError("the odometry has been finished; make a new one for more measurements")
         measurement = checked_measurement(measurement)
         if isinstance(measurement, ImuSample):
+            if self.rig.imu is not None and self.rig.imu.has_matrices:
+                measurement = calibrated_sample(measurement, self.rig.imu)
             for sample in self._synchroniser.add_sample(measurement):
                 self._calibration.add_sample(sample)
                 self._propagate(self._synchroniser.corrected(sample))

@@ -19,7 +19,8 @@ VERSION_KEY = "graphvio_rig"
 FILE_NAME = "rig.yaml"
 
 _RIG_KEYS = (VERSION_KEY, "name", "calibration_sigmas", "imu", "pairs")
-_IMU_KEYS = ("rate_hz", *NOISE_KEYS, "time_offset_s")
+_IMU_MATRICES = ("gyro_matrix", "accel_matrix")
+_IMU_KEYS = ("rate_hz", *NOISE_KEYS, "time_offset_s", *_IMU_MATRICES)
 _PAIR_KEYS = ("name", "left", "right")
 _CAMERA_KEYS = ("name", "model", "size_px", "intrinsics", "distortion", "body_T_cam", "mask")
 
@@ -95,6 +96,9 @@ def to_text(rig: Rig, folder: Path) -> str:
             f"  accel_random_walk: {_number(rig.imu.accel_random_walk)}  # m/s^3/sqrt(Hz)",
             f"  time_offset_s: {_number(rig.imu.time_offset_s)}  # t_imu = t_cam + time_offset_s",
         ]
+        if rig.imu.has_matrices:
+            for key, matrix in zip(_IMU_MATRICES, rig.imu.matrices, strict=True):
+                lines += [f"  {key}:", *(f"    - {_numbers(row)}" for row in matrix)]
     lines.append("pairs:")
     for pair in rig.pairs:
         lines.append(f"  - name: {_quoted(pair.name)}")
@@ -150,6 +154,9 @@ def _camera(section: Section) -> Camera:
 def _imu(section: Section) -> Imu:
     section.only(_IMU_KEYS)
     noise = section.noise("rate_hz", {key: key for key in NOISE_KEYS})
+    for key in _IMU_MATRICES:
+        if section.values.get(key) is not None:
+            noise[key] = tuple(section.array(key, (3, 3)).ravel().tolist())
     return Imu(**noise, time_offset_s=section.number("time_offset_s", 0.0))
 
 

@@ -102,7 +102,7 @@ class Section:
             return self.array(key, (16,)).reshape(4, 4)
         return self.array(key, (4, 4))
 
-    def noise(self, rate_key: str, keys: Mapping[str, str]) -> dict[str, float]:
+    def noise(self, rate_key: str, keys: Mapping[str, str]) -> dict[str, Any]:
         """Get rate and noise densities of an IMU, whose keys are given by the names of `graphvio.rig.Imu`.
 
         Raises:

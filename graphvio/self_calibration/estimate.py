@@ -47,7 +47,7 @@ class CalibrationEstimate:
 
     @cached_property
     def rig(self) -> Rig:
-        """The rig with the calibration that is in force; the matrices of the IMU are not a part of it."""
+        """The rig with the calibration that is in force."""
         if self.is_file_exact:
             return self.file_rig
         moved = RigCalibration.of(self.file_rig).moved(self.difference[: self._n_of_pairs])
@@ -55,7 +55,12 @@ class CalibrationEstimate:
         rig = replace(rig, calibration_sigmas=refined_sigmas(rig, self.posterior))
         if rig.imu is None:
             return rig
-        return replace(rig, imu=replace(rig.imu, time_offset_s=rig.imu.time_offset_s + self.time_offset_s))
+        gyro, accel = (
+            tuple(((np.eye(3) + error) @ matrix).ravel().tolist())
+            for error, matrix in zip(self.imu_matrices, rig.imu.matrices, strict=True)
+        )
+        time_offset_s = rig.imu.time_offset_s + self.time_offset_s
+        return replace(rig, imu=replace(rig.imu, time_offset_s=time_offset_s, gyro_matrix=gyro, accel_matrix=accel))
 
     @property
     def time_offset_s(self) -> float:

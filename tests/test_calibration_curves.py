@@ -91,3 +91,19 @@ def test_picture_shows_steps_where_the_calibration_changed(tmp_path: Path, has_i
     blue = [int((np.abs(each.astype(int) - (0xBF, 0x5F, 0x1F)).max(axis=2) < 12).sum()) for each in pictures]
     assert blue[0] > 300  # the first curve of each panel
     assert blue[1] > 1.05 * blue[0]  # with steps, which are vertical lines
+
+
+def test_estimate_joins_the_imus_matrices_to_those_of_the_file() -> None:
+    rig = default_rig()
+    assert rig.imu is not None
+    of_file = np.eye(3) + 0.01 * np.eye(3, k=1)
+    rig = replace(rig, imu=replace(rig.imu, gyro_matrix=tuple(of_file.ravel().tolist())))
+    names = parameter_names(rig)
+    difference = np.zeros(len(names))
+    difference[names.index("imu.gyro_matrix.yy")] = 0.02
+    difference[names.index("imu.accel_matrix.zx")] = 0.003
+    refined = estimate_of(rig, difference).rig
+    assert refined.imu is not None
+    gyro, accel = refined.imu.matrices
+    assert gyro == pytest.approx(np.diag([1.0, 1.02, 1.0]) @ of_file)
+    assert accel[2, 0] == pytest.approx(0.003)
