@@ -14,6 +14,9 @@ from graphvio.cli.shared import EXIT_INCOMPLETE, check_session_name, warn
 
 if TYPE_CHECKING:
     from graphvio.cli.services import Services
+    from graphvio.config import Config
+    from graphvio.live.calibration_memory import CalibrationMemory
+    from graphvio.live.running import LiveOdometry
     from graphvio.rig import Rig
     from graphvio.viewer import Viewer
 
@@ -34,6 +37,7 @@ def live(
     ] = False,
     health_port: options.HealthPort = None,
     duration: options.Duration = None,
+    forget_calibration: options.ForgetCalibration = False,
     verbose: options.Verbose = False,
 ) -> None:
     """Run the odometry on live sensors until they end, or Ctrl-C or SIGTERM, which leave a complete recording.
@@ -60,7 +64,7 @@ def live(
         raise typer.BadParameter("give a SOURCE, or --list to see the connected devices")
     run_live(
         source, rig, config, record=record, png=png, view=view, health_port=health_port, duration_s=duration,
-        services=Services() if serve else None,
+        forget_calibration=forget_calibration, services=Services() if serve else None,
     )  # fmt: skip
 
 
@@ -74,6 +78,7 @@ def run_live(
     view: bool,
     health_port: int | None,
     duration_s: float | None,
+    forget_calibration: bool,
     services: Services | None,
 ) -> None:
     """Open a source, run the odometry on it with recording, viewer and services, and save everything at the end."""
@@ -108,6 +113,9 @@ def run_live(
         stack.callback(opened.close)
         with sigterm_as_interrupt():  # nothing has to be saved yet
             used = opened.open()
+            memory = _memory(source, opened.name, used, settings, forget_calibration)
+            if memory is not None:
+                used = _remembered(memory, used)
             use_one_opencv_thread()
             warm_up(used, settings)  # measurements that come meanwhile are not used
         signals = stack.enter_context(StopSignals())
@@ -150,10 +158,49 @@ def run_live(
             raise failure
     typer.echo(line_of(figures))
     typer.echo(summary_of(figures))
+    if memory is not None and figures.get("status_tracking"):
+        _keep(memory, running)
     if recorder is not None and record is not None:
         is_whole = _print_recorded(record, recorder.status()) and is_whole
     if not is_whole:
         raise typer.Exit(EXIT_INCOMPLETE)
+
+
+def _memory(source: str, name: str, rig: Rig, settings: Config, forget_calibration: bool) -> CalibrationMemory | None:
+    """Return the memory of a source's calibration, emptied if it is to be, or None where none is kept."""
+    from graphvio.live.calibration_memory import CalibrationMemory, devices_of
+
+    devices = devices_of(source, name)
+    if devices is None or not settings.calibration.online:
+        return None
+    memory = CalibrationMemory(devices, rig)
+    if forget_calibration:
+        memory.forget()
+    return memory
+
+
+def _remembered(memory: CalibrationMemory, rig: Rig) -> Rig:
+    """Return the rig with what earlier runs learnt, or as it is."""
+    from graphvio.errors import RigError
+
+    try:
+        remembered = memory.recall()
+    except RigError as error:
+        warn(f"{error}: not used")
+        return rig
+    if remembered is None:
+        return rig
+    learnt = remembered.saved.strftime("%Y-%m-%d %H:%M")
+    typer.echo(f"calibration: as learnt by the run of {learnt}; --forget-calibration uses the rig file", err=True)
+    return remembered.rig
+
+
+def _keep(memory: CalibrationMemory, running: LiveOdometry) -> None:
+    try:
+        if memory.keep(running.odometry):
+            typer.echo(f"calibration: kept for the next run of {memory.name}")
+    except OSError as error:
+        warn(f"{memory.path}: what was learnt of the calibration cannot be kept ({error.strerror})")
 
 
 def _check_recording(path: Path) -> None:

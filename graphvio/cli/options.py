@@ -41,6 +41,10 @@ HealthPort = Annotated[
 Ros2Domain = Annotated[
     int | None, typer.Option("--ros2", help="Publish ROS 2 topics in this domain.", metavar="DOMAIN", min=0, max=232)
 ]
+ForgetCalibration = Annotated[
+    bool,
+    typer.Option("--forget-calibration", help="Use the rig file, and not what earlier runs learnt."),
+]
 Duration = Annotated[float | None, typer.Option("--for", help="Stop after so many seconds.", metavar="SECONDS")]
 WebPort = Annotated[
     int | None,

@@ -33,6 +33,7 @@ def serve(
     png: options.Png = False,
     health_port: options.HealthPort = None,
     duration: options.Duration = None,
+    forget_calibration: options.ForgetCalibration = False,
     verbose: options.Verbose = False,
 ) -> None:
     """Run the odometry on live sensors and serve estimates and keyframes by gRPC, ROS 2 topics and to browsers.
@@ -58,5 +59,6 @@ def serve(
         view=False,
         health_port=health_port,
         duration_s=duration,
+        forget_calibration=forget_calibration,
         services=Services(host, port, certificate, key, token_file, ros2, web),
     )

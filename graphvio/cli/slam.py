@@ -39,6 +39,7 @@ def slam(
     png: options.Png = False,
     health_port: options.HealthPort = None,
     duration: options.Duration = None,
+    forget_calibration: options.ForgetCalibration = False,
     verbose: options.Verbose = False,
 ) -> None:
     """Run the odometry with a small SLAM system in a process of its own, which corrects the pose in the map.
@@ -68,7 +69,7 @@ def slam(
     )
     run_live(
         source, rig, config, record=record, png=png, view=False, health_port=health_port, duration_s=duration,
-        services=services,
+        forget_calibration=forget_calibration, services=services,
     )  # fmt: skip
 
 

@@ -45,7 +45,7 @@ _MIN_LOG_BAYES_FACTORS = np.array([200.0, 30.0])
 _MAX_MEAN_INNOVATION = 3.0  # squared, of each parameter; 1 where all errors are as modelled
 _MIN_AGREEING = 3  # keyframes whose pairs agreed, from which contradictions are the scene's
 _MAX_REFUSED = 3  # full windows
-_WALK = 0.01  # in one second, as a share of the prior's standard deviations
+WALK = 0.01  # in one second, as a share of the prior's standard deviations
 _MAX_WALK_S = 10.0  # in a window
 _IMU_NOISE_FACTOR = 2.0  # on the stated densities, since biases walk within a window, too
 _MAX_IMU_GAP_NS = 50_000_000
@@ -280,7 +280,7 @@ def _agree(prior: Gaussian, posterior: Gaussian) -> bool:
 
 def _walk_per_second(file_covariance: Float, rig: Rig) -> Float:
     """Return the covariance (C, C) of what the calibration changes in one second, by heat and the like."""
-    walk = _WALK**2 * file_covariance
+    walk = WALK**2 * file_covariance
     if rig.imu is not None:
         at = PAIR * len(rig.pairs)
         biases = np.arange(at + GYRO_BIAS, at + GYRO_MATRIX)

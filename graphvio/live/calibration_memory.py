@@ -1,0 +1,139 @@
+"""What live runs learnt of the calibration of a rig, kept for the next run of the same devices.
+
+It is a rig file in the user's cache, ``calibrations/DEVICES.DIGEST.yaml``, with the time of its writing. The digest is
+that of the rig that the run was given: what was learnt for another rig file does not hold for this one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.calibration_sigmas import CalibrationSigmas
+from graphvio.errors import RigError
+from graphvio.kernels import cache_root
+from graphvio.odometry import Odometry
+from graphvio.reporting.files import replace_file
+from graphvio.rig import Rig
+from graphvio.rig_files import load_rig
+from graphvio.rig_files.native import to_text
+from graphvio.self_calibration.online import WALK
+
+_DIGITS = 12  # of the digest, in a file's name
+_WITHOUT_SERIALS = "rig"
+_NAMED_BY_SERIAL = ("realsense", "oak", "simulator")
+_NAMED_BY_RIG = ("v4l2", "ros2")
+
+
+class Remembered(NamedTuple):
+    """A calibration from memory.
+
+    Attributes:
+        rig: with the standard deviations that it has by now.
+        saved: when it was learnt, local time.
+    """
+
+    rig: Rig
+    saved: datetime
+
+
+class CalibrationMemory:
+    """The memory for one rig.
+
+    Args:
+        devices: name of the devices by their serial numbers, or an empty text where they have none.
+        rig: that the source was given, or the factory's.
+        folder: of all memories; None for the user's cache.
+    """
+
+    def __init__(self, devices: str, rig: Rig, folder: Path | None = None) -> None:
+        self._rig = rig
+        self._devices = devices
+        self._folder = cache_root() / "calibrations" if folder is None else folder
+        digest = hashlib.sha256(to_text(rig, Path("/")).encode()).hexdigest()[:_DIGITS]
+        self.path = self._folder / f"{devices or _WITHOUT_SERIALS}.{digest}.yaml"
+
+    @property
+    def name(self) -> str:
+        """What the memory is of, for messages."""
+        return self._devices or f"the rig {self._rig.name}"
+
+    def recall(self) -> Remembered | None:
+        """Return what was learnt, or None where nothing was for this rig.
+
+        Raises:
+            RigError: if what was learnt is of another rig file, or cannot be read.
+        """
+        if not self.path.exists():
+            if self._of_other_rigs():
+                raise RigError(f"the calibration remembered for {self.name} is of another rig file")
+            return None
+        rig, saved_s = load_rig(self.path), self.path.stat().st_mtime
+        passed_s = max(time.time() - saved_s, 0.0)
+        sigmas = widened(rig.calibration_sigmas, self._rig.calibration_sigmas, passed_s)
+        return Remembered(replace(rig, calibration_sigmas=sigmas), datetime.fromtimestamp(saved_s))
+
+    def keep(self, odometry: Odometry) -> bool:
+        """Keep what a run has learnt, if it has; returns whether it is kept.
+
+        Raises:
+            OSError: if it cannot be written; what was kept before is then unchanged.
+        """
+        refined = odometry.refined_rig
+        is_new = refined is not None and any(finding.is_observed for finding in odometry.calibration_findings)
+        if refined is None or not is_new or refined is self._rig:
+            return False
+        self._folder.mkdir(parents=True, exist_ok=True)
+        replace_file(self.path, to_text(refined, self.path.parent))
+        for other in self._of_other_rigs():
+            other.unlink(missing_ok=True)
+        return True
+
+    def forget(self) -> None:
+        """Remove what was learnt, for this rig file and for others.
+
+        Raises:
+            OSError: if it cannot be removed.
+        """
+        for path in (self.path, *self._of_other_rigs()):
+            path.unlink(missing_ok=True)
+
+    def _of_other_rigs(self) -> list[Path]:
+        """List what was learnt for the same devices with other rig files; without serial numbers nobody knows."""
+        if not self._devices:
+            return []
+        found = self._folder.glob("*.yaml") if self._folder.is_dir() else ()
+        return [path for path in found if path != self.path and path.name.rsplit(".", 2)[0] == self._devices]
+
+
+def devices_of(spec: str, source_name: str) -> str | None:
+    """Return the devices of a live source by their serial numbers, empty where they have none.
+
+    Args:
+        spec: text of the source on the command line.
+        source_name: of the source.
+
+    Returns:
+        The devices, or None for recordings: equal input gives equal output there.
+    """
+    kind = spec.partition(":")[0].partition("?")[0]
+    if kind in _NAMED_BY_SERIAL:
+        return source_name.replace(os.sep, "_")
+    return "" if kind in _NAMED_BY_RIG else None
+
+
+def widened(sigmas: CalibrationSigmas, of_file: CalibrationSigmas, passed_s: float) -> CalibrationSigmas:
+    """Return standard deviations after a time: the calibration walks, at most as far as the rig file may be wrong."""
+    return CalibrationSigmas(
+        **{
+            name: max(min(float(np.hypot(sigma, WALK * np.sqrt(passed_s) * limit)), limit), sigma)
+            for name, sigma, limit in ((name, getattr(sigmas, name), getattr(of_file, name)) for name in vars(of_file))
+        }
+    )
