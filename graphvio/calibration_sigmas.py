@@ -49,6 +49,11 @@ class CalibrationSigmas:
             if not np.isfinite(value) or value <= 0.0:
                 raise RigError(f"calibration_sigmas: {name} is {value}; give a positive standard deviation")
 
+    def epipolar_px(self, focal_px: float) -> float:
+        """Return the standard deviation by which epipolar lines are off near the middle of the image."""
+        turned = np.deg2rad(self.stereo_rotation_deg) * focal_px
+        return float(np.hypot(turned, np.sqrt(2.0) * self.principal_point_px))
+
     def scaled(self, factor: float) -> CalibrationSigmas:
         """Return all standard deviations times a factor."""
         return CalibrationSigmas(**{name: factor * value for name, value in vars(self).items()})

@@ -52,10 +52,12 @@ class StereoMatcher:
         self._config = config
         self._allowed = allowed_right
         self._packed_right = np.zeros(allowed_right.shape, dtype=np.uint32)
+        self._margin_px = 0.0  # by how much the calibration may move epipolar lines
 
-    def recalibrate(self, pair: StereoPair) -> None:
-        """Take another calibration of the cameras from now on."""
+    def recalibrate(self, pair: StereoPair, epipolar_margin_px: float) -> None:
+        """Take another calibration of the cameras from now on, whose epipolar lines may be off by a margin."""
         self._pair = pair
+        self._margin_px = epipolar_margin_px
 
     def match(
         self,
@@ -91,7 +93,7 @@ class StereoMatcher:
         points, covariances, errors = triangulate(
             rays, normalised, pair.right_T_left, pair.left.focal_px, pair.right.focal_px
         )
-        good = passes(good, errors <= settings.max_epipolar_px, "epipolar", rejected)
+        good = passes(good, errors <= settings.max_epipolar_px + self._margin_px, "epipolar", rejected)
         sigma = np.sqrt(covariances[:, 2, 2]) * self._config.motion.pixel_sigma_px
         in_range = (points[:, 2] <= 1.0 / settings.min_depth_m) & (points[:, 2] >= -3.0 * sigma)
         good = passes(good, in_range, "depth_range", rejected)
@@ -123,7 +125,7 @@ class StereoMatcher:
             left[0], right[0], self._packed_right, pixels, guess, directions, slopes, known, found, half
         )
         shift = np.hypot(matched[:, 0] - guess[:, 0], matched[:, 1] - guess[:, 1])
-        close = shift <= np.where(known, _SEARCH_MARGIN_PX, _MAX_REFINEMENT_PX)
+        close = shift <= np.where(known, _SEARCH_MARGIN_PX, _MAX_REFINEMENT_PX + self._margin_px)
         found = passes(found, converged & close, "alignment", rejected)
         found = passes(found, correlations >= settings.min_correlation, "appearance", rejected)
         # A match where motion and earlier depth predict it needs no other check.

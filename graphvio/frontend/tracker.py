@@ -93,10 +93,10 @@ class PairTracker:
         self._last = self._last.extended(replace(new, stage_ms=watch.stage_ms))
         return self._last
 
-    def recalibrate(self, pair: StereoPair) -> None:
-        """Take another calibration of the cameras from now on."""
+    def recalibrate(self, pair: StereoPair, epipolar_margin_px: float) -> None:
+        """Take another calibration of the cameras from now on, whose epipolar lines may be off by a margin."""
         self._pair = pair
-        self._matcher.recalibrate(pair)
+        self._matcher.recalibrate(pair, epipolar_margin_px)
         self._patches.recalibrate(pair)
         self._last = self._last.recalibrated(pair)
 

@@ -121,16 +121,20 @@ class VisualFrontend:
         for tracker in self._trackers:
             tracker.limit_corners(share)
 
-    def recalibrate(self, rig: Rig) -> None:
+    def recalibrate(self, rig: Rig, epipolar_margin_px: float) -> None:
         """Take another calibration of the same cameras from the next frameset on.
 
         Points of the references are triangulated again, so that a motion is measured with one calibration.
+
+        Args:
+            rig: with the calibration.
+            epipolar_margin_px: by how much it may move epipolar lines, added to what matches may be off.
         """
         self._rig = rig
         self._arrays = RigArrays.of(rig)
         self._baselines_m = [pair.baseline_m for pair in rig.pairs]
         for tracker, pair in zip(self._trackers, rig.pairs, strict=True):
-            tracker.recalibrate(pair)
+            tracker.recalibrate(pair, epipolar_margin_px)
         self._references.recalibrate(rig)
         self._latest = {j: frame.recalibrated(rig.pairs[j]) for j, frame in self._latest.items()}
 

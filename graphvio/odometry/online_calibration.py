@@ -19,6 +19,8 @@ from graphvio.self_calibration.imu_correction import ImuCorrection
 from graphvio.self_calibration.online import SelfCalibration
 from graphvio.self_calibration.window import View
 
+_MARGIN_SIGMAS = 3.0  # of epipolar lines by the rig file
+_MAX_MARGIN_PX = 5.0  # farther off, patches are not registered
 _AVERAGED = 100  # samples, whose mean specific force is about that of gravity
 
 
@@ -48,6 +50,10 @@ class OnlineCalibration:
         # Tracks that are followed from frame to frame drift, all alike, and would be taken for an error of the cameras.
         is_possible = config.motion.reference == "keyframe"
         self._calibration = SelfCalibration(rig) if config.calibration.online and is_possible else None
+        self._margin_px = 0.0
+        if self._calibration is not None:
+            self._margin_px = self._epipolar_margin_px()
+            frontend.recalibrate(rig, self._margin_px)
 
     @property
     def estimate(self) -> CalibrationEstimate | None:
@@ -78,8 +84,10 @@ class OnlineCalibration:
             self._report(
                 stamp_ns, EventKind.CALIBRATION_CHANGED, "the images contradict what was known: it is estimated again"
             )
-        if not has_changed:
+        margin_px = self._epipolar_margin_px()
+        if not has_changed and margin_px == self._margin_px:
             return
+        self._margin_px = margin_px
         estimate = self._calibration.estimate
         if not estimate.is_file_exact and not self._is_reported:
             self._is_reported = True
@@ -93,13 +101,21 @@ class OnlineCalibration:
             if finding.is_significant and " against " in finding.part and finding.part not in self._reported:
                 self._reported.add(finding.part)
                 self._report(stamp_ns, EventKind.EXTRINSICS_OFF, f"{finding}; corrected for this run")
-        self._frontend.recalibrate(estimate.rig)
+        self._frontend.recalibrate(estimate.rig, margin_px)
         if self._rig.imu is None:
             return
         self._synchroniser.imu_correction = ImuCorrection(*estimate.imu_matrices, self._mean_force)
         if self._corrects_time_offset:
             wanted_s = self._rig.imu.time_offset_s + estimate.time_offset_s
             self._synchroniser.shift_imu(wanted_s - self._synchroniser.time_offset_s)
+
+    def _epipolar_margin_px(self) -> float:
+        """Return by how much epipolar lines may be off: by the rig file's errors until these are estimated."""
+        assert self._calibration is not None
+        if self._calibration.is_trusted:
+            return 0.0
+        sigma_px = max(self._rig.calibration_sigmas.epipolar_px(pair.left.focal_px) for pair in self._rig.pairs)
+        return min(_MARGIN_SIGMAS * sigma_px, _MAX_MARGIN_PX)
 
     def add(self, estimate: Estimate) -> None:
         """Take a frameset's estimate, and the tracks that belong to it."""

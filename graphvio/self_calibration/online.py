@@ -121,14 +121,11 @@ class SelfCalibration:
             are_contradicting: whether the pairs' motions contradict each other. It is the calibration if they always
                 did, and the scene if they once agreed.
         """
-        if not self._is_keyframe(stamp_ns, views) or (are_contradicting and self._trusts_calibration):
+        if not self._is_keyframe(stamp_ns, views) or (are_contradicting and self.is_trusted):
             return
         self._agreeing += not are_contradicting
         self._last = Keyframe(stamp_ns, odom_T_body, views)
         self._keyframes.append(self._last)
-        sizes = [size for size in _ADJUSTED_AT[self._is_later] if size > self._adjusted_at]
-        if self._pending is None and len(self._keyframes) >= sizes[0]:
-            self._begin_adjustment()
 
     def update(self) -> bool:
         """Take the result that comes into force with this frameset, if there is one.
@@ -137,7 +134,12 @@ class SelfCalibration:
             Whether the calibration in force has changed.
         """
         self._due_in -= 1
-        if self._pending is None or self._due_in > 0:
+        if self._pending is None:
+            sizes = [size for size in _ADJUSTED_AT[self._is_later] if size > self._adjusted_at]
+            if len(self._keyframes) >= sizes[0]:
+                self._begin_adjustment()  # the IMU has by now covered the last keyframe, whatever its time offset
+            return False
+        if self._due_in > 0:
             return False
         adjusted, self._pending = self._pending.result(), None
         prior, solution, evidence, is_full = adjusted.prior, adjusted.solution, adjusted.evidence, adjusted.is_full
@@ -157,7 +159,8 @@ class SelfCalibration:
         return not (was_exact and self.estimate.is_file_exact)
 
     @property
-    def _trusts_calibration(self) -> bool:
+    def is_trusted(self) -> bool:
+        """Whether pairs that contradict each other are the scene's fault, and no longer the calibration's."""
         if self.has_full_window:
             return True
         return self.estimate.is_file_exact and self._agreeing >= _MIN_AGREEING

@@ -104,7 +104,8 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
         found = Eliminated.empty(window.tracks)
         damping = max(0.1 * damping, 1e-9)
         new = _linearise(window, moved, first, nominal, changed, prior, damping, found)
-        if new.cost <= at.cost:
+        loses_intervals = bool((np.isnan(new.imu_errors2) & ~np.isnan(at.imu_errors2)).any())
+        if new.cost <= at.cost and not loses_intervals:
             states, difference, at = moved, changed, new
             if np.abs(step[calibration] / sigmas).max() < _CONVERGED:
                 break
