@@ -28,9 +28,9 @@ from graphvio.self_calibration.solver import GRAVITY_M_S2, Solution, States, Win
 from graphvio.self_calibration.window import Keyframe, View, choose_tracks, median_displacement_px
 
 _WINDOW = 16  # keyframes
-_ADJUSTED_AT = ((1, 3, 6, 10, _WINDOW), (_WINDOW // 2, _WINDOW))  # keyframes, in the first window and later
-_INTERVALS_S = (0.1, 0.25)  # at least, between keyframes, in the first window and later
-_DELAYS_FRAMESETS = (2, 8)  # until a result comes into force, in the first window and later
+_ADJUSTED_AT = ((1, 3, 6, 10, _WINDOW), (5, 10, _WINDOW), (5, 10, _WINDOW), (_WINDOW // 2, _WINDOW))
+_INTERVALS_S = (0.1, 0.1, 0.15, 0.25)
+_DELAYS_FRAMESETS = (2, 4, 4, 8)
 _MIN_DISPLACEMENT_PX = (
     8.0  # median of a pair's tracks since the keyframe before: at a standstill there are no keyframes
 )
@@ -40,7 +40,7 @@ _MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: observations of one track are correlated
 _MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
 _RAYLEIGH_MEDIAN = 1.1774  # of the norm of two standard normal variables
-_MIN_LOG_BAYES_FACTORS = np.array([200.0, 30.0])
+_MIN_LOG_BAYES_FACTORS = np.array([30.0, 10.0])
 """Against exact files, of cameras and of places. Cameras that are not exact reach hundreds with the first image."""
 _MAX_MEAN_INNOVATION = 3.0  # squared, of each parameter; 1 where all errors are as modelled
 _MIN_AGREEING = 3  # keyframes whose pairs agreed, from which contradictions are the scene's
@@ -190,7 +190,7 @@ class SelfCalibration:
         self._due_in = _DELAYS_FRAMESETS[self._is_later]
         self._adjusted_at = len(window)
         if is_full := len(window) >= _WINDOW:
-            self._keyframes, self._adjusted_at, self._is_later = [], 0, 1
+            self._keyframes, self._adjusted_at, self._is_later = [], 0, min(self._is_later + 1, 3)
             duration_s = min((window[-1].stamp_ns - window[0].stamp_ns) * 1e-9, _MAX_WALK_S)
             self._evidence = self._evidence.forgotten(duration_s * self._walk)
         prior = self._evidence.given(self._prior, _assumed(self.estimate.file_factors))
