@@ -1,5 +1,6 @@
 """One pair's tracks, on images of a textured wall that faces the cameras: where each point goes is known."""
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -265,6 +266,21 @@ def test_match_of_no_corner_in_the_right_image_is_rejected() -> None:
         assert matches.good.sum() + sum(matches.rejected.values()) == n
     assert rejected[0] < 0.15 * n
     assert rejected[1] > 2 * rejected[0]
+
+
+def test_match_margin_finds_matches_beside_wrong_epipolar_lines() -> None:
+    pair, images = rectified(), views(np.eye(4))
+    lower = replace(pair.right, intrinsics=pair.right.intrinsics + np.array([0.0, 0.0, 0.0, 2.0]))
+    exact = PairTracker(pair, Config()).observe(0, *images, None, None)
+    tracker = PairTracker(pair, Config())
+    tracker.recalibrate(replace(pair, right=lower), 0.0)
+    strict = tracker.observe(0, *images, None, None)
+    tracker.recalibrate(replace(pair, right=lower), 3.0)
+    wide = tracker.observe(1, *images, None, None)
+    assert strict.has_depth.mean() < 0.1
+    assert wide.has_depth.mean() > 0.7 * exact.has_depth.mean()
+    off_px = wide.pixels - np.array([DISPARITY, 0.0]) - wide.right_pixels
+    assert np.median(np.abs(off_px[wide.has_depth])) < 0.1
 
 
 # ------------------------------------------------------------------ low light

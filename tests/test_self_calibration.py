@@ -20,9 +20,13 @@ from graphvio.self_calibration.bundle import _ERROR_AT as ERROR_AT
 from graphvio.self_calibration.bundle import Eliminated, Tracks, _observe, eliminate_landmarks, total_cost
 from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
 from graphvio.self_calibration.findings import described
+from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.linear import eliminated, solve_symmetric
 from graphvio.self_calibration.online import SelfCalibration
-from graphvio.self_calibration.parameters import BODY, PAIR, STEREO, RigCalibration
+from graphvio.self_calibration.parameters import BODY, PAIR, STEREO, RigCalibration, parameter_names
+from graphvio.self_calibration.prior import file_prior
+from graphvio.self_calibration.solver import GRAVITY_M_S2, States, Window, solve
+from graphvio.self_calibration.window import Keyframe, choose_tracks
 from graphvio.simulation.calibration_error import CalibrationError, draw
 from graphvio.simulation.default_rig import default_rig
 
@@ -203,7 +207,7 @@ def test_self_calibration_in_a_walk_finds_what_the_cameras_show(level: int) -> N
     assert found.file_factors[0] == pytest.approx({1: 0.3, 2: 1.0, 3: 3.0}[level], rel=0.7)
     for pair, exact in zip(found.rig.pairs, true.pairs, strict=True):
         off = so3_log(np.ascontiguousarray(pair.right_T_left[:3, :3] @ exact.right_T_left[:3, :3].T))
-        assert np.rad2deg(np.abs(off)).max() < 0.005
+        assert np.rad2deg(np.abs(off)).max() < {1: 0.005, 2: 0.01, 3: 0.02}[level]  # sigmas are a third to a half of it
         assert pair.left.intrinsics[:2] == pytest.approx(exact.left.intrinsics[:2], rel=5e-4)
     p_12 = found.rig.left2_T_left1() @ np.linalg.inv(true.left2_T_left1())
     assert np.rad2deg(np.linalg.norm(so3_log(np.ascontiguousarray(p_12[:3, :3])))) < 0.03
@@ -269,6 +273,30 @@ def test_self_calibration_with_imu_finds_time_offset_and_cameras_in_body() -> No
         return float(np.rad2deg(np.linalg.norm(so3_log(np.ascontiguousarray(body_T_cam[:3, :3] @ true[:3, :3].T)))))
 
     assert angle_deg(after) < 0.3 * angle_deg(before)
+
+
+def test_solve_late_clock_does_not_drop_intervals_that_the_samples_cover() -> None:
+    # Samples end with the last keyframe, but the clock's offset would need later ones.
+    rig = default_rig()
+    walk, nominal = Walk(rig), RigCalibration.of(rig)
+    framesets = list(walk.framesets(3.2))
+    keyframes = tuple(Keyframe(*framesets[k]) for k in (20, 22, 60))
+    late = [replace(sample, stamp_ns=sample.stamp_ns + 20_000_000) for sample in walk.samples(3.2)]
+    seen = [sample for sample in late if sample.stamp_ns <= keyframes[-1].stamp_ns]
+    samples = InertialSamples(
+        np.array([sample.stamp_ns for sample in seen]),
+        np.array([[*sample.angular_velocity, *sample.linear_acceleration] for sample in seen]),
+        np.array([keyframe.stamp_ns for keyframe in keyframes]),
+        np.array([1e-4, 1e-3]),
+        50_000_000,
+    )
+    poses = np.array([keyframe.odom_T_body for keyframe in keyframes])
+    tracks, landmarks = choose_tracks(keyframes, poses, nominal, 150)
+    velocities = np.zeros((3, 3))
+    states = States(poses, velocities, np.array([0.0, 0.0, -GRAVITY_M_S2]), landmarks)
+    prior = Evidence.none(len(parameter_names(rig))).given(file_prior(rig), np.full(2, 5.0))
+    solution = solve(Window(tracks, 0.15, samples), states, nominal, prior.mean, prior)
+    assert np.isfinite(solution.imu_errors2).all()
 
 
 # ---------------------------------------------------------------- what users see

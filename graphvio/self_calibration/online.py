@@ -28,9 +28,6 @@ from graphvio.self_calibration.solver import GRAVITY_M_S2, Solution, States, Win
 from graphvio.self_calibration.window import Keyframe, View, choose_tracks, median_displacement_px
 
 _WINDOW = 16  # keyframes
-_ADJUSTED_AT = ((1, 3, 6, 10, _WINDOW), (5, 10, _WINDOW), (5, 10, _WINDOW), (_WINDOW // 2, _WINDOW))
-_INTERVALS_S = (0.1, 0.1, 0.15, 0.25)
-_DELAYS_FRAMESETS = (2, 4, 4, 8)
 _MIN_DISPLACEMENT_PX = (
     8.0  # median of a pair's tracks since the keyframe before: at a standstill there are no keyframes
 )
@@ -40,7 +37,7 @@ _MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show
 _NOISE_FACTOR = 2.0  # on the noise that residuals show: observations of one track are correlated
 _MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
 _RAYLEIGH_MEDIAN = 1.1774  # of the norm of two standard normal variables
-_MIN_LOG_BAYES_FACTORS = np.array([30.0, 10.0])
+_MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])
 """Against exact files, of cameras and of places. Cameras that are not exact reach hundreds with the first image."""
 _MAX_MEAN_INNOVATION = 3.0  # squared, of each parameter; 1 where all errors are as modelled
 _MIN_AGREEING = 3  # keyframes whose pairs agreed, from which contradictions are the scene's
@@ -51,6 +48,23 @@ _IMU_NOISE_FACTOR = 2.0  # on the stated densities, since biases walk within a w
 _MAX_IMU_GAP_NS = 50_000_000
 _MAX_IMU_ERROR2 = 100.0  # squared whitened error of an interval, of 9 dimensions
 _MARGIN_NS = 50_000_000  # of IMU samples before a window
+
+
+class _Pace(NamedTuple):
+    """How a window is collected and adjusted: the first ones quickly, since the rig file may be far off."""
+
+    adjusted_at: tuple[int, ...]  # keyframes
+    interval_s: float  # at least, between keyframes
+    delay_framesets: int  # until a result comes into force
+
+
+_PACES = (
+    _Pace((1, 3, 6, 10, _WINDOW), 0.1, 2),
+    _Pace((5, 10, _WINDOW), 0.1, 4),
+    _Pace((5, 10, _WINDOW), 0.15, 4),
+    _Pace((8, _WINDOW), 0.25, 8),
+)
+"""Of the first windows; the last one is that of all later ones."""
 
 
 class _Adjusted(NamedTuple):
@@ -91,7 +105,7 @@ class SelfCalibration:
         self._samples: deque[ImuSample] = deque()
         self._keyframes: list[Keyframe] = []
         self._last: Keyframe | None = None
-        self._is_later = 0  # 1 after the first window
+        self._full_windows = 0
         self._adjusted_at = 0  # keyframes of this window
         self._pending: Future[_Adjusted] | None = None
         self._due_in = 0  # framesets
@@ -135,8 +149,7 @@ class SelfCalibration:
         """
         self._due_in -= 1
         if self._pending is None:
-            sizes = [size for size in _ADJUSTED_AT[self._is_later] if size > self._adjusted_at]
-            if len(self._keyframes) >= sizes[0]:
+            if len(self._keyframes) >= min(size for size in self._pace.adjusted_at if size > self._adjusted_at):
                 self._begin_adjustment()  # the IMU has by now covered the last keyframe, whatever its time offset
             return False
         if self._due_in > 0:
@@ -165,6 +178,10 @@ class SelfCalibration:
             return True
         return self.estimate.is_file_exact and self._agreeing >= _MIN_AGREEING
 
+    @property
+    def _pace(self) -> _Pace:
+        return _PACES[min(self._full_windows, len(_PACES) - 1)]
+
     def _refuse(self, is_full: bool) -> None:
         """Leave a window out that contradicts those before it; after several, these are forgotten: it was a knock."""
         self._refused += is_full
@@ -177,7 +194,7 @@ class SelfCalibration:
         last = self._last
         if last is None or not views:
             return bool(views)
-        if (stamp_ns - last.stamp_ns) * 1e-9 < _INTERVALS_S[self._is_later] - 1e-3:
+        if (stamp_ns - last.stamp_ns) * 1e-9 < self._pace.interval_s - 1e-3:
             return False
         common = views.keys() & last.views.keys()
         return not common or any(
@@ -187,10 +204,10 @@ class SelfCalibration:
     def _begin_adjustment(self) -> None:
         """Adjust the window as it is now; a full one is followed by a new one."""
         window = tuple(self._keyframes)
-        self._due_in = _DELAYS_FRAMESETS[self._is_later]
+        self._due_in = self._pace.delay_framesets
         self._adjusted_at = len(window)
         if is_full := len(window) >= _WINDOW:
-            self._keyframes, self._adjusted_at, self._is_later = [], 0, min(self._is_later + 1, 3)
+            self._keyframes, self._adjusted_at, self._full_windows = [], 0, self._full_windows + 1
             duration_s = min((window[-1].stamp_ns - window[0].stamp_ns) * 1e-9, _MAX_WALK_S)
             self._evidence = self._evidence.forgotten(duration_s * self._walk)
         prior = self._evidence.given(self._prior, _assumed(self.estimate.file_factors))
