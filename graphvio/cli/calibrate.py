@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -28,6 +29,9 @@ def calibrate(
         typer.Option("--out", help="Write the corrected rig here (.yaml), and all numbers next to it.", metavar="FILE"),
     ] = None,
     report: options.ReportFolder = None,
+    what: Annotated[
+        str, typer.Option("--what", help="What to calibrate: pairs, stereo, cameras, imu or all.", metavar="WHAT")
+    ] = "pairs",
     correct_imu: Annotated[
         bool, typer.Option("--correct-imu", help="Also correct the rotation against the IMU and the time offset.")
     ] = False,
@@ -43,11 +47,17 @@ def calibrate(
     seed: options.Seed = 0,
     verbose: options.Verbose = False,
 ) -> None:
-    """Find where a rig's stereo pairs are relative to each other, from a recording; they need not share a view.
+    """Calibrate a rig from a recording of its motion: where its stereo pairs are, or all of its parameters.
 
-    Turn the rig about two axes while you walk, in a place with texture; half a minute is enough. The rig file must be
+    Turn the rig about two axes while you walk, in a place with texture; half a minute is enough.
+
+    --what pairs finds where the pairs are relative to each other, which need not share a view. The rig file must be
     right about each pair's own two cameras; where it has the pairs does not matter. Each pair is also compared with the
     IMU, if there is one.
+
+    --what all finds everything, from a rig file that is about right: cameras (focal lengths, principal points,
+    distortion), stereo (left to right), imu (cameras to IMU, time offset, scale), and pairs. With cameras, stereo or
+    imu all else is kept as in the rig file, which must be right about it.
 
     Ends with exit code 0; with 2 where nothing can be determined; with 3 where the motions determine a part only.
 
@@ -56,9 +66,12 @@ def calibrate(
         graphvio calibrate walk --out rig-calibrated.yaml --report calibration
 
         graphvio calibrate walk --rig rig.yaml --guide
+
+        graphvio calibrate walk --what all --out rig-calibrated.yaml --report calibration
     """
     from graphvio.calibration.calibrate import calibrate_pairs
     from graphvio.calibration.report.document import write_document
+    from graphvio.cli.calibrate_rig import calibrate_rig
     from graphvio.cli.calibration_progress import CalibrationProgress
     from graphvio.config import Config
     from graphvio.errors import CalibrationError
@@ -67,8 +80,12 @@ def calibrate(
     from graphvio.warmup import warm_up
 
     _check_outputs(out, report, [] if rig is None else [rig])
+    is_of_pairs = _is_of_pairs(what, {"--correct-imu": correct_imu, "--guide": guide, "--scale": scale != "auto"})
     settings = Config.load(config)
     opened = open_recording(source, rig, settings, pairs=pairs, from_s=from_s, to_s=to_s, topics=topics)
+    if not is_of_pairs:
+        calibrate_rig(opened, settings, what, out, report)
+        return
     if correct_imu and (out is None or opened.rig.imu is None):
         raise CalibrationError("--correct-imu wants --out FILE to write the rig to, and a recording with an IMU")
     mode = _scale_mode(scale)
@@ -132,6 +149,21 @@ def calibrate_trajectories(
         _write_report(found, report, ", ".join(names), len(read[0]))
     if not found.is_complete:
         raise typer.Exit(EXIT_INCOMPLETE)
+
+
+def _is_of_pairs(what: str, given: Mapping[str, bool]) -> bool:
+    """Return whether only the pairs are calibrated, by their motions, for which there are options of its own."""
+    from graphvio.errors import CalibrationError, ConfigError
+    from graphvio.odometry.recorded_calibration import GROUPS
+
+    if what == "pairs":
+        return True
+    if what not in GROUPS:
+        raise ConfigError(f"--what {what}: give one of pairs, {', '.join(GROUPS)}")
+    for name, is_given in given.items():
+        if is_given:
+            raise CalibrationError(f"{name} is for --what pairs; leave it out with --what {what}")
+    return False
 
 
 def _working(text: str) -> AbstractContextManager[object]:

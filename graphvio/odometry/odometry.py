@@ -33,6 +33,7 @@ from graphvio.odometry.vision_events import VisionEvents
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import Finding
+from graphvio.self_calibration.online import FullWindow
 from graphvio.timing import timed
 
 
@@ -193,6 +194,10 @@ class Odometry:
         """The rig with the calibration as it is known now, or None where the calibration is not estimated."""
         estimate = self._calibration.estimate
         return None if estimate is None else estimate.rig
+
+    def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
+        """Register a function that gets the measurements of each full window of the self-calibration."""
+        self._calibration.on_full_window(on_window)
 
     def limit_corners(self, share: float) -> None:
         """Follow fewer corners from now on, where real time demands it; from the thread that calls `process`.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from graphvio.arrays import Float
@@ -16,7 +18,7 @@ from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import Finding
 from graphvio.self_calibration.imu_correction import ImuCorrection
-from graphvio.self_calibration.online import SelfCalibration
+from graphvio.self_calibration.online import FullWindow, SelfCalibration
 from graphvio.self_calibration.window import View
 
 _MARGIN_SIGMAS = 3.0  # of epipolar lines by the rig file
@@ -64,6 +66,11 @@ class OnlineCalibration:
     def findings(self) -> list[Finding]:
         """What is known of each part of the calibration; empty where it is not estimated."""
         return [] if self._calibration is None else self._calibration.findings()
+
+    def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
+        """Register a function that gets each full window; where the calibration is not estimated there are none."""
+        if self._calibration is not None:
+            self._calibration.on_full_window = on_window
 
     def add_sample(self, sample: ImuSample) -> None:
         """Take an IMU sample as it was measured."""

@@ -17,7 +17,8 @@ _FIVE_SIGMA = 5.7e-7  # probability of a normal variable beyond 5 standard devia
 _OBSERVED = 0.5  # of the prior's standard deviation
 _TURN = "turn about two axes near textured surfaces"
 _DEPTHS = "walk past things at many distances, and let them move across the image"
-_SCALE = "accelerate: walk briskly with turns, or shake the rig"
+SCALE_MOTION = "accelerate: walk briskly with turns, or shake the rig"
+"""What shows lengths; a good rig file knows them better than most recordings do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +101,7 @@ def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Flo
         stereo, body = at + STEREO, at + BODY
         name = f"pair {pair.name}"
         yield f"{name}, rotation left to right", "deg", deg, whole[stereo : stereo + 3], 0.005, _DEPTHS
-        yield f"{name}, translation left to right", "mm", 1e3, whole[stereo + 3 : body], 0.1, _SCALE
+        yield f"{name}, translation left to right", "mm", 1e3, whole[stereo + 3 : body], 0.1, SCALE_MOTION
         if j > 0:
             first = whole[BODY:PAIR]
             relative = whole[body : body + 6] - first
@@ -113,4 +114,4 @@ def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Flo
     yield "cameras to IMU, translation", "mm", 1e3, whole[BODY + 3 : PAIR], 3.0, _TURN
     yield "IMU, time offset", "ms", 1e3, whole[at + TIME_OFFSET : at + TIME_OFFSET + 1], 0.2, _TURN
     yield "IMU, gyro's scale", "%", 100.0, whole[at + GYRO_MATRIX : at + ACCEL_MATRIX : 4], 0.1, _TURN
-    yield "IMU, accelerometer's scale", "%", 100.0, whole[at + ACCEL_MATRIX : at + TIME_OFFSET : 4], 0.1, _SCALE
+    yield "IMU, accelerometer's scale", "%", 100.0, whole[at + ACCEL_MATRIX : at + TIME_OFFSET : 4], 0.1, SCALE_MOTION

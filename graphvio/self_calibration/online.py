@@ -8,7 +8,7 @@ comes into force a fixed number of framesets after its adjustment began, so that
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -67,6 +67,20 @@ _PACES = (
 """Of the first windows; the last one is that of all later ones."""
 
 
+class FullWindow(NamedTuple):
+    """Measurements of a window that is full.
+
+    Attributes:
+        keyframes: in time order.
+        samples: of the IMU, or None.
+        sigma_px: noise of a corner's position, as it is known from the windows before.
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    samples: InertialSamples | None
+    sigma_px: float
+
+
 class _Adjusted(NamedTuple):
     prior: Gaussian
     solution: Solution
@@ -85,6 +99,7 @@ class SelfCalibration:
         estimate: what is known now.
         has_full_window: whether it is based on a full window at least.
         restarts: how often what was known has been forgotten, since later windows contradicted it.
+        on_full_window: called with each window that is full, before it is adjusted.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -99,6 +114,7 @@ class SelfCalibration:
         self.estimate = CalibrationEstimate(rig, posterior, np.zeros_like(posterior.mean), exact)
         self.has_full_window = False
         self.restarts = 0
+        self.on_full_window: Callable[[FullWindow], None] = lambda _: None
         self._agreeing = 0  # keyframes
         self._refused = 0  # full windows, one after the other
         self._sigma_px = _FIRST_SIGMA_PX
@@ -212,6 +228,8 @@ class SelfCalibration:
             self._evidence = self._evidence.forgotten(duration_s * self._walk)
         prior = self._evidence.given(self._prior, _assumed(self.estimate.file_factors))
         samples, difference = self._samples_of(window), self.estimate.posterior.mean
+        if is_full:
+            self.on_full_window(FullWindow(window, samples, self._sigma_px))
         self._pending = self._worker.submit(self._adjust, window, samples, difference, prior, is_full)
 
     def _adjust(

@@ -1,0 +1,82 @@
+"""What ``graphvio calibrate --what`` does for all but the pairs: the whole rig, or some of its parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, stage_bars, warn
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from graphvio.config import Config
+    from graphvio.odometry.recorded_calibration import RecordedCalibration
+    from graphvio.sources import Source
+
+
+def calibrate_rig(opened: Source, settings: Config, what: str, out: Path | None, report: Path | None) -> None:
+    """Calibrate the rig of a recording, print the result, and write what is asked for."""
+    from graphvio.calibration.report.rig_page import write_rig_report
+    from graphvio.odometry.recorded_calibration import calibrate_recording
+    from graphvio.rig_files import save_rig
+    from graphvio.runtime import interruptible, use_one_opencv_thread
+    from graphvio.warmup import warm_up
+
+    use_one_opencv_thread()
+    warm_up(opened.rig, settings)
+    try:
+        with interruptible(), stage_bars() as bars:
+            show = show_stages(bars, {"odometry": opened.frameset_count})
+            found = calibrate_recording(opened, opened.rig, what, settings, show)
+    except KeyboardInterrupt:
+        warn("interrupted; nothing is written")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    _print(found)
+    if not found.is_consistent:
+        warn(
+            f"{out or 'the rig'} is not written: the halves contradict each other, so what is kept as in the file is "
+            "wrong, too; calibrate with --what all"
+        )
+    elif out is not None:
+        save_rig(found.rig, out)
+        typer.echo(f"wrote {out}")
+    if report is not None:
+        typer.echo(f"report: {write_rig_report(found, report, opened.name)}")
+    if not (found.is_complete and found.is_consistent):
+        raise typer.Exit(EXIT_INCOMPLETE)
+
+
+def show_stages(bars: Progress, totals: dict[str, int]) -> Callable[[str, int, int], None]:
+    """Return a function that shows how far a stage is, in a bar of its own; totals may be known beforehand."""
+    tasks: dict[str, TaskID] = {}
+
+    def show(stage: str, done: int, total: int) -> None:
+        total = totals.get(stage, total)
+        if stage not in tasks:
+            tasks[stage] = bars.add_task(stage, total=total)
+        bars.update(tasks[stage], completed=done, total=total)
+
+    return show
+
+
+def _print(found: RecordedCalibration) -> None:
+    from graphvio.calibration.report.rig_page import HEAD, agreement_in_words, doubts_of, rows_of
+
+    rows = [HEAD, *rows_of(found)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(HEAD))]
+    for row in rows:
+        cells = [cell.rjust(width) for cell, width in zip(row[1:-1], widths[1:-1], strict=True)]
+        typer.echo("  ".join([row[0].ljust(widths[0]), *cells, row[-1]]).rstrip())
+    agreements = found.agreements
+    if agreements:
+        worst = max(agreements, key=lambda each: each.statistic / each.dimension)
+        good = sum(each.is_good for each in agreements)
+        typer.echo(
+            f"first half against second: {good} of {len(agreements)} groups agree; worst: {agreement_in_words(worst)}"
+        )
+    for doubt in doubts_of(found):
+        warn(doubt)

@@ -1,0 +1,234 @@
+"""Calibration of a rig from a whole recording, by its self-calibration, with a check of one half by the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import groupby
+
+import numpy as np
+from scipy.special import chdtrc
+
+from graphvio.arrays import Float
+from graphvio.calibration_sigmas import CalibrationSigmas
+from graphvio.config import Config
+from graphvio.config.stages import CalibrationConfig
+from graphvio.errors import CalibrationError
+from graphvio.measurements.sensors import FrameSet, Measurement
+from graphvio.odometry.odometry import Odometry
+from graphvio.rig import Rig
+from graphvio.self_calibration.batch import Batch, calibrate_windows, difference_of
+from graphvio.self_calibration.curves import Curve, curves_of
+from graphvio.self_calibration.evidence import FilePrior
+from graphvio.self_calibration.findings import SCALE_MOTION, Finding, findings
+from graphvio.self_calibration.online import FullWindow
+from graphvio.self_calibration.parameters import RigCalibration
+from graphvio.self_calibration.prior import file_prior
+
+_CAMERAS = ("focal_share", "principal_point_px", "distortion_share")
+_STEREO = ("stereo_rotation_deg", "stereo_baseline_share")
+_IMU = ("body_rotation_deg", "body_translation_m", "time_offset_s", "imu_scale_share", "imu_misalignment_deg")
+GROUPS: dict[str, tuple[str, ...]] = {
+    "cameras": _CAMERAS, "stereo": _STEREO, "imu": _IMU, "all": tuple(vars(CalibrationSigmas())),
+}  # fmt: skip
+"""What can be calibrated -> the standard deviations of its parameters, see `CalibrationSigmas`."""
+_FIXED = {"cameras": _STEREO, "stereo": _CAMERAS, "imu": _CAMERAS + _STEREO, "all": ()}
+"""What is fixed meanwhile. Where pairs and IMU are is estimated along: wrong places would be taken for cameras."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with the stage, how much of it is done, and how much there is."""
+
+_FIXED_SHARE = 1e-3  # of the standard deviations, for what is kept as in the file
+_MIN_WINDOWS = 2
+_MIN_OF_HALVES = 4
+_CHANCE = 1e-3  # by which halves that agree are said not to
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well two halves of a recording agree in one group of parameters.
+
+    Attributes:
+        group: as in `graphvio.self_calibration.curves`.
+        statistic: squared Mahalanobis distance, about as large as ``dimension`` where they agree.
+        dimension: number of parameters.
+        size: largest difference, in ``unit``.
+        unit: of it.
+    """
+
+    group: str
+    statistic: float
+    dimension: int
+    size: float
+    unit: str
+
+    @property
+    def is_good(self) -> bool:
+        """Whether chance explains the difference."""
+        return bool(chdtrc(self.dimension, self.statistic) > _CHANCE)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedCalibration:
+    """A rig's calibration from a recording.
+
+    Attributes:
+        what: one of `GROUPS`.
+        file_rig: of the rig file.
+        batch: what all windows say.
+        halves: what the windows of the first and of the second half say, or None for a short recording.
+        end_ns: stamp of the last frameset.
+        all_findings: what is known of all parts where none is kept as in the file.
+    """
+
+    what: str
+    file_rig: Rig
+    batch: Batch
+    halves: tuple[Batch, Batch] | None
+    end_ns: int
+    all_findings: list[Finding]
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The calibrated rig with its standard deviations; what was not calibrated is as in the file."""
+        refined = self.batch.estimate.rig
+        if self.what == "all":
+            return refined
+        of_file, found = RigCalibration.of(self.file_rig), RigCalibration.of(refined)
+        if self.what == "cameras":
+            written = of_file._replace(intrinsics=found.intrinsics, distortion=found.distortion)
+        elif self.what == "stereo":
+            written = of_file._replace(right_T_left=found.right_T_left)
+        else:
+            moved = found.body_T_left[0] @ np.linalg.inv(of_file.body_T_left[0])
+            written = of_file._replace(body_T_left=moved @ of_file.body_T_left)
+        known = {name: getattr(refined.calibration_sigmas, name) for name in GROUPS[self.what]}
+        return replace(
+            written.applied_to(self.file_rig),
+            imu=refined.imu if self.what == "imu" else self.file_rig.imu,
+            calibration_sigmas=replace(self.file_rig.calibration_sigmas, **known),
+        )
+
+    @cached_property
+    def findings(self) -> list[Finding]:
+        """What is known of each part that was calibrated."""
+        of_file, of_others = (np.sqrt(np.diag(prior.covariance)) for prior in self._priors)
+        both = zip(findings(self.batch.estimate, of_file), findings(self.batch.estimate, of_others), strict=True)
+        return [found for found, other in both if (other.file_sigmas < 0.5 * found.file_sigmas).all()]
+
+    @property
+    def contradicted(self) -> list[Finding]:
+        """Parts that are kept as in the file though the recording contradicts it."""
+        parts = {found.part for found in self.findings}
+        return [found for found in self.all_findings if found.is_significant and found.part not in parts]
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether what is fixed as in the file does not show as an error of what is calibrated."""
+        return self.what == "all" or all(each.is_good for each in self.agreements)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the recording shows every part that was calibrated, but for lengths, which hardly any shows."""
+        return all(found.is_observed or found.motion == SCALE_MOTION for found in self.findings)
+
+    @cached_property
+    def agreements(self) -> list[Agreement]:
+        """How well the halves agree, group by group; empty for a short recording."""
+        if self.halves is None:
+            return []
+        difference, covariance = difference_of(*self.halves)
+        grouped = [list(group) for _, group in groupby(self.curves, lambda curve: curve.group)]
+        return [_agreement(curves, difference, covariance) for curves in grouped]
+
+    @cached_property
+    def curves(self) -> list[Curve]:
+        """The parameters that were calibrated, as numbers for people."""
+        of_file, of_others = (prior.covariance for prior in self._priors)
+        return [c for c in curves_of(self.file_rig) if c.row @ of_others @ c.row < 0.25 * (c.row @ of_file @ c.row)]
+
+    @property
+    def _priors(self) -> tuple[FilePrior, FilePrior]:
+        """Priors of the rig file, and the same with what is calibrated known: in that they differ."""
+        known = _with_fixed(self.file_rig, GROUPS[self.what])
+        return file_prior(self.file_rig), file_prior(known)
+
+
+def calibrate_recording(
+    measurements: Iterable[Measurement],
+    rig: Rig,
+    what: str = "all",
+    config: Config | None = None,
+    on_progress: Progress = lambda *_: None,
+) -> RecordedCalibration:
+    """Run the odometry over a recording, and calibrate its rig from all windows of the self-calibration.
+
+    Args:
+        measurements: of the recording, in time order.
+        rig: of the rig file; its standard deviations are the prior.
+        what: one of `GROUPS`; other parameters are kept as in the file.
+        config: of the odometry.
+        on_progress: follows the work.
+
+    Raises:
+        CalibrationError: if the rig cannot be calibrated so, or hardly moved.
+    """
+    config = replace(config or Config(), calibration=CalibrationConfig(online=True))
+    if config.motion.reference != "keyframe":
+        raise CalibrationError(f"motion.reference is {config.motion.reference}: calibration wants tracks of keyframes")
+    if what == "imu" and rig.imu is None:
+        raise CalibrationError(f"{rig.name} has no IMU to calibrate")
+    windows, odometry, end_ns = _windows(measurements, rig, config, on_progress)
+    if len(windows) < _MIN_WINDOWS:
+        raise CalibrationError(
+            f"the images hardly move, or are not tracked: {len(windows)} windows of keyframes, and at least "
+            f"{_MIN_WINDOWS} are wanted; walk for half a minute with turns, near textured surfaces"
+        )
+    prior_rig = _with_fixed(rig, _FIXED[what])
+    assert odometry.calibration is not None, "the configuration asks for it"
+    first_guess, all_findings = odometry.calibration.posterior.mean, odometry.calibration_findings
+    batch = calibrate_windows(prior_rig, windows, first_guess, lambda k, n: on_progress("all windows", k, n))
+    if sum(batch.left_out) > len(windows) // 2:
+        raise CalibrationError(
+            f"{sum(batch.left_out)} of {len(windows)} windows contradict the others: did the calibration change on the "
+            "way, or is what is kept as in the file wrong (--what all)?"
+        )
+    if len(windows) < _MIN_OF_HALVES:
+        return RecordedCalibration(what, rig, batch, None, end_ns, all_findings)
+    middle, mean = len(windows) // 2, batch.estimate.posterior.mean
+    first = calibrate_windows(prior_rig, windows[:middle], mean, lambda k, n: on_progress("first half", k, n))
+    second = calibrate_windows(prior_rig, windows[middle:], mean, lambda k, n: on_progress("second half", k, n))
+    return RecordedCalibration(what, rig, batch, (first, second), end_ns, all_findings)
+
+
+def _windows(
+    measurements: Iterable[Measurement], rig: Rig, config: Config, on_progress: Progress
+) -> tuple[list[FullWindow], Odometry, int]:
+    """Return the full windows of a recording, the odometry at its end, and the stamp of the last frameset."""
+    windows: list[FullWindow] = []
+    odometry = Odometry(rig, config)
+    odometry.on_full_window(windows.append)
+    count = end_ns = 0
+    for measurement in measurements:
+        odometry.process(measurement)
+        if isinstance(measurement, FrameSet):
+            count, end_ns = count + 1, measurement.stamp_ns
+            on_progress("odometry", count, 0)
+    odometry.finish()
+    return windows, odometry, end_ns
+
+
+def _with_fixed(rig: Rig, names: Sequence[str]) -> Rig:
+    """Return a rig that is next to exactly known in some of its standard deviations."""
+    sigmas = rig.calibration_sigmas
+    return replace(
+        rig, calibration_sigmas=replace(sigmas, **{name: _FIXED_SHARE * getattr(sigmas, name) for name in names})
+    )
+
+
+def _agreement(curves: list[Curve], difference: Float, covariance: Float) -> Agreement:
+    rows = np.array([curve.row for curve in curves])
+    found, spread = rows @ difference, rows @ covariance @ rows.T
+    statistic = float(found @ np.linalg.solve(spread, found))
+    return Agreement(curves[0].group, statistic, len(curves), float(np.abs(found).max()), curves[0].unit)

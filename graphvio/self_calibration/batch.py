@@ -1,0 +1,151 @@
+"""Self-calibration from a whole recording: all windows at once, with one calibration that does not change.
+
+Each window is adjusted with what the windows before it say, and in later rounds also with what those after it say
+(expectation propagation; T. Minka, *Expectation propagation for approximate Bayesian inference*, 2001), so that all are
+linearised at nearly the same calibration and none is counted twice. The IMU's biases alone change between windows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.rig import Rig
+from graphvio.self_calibration.estimate import CalibrationEstimate
+from graphvio.self_calibration.evidence import Evidence, FilePrior, Gaussian
+from graphvio.self_calibration.imu_model import GYRO_BIAS, GYRO_MATRIX
+from graphvio.self_calibration.online import FullWindow, adjusted
+from graphvio.self_calibration.parameters import PAIR, RigCalibration
+from graphvio.self_calibration.prior import file_prior
+
+_ROUNDS = 2
+_MAX_MEAN_INNOVATION = 3.0  # squared, of each parameter; 1 where all errors are as modelled
+_STILL = 1e-5  # share of the file's standard deviations that the calibration changes in one second: next to nothing
+_BIAS_FACTOR = 2.0  # on the stated random walks
+_NO_GAIN = -np.inf
+
+
+class Batch(NamedTuple):
+    """What the windows of a recording say together.
+
+    Attributes:
+        estimate: of the calibration.
+        evidence: of all windows that are used.
+        prior: of the rig file.
+        history: the estimate from longer and longer beginnings of the recording, with the stamp of their end.
+        left_out: (K,) whether each window contradicts the others and is not used.
+    """
+
+    estimate: CalibrationEstimate
+    evidence: Evidence
+    prior: FilePrior
+    history: list[tuple[int, CalibrationEstimate]]
+    left_out: list[bool]
+
+
+def calibrate_windows(
+    rig: Rig,
+    windows: Sequence[FullWindow],
+    difference: Float,
+    on_window: Callable[[int, int], None] = lambda *_: None,
+) -> Batch:
+    """Estimate the calibration from windows.
+
+    Args:
+        rig: of the rig file; its standard deviations say how far each parameter may differ from it.
+        windows: K of them in time order, at least one.
+        difference: (C,) first guess of the difference from the rig.
+        on_window: called with the number of windows adjusted and that of all adjustments.
+    """
+    prior, nominal, n = file_prior(rig), RigCalibration.of(rig), len(windows)
+    factors = np.ones(prior.n_groups)
+    walks = [_walk_after(windows, k, prior, rig) for k in range(n)]
+    sites = [Evidence.none(len(difference))] * n
+    left_out = [False] * n
+    history: list[tuple[int, CalibrationEstimate]] = []
+    for number in range(_ROUNDS):
+        later = _of_later(sites, walks)
+        earlier, history = Evidence.none(len(difference)), []
+        for k, window in enumerate(windows):
+            others = _sum(earlier, later[k]).given(prior, factors)
+            start = difference if number == 0 else others.mean
+            solution = adjusted(window.keyframes, window.samples, nominal, start, others, window.sigma_px)
+            left_out[k] = number > 0 and not _agree(others, solution.calibration)
+            sites[k] = Evidence.none(len(difference)) if left_out[k] else _site(others, solution.calibration)
+            earlier = _sum(earlier, sites[k])
+            history.append((window.keyframes[-1].stamp_ns, _estimate(rig, prior, earlier)))
+            earlier = earlier.forgotten(walks[k])
+            on_window(number * n + k + 1, _ROUNDS * n)
+        if number == 0:
+            factors = _factors(prior, earlier)
+    return Batch(_estimate(rig, prior, earlier), earlier, prior, history, left_out)
+
+
+def difference_of(one: Batch, other: Batch) -> tuple[Float, Float]:
+    """Return by how much two calibrations of a rig from different windows differ, and the covariance of that.
+
+    Both share the rig file's prior; where that is all they have, they agree.
+
+    Returns:
+        The difference (C,), and its covariance (C, C) if both are right.
+    """
+    of_file = one.prior.with_factors(np.maximum(_factors(one.prior, one.evidence), _factors(one.prior, other.evidence)))
+    gains, noise = [], np.zeros_like(of_file)
+    for each in (one, other):
+        covariance = each.estimate.posterior.covariance
+        gains.append(covariance @ each.evidence.information)
+        noise += gains[-1] @ covariance
+    unequal = gains[0] - gains[1]
+    return (
+        one.estimate.posterior.mean - other.estimate.posterior.mean,
+        np.asarray(noise + unequal @ of_file @ unequal.T),
+    )
+
+
+def _estimate(rig: Rig, prior: FilePrior, evidence: Evidence) -> CalibrationEstimate:
+    factors = _factors(prior, evidence)
+    posterior = evidence.given(prior, factors)
+    return CalibrationEstimate(rig, posterior, posterior.mean, factors)
+
+
+def _factors(prior: FilePrior, evidence: Evidence) -> Float:
+    """Return the factors of the file's errors, at least 1: what is not shown is no better known than by the file."""
+    factors, _ = evidence.file_factors(prior, np.full(prior.n_groups, _NO_GAIN))
+    return np.maximum(factors, 1.0)
+
+
+def _site(others: Gaussian, posterior: Gaussian) -> Evidence:
+    """Return what a window says beyond the others."""
+    return Evidence.none(len(others.mean)).with_window(others, posterior)
+
+
+def _sum(one: Evidence, other: Evidence) -> Evidence:
+    return Evidence(one.information + other.information, one.vector + other.vector)
+
+
+def _of_later(sites: Sequence[Evidence], walks: Sequence[Float]) -> list[Evidence]:
+    """Return what the windows after each one say of the calibration at its time."""
+    later = [Evidence.none(len(sites[0].vector))]
+    for site, walk in zip(reversed(sites[1:]), reversed(walks[:-1]), strict=True):
+        later.append(_sum(later[-1], site).forgotten(walk))
+    return later[::-1]
+
+
+def _agree(others: Gaussian, posterior: Gaussian) -> bool:
+    change = posterior.mean - others.mean
+    return float(change @ others.information @ change) < _MAX_MEAN_INNOVATION * len(change)
+
+
+def _walk_after(windows: Sequence[FullWindow], k: int, prior: FilePrior, rig: Rig) -> Float:
+    """Return the covariance (C, C) of what changes from a window to the next one: the biases."""
+    following = windows[min(k + 1, len(windows) - 1)]
+    passed_s = max((following.keyframes[0].stamp_ns - windows[k].keyframes[0].stamp_ns) * 1e-9, 1.0)
+    walk = _STILL**2 * passed_s * prior.covariance
+    if rig.imu is not None:
+        biases = PAIR * len(rig.pairs) + np.arange(GYRO_BIAS, GYRO_MATRIX)
+        walks = np.repeat([rig.imu.gyro_random_walk, rig.imu.accel_random_walk], 3)
+        walk[biases, biases] = (_BIAS_FACTOR * walks) ** 2 * passed_s
+    return walk
