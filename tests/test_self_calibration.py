@@ -249,6 +249,33 @@ def test_self_calibration_at_a_standstill_learns_nothing_more_than_the_first_fra
     assert sigmas[1] == pytest.approx(sigmas[0], rel=1e-9)
 
 
+def test_self_calibration_after_a_knock_finds_the_turned_camera_and_keeps_the_lenses() -> None:
+    rig = default_rig().without_imu()
+    pair = rig.pairs[0]
+    turned = pair.right.body_T_cam @ se3_exp(np.deg2rad([0.06, 0.06, 0.06, 0.0, 0.0, 0.0]))
+    knocked = replace(rig, pairs=(replace(pair, right=replace(pair.right, body_T_cam=turned)), *rig.pairs[1:]))
+    walk, calibration = Walk(rig), SelfCalibration(rig)
+    restarts_before = -1
+    for stamp_ns, pose, views in walk.framesets(14.0):
+        if stamp_ns == 6_000_000_000:
+            restarts_before, walk.rig = calibration.restarts, knocked
+        calibration.update()
+        calibration.add_frameset(stamp_ns, pose, views)
+    calibration.close()
+    assert (restarts_before, calibration.restarts) == (0, 1)
+    found = calibration.estimate.rig.pairs[0]
+    off = so3_log(np.ascontiguousarray(found.right_T_left[:3, :3] @ knocked.pairs[0].right_T_left[:3, :3].T))
+    assert np.rad2deg(np.abs(off)).max() < 0.01
+    assert found.left.intrinsics == pytest.approx(pair.left.intrinsics, abs=0.5)
+
+
+@pytest.mark.parametrize("level", [0, 2])
+def test_self_calibration_of_a_rig_that_stays_as_it_is_reports_no_knock(level: int) -> None:
+    for seed in range(3):
+        written, true, _ = sampled(level, seed) if level else (default_rig().without_imu(),) * 2 + (None,)
+        assert calibrated(SelfCalibration(written), Walk(true, seed=seed), 10.0).restarts == 0
+
+
 def test_self_calibration_repeats_to_the_bit() -> None:
     written, true, _ = sampled(2, 2)
     first, second = (calibrated(SelfCalibration(written), Walk(true), 5.0).estimate.posterior for _ in range(2))

@@ -48,6 +48,7 @@ class OnlineCalibration:
         self._mean_force: Float = np.zeros(3)  # of the first samples
         self._averaged = 0
         self._is_reported = False
+        self._restarts = 0  # of the calibration, that were reported
         self._reported: set[str] = set()
         # Tracks that are followed from frame to frame drift, all alike, and would be taken for an error of the cameras.
         is_possible = config.motion.reference == "keyframe"
@@ -85,9 +86,9 @@ class OnlineCalibration:
         """Let the other stages use the calibration that comes into force with this frameset."""
         if self._calibration is None:
             return
-        restarts = self._calibration.restarts
         has_changed = self._calibration.update()
-        if self._calibration.restarts > restarts:
+        if self._calibration.restarts > self._restarts:
+            self._restarts = self._calibration.restarts
             self._report(
                 stamp_ns, EventKind.CALIBRATION_CHANGED, "the images contradict what was known: it is estimated again"
             )

@@ -81,7 +81,7 @@ class Evidence(NamedTuple):
 
     def forgotten(self, walk: Float) -> Evidence:
         """Return the likelihood after a random walk of the calibration with a covariance (C, C)."""
-        kept = np.eye(len(walk)) - self.information @ np.linalg.inv(self.information + np.linalg.inv(walk))
+        kept = np.linalg.inv(np.eye(len(walk)) + self.information @ walk)
         information = kept @ self.information
         return Evidence(0.5 * (information + information.T), kept @ self.vector)
 

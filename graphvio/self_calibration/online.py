@@ -22,6 +22,7 @@ from graphvio.self_calibration.evidence import EXACT, Evidence, Gaussian
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.imu_model import GYRO_BIAS, GYRO_MATRIX
 from graphvio.self_calibration.inertial import InertialSamples
+from graphvio.self_calibration.knock import KnockDetector, knock_covariance
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
 from graphvio.self_calibration.prior import file_prior
 from graphvio.self_calibration.solver import GRAVITY_M_S2, Solution, States, Window, solve
@@ -115,6 +116,8 @@ class SelfCalibration:
         self.has_full_window = False
         self.restarts = 0
         self.on_full_window: Callable[[FullWindow], None] = lambda _: None
+        self._in_force = self._nominal
+        self._knocks = KnockDetector()
         self._agreeing = 0  # keyframes
         self._refused = 0  # full windows, one after the other
         self._sigma_px = _FIRST_SIGMA_PX
@@ -151,8 +154,13 @@ class SelfCalibration:
             are_contradicting: whether the pairs' motions contradict each other. It is the calibration if they always
                 did, and the scene if they once agreed.
         """
-        if not self._is_keyframe(stamp_ns, views) or (are_contradicting and self.is_trusted):
+        if not self._is_keyframe(stamp_ns, views):
             return
+        if self.is_trusted:
+            if self._knocks.update(views, self._in_force):
+                self._forget_places()
+            elif are_contradicting:
+                return
         self._agreeing += not are_contradicting
         self._last = Keyframe(stamp_ns, odom_T_body, views)
         self._keyframes.append(self._last)
@@ -185,6 +193,7 @@ class SelfCalibration:
             self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
         was_exact = self.estimate.is_file_exact
         self.estimate = adjusted.estimate
+        self._in_force = self._nominal.moved(self.estimate.difference[: PAIR * len(self._rig.pairs)])
         return not (was_exact and self.estimate.is_file_exact)
 
     @property
@@ -199,11 +208,20 @@ class SelfCalibration:
         return _PACES[min(self._full_windows, len(_PACES) - 1)]
 
     def _refuse(self, is_full: bool) -> None:
-        """Leave a window out that contradicts those before it; after several, these are forgotten: it was a knock."""
+        """Leave a window out that contradicts those before it; several such windows are a knock."""
         self._refused += is_full
         if self._refused >= _MAX_REFUSED:
-            self._evidence, self.has_full_window, self._refused = Evidence.none(len(self._walk)), False, 0
-            self.restarts += 1
+            self._forget_places()
+
+    def _forget_places(self) -> None:
+        """Begin again after a knock, with what was known of lenses and IMU."""
+        if self._pending is not None:
+            self._pending.result()  # of a window from before the knock
+            self._pending = None
+        self._evidence = self._evidence.forgotten(knock_covariance(len(self._walk), len(self._rig.pairs)))
+        self._keyframes, self._adjusted_at, self._full_windows = [], 0, 0
+        self.has_full_window, self._agreeing, self._refused = False, 0, 0
+        self.restarts += 1
 
     def _is_keyframe(self, stamp_ns: int, views: Mapping[int, View]) -> bool:
         """Whether the images have moved, and time has passed, since the last keyframe."""

@@ -1,0 +1,67 @@
+"""A knock that turns a camera: matches that all leave their epipolar lines at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.cameras import unproject_pixels
+from graphvio.geometry import skew
+from graphvio.self_calibration.parameters import BODY, PAIR, STEREO, RigCalibration
+from graphvio.self_calibration.window import View
+
+_MIN_MATCHES = 30
+_MAX_OFFSET_PX = 0.25  # median; a calibration in force is within a tenth of it
+_CONFIRMED = 3  # keyframes, one after the other
+_TURNED_RAD, _MOVED_M = np.deg2rad(0.3), 0.005  # what a knock may do to a camera and to a pair
+
+
+class KnockDetector:
+    """Watches how far matches are off their epipolar lines, which nothing in the scene can change."""
+
+    def __init__(self) -> None:
+        self._off = 0  # keyframes, one after the other
+
+    def update(self, views: Mapping[int, View], calibration: RigCalibration) -> bool:
+        """Take a keyframe's views.
+
+        Returns:
+            Whether cameras of a pair have been off for so long that they are no longer where they were.
+        """
+        offsets = [epipolar_offset_px(view, calibration, j) for j, view in views.items()]
+        self._off = self._off + 1 if max(offsets, default=0.0) > _MAX_OFFSET_PX else 0
+        if self._off < _CONFIRMED:
+            return False
+        self._off = 0
+        return True
+
+
+def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> float:
+    """Return by how much a pair's matches are off their epipolar lines in the median, 0 where there are few."""
+    matched = view.has_right
+    if matched.sum() < _MIN_MATCHES:
+        return 0.0
+    rays = []
+    for which, pixels in enumerate((view.left_px, view.right_px)):
+        normalised, _ = unproject_pixels(
+            int(calibration.models[pair, which]), calibration.intrinsics[pair, which],
+            calibration.distortion[pair, which], np.ascontiguousarray(pixels[matched]),
+        )  # fmt: skip
+        rays.append(np.column_stack([normalised, np.ones(len(normalised))]))
+    right_T_left = calibration.right_T_left[pair]
+    lines = rays[0] @ (skew(right_T_left[:3, 3]) @ right_T_left[:3, :3]).T
+    distances = np.sum(lines * rays[1], axis=1) / np.hypot(lines[:, 0], lines[:, 1])
+    return float(abs(np.median(distances)) * calibration.intrinsics[pair, 1, 0])
+
+
+def knock_covariance(n_parameters: int, n_pairs: int) -> Float:
+    """Return the covariance (C, C) of what a knock does: it turns and shifts cameras, and leaves lenses and IMU."""
+    variances = np.zeros(n_parameters)
+    of_pairs = variances[: n_pairs * PAIR].reshape(n_pairs, PAIR)
+    for start in (STEREO, BODY):
+        of_pairs[:, start : start + 3] = _TURNED_RAD**2
+        of_pairs[:, start + 3 : start + 6] = _MOVED_M**2
+    of_pairs[:, STEREO + 3 : BODY] = 0.0  # a housing bends; its length stays
+    return np.diag(variances)
