@@ -17,6 +17,7 @@ from graphvio.measurements.sensors import FrameSet
 from graphvio.odometry import Odometry
 from graphvio.odometry.step import Step
 from graphvio.results import ResultWriter, Summary
+from graphvio.rig import Rig
 from graphvio.self_calibration.findings import described
 from graphvio.sources import Source
 
@@ -76,25 +77,34 @@ class RunListener:
     on_progress: Callable[[Progress], None] = _ignore
 
 
-def run(source: Source, config: Config, writer: ResultWriter, listeners: Sequence[RunListener] = ()) -> Summary:
+def run(
+    source: Source,
+    config: Config,
+    writer: ResultWriter,
+    listeners: Sequence[RunListener] = (),
+    rig: Rig | None = None,
+) -> Summary:
     """Run the odometry over a source and write the results.
 
     Args:
-        source: of the measurements; its rig is used.
+        source: of the measurements.
         config: of the odometry.
         writer: of the results.
         listeners: called in this order.
+        rig: with another calibration than the source's; None for the source's.
 
     Raises:
         GraphvioError: if the source cannot be read or the folder not written.
     """
-    return _Run(source, config, writer, listeners).execute()
+    return _Run(source, config, writer, listeners, rig or source.rig).execute()
 
 
 class _Run:
-    def __init__(self, source: Source, config: Config, writer: ResultWriter, listeners: Sequence[RunListener]) -> None:
+    def __init__(
+        self, source: Source, config: Config, writer: ResultWriter, listeners: Sequence[RunListener], rig: Rig
+    ) -> None:
         self._source = source
-        self._odometry = Odometry(source.rig, config)
+        self._odometry = Odometry(rig, config)
         for listener in listeners:
             self._odometry.subscribe(listener.on_step)
         self._writer = writer

@@ -50,7 +50,7 @@ def optimize(
     no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
     refine_calibration: Annotated[
         bool,
-        typer.Option("--refine-calibration", help="Also estimate the pairs' extrinsics and the IMU's time offset."),
+        typer.Option("--refine-calibration", help="Calibrate each rig first, as calibrate --what all does."),
     ] = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -9,7 +10,8 @@ from pathlib import Path
 
 from graphvio.config import Config
 from graphvio.config.stages import CalibrationConfig
-from graphvio.errors import TrajectoryError
+from graphvio.errors import CalibrationError, TrajectoryError
+from graphvio.odometry.recorded_calibration import calibrate_recording
 from graphvio.optimization.colmap_export import export
 from graphvio.optimization.exchange import covariance_text, frames_text, trajectory_text, write_g2o
 from graphvio.optimization.loops.closures import LoopClosure, Place, closures_to_bytes, load_closures
@@ -24,6 +26,7 @@ from graphvio.optimization.workspace import Workspace, digest
 from graphvio.pipeline import RunListener, run
 from graphvio.results import ResultWriter
 from graphvio.rig import Rig
+from graphvio.rig_files import load_rig
 from graphvio.rig_files.native import to_text
 from graphvio.sources import Source
 from graphvio.trajectory import Trajectory
@@ -31,6 +34,7 @@ from graphvio.trajectory_files import load_trajectory
 from graphvio.version import __version__
 
 DATABASE = "database.db"
+_log = logging.getLogger(__name__)
 
 Progress = Callable[[str, float, float], None]
 """Called with the stage, how much of it is done, and how much there is."""
@@ -60,7 +64,8 @@ def optimize_sessions(
         out: folder of the results: new, or that of an interrupted optimisation of the same, which is continued.
         config: of all stages.
         with_loops: whether to find loop closures and write a map, which needs the extra ``maps``.
-        calibrates: whether the extrinsics of the pairs and the IMU's time offset are estimated as well.
+        calibrates: whether the rigs are calibrated first, from each recording as a whole; and in the graph the
+            extrinsics of the pairs and the IMU's time offset once more.
         on_progress: called with the progress of each stage.
 
     Raises:
@@ -68,6 +73,9 @@ def optimize_sessions(
     """
     sessions = _sessions(sources)
     stages = Stages(sessions, Path(out), config, with_loops=with_loops, calibrates=calibrates, on_progress=on_progress)
+    if calibrates:
+        for number in range(len(sessions)):
+            stages.calibrate(number)
     records = [stages.record(number) for number in range(len(sessions))]
     return stages.result(records, stages.closures(records) if with_loops else None)
 
@@ -116,6 +124,27 @@ class Stages:
             "graphvio": __version__,
         }
         self._space = Workspace(out, self.inputs)
+        self._rigs = [each.source.rig for each in sessions]
+
+    def calibrate(self, number: int) -> None:
+        """Calibrate a session's rig from the whole recording for the later stages; where impossible, it stays."""
+        session = self._sessions[number]
+        name, stage = f"{session.name}/rig-refined.yaml", f"calibration of {session.name}"
+        path = self._space.folder / name
+        if not self._space.has_finished(stage):
+            totals = {"odometry": session.source.frameset_count}
+
+            def on_progress(part: str, done: int, total: int) -> None:
+                self._on_progress(f"{stage}: {part}", done, totals.get(part, total))
+
+            rig = session.source.rig
+            try:
+                rig = calibrate_recording(session.source, rig, "all", self._config, on_progress).rig
+            except CalibrationError as error:
+                _log.warning("%s: %s", session.name, error)
+            self._space.write(name, to_text(rig, path.parent).encode())
+            self._space.finish(stage, name)
+        self._rigs[number] = load_rig(path)
 
     def record(self, number: int) -> SessionRecord:
         """Run the odometry on a session, write its results, and return what it measured."""
@@ -132,8 +161,8 @@ class Stages:
             )
             # All motions of a session must be measured with one calibration, that of the rig file.
             config = replace(self._config, calibration=CalibrationConfig(online=False))
-            with ResultWriter(folder, session.source.rig, config.to_yaml()) as writer:
-                run(session.source, config, writer, [listener])
+            with ResultWriter(folder, self._rigs[number], config.to_yaml()) as writer:
+                run(session.source, config, writer, [listener], self._rigs[number])
             self._space.write(name, recorder.record().to_bytes())
             self._space.finish(stage, name, f"{session.name}/odometry/summary.json")
         return SessionRecord.load(self._space.folder / name)
@@ -155,7 +184,7 @@ class Stages:
 
     def result(self, records: Sequence[SessionRecord], closures: Sequence[LoopClosure] | None) -> Optimization:
         """Optimise the sessions and write all results; without a map if closures are None."""
-        imus = [each.source.rig.imu for each in self._sessions]
+        imus = [rig.imu for rig in self._rigs]
         found = optimize(
             records,
             imus,
@@ -165,8 +194,8 @@ class Stages:
             self._calibrates,
         )
         rigs = [
-            each.source.rig if correction is None else correction.corrected(each.source.rig)
-            for each, correction in zip(self._sessions, found.corrections, strict=True)
+            rig if correction is None else correction.corrected(rig)
+            for rig, correction in zip(self._rigs, found.corrections, strict=True)
         ]
         if self._calibrates:
             for session, rig in zip(self._sessions, rigs, strict=True):
@@ -202,7 +231,7 @@ class Stages:
         session, settings = self._sessions[number], self._config.optimization
         rows = choose_places(record, settings.place_distance_m, settings.place_angle_deg)
         places = [Place(number, row, int(record.stamps_ns[row])) for row in rows.tolist()]
-        return SessionInput(session.name, session.source, session.source.rig, places)
+        return SessionInput(session.name, session.source, self._rigs[number], places)
 
     def _extract(self, session: SessionInput, database: FeatureDatabase) -> None:
         stage, total = _features_of(session.name), len(session.places)
