@@ -18,6 +18,7 @@ from graphvio.odometry import Odometry
 from graphvio.odometry.step import Step
 from graphvio.results import ResultWriter, Summary
 from graphvio.rig import Rig
+from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import described
 from graphvio.sources import Source
 
@@ -66,6 +67,7 @@ class RunListener:
         on_step: takes each step of the odometry, see `graphvio.odometry.Odometry.subscribe`.
         on_estimate: takes each estimate, after its frameset, or None where that is no longer in memory.
         on_event: takes each event of the odometry.
+        on_calibration: takes each calibration that came into force, with the stamp of the frameset.
         on_smoothed: takes stamps and poses ``nav_T_body`` (4, 4) that have left the smoother's window.
         on_progress: takes the progress after each frameset.
     """
@@ -73,6 +75,7 @@ class RunListener:
     on_step: Callable[[Step], None] = _ignore
     on_estimate: Callable[[FrameSet | None, Estimate], None] = _ignore
     on_event: Callable[[Event], None] = _ignore
+    on_calibration: Callable[[int, CalibrationEstimate], None] = _ignore
     on_smoothed: Callable[[Sequence[tuple[int, Float]]], None] = _ignore
     on_progress: Callable[[Progress], None] = _ignore
 
@@ -118,6 +121,7 @@ class _Run:
         self._resets = 0
         self._distance_m = 0.0
         self._previous: Estimate | None = None
+        self._calibration: CalibrationEstimate | None = None
         self._start = perf_counter()
 
     def execute(self) -> Summary:
@@ -162,7 +166,7 @@ class _Run:
 
     def _add_estimate(self, estimate: Estimate) -> None:
         self._writer.add(estimate)
-        self._writer.add_calibration(estimate.stamp_ns, self._odometry.calibration)
+        self._add_calibration(estimate.stamp_ns)
         self._before_start += estimate.status is Status.INITIALISING and estimate.nav_T_body is None
         self._collect()
         frameset = self._pending.pop(estimate.stamp_ns, None)
@@ -181,6 +185,15 @@ class _Run:
         )
         for listener in self._listeners:
             listener.on_progress(progress)
+
+    def _add_calibration(self, stamp_ns: int) -> None:
+        calibration = self._odometry.calibration
+        if calibration is None or calibration is self._calibration:
+            return
+        self._calibration = calibration
+        self._writer.add_calibration(stamp_ns, calibration)
+        for listener in self._listeners:
+            listener.on_calibration(stamp_ns, calibration)
 
     def _collect(self) -> None:
         smoothed = self._odometry.take_smoothed()

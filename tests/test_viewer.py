@@ -18,6 +18,10 @@ from graphvio.measurements.motion import PairReport
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Camera, Imu, Rig, StereoPair
 from graphvio.rig_files import save_rig
+from graphvio.self_calibration.curves import curves_of
+from graphvio.self_calibration.estimate import CalibrationEstimate
+from graphvio.self_calibration.evidence import Gaussian
+from graphvio.self_calibration.prior import file_prior
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import save_trajectory
 from graphvio.viewer import Viewer
@@ -140,6 +144,27 @@ def test_residuals_of_each_pair_are_logged_where_available(tmp_path: Path) -> No
         assert scalars_of(tmp_path / "r.rrd", f"/residuals/front/{entity}") == expected
     assert scalars_of(tmp_path / "r.rrd", "/points/front/candidates") == {e.stamp_ns: 50.0 for e in shown}
     assert scalars_of(tmp_path / "r.rrd", "/points/front/inliers") == {e.stamp_ns: 40.0 for e in shown}
+
+
+def test_calibration_is_logged_with_its_standard_deviations(tmp_path: Path) -> None:
+    rig = some_rig()
+    prior = file_prior(rig)
+    difference = np.zeros(len(prior.group))
+    difference[0] = 0.01 * 400.0  # of fx
+    posterior = Gaussian(difference, np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64))
+    with Viewer(rig, save=tmp_path / "r.rrd") as viewer:
+        viewer.show(None, estimate(0))
+        for k in (1, 5):
+            calibration = CalibrationEstimate(rig, posterior, difference, np.ones(prior.n_groups))
+            viewer.show_calibration(START_NS + k * 50_000_000, calibration)
+    found: dict[str, list[list[float]]] = {}
+    for chunk in importlib.import_module("rerun.chunk").RrdReader(tmp_path / "r.rrd").stream():
+        if chunk.entity_path.startswith("/calibration") and "Scalars:scalars" in chunk.to_record_batch().schema.names:
+            numbers = chunk.to_record_batch().column("Scalars:scalars").to_pylist()
+            found.setdefault(chunk.entity_path, []).extend(numbers)
+    assert len(found) == len(curves_of(rig))
+    assert found["/calibration/focal_lengths/cam0_fx"] == [pytest.approx([1.0, 0.9, 1.1])] * 2
+    assert found["/calibration/IMU__time_offset/value"][0] == pytest.approx([0.0, -2.0, 2.0])
 
 
 def test_show_returns_at_once_while_logging_is_slow(tmp_path: Path, monkeypatch: Any) -> None:

@@ -124,7 +124,7 @@ def run_live(
         running = LiveOdometry(opened, used, settings, wants_keyframes=services is not None)
         stack.callback(running.stop)
         if viewer is not None:
-            running.add_output(ViewOutput(viewer))
+            running.add_output(ViewOutput(viewer, lambda: running.odometry.calibration))
         if health_port is not None:
             health = HealthServer(running.status, port=health_port)
             stack.callback(health.close)

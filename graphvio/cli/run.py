@@ -71,7 +71,9 @@ def run(
         listeners = []
         if view or save_rrd:
             viewer = stack.enter_context(Viewer(opened.rig, spawn=view, save=save_rrd))
-            listeners.append(RunListener(on_estimate=viewer.show, on_event=viewer.show_event))
+            listeners.append(
+                RunListener(on_estimate=viewer.show, on_event=viewer.show_event, on_calibration=viewer.show_calibration)
+            )
         use_one_opencv_thread()
         warm_up(opened.rig, settings)
         listeners.append(RunListener(on_progress=stack.enter_context(_ProgressLine()).show))

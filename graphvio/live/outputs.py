@@ -11,6 +11,7 @@ from graphvio.arrays import Float
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.events import Event
 from graphvio.measurements.sensors import FrameSet, Measurement
+from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import save_trajectory
 from graphvio.viewer import Viewer
@@ -34,14 +35,25 @@ class Output:
 
 
 class ViewOutput(Output):
-    """Shows a live run; images are left out where the viewer has no time for them."""
+    """Shows a live run; images are left out where the viewer has no time for them.
 
-    def __init__(self, viewer: Viewer) -> None:
+    Args:
+        viewer: shows it.
+        calibration: returns what is known of the calibration, or None where it is not estimated.
+    """
+
+    def __init__(self, viewer: Viewer, calibration: Callable[[], CalibrationEstimate | None] = lambda: None) -> None:
         self._viewer = viewer
+        self._calibration = calibration
+        self._shown: CalibrationEstimate | None = None
 
     def add_result(self, estimate: Estimate, frameset: FrameSet | None) -> None:
         """See `Output`."""
         self._viewer.show(frameset, estimate)
+        calibration = self._calibration()
+        if calibration is not None and calibration is not self._shown:
+            self._shown = calibration
+            self._viewer.show_calibration(estimate.stamp_ns, calibration)
 
     def add_event(self, event: Event) -> None:
         """See `Output`."""

@@ -86,7 +86,7 @@ class ResultWriter:
         self._config_sha256 = hashlib.sha256(config_yaml.encode()).hexdigest()
         self._first_ns: int | None = None
         self._last_ns = 0
-        self._calibration: CalibrationEstimate | None = None
+        self._is_calibrated = False
         self._calibrations = CalibrationHistory()
         self._time_offset: tuple[float | None, float | None] = (None, None)
         self._stage_ms: dict[str, array[float]] = {}
@@ -171,15 +171,13 @@ class ResultWriter:
         self._pose_status.append(str(estimate.status))
         self._poses.extend(np.asarray(estimate.nav_T_body, dtype=np.float64).ravel())
 
-    def add_calibration(self, stamp_ns: int, estimate: CalibrationEstimate | None) -> None:
-        """Append the calibration where it has changed since the last call; None where it is not estimated.
+    def add_calibration(self, stamp_ns: int, estimate: CalibrationEstimate) -> None:
+        """Append a calibration that came into force at a stamp.
 
         Raises:
             GraphvioError: if a file cannot be written.
         """
-        if estimate is None or estimate is self._calibration:
-            return
-        self._calibration = estimate
+        self._is_calibrated = True
         self._calibrations.add(stamp_ns, estimate)
         names = parameter_names(estimate.file_rig)
         rows = zip(names, estimate.difference, estimate.sigmas, strict=True)
@@ -276,7 +274,7 @@ class ResultWriter:
             evaluation=evaluation,
             name=self.folder.name,
         )
-        if self._calibration is not None:
+        if self._is_calibrated:
             self._calibrations.plot(self.folder / "calibration.png", self._last_ns, self.folder.name)
         return summary
 

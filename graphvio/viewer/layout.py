@@ -8,6 +8,7 @@ import rerun.blueprint as rrb
 
 from graphvio.measurements.estimate import Status
 from graphvio.rig import Rig
+from graphvio.self_calibration.curves import curves_of
 
 TIMELINE = "time"
 AXES = ("x", "y", "z")
@@ -18,6 +19,11 @@ STATUS_COLOURS = {
     Status.COASTING: (242, 142, 28),
     Status.LOST: (214, 39, 40),
 }
+
+
+def as_entity(name: str) -> str:
+    """Return a part of an entity's path for a name."""
+    return "".join(c if c.isalnum() else "_" for c in name)
 
 
 def blueprint(rig: Rig) -> Any:
@@ -35,9 +41,18 @@ def blueprint(rig: Rig) -> Any:
         rrb.TimeSeriesView(origin="biases/accel", name="accelerometer bias, m/s^2"),
         name="biases",
     )
+    units = {curve.group: curve.unit for curve in curves_of(rig)}
+    calibration = rrb.Grid(
+        *(
+            rrb.TimeSeriesView(origin=f"calibration/{as_entity(group)}", name=f"{group}, {unit}".rstrip(", "))
+            for group, unit in units.items()
+        ),
+        name="calibration",
+    )
     curves = rrb.Tabs(
         rates,
         biases,
+        calibration,
         rrb.TimeSeriesView(origin="timing", name="milliseconds"),
         rrb.TimeSeriesView(origin="points", name="points"),
         rrb.TimeSeriesView(origin="residuals", name="residuals, px"),

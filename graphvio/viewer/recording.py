@@ -11,6 +11,7 @@
 | ``points/<pair>/candidates``, ``inliers`` | number of points |
 | ``residuals/<pair>/joint``, ``own`` | rms reprojection error, px, under the selected motion and the pair's own |
 | ``timing/<stage>`` | milliseconds |
+| ``calibration/<group>/<curve>`` | difference from the rig file, with one standard deviation below and above |
 | ``events`` | changes of status, gates, resets, faults |
 
 The timeline ``time`` is relative to the first stamp.
@@ -37,8 +38,10 @@ from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.events import Event
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
+from graphvio.self_calibration.curves import Curve, curves_of, values_of
+from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.trajectory import Trajectory
-from graphvio.viewer.layout import AXES, RATE_COLOURS, STATUS_COLOURS, TIMELINE, blueprint
+from graphvio.viewer.layout import AXES, RATE_COLOURS, STATUS_COLOURS, TIMELINE, as_entity, blueprint
 from graphvio.viewer.web import WebHost, WebOptions
 
 _MAX_SEGMENT_POSES = 100
@@ -86,6 +89,7 @@ class Recording:
         self._start_ns: int | None = None
         self._unsent: list[Estimate] = []
         self._status: Status | None = None
+        self._calibration_curves: list[Curve] = []
         self._segment: list[tuple[int, Float, Status]] = []
         self._segment_number = 0
         self._epoch = 0
@@ -126,6 +130,19 @@ class Recording:
         """Log an event at its stamp."""
         self._at(event.stamp_ns)
         self._log_text(event.detail, event.kind, (200, 200, 200))
+
+    def add_calibration(self, stamp_ns: int, estimate: CalibrationEstimate) -> None:
+        """Log a calibration that came into force at a stamp."""
+        if not self._calibration_curves:
+            self._calibration_curves = curves_of(estimate.file_rig)
+            for curve in self._calibration_curves:
+                lines = rr.SeriesLines(names=[curve.name or curve.group, "- sigma", "+ sigma"], widths=[2.0, 0.5, 0.5])
+                self._stream.log(_entity_of(curve), lines, static=True)
+        self._at(stamp_ns)
+        for curve, value, sigma in zip(
+            self._calibration_curves, *values_of(self._calibration_curves, estimate), strict=True
+        ):
+            self._stream.log(_entity_of(curve), rr.Scalars([value, value - sigma, value + sigma]))
 
     def add_images(self, frameset: FrameSet, estimate: Estimate) -> None:
         """Log left images with their corners, inliers in green."""
@@ -253,6 +270,10 @@ def ellipsoid(covariance: Float) -> tuple[Float, Float]:
     if np.linalg.det(axes) < 0.0:
         axes[:, 0] = -axes[:, 0]
     return _SIGMAS * np.sqrt(np.maximum(variances, 0.0)), _quat_xyzw(axes)
+
+
+def _entity_of(curve: Curve) -> str:
+    return f"calibration/{as_entity(curve.group)}/{as_entity(curve.name or 'value')}"
 
 
 def _executable() -> dict[str, str]:

@@ -22,6 +22,7 @@ from graphvio.rig import Rig
 from graphvio.viewer.web import WebOptions
 
 if TYPE_CHECKING:
+    from graphvio.self_calibration.estimate import CalibrationEstimate
     from graphvio.trajectory import Trajectory
     from graphvio.viewer.recording import Recording
 
@@ -91,6 +92,10 @@ class Viewer:
     def show_event(self, event: Event) -> None:
         """Show an event; returns at once."""
         self._add_extra(lambda recording: recording.add_event(event))
+
+    def show_calibration(self, stamp_ns: int, estimate: CalibrationEstimate) -> None:
+        """Show a calibration that came into force at a stamp; returns at once."""
+        self._add_extra(lambda recording: recording.add_calibration(stamp_ns, estimate))
 
     def show_path(self, name: str, path: Trajectory, colour: tuple[int, int, int] = (150, 150, 150)) -> None:
         """Show another trajectory in nav, such as the smoothed one or truth; returns at once."""
