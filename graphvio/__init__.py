@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from graphvio.measurements.estimate import Estimate, Prediction, Status
     from graphvio.measurements.sensors import FrameSet, ImuSample
     from graphvio.odometry import Odometry
+    from graphvio.odometry.recorded_calibration import calibrate_recording
     from graphvio.optimization.optimize import Optimization
     from graphvio.optimization.pipeline import optimize_sessions
     from graphvio.rig import Camera, Imu, Rig, StereoPair
@@ -57,6 +58,7 @@ _HOME_OF = {
     "StereoPair": "rig",
     "Trajectory": "trajectory",
     "calibrate_pairs": "calibration.calibrate",
+    "calibrate_recording": "odometry.recorded_calibration",
     "calibrate_trajectories": "calibration.calibrate",
     "load_rig": "rig_files",
     "load_trajectory": "trajectory_files",
@@ -91,6 +93,7 @@ __all__ = [
     "Trajectory",
     "__version__",
     "calibrate_pairs",
+    "calibrate_recording",
     "calibrate_trajectories",
     "load_rig",
     "load_trajectory",

@@ -8,12 +8,16 @@ from pathlib import Path
 
 import list_events
 import plot_layers
+import pytest
+from calibration_walks import recorded
 
 from graphvio.config import Config, profiles
 from graphvio.measurements.events import EventKind
+from graphvio.rig_files import load_rig
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+SELF_CALIBRATION = (ROOT / "docs/self-calibration.md").read_text()
 
 
 def test_the_readmes_python_runs_as_typed(room_walk: Path, tmp_path: Path) -> None:
@@ -24,6 +28,35 @@ def test_the_readmes_python_runs_as_typed(room_walk: Path, tmp_path: Path) -> No
     done = subprocess.run([sys.executable, "-c", blocks[0]], cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("tracking") == 100
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder to work in, with a recording of turns that calibration takes."""
+    folder: Path = tmp_path_factory.mktemp("docs")
+    recorded(folder / "recording", 20.0)
+    return folder
+
+
+def test_the_python_of_self_calibration_runs_as_typed(walk: Path) -> None:
+    (block,) = re.findall(r"```python\n(.*?)```", SELF_CALIBRATION, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", block], cwd=walk, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "pair back, rotation against front: " in done.stdout
+    assert "CalibrationSigmas(focal_share=" in done.stdout
+    assert load_rig(walk / "rig-refined.yaml").imu is not None
+
+
+def test_the_commands_of_self_calibration_run_as_typed(walk: Path) -> None:
+    lines = re.findall(r"^    graphvio (.*?)(?:  +#.*)?$", SELF_CALIBRATION, re.MULTILINE)
+    assert len(lines) == 3
+    for line in lines:
+        arguments = line.replace("RECORDING", "recording").split()
+        command = [sys.executable, "-c", "from graphvio.cli import main; main()", *arguments]
+        done = subprocess.run(command, cwd=walk, capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode == 0, done.stderr
+    for name in ("walk/calibration.png", "again/rig-refined.yaml", "rig-calibrated.yaml", "calibration/report.html"):
+        assert (walk / name).exists(), name
 
 
 def test_events_page_lists_every_kind() -> None:

@@ -139,7 +139,7 @@ def _print_summary(summary: Summary, folder: Path) -> None:
     for sentence in summary.calibration:
         typer.echo(sentence)
     for warning in summary.warnings:
-        warn(f"{warning}; graphvio calibrate finds where it is")
+        warn(f"{warning}; graphvio calibrate --what all finds by how much")
     if summary.resets:
         typer.echo(f"reinitialised {summary.resets} times: see {folder / 'events.jsonl'}")
     typer.echo(f"results: {folder}")
