@@ -276,6 +276,17 @@ def test_self_calibration_of_a_rig_that_stays_as_it_is_reports_no_knock(level: i
         assert calibrated(SelfCalibration(written), Walk(true, seed=seed), 10.0).restarts == 0
 
 
+@pytest.mark.parametrize(("field", "spike"), [("linear_acceleration", 100.0), ("angular_velocity", 8.0)])
+def test_self_calibration_leaves_out_a_wild_sample(field: str, spike: float) -> None:
+    rig = default_rig()
+    walk = Walk(rig)
+    samples = walk.samples(6.0)
+    values = getattr(samples[500], field) + np.array([0.0, spike, 0.0])
+    samples[500] = replace(samples[500], **{field: values})
+    walk.samples = lambda _: samples  # type: ignore[method-assign, assignment]
+    assert calibrated(SelfCalibration(rig), walk, 6.0).estimate.is_file_exact
+
+
 def test_self_calibration_repeats_to_the_bit() -> None:
     written, true, _ = sampled(2, 2)
     first, second = (calibrated(SelfCalibration(written), Walk(true), 5.0).estimate.posterior for _ in range(2))

@@ -12,6 +12,7 @@ EXACT = 1e-3
 """Factor on the file's standard deviations of a file that is as good as exact."""
 _SWEEPS = 3
 _FACTORS = (EXACT, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0)
+MAX_FACTOR = _FACTORS[-1]
 
 
 class Gaussian(NamedTuple):

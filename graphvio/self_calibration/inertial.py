@@ -20,6 +20,7 @@ from graphvio.self_calibration.preintegration import Preintegrated, covering_sam
 POSE, VELOCITY, GRAVITY = 6, 3, 3
 _VELOCITY_I, _POSE_J, _VELOCITY_J, _GRAVITY_AT, _PARAMETERS_AT = 6, 9, 15, 18, 21
 _COLUMNS = _PARAMETERS_AT + PARAMETERS
+_MAX_SPIKE = np.repeat([2.0, 20.0], 3)  # rad/s and m/s^2, of one sample against both neighbours
 
 
 class InertialSamples(NamedTuple):
@@ -44,6 +45,13 @@ class InertialSamples(NamedTuple):
         interval = np.searchsorted(self.keyframes_ns, self.stamps_ns, side="right") - 1
         kept = ~np.isin(interval, intervals)
         return self._replace(stamps_ns=self.stamps_ns[kept], readings=self.readings[kept])
+
+    def intervals_with_spikes(self) -> Int:
+        """Return the intervals between keyframes with a sample that is far from the one before and the one after."""
+        middle = np.median(np.stack([self.readings[:-2], self.readings[1:-1], self.readings[2:]]), axis=0)
+        is_spike = (np.abs(self.readings[1:-1] - middle) > _MAX_SPIKE).any(axis=1)
+        found = np.searchsorted(self.keyframes_ns, self.stamps_ns[1:-1][is_spike], side="right") - 1
+        return np.unique(found[found >= 0])
 
 
 class InertialStates(NamedTuple):

@@ -18,7 +18,7 @@ from graphvio.arrays import Float
 from graphvio.measurements.sensors import ImuSample
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
-from graphvio.self_calibration.evidence import EXACT, Evidence, Gaussian
+from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, Gaussian
 from graphvio.self_calibration.findings import Finding, findings
 from graphvio.self_calibration.imu_model import GYRO_BIAS, GYRO_MATRIX
 from graphvio.self_calibration.inertial import InertialSamples
@@ -40,6 +40,7 @@ _MIN_KEYFRAMES_OF_NOISE, _MIN_OBSERVATIONS_OF_NOISE = 3, 100
 _RAYLEIGH_MEDIAN = 1.1774  # of the norm of two standard normal variables
 _MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])
 """Against exact files, of cameras and of places. Cameras that are not exact reach hundreds with the first image."""
+_MAX_SIGMAS = 4.0  # of a parameter, by the file's standard deviations times the largest factor
 _MAX_MEAN_INNOVATION = 3.0  # squared, of each parameter; 1 where all errors are as modelled
 _MIN_AGREEING = 3  # keyframes whose pairs agreed, from which contradictions are the scene's
 _MAX_REFUSED = 3  # full windows
@@ -107,6 +108,8 @@ class SelfCalibration:
         self._rig = rig
         self._nominal = RigCalibration.of(rig)
         self._prior = file_prior(rig)
+        widest = self._prior.with_factors(np.full(self._prior.n_groups, MAX_FACTOR))
+        self._largest = np.where(self._prior.group < 0, np.inf, _MAX_SIGMAS * np.sqrt(np.diag(widest)))
         self._walk = _walk_per_second(self._prior.covariance, rig)
         self._evidence = Evidence.none(len(self._walk))  # of the full windows
         n_groups = self._prior.n_groups
@@ -183,6 +186,8 @@ class SelfCalibration:
         if self.has_full_window and not _agree(prior, solution.calibration):
             self._refuse(is_full)
             return False
+        if (np.abs(solution.calibration.mean) > self._largest).any():
+            return False  # no rig file is so wrong: the measurements are
         if is_full:
             self._evidence, self.has_full_window, self._refused = evidence, True, 0
         if (
@@ -302,6 +307,8 @@ def adjusted(
     positions = poses[:, :3, 3]
     velocities = np.gradient(positions, stamps_s, axis=0) if len(poses) > 1 else np.zeros_like(positions)
     states = States(poses, velocities, np.array([0.0, 0.0, -GRAVITY_M_S2]), landmarks)
+    if samples is not None:
+        samples = samples.without(samples.intervals_with_spikes())
     solution = solve(Window(tracks, sigma_px, samples), states, nominal, difference, prior)
     if samples is not None and (solution.imu_errors2 > _MAX_IMU_ERROR2).any():
         # A sample that is wild, or an axis that sticks, is not the IMU's calibration.

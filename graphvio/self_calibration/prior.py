@@ -20,7 +20,7 @@ from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR,
 
 _MIN_DISTORTION = 0.005  # of a coefficient, from which its standard deviation is a share of it
 _MIN_SIGMA = 1e-9
-_GYRO_BIAS_SIGMA_RAD_S, _ACCEL_BIAS_SIGMA_M_S2 = 0.02, 0.1
+_GYRO_BIAS_SIGMA_RAD_S, _ACCEL_BIAS_SIGMA_M_S2 = 0.05, 0.3
 
 
 _CAMERAS, _PLACES, _NO_GROUP = 0, 1, -1  # groups of parameters whose errors have a common factor
