@@ -59,6 +59,15 @@ def test_live_begins_with_what_the_last_run_of_the_device_learnt(room_walk: Path
     assert second.count(LEARNT) == 1
     assert [path.name for path in folder.iterdir()] == [memory.name]
 
+    hours_ago_s = time.time() - 4 * 3600.0
+    os.utime(memory, (hours_ago_s, hours_ago_s))  # so that it is worth being confirmed
+    confirmed = live(simulator, "--rig", rig)
+    assert LEARNT in confirmed
+    assert KEPT in confirmed
+    assert memory.stat().st_mtime > hours_ago_s + 3600.0
+    after = calibration_differences(load_rig(memory), true)
+    assert np.linalg.norm(after["left_right_deg"]) < 0.5 * np.linalg.norm(before["left_right_deg"])
+
     assert LEARNT not in live(simulator, "--rig", rig, "--forget-calibration")
 
     other = live(simulator, "--rig", wrong(tmp_path / "other.yaml", true, 1))

@@ -175,7 +175,11 @@ def _memory(source: str, name: str, rig: Rig, settings: Config, forget_calibrati
         return None
     memory = CalibrationMemory(devices, rig)
     if forget_calibration:
-        memory.forget()
+        try:
+            memory.forget()
+        except OSError as error:
+            warn(f"{memory.path}: cannot be removed ({error.strerror})")
+            return None
     return memory
 
 

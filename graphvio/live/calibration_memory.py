@@ -86,12 +86,15 @@ class CalibrationMemory:
         Raises:
             OSError: if it cannot be written; what was kept before is then unchanged.
         """
-        refined = odometry.refined_rig
-        is_new = refined is not None and any(finding.is_observed for finding in odometry.calibration_findings)
-        if refined is None or not is_new or refined is self._rig:
+        estimate = odometry.calibration
+        if estimate is None or not any(finding.is_observed for finding in odometry.calibration_findings):
             return False
+        if estimate.is_file_exact and estimate.file_rig is self._rig:
+            return False
+        if estimate.is_file_exact:  # what was remembered is good enough to stay in force; now it is known better
+            estimate = replace(estimate, difference=estimate.posterior.mean, file_factors=np.ones(1))
         self._folder.mkdir(parents=True, exist_ok=True)
-        replace_file(self.path, to_text(refined, self.path.parent))
+        replace_file(self.path, to_text(estimate.rig, self.path.parent))
         for other in self._of_other_rigs():
             other.unlink(missing_ok=True)
         return True
