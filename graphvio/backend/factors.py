@@ -10,10 +10,13 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.noise import gaussian, isotropic
+from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.backend.states import InitialUncertainty, RigState
 from graphvio.rig import Imu
 
 _ACCEL_BIAS_SIGMA = 0.2
+_GRAVITY_SIGMA_M_S2 = 0.02  # of its length, on Earth
+_MIN_GRAVITY_SIGMA_M_S2 = 1e-3
 _ZERO_VELOCITY_SIGMA_M_S = 0.005  # of the velocity while the images do not move
 
 
@@ -37,6 +40,11 @@ def r(k: int) -> int:
     return int(gtsam.symbol("r", k))
 
 
+def g() -> int:
+    """Return the key of gravity in nav."""
+    return int(gtsam.symbol("g", 0))
+
+
 def first_state(
     k: int, state: RigState, uncertainty: InitialUncertainty, with_imu: bool
 ) -> Iterator[gtsam.NonlinearFactor]:
@@ -47,6 +55,27 @@ def first_state(
         sigmas = np.repeat([_ACCEL_BIAS_SIGMA, uncertainty.gyro_bias_rad_s], 3)
         bias = gtsam.imuBias.ConstantBias(state.accel_bias, state.gyro_bias)
         yield gtsam.PriorFactorConstantBias(b(k), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+
+
+def gravity(gravity_nav: Float, covariance: Float) -> Iterator[gtsam.NonlinearFactor]:
+    """Yield the priors of gravity in nav: of its direction, and of its length.
+
+    Args:
+        gravity_nav: (3,) m/s^2.
+        covariance: (3, 3) of its direction.
+    """
+    along = np.outer(gravity_nav, gravity_nav)  # says next to nothing of the length
+    floor = _MIN_GRAVITY_SIGMA_M_S2**2 * np.eye(3)
+    yield gtsam.PriorFactorVector(g(), gravity_nav, gaussian(covariance + along + floor))
+    yield gtsam.CustomFactor(isotropic(1, _GRAVITY_SIGMA_M_S2), [g()], _length_error)
+
+
+def _length_error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
+    vector = values.atVector(factor.keys()[0])
+    length = float(np.linalg.norm(vector))
+    if jacobians is not None:
+        jacobians[0] = vector[None] / length
+    return np.array([length - GRAVITY_M_S2])
 
 
 def constant_velocity(

@@ -8,7 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.initialisation import InitialAttitude, initial_attitude, level
-from graphvio.backend.states import InitialUncertainty, RigState, as_origin, origin_covariance
+from graphvio.backend.states import InitialUncertainty, RigState, as_origin, gravity_covariance, origin_covariance
 from graphvio.config.stages import InitialisationConfig
 from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.measurements.imu_interval import ImuInterval
@@ -22,6 +22,7 @@ _REINITIALISED_SPEED_SIGMA = 1.0
 _GYRO_BIAS_SIGMA = 0.01
 _WIDE_GYRO_BIAS_SIGMA = 0.1
 _WIDE_TILT_RAD = 0.3
+_TILT0 = 1e-4
 _AFTER_REBUILD = np.diag([0.05] * 3 + [0.1] * 3) ** 2  # added to the pose's covariance, radians and metres
 AFTER_JUMP = np.diag([0.2] * 3 + [1.0] * 3) ** 2
 """Added to a pose's covariance (6, 6) after a gap that nothing bridges."""
@@ -67,7 +68,10 @@ def first_state_at(
         speed_sigma = _STATIONARY_SPEED_SIGMA if attitude.is_stationary else _MOVING_SPEED_SIGMA
     state = RigState(se3(attitude.nav_R_body, position), np.zeros(3), attitude.gyro_bias, np.zeros(3))
     uncertainty = InitialUncertainty(
-        origin_covariance(attitude.nav_R_body, attitude.tilt_sigma_rad), speed_sigma, attitude.gyro_bias_sigma
+        origin_covariance(attitude.nav_R_body, _TILT0),
+        speed_sigma,
+        attitude.gyro_bias_sigma,
+        gravity=gravity_covariance(np.diag([1.0, 1.0, 0.0]) * attitude.tilt_sigma_rad**2, state.gravity_nav),
     )
     return InitialState(stamp_ns, state, uncertainty, attitude.is_stationary)
 

@@ -10,7 +10,6 @@ from bisect import bisect_right
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.backend.states import RigState
 from graphvio.geometry import se3_compose, se3_exp, so3_exp
 from graphvio.kernels import kernel, put
@@ -83,6 +82,7 @@ class _Path:
         self.stamps = [stamp_ns]
         self._epoch = epoch
         self._bias = np.concatenate([state.gyro_bias, state.accel_bias])
+        self._gravity = state.gravity_nav
         self._twist = np.concatenate([rate, state.nav_T_body[:3, :3].T @ state.velocity_nav])
 
     def add(self, stamp_ns: int, sample: Float) -> None:
@@ -113,21 +113,20 @@ class _Path:
         return Prediction(stamp_ns, pose, velocity, now[:3] - self._bias[:3], self._epoch)
 
     def _after(self, i: int, duration_ns: int, mean: Float) -> tuple[Float, Float]:
-        return advanced(self.poses[i], self.velocities[i], mean, self._bias, duration_ns * 1e-9)
+        return advanced(self.poses[i], self.velocities[i], mean, self._bias, self._gravity, duration_ns * 1e-9)
 
 
 @kernel
 def advanced(
-    nav_T_body: Float, velocity_nav: Float, mean: Float, bias: Float, duration_s: float
+    nav_T_body: Float, velocity_nav: Float, mean: Float, bias: Float, gravity_nav: Float, duration_s: float
 ) -> tuple[Float, Float]:
-    """Return pose (4, 4) and velocity (3,) after a step with a mean rate and specific force (6,) and biases (6,).
+    """Return pose (4, 4) and velocity (3,) after a step with a mean rate and specific force (6,), biases (6,) and gravity.
 
     The mean force is that of the step's middle, and so is the attitude that turns it.
     """
     turn = duration_s * (mean[:3] - bias[:3])
     nav_R_body = np.ascontiguousarray(nav_T_body[:3, :3])
-    acceleration = nav_R_body @ so3_exp(0.5 * turn) @ (mean[3:] - bias[3:])
-    acceleration[2] -= GRAVITY_M_S2
+    acceleration = nav_R_body @ so3_exp(0.5 * turn) @ (mean[3:] - bias[3:]) + gravity_nav
     pose = nav_T_body.copy()
     put(pose[:3, :3], nav_R_body @ so3_exp(turn))
     pose[:3, 3] += duration_s * velocity_nav + 0.5 * duration_s**2 * acceleration

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -17,6 +18,8 @@ from graphvio.backend.factors import (
     b,
     constant_velocity,
     first_state,
+    g,
+    gravity,
     imu_without_samples,
     position_reset,
     v,
@@ -28,10 +31,10 @@ from graphvio.backend.gating import excess, gate_innovation, gate_motion, relati
 from graphvio.backend.noise import gaussian, robust
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.reference_views import ReferenceViews
-from graphvio.backend.states import InitialUncertainty, RigState, StateCovariance
+from graphvio.backend.states import InitialUncertainty, RigState, StateCovariance, level_gravity
 from graphvio.backend.window import SOLVER_ERRORS, Window
 from graphvio.config.stages import SmootherConfig
-from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log, skew
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import RelativeMotion
@@ -89,6 +92,10 @@ class Smoother:
         self._nav_covariance = to_nav @ uncertainty.of_nav @ to_nav.T
         for factor in first_state(k, state, uncertainty, self.has_imu):
             self._window.add(factor)
+        if self.has_imu:
+            self._window.values.insert(g(), state.gravity_nav)
+            for factor in gravity(state.gravity_nav, uncertainty.gravity):
+                self._window.add(factor)
 
     def extend(self, stamp_ns: int, interval: ImuInterval | None) -> RigState:
         """Predict the next state and append it: by the IMU, or without an interval of it by constant velocity."""
@@ -97,19 +104,22 @@ class Smoother:
         before = self.state()
         if interval is None or self._params is None:
             motion = se3_exp(self._previous_motion * dt)
-            state = RigState(before.nav_T_body @ motion, before.velocity_nav, before.gyro_bias, before.accel_bias)
+            state = replace(before, nav_T_body=before.nav_T_body @ motion)
             j = self._append(stamp_ns, state)
             self._link_by_constant_velocity(i, j, motion, dt)
             return state
         bias = gtsam.imuBias.ConstantBias(before.accel_bias, before.gyro_bias)
         measurements = preintegrate(interval, self._params, bias)
         predicted = measurements.predict(gtsam.NavState(gtsam.Pose3(before.nav_T_body), before.velocity_nav), bias)
-        state = RigState(
-            predicted.pose().matrix(), np.asarray(predicted.velocity()), before.gyro_bias, before.accel_bias
-        )
+        beyond = before.gravity_nav - level_gravity()  # which gtsam predicts with
+        pose = predicted.pose().matrix()
+        pose[:3, 3] += 0.5 * dt**2 * beyond
+        state = replace(before, nav_T_body=pose, velocity_nav=np.asarray(predicted.velocity()) + dt * beyond)
         j = self._append(stamp_ns, state)
         self._constrained_ns = stamp_ns
-        self._window.add(gtsam.CombinedImuFactor(x(i), v(i), x(j), v(j), b(i), b(j), measurements))
+        self._window.add(
+            gtsam.CombinedImuFactorWithGravityVector(x(i), v(i), x(j), v(j), b(i), b(j), g(), measurements)
+        )
         return state
 
     def knows(self, stamp_ns: int) -> bool:
@@ -133,6 +143,7 @@ class Smoother:
             np.asarray(values.atVector(v(k))),
             np.asarray(bias.gyroscope()),
             np.asarray(bias.accelerometer()),
+            np.asarray(values.atVector(g())),
         )
 
     def latest_rate(self) -> Float | None:
@@ -148,12 +159,14 @@ class Smoother:
         k = self._index_of[self.latest_ns]
         if not self.has_imu:
             return StateCovariance(self.covariance())
-        joint = self._window.joint_covariance([x(k), v(k), b(k)])
+        joint = self._window.joint_covariance([x(k), v(k), b(k), g()])
         return StateCovariance(
             pose=self._with_nav(joint[:6, :6]),
             velocity=joint[6:9, 6:9],
-            gyro_bias=joint[12:, 12:],
+            gyro_bias=joint[12:15, 12:15],
             accel_bias=joint[9:12, 9:12],
+            gravity=joint[15:, 15:],
+            tilt=self._tilt_covariance(joint),
         )
 
     def covariance_since(self, stamp_ns: int) -> Float:
@@ -208,7 +221,7 @@ class Smoother:
         `covariance` returns.
         """
         k = self._index_of[self.latest_ns]
-        keys = [x(k), v(k), b(k)] if self.has_imu else [x(k)]
+        keys = [x(k), v(k), b(k), g()] if self.has_imu else [x(k)]
         forgotten, factor = position_reset(
             keys, self._window.joint_covariance(keys), _RESET_SIGMA_M, self._window.values
         )
@@ -218,6 +231,18 @@ class Smoother:
 
     def _new_window(self) -> Window:
         return Window(min_iterations=1 if self._config.huber_probability == 1.0 else 2)
+
+    def _tilt_covariance(self, joint: Float) -> Float:
+        """Return the covariance (3, 3) of gravity's direction in the newest body frame, from that of pose to gravity."""
+        state = self.state()
+        body_R_nav = state.nav_T_body[:3, :3].T
+        gravity_body = body_R_nav @ state.gravity_nav
+        rows = np.r_[0:3, 15:18]
+        length = np.linalg.norm(gravity_body)
+        down = gravity_body / length
+        across = (np.eye(3) - np.outer(down, down)) / length
+        jacobian = across @ np.hstack([skew(gravity_body), body_R_nav])
+        return np.asarray(jacobian @ joint[np.ix_(rows, rows)] @ jacobian.T)
 
     def _with_nav(self, covariance: Float) -> Float:
         """Add the covariance of nav to that of the newest pose (6, 6), in body."""
@@ -313,7 +338,7 @@ class Smoother:
         stamps = sorted(keep & self._index_of.keys() - {self.latest_ns})
         keys = [key for stamp in stamps for key in self._views.keys(self._index_of[stamp])]
         newest = self._index_of[self.latest_ns]
-        return [*keys, x(newest), v(newest), b(newest)] if self.has_imu else [*keys, x(newest)]
+        return [*keys, x(newest), v(newest), b(newest), g()] if self.has_imu else [*keys, x(newest)]
 
     def _forget(self, oldest_ns: int, keep: frozenset[int]) -> list[tuple[int, Float]]:
         leaving = [s for s in self._stamps[:-1] if s < oldest_ns and s not in keep]

@@ -7,9 +7,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.backend.inertial import GRAVITY_M_S2
+from graphvio.geometry import skew
 
 _POSITION_SIGMA_M = 1e-3
 _HEADING_SIGMA_RAD = 1e-3
+
+
+def level_gravity() -> Float:
+    """Return gravity (3,) m/s^2 in a nav frame whose z axis points exactly up."""
+    return np.array([0.0, 0.0, -GRAVITY_M_S2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,12 +28,14 @@ class RigState:
         velocity_nav: (3,) m/s.
         gyro_bias: (3,) rad/s.
         accel_bias: (3,) m/s^2.
+        gravity_nav: (3,) m/s^2, downwards.
     """
 
     nav_T_body: Float
     velocity_nav: Float
     gyro_bias: Float
     accel_bias: Float
+    gravity_nav: Float = field(default_factory=level_gravity)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +48,15 @@ class InitialUncertainty:
         gyro_bias_rad_s: standard deviation of each component.
         of_nav: (6, 6) additional covariance of the pose that is reported but not estimated, such as the uncertainty of
             where an epoch begins: no later measurement can reduce it.
+        gravity: (3, 3) covariance of gravity's direction in nav, (m/s^2)^2; zero where nav is level by definition, so
+            that measurements turn the poses.
     """
 
     pose: Float
     velocity_m_s: float
     gyro_bias_rad_s: float
     of_nav: Float = field(default_factory=lambda: np.zeros((6, 6)))
+    gravity: Float = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,17 +68,27 @@ class StateCovariance:
         velocity: (3, 3) in nav.
         gyro_bias: (3, 3).
         accel_bias: (3, 3).
+        gravity: (3, 3) of gravity in nav.
+        tilt: (3, 3) of the direction of gravity in body, a unit vector: of roll and pitch.
     """
 
     pose: Float
     velocity: Float | None = None
     gyro_bias: Float | None = None
     accel_bias: Float | None = None
+    gravity: Float | None = None
+    tilt: Float | None = None
 
 
 def origin_covariance(nav_R_body: Float, tilt_sigma_rad: float) -> Float:
     """Return the covariance (6, 6) of a pose that defines position and heading of nav, and measures roll and pitch."""
     return _origin_covariance(nav_R_body, np.eye(2) * tilt_sigma_rad**2)
+
+
+def gravity_covariance(of_rotation: Float, gravity_nav: Float) -> Float:
+    """Return the covariance (3, 3) of gravity (3,) that is turned by a rotation vector with a covariance (3, 3) in nav."""
+    turned = skew(gravity_nav)
+    return np.asarray(turned @ of_rotation @ turned.T)
 
 
 def as_origin(nav_R_body: Float, covariance: Float) -> tuple[Float, Float]:
