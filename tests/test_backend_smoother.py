@@ -6,7 +6,7 @@ import pytest
 from synthetic import UP, filled_buffer, measured_motion, pose_at, stamps_ns, transform, velocity_at
 
 from graphvio.arrays import Float
-from graphvio.backend.factors import b, v, x
+from graphvio.backend.factors import b, g, v, x
 from graphvio.backend.inertial import ImuBuffer
 from graphvio.backend.smoother import Smoother
 from graphvio.backend.states import InitialUncertainty, RigState, origin_covariance
@@ -405,7 +405,7 @@ def own_position_sigma_m(run: Run) -> float:
     """What the window does not know of the newest position given all else of that state."""
     smoother = run.smoother
     k = smoother._index_of[smoother.latest_ns]
-    keys = [x(k), v(k), b(k)] if smoother.has_imu else [x(k)]
+    keys = [x(k), v(k), b(k), g()] if smoother.has_imu else [x(k)]
     joint = smoother._window.joint_covariance(keys)
     others, position = np.delete(np.arange(len(joint)), slice(3, 6)), np.arange(3, 6)
     gain = np.linalg.solve(joint[np.ix_(others, others)], joint[np.ix_(others, position)])

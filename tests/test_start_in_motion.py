@@ -119,9 +119,10 @@ def run(
         out.status.append(estimator.update(stamp_ns, used, frozenset()).status)
         state, covariance = estimator.state(), estimator.covariance
         rotation = state.nav_T_body[:3, :3]
-        out.tilt_deg.append(float(np.rad2deg(np.arccos(min(rotation[2] @ true[2, :3], 1.0)))))
-        about_nav = (rotation @ covariance.pose[:3, :3] @ rotation.T)[:2, :2]
-        out.tilt_sigma_deg.append(float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(about_nav)[-1]))))
+        up = -rotation.T @ state.gravity_nav / np.linalg.norm(state.gravity_nav)
+        out.tilt_deg.append(float(np.rad2deg(np.arccos(min(up @ true[2, :3], 1.0)))))
+        assert covariance.tilt is not None
+        out.tilt_sigma_deg.append(float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(covariance.tilt)[-1]))))
         error = rotation.T @ state.velocity_nav - true[:3, :3].T @ swing.velocity(t)
         assert covariance.velocity is not None
         out.speed_m_s.append(float(np.linalg.norm(error)))

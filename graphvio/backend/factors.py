@@ -9,14 +9,15 @@ import gtsam
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.noise import gaussian, isotropic
 from graphvio.backend.inertial import GRAVITY_M_S2
+from graphvio.backend.noise import gaussian, isotropic
 from graphvio.backend.states import InitialUncertainty, RigState
 from graphvio.rig import Imu
 
 _ACCEL_BIAS_SIGMA = 0.2
 _GRAVITY_SIGMA_M_S2 = 0.02  # of its length, on Earth
 _MIN_GRAVITY_SIGMA_M_S2 = 1e-3
+_SUM = int(gtsam.symbol("s", 0))
 _ZERO_VELOCITY_SIGMA_M_S = 0.005  # of the velocity while the images do not move
 
 
@@ -146,11 +147,27 @@ def position_reset(
     rows = np.sqrt(1.0 / sigma_m**2 - 1.0 / variances)[:, None] * axes.T
     jacobian = np.empty((3, len(covariance)))
     jacobian[:, order] = rows @ np.hstack([np.eye(3), -gain])
-    blocks: list[Any] = []
-    at, dims = 0, values.dims()
-    for key in keys:
-        blocks += [key, jacobian[:, at : at + dims[key]]]
-        at += dims[key]
-    linear = gtsam.JacobianFactor(*blocks, np.zeros(3), gtsam.noiseModel.Unit.Create(3))  # type: ignore[call-overload]
+    dims = values.dims()
+    columns = np.split(jacobian, np.cumsum([dims[key] for key in keys])[:-1], axis=1)
+    linear = _linear(list(zip(keys, columns, strict=True)))
     forgotten = (axes * (variances - sigma_m**2)) @ axes.T
     return forgotten, gtsam.LinearContainerFactor(linear, values)
+
+
+def _linear(terms: list[tuple[int, Float]]) -> gtsam.GaussianFactor:
+    """Return the factor of unit noise whose error (3,) is the sum of some variables times matrices (3, D).
+
+    gtsam's constructors take three variables from Python. More are made of two factors that share one more variable,
+    each with half of the variance, by eliminating it.
+    """
+    unit = gtsam.noiseModel.Unit.Create(3)
+    if len(terms) == 1:
+        return gtsam.JacobianFactor(*terms[0], np.zeros(3), unit)
+    graph, half = gtsam.GaussianFactorGraph(), isotropic(3, np.sqrt(0.5))
+    for sign, part in ((-1.0, terms[:2]), (1.0, terms[2:])):
+        blocks: list[Any] = [_SUM, sign * np.eye(3)]
+        for term in part:
+            blocks += term
+        graph.add(gtsam.JacobianFactor(*blocks, np.zeros(3), half))
+    _, remaining = graph.eliminatePartialMultifrontal(gtsam.Ordering([_SUM]), gtsam.EliminateQR)
+    return remaining.at(0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.initialisation import InitialAttitude, initial_attitude, level
-from graphvio.backend.states import InitialUncertainty, RigState, as_origin, gravity_covariance, origin_covariance
+from graphvio.backend.states import InitialUncertainty, RigState, StateCovariance, as_origin, certain_origin, gravity_by_tilt, origin_covariance
 from graphvio.config.stages import InitialisationConfig
 from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.measurements.imu_interval import ImuInterval
@@ -22,7 +22,6 @@ _REINITIALISED_SPEED_SIGMA = 1.0
 _GYRO_BIAS_SIGMA = 0.01
 _WIDE_GYRO_BIAS_SIGMA = 0.1
 _WIDE_TILT_RAD = 0.3
-_TILT0 = 1e-4
 _AFTER_REBUILD = np.diag([0.05] * 3 + [0.1] * 3) ** 2  # added to the pose's covariance, radians and metres
 AFTER_JUMP = np.diag([0.2] * 3 + [1.0] * 3) ** 2
 """Added to a pose's covariance (6, 6) after a gap that nothing bridges."""
@@ -68,43 +67,55 @@ def first_state_at(
         speed_sigma = _STATIONARY_SPEED_SIGMA if attitude.is_stationary else _MOVING_SPEED_SIGMA
     state = RigState(se3(attitude.nav_R_body, position), np.zeros(3), attitude.gyro_bias, np.zeros(3))
     uncertainty = InitialUncertainty(
-        origin_covariance(attitude.nav_R_body, _TILT0),
-        speed_sigma,
-        attitude.gyro_bias_sigma,
-        gravity=gravity_covariance(np.diag([1.0, 1.0, 0.0]) * attitude.tilt_sigma_rad**2, state.gravity_nav),
+        origin_covariance(attitude.nav_R_body, attitude.tilt_sigma_rad), speed_sigma, attitude.gyro_bias_sigma
     )
     return InitialState(stamp_ns, state, uncertainty, attitude.is_stationary)
 
 
-def after_failure(stamp_ns: int, state: RigState, pose_covariance: Float) -> InitialState:
+def with_free_gravity(initial: InitialState) -> InitialState:
+    """Let the first pose define all of nav: what is unknown of roll and pitch is gravity's direction in nav.
+
+    Later measurements then turn gravity, and not the poses.
+    """
+    state, known = initial.state, initial.uncertainty
+    tilted = gravity_by_tilt(state.nav_T_body[:3, :3], known.pose, state.gravity_nav)
+    return replace(initial, uncertainty=replace(known, pose=certain_origin(), gravity=known.gravity + tilted))
+
+
+def after_failure(stamp_ns: int, state: RigState, covariance: StateCovariance) -> InitialState:
     """Reinitialise at the predicted state, after a window that has no solution.
 
     Args:
         stamp_ns: Stamp of the state.
         state: The prediction.
-        pose_covariance: (6, 6) of the last pose that was known, tangent in body.
+        covariance: Of the last state that was known.
     """
-    return _reinitialised(stamp_ns, state, pose_covariance + _AFTER_REBUILD)
+    return _reinitialised(stamp_ns, state, covariance.pose + _AFTER_REBUILD, covariance.gravity)
 
 
-def after_gap(stamp_ns: int, state: RigState, pose_covariance: Float) -> InitialState:
-    """Reinitialise at the last state, after a gap that nothing bridges; arguments as for `after_failure`."""
-    return _reinitialised(stamp_ns, state, pose_covariance + AFTER_JUMP)
+def after_gap(stamp_ns: int, state: RigState, covariance: StateCovariance) -> InitialState:
+    """Begin an epoch at the last state, after a gap that nothing bridges; arguments as for `after_failure`."""
+    return _of_new_epoch(stamp_ns, state, covariance.pose + AFTER_JUMP, covariance.gravity)
 
 
-def after_lost(motion: RelativeMotion, state: RigState, pose_covariance: Float) -> InitialState:
-    """Reinitialise at the predicted state, with the velocity of the first motion that vision measures again.
+def after_lost(motion: RelativeMotion, state: RigState, covariance: StateCovariance) -> InitialState:
+    """Begin an epoch at the predicted state, with the velocity of the first motion that vision measures again.
 
     Args:
         motion: A motion that ends in the state.
         state: The prediction.
-        pose_covariance: (6, 6) of the prediction, tangent in body.
+        covariance: Of the prediction.
     """
-    return _reinitialised(motion.stamp_ns, _with_velocity(state, motion), pose_covariance)
+    return _of_new_epoch(motion.stamp_ns, _with_velocity(state, motion), covariance.pose, covariance.gravity)
 
 
 def from_vision(
-    motion: RelativeMotion, nav_T_body: Float, state: RigState, pose_covariance: Float, prediction_failed: bool
+    motion: RelativeMotion,
+    nav_T_body: Float,
+    state: RigState,
+    pose_covariance: Float,
+    gravity_covariance: Float | None,
+    prediction_failed: bool,
 ) -> InitialState:
     """Reinitialise at the pose that a chain of motions leads to.
 
@@ -113,6 +124,7 @@ def from_vision(
         nav_T_body: (4, 4) pose at its end.
         state: The prediction for the same instant.
         pose_covariance: (6, 6) of the pose at the beginning of the chain, tangent in body; the chain is better known.
+        gravity_covariance: (3, 3) of gravity in nav, or None where it is not estimated.
         prediction_failed: Whether the prediction is known to be wrong; else vision may be wrong as well, and the pose
             is uncertain by as much as it differs from the prediction.
     """
@@ -120,28 +132,40 @@ def from_vision(
     state = _with_velocity(replace(state, nav_T_body=nav_T_body), motion)
     covariance = pose_covariance + motion.covariance + np.diag(apart**2)
     gyro_bias_sigma = _GYRO_BIAS_SIGMA if prediction_failed else _WIDE_GYRO_BIAS_SIGMA
-    return _reinitialised(motion.stamp_ns, state, covariance, gyro_bias_sigma)
+    return _reinitialised(motion.stamp_ns, state, covariance, gravity_covariance, gyro_bias_sigma)
 
 
 def with_wide_attitude(initial: InitialState) -> InitialState:
-    """Return the same state with roll, pitch and gyro bias as uncertain as at a first initialisation.
+    """Return the first state of an epoch with gravity and gyro bias as uncertain as at a first initialisation.
 
     For a state that is reinitialised soon after the last time: what it would take over is probably wrong.
     """
-    nav_R_body = initial.state.nav_T_body[:3, :3]
-    pose = initial.uncertainty.pose.copy()
-    pose[:3, :3] += nav_R_body.T @ np.diag([_WIDE_TILT_RAD, _WIDE_TILT_RAD, 0.0]) ** 2 @ nav_R_body
-    uncertainty = replace(initial.uncertainty, pose=pose, gyro_bias_rad_s=_WIDE_GYRO_BIAS_SIGMA)
-    return replace(initial, uncertainty=uncertainty, is_known=False)
+    uncertainty = replace(initial.uncertainty, gyro_bias_rad_s=_WIDE_GYRO_BIAS_SIGMA)
+    uncertainty = replace(uncertainty, pose=uncertainty.pose + np.diag([_WIDE_TILT_RAD] * 3 + [0.0] * 3) ** 2)
+    return with_free_gravity(replace(initial, uncertainty=uncertainty, is_known=False))
+
+
+def _of_new_epoch(
+    stamp_ns: int, state: RigState, pose_covariance: Float, gravity_covariance: Float | None
+) -> InitialState:
+    # The pose defines the epoch's nav: its uncertainty is reported, but nothing is estimated of it.
+    initial = with_free_gravity(_reinitialised(stamp_ns, state, pose_covariance, gravity_covariance))
+    return replace(initial, uncertainty=replace(initial.uncertainty, of_nav=pose_covariance))
 
 
 def _reinitialised(
-    stamp_ns: int, state: RigState, pose_covariance: Float, gyro_bias_sigma: float = _GYRO_BIAS_SIGMA
+    stamp_ns: int,
+    state: RigState,
+    pose_covariance: Float,
+    gravity_covariance: Float | None,
+    gyro_bias_sigma: float = _GYRO_BIAS_SIGMA,
 ) -> InitialState:
     # Position and heading must not move when the attitude becomes known better: their uncertainty is reported, but
     # nothing is estimated of it.
     pose, of_nav = as_origin(state.nav_T_body[:3, :3], pose_covariance)
-    return InitialState(stamp_ns, state, InitialUncertainty(pose, _REINITIALISED_SPEED_SIGMA, gyro_bias_sigma, of_nav))
+    gravity = np.zeros((3, 3)) if gravity_covariance is None else gravity_covariance
+    uncertainty = InitialUncertainty(pose, _REINITIALISED_SPEED_SIGMA, gyro_bias_sigma, of_nav, gravity)
+    return InitialState(stamp_ns, state, uncertainty)
 
 
 def _with_velocity(state: RigState, motion: RelativeMotion) -> RigState:

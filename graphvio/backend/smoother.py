@@ -31,10 +31,10 @@ from graphvio.backend.gating import excess, gate_innovation, gate_motion, relati
 from graphvio.backend.noise import gaussian, robust
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.reference_views import ReferenceViews
-from graphvio.backend.states import InitialUncertainty, RigState, StateCovariance, level_gravity
+from graphvio.backend.states import InitialUncertainty, RigState, StateCovariance, level_gravity, tilt_covariance
 from graphvio.backend.window import SOLVER_ERRORS, Window
 from graphvio.config.stages import SmootherConfig
-from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log, skew
+from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import RelativeMotion
@@ -42,6 +42,7 @@ from graphvio.rig import Imu
 
 _UNKNOWN_RATE_SIGMA_RAD_S = 1.0
 _RESET_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
+_POSE_AND_GRAVITY = np.r_[0:6, 15:18]
 _MAX_ADVANCED = 2  # framesets in a row for which the window is not solved as a whole
 
 
@@ -166,7 +167,7 @@ class Smoother:
             gyro_bias=joint[12:15, 12:15],
             accel_bias=joint[9:12, 9:12],
             gravity=joint[15:, 15:],
-            tilt=self._tilt_covariance(joint),
+            tilt=tilt_covariance(self.state(), joint[np.ix_(_POSE_AND_GRAVITY, _POSE_AND_GRAVITY)]),
         )
 
     def covariance_since(self, stamp_ns: int) -> Float:
@@ -231,18 +232,6 @@ class Smoother:
 
     def _new_window(self) -> Window:
         return Window(min_iterations=1 if self._config.huber_probability == 1.0 else 2)
-
-    def _tilt_covariance(self, joint: Float) -> Float:
-        """Return the covariance (3, 3) of gravity's direction in the newest body frame, from that of pose to gravity."""
-        state = self.state()
-        body_R_nav = state.nav_T_body[:3, :3].T
-        gravity_body = body_R_nav @ state.gravity_nav
-        rows = np.r_[0:3, 15:18]
-        length = np.linalg.norm(gravity_body)
-        down = gravity_body / length
-        across = (np.eye(3) - np.outer(down, down)) / length
-        jacobian = across @ np.hstack([skew(gravity_body), body_R_nav])
-        return np.asarray(jacobian @ joint[np.ix_(rows, rows)] @ jacobian.T)
 
     def _with_nav(self, covariance: Float) -> Float:
         """Add the covariance of nav to that of the newest pose (6, 6), in body."""

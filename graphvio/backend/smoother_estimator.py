@@ -16,6 +16,7 @@ from graphvio.backend.initial_state import (
     after_lost,
     first_state_at,
     from_vision,
+    with_free_gravity,
     with_wide_attitude,
 )
 from graphvio.backend.smoother import Smoother
@@ -125,7 +126,8 @@ class SmootherEstimator:
         elif self._rig.imu is not None and imu is None:
             self._status.report_no_imu(stamp_ns)
         self._smoother = Smoother(self._config.smoother, self._rig.imu if imu else None)
-        self._initialise_at(first_state_at(stamp_ns, position, imu, self._rig, self._config.initialisation))
+        initial = first_state_at(stamp_ns, position, imu, self._rig, self._config.initialisation)
+        self._initialise_at(with_free_gravity(initial) if imu else initial)
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
         """Extend the window by the IMU, or by constant velocity; a gap that neither bridges ends the epoch."""
@@ -178,7 +180,7 @@ class SmootherEstimator:
             is_constrained,
             self._sigma_m,
             self.has_imu,
-            lambda: missing_of(self.state(), self.covariance, self._config.initialisation),
+            lambda: missing_of(self.covariance, self._config.initialisation),
         )
         return StateUpdate(status, needs_keyframe=is_rebuilt)
 
@@ -251,13 +253,13 @@ class SmootherEstimator:
         """Make a new window around a state, after one that has no solution; status and epoch stay as they are."""
         self._report(stamp_ns, EventKind.WINDOW_REBUILT, str(error))
         was_lost, sigma_m = self._status.is_lost, self._sigma_m
-        self._reinitialise(after_failure(stamp_ns, state, self.covariance.pose), stamp_ns - 1)
+        self._reinitialise(after_failure(stamp_ns, state, self.covariance), stamp_ns - 1)
         self._status.is_lost, self._sigma_m, self._rebuilt_sigma_m = was_lost, sigma_m, sigma_m
 
     def _reinitialise_after_gap(self, stamp_ns: int) -> None:
         """Begin an epoch at the last pose, after a pause or a jump of the clock that nothing bridges."""
         last_ns = self.latest_ns
-        self._reinitialise(after_gap(stamp_ns, self.state(), self.covariance.pose), last_ns)
+        self._reinitialise(after_gap(stamp_ns, self.state(), self.covariance), last_ns)
         self.epoch += 1
         gap_s = (stamp_ns - last_ns) * 1e-9
         self._report(
@@ -267,7 +269,7 @@ class SmootherEstimator:
     def _reinitialise_after_lost(self, motion: RelativeMotion) -> None:
         """Begin an epoch at the predicted pose, with the velocity of the first motion after the estimate was lost."""
         smoother = self._running
-        initial = after_lost(motion, smoother.state(), smoother.covariance())
+        initial = after_lost(motion, smoother.state(), smoother.state_covariance())
         if self.has_imu and self._accepted < _MIN_TRUSTED_MOTIONS:
             initial = with_wide_attitude(initial)
         self._reinitialise(initial, self._tracked_ns)
@@ -286,7 +288,9 @@ class SmootherEstimator:
         """
         smoother, nav_T_body = self._running, self._refused[motion.stamp_ns]
         predicted = smoother.state()
-        initial = from_vision(motion, nav_T_body, predicted, self._tracked_covariance, self._imu_failed)
+        initial = from_vision(
+            motion, nav_T_body, predicted, self._tracked_covariance, self.covariance.gravity, self._imu_failed
+        )
         self._reinitialise(initial, self._tracked_ns)
         apart_m = np.linalg.norm(se3_log(se3_inverse(nav_T_body) @ predicted.nav_T_body)[3:])
         self._report(

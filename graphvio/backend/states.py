@@ -8,10 +8,11 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.inertial import GRAVITY_M_S2
+from graphvio.backend.initialisation import level
 from graphvio.geometry import skew
 
 _POSITION_SIGMA_M = 1e-3
-_HEADING_SIGMA_RAD = 1e-3
+_ATTITUDE_SIGMA_RAD = 1e-3
 
 
 def level_gravity() -> Float:
@@ -68,8 +69,8 @@ class StateCovariance:
         velocity: (3, 3) in nav.
         gyro_bias: (3, 3).
         accel_bias: (3, 3).
-        gravity: (3, 3) of gravity in nav.
-        tilt: (3, 3) of the direction of gravity in body, a unit vector: of roll and pitch.
+        gravity: (3, 3) of gravity in nav, (m/s^2)^2.
+        tilt: (2, 2) of roll and pitch against gravity, about the horizontal axes of nav turned level.
     """
 
     pose: Float
@@ -85,10 +86,17 @@ def origin_covariance(nav_R_body: Float, tilt_sigma_rad: float) -> Float:
     return _origin_covariance(nav_R_body, np.eye(2) * tilt_sigma_rad**2)
 
 
-def gravity_covariance(of_rotation: Float, gravity_nav: Float) -> Float:
-    """Return the covariance (3, 3) of gravity (3,) that is turned by a rotation vector with a covariance (3, 3) in nav."""
+def gravity_by_tilt(nav_R_body: Float, of_pose: Float, gravity_nav: Float) -> Float:
+    """Return the covariance (3, 3) of gravity (3,) in nav by the tilt of a pose (6, 6) that is taken for certain in nav."""
+    about_nav = np.zeros((3, 3))
+    about_nav[:2, :2] = (nav_R_body @ of_pose[:3, :3] @ nav_R_body.T)[:2, :2]
     turned = skew(gravity_nav)
-    return np.asarray(turned @ of_rotation @ turned.T)
+    return np.asarray(turned @ about_nav @ turned.T)
+
+
+def certain_origin() -> Float:
+    """Return the covariance (6, 6) of a pose that defines all of nav: the same in any frame."""
+    return np.diag(np.repeat([_ATTITUDE_SIGMA_RAD, _POSITION_SIGMA_M], 3) ** 2)
 
 
 def as_origin(nav_R_body: Float, covariance: Float) -> tuple[Float, Float]:
@@ -106,9 +114,26 @@ def as_origin(nav_R_body: Float, covariance: Float) -> tuple[Float, Float]:
 
 def _origin_covariance(nav_R_body: Float, tilt: Float) -> Float:
     """Return the covariance (6, 6) in body for a covariance (2, 2) of tilt about nav's horizontal axes."""
-    about_nav = np.diag([0.0, 0.0, _HEADING_SIGMA_RAD**2])
+    about_nav = np.eye(3) * _ATTITUDE_SIGMA_RAD**2
     about_nav[:2, :2] = tilt
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = nav_R_body.T @ about_nav @ nav_R_body
     covariance[3:, 3:] = np.eye(3) * _POSITION_SIGMA_M**2
     return covariance
+
+def level_R_nav(gravity_nav: Float) -> Float:
+    """Return the rotation (3, 3) that turns nav level, by gravity (3,) in nav; nav's x axis keeps its heading."""
+    return level(-gravity_nav)
+
+
+def tilt_covariance(state: RigState, covariance: Float) -> Float:
+    """Return the covariance (2, 2) of roll and pitch about the horizontal axes of nav turned level.
+
+    Args:
+        state: The rig.
+        covariance: (9, 9) of its pose, tangent in body, and of gravity in nav.
+    """
+    turn = level_R_nav(state.gravity_nav)
+    across = np.array([[0.0, -1.0], [1.0, 0.0]]) / np.linalg.norm(state.gravity_nav)
+    jacobian = np.hstack([(turn @ state.nav_T_body[:3, :3])[:2], np.zeros((2, 3)), across @ turn[:2]])
+    return np.asarray(jacobian @ covariance @ jacobian.T)

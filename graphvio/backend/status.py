@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from graphvio.backend.initial_state import InitialState
-from graphvio.backend.states import RigState, StateCovariance
+from graphvio.backend.states import StateCovariance
 from graphvio.config.stages import InitialisationConfig
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind, Report
@@ -90,13 +90,11 @@ class StatusMonitor:
         return True
 
 
-def missing_of(state: RigState, covariance: StateCovariance, config: InitialisationConfig) -> str:
+def missing_of(covariance: StateCovariance, config: InitialisationConfig) -> str:
     """Say what of a state is not known well enough yet for its initialisation to be over, or nothing."""
-    if covariance.velocity is None:
+    if covariance.velocity is None or covariance.tilt is None:
         return ""
-    nav_R_body = state.nav_T_body[:3, :3]
-    about_nav = nav_R_body @ covariance.pose[:3, :3] @ nav_R_body.T
-    tilt_deg = np.rad2deg(np.sqrt(np.linalg.eigvalsh(about_nav[:2, :2])[-1]))
+    tilt_deg = np.rad2deg(np.sqrt(np.linalg.eigvalsh(covariance.tilt)[-1]))
     speed_m_s = np.sqrt(np.linalg.eigvalsh(covariance.velocity)[-1])
     reasons = []
     if tilt_deg > config.tilt_sigma_deg:

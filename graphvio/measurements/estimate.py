@@ -38,6 +38,12 @@ class Estimate:
         gyro_bias: (3,) rad/s, or None without an IMU.
         accel_bias: (3,) m/s^2, or None without an IMU.
         velocity_covariance: (3, 3) of ``velocity_nav``, in nav, or None where it is not estimated.
+        gravity_nav: (3,) m/s^2 in nav, downwards, or None without an IMU. Its direction at the beginning of an epoch is
+            uncertain and becomes known later; poses are not turned then, so that nav may be off the level by what
+            ``gravity_nav`` says.
+        gravity_covariance: (3, 3) of ``gravity_nav``, in nav, or None without an IMU.
+        tilt_covariance: (2, 2) of roll and pitch against gravity, rad^2, about the horizontal axes of nav turned level;
+            None without an IMU.
         gyro_bias_covariance: (3, 3), or None where the bias is not estimated.
         accel_bias_covariance: (3, 3), or None where the bias is not estimated.
         time_offset_s: The IMU's stamp less the framesets' stamp of the same instant, as estimated, or None.
@@ -68,6 +74,9 @@ class Estimate:
     velocity_covariance: Float | None = None
     gyro_bias_covariance: Float | None = None
     accel_bias_covariance: Float | None = None
+    gravity_nav: Float | None = None
+    gravity_covariance: Float | None = None
+    tilt_covariance: Float | None = None
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
     innovations: Mapping[str, GateResult] = field(default_factory=dict)

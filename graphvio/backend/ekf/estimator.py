@@ -13,7 +13,7 @@ from graphvio.backend.ekf.process import noise_sigmas
 from graphvio.backend.ekf.state import ATTITUDE, ERRORS, GYRO_BIAS, POSITION, RATE, VELOCITY, FilterState
 from graphvio.backend.estimator import MeasurementUpdate, StateUpdate
 from graphvio.backend.initial_state import AFTER_JUMP, MAX_UNBRIDGED_S, first_state_at
-from graphvio.backend.states import RigState, StateCovariance
+from graphvio.backend.states import RigState, StateCovariance, tilt_covariance
 from graphvio.backend.status import StatusMonitor
 from graphvio.config import Config
 from graphvio.geometry import se3_adjoint, se3_inverse, skew
@@ -240,7 +240,17 @@ class FilterEstimator:
         by_error[:, VELOCITY] = state.nav_R_body
         by_error[:, ATTITUDE] = -state.nav_R_body @ skew(state.velocity_body)
         velocity = by_error @ covariance @ by_error.T
-        return StateCovariance(pose, velocity, covariance[GYRO_BIAS, GYRO_BIAS] if self._has_imu else None)
+        if not self._has_imu:
+            return StateCovariance(pose, velocity)
+        of_level_nav = np.zeros((9, 9))  # the filter's nav is level by definition
+        of_level_nav[:6, :6] = pose
+        return StateCovariance(
+            pose,
+            velocity,
+            covariance[GYRO_BIAS, GYRO_BIAS],
+            gravity=np.zeros((3, 3)),
+            tilt=tilt_covariance(self.state(), of_level_nav),
+        )
 
     def _inertial(self, rates: VisualRates | None) -> list[Measurement]:
         """Return the gyro's and the accelerometer's measurements over the newest step, as far as they are used."""
