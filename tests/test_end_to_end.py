@@ -77,7 +77,8 @@ def assert_gravity_and_gyro_bias_are_found(out: Path) -> None:
     estimate, truth = load_trajectory(out / "trajectory.txt"), load_trajectory(path)
     (true,), known = truth.at(estimate.stamps_ns[-1:], 0.1)[0].nav_T_body, truth.at(estimate.stamps_ns[-1:], 0.1)[1]
     assert known.all()
-    up, true_up = estimate.nav_T_body[-1, 2, :3], true[2, :3]
+    gravity = np.loadtxt(out / "gravity.csv", delimiter=",", skiprows=1)[-1, 1:4]
+    up, true_up = -gravity @ estimate.nav_T_body[-1, :3, :3] / np.linalg.norm(gravity), true[2, :3]
     assert np.rad2deg(np.linalg.norm(np.cross(up, true_up))) < 0.3
     assert up @ true_up > 0.0
     columns = np.genfromtxt(path, delimiter=",", comments="#")
@@ -97,7 +98,7 @@ def test_run_is_complete_accurate_and_repeatable(room_walk: Path, tmp_path: Path
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
     names = {path.name for path in (tmp_path / "a").iterdir()}
     assert names == {
-        "trajectory.txt", "trajectory_smoothed.txt", "covariance.csv", "imu_bias.csv", "pairs.csv",
+        "trajectory.txt", "trajectory_smoothed.txt", "covariance.csv", "imu_bias.csv", "gravity.csv", "pairs.csv",
         "events.jsonl", "config.yaml", "rig.yaml", "summary.json", "trajectory.png",
         "calibration.csv", "calibration.png", "rig-refined.yaml",
     }  # fmt: skip

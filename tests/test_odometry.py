@@ -101,14 +101,18 @@ def test_smoothed_poses_cover_every_frameset_once(odometry: Odometry, measuremen
     assert odometry.take_smoothed() == []
 
 
-def test_nav_is_upright_and_scale_is_metric(
+def test_gravity_points_down_and_scale_is_metric(
     odometry: Odometry, measurements: list[Measurement], truth: Trajectory
 ) -> None:
     estimate = feed(odometry, measurements)[-1]
     assert estimate.nav_T_body is not None
     true, _ = truth.at(np.array([framesets(measurements)[0].stamp_ns, estimate.stamp_ns]), 0.1)
-    up_error = np.arccos(min(1.0, estimate.nav_T_body[2, :3] @ true.rotations[1][2]))
+    assert estimate.gravity_nav is not None
+    assert estimate.tilt_covariance is not None
+    up = -estimate.nav_T_body[:3, :3].T @ estimate.gravity_nav / np.linalg.norm(estimate.gravity_nav)
+    up_error = np.arccos(min(1.0, up @ true.rotations[1][2]))
     assert np.rad2deg(up_error) < 0.5
+    assert up_error < 4.0 * np.sqrt(np.linalg.eigvalsh(estimate.tilt_covariance)[-1])
     walked = np.linalg.norm(true.positions[1] - true.positions[0])
     assert np.linalg.norm(estimate.nav_T_body[:3, 3]) == pytest.approx(walked, abs=0.01)
 

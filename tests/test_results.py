@@ -59,6 +59,8 @@ def estimates() -> list[Estimate]:
             epoch=int(k >= LOST.stop),
             gyro_bias=np.array([0.001, 0.002, 0.003]),
             accel_bias=np.array([0.1, 0.2, 0.3]),
+            gravity_nav=np.array([0.1, 0.2, -9.8]),
+            tilt_covariance=np.diag([0.02, 0.01]) ** 2,
             pairs=reports(k),
             stage_ms={"track": float(k), "solve": 2.0},
         )
@@ -108,6 +110,7 @@ def test_writer_writes_all_files(folder: Path) -> None:
         "config.yaml",
         "covariance.csv",
         "events.jsonl",
+        "gravity.csv",
         "imu_bias.csv",
         "pairs.csv",
         "rig.yaml",
@@ -144,6 +147,9 @@ def test_biases_and_events_are_written(folder: Path) -> None:
     bias = np.loadtxt(folder / "imu_bias.csv", delimiter=",", skiprows=1)
     assert bias.shape == (COUNT, 7)
     np.testing.assert_allclose(bias[0, 1:], [0.001, 0.002, 0.003, 0.1, 0.2, 0.3])
+    gravity = np.loadtxt(folder / "gravity.csv", delimiter=",", skiprows=1)
+    assert gravity.shape == (COUNT, 5)
+    np.testing.assert_allclose(gravity[0, 1:], [0.1, 0.2, -9.8, 0.02])
     events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
     assert events[0] == {
         "stamp_ns": START_NS,
@@ -222,7 +228,8 @@ def test_path_length_leaves_out_step_between_epochs(folder: Path) -> None:
 def test_writer_with_equal_input_writes_equal_bytes(folder: Path, tmp_path: Path) -> None:
     write_all(tmp_path / "again")
     for name in (
-        "trajectory.txt", "trajectory_smoothed.txt", "covariance.csv", "imu_bias.csv", "pairs.csv", "events.jsonl",
+        "trajectory.txt", "trajectory_smoothed.txt", "covariance.csv", "imu_bias.csv", "gravity.csv", "pairs.csv",
+        "events.jsonl",
     ):  # fmt: skip
         assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes(), name
 

@@ -8,9 +8,9 @@ import pytest
 from graphvio.arrays import Float
 from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.backend.smoother_estimator import SmootherEstimator
-from graphvio.backend.states import InitialUncertainty, origin_covariance
+from graphvio.backend.states import InitialUncertainty, level_R_nav, origin_covariance
 from graphvio.config import Config
-from graphvio.geometry import se3, se3_exp, so3_exp, so3_log
+from graphvio.geometry import se3, se3_exp, se3_inverse, se3_log, so3_exp, so3_log
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.measurements.sensors import ImuSample
@@ -62,6 +62,8 @@ class Outcome:
         tilt_deg, speed_m_s: errors of roll and pitch, and of velocity in body.
         tilt_sigma_deg, speed_sigma_m_s: as reported.
         step_m: how far the step to the frameset is from the true one, in the frame of the rig before it.
+        tilt_square: squared Mahalanobis distance of the error of roll and pitch.
+        turned_deg, moved_m: errors of the motion from the first pose, as it was emitted, to the newest one.
     """
 
     tilt_deg: list[float] = field(default_factory=list)
@@ -69,6 +71,9 @@ class Outcome:
     speed_m_s: list[float] = field(default_factory=list)
     speed_sigma_m_s: list[float] = field(default_factory=list)
     step_m: list[float] = field(default_factory=list)
+    tilt_square: list[float] = field(default_factory=list)
+    turned_deg: list[float] = field(default_factory=list)
+    moved_m: list[float] = field(default_factory=list)
     status: list[Status] = field(default_factory=list)
     events: list[tuple[float, str, str]] = field(default_factory=list)
 
@@ -85,13 +90,19 @@ def run(
     sigmas: Float | None = SIGMAS,
     duration_s: float = 4.0,
     bias_error: Float | None = None,
+    with_imu: bool = True,
 ) -> Outcome:
     """Vision has these errors, one sigma, or sees nothing; the gyro's bias may be thought to be known, and be wrong."""
     rng, rig, config = np.random.default_rng(seed), default_rig(), Config()
-    assert rig.imu is not None
+    imu = rig.imu
+    assert imu is not None
+    if not with_imu:
+        rig = rig.without_imu()
     swing, synchroniser, out = Swing(rng, accel_m_s2, hertz), Synchroniser(rig, config, lambda *_: None), Outcome()
-    for k in range(-round(rig.imu.rate_hz), round((duration_s + 0.1) * rig.imu.rate_hz)):
-        synchroniser.add_sample(swing.sample(k / rig.imu.rate_hz, rig.imu))
+    for k in range(-round(imu.rate_hz), round((duration_s + 0.1) * imu.rate_hz)):
+        sample = swing.sample(k / imu.rate_hz, imu)
+        if with_imu:
+            synchroniser.add_sample(sample)
     estimator = SmootherEstimator(
         rig,
         config,
@@ -103,13 +114,14 @@ def run(
         stamp_ns, true = BASE_NS + round(t * 1e9), swing.pose(t)
         used = n == 0
         if n == 0:
-            estimator.initialise(stamp_ns, synchroniser.initial_interval(stamp_ns))
+            estimator.initialise(stamp_ns, synchroniser.initial_interval(stamp_ns) if with_imu else None)
+            first, true_first = estimator.state().nav_T_body, true
             if bias_error is not None:
                 state = replace(estimator.state(), gyro_bias=swing.gyro_bias + bias_error)
                 known = InitialUncertainty(origin_covariance(state.nav_T_body[:3, :3], 0.25), 0.3, 0.001)
                 estimator._running.initialise(stamp_ns, state, known)
         else:
-            estimator.predict(stamp_ns, synchroniser.interval(before_ns, stamp_ns))
+            estimator.predict(stamp_ns, synchroniser.interval(before_ns, stamp_ns) if with_imu else None)
             if sigmas is not None:
                 measured = np.linalg.inv(true_before) @ true @ se3_exp(sigmas * rng.standard_normal(6))
                 motion = RelativeMotion(before_ns, stamp_ns, measured, np.diag(sigmas**2), np.zeros((6, 6)), 200)
@@ -119,9 +131,17 @@ def run(
         out.status.append(estimator.update(stamp_ns, used, frozenset()).status)
         state, covariance = estimator.state(), estimator.covariance
         rotation = state.nav_T_body[:3, :3]
+        moved, true_moved = se3_inverse(first) @ state.nav_T_body, se3_inverse(true_first) @ true
+        out.turned_deg.append(float(np.rad2deg(np.linalg.norm(se3_log(se3_inverse(moved) @ true_moved)[:3]))))
+        out.moved_m.append(float(np.linalg.norm(moved[:3, 3] - true_moved[:3, 3])))
+        if not with_imu:
+            before_ns, before, true_before = stamp_ns, state.nav_T_body, true
+            continue
         up = -rotation.T @ state.gravity_nav / np.linalg.norm(state.gravity_nav)
         out.tilt_deg.append(float(np.rad2deg(np.arccos(min(up @ true[2, :3], 1.0)))))
         assert covariance.tilt is not None
+        tilt = (level_R_nav(state.gravity_nav) @ rotation @ true[2, :3])[[1, 0]] * [1.0, -1.0]
+        out.tilt_square.append(float(tilt @ np.linalg.solve(covariance.tilt, tilt)))
         out.tilt_sigma_deg.append(float(np.rad2deg(np.sqrt(np.linalg.eigvalsh(covariance.tilt)[-1]))))
         error = rotation.T @ state.velocity_nav - true[:3, :3].T @ swing.velocity(t)
         assert covariance.velocity is not None
@@ -149,6 +169,34 @@ def test_it_is_known_within_two_seconds_and_rightly(accel_m_s2: float, hertz: fl
     assert np.median([out.tilt_deg[-1] for out in outcomes]) < 0.6
     if accel_m_s2 > 1.0:  # where it began far off
         assert max(out.tilt_deg[0] for out in outcomes) > 10.0
+
+
+@pytest.mark.parametrize(("accel_m_s2", "hertz"), [(1.0, 0.5), (5.0, 0.5), (15.0, 1.0)])
+def test_gravity_turns_and_the_poses_do_not(accel_m_s2: float, hertz: float) -> None:
+    """What is level is learnt by many degrees, and the motion from the first pose is right all along."""
+    outcomes = [run(seed, accel_m_s2, hertz) for seed in range(8)]
+    learnt = [out.tilt_deg[0] - out.tilt_deg[-1] for out in outcomes]
+    assert max(learnt) > (1.0 if accel_m_s2 == 1.0 else 10.0)
+    for out in outcomes:
+        assert max(out.turned_deg[20:]) < 1.5  # as without an IMU: 80 motions of 1 mrad on each axis
+        assert out.moved_m[-1] < 0.12
+
+
+def test_level_is_known_as_well_as_it_is_said_to_be() -> None:
+    """Biases of this IMU are half as large as is allowed for, and its noise a third: the mean may be below 2."""
+    squares = np.array([run(seed, accel, 0.5).tilt_square for accel in (1.0, 5.0) for seed in range(20)])
+    for seconds in (1.0, 2.0, 3.9):
+        mean = squares[:, round(seconds / STEP_S)].mean()
+        assert 0.2 < mean < 2.7  # 95 % of such means are below 2.65
+
+
+def test_imu_makes_poses_no_worse() -> None:
+    """The same motions with and without the IMU, started in motion."""
+    ratios = []
+    for seed in range(10):
+        one, other = (run(seed, 2.0, 0.5, with_imu=with_imu) for with_imu in (True, False))
+        ratios.append(np.sqrt(np.mean(np.square(one.moved_m)) / np.mean(np.square(other.moved_m))))
+    assert np.median(ratios) < 1.05
 
 
 def test_without_motions_it_is_never_known() -> None:

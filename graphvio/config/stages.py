@@ -90,9 +90,9 @@ class MotionConfig(Stage):
     sigma_inflation: float = 1.2
     """Factor on a motion's standard deviations, for errors that residuals do not show, such as those of matches that
     share a patch."""
-    calibration_error_share: float = 0.002
-    """Standard deviation that errors of the calibration add to a motion, as a share of its angle and distance, where
-    there is an IMU."""
+    calibration_error_share: float = 0.0002
+    """Standard deviation that errors which many points have in common add to a motion, as a share of its angle and
+    distance, where there is an IMU."""
     min_inliers: int = 12
     """Motions that explain fewer points are rejected."""
     min_inlier_share: float = 0.3

@@ -42,6 +42,7 @@ _TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
 COVARIANCE_HEADER = ",".join(["stamp_ns", *(f"{a}_{b}" for a, b in combinations_with_replacement(_TANGENT, 2))])
 """Columns of `covariance_row`."""
 _BIAS_HEADER = "stamp_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
+_GRAVITY_HEADER = "stamp_ns,gravity_x,gravity_y,gravity_z,tilt_sigma"
 _CALIBRATION_HEADER = "stamp_ns,parameter,difference,sigma"
 _PAIRS_HEADER = "stamp_ns,pair,points,inliers,rms_px,own_inliers,own_rms_px"
 _UPPER = np.triu_indices(6)
@@ -112,6 +113,7 @@ class ResultWriter:
                 ("trajectory.txt", ""),
                 ("covariance.csv", COVARIANCE_HEADER),
                 ("imu_bias.csv", _BIAS_HEADER),
+                ("gravity.csv", _GRAVITY_HEADER),
                 ("pairs.csv", _PAIRS_HEADER),
                 ("events.jsonl", ""),
                 ("calibration.csv", _CALIBRATION_HEADER),
@@ -158,6 +160,9 @@ class ResultWriter:
             self._stage_ms.setdefault(stage, array("d")).append(spent_ms)
         if estimate.gyro_bias is not None and estimate.accel_bias is not None:
             self._write("imu_bias.csv", _csv(stamp, [*estimate.gyro_bias, *estimate.accel_bias]))
+        if estimate.gravity_nav is not None and estimate.tilt_covariance is not None:
+            tilt_sigma = float(np.sqrt(np.linalg.eigvalsh(estimate.tilt_covariance)[-1]))
+            self._write("gravity.csv", _csv(stamp, [*estimate.gravity_nav, tilt_sigma]))
         for index in sorted(estimate.pairs):
             self._add_report(stamp, self._pair_names[index], estimate.pairs[index])
         if estimate.nav_T_body is None:

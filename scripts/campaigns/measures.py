@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from graphvio.arrays import Float
-from graphvio.geometry import se3_inverse, se3_log
+from graphvio.backend.states import level_R_nav
 
 CONFIDENCE = 0.95
 
@@ -77,19 +77,14 @@ def rows(squares: Squares, names: Mapping[str, str]) -> list[list[str]]:
 HEAD = ("what", "dimensions", "mean", f"{100 * CONFIDENCE:.0f} % band", "times in band")
 
 
-def tilt_error(nav_T_body: Float, true: Float, covariance: Float) -> tuple[Float, Float]:
-    """Return error (2,) and covariance (2, 2), from the pose (6, 6), of roll and pitch about nav's horizontal axes."""
-    rotation = nav_T_body[:3, :3]
-    off = np.eye(4)
-    off[:3, :3] = true[:3, :3] @ rotation.T
-    about_nav = rotation @ covariance[:3, :3] @ rotation.T
-    return se3_log(off)[:2], about_nav[:2, :2]
+def tilt_error(nav_T_body: Float, gravity_nav: Float, true: Float) -> Float:
+    """Return the error (2,) of roll and pitch against gravity, about the horizontal axes of nav turned level.
 
-
-def heading_aligned(nav_T_body: Float, world_T_body: Float) -> Float:
-    """Return the upright ``nav_T_world`` (4, 4) that gives both poses the same heading."""
-    about = nav_T_body @ se3_inverse(np.ascontiguousarray(world_T_body))
-    heading = np.arctan2(about[1, 0] - about[0, 1], about[0, 0] + about[1, 1])
-    turned = np.eye(4)
-    turned[:2, :2] = [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
-    return turned
+    Args:
+        nav_T_body: (4, 4) estimated pose.
+        gravity_nav: (3,) as estimated.
+        true: (4, 4) pose of body in a level frame.
+    """
+    level_R_body = level_R_nav(gravity_nav) @ nav_T_body[:3, :3]
+    true_up = level_R_body @ true[2, :3]
+    return np.array([true_up[1], -true_up[0]])

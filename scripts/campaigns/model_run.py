@@ -98,9 +98,10 @@ class _ModelRun:
         assert known.velocity is not None
         assert known.gyro_bias is not None
         assert known.accel_bias is not None
+        assert known.tilt is not None
         for name, error, covariance in (
             ("velocity", self._velocities[k] - state.velocity_nav, known.velocity),
-            ("tilt", *tilt_error(state.nav_T_body, self._truth[k], known.pose)),
+            ("tilt", tilt_error(state.nav_T_body, state.gravity_nav, self._truth[k]), known.tilt),
             ("gyro bias", self._track.gyro_bias[sample] - state.gyro_bias, known.gyro_bias),
             ("accel bias", self._track.accel_bias[sample] - state.accel_bias, known.accel_bias),
         ):

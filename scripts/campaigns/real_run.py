@@ -118,8 +118,9 @@ def _misses_of_state(smoother: Smoother, truth: Truth, k: int) -> Iterator[Miss]
     assert known.velocity is not None
     assert known.gyro_bias is not None
     assert known.accel_bias is not None
+    assert known.tilt is not None
     yield Miss("velocity", k, truth.velocity_world[k] - state.velocity_nav, known.velocity)
-    yield Miss("tilt", k, *tilt_error(state.nav_T_body, truth.world_T_body[k], known.pose))
+    yield Miss("tilt", k, tilt_error(state.nav_T_body, state.gravity_nav, truth.world_T_body[k]), known.tilt)
     yield Miss("gyro bias", k, truth.gyro_bias[k] - state.gyro_bias, known.gyro_bias)
     yield Miss("accel bias", k, truth.accel_bias[k] - state.accel_bias, known.accel_bias)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from benchmarks.recordings import simulated
 
-from campaigns.measures import heading_aligned, tilt_error
+from campaigns.measures import tilt_error
 from campaigns.model_run import Square
 from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
@@ -84,17 +84,18 @@ class _Run:
         k = self._sample(estimate.stamp_ns)
         if estimate.nav_T_body is None or estimate.velocity_nav is None or estimate.covariance is None:
             return
-        # The heading and the place of nav are those of the first frameset.
-        nav_T_world = heading_aligned(estimate.nav_T_body, self._states.world_T_body[k])
+        true = self._states.world_T_body[k]
         assert estimate.velocity_covariance is not None
         assert estimate.gyro_bias is not None
         assert estimate.gyro_bias_covariance is not None
         assert estimate.accel_bias is not None
         assert estimate.accel_bias_covariance is not None
-        true_velocity = nav_T_world[:3, :3] @ self._states.velocity[k]
+        assert estimate.gravity_nav is not None
+        assert estimate.tilt_covariance is not None
+        true_velocity = estimate.nav_T_body[:3, :3] @ true[:3, :3].T @ self._states.velocity[k]  # seen from body
         for name, error, covariance in (
             ("velocity", true_velocity - estimate.velocity_nav, estimate.velocity_covariance),
-            ("tilt", *tilt_error(estimate.nav_T_body, nav_T_world @ self._states.world_T_body[k], estimate.covariance)),
+            ("tilt", tilt_error(estimate.nav_T_body, estimate.gravity_nav, true), estimate.tilt_covariance),
             ("gyro bias", self._track.gyro_bias[k] - estimate.gyro_bias, estimate.gyro_bias_covariance),
             ("accel bias", self._track.accel_bias[k] - estimate.accel_bias, estimate.accel_bias_covariance),
         ):

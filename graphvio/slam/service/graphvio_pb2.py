@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n$graphvio/slam/service/graphvio.proto\x12\x0bgraphvio.v1\"\x10\n\x0eGetInfoRequest\"\xa0\x01\n\x04Info\x12\x0f\n\x07version\x18\x01 \x01(\t\x12\x10\n\x08rig_yaml\x18\x02 \x01(\t\x12\x0e\n\x06run_id\x18\x03 \x01(\t\x12\x12\n\x05\x65poch\x18\x04 \x01(\x03H\x00\x88\x01\x01\x12\x1a\n\x12oldest_keyframe_id\x18\x05 \x01(\x03\x12\x18\n\x10next_keyframe_id\x18\x06 \x01(\x03\x12\x11\n\thas_ended\x18\x07 \x01(\x08\x42\x08\n\x06_epoch\"\x12\n\x10GetStatusRequest\"\x8e\x01\n\x0cStatusReport\x12\x35\n\x06values\x18\x01 \x03(\x0b\x32%.graphvio.v1.StatusReport.ValuesEntry\x1aG\n\x0bValuesEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\'\n\x05value\x18\x02 \x01(\x0b\x32\x18.graphvio.v1.StatusValue:\x02\x38\x01\"I\n\x0bStatusValue\x12\x10\n\x06number\x18\x01 \x01(\x01H\x00\x12\x0f\n\x05\x63ount\x18\x02 \x01(\x03H\x00\x12\x0e\n\x04text\x18\x03 \x01(\tH\x00\x42\x07\n\x05value\"I\n\x16StreamEstimatesRequest\x12\x1f\n\x04rate\x18\x01 \x01(\x0e\x32\x11.graphvio.v1.Rate\x12\x0e\n\x06run_id\x18\x02 \x01(\t\"\x97\x01\n\x0e\x45stimateUpdate\x12)\n\x08\x65stimate\x18\x01 \x01(\x0b\x32\x15.graphvio.v1.EstimateH\x00\x12-\n\nprediction\x18\x02 \x01(\x0b\x32\x17.graphvio.v1.PredictionH\x00\x12\x12\n\nmap_T_odom\x18\x03 \x03(\x01\x12\x0e\n\x06missed\x18\x04 \x01(\x04\x42\x07\n\x05state\"\xdb\x03\n\x08\x45stimate\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12+\n\x06status\x18\x02 \x01(\x0e\x32\x1b.graphvio.v1.TrackingStatus\x12\r\n\x05\x65poch\x18\x03 \x01(\x03\x12\x13\n\x0bodom_T_body\x18\x04 \x03(\x01\x12\x12\n\ncovariance\x18\x05 \x03(\x01\x12\x15\n\rvelocity_odom\x18\x06 \x03(\x01\x12\x1b\n\x13velocity_covariance\x18\x07 \x03(\x01\x12\x11\n\tgyro_bias\x18\x08 \x03(\x01\x12\x1c\n\x14gyro_bias_covariance\x18\t \x03(\x01\x12\x12\n\naccel_bias\x18\n \x03(\x01\x12\x1d\n\x15\x61\x63\x63\x65l_bias_covariance\x18\x0b \x03(\x01\x12\x1a\n\rtime_offset_s\x18\x0c \x01(\x01H\x00\x88\x01\x01\x12 \n\x13time_offset_sigma_s\x18\r \x01(\x01H\x01\x88\x01\x01\x12*\n\x06vision\x18\x0e \x01(\x0e\x32\x1a.graphvio.v1.VisionQuality\x12\x15\n\rvision_reason\x18\x0f \x01(\t\x12\x15\n\ris_stationary\x18\x10 \x01(\x08\x42\x10\n\x0e_time_offset_sB\x16\n\x14_time_offset_sigma_s\"s\n\nPrediction\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\r\n\x05\x65poch\x18\x02 \x01(\x03\x12\x13\n\x0bodom_T_body\x18\x03 \x03(\x01\x12\x15\n\rvelocity_odom\x18\x04 \x03(\x01\x12\x18\n\x10\x61ngular_velocity\x18\x05 \x03(\x01\"h\n\x16StreamKeyframesRequest\x12\x0f\n\x07\x66rom_id\x18\x01 \x01(\x03\x12\x13\n\x0bwith_images\x18\x02 \x01(\x08\x12\x18\n\x10with_descriptors\x18\x03 \x01(\x08\x12\x0e\n\x06run_id\x18\x04 \x01(\t\"G\n\x0eKeyframeUpdate\x12\'\n\x08keyframe\x18\x01 \x01(\x0b\x32\x15.graphvio.v1.Keyframe\x12\x0c\n\x04gone\x18\x02 \x01(\x03\"\xc1\x02\n\x08Keyframe\x12\n\n\x02id\x18\x01 \x01(\x03\x12\r\n\x05\x65poch\x18\x02 \x01(\x03\x12\x10\n\x08stamp_ns\x18\x03 \x01(\x03\x12+\n\x06status\x18\x04 \x01(\x0e\x32\x1b.graphvio.v1.TrackingStatus\x12\x13\n\x0bodom_T_body\x18\x05 \x03(\x01\x12\x12\n\ncovariance\x18\x06 \x03(\x01\x12\x18\n\x0bprevious_id\x18\x07 \x01(\x03H\x00\x88\x01\x01\x12\x17\n\x0fprevious_T_body\x18\x08 \x03(\x01\x12\x1b\n\x13relative_covariance\x18\t \x03(\x01\x12)\n\tlandmarks\x18\n \x01(\x0b\x32\x16.graphvio.v1.Landmarks\x12\'\n\x06images\x18\x0b \x03(\x0b\x32\x17.graphvio.v1.PairImagesB\x0e\n\x0c_previous_id\"\xa6\x01\n\tLandmarks\x12\x0c\n\x04pair\x18\x01 \x03(\x03\x12\x10\n\x08track_id\x18\x02 \x03(\x03\x12\x13\n\x0bpoints_body\x18\x03 \x03(\x01\x12\x13\n\x0b\x63ovariances\x18\x04 \x03(\x01\x12\x0f\n\x07left_px\x18\x05 \x03(\x01\x12\x10\n\x08right_px\x18\x06 \x03(\x01\x12\x17\n\x0f\x64\x65scriptor_size\x18\x07 \x01(\r\x12\x13\n\x0b\x64\x65scriptors\x18\x08 \x01(\x0c\"_\n\nPairImages\x12\x0c\n\x04pair\x18\x01 \x01(\x03\x12 \n\x04left\x18\x02 \x01(\x0b\x32\x12.graphvio.v1.Image\x12!\n\x05right\x18\x03 \x01(\x0b\x32\x12.graphvio.v1.Image\"6\n\x05Image\x12\r\n\x05width\x18\x01 \x01(\r\x12\x0e\n\x06height\x18\x02 \x01(\r\x12\x0e\n\x06pixels\x18\x03 \x01(\x0c\"%\n\x13StreamEventsRequest\x12\x0e\n\x06run_id\x18\x01 \x01(\t\"M\n\x0b\x45ventUpdate\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\x0c\n\x04kind\x18\x02 \x01(\t\x12\x0e\n\x06\x64\x65tail\x18\x03 \x01(\t\x12\x0e\n\x06missed\x18\x04 \x01(\x04\"]\n\x0e\x43orrectRequest\x12\x13\n\x0bkeyframe_id\x18\x01 \x01(\x03\x12\x12\n\nmap_T_body\x18\x02 \x03(\x01\x12\x12\n\ncovariance\x18\x03 \x03(\x01\x12\x0e\n\x06run_id\x18\x04 \x01(\t\"\x80\x01\n\x0f\x43orrectResponse\x12\x10\n\x08\x61\x63\x63\x65pted\x18\x01 \x01(\x08\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x16\n\tstatistic\x18\x03 \x01(\x01H\x00\x88\x01\x01\x12\x11\n\tthreshold\x18\x04 \x01(\x01\x12\x12\n\nmap_T_odom\x18\x05 \x03(\x01\x42\x0c\n\n_statistic*\xa9\x01\n\x0eTrackingStatus\x12\x1f\n\x1bTRACKING_STATUS_UNSPECIFIED\x10\x00\x12 \n\x1cTRACKING_STATUS_INITIALISING\x10\x01\x12\x1c\n\x18TRACKING_STATUS_TRACKING\x10\x02\x12\x1c\n\x18TRACKING_STATUS_COASTING\x10\x03\x12\x18\n\x14TRACKING_STATUS_LOST\x10\x04*|\n\rVisionQuality\x12\x1e\n\x1aVISION_QUALITY_UNSPECIFIED\x10\x00\x12\x17\n\x13VISION_QUALITY_GOOD\x10\x01\x12\x17\n\x13VISION_QUALITY_WEAK\x10\x02\x12\x19\n\x15VISION_QUALITY_FAILED\x10\x03*:\n\x04Rate\x12\x14\n\x10RATE_UNSPECIFIED\x10\x00\x12\x0e\n\nRATE_FRAME\x10\x01\x12\x0c\n\x08RATE_IMU\x10\x02\x32\xce\x03\n\x08\x46rontEnd\x12\x39\n\x07GetInfo\x12\x1b.graphvio.v1.GetInfoRequest\x1a\x11.graphvio.v1.Info\x12\x45\n\tGetStatus\x12\x1d.graphvio.v1.GetStatusRequest\x1a\x19.graphvio.v1.StatusReport\x12U\n\x0fStreamEstimates\x12#.graphvio.v1.StreamEstimatesRequest\x1a\x1b.graphvio.v1.EstimateUpdate0\x01\x12U\n\x0fStreamKeyframes\x12#.graphvio.v1.StreamKeyframesRequest\x1a\x1b.graphvio.v1.KeyframeUpdate0\x01\x12L\n\x0cStreamEvents\x12 .graphvio.v1.StreamEventsRequest\x1a\x18.graphvio.v1.EventUpdate0\x01\x12\x44\n\x07\x43orrect\x12\x1b.graphvio.v1.CorrectRequest\x1a\x1c.graphvio.v1.CorrectResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n$graphvio/slam/service/graphvio.proto\x12\x0bgraphvio.v1\"\x10\n\x0eGetInfoRequest\"\xa0\x01\n\x04Info\x12\x0f\n\x07version\x18\x01 \x01(\t\x12\x10\n\x08rig_yaml\x18\x02 \x01(\t\x12\x0e\n\x06run_id\x18\x03 \x01(\t\x12\x12\n\x05\x65poch\x18\x04 \x01(\x03H\x00\x88\x01\x01\x12\x1a\n\x12oldest_keyframe_id\x18\x05 \x01(\x03\x12\x18\n\x10next_keyframe_id\x18\x06 \x01(\x03\x12\x11\n\thas_ended\x18\x07 \x01(\x08\x42\x08\n\x06_epoch\"\x12\n\x10GetStatusRequest\"\x8e\x01\n\x0cStatusReport\x12\x35\n\x06values\x18\x01 \x03(\x0b\x32%.graphvio.v1.StatusReport.ValuesEntry\x1aG\n\x0bValuesEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\'\n\x05value\x18\x02 \x01(\x0b\x32\x18.graphvio.v1.StatusValue:\x02\x38\x01\"I\n\x0bStatusValue\x12\x10\n\x06number\x18\x01 \x01(\x01H\x00\x12\x0f\n\x05\x63ount\x18\x02 \x01(\x03H\x00\x12\x0e\n\x04text\x18\x03 \x01(\tH\x00\x42\x07\n\x05value\"I\n\x16StreamEstimatesRequest\x12\x1f\n\x04rate\x18\x01 \x01(\x0e\x32\x11.graphvio.v1.Rate\x12\x0e\n\x06run_id\x18\x02 \x01(\t\"\x97\x01\n\x0e\x45stimateUpdate\x12)\n\x08\x65stimate\x18\x01 \x01(\x0b\x32\x15.graphvio.v1.EstimateH\x00\x12-\n\nprediction\x18\x02 \x01(\x0b\x32\x17.graphvio.v1.PredictionH\x00\x12\x12\n\nmap_T_odom\x18\x03 \x03(\x01\x12\x0e\n\x06missed\x18\x04 \x01(\x04\x42\x07\n\x05state\"\xa6\x04\n\x08\x45stimate\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12+\n\x06status\x18\x02 \x01(\x0e\x32\x1b.graphvio.v1.TrackingStatus\x12\r\n\x05\x65poch\x18\x03 \x01(\x03\x12\x13\n\x0bodom_T_body\x18\x04 \x03(\x01\x12\x12\n\ncovariance\x18\x05 \x03(\x01\x12\x15\n\rvelocity_odom\x18\x06 \x03(\x01\x12\x1b\n\x13velocity_covariance\x18\x07 \x03(\x01\x12\x11\n\tgyro_bias\x18\x08 \x03(\x01\x12\x1c\n\x14gyro_bias_covariance\x18\t \x03(\x01\x12\x12\n\naccel_bias\x18\n \x03(\x01\x12\x1d\n\x15\x61\x63\x63\x65l_bias_covariance\x18\x0b \x03(\x01\x12\x1a\n\rtime_offset_s\x18\x0c \x01(\x01H\x00\x88\x01\x01\x12 \n\x13time_offset_sigma_s\x18\r \x01(\x01H\x01\x88\x01\x01\x12*\n\x06vision\x18\x0e \x01(\x0e\x32\x1a.graphvio.v1.VisionQuality\x12\x15\n\rvision_reason\x18\x0f \x01(\t\x12\x15\n\ris_stationary\x18\x10 \x01(\x08\x12\x14\n\x0cgravity_odom\x18\x11 \x03(\x01\x12\x1a\n\x12gravity_covariance\x18\x12 \x03(\x01\x12\x17\n\x0ftilt_covariance\x18\x13 \x03(\x01\x42\x10\n\x0e_time_offset_sB\x16\n\x14_time_offset_sigma_s\"s\n\nPrediction\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\r\n\x05\x65poch\x18\x02 \x01(\x03\x12\x13\n\x0bodom_T_body\x18\x03 \x03(\x01\x12\x15\n\rvelocity_odom\x18\x04 \x03(\x01\x12\x18\n\x10\x61ngular_velocity\x18\x05 \x03(\x01\"h\n\x16StreamKeyframesRequest\x12\x0f\n\x07\x66rom_id\x18\x01 \x01(\x03\x12\x13\n\x0bwith_images\x18\x02 \x01(\x08\x12\x18\n\x10with_descriptors\x18\x03 \x01(\x08\x12\x0e\n\x06run_id\x18\x04 \x01(\t\"G\n\x0eKeyframeUpdate\x12\'\n\x08keyframe\x18\x01 \x01(\x0b\x32\x15.graphvio.v1.Keyframe\x12\x0c\n\x04gone\x18\x02 \x01(\x03\"\xc1\x02\n\x08Keyframe\x12\n\n\x02id\x18\x01 \x01(\x03\x12\r\n\x05\x65poch\x18\x02 \x01(\x03\x12\x10\n\x08stamp_ns\x18\x03 \x01(\x03\x12+\n\x06status\x18\x04 \x01(\x0e\x32\x1b.graphvio.v1.TrackingStatus\x12\x13\n\x0bodom_T_body\x18\x05 \x03(\x01\x12\x12\n\ncovariance\x18\x06 \x03(\x01\x12\x18\n\x0bprevious_id\x18\x07 \x01(\x03H\x00\x88\x01\x01\x12\x17\n\x0fprevious_T_body\x18\x08 \x03(\x01\x12\x1b\n\x13relative_covariance\x18\t \x03(\x01\x12)\n\tlandmarks\x18\n \x01(\x0b\x32\x16.graphvio.v1.Landmarks\x12\'\n\x06images\x18\x0b \x03(\x0b\x32\x17.graphvio.v1.PairImagesB\x0e\n\x0c_previous_id\"\xa6\x01\n\tLandmarks\x12\x0c\n\x04pair\x18\x01 \x03(\x03\x12\x10\n\x08track_id\x18\x02 \x03(\x03\x12\x13\n\x0bpoints_body\x18\x03 \x03(\x01\x12\x13\n\x0b\x63ovariances\x18\x04 \x03(\x01\x12\x0f\n\x07left_px\x18\x05 \x03(\x01\x12\x10\n\x08right_px\x18\x06 \x03(\x01\x12\x17\n\x0f\x64\x65scriptor_size\x18\x07 \x01(\r\x12\x13\n\x0b\x64\x65scriptors\x18\x08 \x01(\x0c\"_\n\nPairImages\x12\x0c\n\x04pair\x18\x01 \x01(\x03\x12 \n\x04left\x18\x02 \x01(\x0b\x32\x12.graphvio.v1.Image\x12!\n\x05right\x18\x03 \x01(\x0b\x32\x12.graphvio.v1.Image\"6\n\x05Image\x12\r\n\x05width\x18\x01 \x01(\r\x12\x0e\n\x06height\x18\x02 \x01(\r\x12\x0e\n\x06pixels\x18\x03 \x01(\x0c\"%\n\x13StreamEventsRequest\x12\x0e\n\x06run_id\x18\x01 \x01(\t\"M\n\x0b\x45ventUpdate\x12\x10\n\x08stamp_ns\x18\x01 \x01(\x03\x12\x0c\n\x04kind\x18\x02 \x01(\t\x12\x0e\n\x06\x64\x65tail\x18\x03 \x01(\t\x12\x0e\n\x06missed\x18\x04 \x01(\x04\"]\n\x0e\x43orrectRequest\x12\x13\n\x0bkeyframe_id\x18\x01 \x01(\x03\x12\x12\n\nmap_T_body\x18\x02 \x03(\x01\x12\x12\n\ncovariance\x18\x03 \x03(\x01\x12\x0e\n\x06run_id\x18\x04 \x01(\t\"\x80\x01\n\x0f\x43orrectResponse\x12\x10\n\x08\x61\x63\x63\x65pted\x18\x01 \x01(\x08\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x16\n\tstatistic\x18\x03 \x01(\x01H\x00\x88\x01\x01\x12\x11\n\tthreshold\x18\x04 \x01(\x01\x12\x12\n\nmap_T_odom\x18\x05 \x03(\x01\x42\x0c\n\n_statistic*\xa9\x01\n\x0eTrackingStatus\x12\x1f\n\x1bTRACKING_STATUS_UNSPECIFIED\x10\x00\x12 \n\x1cTRACKING_STATUS_INITIALISING\x10\x01\x12\x1c\n\x18TRACKING_STATUS_TRACKING\x10\x02\x12\x1c\n\x18TRACKING_STATUS_COASTING\x10\x03\x12\x18\n\x14TRACKING_STATUS_LOST\x10\x04*|\n\rVisionQuality\x12\x1e\n\x1aVISION_QUALITY_UNSPECIFIED\x10\x00\x12\x17\n\x13VISION_QUALITY_GOOD\x10\x01\x12\x17\n\x13VISION_QUALITY_WEAK\x10\x02\x12\x19\n\x15VISION_QUALITY_FAILED\x10\x03*:\n\x04Rate\x12\x14\n\x10RATE_UNSPECIFIED\x10\x00\x12\x0e\n\nRATE_FRAME\x10\x01\x12\x0c\n\x08RATE_IMU\x10\x02\x32\xce\x03\n\x08\x46rontEnd\x12\x39\n\x07GetInfo\x12\x1b.graphvio.v1.GetInfoRequest\x1a\x11.graphvio.v1.Info\x12\x45\n\tGetStatus\x12\x1d.graphvio.v1.GetStatusRequest\x1a\x19.graphvio.v1.StatusReport\x12U\n\x0fStreamEstimates\x12#.graphvio.v1.StreamEstimatesRequest\x1a\x1b.graphvio.v1.EstimateUpdate0\x01\x12U\n\x0fStreamKeyframes\x12#.graphvio.v1.StreamKeyframesRequest\x1a\x1b.graphvio.v1.KeyframeUpdate0\x01\x12L\n\x0cStreamEvents\x12 .graphvio.v1.StreamEventsRequest\x1a\x18.graphvio.v1.EventUpdate0\x01\x12\x44\n\x07\x43orrect\x12\x1b.graphvio.v1.CorrectRequest\x1a\x1c.graphvio.v1.CorrectResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,12 +33,12 @@ if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_STATUSREPORT_VALUESENTRY']._loaded_options = None
   _globals['_STATUSREPORT_VALUESENTRY']._serialized_options = b'8\001'
-  _globals['_TRACKINGSTATUS']._serialized_start=2468
-  _globals['_TRACKINGSTATUS']._serialized_end=2637
-  _globals['_VISIONQUALITY']._serialized_start=2639
-  _globals['_VISIONQUALITY']._serialized_end=2763
-  _globals['_RATE']._serialized_start=2765
-  _globals['_RATE']._serialized_end=2823
+  _globals['_TRACKINGSTATUS']._serialized_start=2543
+  _globals['_TRACKINGSTATUS']._serialized_end=2712
+  _globals['_VISIONQUALITY']._serialized_start=2714
+  _globals['_VISIONQUALITY']._serialized_end=2838
+  _globals['_RATE']._serialized_start=2840
+  _globals['_RATE']._serialized_end=2898
   _globals['_GETINFOREQUEST']._serialized_start=53
   _globals['_GETINFOREQUEST']._serialized_end=69
   _globals['_INFO']._serialized_start=72
@@ -56,29 +56,29 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_ESTIMATEUPDATE']._serialized_start=550
   _globals['_ESTIMATEUPDATE']._serialized_end=701
   _globals['_ESTIMATE']._serialized_start=704
-  _globals['_ESTIMATE']._serialized_end=1179
-  _globals['_PREDICTION']._serialized_start=1181
-  _globals['_PREDICTION']._serialized_end=1296
-  _globals['_STREAMKEYFRAMESREQUEST']._serialized_start=1298
-  _globals['_STREAMKEYFRAMESREQUEST']._serialized_end=1402
-  _globals['_KEYFRAMEUPDATE']._serialized_start=1404
-  _globals['_KEYFRAMEUPDATE']._serialized_end=1475
-  _globals['_KEYFRAME']._serialized_start=1478
-  _globals['_KEYFRAME']._serialized_end=1799
-  _globals['_LANDMARKS']._serialized_start=1802
-  _globals['_LANDMARKS']._serialized_end=1968
-  _globals['_PAIRIMAGES']._serialized_start=1970
-  _globals['_PAIRIMAGES']._serialized_end=2065
-  _globals['_IMAGE']._serialized_start=2067
-  _globals['_IMAGE']._serialized_end=2121
-  _globals['_STREAMEVENTSREQUEST']._serialized_start=2123
-  _globals['_STREAMEVENTSREQUEST']._serialized_end=2160
-  _globals['_EVENTUPDATE']._serialized_start=2162
-  _globals['_EVENTUPDATE']._serialized_end=2239
-  _globals['_CORRECTREQUEST']._serialized_start=2241
-  _globals['_CORRECTREQUEST']._serialized_end=2334
-  _globals['_CORRECTRESPONSE']._serialized_start=2337
-  _globals['_CORRECTRESPONSE']._serialized_end=2465
-  _globals['_FRONTEND']._serialized_start=2826
-  _globals['_FRONTEND']._serialized_end=3288
+  _globals['_ESTIMATE']._serialized_end=1254
+  _globals['_PREDICTION']._serialized_start=1256
+  _globals['_PREDICTION']._serialized_end=1371
+  _globals['_STREAMKEYFRAMESREQUEST']._serialized_start=1373
+  _globals['_STREAMKEYFRAMESREQUEST']._serialized_end=1477
+  _globals['_KEYFRAMEUPDATE']._serialized_start=1479
+  _globals['_KEYFRAMEUPDATE']._serialized_end=1550
+  _globals['_KEYFRAME']._serialized_start=1553
+  _globals['_KEYFRAME']._serialized_end=1874
+  _globals['_LANDMARKS']._serialized_start=1877
+  _globals['_LANDMARKS']._serialized_end=2043
+  _globals['_PAIRIMAGES']._serialized_start=2045
+  _globals['_PAIRIMAGES']._serialized_end=2140
+  _globals['_IMAGE']._serialized_start=2142
+  _globals['_IMAGE']._serialized_end=2196
+  _globals['_STREAMEVENTSREQUEST']._serialized_start=2198
+  _globals['_STREAMEVENTSREQUEST']._serialized_end=2235
+  _globals['_EVENTUPDATE']._serialized_start=2237
+  _globals['_EVENTUPDATE']._serialized_end=2314
+  _globals['_CORRECTREQUEST']._serialized_start=2316
+  _globals['_CORRECTREQUEST']._serialized_end=2409
+  _globals['_CORRECTRESPONSE']._serialized_start=2412
+  _globals['_CORRECTRESPONSE']._serialized_end=2540
+  _globals['_FRONTEND']._serialized_start=2901
+  _globals['_FRONTEND']._serialized_end=3363
 # @@protoc_insertion_point(module_scope)
