@@ -92,7 +92,7 @@ def test_estimate_round_trip(status: Status) -> None:
 
 
 def test_every_field_of_an_estimate_is_sent_or_a_diagnostic() -> None:
-    names = {field.name.replace("velocity_nav", "velocity_odom").replace("nav_", "odom_") for field in fields(Estimate)}
+    names = {re.sub("(^|_)nav(_|$)", r"\1odom\2", field.name) for field in fields(Estimate)}
     assert {field.name for field in messages.Estimate.DESCRIPTOR.fields} == names - DIAGNOSTICS
 
 

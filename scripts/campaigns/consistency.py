@@ -102,12 +102,11 @@ def _write(
     if args.rendered:
         report.add(
             "#### Rendered images",
-            f"The whole odometry, {args.rendered} IMUs on each of {', '.join(SCENES)}. The defaults allow for what the "
-            "simulator does not have, errors of the calibration and an IMU noisier than its data sheet; here they do "
-            f"not (`motion.calibration_error_share` {CALIBRATION_ERROR_SHARE:g} instead of "
-            f"{Config().motion.calibration_error_share:g}, `smoother.imu_noise_scale` 1). That share stands for "
-            "errors of tracking that motions have in common, and was chosen on these recordings; a row shows the pose "
-            "over 10 s with a share of 0. The initial covariance of the biases is wider than the simulator's biases "
+            f"The whole odometry, {args.rendered} IMUs on each of {', '.join(SCENES)}. The defaults allow for an IMU "
+            "noisier than its data sheet, which the simulator does not have; here they do not "
+            "(`smoother.imu_noise_scale` 1). `motion.calibration_error_share` is "
+            f"{CALIBRATION_ERROR_SHARE:g} as by default: it stands for errors of tracking that motions have in "
+            "common, and was chosen on these recordings; a row shows the pose over 10 s with a share of 0. The initial covariance of the biases is wider than the simulator's biases "
             "are, so that less than the number of dimensions is expected of them and of the tilt. The aim is a factor "
             "of 2 for the others.",
         )
