@@ -138,7 +138,7 @@ def run(
             before_ns, before, true_before = stamp_ns, state.nav_T_body, true
             continue
         up = -rotation.T @ state.gravity_nav / np.linalg.norm(state.gravity_nav)
-        out.tilt_deg.append(float(np.rad2deg(np.arccos(min(up @ true[2, :3], 1.0)))))
+        out.tilt_deg.append(float(np.rad2deg(np.arccos(min(float(up @ true[2, :3]), 1.0)))))
         assert covariance.tilt is not None
         tilt = (level_R_nav(state.gravity_nav) @ rotation @ true[2, :3])[[1, 0]] * [1.0, -1.0]
         out.tilt_square.append(float(tilt @ np.linalg.solve(covariance.tilt, tilt)))

@@ -168,6 +168,6 @@ def _linear(terms: list[tuple[int, Float]]) -> gtsam.GaussianFactor:
         blocks: list[Any] = [_SUM, sign * np.eye(3)]
         for term in part:
             blocks += term
-        graph.add(gtsam.JacobianFactor(*blocks, np.zeros(3), half))
+        graph.add(gtsam.JacobianFactor(*blocks, np.zeros(3), half))  # type: ignore[call-overload]
     _, remaining = graph.eliminatePartialMultifrontal(gtsam.Ordering([_SUM]), gtsam.EliminateQR)
     return remaining.at(0)

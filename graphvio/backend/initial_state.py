@@ -8,7 +8,15 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.initialisation import InitialAttitude, initial_attitude, level
-from graphvio.backend.states import InitialUncertainty, RigState, StateCovariance, as_origin, certain_origin, gravity_by_tilt, origin_covariance
+from graphvio.backend.states import (
+    InitialUncertainty,
+    RigState,
+    StateCovariance,
+    as_origin,
+    certain_origin,
+    gravity_by_tilt,
+    origin_covariance,
+)
 from graphvio.config.stages import InitialisationConfig
 from graphvio.geometry import se3, se3_inverse, se3_log
 from graphvio.measurements.imu_interval import ImuInterval

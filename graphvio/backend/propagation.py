@@ -120,7 +120,7 @@ class _Path:
 def advanced(
     nav_T_body: Float, velocity_nav: Float, mean: Float, bias: Float, gravity_nav: Float, duration_s: float
 ) -> tuple[Float, Float]:
-    """Return pose (4, 4) and velocity (3,) after a step with a mean rate and specific force (6,), biases (6,) and gravity.
+    """Return pose (4, 4) and velocity (3,) after a step with a mean rate and specific force (6,), and biases (6,).
 
     The mean force is that of the step's middle, and so is the attitude that turns it.
     """

@@ -87,11 +87,9 @@ def origin_covariance(nav_R_body: Float, tilt_sigma_rad: float) -> Float:
 
 
 def gravity_by_tilt(nav_R_body: Float, of_pose: Float, gravity_nav: Float) -> Float:
-    """Return the covariance (3, 3) of gravity (3,) in nav by the tilt of a pose (6, 6) that is taken for certain in nav."""
-    about_nav = np.zeros((3, 3))
-    about_nav[:2, :2] = (nav_R_body @ of_pose[:3, :3] @ nav_R_body.T)[:2, :2]
-    turned = skew(gravity_nav)
-    return np.asarray(turned @ about_nav @ turned.T)
+    """Return the covariance (3, 3) of gravity (3,) in nav that the tilt of a pose (6, 6) is, if nav is defined by it."""
+    turned = skew(gravity_nav) @ nav_R_body
+    return np.asarray(turned @ of_pose[:3, :3] @ turned.T)
 
 
 def certain_origin() -> Float:
@@ -120,6 +118,7 @@ def _origin_covariance(nav_R_body: Float, tilt: Float) -> Float:
     covariance[:3, :3] = nav_R_body.T @ about_nav @ nav_R_body
     covariance[3:, 3:] = np.eye(3) * _POSITION_SIGMA_M**2
     return covariance
+
 
 def level_R_nav(gravity_nav: Float) -> Float:
     """Return the rotation (3, 3) that turns nav level, by gravity (3,) in nav; nav's x axis keeps its heading."""
