@@ -200,6 +200,7 @@ def test_a_window_that_fails_while_lost_glues_nothing(
 
     failing: list[int] = []
     monkeypatch.setattr(Window, "optimize", fails_now_and_then)
+    monkeypatch.setattr(Window, "advance", lambda *_: False)  # or it depends on the solver which framesets optimise
     odometry, estimates = Odometry(open_source(walk_folder).rig, config), []
     for measurement in altered(measurements, START_S, START_S + 3.0, blackened):
         if isinstance(measurement, FrameSet) and (measurement.stamp_ns - start_ns) // MS in (5500, 6000, 6050):

@@ -87,7 +87,7 @@ def origin_covariance(nav_R_body: Float, tilt_sigma_rad: float) -> Float:
 
 
 def gravity_by_tilt(nav_R_body: Float, of_pose: Float, gravity_nav: Float) -> Float:
-    """Return the covariance (3, 3) of gravity (3,) in nav that the tilt of a pose (6, 6) is, if nav is defined by it."""
+    """Return the covariance (3, 3) of gravity (3,) in nav that the tilt of a pose (6, 6) is where it defines nav."""
     turned = skew(gravity_nav) @ nav_R_body
     return np.asarray(turned @ of_pose[:3, :3] @ turned.T)
 

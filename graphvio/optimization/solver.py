@@ -84,7 +84,7 @@ def solve(
         OptimizationError: if there is no unique solution.
     """
     params = gtsam.LevenbergMarquardtParams()
-    params.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
+    params.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky's digits do not suffice for motions known to 0.01 mm
     with gtsam_errors("the session's graph cannot be solved"):
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
         cost = optimizer.error()
@@ -113,7 +113,7 @@ class Marginals:
         self._values = values
         ordering = gtsam.Ordering.MetisNonlinearFactorGraph(graph)
         with gtsam_errors("the session's graph leaves a state free"):
-            self._tree = graph.linearize(values).eliminateMultifrontal(ordering)
+            self._tree = graph.linearize(values).eliminateMultifrontal(ordering, gtsam.EliminateQR)
 
     def pose(self, k: int) -> Float:
         """Return the covariance (6, 6) of state k's pose, tangent ``[rotation, translation]`` in body."""
