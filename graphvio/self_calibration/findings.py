@@ -78,7 +78,7 @@ def described(found: list[Finding]) -> list[str]:
     """Return sentences for a person: what differs from the rig file, and what the motion did not show."""
     if not found:
         return []
-    wrong = [str(finding) for finding in found if finding.is_significant]
+    wrong = [finding.part for finding in found if finding.is_significant]
     sentences = [f"calibration corrected: {'; '.join(wrong)}"] if wrong else ["calibration: as in the rig file"]
     for motion in dict.fromkeys(finding.motion for finding in found):
         hidden = [finding.part for finding in found if finding.motion == motion and not finding.is_observed]
