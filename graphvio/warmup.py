@@ -5,7 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from graphvio.backend.inertial import GRAVITY_M_S2, NO_SAMPLES, ImuBuffer
+from graphvio.backend.inertial import NO_SAMPLES, ImuBuffer
 from graphvio.backend.noise import own_covariance
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.propagation import Propagator
@@ -18,7 +18,7 @@ from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import common_rows
 from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, so3_log
-from graphvio.measurements.sensors import ImuSample
+from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Imu, Rig
 from graphvio.self_calibration.online import adjust_nothing
 from graphvio.slam.landmarks import orientations
@@ -66,7 +66,7 @@ def warm_up(rig: Rig, config: Config) -> None:
         se3_adjoint(pose)
         so3_log(pose[:3, :3].copy(order="K"))
     _warm_up_imu(rig.imu or Imu())
-    if config.calibration.online:
+    if config.estimates_calibration:
         adjust_nothing(rig)
 
 

@@ -117,7 +117,7 @@ def test_motions_between_keyframes_are_within_their_covariance(
         run = run_of(rig.without_imu(), [e for e in measurements if isinstance(e, FrameSet)])
         assert run.keyframes[0].stamp_ns == run.estimates[0].stamp_ns  # though it is initialising
     elif kind == "filter":
-        config = "{motion: {reference: previous, calibration_error_share: 0.002}, fusion: {estimator: filter}}"
+        config = "{motion: {reference: previous}, fusion: {estimator: filter}}"
         run = run_of(rig, until(measurements, 60), config)
         assert len(run.keyframes) == len(run.estimates)
     elif kind == "in_turns":

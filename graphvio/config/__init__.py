@@ -62,6 +62,14 @@ class Config:
                 "{reference: keyframe}"
             )
 
+    @property
+    def estimates_calibration(self) -> bool:
+        """Whether the calibration is estimated while the odometry runs.
+
+        Tracks that are followed from frame to frame drift, all alike, and would be taken for an error of the cameras.
+        """
+        return self.calibration.online and self.motion.reference == "keyframe"
+
     @staticmethod
     def load(name_or_path: str | Path) -> Config:
         """Read a profile by its name, or a YAML file.

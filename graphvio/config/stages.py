@@ -90,9 +90,11 @@ class MotionConfig(Stage):
     sigma_inflation: float = 1.2
     """Factor on a motion's standard deviations, for errors that residuals do not show, such as those of matches that
     share a patch."""
-    calibration_error_share: float = 0.0002
+    shared_error_share: float = 0.0002
     """Standard deviation that errors which many points have in common add to a motion, as a share of its angle and
     distance, where there is an IMU."""
+    calibration_error_share: float = 0.002
+    """The same for errors of the rig file, where the calibration is not estimated during the run."""
     min_inliers: int = 12
     """Motions that explain fewer points are rejected."""
     min_inlier_share: float = 0.3

@@ -14,7 +14,7 @@ _MAX_VALUE = 1e12
 _MAY_BE_ZERO = frozenset(
     ("seed", "border_px", "keyframe_overlap", "min_inlier_share", "min_response",
      "scarce_share", "min_correlation", "max_gated_s", "simultaneous_ms", "max_imu_wait_ms", "max_imu_start_wait_s",
-     "calibration_error_share")
+     "shared_error_share", "calibration_error_share")
 )  # fmt: skip
 _RANGES = {"cells_across": (2, 100), "window_px": (5, 63), "levels": (1, 8), "min_inliers": (3, 1000)}
 _EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")

@@ -113,7 +113,7 @@ class RecordedCalibration:
     @cached_property
     def findings(self) -> list[Finding]:
         """What is known of each part that was calibrated."""
-        of_file, of_others = (np.sqrt(np.diag(prior.covariance)) for prior in self._priors)
+        of_file, of_others = (prior.covariance for prior in self._priors)
         both = zip(findings(self.batch.estimate, of_file), findings(self.batch.estimate, of_others), strict=True)
         return [found for found, other in both if (other.file_sigmas < 0.5 * found.file_sigmas).all()]
 
@@ -175,7 +175,7 @@ def calibrate_recording(
         CalibrationError: if the rig cannot be calibrated so, or hardly moved.
     """
     config = replace(config or Config(), calibration=CalibrationConfig(online=True))
-    if config.motion.reference != "keyframe":
+    if not config.estimates_calibration:
         raise CalibrationError(f"motion.reference is {config.motion.reference}: calibration wants tracks of keyframes")
     if what == "imu" and rig.imu is None:
         raise CalibrationError(f"{rig.name} has no IMU to calibrate")

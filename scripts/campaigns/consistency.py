@@ -19,7 +19,7 @@ from benchmarks.report import DOCS, Report, log_progress, machine
 from campaigns.measures import HEAD, Squares, rows
 from campaigns.model_run import model_run
 from campaigns.picture import draw_consistency
-from campaigns.rendered_run import CALIBRATION_ERROR_SHARE, WITHOUT_SHARE, rendered_run
+from campaigns.rendered_run import SHARED_ERROR_SHARE, WITHOUT_SHARE, rendered_run
 from campaigns.synthetic_vision import Template, templates_of
 from campaigns.walks import SCENES
 from graphvio.errors import GraphvioError
@@ -103,8 +103,8 @@ def _write(
             "#### Rendered images",
             f"The whole odometry, {args.rendered} IMUs on each of {', '.join(SCENES)}. The defaults allow for an IMU "
             "noisier than its data sheet, which the simulator does not have; here they do not "
-            "(`smoother.imu_noise_scale` 1). `motion.calibration_error_share` is "
-            f"{CALIBRATION_ERROR_SHARE:g}, as by default: it stands for errors of tracking that motions have in "
+            "(`smoother.imu_noise_scale` 1). `motion.shared_error_share` is "
+            f"{SHARED_ERROR_SHARE:g}, as by default: it stands for errors of tracking that motions have in "
             "common, and was chosen on these recordings; a row shows the pose over 10 s with a share of 0. The initial "
             "covariance of the biases is wider than the simulator's biases are, so that less than the number of "
             "dimensions is expected of them and of the tilt. The aim is a factor of 2 for the others.",

@@ -14,11 +14,11 @@ import numpy as np
 from campaigns.flight import STEP_NS, Flight, Truth
 from graphvio.arrays import Float, Int
 from graphvio.backend.factors import b, v, x
-from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.backend.noise import isotropic
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.backend.states import StateCovariance
 from graphvio.geometry import so3_log
+from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.rig import Imu
 
 _POSITION_SIGMA_M, _LEVER_ARM_SIGMA_M, _BIAS_SIGMA = 1e-3, 0.1, 1.0

@@ -22,7 +22,7 @@ from graphvio.simulation.imu import ImuTrack, measure
 from graphvio.simulation.motion import MotionStates
 from graphvio.sources import open_source
 
-CALIBRATION_ERROR_SHARE = 2e-4
+SHARED_ERROR_SHARE = MotionConfig().shared_error_share
 """Stands for errors of tracking that motions have in common; the simulator's calibration has none."""
 WITHOUT_SHARE = ", share 0"
 _WARM_UP_S = 2.0
@@ -39,9 +39,9 @@ def rendered_run(seed: int, scene: str, data: Path, duration_s: float) -> list[S
     track = measure(motion, source.rig.imu, times, stamps, 1000 + seed)
     measurements = [_resampled(measurement, track) for measurement in source]
     squares: list[Square] = []
-    for seconds, share in ((1, CALIBRATION_ERROR_SHARE), (10, CALIBRATION_ERROR_SHARE), (10, 0.0)):
+    for seconds, share in ((1, SHARED_ERROR_SHARE), (10, SHARED_ERROR_SHARE), (10, 0.0)):
         config = Config(
-            motion=MotionConfig(calibration_error_share=share),
+            motion=MotionConfig(shared_error_share=share),
             smoother=SmootherConfig(lag_s=_WINDOW_S[seconds], imu_noise_scale=1.0),
         )
         run = _Run(source.start_ns, Odometry(source.rig, config), track, motion.at(times))
