@@ -135,7 +135,9 @@ def plot(path: Path) -> None:
     for name, (x, y) in places.items():
         corner, colour = (x - HALF_WIDTH, y - HALF_HEIGHT), CORE if name in core else OTHER
         axes.add_patch(plt.Rectangle(corner, 2 * HALF_WIDTH, 2 * HALF_HEIGHT, fc=colour, ec=INK, lw=1.2, zorder=3))
-        axes.text(x, y + 0.12, name, ha="center", va="center", fontsize=12.5, weight="bold", zorder=4)
+        axes.text(
+            x, y + 0.12, name, ha="center", va="center", fontsize=min(12.5, 190 / len(name)), weight="bold", zorder=4
+        )
         size = f"{lines_of_code(name)} lines"
         axes.text(x, y - 0.15, size, ha="center", va="center", fontsize=10, color="#444444", zorder=4)
     axes.set(xlim=(-0.55, COLUMNS - 0.45), ylim=(-0.5, len(rows) - 0.5))

@@ -10,11 +10,11 @@ from hypothesis import settings
 from scipy.spatial.transform import Rotation
 
 from graphvio.arrays import AnyArray, Float
-from graphvio.backend.inertial import GRAVITY_M_S2, ImuBuffer
+from graphvio.backend.inertial import ImuBuffer
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.stereo import triangulate
 from graphvio.measurements.motion import RelativeMotion
-from graphvio.measurements.sensors import ImuSample
+from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Camera, Imu, Rig, StereoPair
 
 # A first call may compile; and a test that fails does so every time.

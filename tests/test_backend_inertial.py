@@ -5,10 +5,10 @@ from scipy.spatial.transform import Rotation
 from synthetic import UP, filled_buffer, pose_at, velocity_at
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import GRAVITY_M_S2, ImuBuffer
+from graphvio.backend.inertial import ImuBuffer
 from graphvio.backend.preintegration import preintegrate, preintegration_params
 from graphvio.measurements.imu_interval import ImuInterval
-from graphvio.measurements.sensors import ImuSample
+from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Imu
 
 MS = 1_000_000

@@ -4,10 +4,10 @@ from scipy.spatial.transform import Rotation
 from synthetic import UP, filled_buffer, pose_at
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.backend.initialisation import initial_attitude, level
 from graphvio.config.stages import InitialisationConfig
 from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.rig import Imu
 
 CONFIG = InitialisationConfig()

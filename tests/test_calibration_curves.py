@@ -44,15 +44,18 @@ def test_curves_have_their_units_and_the_file_s_standard_deviations() -> None:
     difference[index["imu.gyro_matrix.yy"]] = 0.004
     difference[index["imu.time_offset_s"]] = -0.0015
     found = values_by_name(rig, difference)
+    front, back = (pair.left.body_T_cam[:3, 3] for pair in rig.pairs)
+    turned_mm = 1e3 * np.cross([0.0, 0.0, np.deg2rad(1.0)], back - front)  # of both pairs together
     expected = {
         ("focal lengths", "cam0 fx"): (1.0, 0.1),
         ("principal points", "cam3 cy"): (0.7, 0.5),
         ("left to right, rotation", "back y"): (0.2, 0.05),
         ("baselines", "back"): (0.2, 0.2),
         ("pairs against front, rotation", "back z"): (0.25, 0.3),
-        ("pairs against front, translation", "back y"): (-2.0, 5.0),
+        ("pairs against front, translation", "back y"): (-2.0 - turned_mm[1], 5.0),
+        ("pairs against front, translation", "back x"): (-turned_mm[0], 5.0),
         ("cameras to IMU, rotation", "z"): (1.0, 0.3),
-        ("cameras to IMU, translation", "y"): (3.0, 5.0),
+        ("cameras to IMU, translation", "y"): (3.0, np.hypot(5.0, 1e3 * np.deg2rad(0.3) * np.hypot(*front[[0, 2]]))),
         ("IMU, gyro's scale", "y"): (0.4, 0.3),
         ("IMU, time offset", ""): (-1.5, 2.0),
     }

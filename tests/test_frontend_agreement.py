@@ -11,7 +11,6 @@ from graphvio.arrays import AnyArray, Float
 from graphvio.config import Config
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, _consensus_sets, _in_order, agree
-from graphvio.frontend.alignment import Misalignment
 from graphvio.frontend.frozen import Frozen
 from graphvio.frontend.observations import Correspondences, Observations, RigArrays
 from graphvio.frontend.pair_reports import pair_reports
@@ -37,11 +36,11 @@ def agreement_of(
     seed: int = 0,
     arrays: RigArrays = ARRAYS,
     in_doubt: bool = False,
-    misaligned: Mapping[int, Misalignment] | None = None,
+    uncertain: Mapping[int, Float] | None = None,
 ) -> Agreement:
     rng = np.random.default_rng(seed)
     joint = joint_motion(arrays, seen, STILL, CONFIG, rng)
-    return agree(arrays, seen, joint, CONFIG, rng, misaligned or {}, in_doubt)
+    return agree(arrays, seen, joint, CONFIG, rng, uncertain or {}, in_doubt)
 
 
 def mixed(first: tuple[Float, int], second: tuple[Float, int], seed: int = 0) -> Observations:
@@ -132,22 +131,22 @@ def test_doubt_lasts_a_second() -> None:
     assert sides == {0: 1, 500: 2, 1450: 2, 1550: 1}
 
 
-PLACE = Misalignment(np.full(6, 0.01), 0.1**2 * np.eye(6), 100.0)  # corrected, but hardly known
+PLACE = 0.1**2 * np.eye(6)  # corrected, but hardly known
 
 
 def test_what_is_not_known_of_a_pairs_place_is_in_its_motions_covariance() -> None:
     """Together with another pair, as a side of its own, and alone."""
     seen = mixed((TRUTH, 80), (TRUTH, 80))
-    exact, corrected = agreement_of(seen), agreement_of(seen, misaligned={1: PLACE})
+    exact, corrected = agreement_of(seen), agreement_of(seen, uncertain={1: PLACE})
     assert len(corrected.hypotheses) == 1
     weighed = corrected.hypotheses[0].refined
     trusted = corrected.own[0].cur_T_ref
     assert distance(weighed.cur_T_ref, trusted) < distance(exact.hypotheses[0].refined.cur_T_ref, trusted)
     assert np.trace(weighed.covariance) > 1.2 * np.trace(exact.hypotheses[0].refined.covariance)
     np.testing.assert_array_equal(corrected.own[1].covariance, exact.own[1].covariance)  # watching P_12 needs it bare
-    contradicted = agreement_of(mixed((TRUTH, 80), (DOOR, 80)), misaligned={1: PLACE}).hypotheses[1]
+    contradicted = agreement_of(mixed((TRUTH, 80), (DOOR, 80)), uncertain={1: PLACE}).hypotheses[1]
     assert contradicted.pairs == (1,)
-    alone = agreement_of(seen.of_pair(1), misaligned={1: PLACE}).hypotheses[0]
+    alone = agreement_of(seen.of_pair(1), uncertain={1: PLACE}).hypotheses[0]
     for side in (contradicted, alone):
         lever = 0.1 * np.linalg.norm(se3_adjoint(side.refined.cur_T_ref) - np.eye(6), axis=1)
         assert np.all(np.sqrt(np.diag(side.refined.covariance)) > lever)
@@ -157,14 +156,14 @@ def test_an_error_of_p12_that_is_known_to_be_possible_is_no_contradiction() -> N
     off = np.array([0.05, 0.0, -0.05, 0.0, 0.0, 0.0])
     seen = mixed((TRUTH, 80), (se3_exp(-off) @ TRUTH @ se3_exp(off), 80))
     assert agreement_of(seen).contradicts
-    assert not agreement_of(seen, misaligned={1: PLACE}).contradicts
+    assert not agreement_of(seen, uncertain={1: PLACE}).contradicts
 
 
 def test_a_second_motion_of_all_pairs_is_not_mixed_with_what_the_pairs_say_alone() -> None:
     """Each view has a door of its own that outnumbers the world: the world's motion is nobody's, and stays itself."""
     world = mixed((TRUTH, 30), (TRUTH, 30), 3)
     seen = joined(world, mixed((DOOR, 40), (OTHER_DOOR, 40), 4))
-    sides = agreement_of(seen, misaligned={1: Misalignment(np.zeros(6), 1e-8 * np.eye(6), 100.0)}).hypotheses
+    sides = agreement_of(seen, uncertain={1: 1e-8 * np.eye(6)}).hypotheses
     assert sides[0].pairs == (0, 1)
     assert distance(sides[0].refined.cur_T_ref, TRUTH) < 5e-3
 

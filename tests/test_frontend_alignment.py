@@ -5,7 +5,7 @@ import pytest
 from synthetic import random_covariance, random_transform, transform
 
 from graphvio.arrays import Float
-from graphvio.frontend.alignment import Misalignment, PairAlignment, combined, placed
+from graphvio.frontend.alignment import PairAlignment, combined, placed
 from graphvio.frontend.refinement import Refined
 from graphvio.geometry import se3_exp, se3_log
 
@@ -147,8 +147,7 @@ def test_a_corrected_pair_counts_for_what_is_known_of_its_place(known_to: float,
         for each in reported:
             noisy = np.ascontiguousarray(se3_exp(noise * rng.standard_normal(6)) @ each)
             own.append(Refined(noisy, covariance, 0.5 * covariance, INLIER, ERRORS_PX))
-        place = Misalignment(d, known_to**2 * np.eye(6), 100.0)
-        found = combined(own[0], [placed(own[0], None), placed(own[1], place)])
+        found = combined(own[0], [placed(own[0], None), placed(own[1], known_to**2 * np.eye(6))])
         error = se3_log(np.ascontiguousarray(found.cur_T_ref @ np.linalg.inv(motion)))
         nees.append(error @ np.linalg.solve(found.covariance, error))
         sizes.append(np.linalg.det(found.covariance / noise**2) ** (1 / 6))

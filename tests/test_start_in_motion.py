@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.backend.states import InitialUncertainty, level_R_nav, origin_covariance
 from graphvio.config import Config
 from graphvio.geometry import se3, se3_exp, se3_inverse, se3_log, so3_exp, so3_log
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
-from graphvio.measurements.sensors import ImuSample
+from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Imu
 from graphvio.simulation.default_rig import default_rig

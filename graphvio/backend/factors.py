@@ -9,9 +9,9 @@ import gtsam
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.backend.noise import gaussian, isotropic
 from graphvio.backend.states import InitialUncertainty, RigState
+from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.rig import Imu
 
 _ACCEL_BIAS_SIGMA = 0.2

@@ -12,7 +12,6 @@ from graphvio.measurements.events import EventKind
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.sensors import ImuSample
 
-GRAVITY_M_S2 = 9.81
 _MAX_RATE = 100.0  # rad/s and m/s^2: beyond what any inertial sensor for this use can read
 _MAX_FORCE = 1000.0
 NO_SAMPLES = (np.empty(0, dtype=np.int64), np.empty((0, 6)))

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.config.stages import InitialisationConfig
 from graphvio.geometry import so3_exp
 from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.sensors import GRAVITY_M_S2
 
 _MIN_STANDSTILL_S = 0.3
 _SPEED_CHANGE_SIGMA_M_S = 1.5  # the rig may be speeding up or braking

@@ -10,10 +10,10 @@ import gtsam
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.geometry import so3_exp
 from graphvio.kernels import kernel
 from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.rig import Imu
 
 _INTEGRATION_SIGMA = 3e-5  # m/s^2-like noise that stands for the error of integrating piecewise constant rates

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.backend.initialisation import level
 from graphvio.geometry import skew
+from graphvio.measurements.sensors import GRAVITY_M_S2
 
 _POSITION_SIGMA_M = 1e-3
 _ATTITUDE_SIGMA_RAD = 1e-3

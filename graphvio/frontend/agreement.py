@@ -12,9 +12,9 @@ from itertools import combinations
 
 import numpy as np
 
-from graphvio.arrays import Bool
+from graphvio.arrays import Bool, Float
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.alignment import Misalignment, combined, placed
+from graphvio.frontend.alignment import combined, placed
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.ransac import search
 from graphvio.frontend.refinement import Refined, refine
@@ -22,7 +22,7 @@ from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.geometry import se3_inverse, se3_log
 
 _T = THRESHOLDS.agreement
-_NONE: Mapping[int, Misalignment] = {}
+_NONE: Mapping[int, Float] = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ def agree(
     joint: Refined,
     config: MotionConfig,
     rng: np.random.Generator,
-    misaligned: Mapping[int, Misalignment] = _NONE,
+    uncertain: Mapping[int, Float] = _NONE,
     in_doubt: bool = False,
 ) -> Agreement:
     """Compare the pairs' own motions, and return the motion of each consensus set.
@@ -78,7 +78,8 @@ def agree(
         joint: `graphvio.frontend.selection.joint_motion` of these.
         config: Configuration of the motion stage.
         rng: Source of random triples.
-        misaligned: Pairs whose extrinsics have been corrected, which leaves them uncertain.
+        uncertain: Pair index -> covariance (6, 6) of an error d of its extrinsics, which are ``exp(d) body_T_left``, of
+            the pairs whose extrinsics have been corrected.
         in_doubt: Whether the pairs contradicted each other a moment ago: a smaller distance then separates them.
     """
     everyone = observations.pairs
@@ -87,8 +88,8 @@ def agree(
         motions = {j: _own_motion(rig, observations, j, joint, config, rng) for j in everyone}
         own = {j: motion for j, motion in motions.items() if is_supported(motion.inlier, config)}
     elif everyone:
-        joint = placed(joint, misaligned.get(everyone[0]))
-    placed_motions = {j: placed(motion, misaligned.get(j)) for j, motion in own.items()}
+        joint = placed(joint, uncertain.get(everyone[0]))
+    placed_motions = {j: placed(motion, uncertain.get(j)) for j, motion in own.items()}
     apart = {
         (i, j): disagreement(placed_motions[i], placed_motions[j]) for i, j in combinations(sorted(placed_motions), 2)
     }
@@ -96,10 +97,10 @@ def agree(
     max_distance = max((apart[pair] for pairs in sets for pair in combinations(sorted(pairs), 2)), default=0.0)
     if len(sets) > 1:
         hypotheses = _in_order(
-            [_hypothesis(rig, observations, sorted(pairs), own, placed_motions, misaligned, config) for pairs in sets]
+            [_hypothesis(rig, observations, sorted(pairs), own, placed_motions, uncertain, config) for pairs in sets]
         )
     else:
-        if sets and not misaligned.keys().isdisjoint(sets[0]):
+        if sets and not uncertain.keys().isdisjoint(sets[0]):
             joint = combined(joint, [placed_motions[j] for j in sorted(sets[0])])
         hypotheses = [MotionHypothesis(everyone, joint)]
     second = _second_motion(rig, observations, hypotheses, config, rng)
@@ -169,7 +170,7 @@ def _hypothesis(
     pairs: list[int],
     own: Mapping[int, Refined],
     placed_motions: Mapping[int, Refined],
-    misaligned: Mapping[int, Misalignment],
+    uncertain: Mapping[int, Float],
     config: MotionConfig,
 ) -> MotionHypothesis:
     """Return the motion of a consensus set."""
@@ -178,7 +179,7 @@ def _hypothesis(
     if len(pairs) > 1:
         first = own[max(pairs, key=lambda j: int(own[j].inlier.sum()))]
         refined = refine(rig, observations.of_rows(rows), first.cur_T_ref, config)
-        if not misaligned.keys().isdisjoint(pairs):
+        if not uncertain.keys().isdisjoint(pairs):
             refined = combined(refined, [placed_motions[j] for j in pairs])
     return MotionHypothesis(tuple(pairs), _spread_over(rows, refined))
 

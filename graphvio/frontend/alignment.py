@@ -131,12 +131,12 @@ def describe(rig: Rig, pair: int, misalignment: Misalignment) -> str:
     )
 
 
-def placed(motion: Refined, misalignment: Misalignment | None) -> Refined:
-    """Add the uncertainty of a pair's extrinsics to the covariance of its motion."""
-    if misalignment is None:
+def placed(motion: Refined, extrinsics: Float | None) -> Refined:
+    """Add the covariance (6, 6) of a pair's extrinsics to that of its motion."""
+    if extrinsics is None:
         return motion
     lever = np.eye(6) - se3_adjoint(motion.cur_T_ref)
-    return replace(motion, covariance=motion.covariance + lever @ misalignment.covariance @ lever.T)
+    return replace(motion, covariance=motion.covariance + lever @ extrinsics @ lever.T)
 
 
 def combined(joint: Refined, motions: Sequence[Refined]) -> Refined:

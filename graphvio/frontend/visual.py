@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -91,9 +92,11 @@ class VisualFrontend:
         self._references = References(config.motion)
         # Errors of focal lengths and baselines scale all motions alike. No residual shows that, and an IMU must not be
         # corrected by it; without an IMU nothing shows the scale, and as noise it would only be smoothed.
-        self._scale_sigma = 0.0 if rig.imu is None else config.motion.calibration_error_share
+        of_file = 0.0 if config.estimates_calibration else config.motion.calibration_error_share
+        self._scale_sigma = 0.0 if rig.imu is None else float(np.hypot(config.motion.shared_error_share, of_file))
         self._standstill = Standstill()
         self._alignments = {j: PairAlignment() for j in range(1, len(rig.pairs))}
+        self._uncertain: Mapping[int, Float] = {}  # covariances of extrinsics that are corrected
         self._contradicted_ns: int | None = None  # when the pairs last were beyond 5 sigma of each other
         self._workers = ThreadPoolExecutor(len(rig.pairs), thread_name_prefix="graphvio-pair")
 
@@ -121,7 +124,9 @@ class VisualFrontend:
         for tracker in self._trackers:
             tracker.limit_corners(share)
 
-    def recalibrate(self, rig: Rig, epipolar_margin_px: float) -> None:
+    def recalibrate(
+        self, rig: Rig, epipolar_margin_px: float, uncertain: Mapping[int, Float] = MappingProxyType({})
+    ) -> None:
         """Take another calibration of the same cameras from the next frameset on.
 
         Points of the references are triangulated again, so that a motion is measured with one calibration.
@@ -129,10 +134,12 @@ class VisualFrontend:
         Args:
             rig: with the calibration.
             epipolar_margin_px: by how much it may move epipolar lines, added to what matches may be off.
+            uncertain: pair index -> covariance (6, 6) of its extrinsics relative to the first pair, see `agree`.
         """
         self._rig = rig
         self._arrays = RigArrays.of(rig)
         self._baselines_m = [pair.baseline_m for pair in rig.pairs]
+        self._uncertain = uncertain
         for tracker, pair in zip(self._trackers, rig.pairs, strict=True):
             tracker.recalibrate(pair, epipolar_margin_px)
         self._references.recalibrate(rig)
@@ -215,7 +222,7 @@ class VisualFrontend:
         if config.selection == "joint":
             refined = joint_motion(self._arrays, observations, start, config, rng)
             in_doubt = self._is_in_doubt(seen.stamp_ns)
-            agreement = agree(self._arrays, observations, refined, config, rng, self.misaligned, in_doubt)
+            agreement = agree(self._arrays, observations, refined, config, rng, self._uncertain, in_doubt)
             if agreement.contradicts:
                 self._contradicted_ns = seen.stamp_ns
         else:
@@ -266,7 +273,7 @@ class VisualFrontend:
         if not self._references.must_be_replaced(seen.frames, seen.correspondences, refined, is_contradicted):
             return {}, {}
         own = self._own_motions(seen, agreement)
-        if not self._config.calibration.online or self._config.motion.reference == "previous":
+        if not self._config.estimates_calibration:
             self._learn_alignments(agreement)
         return self._refer_to(seen.frames), own
 
@@ -350,3 +357,4 @@ class VisualFrontend:
             alignment.add(own[0], own[j])
             if alignment.learn():
                 self._arrays = self._arrays.corrected(RigArrays.of(self._rig), j, alignment.correction)
+                self._uncertain = {i: misalignment.covariance for i, misalignment in self.misaligned.items()}

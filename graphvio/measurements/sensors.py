@@ -16,6 +16,8 @@ from graphvio.arrays import Float, Image
 from graphvio.errors import MeasurementError
 from graphvio.rig import Imu
 
+GRAVITY_M_S2 = 9.81
+"""What gravity measures; its direction is estimated."""
 _LARGEST_STAMP = 2**62  # differences of two stamps are int64, too
 
 

@@ -49,10 +49,8 @@ class OnlineCalibration:
         self._averaged = 0
         self._is_reported = False
         self._restarts = 0  # of the calibration, that were reported
-        self._reported: set[str] = set()
-        # Tracks that are followed from frame to frame drift, all alike, and would be taken for an error of the cameras.
-        is_possible = config.motion.reference == "keyframe"
-        self._calibration = SelfCalibration(rig) if config.calibration.online and is_possible else None
+        self._reported: set[str] = set()  # pairs
+        self._calibration = SelfCalibration(rig) if config.estimates_calibration else None
         self._margin_px = 0.0
         if self._calibration is not None:
             self._margin_px = self._epipolar_margin_px()
@@ -105,17 +103,23 @@ class OnlineCalibration:
                 f"the images contradict the rig file (its errors are {estimate.file_factors.max():.1g} times its "
                 "standard deviations): the calibration is corrected from now on",
             )
-        for finding in self._calibration.findings():
-            if finding.is_significant and " against " in finding.part and finding.part not in self._reported:
-                self._reported.add(finding.part)
-                self._report(stamp_ns, EventKind.EXTRINSICS_OFF, f"{finding}; corrected for this run")
-        self._frontend.recalibrate(estimate.rig, margin_px)
+        self._report_places(stamp_ns)
+        self._frontend.recalibrate(estimate.rig, margin_px, self._calibration.extrinsics)
         if self._rig.imu is None:
             return
         self._synchroniser.imu_correction = ImuCorrection(*estimate.imu_matrices, self._mean_force)
         if self._corrects_time_offset:
             wanted_s = self._rig.imu.time_offset_s + estimate.time_offset_s
             self._synchroniser.shift_imu(wanted_s - self._synchroniser.time_offset_s)
+
+    def _report_places(self, stamp_ns: int) -> None:
+        """Report each pair that is not where the rig file has it, once."""
+        assert self._calibration is not None
+        for finding in self._calibration.findings():
+            pair, _, kind = finding.part.partition(", ")
+            if finding.is_significant and " against " in kind and pair not in self._reported:
+                self._reported.add(pair)
+                self._report(stamp_ns, EventKind.EXTRINSICS_OFF, f"{finding}; corrected for this run")
 
     def _epipolar_margin_px(self) -> float:
         """Return by how much epipolar lines may be off: by the rig file's errors until these are estimated."""

@@ -16,15 +16,12 @@ from graphvio.arrays import Float
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import Evidence, FilePrior, Gaussian
-from graphvio.self_calibration.imu_model import GYRO_BIAS, GYRO_MATRIX
 from graphvio.self_calibration.online import FullWindow, adjusted
-from graphvio.self_calibration.parameters import PAIR, RigCalibration
-from graphvio.self_calibration.prior import file_prior
+from graphvio.self_calibration.parameters import RigCalibration
+from graphvio.self_calibration.prior import file_prior, walk_per_second
 
 _ROUNDS = 2
-_MAX_MEAN_INNOVATION = 3.0  # squared, of each parameter; 1 where all errors are as modelled
 _STILL = 1e-5  # share of the file's standard deviations that the calibration changes in one second: next to nothing
-_BIAS_FACTOR = 2.0  # on the stated random walks
 _NO_GAIN = -np.inf
 
 
@@ -62,7 +59,8 @@ def calibrate_windows(
     """
     prior, nominal, n = file_prior(rig), RigCalibration.of(rig), len(windows)
     factors = np.ones(prior.n_groups)
-    walks = [_walk_after(windows, k, prior, rig) for k in range(n)]
+    per_second = walk_per_second(rig, prior, _STILL)
+    walks = [_walk_after(windows, k, per_second) for k in range(n)]
     sites = [Evidence.none(len(difference))] * n
     left_out = [False] * n
     history: list[tuple[int, CalibrationEstimate]] = []
@@ -73,7 +71,7 @@ def calibrate_windows(
             others = _sum(earlier, later[k]).given(prior, factors)
             start = difference if number == 0 else others.mean
             solution = adjusted(window.keyframes, window.samples, nominal, start, others, window.sigma_px)
-            left_out[k] = number > 0 and not _agree(others, solution.calibration)
+            left_out[k] = number > 0 and not others.is_confirmed_by(solution.calibration)
             sites[k] = Evidence.none(len(difference)) if left_out[k] else _site(others, solution.calibration)
             earlier = _sum(earlier, sites[k])
             history.append((window.keyframes[-1].stamp_ns, _estimate(rig, prior, earlier)))
@@ -134,18 +132,7 @@ def _of_later(sites: Sequence[Evidence], walks: Sequence[Float]) -> list[Evidenc
     return later[::-1]
 
 
-def _agree(others: Gaussian, posterior: Gaussian) -> bool:
-    change = posterior.mean - others.mean
-    return float(change @ others.information @ change) < _MAX_MEAN_INNOVATION * len(change)
-
-
-def _walk_after(windows: Sequence[FullWindow], k: int, prior: FilePrior, rig: Rig) -> Float:
+def _walk_after(windows: Sequence[FullWindow], k: int, per_second: Float) -> Float:
     """Return the covariance (C, C) of what changes from a window to the next one: the biases."""
     following = windows[min(k + 1, len(windows) - 1)]
-    passed_s = max((following.keyframes[0].stamp_ns - windows[k].keyframes[0].stamp_ns) * 1e-9, 1.0)
-    walk = _STILL**2 * passed_s * prior.covariance
-    if rig.imu is not None:
-        biases = PAIR * len(rig.pairs) + np.arange(GYRO_BIAS, GYRO_MATRIX)
-        walks = np.repeat([rig.imu.gyro_random_walk, rig.imu.accel_random_walk], 3)
-        walk[biases, biases] = (_BIAS_FACTOR * walks) ** 2 * passed_s
-    return walk
+    return per_second * max((following.keyframes[0].stamp_ns - windows[k].keyframes[0].stamp_ns) * 1e-9, 1.0)

@@ -54,6 +54,20 @@ class Tracks(NamedTuple):
     right_px: Float
     has_right: Bool
 
+    def of(self, kept: Bool) -> "Tracks":
+        """Return those of the landmarks (L,) that are kept."""
+        lengths = np.diff(self.rows)
+        rows = np.repeat(kept, lengths)
+        return Tracks(
+            self.pair[kept],
+            self.odom_T_landmark[kept],
+            np.r_[0, np.cumsum(lengths[kept])],
+            self.keyframe[rows],
+            self.left_px[rows],
+            self.right_px[rows],
+            self.has_right[rows],
+        )
+
 
 class Eliminated(NamedTuple):
     """What the elimination of the landmarks leaves behind, to find them again.

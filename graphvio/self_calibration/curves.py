@@ -12,7 +12,7 @@ from graphvio.arrays import Float
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, PARAMETERS, TIME_OFFSET
-from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR, STEREO
+from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR, STEREO, relative_to_first
 
 _DEG = float(np.rad2deg(1.0))
 _AXES = tuple("xyz")
@@ -78,16 +78,16 @@ def _of_cameras(rig: Rig) -> Iterator[Curve]:
 def _of_pairs(rig: Rig) -> Iterator[Curve]:
     unit = np.eye(_size(rig))
     for j, pair in enumerate(rig.pairs):
-        stereo, body = unit[j * PAIR + STEREO :], unit[j * PAIR + BODY :]
+        stereo = unit[j * PAIR + STEREO :]
+        relative = relative_to_first(rig, j) @ unit[: PAIR * len(rig.pairs)]
         for i, axis in enumerate(_AXES):
             yield Curve("left to right, rotation", "deg", pair.name, axis, _DEG * stereo[i])
         along = pair.right_T_left[:3, 3] / pair.baseline_m**2
         yield Curve("baselines", "%", pair.name, "", 100.0 * along @ stereo[3:6])
         for i, axis in enumerate(_AXES if j > 0 else ()):
             against = f" against {rig.pairs[0].name}"
-            relative = body[i] - unit[BODY + i], body[3 + i] - unit[BODY + 3 + i]
-            yield Curve(f"pairs{against}, rotation", "deg", pair.name, axis, _DEG * relative[0])
-            yield Curve(f"pairs{against}, translation", "mm", pair.name, axis, 1e3 * relative[1])
+            yield Curve(f"pairs{against}, rotation", "deg", pair.name, axis, _DEG * relative[i])
+            yield Curve(f"pairs{against}, translation", "mm", pair.name, axis, 1e3 * relative[3 + i])
 
 
 def _of_imu(rig: Rig) -> Iterator[Curve]:

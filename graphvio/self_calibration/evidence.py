@@ -11,6 +11,7 @@ from graphvio.arrays import Float, Int
 EXACT = 1e-3
 """Factor on the file's standard deviations of a file that is as good as exact."""
 _SWEEPS = 3
+_MAX_MEAN_INNOVATION = 3.0  # squared, of each parameter; 1 where all errors are as modelled
 _FACTORS = (EXACT, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0)
 MAX_FACTOR = _FACTORS[-1]
 
@@ -35,6 +36,10 @@ class Gaussian(NamedTuple):
         """Return half of the squared Mahalanobis distance of a difference (C,)."""
         off = difference - self.mean
         return float(0.5 * off @ self.information @ off)
+
+    def is_confirmed_by(self, posterior: Gaussian) -> bool:
+        """Return whether a posterior of this fits it, with a margin for errors that are not modelled."""
+        return 2.0 * self.cost(posterior.mean) < _MAX_MEAN_INNOVATION * len(self.mean)
 
 
 class FilePrior(NamedTuple):

@@ -11,7 +11,7 @@ from scipy.special import chdtri
 from graphvio.arrays import Float
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, TIME_OFFSET
-from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR, STEREO
+from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR, STEREO, relative_to_first
 
 _FIVE_SIGMA = 5.7e-7  # probability of a normal variable beyond 5 standard deviations
 _OBSERVED = 0.5  # of the prior's standard deviation
@@ -54,19 +54,19 @@ class Finding:
         return f"{self.part}: {size:.3g} {self.unit} from the rig file (sigma {sigma:.2g})"
 
 
-def findings(estimate: CalibrationEstimate, file_sigmas: Float) -> list[Finding]:
+def findings(estimate: CalibrationEstimate, file_covariance: Float) -> list[Finding]:
     """Return all parts of a calibration.
 
     Args:
         estimate: of the calibration.
-        file_sigmas: (C,) standard deviations of the rig file's values.
+        file_covariance: (C, C) of the rig file's values.
     """
     covariance = estimate.posterior.covariance
     found = []
     for part, unit, scale, rows, floor, motion in _parts(estimate):
         difference = scale * (rows @ estimate.difference)
         of_part = scale**2 * rows @ covariance @ rows.T
-        of_file = np.abs(scale) * np.sqrt((rows**2) @ file_sigmas**2)
+        of_file = np.abs(scale) * np.sqrt(np.diag(rows @ file_covariance @ rows.T))
         uncertain = of_part + floor**2 * np.eye(len(difference))
         distance = float(difference @ np.linalg.solve(uncertain, difference))
         is_significant = distance > float(chdtri(len(difference), _FIVE_SIGMA))
@@ -103,8 +103,7 @@ def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Flo
         yield f"{name}, rotation left to right", "deg", deg, whole[stereo : stereo + 3], 0.005, _DEPTHS
         yield f"{name}, translation left to right", "mm", 1e3, whole[stereo + 3 : body], 0.1, SCALE_MOTION
         if j > 0:
-            first = whole[BODY:PAIR]
-            relative = whole[body : body + 6] - first
+            relative = relative_to_first(rig, j) @ whole[: PAIR * len(rig.pairs)]
             yield f"{name}, rotation against {rig.pairs[0].name}", "deg", deg, relative[:3], 0.03, _TURN
             yield f"{name}, translation against {rig.pairs[0].name}", "mm", 1e3, relative[3:], 3.0, _TURN
     if rig.imu is None:

@@ -15,23 +15,20 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.measurements.sensors import ImuSample
+from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, Gaussian
 from graphvio.self_calibration.findings import Finding, findings
-from graphvio.self_calibration.imu_model import GYRO_BIAS, GYRO_MATRIX
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.knock import KnockDetector, knock_covariance
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
-from graphvio.self_calibration.prior import file_prior
-from graphvio.self_calibration.solver import GRAVITY_M_S2, Solution, States, Window, solve
-from graphvio.self_calibration.window import Keyframe, View, choose_tracks, median_displacement_px
+from graphvio.self_calibration.prior import extrinsic_covariances, file_prior, walk_per_second
+from graphvio.self_calibration.solver import Solution, States, Window, solve
+from graphvio.self_calibration.window import Keyframe, View, choose_tracks, median_displacement_px, stationary
 
 _WINDOW = 16  # keyframes
-_MIN_DISPLACEMENT_PX = (
-    8.0  # median of a pair's tracks since the keyframe before: at a standstill there are no keyframes
-)
+_MIN_DISPLACEMENT_PX = 8.0  # median of a pair's tracks since the last keyframe: a standstill has no keyframes
 _MAX_TRACKS = 150  # of each pair
 _FIRST_SIGMA_PX = 0.15
 _MIN_SIGMA_PX = 0.12  # errors of registration that all tracks share do not show in residuals
@@ -41,12 +38,13 @@ _RAYLEIGH_MEDIAN = 1.1774  # of the norm of two standard normal variables
 _MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])
 """Against exact files, of cameras and of places. Cameras that are not exact reach hundreds with the first image."""
 _MAX_SIGMAS = 4.0  # of a parameter, by the file's standard deviations times the largest factor
-_MAX_MEAN_INNOVATION = 3.0  # squared, of each parameter; 1 where all errors are as modelled
 _MIN_AGREEING = 3  # keyframes whose pairs agreed, from which contradictions are the scene's
 _MAX_REFUSED = 3  # full windows
 WALK = 0.01  # in one second, as a share of the prior's standard deviations
 _MAX_WALK_S = 10.0  # in a window
 _IMU_NOISE_FACTOR = 2.0  # on the stated densities, since biases walk within a window, too
+_MAX_SELECTIONS = 2  # of the landmarks that stand still
+_CONSENSUS, _ALL = 0.5, 0.98  # shares of them, between which the others are left out
 _MAX_IMU_GAP_NS = 50_000_000
 _MAX_IMU_ERROR2 = 100.0  # squared whitened error of an interval, of 9 dimensions
 _MARGIN_NS = 50_000_000  # of IMU samples before a window
@@ -88,6 +86,7 @@ class _Adjusted(NamedTuple):
     solution: Solution
     evidence: Evidence
     estimate: CalibrationEstimate
+    extrinsics: dict[int, Float]
     is_full: bool
 
 
@@ -99,6 +98,9 @@ class SelfCalibration:
 
     Attributes:
         estimate: what is known now.
+        extrinsics: pair index -> covariance (6, 6) of its place relative to the first pair, see
+            `graphvio.self_calibration.prior.extrinsic_covariances`; empty while the rig file is as good as exact. The
+            file may be as wrong there as any: a few windows may show that it is wrong long before they show how wrong.
         has_full_window: whether it is based on a full window at least.
         restarts: how often what was known has been forgotten, since later windows contradicted it.
         on_full_window: called with each window that is full, before it is adjusted.
@@ -110,12 +112,13 @@ class SelfCalibration:
         self._prior = file_prior(rig)
         widest = self._prior.with_factors(np.full(self._prior.n_groups, MAX_FACTOR))
         self._largest = np.where(self._prior.group < 0, np.inf, _MAX_SIGMAS * np.sqrt(np.diag(widest)))
-        self._walk = _walk_per_second(self._prior.covariance, rig)
+        self._walk = walk_per_second(rig, self._prior, WALK)
         self._evidence = Evidence.none(len(self._walk))  # of the full windows
         n_groups = self._prior.n_groups
         posterior = self._evidence.given(self._prior, np.ones(n_groups))
         exact = np.full(n_groups, EXACT)
         self.estimate = CalibrationEstimate(rig, posterior, np.zeros_like(posterior.mean), exact)
+        self.extrinsics: dict[int, Float] = {}
         self.has_full_window = False
         self.restarts = 0
         self.on_full_window: Callable[[FullWindow], None] = lambda _: None
@@ -139,7 +142,7 @@ class SelfCalibration:
 
     def findings(self) -> list[Finding]:
         """Return what is known of each part of the calibration."""
-        return findings(self.estimate, np.sqrt(np.diag(self._prior.covariance)))
+        return findings(self.estimate, self._prior.covariance)
 
     def add_sample(self, sample: ImuSample) -> None:
         """Take an IMU sample as it was measured, in time order."""
@@ -183,7 +186,7 @@ class SelfCalibration:
             return False
         adjusted, self._pending = self._pending.result(), None
         prior, solution, evidence, is_full = adjusted.prior, adjusted.solution, adjusted.evidence, adjusted.is_full
-        if self.has_full_window and not _agree(prior, solution.calibration):
+        if self.has_full_window and not prior.is_confirmed_by(solution.calibration):
             self._refuse(is_full)
             return False
         if (np.abs(solution.calibration.mean) > self._largest).any():
@@ -197,7 +200,7 @@ class SelfCalibration:
             noise = float(np.sqrt(np.nanmedian(solution.errors2))) / _RAYLEIGH_MEDIAN * self._sigma_px
             self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
         was_exact = self.estimate.is_file_exact
-        self.estimate = adjusted.estimate
+        self.estimate, self.extrinsics = adjusted.estimate, adjusted.extrinsics
         self._in_force = self._nominal.moved(self.estimate.difference[: PAIR * len(self._rig.pairs)])
         return not (was_exact and self.estimate.is_file_exact)
 
@@ -270,7 +273,11 @@ class SelfCalibration:
         posterior = evidence.given(self._prior, _assumed(factors))
         in_force = evidence.given(self._prior, factors).mean if (factors != EXACT).any() else np.zeros_like(difference)
         estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor)
-        return _Adjusted(prior, solution, evidence, estimate, is_full)
+        extrinsics = {}
+        if not estimate.is_file_exact:
+            anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
+            extrinsics = extrinsic_covariances(self._rig, anywhere)
+        return _Adjusted(prior, solution, evidence, estimate, extrinsics, is_full)
 
     def _samples_of(self, window: tuple[Keyframe, ...]) -> InertialSamples | None:
         """Return the IMU over a window, or None where there is none; older samples are forgotten."""
@@ -310,6 +317,13 @@ def adjusted(
     if samples is not None:
         samples = samples.without(samples.intervals_with_spikes())
     solution = solve(Window(tracks, sigma_px, samples), states, nominal, difference, prior)
+    for _ in range(_MAX_SELECTIONS):
+        # Poses are free, and a crowd takes them along: from where they began, the rest decides.
+        stands = stationary(tracks, solution.errors2)
+        if not _CONSENSUS < np.mean(stands) < _ALL:
+            break
+        tracks, states = tracks.of(stands), states._replace(landmarks=states.landmarks[stands])
+        solution = solve(Window(tracks, sigma_px, samples), states, nominal, difference, prior)
     if samples is not None and (solution.imu_errors2 > _MAX_IMU_ERROR2).any():
         # A sample that is wild, or an axis that sticks, is not the IMU's calibration.
         believed = samples.without(np.flatnonzero(solution.imu_errors2 > _MAX_IMU_ERROR2))
@@ -333,20 +347,3 @@ def adjust_nothing(rig: Rig) -> None:
 def _assumed(factors: Float) -> Float:
     """Return the factors without those of exact parts, which may yet turn out to be wrong."""
     return np.where(factors == EXACT, 1.0, factors)
-
-
-def _agree(prior: Gaussian, posterior: Gaussian) -> bool:
-    """Whether a window fits what was known before it, with a margin for errors that are not modelled."""
-    change = posterior.mean - prior.mean
-    return float(change @ prior.information @ change) < _MAX_MEAN_INNOVATION * len(change)
-
-
-def _walk_per_second(file_covariance: Float, rig: Rig) -> Float:
-    """Return the covariance (C, C) of what the calibration changes in one second, by heat and the like."""
-    walk = WALK**2 * file_covariance
-    if rig.imu is not None:
-        at = PAIR * len(rig.pairs)
-        biases = np.arange(at + GYRO_BIAS, at + GYRO_MATRIX)
-        walks = np.repeat([rig.imu.gyro_random_walk, rig.imu.accel_random_walk], 3)
-        walk[biases, biases] = (_IMU_NOISE_FACTOR * walks) ** 2
-    return walk

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float, Int
-from graphvio.geometry import so3_exp
+from graphvio.geometry import skew, so3_exp
 from graphvio.rig import Camera, Rig, StereoPair
 
 INTRINSICS, DISTORTION, ROTATION, TRANSLATION = 4, 5, 3, 3
@@ -39,6 +39,19 @@ def parameter_names(rig: Rig) -> list[str]:
         names += [f"imu.{sensor}_matrix.{element}" for sensor in ("gyro", "accel") for element in _MATRIX]
         names.append("imu.time_offset_s")
     return names
+
+
+def relative_to_first(rig: Rig, j: int) -> Float:
+    """Return the derivatives (6, P * PAIR) of pair j's rotation and translation, in body's axes, seen from pair 0.
+
+    Where body turns or moves against all cameras, the pairs' places in it change, and none of these differences does.
+    """
+    rows = np.zeros((6, PAIR * len(rig.pairs)))
+    first, own = rows[:, BODY:PAIR], rows[:, j * PAIR + BODY : (j + 1) * PAIR]
+    first -= np.eye(6)
+    own += np.eye(6)
+    first[3:, :3] += skew(rig.pairs[j].left.body_T_cam[:3, 3] - rig.pairs[0].left.body_T_cam[:3, 3])
+    return rows
 
 
 class RigCalibration(NamedTuple):

@@ -6,6 +6,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.calibration_sigmas import CalibrationSigmas
+from graphvio.geometry import skew
 from graphvio.rig import Rig, StereoPair
 from graphvio.self_calibration.evidence import FilePrior, Gaussian
 from graphvio.self_calibration.imu_model import (
@@ -16,11 +17,12 @@ from graphvio.self_calibration.imu_model import (
     PARAMETERS,
     TIME_OFFSET,
 )
-from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR, STEREO
+from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR, STEREO, relative_to_first
 
 _MIN_DISTORTION = 0.005  # of a coefficient, from which its standard deviation is a share of it
 _MIN_SIGMA = 1e-9
 _GYRO_BIAS_SIGMA_RAD_S, _ACCEL_BIAS_SIGMA_M_S2 = 0.05, 0.3
+_BIAS_WALK_FACTOR = 2.0  # on the stated random walks, which are those of a sensor at one temperature
 
 
 _CAMERAS, _PLACES, _NO_GROUP = 0, 1, -1  # groups of parameters whose errors have a common factor
@@ -45,6 +47,38 @@ def file_prior(rig: Rig) -> FilePrior:
     return FilePrior(covariance, np.concatenate([group, of_imu]))
 
 
+def walk_per_second(rig: Rig, prior: FilePrior, share: float) -> Float:
+    """Return the covariance (C, C) of what a calibration changes in one second, by heat and the like.
+
+    Args:
+        rig: of the prior; its IMU states the random walk of the biases.
+        prior: of the calibration.
+        share: standard deviation of the others, as a share of the prior's.
+    """
+    walk = share**2 * prior.covariance
+    if rig.imu is not None:
+        biases = PAIR * len(rig.pairs) + np.arange(GYRO_BIAS, GYRO_MATRIX)
+        walks = np.repeat([rig.imu.gyro_random_walk, rig.imu.accel_random_walk], 3)
+        walk[biases, biases] = (_BIAS_WALK_FACTOR * walks) ** 2
+    return walk
+
+
+def extrinsic_covariances(rig: Rig, posterior: Gaussian) -> dict[int, Float]:
+    """Return the covariances of the pairs' places relative to the first pair.
+
+    Returns:
+        Pair index, of all but the first -> covariance (6, 6) of the error d of extrinsics ``exp(d) body_T_left``.
+    """
+    n = PAIR * len(rig.pairs)
+    of_pairs, found = posterior.covariance[:n, :n], {}
+    for j, pair in enumerate(rig.pairs[1:], start=1):
+        about_origin = np.eye(6)  # of body, and not about the camera
+        about_origin[3:, :3] = skew(pair.left.body_T_cam[:3, 3])
+        rows = about_origin @ relative_to_first(rig, j)
+        found[j] = rows @ of_pairs @ rows.T
+    return found
+
+
 def refined_sigmas(rig: Rig, posterior: Gaussian) -> CalibrationSigmas:
     """Return the standard deviations of a posterior, of each kind of parameter the largest.
 
@@ -55,7 +89,9 @@ def refined_sigmas(rig: Rig, posterior: Gaussian) -> CalibrationSigmas:
     covariance = posterior.covariance
     of_pair = [_sigmas(covariance, slice(j * PAIR, (j + 1) * PAIR)) for j in range(len(rig.pairs))]
     first, stereo_at = of_pair[0][BODY:], slice(STEREO, STEREO + 3)
-    relative = [_sigmas_of_difference(covariance, j) for j in range(1, len(rig.pairs))] or [first]
+    of_pairs = covariance[: PAIR * len(rig.pairs), : PAIR * len(rig.pairs)]
+    rows = [relative_to_first(rig, j) for j in range(1, len(rig.pairs))]
+    relative = [np.sqrt(np.diag(each @ of_pairs @ each.T)) for each in rows] or [first]
     cameras = [
         (camera, of_pair[j][which * CAMERA : (which + 1) * CAMERA])
         for j, pair in enumerate(rig.pairs)
@@ -88,13 +124,6 @@ def _sigmas(covariance: Float, rows: slice) -> Float:
     return np.asarray(np.sqrt(np.diag(covariance)[rows]))
 
 
-def _sigmas_of_difference(covariance: Float, j: int) -> Float:
-    """Return the standard deviations (6,) of pair j's place less that of pair 0."""
-    one, other = np.arange(BODY, PAIR), np.arange(j * PAIR + BODY, (j + 1) * PAIR)
-    variance = covariance[one, one] + covariance[other, other] - 2.0 * covariance[one, other]
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
-
-
 def _sigmas_of_imu(known: CalibrationSigmas) -> Float:
     """Return the standard deviations (25,) of the IMU's parameters, see `graphvio.self_calibration.imu_model`."""
     sigmas = np.empty(PARAMETERS)
@@ -115,10 +144,14 @@ def _covariance_of_pairs(rig: Rig) -> Float:
         covariance[of_pair, of_pair] = np.diag(np.maximum(_sigmas_of_pair(pair, known), _MIN_SIGMA) ** 2)
     common = np.repeat([np.deg2rad(known.body_rotation_deg), known.body_translation_m], 3) ** 2
     single = np.repeat([np.deg2rad(known.pair_rotation_deg), known.pair_translation_m], 3) ** 2
-    for i in range(n_pairs):
-        for j in range(n_pairs):
-            block = common + single if i == j and j > 0 else common
-            covariance[i * PAIR + BODY : (i + 1) * PAIR, j * PAIR + BODY : (j + 1) * PAIR] = np.diag(block)
+    by_common = np.zeros((n_pairs * PAIR, 6))  # body turns about its origin, which moves the cameras in it
+    for j, pair in enumerate(rig.pairs):
+        place = slice(j * PAIR + BODY, (j + 1) * PAIR)
+        by_common[place] = np.eye(6)
+        by_common[place][3:, :3] = -skew(pair.left.body_T_cam[:3, 3])
+        if j > 0:
+            covariance[place, place] = np.diag(single)
+    covariance += (by_common * common) @ by_common.T
     return covariance
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.geometry import so3_exp
+from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landmarks, landmarks_after, total_cost
 from graphvio.self_calibration.evidence import Gaussian
 from graphvio.self_calibration.imu_model import PARAMETERS
@@ -21,7 +22,6 @@ _CONVERGED = 0.05  # standard deviations of the prior
 _LOOSE_POSE_SIGMAS = np.repeat([np.deg2rad(5.0), 0.3], 3)  # keeps poses that no track constrains
 _LOOSE_VELOCITY_SIGMA, _LOOSE_GRAVITY_SIGMA = 5.0, 3.0
 _FIXED = 1e-9
-GRAVITY_M_S2 = 9.81
 _GRAVITY_NORM_SIGMA = 5e-3
 
 

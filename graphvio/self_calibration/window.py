@@ -14,6 +14,9 @@ from graphvio.kernels import kernel
 from graphvio.self_calibration.bundle import Tracks
 from graphvio.self_calibration.parameters import RigCalibration
 
+_MAX_ERROR2 = 25.0  # squared whitened error of a view of what stands still
+_MAX_OFF = 0.3  # share of a landmark's views that may be farther off
+
 
 class View(NamedTuple):
     """What one pair saw at one instant: N tracks.
@@ -96,6 +99,15 @@ def choose_tracks(
     landmarks[:, 2] = np.maximum(inverse_depths[first], 0.0)
     odom_T_landmark = poses[keyframe[first]] @ calibration.body_T_left[pair]
     return Tracks(pair, odom_T_landmark, bounds, keyframe, left_px, right_px, has_right), landmarks
+
+
+def stationary(tracks: Tracks, errors2: Float) -> Bool:
+    """Find the landmarks (L,) that stand still, from squared whitened errors (N, 2): few of their views are far off."""
+    if not len(tracks.pair):
+        return np.ones(0, dtype=bool)
+    is_off = np.nanmax(errors2, axis=1) > _MAX_ERROR2
+    n_off = np.add.reduceat(is_off, tracks.rows[:-1], dtype=np.int64)
+    return np.asarray(n_off <= _MAX_OFF * np.diff(tracks.rows))
 
 
 def median_displacement_px(then: View, now: View) -> float:

@@ -9,9 +9,9 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.backend.ekf.state import ATTITUDE, ERRORS, GYRO_BIAS, RATE, VELOCITY, FilterState
-from graphvio.backend.inertial import GRAVITY_M_S2
 from graphvio.geometry import skew, so3_log, so3_right_jacobian_inverse
 from graphvio.measurements.motion import RelativeMotion
+from graphvio.measurements.sensors import GRAVITY_M_S2
 
 GRAVITY = np.array([0.0, 0.0, GRAVITY_M_S2])
 """Specific force at a standstill, in nav."""
