@@ -318,7 +318,7 @@ def adjusted(
         samples = samples.without(samples.intervals_with_spikes())
     solution = solve(Window(tracks, sigma_px, samples), states, nominal, difference, prior)
     for _ in range(_MAX_SELECTIONS):
-        # Poses are free, and a crowd takes them along: from where they began, the rest decides.
+        # Poses are free, and a crowd takes them along: from where they began, the others decide.
         stands = stationary(tracks, solution.errors2)
         if not _CONSENSUS < np.mean(stands) < _ALL:
             break
