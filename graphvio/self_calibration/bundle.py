@@ -19,7 +19,6 @@ from graphvio.self_calibration.parameters import (
     CAMERA,
     DISTORTION,
     INTRINSICS,
-    LEFT,
     PAIR,
     RIGHT,
     STEREO,
@@ -98,12 +97,15 @@ class Eliminated(NamedTuple):
 
 @kernel
 def _project(
-    model: int, intrinsics: Float, distortion: Float, y: Float, seen: Float, to_pixel: Float, error: Float,
+    calibration: RigCalibration, j: int, image: int, y: Float, seen: Float, to_pixel: Float, error: Float,
     by_camera: Float,
 ) -> bool:  # fmt: skip
     """Project a homogeneous point (3,): the error (2,), its derivatives by the point (2, 3) and the camera (2, 9)."""
     if not y[2] > _MIN_DEPTH_RATIO:
         return False
+    model, intrinsics, distortion = (
+        calibration.models[j, image], calibration.intrinsics[j, image], calibration.distortion[j, image],
+    )  # fmt: skip
     a, b = y[0] / y[2], y[1] / y[2]
     u, v, uu, uv, vu, vv = distort(model, distortion, a, b)
     if not (uu > 0.0 and uu * vv - uv * vu > 0.0):
@@ -115,8 +117,8 @@ def _project(
     to_pixel[1, 0], to_pixel[1, 1] = fy * vu * inverse, fy * vv * inverse
     to_pixel[0, 2] = -(a * to_pixel[0, 0] + b * to_pixel[0, 1])
     to_pixel[1, 2] = -(a * to_pixel[1, 0] + b * to_pixel[1, 1])
-    by_camera[:] = 0.0
-    by_camera[0, 0], by_camera[1, 1], by_camera[0, 2], by_camera[1, 3] = u, v, 1.0, 1.0
+    by_camera[0, 0], by_camera[0, 1], by_camera[0, 2], by_camera[0, 3] = u, 0.0, 1.0, 0.0
+    by_camera[1, 0], by_camera[1, 1], by_camera[1, 2], by_camera[1, 3] = 0.0, v, 0.0, 1.0
     basis = distortion_basis(model, a, b)
     for i in range(DISTORTION):
         by_camera[0, INTRINSICS + i], by_camera[1, INTRINSICS + i] = fx * basis[i, 0], fy * basis[i, 1]
@@ -139,108 +141,88 @@ def _observe(
 ) -> int:  # fmt: skip
     """Fill the rows (4, _COLUMNS) of one observation: derivatives by pose, calibration and landmark, and errors.
 
+    Loops stand for slices throughout: each slice that is assigned takes seconds to compile, in every kernel that calls.
+
     Returns:
         The number of rows that were filled: 0, 2 or 4, pixels of the left image first.
     """
-    rows[:] = 0.0
-    a, b, w = landmark
-    frame_R, frame_t = odom_T_landmark[:3, :3], odom_T_landmark[:3, 3]
-    body_R, body_t = pose[:3, :3], pose[:3, 3]
-    left_R, left_t = calibration.body_T_left[j, :3, :3], calibration.body_T_left[j, :3, 3]
-    in_body, by_point = np.empty(3), np.empty((3, 3))
-    in_left_body, in_left, left_by_body, left_by_point = np.empty(3), np.empty(3), left_R.T, np.empty((3, 3))
-    in_odom = np.empty(3)
+    for r in range(4):
+        for c in range(_COLUMNS):
+            rows[r, c] = 0.0
+    a, b, w = landmark[0], landmark[1], landmark[2]
+    frame, left, right = odom_T_landmark, calibration.body_T_left[j], calibration.right_T_left[j]
+    in_odom, in_body, in_left_body, in_camera = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    by_point, left_by_point = np.empty((3, 3)), np.empty((3, 3))
+    to_pixel, by_left, by_body, turned = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
+    error, by_camera, seen = np.empty(2), np.empty((2, CAMERA)), left_px
     for r in range(3):
-        in_odom[r] = frame_R[r, 0] * a + frame_R[r, 1] * b + frame_R[r, 2] + w * (frame_t[r] - body_t[r])
+        in_odom[r] = frame[r, 0] * a + frame[r, 1] * b + frame[r, 2] + w * (frame[r, 3] - pose[r, 3])
     for r in range(3):
-        in_body[r] = body_R[0, r] * in_odom[0] + body_R[1, r] * in_odom[1] + body_R[2, r] * in_odom[2]
-        by_point[r, 0] = body_R[0, r] * frame_R[0, 0] + body_R[1, r] * frame_R[1, 0] + body_R[2, r] * frame_R[2, 0]
-        by_point[r, 1] = body_R[0, r] * frame_R[0, 1] + body_R[1, r] * frame_R[1, 1] + body_R[2, r] * frame_R[2, 1]
+        in_body[r] = pose[0, r] * in_odom[0] + pose[1, r] * in_odom[1] + pose[2, r] * in_odom[2]
+        for c in range(2):
+            by_point[r, c] = pose[0, r] * frame[0, c] + pose[1, r] * frame[1, c] + pose[2, r] * frame[2, c]
         by_point[r, 2] = (
-            body_R[0, r] * (frame_t[0] - body_t[0])
-            + body_R[1, r] * (frame_t[1] - body_t[1])
-            + body_R[2, r] * (frame_t[2] - body_t[2])
-            - left_t[r]
+            pose[0, r] * (frame[0, 3] - pose[0, 3])
+            + pose[1, r] * (frame[1, 3] - pose[1, 3])
+            + pose[2, r] * (frame[2, 3] - pose[2, 3])
+            - left[r, 3]
         )
-        in_left_body[r] = in_body[r] - w * left_t[r]
+        in_left_body[r] = in_body[r] - w * left[r, 3]
     for r in range(3):
-        in_left[r] = (
-            left_by_body[r, 0] * in_left_body[0]
-            + left_by_body[r, 1] * in_left_body[1]
-            + left_by_body[r, 2] * in_left_body[2]
-        )
+        in_camera[r] = left[0, r] * in_left_body[0] + left[1, r] * in_left_body[1] + left[2, r] * in_left_body[2]
         for c in range(3):
             left_by_point[r, c] = (
-                left_by_body[r, 0] * by_point[0, c]
-                + left_by_body[r, 1] * by_point[1, c]
-                + left_by_body[r, 2] * by_point[2, c]
+                left[0, r] * by_point[0, c] + left[1, r] * by_point[1, c] + left[2, r] * by_point[2, c]
             )
-    to_pixel, error, by_camera = np.empty((2, 3)), np.empty(2), np.empty((2, CAMERA))
-    by_body, turned = np.empty((2, 3)), np.empty((2, 3))
-    if not _project(
-        calibration.models[j, 0], calibration.intrinsics[j, 0], calibration.distortion[j, 0], in_left, left_px,
-        to_pixel, error, by_camera,
-    ):  # fmt: skip
-        return 0
-    _fill(rows[:2], to_pixel, left_by_body, left_by_point, in_body, in_left_body, w, by_body, turned)
-    rows[:2, POSE + LEFT : POSE + LEFT + CAMERA] = by_camera
-    rows[:2, _ERROR_AT] = error
-    if not has_right:
-        return 2
-    right_R, right_t = calibration.right_T_left[j, :3, :3], calibration.right_T_left[j, :3, 3]
-    in_right = np.empty(3)
-    for r in range(3):
-        in_right[r] = (
-            right_R[r, 0] * in_left[0] + right_R[r, 1] * in_left[1] + right_R[r, 2] * in_left[2] + w * right_t[r]
-        )
-    if not _project(
-        calibration.models[j, 1], calibration.intrinsics[j, 1], calibration.distortion[j, 1], in_right, right_px,
-        to_pixel, error, by_camera,
-    ):  # fmt: skip
-        return 2
-    by_left = np.empty((2, 3))
-    for r in range(2):
-        for c in range(3):
-            by_left[r, c] = (
-                to_pixel[r, 0] * right_R[0, c] + to_pixel[r, 1] * right_R[1, c] + to_pixel[r, 2] * right_R[2, c]
-            )
-    _fill(rows[2:], by_left, left_by_body, left_by_point, in_body, in_left_body, w, by_body, turned)
-    for r in range(2):
-        rows[2 + r, _POINT_AT + 2] += (
-            to_pixel[r, 0] * right_t[0] + to_pixel[r, 1] * right_t[1] + to_pixel[r, 2] * right_t[2]
-        )
-    rows[2:, POSE + RIGHT : POSE + RIGHT + CAMERA] = by_camera
-    _turned(in_left, by_left, turned)
-    rows[2:, POSE + STEREO : POSE + STEREO + 3] = -turned
-    rows[2:, POSE + STEREO + 3 : POSE + STEREO + 6] = w * to_pixel
-    rows[2:, _ERROR_AT] = error
-    return 4
-
-
-@kernel
-def _fill(
-    rows: Float, by_left: Float, left_by_body: Float, left_by_point: Float, in_body: Float, in_left_body: Float,
-    w: float, by_body: Float, turned: Float,
-) -> None:  # fmt: skip
-    """Fill two rows: derivatives by the pose, by ``body_T_left`` and by the landmark, from those by the point."""
-    for r in range(2):
-        for c in range(3):
-            by_body[r, c] = (
-                by_left[r, 0] * left_by_body[0, c]
-                + by_left[r, 1] * left_by_body[1, c]
-                + by_left[r, 2] * left_by_body[2, c]
-            )
-            rows[r, _POINT_AT + c] = (
-                by_left[r, 0] * left_by_point[0, c]
-                + by_left[r, 1] * left_by_point[1, c]
-                + by_left[r, 2] * left_by_point[2, c]
-            )
-    _turned(in_body, by_body, turned)
-    rows[:, 0:3] = turned
-    rows[:, 3:6] = -w * by_body
-    _turned(in_left_body, by_body, turned)
-    rows[:, POSE + BODY : POSE + BODY + 3] = turned
-    rows[:, POSE + BODY + 3 : POSE + BODY + 6] = -w * by_body
+    for image in range(2 if has_right else 1):
+        first = 2 * image
+        in_left_x, in_left_y, in_left_z = in_camera[0], in_camera[1], in_camera[2]
+        if image == 1:
+            seen = right_px
+            for r in range(3):
+                in_camera[r] = (
+                    right[r, 0] * in_left_x + right[r, 1] * in_left_y + right[r, 2] * in_left_z + w * right[r, 3]
+                )
+        if not _project(calibration, j, image, in_camera, seen, to_pixel, error, by_camera):
+            return first
+        for r in range(2):
+            rows[first + r, _ERROR_AT] = error[r]
+            for c in range(CAMERA):
+                rows[first + r, POSE + image * RIGHT + c] = by_camera[r, c]
+            for c in range(3):
+                by_left[r, c] = to_pixel[r, c]
+                if image == 1:
+                    by_left[r, c] = (
+                        to_pixel[r, 0] * right[0, c] + to_pixel[r, 1] * right[1, c] + to_pixel[r, 2] * right[2, c]
+                    )
+        for r in range(2):
+            for c in range(3):
+                by_body[r, c] = by_left[r, 0] * left[c, 0] + by_left[r, 1] * left[c, 1] + by_left[r, 2] * left[c, 2]
+                rows[first + r, _POINT_AT + c] = (
+                    by_left[r, 0] * left_by_point[0, c]
+                    + by_left[r, 1] * left_by_point[1, c]
+                    + by_left[r, 2] * left_by_point[2, c]
+                )
+                rows[first + r, 3 + c] = rows[first + r, POSE + BODY + 3 + c] = -w * by_body[r, c]
+        _turned(in_body, by_body, turned)
+        for r in range(2):
+            for c in range(3):
+                rows[first + r, c] = turned[r, c]
+        _turned(in_left_body, by_body, turned)
+        for r in range(2):
+            for c in range(3):
+                rows[first + r, POSE + BODY + c] = turned[r, c]
+        if image == 1:
+            in_camera[0], in_camera[1], in_camera[2] = in_left_x, in_left_y, in_left_z
+            _turned(in_camera, by_left, turned)
+            for r in range(2):
+                rows[first + r, _POINT_AT + 2] += (
+                    to_pixel[r, 0] * right[0, 3] + to_pixel[r, 1] * right[1, 3] + to_pixel[r, 2] * right[2, 3]
+                )
+                for c in range(3):
+                    rows[first + r, POSE + STEREO + c] = -turned[r, c]
+                    rows[first + r, POSE + STEREO + 3 + c] = w * to_pixel[r, c]
+    return 4 if has_right else 2
 
 
 @kernel
@@ -303,15 +285,20 @@ def eliminate_landmarks(
         at = n_poses + PAIR * tracks.pair[point]
         v, bl = np.zeros((3, 3)), np.zeros(3)
         wc = eliminated.by_calibration[point]
-        wc[:] = 0.0
-        by_calibration[:] = 0.0
+        for c in range(PAIR):
+            for d in range(3):
+                wc[d, c] = 0.0
+            for d in range(PAIR):
+                by_calibration[c, d] = 0.0
         for n in range(first, last):
             k = 6 * tracks.keyframe[n]
             filled = _observe(
                 poses[tracks.keyframe[n]], calibration, tracks.pair[point], tracks.odom_T_landmark[point],
                 landmarks[point], tracks.left_px[n], tracks.right_px[n], tracks.has_right[n], rows,
             )  # fmt: skip
-            local[:] = 0.0
+            for c in range(_COLUMNS):
+                for d in range(_COLUMNS):
+                    local[c, d] = 0.0
             for r in range(0, filled, 2):
                 du, dv = rows[r, _ERROR_AT], rows[r + 1, _ERROR_AT]
                 e2 = (du * du + dv * dv) / (sigma_px * sigma_px)
