@@ -1,6 +1,15 @@
-"""Warm-up: compiles or loads from the cache every kernel of the odometry, before the first image arrives."""
+"""Warm-up: compiles or loads from the cache every kernel of the odometry, before the first image arrives.
+
+Compiling takes a minute or more of one core. Where the cache is empty, a second process compiles a half of the kernels,
+and another program that compiles at the same time is waited for.
+"""
 
 from __future__ import annotations
+
+import fcntl
+import pickle
+import subprocess
+import sys
 
 import gtsam
 import numpy as np
@@ -17,13 +26,17 @@ from graphvio.frontend.observations import Observations, RigArrays, correspond
 from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import common_rows
-from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, so3_log
+from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, skew, so3_log
+from graphvio.kernels import any_compiled_before, cache_root
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Imu, Rig
 from graphvio.self_calibration.online import adjust_nothing
 from graphvio.slam.landmarks import orientations
 
 _POINTS = 20
+_CALIBRATION = "graphvio.self_calibration.bundle"
+_COMPILED_LAST = ("graphvio.frontend.lucas_kanade", "graphvio.frontend.refinement", "graphvio.backend.propagation")
+_OTHER_PROCESS = "from graphvio.warmup import warm_up_second_half; warm_up_second_half()"
 
 
 def warm_up(rig: Rig, config: Config) -> None:
@@ -33,6 +46,45 @@ def warm_up(rig: Rig, config: Config) -> None:
         rig: the rig, for its image size and its IMU.
         config: configuration of all stages.
     """
+    if not _are_compiled(config):
+        _compile_in_parallel(rig, config)
+    _warm_up_first_half(rig, config)
+    _warm_up_motion(rig, config)
+
+
+def warm_up_second_half() -> None:
+    """Compile what `_warm_up_first_half` leaves, for the pickled rig and configuration of the standard input."""
+    rig, config = pickle.load(sys.stdin.buffer)
+    _warm_up_motion(rig, config)
+
+
+def _are_compiled(config: Config) -> bool:
+    """Return whether the cache holds the kernels, as far as the modules that are compiled last tell."""
+    modules = (*_COMPILED_LAST, _CALIBRATION) if config.estimates_calibration else _COMPILED_LAST
+    return all(any_compiled_before(module) for module in modules)
+
+
+def _compile_in_parallel(rig: Rig, config: Config) -> None:
+    """Compile a half of the kernels here and the other one in a second process; only one program does so at a time."""
+    with (cache_root() / "compiling.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if _are_compiled(config):
+            return  # by the program that was waited for
+        command = [sys.executable, "-c", _OTHER_PROCESS]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL) as other:
+            assert other.stdin is not None
+            try:
+                pickle.dump((rig, config), other.stdin)
+                other.stdin.close()
+                _warm_up_first_half(rig, config)
+            except BaseException:
+                other.kill()
+                raise
+        # Whatever it did not do, for instance since it does not find graphvio, is compiled here.
+
+
+def _warm_up_first_half(rig: Rig, config: Config) -> None:
+    """Call the kernels of tracking, of the back-end and of the self-calibration."""
     rng = np.random.default_rng(0)
     pair = rig.pairs[0]
     width, height = pair.left.size_px
@@ -43,6 +95,25 @@ def warm_up(rig: Rig, config: Config) -> None:
         tracker.keep_keyframe_patches()
     correspond({0: frame}, {0: frame})
     common_rows(frame.ids, frame.ids)
+    orientations(noise, np.full((1, 2), 20.0))
+    pair.left.project(np.ones((1, 3)))
+    se3(np.eye(3), np.zeros(3))
+    se3_exp(np.zeros(6))
+    skew(np.zeros(3))
+    own_covariance(np.eye(6), np.eye(6))
+    for pose in (np.eye(4), np.asfortranarray(np.eye(4))):  # gtsam's matrices are in Fortran's order
+        se3_log(pose)
+        se3_inverse(pose)
+        se3_adjoint(pose)
+        so3_log(pose[:3, :3].copy(order="K"))
+    _warm_up_imu(rig.imu or Imu())
+    if config.estimates_calibration:
+        adjust_nothing(rig)
+
+
+def _warm_up_motion(rig: Rig, config: Config) -> None:
+    """Call the kernels that estimate a motion."""
+    rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.3, 0.3, (_POINTS, 2)), rng.uniform(0.1, 1.0, _POINTS)])
     observations = Observations(
         np.zeros(_POINTS, dtype=np.int64),
@@ -55,19 +126,6 @@ def warm_up(rig: Rig, config: Config) -> None:
     for solve in (joint_motion, best_pair_motion):
         solve(RigArrays.of(rig), observations, np.eye(4), config.motion, rng)
     learn_from_nothing(joint_motion(RigArrays.of(rig), observations, np.eye(4), config.motion, rng))
-    orientations(noise, np.full((1, 2), 20.0))
-    pair.left.project(np.ones((1, 3)))
-    se3(np.eye(3), np.zeros(3))
-    se3_exp(np.zeros(6))
-    own_covariance(np.eye(6), np.eye(6))
-    for pose in (np.eye(4), np.asfortranarray(np.eye(4))):  # gtsam's matrices are in Fortran's order
-        se3_log(pose)
-        se3_inverse(pose)
-        se3_adjoint(pose)
-        so3_log(pose[:3, :3].copy(order="K"))
-    _warm_up_imu(rig.imu or Imu())
-    if config.estimates_calibration:
-        adjust_nothing(rig)
 
 
 def _warm_up_imu(imu: Imu) -> None:

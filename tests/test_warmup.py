@@ -1,11 +1,21 @@
 """After the warm-up, the first framesets find every kernel compiled."""
 
+import fcntl
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
+import pytest
+from typer.testing import CliRunner
 
 import graphvio.kernels
+import graphvio.warmup
 from graphvio import FrameSet, ImuSample, Odometry
+from graphvio.cli import app
 from graphvio.config import Config
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.simulation import default_rig, make_simulator
@@ -56,3 +66,40 @@ def test_no_kernel_is_compiled_after_the_warm_up() -> None:
         odometry.finish()
         assert keyframes
         assert compiled() - before == set()
+
+
+def test_warm_up_second_half_compiles_what_the_first_one_leaves() -> None:
+    halves = [graphvio.warmup._warm_up_first_half, graphvio.warmup._warm_up_motion]
+    done = subprocess.run(
+        [sys.executable, "-c", graphvio.warmup._OTHER_PROCESS],
+        input=pickle.dumps((default_rig(), Config())),
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    for half in halves:
+        half(default_rig(), Config())
+    names = {name for _, name, _ in compiled()}
+    assert {"_refined", "register", "eliminate_landmarks"} <= names
+
+
+def test_compile_in_parallel_waits_for_another_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    warm_up(default_rig(), Config())
+    monkeypatch.setattr(graphvio.warmup, "cache_root", lambda: tmp_path)
+    monkeypatch.setattr(
+        subprocess, "Popen", lambda *_, **__: pytest.fail("it compiles what the other one has compiled")
+    )
+    waiting = Thread(target=graphvio.warmup._compile_in_parallel, args=(default_rig(), Config()))
+    with (tmp_path / "compiling.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        waiting.start()
+        waiting.join(0.3)
+        assert waiting.is_alive()
+    waiting.join(20.0)
+    assert not waiting.is_alive()
+
+
+def test_warmup_command_names_the_folder_of_the_kernels() -> None:
+    done = CliRunner().invoke(app, ["warmup"])
+    assert done.exit_code == 0, done.output
+    assert done.output.startswith(f"kernels are compiled in {graphvio.kernels.cache_root()} (")

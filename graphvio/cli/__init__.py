@@ -20,6 +20,7 @@ from graphvio.cli.shared import EXIT_BAD_INPUT, EXIT_INTERRUPTED, warn
 from graphvio.cli.simulate import simulate
 from graphvio.cli.slam import slam
 from graphvio.cli.view import view
+from graphvio.cli.warmup import warmup
 from graphvio.errors import GraphvioError
 from graphvio.runtime import interruptible
 
@@ -49,6 +50,7 @@ app.command()(simulate)
 app.command()(view)
 app.command(name="dump-config")(dump_config)
 app.command()(doctor)
+app.command()(warmup)
 
 
 def main() -> None:
