@@ -59,7 +59,7 @@ def warm_up_second_half() -> None:
 
 
 def _are_compiled(config: Config) -> bool:
-    """Return whether the cache holds the kernels, as far as the modules that are compiled last tell."""
+    """Return whether the cache holds the kernels, as far as the modules that are compiled last show."""
     modules = (*_COMPILED_LAST, _CALIBRATION) if config.estimates_calibration else _COMPILED_LAST
     return all(any_compiled_before(module) for module in modules)
 
