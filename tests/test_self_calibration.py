@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +15,10 @@ from graphvio.calibration_sigmas import LEVELS
 from graphvio.cameras import MODEL_NAMES
 from graphvio.errors import RigError
 from graphvio.geometry import se3_exp, so3_exp, so3_log
-from graphvio.measurements.sensors import GRAVITY_M_S2
+from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Camera, Rig, StereoPair
 from graphvio.rig_files import load_rig, save_rig
+from graphvio.self_calibration import online
 from graphvio.self_calibration.bundle import _COLUMNS as COLUMNS
 from graphvio.self_calibration.bundle import _ERROR_AT as ERROR_AT
 from graphvio.self_calibration.bundle import Eliminated, Tracks, _observe, eliminate_landmarks, total_cost
@@ -24,10 +26,10 @@ from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gauss
 from graphvio.self_calibration.findings import described
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.linear import eliminated, solve_symmetric
-from graphvio.self_calibration.online import SelfCalibration
+from graphvio.self_calibration.online import FullWindow, SelfCalibration
 from graphvio.self_calibration.parameters import BODY, PAIR, STEREO, RigCalibration, parameter_names
 from graphvio.self_calibration.prior import file_prior
-from graphvio.self_calibration.solver import States, Window, solve
+from graphvio.self_calibration.solver import Solution, States, Window, solve
 from graphvio.self_calibration.window import Keyframe, View, choose_tracks
 from graphvio.simulation.calibration_error import CalibrationError, draw
 from graphvio.simulation.default_rig import default_rig
@@ -305,6 +307,55 @@ def test_self_calibration_in_motions_that_show_little_stays_near_the_file(walk: 
         off = (found.posterior.mean - difference(written, true))[known]
         assert (np.abs(off) < 3.0 * np.sqrt(np.diag(file_prior(written).covariance))[known]).all()
         assert (np.abs(off) < 5.0 * found.sigmas[known]).all()
+
+
+def test_self_calibration_in_a_new_frame_of_poses_starts_another_window() -> None:
+    rig = default_rig().without_imu()
+    walk, jump, jump_ns = Walk(rig), se3_exp(np.array([0.0, 0.0, 1.5, 5.0, -3.0, 1.0])), 4_000_000_000
+    calibration, windows = SelfCalibration(rig), list[FullWindow]()
+    calibration.on_full_window = windows.append
+    for stamp_ns, pose, views in walk.framesets(9.0):
+        calibration.update()
+        if stamp_ns == jump_ns:
+            calibration.start_window()
+        calibration.add_frameset(stamp_ns, np.ascontiguousarray(jump @ pose) if stamp_ns >= jump_ns else pose, views)
+    calibration.close()
+    assert calibration.estimate.is_file_exact
+    assert {keyframe.stamp_ns >= jump_ns for window in windows for keyframe in window.keyframes} == {False, True}
+    for window in windows:
+        assert len({keyframe.stamp_ns >= jump_ns for keyframe in window.keyframes}) == 1
+
+
+@pytest.mark.parametrize("failure", ["raises", "is NaN"])
+def test_self_calibration_leaves_out_what_cannot_be_solved(failure: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = default_rig().without_imu()
+    solve_window, count = online.adjusted, 0
+
+    def fails_at_first(*arguments: Any) -> Solution:
+        nonlocal count
+        count += 1
+        if count > 2:
+            return solve_window(*arguments)
+        if failure == "raises":
+            raise np.linalg.LinAlgError("singular")
+        solution = solve_window(*arguments)
+        unknown = Gaussian(np.full_like(solution.calibration.mean, np.nan), solution.calibration.information)
+        return solution._replace(calibration=unknown)
+
+    monkeypatch.setattr(online, "adjusted", fails_at_first)
+    found = calibrated(SelfCalibration(rig), Walk(rig), 5.0)
+    assert count > 2
+    assert found.has_full_window
+    assert found.estimate.is_file_exact
+    assert np.isfinite(found.estimate.posterior.mean).all()
+
+
+def test_self_calibration_at_a_standstill_keeps_few_samples() -> None:
+    calibration, zero = SelfCalibration(default_rig()), np.zeros(3)
+    for k in range(200 * 120):
+        calibration.add_sample(ImuSample(5_000_000 * k, zero, zero))
+    calibration.close()
+    assert len(calibration._samples) <= 200 * 30 + 1
 
 
 def test_self_calibration_after_a_knock_finds_the_turned_camera_and_keeps_the_lenses() -> None:

@@ -47,6 +47,7 @@ class OnlineCalibration:
         self._corrects_time_offset = rig.imu is not None and not config.fusion.estimate_time_offset
         self._mean_force: Float = np.zeros(3)  # of the first samples
         self._averaged = 0
+        self._epoch = 0
         self._is_reported = False
         self._restarts = 0  # of the calibration, that were reported
         self._reported: set[str] = set()  # pairs
@@ -135,6 +136,9 @@ class OnlineCalibration:
             return
         if estimate.status not in (Status.TRACKING, Status.INITIALISING) or estimate.vision is Quality.FAILED:
             return
+        if estimate.epoch != self._epoch:
+            self._epoch = estimate.epoch
+            self._calibration.start_window()
         views = {
             j: View(frame.ids, frame.pixels, frame.right_pixels, frame.has_depth, frame.points[:, 2])
             for j, frame in self._frontend.frames_at(estimate.stamp_ns).items()

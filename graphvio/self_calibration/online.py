@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import NamedTuple
 
 import numpy as np
@@ -48,6 +48,7 @@ _CONSENSUS, _ALL = 0.5, 0.98  # shares of them, between which the others are lef
 _MAX_IMU_GAP_NS = 50_000_000
 _MAX_IMU_ERROR2 = 100.0  # squared whitened error of an interval, of 9 dimensions
 _MARGIN_NS = 50_000_000  # of IMU samples before a window
+_KEPT_NS = 30_000_000_000  # of IMU samples: a rig that stands has no keyframes for hours
 
 
 class _Pace(NamedTuple):
@@ -147,6 +148,8 @@ class SelfCalibration:
     def add_sample(self, sample: ImuSample) -> None:
         """Take an IMU sample as it was measured, in time order."""
         self._samples.append(sample)
+        while sample.stamp_ns - self._samples[0].stamp_ns > _KEPT_NS:
+            self._samples.popleft()
 
     def add_frameset(
         self, stamp_ns: int, odom_T_body: Float, views: Mapping[int, View], are_contradicting: bool = False
@@ -171,6 +174,10 @@ class SelfCalibration:
         self._last = Keyframe(stamp_ns, odom_T_body, views)
         self._keyframes.append(self._last)
 
+    def start_window(self) -> None:
+        """Leave the window that is not full: the poses that come are in another frame, or their clock is another."""
+        self._keyframes, self._adjusted_at, self._last = [], 0, None
+
     def update(self) -> bool:
         """Take the result that comes into force with this frameset, if there is one.
 
@@ -184,12 +191,16 @@ class SelfCalibration:
             return False
         if self._due_in > 0:
             return False
-        adjusted, self._pending = self._pending.result(), None
+        pending, self._pending = self._pending, None
+        try:
+            adjusted = pending.result()
+        except np.linalg.LinAlgError:
+            return False  # measurements that determine nothing
         prior, solution, evidence, is_full = adjusted.prior, adjusted.solution, adjusted.evidence, adjusted.is_full
         if self.has_full_window and not prior.is_confirmed_by(solution.calibration):
             self._refuse(is_full)
             return False
-        if (np.abs(solution.calibration.mean) > self._largest).any():
+        if not (np.abs(solution.calibration.mean) <= self._largest).all():  # also rejects NaN
             return False  # no rig file is so wrong: the measurements are
         if is_full:
             self._evidence, self.has_full_window, self._refused = evidence, True, 0
@@ -224,7 +235,7 @@ class SelfCalibration:
     def _forget_places(self) -> None:
         """Begin again after a knock, with what was known of lenses and IMU."""
         if self._pending is not None:
-            self._pending.result()  # of a window from before the knock
+            wait([self._pending])  # it is of a window from before the knock, and reads what changes now
             self._pending = None
         self._evidence = self._evidence.forgotten(knock_covariance(len(self._walk), len(self._rig.pairs)))
         self._keyframes, self._adjusted_at, self._full_windows = [], 0, 0
