@@ -309,7 +309,7 @@ def test_self_calibration_in_motions_that_show_little_stays_near_the_file(walk: 
         assert (np.abs(off) < 5.0 * found.sigmas[known]).all()
 
 
-def test_self_calibration_in_a_new_frame_of_poses_starts_another_window() -> None:
+def test_self_calibration_in_a_new_frame_of_poses_begins_another_window() -> None:
     rig = default_rig().without_imu()
     walk, jump, jump_ns = Walk(rig), se3_exp(np.array([0.0, 0.0, 1.5, 5.0, -3.0, 1.0])), 4_000_000_000
     calibration, windows = SelfCalibration(rig), list[FullWindow]()
