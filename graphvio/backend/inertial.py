@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import Literal
 
 import numpy as np
@@ -55,9 +56,10 @@ class ImuBuffer:
 
     def add(self, sample: ImuSample) -> str:
         """Take a sample, and return the kind of its fault if it is unusable, or an empty string."""
-        if not (np.isfinite(sample.angular_velocity).all() and np.isfinite(sample.linear_acceleration).all()):
+        rate, force = sample.angular_velocity.tolist(), sample.linear_acceleration.tolist()  # numpy is slow for three
+        if not all(map(isfinite, (*rate, *force))):
             return EventKind.IMU_NOT_FINITE
-        if np.abs(sample.angular_velocity).max() > _MAX_RATE or np.abs(sample.linear_acceleration).max() > _MAX_FORCE:
+        if max(map(abs, rate)) > _MAX_RATE or max(map(abs, force)) > _MAX_FORCE:
             return EventKind.IMU_OUT_OF_RANGE
         newest_ns = self.newest_ns
         if newest_ns is not None and sample.stamp_ns <= newest_ns:
@@ -67,8 +69,7 @@ class ImuBuffer:
         if self._end == len(self._stamps):
             self._make_room()
         self._stamps[self._end] = sample.stamp_ns
-        self._values[self._end, :3] = sample.angular_velocity
-        self._values[self._end, 3:] = sample.linear_acceleration
+        self._values[self._end] = (*rate, *force)
         self._end += 1
         return ""
 

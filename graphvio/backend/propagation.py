@@ -1,11 +1,13 @@
 """Prediction of poses between framesets and beyond the newest one, from the newest state and the IMU since then.
 
-One thread may predict while another processes a frameset: the path is replaced as a whole, and only grows at its end.
+Samples are collected as they come, and propagated when a prediction asks for them. One thread may predict while another
+processes a frameset: the path is replaced as a whole, and only grows at its end.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
+from threading import Lock
 
 import numpy as np
 
@@ -53,16 +55,16 @@ class Propagator:
             path.add(stamp, sample)
         self._path = path
 
-    def add(self, stamp_ns: int, sample: Float) -> Prediction | None:
-        """Add an IMU sample (6,), and return the prediction at its instant, or None."""
+    def add(self, stamp_ns: int, sample: Float) -> bool:
+        """Add an IMU sample (6,), and return whether it is newer than the others and can be predicted from."""
         path = self._path
         if path is None or not path.samples or stamp_ns <= path.stamps[-1]:
-            return None
+            return False
         if stamp_ns - path.stamps[-1] > self._max_gap_ns or stamp_ns - path.stamps[0] > _MAX_BLIND_NS:
             self._path = None  # what happened in a gap is not known, nor where an IMU alone would be by now
-            return None
+            return False
         path.add(stamp_ns, sample)
-        return path.predict(stamp_ns, self._longest_ns)
+        return True
 
     def predict(self, stamp_ns: int) -> Prediction | None:
         """Return the prediction at an instant, or None where there is none."""
@@ -80,6 +82,7 @@ class _Path:
         self.poses, self.velocities = [state.nav_T_body], [state.velocity_nav]
         self.samples = [] if sample is None else [sample]
         self.stamps = [stamp_ns]
+        self._growing = Lock()
         self._epoch = epoch
         self._bias = np.concatenate([state.gyro_bias, state.accel_bias])
         self._gravity = state.gravity_nav
@@ -87,11 +90,17 @@ class _Path:
 
     def add(self, stamp_ns: int, sample: Float) -> None:
         """Add a sample (6,)."""
-        pose, velocity = self._after(-1, stamp_ns - self.stamps[-1], 0.5 * (self.samples[-1] + sample))
-        self.poses.append(pose)
-        self.velocities.append(velocity)
         self.samples.append(sample)
         self.stamps.append(stamp_ns)
+
+    def _propagate(self, end: int) -> None:
+        """Propagate up to a sample."""
+        with self._growing:
+            for i in range(len(self.poses), end + 1):
+                mean = 0.5 * (self.samples[i - 1] + self.samples[i])
+                pose, velocity = self._after(i - 1, self.stamps[i] - self.stamps[i - 1], mean)
+                self.poses.append(pose)
+                self.velocities.append(velocity)
 
     def predict(self, stamp_ns: int, longest_ns: int) -> Prediction | None:
         """Return the state at an instant, at most ``longest_ns`` after the newest sample, or None."""
@@ -105,6 +114,7 @@ class _Path:
         if not self.samples:
             pose = se3_compose(self.poses[i], se3_exp(self._twist * (after_ns * 1e-9)))
             return Prediction(stamp_ns, pose, pose[:3, :3] @ self._twist[3:], self._twist[:3], self._epoch)
+        self._propagate(i)
         sample = now = self.samples[i]
         if not is_newest:
             fraction = after_ns / (self.stamps[i + 1] - self.stamps[i])

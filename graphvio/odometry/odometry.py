@@ -109,7 +109,7 @@ class Odometry:
                 measurement = calibrated_sample(measurement, self.rig.imu)
             for sample in self._synchroniser.add_sample(measurement):
                 self._calibration.add_sample(sample)
-                self._propagate(self._synchroniser.corrected(sample))
+                self._propagate(*self._synchroniser.corrected(sample))
         else:
             self._synchroniser.add_frameset(measurement)
         return self.process_due()
@@ -371,9 +371,9 @@ class Odometry:
             stamp_ns, estimator.state(), estimator.epoch, np.zeros(3) if rate is None else rate, *samples
         )
 
-    def _propagate(self, sample: ImuSample) -> None:
-        """Carry the prediction on by an IMU sample."""
-        values = np.concatenate([sample.angular_velocity, sample.linear_acceleration])
-        prediction = self._propagator.add(sample.stamp_ns, values)
-        if prediction is not None and self._on_prediction is not None:
-            self._on_prediction(prediction)
+    def _propagate(self, stamp_ns: int, sample: Float) -> None:
+        """Carry the prediction on by an IMU sample (6,)."""
+        if self._propagator.add(stamp_ns, sample) and self._on_prediction is not None:
+            prediction = self._propagator.predict(stamp_ns)
+            if prediction is not None:
+                self._on_prediction(prediction)

@@ -70,10 +70,10 @@ class Synchroniser:
                 usable.append(confirmed)
         return usable
 
-    def corrected(self, sample: ImuSample) -> ImuSample:
-        """Return a usable sample with its readings corrected and its stamp on the framesets' clock."""
+    def corrected(self, sample: ImuSample) -> tuple[int, Float]:
+        """Return a usable sample's stamp on the framesets' clock, and its corrected readings (6,)."""
         values = self.imu_correction.applied(np.concatenate([sample.angular_velocity, sample.linear_acceleration]))
-        return ImuSample(sample.stamp_ns - self._offset_ns, values[:3], values[3:])
+        return sample.stamp_ns - self._offset_ns, values
 
     def add_frameset(self, frameset: FrameSet) -> None:
         """Take a frameset that is newer than those before it.
