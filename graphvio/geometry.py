@@ -27,6 +27,37 @@ def skew(v: Float) -> Float:
 
 
 @kernel
+def multiply(a: Float, b: Float) -> Float:
+    """Multiply two matrices (3, 3). In a kernel it is faster than ``@``, which calls a library for large matrices."""
+    product = np.empty((3, 3))
+    for i in range(3):
+        for k in range(3):
+            product[i, k] = a[i, 0] * b[0, k] + a[i, 1] * b[1, k] + a[i, 2] * b[2, k]
+    return product
+
+
+@kernel
+def rotate(rotation: Float, v: Float) -> Float:
+    """Multiply a matrix (3, 3) by a vector (3,)."""
+    rotated = np.empty(3)
+    for i in range(3):
+        rotated[i] = rotation[i, 0] * v[0] + rotation[i, 1] * v[1] + rotation[i, 2] * v[2]
+    return rotated
+
+
+@kernel
+def _of_skew(phi: Float, a: float, b: float) -> Float:
+    """Return ``I + a K + b K^2`` (3, 3) with ``K = skew(phi)``."""
+    square = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    m = skew(phi)
+    for i in range(3):
+        for k in range(3):
+            m[i, k] = a * m[i, k] + b * phi[i] * phi[k]
+        m[i, i] += 1.0 - b * square
+    return m
+
+
+@kernel
 def so3_exp(phi: Float) -> Float:
     """Compute the rotation matrix (3, 3) of a rotation vector (3,), radians."""
     angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
@@ -37,8 +68,7 @@ def so3_exp(phi: Float) -> Float:
     else:
         a = np.sin(angle) / angle
         b = (1.0 - np.cos(angle)) / angle2
-    k = skew(phi)
-    return np.eye(3) + a * k + b * (k @ k)
+    return _of_skew(phi, a, b)
 
 
 @kernel
@@ -50,7 +80,10 @@ def so3_log(rotation: Float) -> Float:
         scale = 2.0 / q[0] - 2.0 * sine * sine / (3.0 * q[0] * q[0] * q[0])
     else:
         scale = 2.0 * np.arctan2(sine, q[0]) / sine
-    return scale * q[1:]
+    phi = np.empty(3)
+    for i in range(3):
+        phi[i] = scale * q[1 + i]
+    return phi
 
 
 @kernel
@@ -64,8 +97,7 @@ def so3_right_jacobian(phi: Float) -> Float:
     else:
         b = (1.0 - np.cos(angle)) / angle2
         c = (angle - np.sin(angle)) / (angle2 * angle)
-    k = skew(phi)
-    return np.eye(3) - b * k + c * (k @ k)
+    return _of_skew(phi, -b, c)
 
 
 @kernel
@@ -77,8 +109,7 @@ def so3_right_jacobian_inverse(phi: Float) -> Float:
         c = 1.0 / 12.0 + angle2 / 720.0
     else:
         c = 1.0 / angle2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
-    k = skew(phi)
-    return np.eye(3) + 0.5 * k + c * (k @ k)
+    return _of_skew(phi, 0.5, c)
 
 
 @kernel
@@ -106,9 +137,11 @@ def quat_wxyz_from_rotation(rotation: Float) -> Float:
         q[1 + i] = 0.25 * s
         q[1 + j] = (r[j, i] + r[i, j]) / s
         q[1 + k] = (r[k, i] + r[i, k]) / s
-    q /= np.sqrt(np.sum(q * q))
+    norm = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     if q[0] < 0.0:
-        q = -q
+        norm = -norm
+    for i in range(4):
+        q[i] /= norm
     return q
 
 
@@ -126,9 +159,12 @@ def rotation_from_quat_wxyz(quat_wxyz: Float) -> Float:
 @kernel
 def se3(rotation: Float, translation: Float) -> Float:
     """Build a transform (4, 4) from its rotation (3, 3) and translation (3,)."""
-    t = np.eye(4)
-    put(t[:3, :3], rotation)
-    put(t[:3, 3], translation)
+    t = np.zeros((4, 4))
+    for i in range(3):
+        for k in range(3):
+            t[i, k] = rotation[i, k]
+        t[i, 3] = translation[i]
+    t[3, 3] = 1.0
     return t
 
 
@@ -148,7 +184,7 @@ def se3_inverse(a_T_b: Float) -> Float:
 def se3_compose(a_T_b: Float, b_T_c: Float) -> Float:
     """Multiply two transforms (4, 4): ``a_T_c``.
 
-    In a kernel this is several times faster than ``@``, which calls a library for large matrices.
+    See `multiply`.
     """
     a, b = a_T_b, b_T_c
     product = np.zeros((4, 4))
@@ -164,27 +200,29 @@ def se3_exp(xi: Float) -> Float:
     """Compute the transform (4, 4) of a tangent vector (6,) ``[rotation, translation]``."""
     phi = xi[:3]
     left_jacobian = so3_right_jacobian(-phi)
-    return se3(so3_exp(phi), left_jacobian @ xi[3:])
+    return se3(so3_exp(phi), rotate(left_jacobian, xi[3:]))
 
 
 @kernel
 def se3_log(a_T_b: Float) -> Float:
     """Compute the tangent vector (6,) ``[rotation, translation]`` of a transform (4, 4)."""
-    phi = so3_log(np.ascontiguousarray(a_T_b[:3, :3]))
+    phi = so3_log(a_T_b)
+    rho = rotate(so3_right_jacobian_inverse(-phi), a_T_b[:, 3])
     xi = np.empty(6)
-    put(xi[:3], phi)
-    put(xi[3:], so3_right_jacobian_inverse(-phi) @ np.ascontiguousarray(a_T_b[:3, 3]))
+    for i in range(3):
+        xi[i], xi[3 + i] = phi[i], rho[i]
     return xi
 
 
 @kernel
 def se3_adjoint(a_T_b: Float) -> Float:
     """Compute the adjoint (6, 6): ``a_T_b exp(xi_b) = exp(Ad xi_b) a_T_b``."""
-    rotation = np.ascontiguousarray(a_T_b[:3, :3])
+    turned = multiply(skew(a_T_b[:, 3]), a_T_b)
     adjoint = np.zeros((6, 6))
-    put(adjoint[:3, :3], rotation)
-    put(adjoint[3:, 3:], rotation)
-    put(adjoint[3:, :3], skew(a_T_b[:3, 3]) @ rotation)
+    for i in range(3):
+        for k in range(3):
+            adjoint[i, k] = adjoint[3 + i, 3 + k] = a_T_b[i, k]
+            adjoint[3 + i, k] = turned[i, k]
     return adjoint
 
 

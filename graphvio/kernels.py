@@ -76,9 +76,9 @@ def _compile(function: Callable[P, R], *, fastmath: bool | set[str]) -> Callable
     try:
         # What a kernel calls becomes part of it. Else the linker takes whichever copy of the callee it met first, and
         # these differ by how often they were optimised: the run that compiles would not give what later ones give.
-        compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=fastmath, forceinline=True)(
-            function
-        )
+        compiled = numba.njit(
+            cache=True, nogil=True, error_model="numpy", fastmath=fastmath, forceinline=True, no_cfunc_wrapper=True
+        )(function)
     finally:
         numba.config.CACHE_DIR = callers_choice
     _registered.append(compiled)

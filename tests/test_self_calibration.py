@@ -15,6 +15,7 @@ from graphvio.calibration_sigmas import LEVELS
 from graphvio.cameras import MODEL_NAMES
 from graphvio.errors import RigError
 from graphvio.geometry import se3_exp, so3_exp, so3_log
+from graphvio.linear_algebra import eliminated, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Camera, Rig, StereoPair
 from graphvio.rig_files import load_rig, save_rig
@@ -25,7 +26,6 @@ from graphvio.self_calibration.bundle import Eliminated, Tracks, _observe, elimi
 from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
 from graphvio.self_calibration.findings import described
 from graphvio.self_calibration.inertial import InertialSamples
-from graphvio.self_calibration.linear import eliminated, solve_symmetric
 from graphvio.self_calibration.online import FullWindow, SelfCalibration
 from graphvio.self_calibration.parameters import BODY, PAIR, STEREO, RigCalibration, parameter_names
 from graphvio.self_calibration.prior import file_prior

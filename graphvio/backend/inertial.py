@@ -196,7 +196,8 @@ def _note_repeats(
     """Add a sample (6,), and return since when some axis has repeated its value though others moved."""
     for axis in range(6):
         if now[axis] != before[axis]:
-            low[axis], high[axis] = now, now
+            put(low[axis], now)
+            put(high[axis], now)
         moved = False
         for other in range(6):
             low[axis, other] = min(low[axis, other], now[other])

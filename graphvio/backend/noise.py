@@ -8,6 +8,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.kernels import kernel
+from graphvio.linear_algebra import cholesky, solve_lower
 
 _MIN_OWN_SHARE = 0.001  # of each direction of a motion's covariance: keeps it positive definite
 
@@ -40,8 +41,8 @@ def own_covariance(covariance: Float, shared: Float) -> Float:
 
     The shared part may exceed the covariance a little as the rig moves on: a minimum is always the motion's own.
     """
-    root = np.linalg.cholesky(covariance)
-    white = np.linalg.solve(root, np.linalg.solve(root, shared).T)
+    root = cholesky(covariance)
+    white = solve_lower(root, solve_lower(root, shared).T)
     shares, axes = np.linalg.eigh(np.eye(6) - 0.5 * (white + white.T))
     axes = root @ np.ascontiguousarray(axes)
     own: Float = (axes * np.maximum(shares, _MIN_OWN_SHARE)) @ np.ascontiguousarray(axes.T)

@@ -13,8 +13,8 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.backend.states import RigState
-from graphvio.geometry import se3_compose, se3_exp, so3_exp
-from graphvio.kernels import kernel, put
+from graphvio.geometry import multiply, rotate, se3, se3_compose, se3_exp, so3_exp
+from graphvio.kernels import kernel
 from graphvio.measurements.estimate import Prediction
 
 _MAX_BLIND_NS = 5_000_000_000  # without a frameset
@@ -135,9 +135,7 @@ def advanced(
     The mean force is that of the step's middle, and so is the attitude that turns it.
     """
     turn = duration_s * (mean[:3] - bias[:3])
-    nav_R_body = np.ascontiguousarray(nav_T_body[:3, :3])
-    acceleration = nav_R_body @ so3_exp(0.5 * turn) @ (mean[3:] - bias[3:]) + gravity_nav
-    pose = nav_T_body.copy()
-    put(pose[:3, :3], nav_R_body @ so3_exp(turn))
-    pose[:3, 3] += duration_s * velocity_nav + 0.5 * duration_s**2 * acceleration
-    return pose, velocity_nav + duration_s * acceleration
+    half_turned = multiply(nav_T_body, so3_exp(0.5 * turn))
+    acceleration = rotate(half_turned, mean[3:] - bias[3:]) + gravity_nav
+    position = nav_T_body[:3, 3] + duration_s * velocity_nav + 0.5 * duration_s**2 * acceleration
+    return se3(multiply(nav_T_body, so3_exp(turn)), position), velocity_nav + duration_s * acceleration

@@ -17,7 +17,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.frontend.refinement import Refined
 from graphvio.frontend.thresholds import THRESHOLDS
-from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from graphvio.geometry import se3_adjoint, se3_compose, se3_exp, se3_inverse, se3_log
 from graphvio.kernels import kernel
 from graphvio.rig import Rig
 
@@ -174,7 +174,13 @@ def _linearised(correction: Float, trusted: Float, pairs: Float, whiteners: Floa
     errors, derivatives = np.empty((n, 6)), np.empty((n, 6, 6))
     inverse = se3_inverse(correction)
     for i in range(n):
-        corrected = correction @ pairs[i] @ inverse
-        errors[i] = whiteners[i] @ se3_log(corrected @ se3_inverse(trusted[i]))
-        derivatives[i] = whiteners[i] @ (np.eye(6) - se3_adjoint(corrected))
+        corrected = se3_compose(se3_compose(correction, pairs[i]), inverse)
+        apart, adjoint = se3_log(se3_compose(corrected, se3_inverse(trusted[i]))), se3_adjoint(corrected)
+        for r in range(6):
+            errors[i, r] = 0.0
+            for k in range(6):
+                errors[i, r] += whiteners[i, r, k] * apart[k]
+                derivatives[i, r, k] = whiteners[i, r, k]
+                for m in range(6):
+                    derivatives[i, r, k] -= whiteners[i, r, m] * adjoint[m, k]
     return errors, derivatives

@@ -5,7 +5,7 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.geometry import se3_compose
-from graphvio.kernels import fast_kernel, kernel, vector_kernel
+from graphvio.kernels import fast_kernel, kernel, put, vector_kernel
 
 MIN_DEPTH_RATIO = 1e-3
 """Depth over the reference depth below which a point counts as behind the camera."""
@@ -41,7 +41,7 @@ def left_motions(cur_T_ref: Float, rig: RigArrays) -> Float:
     for j in range(n_pairs):
         body_T_left_ref = se3_compose(cur_T_ref, rig.body_T_left[j])
         for side in range(2):
-            motions[j, side] = se3_compose(rig.cam_T_body[j, side], body_T_left_ref)
+            put(motions[j, side], se3_compose(rig.cam_T_body[j, side], body_T_left_ref))
     return motions
 
 

@@ -242,7 +242,8 @@ def _add_squares(columns: Float, weights: Float, normal: Float) -> None:
 @vector_kernel
 def _symmetric(normal: Float) -> Float:
     """Return the symmetric matrix (6, 6) of its upper triangle."""
-    whole = normal[:6, :6].copy()
-    for c in range(6):
-        put(whole[c:, c], whole[c, c:])
+    whole = np.empty((6, 6))
+    for r in range(6):
+        for c in range(r, 6):
+            whole[r, c] = whole[c, r] = normal[r, c]
     return whole

@@ -39,54 +39,60 @@ class Influence(NamedTuple):
 @kernel
 def influence(errors2: Float, has_right: Bool, scale: float) -> Influence:
     """Compute the moments of squared whitened errors (N,), of dimension 4 with a right image and 2 without."""
-    finite = np.isfinite(errors2)
-    e2, d = errors2[finite], np.where(has_right[finite], 4.0, 2.0)
-    n = d.sum()
+    n = weights = slopes = squares = 0.0
+    for i in range(len(errors2)):
+        if np.isfinite(errors2[i]):
+            d, w = 4.0 if has_right[i] else 2.0, 1.0 / (1.0 + errors2[i] / scale**2)
+            n += d
+            weights += d * w
+            slopes += d * influence_slope(errors2[i], has_right[i], scale)
+            squares += w**2 * errors2[i]
     if n == 0.0:
         return Influence(1.0, 1.0, 1.0, 1.0)
-    w = 1.0 / (1.0 + e2 / scale**2)
-    weight = (d * w).sum() / n
-    slope = (d * influence_slopes(e2, has_right[finite], scale)).sum() / n
-    square = (w**2 * e2).sum() / slope**2
+    weight, slope = weights / n, slopes / n
     # The mean of 1 / chi^2 lacks two degrees of freedom: without them the variance is right on average.
-    variance = (square + _PRIOR_RESIDUALS) / (max(n - 6.0, 0.0) + _PRIOR_RESIDUALS - 2.0)
+    variance = (squares / slope**2 + _PRIOR_RESIDUALS) / (max(n - 6.0, 0.0) + _PRIOR_RESIDUALS - 2.0)
     variance *= _EXCESS_INFORMATION
     return Influence(weight * variance, weight, slope, variance)
 
 
 @kernel
-def influence_slopes(errors2: Float, has_right: Bool, scale: float) -> Float:
-    """Compute the mean of ``psi'`` over the dimensions of each point's error (N,)."""
-    w = 1.0 / (1.0 + errors2 / scale**2)
-    return w - 2.0 * w * (1.0 - w) / np.where(has_right, 4.0, 2.0)
+def influence_slope(error2: float, has_right: bool, scale: float) -> float:
+    """Compute the mean of ``psi'`` over the dimensions of a point's error."""
+    w = 1.0 / (1.0 + error2 / scale**2)
+    return w - 2.0 * w * (1.0 - w) / (4.0 if has_right else 2.0)
 
 
 @kernel
 def noise_variance(errors2: Float, has_right: Bool, largest2: float) -> float:
     """Estimate the variance of most points' noise, over the modelled one, by the median of those below ``largest2``."""
-    near = errors2 < largest2
-    if not near.any():
-        return 1.0
-    medians = np.where(has_right[near], _MEDIAN_CHI2_OF_4, _MEDIAN_CHI2_OF_2)
-    return max(float(np.median(errors2[near] / medians)), _MIN_VARIANCE)
+    ratios, near = np.empty(len(errors2)), 0
+    for i in range(len(errors2)):
+        if errors2[i] < largest2:
+            ratios[near] = errors2[i] / (_MEDIAN_CHI2_OF_4 if has_right[i] else _MEDIAN_CHI2_OF_2)
+            near += 1
+    return max(float(np.median(ratios[:near])), _MIN_VARIANCE) if near > 0 else 1.0
 
 
 @kernel
 def noise_by_pair(errors2: Float, has_right: Bool, pair: Int, pairs: int, largest2: float) -> Float:
     """Estimate the variance of each pair's noise (P,) over that of all points; near 1 for pairs with few points."""
+    variances, fitting = np.ones(pairs + 1), np.zeros(pairs + 1)
+    for j in range(pairs + 1):  # the last is that of all pairs
+        of_pair = (pair == j) | (j == pairs)
+        variances[j] = noise_variance(errors2[of_pair], has_right[of_pair], largest2)
+        for i in range(len(errors2)):
+            fitting[j] += of_pair[i] and errors2[i] < largest2
     ratios = np.ones(pairs)
-    usual = noise_variance(errors2, has_right, largest2)
     for j in range(pairs):
-        of_pair = pair == j
-        fitting = np.sum(errors2[of_pair] < largest2)
-        if 0 < fitting < np.sum(errors2 < largest2):
-            own = noise_variance(errors2[of_pair], has_right[of_pair], largest2) / usual
-            ratio = (fitting * own + _POINTS_OF_EQUAL_NOISE) / (fitting + _POINTS_OF_EQUAL_NOISE)
+        if 0.0 < fitting[j] < fitting[pairs]:
+            own = variances[j] / variances[pairs]
+            ratio = (fitting[j] * own + _POINTS_OF_EQUAL_NOISE) / (fitting[j] + _POINTS_OF_EQUAL_NOISE)
             ratios[j] = min(max(ratio, 1.0 / _MAX_RATIO), _MAX_RATIO)
     return ratios
 
 
 @kernel
-def inlier_cutoff(errors2: Float, has_right: Bool, largest2: float) -> float:
-    """Compute the squared error below which a point is an inlier: by the noise of most points, at most ``largest2``."""
-    return min(largest2, _CUTOFF * noise_variance(errors2, has_right, largest2))
+def inlier_cutoff(variance: float, largest2: float) -> float:
+    """Compute the squared error below which a point is an inlier: by the noise's variance, at most ``largest2``."""
+    return min(largest2, _CUTOFF * variance)

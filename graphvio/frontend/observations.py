@@ -15,7 +15,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.frontend.tracks import PairFrame, common_rows
-from graphvio.kernels import kernel
+from graphvio.kernels import kernel, put
 from graphvio.rig import Rig
 
 
@@ -170,7 +170,7 @@ def _join(
     in_right, seen = np.zeros((n, 2)), has_right[at_now]
     for i in range(n):
         if seen[i]:
-            in_right[i] = right[at_now[i]]
+            put(in_right[i], right[at_now[i]])
     return Observations(
         np.full(n, pair, dtype=np.int64), points[at_then], covariances[at_then], left[at_now], in_right, seen
     ), at_now

@@ -8,7 +8,7 @@ from graphvio.frontend.cost import MAX_ERROR2, left_motions, score_all, squared_
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.resection import resect
 from graphvio.geometry import se3_compose, se3_inverse
-from graphvio.kernels import kernel
+from graphvio.kernels import kernel, put
 
 _MIN_INVERSE_DEPTH = 0.005
 _MAX_RELATIVE_DEPTH_SIGMA = 0.3
@@ -103,7 +103,9 @@ def _preempt(
         chunk = order[(place >= start) & (place < start + chunk_points)]
         if len(chunk) == 0:
             break
-        scores[alive] += score_all(hypotheses[alive], rig, observations, chunk, cauchy_scale_px)
+        of_chunk = score_all(hypotheses[alive], rig, observations, chunk, cauchy_scale_px)
+        for i, h in enumerate(alive):
+            scores[h] += of_chunk[i]
         ranked = alive[np.argsort(scores[alive], kind="mergesort")]
         alive = ranked[: (len(ranked) + 1) // 2]
         start += chunk_points
@@ -164,7 +166,7 @@ def _resect_triples(
                 continue
             left_cur_T_ref, solved = _resect_triple(triple, observations, right_T_left, rig.focal_px[j, 1])
             if solved:
-                motions[found] = se3_compose(se3_compose(body_T_left, left_cur_T_ref), left_ref_T_body)
+                put(motions[found], se3_compose(se3_compose(body_T_left, left_cur_T_ref), left_ref_T_body))
                 sources[found] = j
                 found += 1
     return motions[:found], sources[:found]

@@ -19,10 +19,11 @@ from graphvio.config.stages import MotionConfig
 from graphvio.frontend.blocks import POINTS, Blocks, in_blocks, lane_by_lane, point_by_point
 from graphvio.frontend.cost import left_motions
 from graphvio.frontend.linearisation import Expansion, expand, information_through_points, linearise, unexpanded
-from graphvio.frontend.noise import influence, influence_slopes, inlier_cutoff, noise_by_pair, noise_variance
+from graphvio.frontend.noise import influence, influence_slope, inlier_cutoff, noise_by_pair, noise_variance
 from graphvio.frontend.observations import Observations, RigArrays, image_by_image
 from graphvio.geometry import se3_compose, se3_exp
 from graphvio.kernels import kernel
+from graphvio.linear_algebra import cholesky, solve_lower, solve_symmetric
 
 _MAX_ROUNDS = 3
 _MAX_REPETITIONS = 5  # of these rounds, where outliers stay in the cost and make convergence slow
@@ -95,32 +96,33 @@ def _refined(
     """Compute the fields of `Refined`, in their order; ``known`` has no elements where inliers are not known."""
     widest, largest2 = scale_px / sigma, (max_error_px / sigma) ** 2
     has_right, blocks = observations.has_right, in_blocks(observations)
-    at = unexpanded(blocks)
-    pose, inlier = cur_T_ref, known
+    at, pose, hessian = unexpanded(blocks), cur_T_ref, np.empty((6, 6))
     sigmas_px = np.full(len(rig.focal_px), sigma)
     errors2 = _squared_errors(pose, rig, blocks, at, sigmas_px)
-    if len(inlier) == len(has_right):
-        scale = _scale(errors2[inlier], has_right[inlier], widest, largest2)
-    else:
-        # Until the result does not depend on the initial motion. Gross errors are left out as soon as they stand out:
-        # near the camera, they would bias the motion more in each round.
-        candidates = np.ones(len(has_right))
-        for number in range(_ROUNDS_TO_FIND_INLIERS):
-            scale = _scale(errors2, has_right, widest, largest2)
-            if number >= _ROUNDS_WITH_ALL:
-                candidates = (errors2 < _GROSS * inlier_cutoff(errors2, has_right, largest2)).astype(np.float64)
-            active = lane_by_lane(blocks, candidates)
-            pose, _, errors2 = _levenberg_marquardt(pose, rig, blocks, at, active, sigmas_px, scale, 1, _NEAR)
-        # One pair's images may be blurred or dim: its points are then less certain than the others'.
-        noise = noise_by_pair(errors2, has_right, observations.pair, len(sigmas_px), largest2)
-        errors2 /= noise[observations.pair]
-        sigmas_px *= np.sqrt(noise)
-        inlier = errors2 < inlier_cutoff(errors2, has_right, largest2)
-        inlier &= _is_of_an_explained_pair(observations.pair, inlier)
-    active = lane_by_lane(blocks, inlier.astype(np.float64))
-    pose, hessian, errors2 = _levenberg_marquardt(
-        pose, rig, blocks, at, active, sigmas_px, scale, _MAX_ROUNDS, _CONVERGED
-    )
+    is_known = len(known) == len(has_right)
+    inlier = known if is_known else np.ones(len(has_right), dtype=np.bool_)
+    judged, scale = inlier, widest
+    # One loop for the search and for the last, precise round: a kernel is compiled anew at each place that calls it.
+    for number in range(_ROUNDS_TO_FIND_INLIERS if is_known else 0, _ROUNDS_TO_FIND_INLIERS + 1):
+        is_last = number == _ROUNDS_TO_FIND_INLIERS
+        if is_last and not is_known:
+            # One pair's images may be blurred or dim: its points are then less certain than the others'.
+            noise = noise_by_pair(errors2, has_right, observations.pair, len(sigmas_px), largest2)
+            errors2 /= noise[observations.pair]
+            sigmas_px *= np.sqrt(noise)
+        variance = noise_variance(errors2[judged], has_right[judged], largest2)
+        if is_known or not is_last:
+            scale = _scale(variance, widest)
+        # Gross errors are left out as soon as they stand out: near the camera, they would bias the motion more in each
+        # round. The result is not to depend on the initial motion, by which other points would be taken for wrong.
+        if not is_known and number >= _ROUNDS_WITH_ALL:
+            inlier = errors2 < inlier_cutoff(variance, largest2) * (1.0 if is_last else _GROSS)
+            if is_last:
+                inlier &= _is_of_an_explained_pair(observations.pair, inlier, len(sigmas_px))
+        pose, hessian, errors2 = _levenberg_marquardt(
+            pose, rig, blocks, at, lane_by_lane(blocks, inlier.astype(np.float64)), sigmas_px, scale,
+            _MAX_ROUNDS if is_last else 1, _CONVERGED if is_last else _NEAR,
+        )  # fmt: skip
     covariance, shared = _covariances(pose, hessian, errors2, rig, blocks, at, inlier, has_right, sigmas_px, scale)
     errors_px = _errors_px(errors2, has_right, sigmas_px[observations.pair])
     return pose, inflation * covariance, inflation * shared, inlier, errors_px
@@ -148,9 +150,9 @@ def _refined_per_image(
     errors2 = _squared_errors(pose, rig, blocks, at, sigmas_px)
     inlier = known
     if len(inlier) != len(has_right):
-        inlier = errors2 < inlier_cutoff(errors2, has_right, largest2)
-        inlier &= _is_of_an_explained_pair(observations.pair, inlier)
-    scale = _scale(errors2[inlier], has_right[inlier], scale_px / sigma, largest2)
+        inlier = errors2 < inlier_cutoff(noise_variance(errors2, has_right, largest2), largest2)
+        inlier &= _is_of_an_explained_pair(observations.pair, inlier, len(sigmas_px))
+    scale = _scale(noise_variance(errors2[inlier], has_right[inlier], largest2), scale_px / sigma)
     hessian = np.empty((6, 6))
     linearise(
         left_motions(pose, rig), rig, blocks, at, lane_by_lane(blocks, inlier.astype(np.float64)), scale,
@@ -170,40 +172,52 @@ def _covariances(
     used = influence(errors2[inlier], has_right[inlier], scale)
     # Backward propagation of the reprojection covariance. The small prior keeps unconstrained directions finite.
     information = hessian / used.factor + np.eye(6) / _WEAK_DIRECTION_SIGMA**2
-    root = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(information)).T)
+    lower = cholesky(information)
+    root = solve_lower(lower, np.eye(6))
     covariance = root @ root.T
-    factors = lane_by_lane(blocks, np.where(inlier, influence_slopes(errors2, has_right, scale) ** 2, 0.0))
-    through_points = information_through_points(left_motions(pose, rig), rig, blocks, at, sigmas_px, factors)
+    factors = np.zeros(len(inlier))
+    for i in range(len(inlier)):
+        if inlier[i]:
+            factors[i] = influence_slope(errors2[i], has_right[i], scale) ** 2
+    through_points = information_through_points(
+        left_motions(pose, rig), rig, blocks, at, sigmas_px, lane_by_lane(blocks, factors)
+    )
     gain = covariance / used.factor * (used.weight / used.slope)
-    shared = _bounded(used.variance * gain @ through_points @ gain, root)
+    shared = _bounded(used.variance * gain @ through_points @ gain, root, lower.T)
     return covariance, shared
 
 
 @kernel
-def _scale(errors2: Float, has_right: Bool, widest: float, largest2: float) -> float:
-    """Compute the scale of the Cauchy cost, less where the noise is less than modelled.
+def _scale(variance: float, widest: float) -> float:
+    """Compute the scale of the Cauchy cost, less where the noise's variance is less than modelled.
 
     A wrong point next to a camera has the leverage of a hundred others, and must look as wrong as it is.
     """
-    return float(widest * np.sqrt(min(noise_variance(errors2, has_right, largest2), 1.0)))
+    return float(widest * np.sqrt(min(variance, 1.0)))
 
 
 @kernel
-def _is_of_an_explained_pair(pair: Int, inlier: Bool) -> Bool:
+def _is_of_an_explained_pair(pair: Int, inlier: Bool, pairs: int) -> Bool:
     """Select the points (N,) of pairs of which more fit than would by chance; all points, if there is no such pair."""
-    fitting = np.bincount(pair, weights=inlier.astype(np.float64))
-    explained = fitting >= np.maximum(_MIN_SHARE_OF_A_PAIR * np.bincount(pair), _MIN_POINTS_OF_A_PAIR)
+    points, fitting = np.zeros(pairs), np.zeros(pairs)
+    for i in range(len(pair)):
+        points[pair[i]] += 1.0
+        fitting[pair[i]] += inlier[i]
+    explained = fitting >= np.maximum(_MIN_SHARE_OF_A_PAIR * points, _MIN_POINTS_OF_A_PAIR)
     those: Bool = explained[pair] | (not explained.any())
     return those
 
 
 @kernel
-def _bounded(shared: Float, root: Float) -> Float:
+def _bounded(shared: Float, root: Float, inverse: Float) -> Float:
     """Bound the shared part of a covariance ``root root^T``, so that it and the remainder are positive definite."""
-    inverse = np.linalg.inv(root)
     shares, axes = np.linalg.eigh(inverse @ shared @ inverse.T)
-    turned = root @ axes
-    bounded: Float = (turned * np.minimum(np.maximum(shares, _SHARED_BOUNDS[0]), _SHARED_BOUNDS[1])) @ turned.T
+    turned, scaled = root @ axes, root @ axes
+    for c in range(6):
+        share = min(max(shares[c], _SHARED_BOUNDS[0]), _SHARED_BOUNDS[1])
+        for r in range(6):
+            scaled[r, c] *= share
+    bounded: Float = scaled @ turned.T
     return bounded
 
 
@@ -222,20 +236,9 @@ def _levenberg_marquardt(
     hessian, gradient, errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), POINTS))
     new_hessian, new_gradient, new_errors2 = np.zeros((6, 6)), np.zeros(6), np.empty((len(blocks.pair), POINTS))
     for _ in range(rounds):
-        motions = left_motions(pose, rig)
-        expand(motions, rig, blocks, sigmas_px, at)
-        moved = 0.0
-        cost = linearise(motions, rig, blocks, at, active, scale, hessian, gradient, errors2)
-        damping = 1e-6
-        for _ in range(_STEPS_PER_ROUND):
-            damped = hessian.copy()
-            for k in range(6):
-                damped[k, k] += damping * hessian[k, k] + 1e-9
-            step = np.linalg.solve(damped, gradient)
-            candidate = se3_compose(se3_exp(step), pose)  # type: ignore[arg-type]
-            if np.max(np.abs(step)) < tolerance:
-                pose = candidate
-                break
+        expand(left_motions(pose, rig), rig, blocks, sigmas_px, at)
+        candidate, cost, damping, moved, length = pose, np.inf, 1e-5, 0.0, 0.0
+        for _ in range(1 + _STEPS_PER_ROUND):
             new_cost = linearise(
                 left_motions(candidate, rig), rig, blocks, at, active, scale, new_hessian, new_gradient, new_errors2
             )
@@ -245,9 +248,18 @@ def _levenberg_marquardt(
                 gradient, new_gradient = new_gradient, gradient
                 errors2, new_errors2 = new_errors2, errors2
                 damping *= 0.1
-                moved = max(moved, np.max(np.abs(step)))
+                moved = max(moved, length)
             else:
                 damping = max(damping * 10.0, 1e-4)
+            damped = hessian.copy()
+            for k in range(6):
+                damped[k, k] += damping * hessian[k, k] + 1e-9
+            step = solve_symmetric(damped, gradient)
+            length = np.max(np.abs(step))
+            candidate = se3_compose(se3_exp(step), pose)
+            if length < tolerance:
+                pose = candidate
+                break
         if moved < _NEAR:
             break  # the points' places and weights would not change any more
     return pose, hessian, point_by_point(blocks, errors2)
@@ -259,14 +271,18 @@ def explained(rig: RigArrays, observations: Observations, cur_T_ref: Float, conf
     sigmas_px = np.full(len(rig.focal_px), sigma)
     blocks = in_blocks(observations)
     errors2 = _squared_errors(cur_T_ref, rig, blocks, unexpanded(blocks), sigmas_px)
-    inlier = errors2 < inlier_cutoff(errors2, has_right, (config.max_error_px / sigma) ** 2)
+    largest2 = (config.max_error_px / sigma) ** 2
+    inlier = errors2 < inlier_cutoff(noise_variance(errors2, has_right, largest2), largest2)
     return np.asarray(inlier), _errors_px(errors2, has_right, sigmas_px[observations.pair])
 
 
 @kernel
 def _errors_px(errors2: Float, has_right: Bool, sigmas_px: Float) -> Float:
     """Convert squared whitened errors (N,) of points with a noise (N,) to pixels in one direction."""
-    return sigmas_px * np.sqrt(errors2 / np.where(has_right, 4.0, 2.0))
+    errors_px = np.empty(len(errors2))
+    for i in range(len(errors2)):
+        errors_px[i] = sigmas_px[i] * np.sqrt(errors2[i] / (4.0 if has_right[i] else 2.0))
+    return errors_px
 
 
 @kernel

@@ -63,7 +63,8 @@ def resect(points: Float, rays: Float) -> tuple[Float, int]:
         if u <= 0.0 or not s1_squared > 0.0:
             continue
         s1 = np.sqrt(s1_squared)
-        seen[0], seen[1], seen[2] = s1 * rays[0], u * s1 * rays[1], v * s1 * rays[2]
+        for c in range(3):
+            seen[0, c], seen[1, c], seen[2, c] = s1 * rays[0, c], u * s1 * rays[1, c], v * s1 * rays[2, c]
         if _triangle_axes(seen, axes_cam):
             _align_triangles(points, axes_a, seen, axes_cam, poses[count])
             count += 1
@@ -119,7 +120,8 @@ def _triangle_axes(corners: Float, axes: Float) -> bool:
 def _normalise(v: Float) -> float:
     """Divide a vector (3,) by its length, and return the length."""
     length = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    v /= length
+    for i in range(3):
+        v[i] /= length
     return length
 
 

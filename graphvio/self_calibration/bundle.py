@@ -13,7 +13,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.cameras import distort, distortion_basis
-from graphvio.kernels import kernel
+from graphvio.kernels import kernel, put
 from graphvio.self_calibration.parameters import (
     BODY,
     CAMERA,
@@ -332,7 +332,8 @@ def eliminate_landmarks(
             for d in range(c):
                 v[c, d] = v[d, c]
         inverse = _inverse3(v)
-        eliminated.inverse[point], eliminated.gradient[point] = inverse, bl
+        put(eliminated.inverse[point], inverse)
+        put(eliminated.gradient[point], bl)
         vb = inverse @ bl
         vwc = inverse @ wc
         for c in range(PAIR):
@@ -380,9 +381,15 @@ def landmarks_after(landmarks: Float, tracks: Tracks, eliminated: Eliminated, st
     moved = landmarks.copy()
     for point in range(len(landmarks)):
         at = 6 * n_keyframes + PAIR * tracks.pair[point]
-        b = eliminated.gradient[point] + eliminated.by_calibration[point] @ step[at : at + PAIR]
-        for n in range(tracks.rows[point], tracks.rows[point + 1]):
-            k = 6 * tracks.keyframe[n]
-            b += eliminated.by_pose[n] @ step[k : k + 6]
-        moved[point] -= eliminated.inverse[point] @ b
+        b = eliminated.gradient[point].copy()
+        for r in range(3):
+            for c in range(PAIR):
+                b[r] += eliminated.by_calibration[point, r, c] * step[at + c]
+            for n in range(tracks.rows[point], tracks.rows[point + 1]):
+                k = 6 * tracks.keyframe[n]
+                for c in range(6):
+                    b[r] += eliminated.by_pose[n, r, c] * step[k + c]
+        for r in range(3):
+            for c in range(3):
+                moved[point, r] -= eliminated.inverse[point, r, c] * b[c]
     return moved

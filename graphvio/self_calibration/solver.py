@@ -8,12 +8,12 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.geometry import so3_exp
+from graphvio.linear_algebra import eliminated, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landmarks, landmarks_after, total_cost
 from graphvio.self_calibration.evidence import Gaussian
 from graphvio.self_calibration.imu_model import PARAMETERS
 from graphvio.self_calibration.inertial import InertialSamples, InertialStates, inertial_equations
-from graphvio.self_calibration.linear import eliminated, solve_symmetric
 from graphvio.self_calibration.parameters import PAIR, RigCalibration
 
 _ROBUST_SCALE = 2.5  # of the Cauchy cost, in standard deviations

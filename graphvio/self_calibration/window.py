@@ -10,7 +10,6 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.cameras import unproject_pixels
-from graphvio.kernels import kernel
 from graphvio.self_calibration.bundle import Tracks
 from graphvio.self_calibration.parameters import RigCalibration
 
@@ -76,7 +75,7 @@ def choose_tracks(
         ]
         order = np.lexsort((columns[0], ids))
         rows = _longest(ids[order], columns[3][order], max_tracks)
-        chosen = order[rows]
+        chosen: Int = order[rows]
         if len(chosen):
             parts.append((j, ids[chosen], *(column[chosen] for column in columns)))
     if not parts:
@@ -118,30 +117,17 @@ def median_displacement_px(then: View, now: View) -> float:
     return float(np.median(np.linalg.norm(now.left_px[at_now] - then.left_px[at_then], axis=1)))
 
 
-@kernel
 def _longest(ids: Int, has_right: Bool, max_tracks: int) -> Int:
     """Select the rows of the tracks seen most often, and matched at least once, of rows (N,) sorted by identity."""
-    n = len(ids)
-    firsts, lengths = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
-    count = i = 0
-    while i < n:
-        end, matched = i, False
-        while end < n and ids[end] == ids[i]:
-            matched |= has_right[end]
-            end += 1
-        if matched:
-            firsts[count], lengths[count] = i, end - i
-            count += 1
-        i = end
-    best = np.argsort(-lengths[:count], kind="mergesort")[:max_tracks]
-    best.sort()
-    rows = np.empty(lengths[best].sum(), dtype=np.int64)
-    at = 0
-    for track in best:
-        for row in range(firsts[track], firsts[track] + lengths[track]):
-            rows[at] = row
-            at += 1
-    return rows
+    if not len(ids):
+        return np.empty(0, dtype=np.int64)
+    firsts = np.concatenate([[0], np.flatnonzero(np.diff(ids)) + 1])
+    lengths = np.diff(firsts, append=len(ids))
+    matched = np.flatnonzero(np.logical_or.reduceat(has_right, firsts))
+    longest = np.sort(matched[np.argsort(-lengths[matched], kind="stable")[:max_tracks]])
+    is_of_one = np.zeros(len(firsts), dtype=bool)
+    is_of_one[longest] = True
+    return np.flatnonzero(np.repeat(is_of_one, lengths))
 
 
 _NOTHING = Tracks(

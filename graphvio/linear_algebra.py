@@ -1,6 +1,7 @@
-"""Positive definite systems of a few hundred unknowns, in the thread that solves them.
+"""Solvers of positive definite systems for kernels, in the thread that calls them.
 
-numpy's solvers start threads of their own, which take the cores from the odometry and wait for each other.
+LAPACK's start threads of their own for a few hundred unknowns, which take the cores from the odometry and wait for each
+other; and numba compiles its interface to LAPACK for 10 s.
 """
 
 import numpy as np
