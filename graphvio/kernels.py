@@ -5,11 +5,13 @@ of a module is therefore named after a digest of its source and of all that it i
 outdated machine code is never run by mistake.
 """
 
+import atexit
 import functools
 import hashlib
 import logging
 import os
 import re
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
@@ -27,6 +29,7 @@ _PACKAGE = Path(__file__).parent
 _IMPORT = re.compile(r"^from (graphvio[\w.]*) import", re.MULTILINE)
 _ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
 _registered: list[Any] = []
+_compilers: list[subprocess.Popen[bytes]] = []
 _log = logging.getLogger(__name__)
 
 
@@ -90,6 +93,23 @@ def any_compiled_before(module: str) -> bool:
     return any((cache_root() / source_digest(module)).rglob("*.nbc"))
 
 
+def compile_elsewhere(compiler: subprocess.Popen[bytes]) -> None:
+    """Note that a process compiles kernels that this one needs later; it ends with this one at the latest."""
+    _compilers.append(compiler)
+    atexit.register(compiler.kill)
+
+
+def is_compiling_elsewhere() -> bool:
+    """Return whether a process of `compile_elsewhere` is still at work."""
+    return any(compiler.poll() is None for compiler in _compilers)
+
+
+def await_compilers() -> None:
+    """Wait until no other process compiles kernels for this one; what it has not compiled is compiled here."""
+    for compiler in _compilers:
+        compiler.wait()
+
+
 @functools.cache
 def source_digest(module: str) -> str:
     """Return a module's name with a digest of its source and of all that it imports from this package."""
@@ -119,7 +139,7 @@ class _Announcer(numba_event.Listener):  # type: ignore[misc]
         """Handle that numba begins to compile a function that no cache holds."""
         if not self._announced and event.data["dispatcher"] in _registered:
             self._announced = True
-            _log.warning("compiling numerical kernels for this machine, once; it takes one to two minutes")
+            _log.warning("compiling numerical kernels for this machine, once; it takes about a minute")
 
     def on_end(self, event: Any) -> None:
         """Handle that numba has compiled a function."""

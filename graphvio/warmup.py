@@ -1,12 +1,14 @@
 """Warm-up: compiles or loads from the cache every kernel of the odometry, before the first image arrives.
 
-Compiling takes a minute or more of one core. Where the cache is empty, a second process compiles a half of the kernels,
-and another program that compiles at the same time is waited for.
+Compiling takes a minute of one core. Where the cache is empty, a second process compiles the kernels that estimate a
+motion and, while the odometry may begin, those of the self-calibration, which is to wait for it. Another program that
+compiles at the same time is waited for.
 """
 
 from __future__ import annotations
 
 import fcntl
+import os
 import pickle
 import subprocess
 import sys
@@ -27,7 +29,7 @@ from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import common_rows
 from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, skew, so3_log
-from graphvio.kernels import any_compiled_before, cache_root
+from graphvio.kernels import any_compiled_before, await_compilers, cache_root, compile_elsewhere, is_compiling_elsewhere
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Imu, Rig
 from graphvio.self_calibration.online import adjust_nothing
@@ -35,27 +37,36 @@ from graphvio.slam.landmarks import orientations
 
 _POINTS = 20
 _CALIBRATION = "graphvio.self_calibration.bundle"
+_MOTION_IS_COMPILED = b"motion"
 _COMPILED_LAST = ("graphvio.frontend.lucas_kanade", "graphvio.frontend.refinement", "graphvio.backend.propagation")
-_OTHER_PROCESS = "from graphvio.warmup import warm_up_second_half; warm_up_second_half()"
+_OTHER_PROCESS = "from graphvio.warmup import compile_for_another; compile_for_another()"
 
 
-def warm_up(rig: Rig, config: Config) -> None:
+def warm_up(rig: Rig, config: Config, *, wait_for_calibration: bool = True) -> None:
     """Call every kernel once on noise, with the array types that the odometry uses.
 
     Args:
         rig: the rig, for its image size and its IMU.
         config: configuration of all stages.
+        wait_for_calibration: whether the kernels of the self-calibration are waited for too where they have to be
+            compiled; else the self-calibration waits for them when it has seen enough.
     """
     if not _are_compiled(config):
         _compile_in_parallel(rig, config)
-    _warm_up_first_half(rig, config)
+    _warm_up_tracking(rig, config)
     _warm_up_motion(rig, config)
+    if config.estimates_calibration and (wait_for_calibration or not is_compiling_elsewhere()):
+        await_compilers()
+        adjust_nothing(rig)
 
 
-def warm_up_second_half() -> None:
-    """Compile what `_warm_up_first_half` leaves, for the pickled rig and configuration of the standard input."""
+def compile_for_another() -> None:
+    """Compile what `_compile_in_parallel` leaves, for the pickled rig and configuration of the standard input."""
     rig, config = pickle.load(sys.stdin.buffer)
     _warm_up_motion(rig, config)
+    os.write(sys.stdout.fileno(), _MOTION_IS_COMPILED)
+    if config.estimates_calibration:
+        adjust_nothing(rig)
 
 
 def _are_compiled(config: Config) -> bool:
@@ -65,26 +76,30 @@ def _are_compiled(config: Config) -> bool:
 
 
 def _compile_in_parallel(rig: Rig, config: Config) -> None:
-    """Compile a half of the kernels here and the other one in a second process; only one program does so at a time."""
+    """Compile the kernels of tracking here and the others in a second process; only one program does so at a time.
+
+    It returns once a motion can be estimated. The second process holds the lock until it has finished.
+    """
     with (cache_root() / "compiling.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if _are_compiled(config):
             return  # by the program that was waited for
-        command = [sys.executable, "-c", _OTHER_PROCESS]
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.DEVNULL) as other:
-            assert other.stdin is not None
-            try:
-                pickle.dump((rig, config), other.stdin)
-                other.stdin.close()
-                _warm_up_first_half(rig, config)
-            except BaseException:
-                other.kill()
-                raise
-        # Whatever it did not do, for instance since it does not find graphvio, is compiled here.
+        command, pipe = [sys.executable, "-c", _OTHER_PROCESS], subprocess.PIPE
+        other = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, pass_fds=[lock.fileno()])
+        compile_elsewhere(other)
+        assert other.stdin is not None
+        assert other.stdout is not None
+        try:
+            pickle.dump((rig, config), other.stdin)
+            other.stdin.close()
+        except BrokenPipeError:
+            return  # it does not find graphvio, for instance: everything is compiled here
+        _warm_up_tracking(rig, config)
+        other.stdout.read(len(_MOTION_IS_COMPILED))
 
 
-def _warm_up_first_half(rig: Rig, config: Config) -> None:
-    """Call the kernels of tracking, of the back-end and of the self-calibration."""
+def _warm_up_tracking(rig: Rig, config: Config) -> None:
+    """Call the kernels of tracking and of geometry."""
     rng = np.random.default_rng(0)
     pair = rig.pairs[0]
     width, height = pair.left.size_px
@@ -106,13 +121,11 @@ def _warm_up_first_half(rig: Rig, config: Config) -> None:
         se3_inverse(pose)
         se3_adjoint(pose)
         so3_log(pose[:3, :3].copy(order="K"))
-    _warm_up_imu(rig.imu or Imu())
-    if config.estimates_calibration:
-        adjust_nothing(rig)
 
 
 def _warm_up_motion(rig: Rig, config: Config) -> None:
-    """Call the kernels that estimate a motion."""
+    """Call the kernels that estimate a motion, by vision and by the IMU."""
+    _warm_up_imu(rig.imu or Imu())
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-0.3, 0.3, (_POINTS, 2)), rng.uniform(0.1, 1.0, _POINTS)])
     observations = Observations(

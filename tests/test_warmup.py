@@ -68,8 +68,7 @@ def test_no_kernel_is_compiled_after_the_warm_up() -> None:
         assert compiled() - before == set()
 
 
-def test_warm_up_second_half_compiles_what_the_first_one_leaves() -> None:
-    halves = [graphvio.warmup._warm_up_first_half, graphvio.warmup._warm_up_motion]
+def test_other_process_compiles_motion_and_calibration() -> None:
     done = subprocess.run(
         [sys.executable, "-c", graphvio.warmup._OTHER_PROCESS],
         input=pickle.dumps((default_rig(), Config())),
@@ -77,10 +76,30 @@ def test_warm_up_second_half_compiles_what_the_first_one_leaves() -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    for half in halves:
-        half(default_rig(), Config())
-    names = {name for _, name, _ in compiled()}
-    assert {"_refined", "register", "eliminate_landmarks"} <= names
+    assert done.stdout == graphvio.warmup._MOTION_IS_COMPILED
+    assert all(
+        map(graphvio.kernels.any_compiled_before, ("graphvio.frontend.refinement", graphvio.warmup._CALIBRATION))
+    )
+
+
+@pytest.mark.parametrize("other_process", ["works", "fails"])
+def test_warm_up_compiles_in_parallel_and_survives_a_failing_process(other_process: str) -> None:
+    """In a process of its own, which takes the kernels for uncompiled though the cache has them, to be done sooner."""
+    program = f"""
+from graphvio import kernels, warmup
+from graphvio.config import Config
+from graphvio.simulation import default_rig
+if {other_process == "fails"}:
+    warmup._OTHER_PROCESS = "raise SystemExit(1)"
+warmup._are_compiled = lambda config: False
+warmup.warm_up(default_rig(), Config())
+print(len(kernels._compilers), kernels.is_compiling_elsewhere(), kernels._compilers[0].returncode)
+names = [kernel.py_func.__name__ for kernel in kernels._registered if kernel.signatures]
+print("register" in names, "_refined" in names, "eliminate_landmarks" in names)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["1", "False", str(int(other_process == "fails")), "True", "True", "True"]
 
 
 def test_compile_in_parallel_waits_for_another_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv  # scipy.stats takes a second to import
 
 from graphvio.arrays import Float
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
@@ -59,4 +59,4 @@ def excess(value: Float, covariance: Float, max_length: float) -> float | None:
 @cache
 def chi_square_quantile(probability: float, degrees_of_freedom: int) -> float:
     """Return the quantile of the chi-square distribution."""
-    return float(chi2.ppf(probability, degrees_of_freedom))
+    return float(2.0 * gammaincinv(0.5 * degrees_of_freedom, probability))

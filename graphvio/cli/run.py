@@ -75,7 +75,7 @@ def run(
                 RunListener(on_estimate=viewer.show, on_event=viewer.show_event, on_calibration=viewer.show_calibration)
             )
         use_one_opencv_thread()
-        warm_up(opened.rig, settings)
+        warm_up(opened.rig, settings, wait_for_calibration=False)
         listeners.append(RunListener(on_progress=stack.enter_context(_ProgressLine()).show))
         try:
             with interruptible():

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class AlignmentThresholds:
     cauchy_scale: float = 9.0
     max_outlier_share: float = 0.3
     prior_sigmas: np.ndarray[tuple[int], np.dtype[np.float64]] = field(default_factory=lambda: np.repeat([0.1, 0.2], 3))
-    max_chance_distance: float = float(chi2.isf(1e-9, 6))
+    max_chance_distance: float = float(chdtri(6, 1e-9))
     max_vague_share: float = 0.25
     max_fine_rad: float = float(np.deg2rad(0.2))
     max_fine_m: float = 0.01

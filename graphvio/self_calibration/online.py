@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.kernels import await_compilers
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
@@ -278,6 +279,7 @@ class SelfCalibration:
         is_full: bool,
     ) -> _Adjusted:
         """Adjust a window; what is read here does not change while an adjustment is pending."""
+        await_compilers()
         solution = adjusted(window, samples, self._nominal, difference, prior, self._sigma_px)
         evidence = self._evidence.with_window(prior, solution.calibration)
         factors, log_bayes_factor = evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS)

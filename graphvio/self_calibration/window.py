@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -63,7 +63,7 @@ def choose_tracks(
     Returns:
         The tracks, and the landmarks (L, 3) in their frames.
     """
-    parts = []
+    parts: list[tuple[Any, ...]] = []
     for j in range(len(calibration.models)):
         seen = [(k, keyframe.views[j]) for k, keyframe in enumerate(keyframes) if j in keyframe.views]
         if not seen:

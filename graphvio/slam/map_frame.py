@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from graphvio.arrays import Float
+from graphvio.backend.gating import chi_square_quantile
 from graphvio.errors import MeasurementError
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from graphvio.slam.keyframe import CorrectionResult, Keyframe
@@ -54,7 +54,7 @@ class MapFrame:
     """
 
     def __init__(self, probability: float) -> None:
-        self._threshold = float(chi2.ppf(probability, 6))
+        self._threshold = chi_square_quantile(probability, 6)
         self._lock = threading.Lock()
         self._epoch: int | None = None
         self._passed: dict[int, _Passed] = {}
