@@ -29,6 +29,7 @@ POSE, POINT = 6, 3
 _POINT_AT = POSE + PAIR
 _ERROR_AT = _POINT_AT + POINT
 _COLUMNS = _ERROR_AT + 1
+_ERROR2_BEHIND = 1e6  # of a landmark behind the camera
 _MIN_DEPTH_RATIO = 1e-3
 
 
@@ -226,42 +227,10 @@ def _observe(
 
 
 @kernel
-def total_cost(
-    poses: Float, calibration: RigCalibration, landmarks: Float, tracks: Tracks, sigma_px: float, scale: float
-) -> tuple[float, Float]:
-    """Compute the robust cost of all errors, and the squared whitened error of each image's observation (N, 2).
-
-    Args:
-        poses: (K, 4, 4) ``odom_T_body``.
-        calibration: of P pairs.
-        landmarks: (L, 3).
-        tracks: of these.
-        sigma_px: noise of a corner's position.
-        scale: of the Cauchy cost, in whitened units.
-    """
-    errors2 = np.full((len(tracks.keyframe), 2), np.nan)
-    rows, cost = np.zeros((4, _COLUMNS)), 0.0
-    for point in range(len(landmarks)):
-        for n in range(tracks.rows[point], tracks.rows[point + 1]):
-            filled = _observe(
-                poses[tracks.keyframe[n]], calibration, tracks.pair[point], tracks.odom_T_landmark[point],
-                landmarks[point], tracks.left_px[n], tracks.right_px[n], tracks.has_right[n], rows,
-            )  # fmt: skip
-            for image in range(2 if tracks.has_right[n] else 1):
-                e2 = 1e6
-                if filled >= 2 * image + 2:
-                    du, dv = rows[2 * image, _ERROR_AT], rows[2 * image + 1, _ERROR_AT]
-                    e2 = (du * du + dv * dv) / (sigma_px * sigma_px)
-                errors2[n, image] = e2
-                cost += 0.5 * scale * scale * np.log(1.0 + e2 / (scale * scale))
-    return cost, errors2
-
-
-@kernel
 def eliminate_landmarks(
     poses: Float, calibration: RigCalibration, landmarks: Float, tracks: Tracks, sigma_px: float, scale: float,
     damping: float, hessian: Float, gradient: Float, eliminated: Eliminated,
-) -> None:  # fmt: skip
+) -> tuple[float, Float]:  # fmt: skip
     """Add the normal equations of poses and calibration, landmarks eliminated.
 
     Args:
@@ -275,11 +244,15 @@ def eliminate_landmarks(
         hessian: (6 K + P PAIR, 6 K + P PAIR), upper and lower triangle, is added to.
         gradient: (6 K + P PAIR,) is added to.
         eliminated: output.
+
+    Returns:
+        Robust cost of all errors, and the squared whitened error of each image's observation (N, 2), NaN without one.
     """
     n_poses = 6 * len(poses)
     rows = np.zeros((4, _COLUMNS))
     local = np.zeros((_COLUMNS, _COLUMNS))
     by_calibration = np.zeros((PAIR, PAIR))
+    errors2, cost = np.full((len(tracks.keyframe), 2), np.nan), 0.0
     for point in range(len(landmarks)):
         first, last = tracks.rows[point], tracks.rows[point + 1]
         at = n_poses + PAIR * tracks.pair[point]
@@ -299,9 +272,13 @@ def eliminate_landmarks(
             for c in range(_COLUMNS):
                 for d in range(_COLUMNS):
                     local[c, d] = 0.0
-            for r in range(0, filled, 2):
+            for r in range(0, 4 if tracks.has_right[n] else 2, 2):
                 du, dv = rows[r, _ERROR_AT], rows[r + 1, _ERROR_AT]
-                e2 = (du * du + dv * dv) / (sigma_px * sigma_px)
+                e2 = (du * du + dv * dv) / (sigma_px * sigma_px) if r < filled else _ERROR2_BEHIND
+                errors2[n, r // 2] = e2
+                cost += 0.5 * scale * scale * np.log(1.0 + e2 / (scale * scale))
+                if r >= filled:
+                    continue
                 weight = 1.0 / ((1.0 + e2 / (scale * scale)) * sigma_px * sigma_px)
                 for one in (r, r + 1):
                     for c in range(_COLUMNS - 1):
@@ -359,6 +336,7 @@ def eliminate_landmarks(
     for c in range(len(gradient)):
         for d in range(c):
             hessian[c, d] = hessian[d, c]
+    return cost, errors2
 
 
 @kernel

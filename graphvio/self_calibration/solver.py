@@ -10,7 +10,7 @@ from graphvio.arrays import Float, Int
 from graphvio.geometry import so3_exp
 from graphvio.linear_algebra import eliminated, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2
-from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landmarks, landmarks_after, total_cost
+from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landmarks, landmarks_after
 from graphvio.self_calibration.evidence import Gaussian
 from graphvio.self_calibration.imu_model import PARAMETERS
 from graphvio.self_calibration.inertial import InertialSamples, InertialStates, inertial_equations
@@ -131,8 +131,7 @@ def _linearise(
     cameras = slice(0, 6 * n + n_cameras)
     visual_hessian, visual_gradient = np.zeros((cameras.stop, cameras.stop)), np.zeros(cameras.stop)
     moved = nominal.moved(difference[:n_cameras])
-    cost, errors2 = total_cost(states.poses, moved, states.landmarks, window.tracks, window.sigma_px, _ROBUST_SCALE)
-    eliminate_landmarks(
+    cost, errors2 = eliminate_landmarks(
         states.poses, moved, states.landmarks, window.tracks, window.sigma_px, _ROBUST_SCALE, damping,
         visual_hessian, visual_gradient, found,
     )  # fmt: skip

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -87,7 +86,8 @@ def choose_tracks(
     firsts = np.flatnonzero(np.r_[True, (np.diff(ids) != 0) | (np.diff(pair_of_rows) != 0)])
     bounds = np.r_[firsts, len(ids)]
     pair = pair_of_rows[firsts]
-    first = np.array([start + int(np.argmax(has_right[start:end])) for start, end in pairwise(bounds)])
+    matched = np.flatnonzero(has_right)
+    first = matched[np.searchsorted(matched, firsts)]
     landmarks = np.empty((len(firsts), 3))
     for j in np.unique(pair):
         of_pair = pair == j
