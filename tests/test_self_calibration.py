@@ -478,6 +478,8 @@ def test_calibration_sigmas_in_a_rig_file_are_checked(tmp_path: Path) -> None:
         ("calibration_sigmas: factry", "there is no level 'factry'"),
         ("calibration_sigmas: {focal_shar: 0.1}", "focal_share"),
         ("calibration_sigmas: {focal_share: -0.1}", "positive"),
+        ("calibration_sigmas: {focal_share: true}", "numbers only"),
+        ("calibration_sigmas:", "no level given"),
     ):
         (tmp_path / "wrong.yaml").write_text(f"{text}{added}\n")
         with pytest.raises(RigError, match=message):

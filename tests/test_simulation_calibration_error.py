@@ -300,6 +300,7 @@ def test_command_with_one_component_writes_a_rig_that_is_wrong_in_it_alone(tmp_p
     ("options", "message"),
     [
         (["--calibration-error", "5"], "level 5"),
+        (["--calibration-error", "focal"], "component"),
         (["--calibration-error", "2", "--calibration-component", "lens"], "'lens'"),
         (["--rig-change", "heat"], "'heat'"),
         (["--calibration-component", "focal"], "--calibration-error"),

@@ -23,7 +23,7 @@ def simulate(
         float, typer.Option("--trigger-offset-ms", help="Each pair is triggered so much after the previous one.")
     ] = 0.0,
     calibration_error: Annotated[
-        int | None,
+        str | None,
         typer.Option(
             "--calibration-error",
             help="Files are as wrong as by a calibration that is careful (1), usual (2) or of long ago (3).  "

@@ -110,15 +110,14 @@ def to_text(rig: Rig, folder: Path) -> str:
 
 def _sigmas(document: Section) -> CalibrationSigmas:
     """Read the standard deviations of the calibration: a level's name, or values by name."""
-    given = document.values.get("calibration_sigmas")
-    if given is None:
+    if "calibration_sigmas" not in document.values:
         return FACTORY
-    if isinstance(given, str):
+    given = document.values["calibration_sigmas"]
+    if given is None or isinstance(given, str):
         if given not in LEVELS:
-            raise RigError(
-                f"{document.where('calibration_sigmas')}: there is no level {given!r}; use one of "
-                f"{', '.join(LEVELS)}, or a mapping of values"
-            )
+            fault = "there is no level given" if given is None else f"there is no level {given!r}"
+            where, levels = document.where("calibration_sigmas"), ", ".join(LEVELS)
+            raise RigError(f"{where}: {fault}; use one of {levels}, or a mapping of values")
         return LEVELS[given]
     section, names = document.section("calibration_sigmas"), [field.name for field in fields(CalibrationSigmas)]
     section.only(names)

@@ -75,6 +75,8 @@ class Section:
     def array(self, key: str, shape: tuple[int, ...] | None = None) -> Float:
         """Get a required array of finite numbers; ``shape`` None takes any one-dimensional array."""
         value = self.get(key)
+        if isinstance(value, bool):  # which numpy takes for 1 or 0
+            raise RigError(f"{self.where(key)}: is {_shown(value)}; it must hold numbers only")
         try:
             array = np.array(value, dtype=np.float64)  # converts '1e-5', which YAML 1.1 reads as a string
         except (TypeError, ValueError):

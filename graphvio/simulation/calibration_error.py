@@ -65,7 +65,7 @@ class CalibrationError:
                 raise SourceError(f"calibration error: {name} is {value}; give a finite number that is not negative")
 
     @staticmethod
-    def of_level(level: int, components: Sequence[str] | None = None) -> CalibrationError:
+    def of_level(level: int | str, components: Sequence[str] | None = None) -> CalibrationError:
         """Return the errors of one of `LEVELS`.
 
         Args:
@@ -75,17 +75,19 @@ class CalibrationError:
         Raises:
             SourceError: if there is no such level or component.
         """
-        if level not in _LEVELS:
+        known = {str(each): error for each, error in _LEVELS.items()}.get(str(level))
+        if known is None:
             raise SourceError(
-                f"there is no calibration error of level {level}; choose from {', '.join(map(str, LEVELS))}"
+                f"there is no calibration error of level {level}; choose from {', '.join(map(str, LEVELS))}, and for "
+                f"a single error also its component: {', '.join(COMPONENTS)}"
             )
         if components is None:
-            return _LEVELS[level]
+            return known
         for name in components:
             if name not in COMPONENTS:
                 raise SourceError(f"no calibration error has the name {name!r}; choose from {', '.join(COMPONENTS)}")
         kept = [each for name in components for each in COMPONENTS[name]]
-        return CalibrationError(**{name: getattr(_LEVELS[level], name) for name in kept})
+        return CalibrationError(**{name: getattr(known, name) for name in kept})
 
 
 COMPONENTS: dict[str, tuple[str, ...]] = {

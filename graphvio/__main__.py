@@ -1,0 +1,5 @@
+"""``python -m graphvio``: the command line."""
+
+from graphvio.cli import main
+
+main()
