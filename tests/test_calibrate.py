@@ -70,7 +70,7 @@ def test_calibrate_pairs_errors_are_within_covariance(walk: Path, found: Calibra
 def test_calibrate_pairs_wrong_rig_gives_same_result(walk: Path, found: Calibration) -> None:
     rig = load_rig(walk / "rig.yaml")
     other = calibrate_pairs(open_source(walk, with_wrong_place(rig, 3.0, 0.05)))
-    np.testing.assert_allclose(other.left2_T_left1, found.left2_T_left1, atol=1e-7)  # but for rounding
+    assert sigmas_from(found, other.left2_T_left1) < 0.02  # rounding, which the tracking's iterations magnify
     present = other.compare_rig()
     assert present is not None
     assert present.is_off

@@ -31,7 +31,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def cold(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("graphvio.warmup.warm_up", lambda *_: None)
+    monkeypatch.setattr("graphvio.warmup.warm_up", lambda *_, **__: None)
 
 
 def interrupted_kernel(*_: Any, **__: Any) -> NoReturn:

@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks import accuracy, backend, calibration_error, faults, frontend, optimize, slam
+from benchmarks import accuracy, backend, calibration_error, faults, frontend, optimize, slam, startup
 from benchmarks.command_line import run_command_line
 
 if __name__ == "__main__":
@@ -11,7 +11,8 @@ if __name__ == "__main__":
             "scripts/benchmark",
             "Measures speed, accuracy and behaviour under faults. docs/benchmarks.md says what is compared.",
             tuple(
-                module.add_parser for module in (frontend, backend, accuracy, calibration_error, faults, optimize, slam)
+                module.add_parser
+                for module in (startup, frontend, backend, accuracy, calibration_error, faults, optimize, slam)
             ),
             "Timings mean something only on a machine that does nothing else meanwhile.",
         )

@@ -1,0 +1,53 @@
+"""Program of ``scripts/benchmark startup``: prints the seconds that each part takes until the first estimate, as JSON.
+
+Usage: ``python -m benchmarks.first_estimate RECORDING PAIRS IMU``, pairs as 0 or 0,1 and IMU as yes or no. It imports
+nothing before the clock runs.
+"""
+
+import json
+import sys
+from pathlib import Path
+from time import perf_counter
+
+_BEGIN_S = perf_counter()
+
+
+def main() -> None:
+    """Open the recording and process it up to the first estimate, as ``graphvio run`` does."""
+    laps, last_s = {}, _BEGIN_S
+
+    def lap(name: str) -> None:
+        nonlocal last_s
+        now_s = perf_counter()
+        laps[name], last_s = now_s - last_s, now_s
+
+    from graphvio.cli.shared import open_recording
+    from graphvio.config import Config
+    from graphvio.odometry import Odometry
+    from graphvio.pipeline import run  # noqa: F401 - the command imports it
+    from graphvio.results import ResultWriter  # noqa: F401
+    from graphvio.runtime import use_one_opencv_thread
+    from graphvio.warmup import warm_up
+
+    lap("import")
+    path, pairs, imu = sys.argv[1:]
+    config = Config()
+    recording = open_recording(
+        Path(path), None, config, pairs=pairs, no_imu=imu == "no", from_s=None, to_s=None, topics=None
+    )  # fmt: skip
+    lap("open")
+    use_one_opencv_thread()
+    warm_up(recording.rig, config, wait_for_calibration=False)
+    lap("kernels")
+    odometry = Odometry(recording.rig, config)
+    for measurement in recording:
+        estimate = odometry.process(measurement)
+        if estimate is not None and estimate.nav_T_body is not None:
+            break
+    lap("first pose")
+    odometry.finish()
+    print(json.dumps(laps))
+
+
+if __name__ == "__main__":
+    main()
