@@ -102,7 +102,7 @@ def _refined(
     is_known = len(known) == len(has_right)
     inlier = known if is_known else np.ones(len(has_right), dtype=np.bool_)
     judged, scale = inlier, widest
-    # One loop for the search and for the last, precise round: a kernel is compiled anew at each place that calls it.
+    # One loop for the search and for the last, precise round: a kernel is compiled again wherever it is called.
     for number in range(_ROUNDS_TO_FIND_INLIERS if is_known else 0, _ROUNDS_TO_FIND_INLIERS + 1):
         is_last = number == _ROUNDS_TO_FIND_INLIERS
         if is_last and not is_known:

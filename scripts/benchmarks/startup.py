@@ -56,7 +56,7 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = add_command(
         subparsers, "startup", "time until the first pose, with compiled kernels and without", __doc__, run
     )
-    parser.add_argument("--rounds", type=int, default=5, metavar="N", help="warm starts of each kind (default: 5)")
+    parser.add_argument("--rounds", type=int, default=5, metavar="N", help="warm ones of each kind (default: 5)")
     parser.add_argument("--no-cold", action="store_true", help="leave out the start that compiles everything")
     add_report_options(parser)
     add_data_option(parser)
@@ -70,9 +70,9 @@ def run(args: argparse.Namespace) -> None:
     report = Report()
     report.add(machine())
     report.add(
-        "Each start is a process of its own. *Import* is that of what `graphvio run` uses, *open* reads the index of "
+        "Each row is of processes of their own. *Import* is that of what `graphvio run` uses, *open* reads the index of "
         "the recording and the rig, *kernels* compiles them or loads them from the cache, *first pose* is from the "
-        f"first measurement to the first estimate that has a pose. Medians of {args.rounds} warm starts."
+        f"first measurement to the first estimate that has a pose. Medians of {args.rounds} with a warm cache."
     )
     rows = []
     for case in _CASES:
