@@ -70,8 +70,8 @@ def run(args: argparse.Namespace) -> None:
     report = Report()
     report.add(machine())
     report.add(
-        "Each row is of processes of their own. *Import* is that of what `graphvio run` uses, *open* reads the index of "
-        "the recording and the rig, *kernels* compiles them or loads them from the cache, *first pose* is from the "
+        "Each row is of processes of their own. *Import* is that of what `graphvio run` uses, *open* reads the index "
+        "of the recording and the rig, *kernels* compiles them or loads them from the cache, *first pose* is from the "
         f"first measurement to the first estimate that has a pose. Medians of {args.rounds} with a warm cache."
     )
     rows = []
