@@ -62,7 +62,7 @@ def _table(findings: dict[str, Any]) -> Any:
     cache = findings["kernel_cache"]
     table.add_row("kernel cache", f"{escape(cache['folder'])}, {cache['files']} files, {cache['megabytes']:.1f} MB")
     modules = cache["compiled_modules"]
-    missing = "" if all(modules.values()) else "; the others compile when first used, which takes one to two minutes"
+    missing = "" if all(modules.values()) else "; the others compile when first used, which takes about a minute"
     table.add_row("modules compiled", f"{sum(modules.values())} of {len(modules)}{missing}")
     return table
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float, Int
+from graphvio.linear_algebra import cholesky, solve_lower
 
 EXACT = 1e-3
 """Factor on the file's standard deviations of a file that is as good as exact."""
@@ -60,8 +61,12 @@ class FilePrior(NamedTuple):
 
     def with_factors(self, factors: Float) -> Float:
         """Return the covariance (C, C) for the groups' factors (G,)."""
-        each = np.append(factors, 1.0)[self.group]
+        each = self.of_each(factors)
         return np.asarray(self.covariance * each * each[:, None])
+
+    def of_each(self, factors: Float) -> Float:
+        """Return each parameter's factor (C,), of the groups' factors (G,)."""
+        return np.asarray(np.append(factors, 1.0)[self.group])
 
 
 class Evidence(NamedTuple):
@@ -112,15 +117,15 @@ class Evidence(NamedTuple):
             The factors (G,), `EXACT` for a group that is as good as exact; and twice the logarithm of their likelihood
             over that of an exact file.
         """
-        factors = np.full(prior.n_groups, EXACT)
-        exact = best = self._likelihood(prior, factors)
+        factors, information = np.full(prior.n_groups, EXACT), np.asarray(np.linalg.inv(prior.covariance), np.float64)
+        exact = best = self._likelihood(prior, information, factors)
         for _ in range(_SWEEPS):
             before = factors.copy()
             for group in range(prior.n_groups):
                 likelihoods = []
                 for factor in _FACTORS:
                     factors[group] = factor
-                    likelihoods.append(self._likelihood(prior, factors))
+                    likelihoods.append(self._likelihood(prior, information, factors))
                 found = int(np.argmax(likelihoods))
                 if likelihoods[found] - likelihoods[0] < min_gains[group]:
                     found = 0
@@ -129,9 +134,16 @@ class Evidence(NamedTuple):
                 break
         return factors, best - exact
 
-    def _likelihood(self, prior: FilePrior, factors: Float) -> float:
-        """Return twice the logarithm of the marginal likelihood of factors, up to a constant."""
-        covariance = prior.with_factors(factors)
-        information = self.information + np.linalg.inv(covariance)
-        fit = self.vector @ np.linalg.solve(information, self.vector)
-        return float(fit - np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(information)[1])
+    def _likelihood(self, prior: FilePrior, information: Float, factors: Float) -> float:
+        """Return twice the logarithm of the marginal likelihood of factors, up to a constant.
+
+        Args:
+            prior: of the calibration.
+            information: (C, C) inverse of its covariance for factors of 1.
+            factors: (G,).
+        """
+        each = prior.of_each(factors)
+        lower = cholesky(self.information + information / (each * each[:, None]))
+        fitted = solve_lower(lower, self.vector.reshape(1, -1))[0]
+        likelihood = float(fitted @ fitted - 2.0 * np.log(each * np.diag(lower)).sum())
+        return likelihood if np.isfinite(likelihood) else -np.inf  # a matrix that rounding made indefinite
