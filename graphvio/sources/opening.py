@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
 
 from graphvio.errors import RigError, SourceError
 from graphvio.rig import Rig
@@ -16,28 +15,18 @@ from graphvio.sources.base import Source
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import Index
 from graphvio.sources.matching import TOLERANCE_NS
+from graphvio.sources.plug_ins import Layout, plug_ins
 from graphvio.sources.recording import Recording
 
 _MAX_TOLERANCE_MS = 10.0
 
 
-class _Layout(Protocol):
-    """A module that reads folders of one layout."""
-
-    LAYOUT: str
-
-    def matches(self, path: Path) -> bool: ...
-
-    def read_index(self, path: Path, rig: Rig, faults: FaultLog) -> Index: ...
-
-
-_LAYOUTS: tuple[_Layout, ...] = (euroc, kitti_odometry, kitti_raw)
-_KNOWN = "; ".join(layout.LAYOUT for layout in _LAYOUTS)
+_LAYOUTS: tuple[Layout, ...] = (euroc, kitti_odometry, kitti_raw)
 
 
 def is_recording(path: Path) -> bool:
     """Return whether a path has a known layout, so that `open_source` would try to read it."""
-    return is_store(path) or (path.is_dir() and any(layout.matches(path) for layout in _LAYOUTS))
+    return is_store(path) or (path.is_dir() and _matching(path) is not None)
 
 
 def open_source(
@@ -98,15 +87,26 @@ def _read_index(path: Path, rig: Rig | None, topics: Mapping[str, str]) -> tuple
     return layout.read_index(path, rig, faults), rig, faults
 
 
-def _layout_of(path: Path) -> _Layout:
+def _layout_of(path: Path) -> Layout:
     if not path.is_dir():
-        raise SourceError(f"{path}: is no recording that graphvio knows; {session.LAYOUT}, or a folder ({_KNOWN})")
+        raise SourceError(f"{path}: is no recording that graphvio knows; {session.LAYOUT}, or a folder ({_known()})")
     if next(path.iterdir(), None) is None:
-        raise SourceError(f"{path}: is empty; looked for {_KNOWN}")
-    layout = next((known for known in _LAYOUTS if known.matches(path)), None)
+        raise SourceError(f"{path}: is empty; looked for {_known()}")
+    layout = _matching(path)
     if layout is None:
-        raise SourceError(f"{path}: has none of the known layouts; looked for {_KNOWN}")
+        failures = "".join(f"; {failure}" for failure in plug_ins().failures)
+        raise SourceError(f"{path}: has none of the known layouts; looked for {_known()}{failures}")
     return layout
+
+
+def _matching(path: Path) -> Layout | None:
+    """Return the layout of a folder; plug-ins are asked, and loaded, where no own layout matches."""
+    own = next((layout for layout in _LAYOUTS if layout.matches(path)), None)
+    return own or next((layout for layout in plug_ins().layouts if layout.matches(path)), None)
+
+
+def _known() -> str:
+    return "; ".join(layout.LAYOUT for layout in (*_LAYOUTS, *plug_ins().layouts))
 
 
 def _required(rig: Rig | None, path: Path) -> Rig:

@@ -1,0 +1,70 @@
+"""Layouts of recordings that other packages add, by entry points of the group ``graphvio.sources``."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from graphvio.rig import Rig
+from graphvio.sources.faults import FaultLog
+from graphvio.sources.index import Index
+
+GROUP = "graphvio.sources"
+
+
+class Layout(Protocol):
+    """Reader of recordings of one layout: a module, or any object, with these members.
+
+    Attributes:
+        LAYOUT: The layout in words, for messages, such as ``KITTI odometry: image_0/*.png, times.txt``.
+    """
+
+    LAYOUT: str
+
+    def matches(self, path: Path) -> bool:
+        """Return whether a folder has this layout, from the names of files in it."""
+
+    def read_index(self, path: Path, rig: Rig, faults: FaultLog) -> Index:
+        """Index the images of a rig's cameras, and the IMU if it has one.
+
+        Args:
+            path: Folder of the recording.
+            rig: Cameras to read.
+            faults: Takes what is wrong with single files or lines.
+
+        Raises:
+            SourceError: If the folder cannot be read.
+        """
+
+
+class PlugIns(NamedTuple):
+    """The layouts of installed packages.
+
+    Attributes:
+        layouts: Those that could be loaded, sorted by name.
+        failures: Why each of the others could not be.
+    """
+
+    layouts: tuple[Layout, ...]
+    failures: tuple[str, ...]
+
+
+@cache
+def plug_ins() -> PlugIns:
+    """Load the layouts of installed packages, once for a process."""
+    layouts: list[Layout] = []
+    failures: list[str] = []
+    for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
+        try:
+            layout = entry.load()
+        except Exception as error:  # whatever somebody's module raises
+            failures.append(f"the plug-in {entry.name} ({entry.value}) cannot be loaded: {error}")
+            continue
+        missing = [name for name in ("LAYOUT", "matches", "read_index") if not hasattr(layout, name)]
+        if missing:
+            failures.append(f"the plug-in {entry.name} ({entry.value}) has no {', '.join(missing)}")
+        else:
+            layouts.append(layout)
+    return PlugIns(tuple(layouts), tuple(failures))
