@@ -74,6 +74,12 @@ def test_spec_is_parsed() -> None:
     assert SourceSpec.parse("replay:/data/a:b=c.mcap").what == "/data/a:b=c.mcap"
 
 
+def test_the_path_of_a_recording_is_a_replay_of_it(tmp_path: Path) -> None:
+    (tmp_path / "a:walk").mkdir()
+    spec = SourceSpec.parse(f"{tmp_path}/a:walk?speed=2")
+    assert spec == SourceSpec("replay", f"{tmp_path}/a:walk", {"speed": "2"})
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -1,7 +1,7 @@
 """The command line: one module per command, which imports heavy packages when it is called."""
 
 import sys
-from typing import NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -23,16 +23,33 @@ from graphvio.cli.view import view
 from graphvio.cli.warmup import warmup
 from graphvio.errors import GraphvioError
 from graphvio.runtime import interruptible
+from graphvio.version import __version__
 
 app = typer.Typer(
     name="graphvio",
     help="Visual-inertial odometry for rigs of several stereo pairs.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     epilog="Examples:  graphvio simulate room --out room  |  graphvio run room  |  graphvio doctor",
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"graphvio {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    pass  # the option acts by its callback
+
+
 app.command()(run)
 app.command()(live)
 app.command()(serve)

@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 def live(
     source: Annotated[
         str | None,
-        typer.Argument(help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator."),
+        typer.Argument(
+            help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator; or a recording's path."
+        ),
     ] = None,
     list_devices: Annotated[bool, typer.Option("--list", help="List the connected devices, and end.")] = False,
     rig: options.RigFile = None,

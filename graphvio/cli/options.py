@@ -32,7 +32,10 @@ ToS = Annotated[float | None, typer.Option("--to", help="End at this second of t
 Png = Annotated[bool, typer.Option("--png", help="Pack images as PNG: smaller and slower.")]
 SessionOut = Annotated[Path, typer.Option("--out", help="Session to write; a new file, .mcap.", metavar="FILE")]
 LiveSource = Annotated[
-    str, typer.Argument(help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator.")
+    str,
+    typer.Argument(
+        help="KIND[:DEVICE][?OPTION=VALUE]: v4l2, realsense, oak, ros2, replay or simulator; or a recording's path."
+    ),
 ]
 Record = Annotated[Path | None, typer.Option("--record", help="Record everything as a session, .mcap.", metavar="FILE")]
 HealthPort = Annotated[

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 from typing import Protocol, cast
 
 from graphvio.config.values import nearest
@@ -17,7 +18,7 @@ KINDS = ("v4l2", "realsense", "oak", "ros2", "replay", "simulator")
 
 @dataclass(frozen=True)
 class SourceSpec:
-    """``KIND[:WHAT][?KEY=VALUE[&KEY=VALUE]]``, such as ``realsense:0123,4567?rate_hz=30``."""
+    """``KIND[:WHAT][?KEY=VALUE[&KEY=VALUE]]``, such as ``realsense:0123,4567?rate_hz=30``; or a recording's path."""
 
     kind: str  # of source, one of `KINDS`
     what: str = ""  # device, devices separated by commas, path or name; may be empty
@@ -33,9 +34,12 @@ class SourceSpec:
         head, _, tail = text.partition("?")
         kind, _, what = head.partition(":")
         if kind not in KINDS:
-            raise SourceError(
-                f"{text}: there is no live source {kind!r}{nearest(kind, KINDS)}; there are {', '.join(KINDS)}"
-            )
+            if not head or not Path(head).exists():
+                raise SourceError(
+                    f"{text}: there is no live source {kind!r}{nearest(kind, KINDS)}; there are {', '.join(KINDS)}, "
+                    "and recordings by their path"
+                )
+            kind, what = "replay", head
         options: dict[str, str] = {}
         for each in filter(None, tail.split("&")):
             key, equals, value = each.partition("=")
