@@ -95,3 +95,28 @@ def test_evaluate_unwritable_json_is_an_error(
 ) -> None:
     assert run(monkeypatch, "evaluate", *files, "--json", files[0].parent / "no" / "e.json") == 2
     assert "cannot be written" in capsys.readouterr().err
+
+
+def test_a_recording_is_taken_for_its_truth(
+    room_walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = next((room_walk / "mav0").glob("state_groundtruth_estimate0/data.csv"))
+    tables = []
+    for given in (truth, room_walk):
+        assert run(monkeypatch, "evaluate", truth, given) == 0
+        tables.append(capsys.readouterr().out)
+    assert tables[0] == tables[1]
+    assert "ATE, position" in tables[0]
+
+
+def test_a_recording_without_a_truth_is_named(
+    room_walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    walk, truth = tmp_path / "walk", room_walk / "mav0/state_groundtruth_estimate0/data.csv"
+    (walk / "mav0").mkdir(parents=True)
+    for sensor in (room_walk / "mav0").iterdir():
+        if sensor.name != "state_groundtruth_estimate0":
+            (walk / "mav0" / sensor.name).symlink_to(sensor)
+    (walk / "rig.yaml").symlink_to(room_walk / "rig.yaml")
+    assert run(monkeypatch, "evaluate", truth, walk) == 2
+    assert f"{walk}: this recording has no true trajectory" in capsys.readouterr().err

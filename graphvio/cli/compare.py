@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
-from graphvio.cli.shared import EXIT_ABOVE_LIMIT, names_of, warn
+from graphvio.cli.shared import EXIT_ABOVE_LIMIT, names_of, true_trajectory, warn
 
 if TYPE_CHECKING:
     from graphvio.evaluation import Compared
@@ -20,7 +20,11 @@ def compare(
         typer.Argument(help="Result folders of `graphvio run` and `graphvio optimize`, or trajectory files."),
     ],
     truth: Annotated[
-        Path | None, typer.Option("--truth", help="True trajectory.  [default: the first result is the reference]")
+        Path | None,
+        typer.Option(
+            "--truth",
+            help="True trajectory, or a recording that has one.  [default: the first result is the reference]",
+        ),
     ] = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", help="Plot all errors over time: .png, .pdf or .svg.", metavar="FILE")
@@ -52,7 +56,7 @@ def compare(
     names, trajectories = names_of(results), [load_trajectory(_file(path, smoothed)) for path in results]
     if truth is None and len(results) < 2:
         raise GraphvioError("one result and no truth: there is nothing to compare; give --truth FILE or more results")
-    reference = load_trajectory(truth) if truth is not None else trajectories[0]
+    reference = true_trajectory(truth) if truth is not None else trajectories[0]
     first = 0 if truth is not None else 1
     compared = compare_all(names[first:], trajectories[first:], reference)
     Console(soft_wrap=True).print(_table(compared))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.shared import true_trajectory
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 def evaluate(
     trajectory: Annotated[Path, typer.Argument(help="Estimated trajectory, TUM or EuRoC (detected).")],
-    truth: Annotated[Path, typer.Argument(help="True trajectory, TUM or EuRoC.")],
+    truth: Annotated[Path, typer.Argument(help="True trajectory, TUM or EuRoC, or a recording that has one.")],
     plot: Annotated[
         Path | None, typer.Option(help="Plot both, and the error over time: .png, .pdf or .svg.", metavar="FILE")
     ] = None,
@@ -33,7 +34,7 @@ def evaluate(
 
     Examples:
 
-        graphvio evaluate results/corridor-1/trajectory.txt data/corridor/truth.txt
+        graphvio evaluate results/corridor-1/trajectory.txt data/corridor
 
         graphvio evaluate results/mh01-1/trajectory.txt mav0/state_groundtruth_estimate0/data.csv --plot mh01.png
     """
@@ -45,7 +46,7 @@ def evaluate(
     from graphvio.evaluation import evaluate as measure
     from graphvio.trajectory_files import load_trajectory
 
-    figures = measure(load_trajectory(trajectory), load_trajectory(truth), max_gap_s=max_gap)
+    figures = measure(load_trajectory(trajectory), true_trajectory(truth), max_gap_s=max_gap)
     Console().print(_table(figures))
     if json_file is not None:
         try:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from graphvio.config import Config
     from graphvio.rig import Rig
     from graphvio.sources import Source
+    from graphvio.trajectory import Trajectory
 
 EXIT_BAD_INPUT = 2
 EXIT_INCOMPLETE = 3  # results are written, but not all that was asked for
@@ -34,6 +35,26 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 
 
 # ---------------------------------------------------------------------- recordings
+
+
+def true_trajectory(path: Path) -> Trajectory:
+    """Read a trajectory file, or the truth of a recording.
+
+    Raises:
+        TrajectoryError: if there is none.
+        SourceError: if the recording cannot be read.
+    """
+    from graphvio.errors import TrajectoryError
+    from graphvio.sessions.store import is_store
+    from graphvio.sources import is_recording, open_source
+    from graphvio.trajectory_files import load_trajectory
+
+    if path.is_dir() and not is_store(path) and is_recording(path):  # a session holds its truth itself
+        truth = open_source(path).truth
+        if truth is None:
+            raise TrajectoryError(f"{path}: this recording has no true trajectory; give a file, TUM or EuRoC")
+        path = truth
+    return load_trajectory(path)
 
 
 def open_recording(
