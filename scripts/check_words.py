@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-FOLDERS = ("graphvio", "tests", "scripts", "docs", "configs")
+FOLDERS = ("graphvio", "tests", "scripts", "docs", "configs", "examples")
 SUFFIXES = (".py", ".md", ".proto", ".yaml", ".html", ".css", ".js", "")
 OWN_WORDS = (
     "<span",
