@@ -1,10 +1,22 @@
-"""Camera models: pinhole with radial-tangential distortion, and equidistant (Kannala-Brandt) fisheye.
+"""Camera models: what a lens does to the image of a point, and its inverse.
 
 Frame ``cam``: x right, y down, z forward; pixel (0, 0) is the centre of the upper left pixel. A model is given
-by its number, ``intrinsics`` (4,) ``[fx, fy, cx, cy]`` in pixels and ``distortion`` (5,):
-``[k1, k2, p1, p2, k3]`` (radial-tangential, OpenCV's order) or ``[k1, k2, k3, k4, 0]`` (equidistant).
-Normalised image coordinates are ``(X / Z, Y / Z)``, the paper's ``h`` (section 3): the half-space behind the camera
-has none, and rays beyond 80 degrees from the axis are invalid.
+by its number, ``intrinsics`` (4,) ``[fx, fy, cx, cy]`` in pixels and ``distortion`` (8,), the coefficients of
+`COEFFICIENTS` in their order, filled with zeros. Normalised image coordinates are ``(X / Z, Y / Z)``, the paper's ``h``
+(section 3): the half-space behind the camera has none, and rays beyond 80 degrees from the axis are invalid, whatever
+the model could represent. Distorted coordinates are those that ``intrinsics`` map to pixels.
+
+- ``radial-tangential`` and ``rational``: D. C. Brown, *Close-range camera calibration*, 1971, in OpenCV's order; the
+  second with the denominator of OpenCV's rational polynomial;
+- ``equidistant``: J. Kannala and S. Brandt, *A generic camera model and calibration method for conventional,
+  wide-angle, and fish-eye lenses*, 2006, with four coefficients as in OpenCV's fisheye;
+- ``double-sphere``: V. Usenko, N. Demmel and D. Cremers, *The double sphere camera model*, 2018;
+- ``extended-unified``: B. Khomutenko, G. Garcia and P. Martinet, *An enhanced unified camera model*, 2016;
+- ``omnidirectional``: C. Mei and P. Rives, *Single view point omnidirectional camera calibration from planar grids*,
+  2007: the unified model, then radial-tangential distortion.
+
+The last three are one formula here. A point is projected to the unit sphere, or with `beta` to an ellipsoid; its
+centre is moved by `xi`, and the result is projected again from a place that `alpha` gives.
 """
 
 import numpy as np
@@ -14,12 +26,47 @@ from graphvio.kernels import kernel
 
 RADIAL_TANGENTIAL = 0
 EQUIDISTANT = 1
-MODEL_NAMES = {"radial-tangential": RADIAL_TANGENTIAL, "equidistant": EQUIDISTANT}
+RATIONAL = 2
+DOUBLE_SPHERE = 3
+EXTENDED_UNIFIED = 4
+OMNIDIRECTIONAL = 5
+MODEL_NAMES = {
+    "radial-tangential": RADIAL_TANGENTIAL,
+    "equidistant": EQUIDISTANT,
+    "rational": RATIONAL,
+    "double-sphere": DOUBLE_SPHERE,
+    "extended-unified": EXTENDED_UNIFIED,
+    "omnidirectional": OMNIDIRECTIONAL,
+}
+
+N_COEFFICIENTS = 8
+"""Length of all arrays of coefficients."""
+COEFFICIENTS = {
+    "radial-tangential": ("k1", "k2", "p1", "p2", "k3"),
+    "equidistant": ("k1", "k2", "k3", "k4"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "double-sphere": ("xi", "alpha"),
+    "extended-unified": ("alpha", "beta"),
+    "omnidirectional": ("xi", "k1", "k2", "p1", "p2"),
+}
+"""Coefficients of each model, in the order of ``distortion``."""
+N_BASIS = 5
+"""Number of coefficients, the first ones, among which are all that a model is linear in."""
+LINEAR_COEFFICIENTS = {
+    "radial-tangential": ("k1", "k2", "p1", "p2", "k3"),
+    "equidistant": ("k1", "k2", "k3", "k4"),
+    "rational": ("k1", "k2", "p1", "p2", "k3"),
+    "double-sphere": (),
+    "extended-unified": (),
+    "omnidirectional": ("k1", "k2", "p1", "p2"),
+}
+"""Those that distorted coordinates are linear in, see `distortion_basis`; the self-calibration keeps the others."""
 
 MAX_ANGLE_RAD = np.deg2rad(80.0)
 _MAX_TAN = float(np.tan(MAX_ANGLE_RAD))
 _NEWTON_STEPS = 20
 _NEWTON_TOLERANCE = 1e-12
+_ROUNDING = 1e-6
 
 
 @kernel
@@ -27,66 +74,134 @@ def distort(model: int, distortion: Float, x: float, y: float) -> tuple[float, f
     """Compute the distorted normalised coordinates of (x, y), and their Jacobian (2, 2).
 
     Returns:
-        ``(xd, yd, dxd/dx, dxd/dy, dyd/dx, dyd/dy)``.
+        ``(xd, yd, dxd/dx, dxd/dy, dyd/dx, dyd/dy)``; outside the model's domain, (x, y) with the Jacobian -1.
     """
-    r2 = x * x + y * y
-    if model == RADIAL_TANGENTIAL:
-        k1, k2, p1, p2, k3 = distortion[0], distortion[1], distortion[2], distortion[3], distortion[4]
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2))  # d radial / d r2, times 2
-        xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-        yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-        cross = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
-        return (
-            xd,
-            yd,
-            radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x,
-            cross,
-            cross,
-            radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x,
-        )
-    r = np.sqrt(r2)
-    if r < 1e-8:
-        return x, y, 1.0, 0.0, 0.0, 1.0
-    theta = np.arctan(r)
-    t2 = theta * theta
-    k1, k2, k3, k4 = distortion[0], distortion[1], distortion[2], distortion[3]
-    theta_d = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-    slope_theta = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
-    scale = theta_d / r
-    dscale = (slope_theta / (1.0 + r2) - scale) / r2  # (d scale / d r) / r
-    return (x * scale, y * scale, scale + x * x * dscale, x * y * dscale, x * y * dscale, scale + y * y * dscale)
+    if model == EQUIDISTANT:
+        r2 = x * x + y * y
+        r = np.sqrt(r2)
+        if r < 1e-8:
+            return x, y, 1.0, 0.0, 0.0, 1.0
+        theta = np.arctan(r)
+        t2 = theta * theta
+        k1, k2, k3, k4 = distortion[0], distortion[1], distortion[2], distortion[3]
+        theta_d = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        slope_theta = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
+        scale = theta_d / r
+        dscale = (slope_theta / (1.0 + r2) - scale) / r2  # (d scale / d r) / r
+        return (x * scale, y * scale, scale + x * x * dscale, x * y * dscale, x * y * dscale, scale + y * y * dscale)
+    if model < DOUBLE_SPHERE:
+        return _polynomial(model, distortion, x, y)
+    scale, dscale = _sphere(model, distortion, x, y)
+    if not scale > 0.0:
+        return x, y, -1.0, 0.0, 0.0, -1.0
+    u, v = x * scale, y * scale
+    ux, uy, vy = scale + x * x * dscale, x * y * dscale, scale + y * y * dscale
+    if model != OMNIDIRECTIONAL:
+        return u, v, ux, uy, uy, vy
+    xd, yd, a, b, c, d = _polynomial(model, distortion, u, v)
+    return xd, yd, a * ux + b * uy, a * uy + b * vy, c * ux + d * uy, c * uy + d * vy
 
 
 @kernel
-def distortion_basis(model: int, x: float, y: float) -> Float:
-    """Compute the derivatives (5, 2) of the distorted normalised coordinates of (x, y) by the coefficients.
+def _polynomial(model: int, distortion: Float, x: float, y: float) -> tuple[float, float, float, float, float, float]:
+    """Apply radial and tangential distortion, with their denominator for ``rational``; returns as `distort` does.
 
-    Both models are linear in these.
+    For ``radial-tangential`` the denominator is 1 exactly, and nothing is rounded by it.
     """
-    basis = np.zeros((5, 2))
+    first = 1 if model == OMNIDIRECTIONAL else 0
+    k1, k2, p1, p2 = distortion[first], distortion[first + 1], distortion[first + 2], distortion[first + 3]
+    k3 = 0.0 if model == OMNIDIRECTIONAL else distortion[4]
     r2 = x * x + y * y
-    if model == RADIAL_TANGENTIAL:
-        basis[0, 0], basis[0, 1] = x * r2, y * r2
-        basis[1, 0], basis[1, 1] = x * r2 * r2, y * r2 * r2
-        basis[2, 0], basis[2, 1] = 2.0 * x * y, r2 + 2.0 * y * y
-        basis[3, 0], basis[3, 1] = r2 + 2.0 * x * x, 2.0 * x * y
-        basis[4, 0], basis[4, 1] = x * r2 * r2 * r2, y * r2 * r2 * r2
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2))  # d radial / d r2, times 2
+    if model == RATIONAL:
+        k4, k5, k6 = distortion[5], distortion[6], distortion[7]
+        denominator = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        if not denominator > 0.0:
+            return x, y, -1.0, 0.0, 0.0, -1.0
+        radial /= denominator
+        slope = (slope - radial * 2.0 * (k4 + r2 * (2.0 * k5 + 3.0 * k6 * r2))) / denominator
+    xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    cross = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+    return (
+        xd,
+        yd,
+        radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x,
+        cross,
+        cross,
+        radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x,
+    )
+
+
+@kernel
+def _sphere_shape(model: int, distortion: Float) -> tuple[float, float, float]:
+    """Return ``(xi, alpha, beta)`` of a model with a sphere."""
+    if model == DOUBLE_SPHERE:
+        return distortion[0], distortion[1], 1.0
+    if model == EXTENDED_UNIFIED:
+        return 0.0, distortion[0], distortion[1]
+    return distortion[0], 0.0, 1.0
+
+
+@kernel
+def _sphere(model: int, distortion: Float, x: float, y: float) -> tuple[float, float]:
+    """Compute by what a sphere model scales (x, y), and ``(d scale / d r) / r``; 0 outside the model's domain.
+
+    The domain is that of Usenko et al., (43) to (45), before its approximation to first order in xi: what is left of
+    the unified model's own, ``z > -w d``, at the second sphere.
+    """
+    xi, alpha, beta = _sphere_shape(model, distortion)
+    r2 = x * x + y * y
+    d1 = np.sqrt(1.0 + r2)
+    z = 1.0 + xi * d1  # at the second sphere
+    d2 = np.sqrt(beta * r2 + z * z)
+    denominator = alpha * d2 + (1.0 - alpha) * z
+    if not (denominator > 0.0 and (1.0 - alpha) * d2 + alpha * z > 0.0):
+        return 0.0, 0.0
+    scale = 1.0 / denominator
+    slope = alpha * (beta + z * xi / d1) / d2 + (1.0 - alpha) * xi / d1  # (d denominator / d r) / r
+    return scale, -slope * scale * scale
+
+
+@kernel
+def distortion_basis(model: int, distortion: Float, x: float, y: float) -> Float:
+    """Compute the derivatives (5, 2) of the distorted normalised coordinates of (x, y) by the first coefficients.
+
+    Zero for those that are not in `LINEAR_COEFFICIENTS`.
+    """
+    basis = np.zeros((N_BASIS, 2))
+    if model == EQUIDISTANT:
+        r2 = x * x + y * y
+        r = np.sqrt(r2)
+        if r > 1e-8:
+            theta = np.arctan(r)
+            power, t2 = theta / r, theta * theta
+            for i in range(4):
+                power *= t2
+                basis[i, 0], basis[i, 1] = x * power, y * power
         return basis
-    r = np.sqrt(r2)
-    if r > 1e-8:
-        theta = np.arctan(r)
-        power, t2 = theta / r, theta * theta
-        for i in range(4):
-            power *= t2
-            basis[i, 0], basis[i, 1] = x * power, y * power
+    if model in (DOUBLE_SPHERE, EXTENDED_UNIFIED):
+        return basis
+    first, scale = 0, 1.0
+    if model == OMNIDIRECTIONAL:
+        first, (on_plane, _) = 1, _sphere(model, distortion, x, y)
+        x, y = x * on_plane, y * on_plane
+    r2 = x * x + y * y
+    if model == RATIONAL:
+        scale = 1.0 / (1.0 + r2 * (distortion[5] + r2 * (distortion[6] + r2 * distortion[7])))
+    basis[first, 0], basis[first, 1] = x * r2 * scale, y * r2 * scale
+    basis[first + 1, 0], basis[first + 1, 1] = x * r2 * r2 * scale, y * r2 * r2 * scale
+    basis[first + 2, 0], basis[first + 2, 1] = 2.0 * x * y, r2 + 2.0 * y * y
+    basis[first + 3, 0], basis[first + 3, 1] = r2 + 2.0 * x * x, 2.0 * x * y
+    if first == 0:
+        basis[4, 0], basis[4, 1] = x * r2 * r2 * r2 * scale, y * r2 * r2 * r2 * scale
     return basis
 
 
 @kernel
 def undistort(model: int, distortion: Float, xd: float, yd: float) -> tuple[float, float, bool]:
-    """Find the normalised coordinates whose distortion is (xd, yd), by Newton's method; False where there are none."""
-    x, y = xd, yd
+    """Find the normalised coordinates whose distortion is (xd, yd); False where there are none within 80 degrees."""
     if model == EQUIDISTANT:
         theta_d = np.sqrt(xd * xd + yd * yd)
         if theta_d < 1e-8:
@@ -104,31 +219,79 @@ def undistort(model: int, distortion: Float, xd: float, yd: float) -> tuple[floa
             return 0.0, 0.0, False
         scale = np.tan(theta) / theta_d
         return xd * scale, yd * scale, True
-    for _ in range(_NEWTON_STEPS):
-        u, v, a, b, c, d = distort(model, distortion, x, y)
+    x, y, z, found = ray_of(model, distortion, xd, yd)
+    if model >= DOUBLE_SPHERE:
+        if not (found and z > 0.0):
+            return 0.0, 0.0, False
+        x, y = x / z, y / z
+    return x, y, found and x * x + y * y < _MAX_TAN * _MAX_TAN
+
+
+@kernel
+def ray_of(model: int, distortion: Float, xd: float, yd: float) -> tuple[float, float, float, bool]:
+    """Find the direction whose distorted coordinates are (xd, yd), at any angle; not for ``equidistant``.
+
+    Polynomials are inverted by Newton's method, spheres in closed form: Usenko et al., (46) to (50).
+
+    Returns:
+        ``(x, y, z)`` of any length, and whether there is one.
+    """
+    x, y, converged = xd, yd, True
+    if model < DOUBLE_SPHERE or model == OMNIDIRECTIONAL:
+        x, y, converged = _inverse_polynomial(model, distortion, xd, yd)
+        if model != OMNIDIRECTIONAL:
+            return x, y, 1.0, converged
+    xi, alpha, beta = _sphere_shape(model, distortion)
+    r2 = x * x + y * y
+    radicand = 1.0 - (2.0 * alpha - 1.0) * beta * r2
+    if not radicand >= 0.0:
+        return 0.0, 0.0, 0.0, False
+    z = (1.0 - beta * alpha * alpha * r2) / (alpha * np.sqrt(radicand) + 1.0 - alpha)
+    if model == EXTENDED_UNIFIED:
+        return x, y, z, converged
+    radicand = z * z + (1.0 - xi * xi) * r2
+    if not radicand >= 0.0:
+        return 0.0, 0.0, 0.0, False
+    length = (z * xi + np.sqrt(radicand)) / (z * z + r2)
+    return length * x, length * y, length * z - xi, converged and length > 0.0
+
+
+@kernel
+def _inverse_polynomial(model: int, distortion: Float, xd: float, yd: float) -> tuple[float, float, bool]:
+    """Invert `_polynomial` by Newton's method; False where it does not converge."""
+    x, y, u, v, is_close = xd, yd, xd, yd, False
+    a, b, c, d = 1.0, 0.0, 0.0, 1.0
+    for i in range(_NEWTON_STEPS + 1):
+        u, v, a, b, c, d = _polynomial(model, distortion, x, y)
+        if is_close or i == _NEWTON_STEPS:
+            break
+        if model == RATIONAL and a == -1.0:  # beyond a pole
+            x, y = 0.5 * x, 0.5 * y
+            continue
         ex, ey = u - xd, v - yd
         determinant = a * d - b * c
         step_x = (d * ex - b * ey) / determinant
         step_y = (a * ey - c * ex) / determinant
         x -= step_x
         y -= step_y
-        if abs(step_x) + abs(step_y) < _NEWTON_TOLERANCE:
-            break
+        is_close = abs(step_x) + abs(step_y) < _NEWTON_TOLERANCE
     # Beyond the radius where distortion folds back, Newton lands on a point whose Jacobian is not positive.
-    u, v, a, b, c, d = distort(model, distortion, x, y)
-    converged = abs(u - xd) + abs(v - yd) < 1e-8 and a * d - b * c > 0.0 and a > 0.0
-    return x, y, converged and x * x + y * y < _MAX_TAN * _MAX_TAN
+    return x, y, abs(u - xd) + abs(v - yd) < 1e-8 and a * d - b * c > 0.0 and a > 0.0
 
 
 @kernel
 def fold_radius(model: int, distortion: Float) -> float:
-    """Find the normalised radius from which distortion maps outer points inwards again, at most tan(80 degrees)."""
+    """Find the normalised radius from which distortion maps outer points inwards again, at most tan(80 degrees).
+
+    It ends there for a model whose domain is less than that.
+    """
     radius = 0.0
     while radius < _MAX_TAN:
-        _, _, slope, _, _, _ = distort(model, distortion, radius, 0.0)
-        _, _, _, _, _, slope_y = distort(model, distortion, 0.0, radius)
-        if slope <= 0.0 or slope_y <= 0.0:
-            return radius
+        for axis in range(2):
+            x, y = (radius, 0.0) if axis == 0 else (0.0, radius)
+            _, _, slope_x, _, _, slope_y = distort(model, distortion, x, y)
+            if (slope_x if axis == 0 else slope_y) <= 0.0:
+                return radius
         radius += 0.01
     return _MAX_TAN
 
@@ -140,7 +303,7 @@ def project_points(model: int, intrinsics: Float, distortion: Float, points: Flo
     Args:
         model: number of the model.
         intrinsics: (4,) pixels.
-        distortion: (5,).
+        distortion: (8,).
         points: (N, 3) metres, frame cam.
 
     Returns:
@@ -177,3 +340,56 @@ def unproject_pixels(model: int, intrinsics: Float, distortion: Float, pixels: F
         if ok:
             normalised[i, 0], normalised[i, 1], valid[i] = x, y, True
     return normalised, valid
+
+
+def central_scale(model: int, distortion: Float) -> float:
+    """Return by what the lens scales normalised coordinates around the optical axis, tangential distortion aside."""
+    return 1.0 / (1.0 + float(distortion[0])) if model in (DOUBLE_SPHERE, OMNIDIRECTIONAL) else 1.0
+
+
+def lens_fault(model: str, distortion: Float) -> str:
+    """Say what is wrong with coefficients, and what to do; empty if nothing is.
+
+    Args:
+        model: its name.
+        distortion: (8,).
+    """
+    names = COEFFICIENTS[model]
+    order = f"give {model} the coefficients {', '.join(names)} in this order"
+    too_many = np.abs(distortion[len(names) :]) > _ROUNDING
+    if too_many.any():
+        last = len(names) + int(np.flatnonzero(too_many)[-1]) + 1
+        return f"has {last} distortion coefficients, and {model} has {len(names)}; {order}"
+    of = dict(zip(names, distortion.tolist(), strict=False))
+    if not 0.0 <= of.get("alpha", 0.0) <= 1.0:
+        return f"alpha is {of['alpha']:g}, and must be between 0 and 1; {order}"
+    if not of.get("beta", 1.0) > 0.0:
+        return f"beta is {of['beta']:g}, and must be positive; {order}"
+    if not of.get("xi", 0.0) > -1.0:
+        return f"xi is {of['xi']:g}, and must be more than -1; {order}"
+    if model == "double-sphere" and of["xi"] > 1.0:
+        return f"xi is {of['xi']:g}, and must be at most 1; {order}"
+    return ""
+
+
+def view_fault(model: str, intrinsics: Float, distortion: Float, size_px: tuple[int, int]) -> str:
+    """Say which corner of the image no ray reaches by the model, however wide, and what to do; empty if there is none.
+
+    Args:
+        model: its name; with ``radial-tangential`` and ``equidistant`` nothing is tested.
+        intrinsics: (4,) pixels.
+        distortion: (8,).
+        size_px: (width, height).
+    """
+    number = MODEL_NAMES[model]
+    if number in (RADIAL_TANGENTIAL, EQUIDISTANT):
+        return ""
+    fx, fy, cx, cy = intrinsics.tolist()
+    for u in (0, size_px[0] - 1):
+        for v in (0, size_px[1] - 1):
+            if not ray_of(number, distortion, (u - cx) / fx, (v - cy) / fy)[3]:
+                return (
+                    f"no ray reaches the image's corner ({u}, {v}) by its {model} lens; check intrinsics, size and "
+                    f"coefficients ({', '.join(COEFFICIENTS[model])}), or give a mask if the corners are black"
+                )
+    return ""

@@ -15,7 +15,15 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float
 from graphvio.calibration_sigmas import FACTORY, CalibrationSigmas
-from graphvio.cameras import MODEL_NAMES, project_points, unproject_pixels
+from graphvio.cameras import (
+    MODEL_NAMES,
+    N_COEFFICIENTS,
+    central_scale,
+    lens_fault,
+    project_points,
+    unproject_pixels,
+    view_fault,
+)
 from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
 
@@ -36,10 +44,10 @@ class Camera:
 
     Attributes:
         name: unique in the rig, such as ``cam0``.
-        model: ``radial-tangential`` (pinhole, Brown distortion) or ``equidistant`` (Kannala-Brandt fisheye).
+        model: of the lens, one of `graphvio.cameras.MODEL_NAMES`.
         size_px: (width, height).
         intrinsics: (4,) ``[fx, fy, cx, cy]``, pixels.
-        distortion: (5,), see `graphvio.cameras`; shorter input is filled with zeros.
+        distortion: (8,), see `graphvio.cameras.COEFFICIENTS`; shorter input is filled with zeros.
         body_T_cam: (4, 4), metres.
         mask: image file whose black pixels are not used (parts of the rig or of its carrier), or None.
 
@@ -66,9 +74,13 @@ class Camera:
         if intrinsics[0] <= 0 or intrinsics[1] <= 0:
             raise RigError(f"{where}: focal lengths {intrinsics[:2].tolist()} must be positive, in pixels")
         given = np.asarray(self.distortion, dtype=np.float64).ravel()
-        if len(given) > 5:
-            raise RigError(f"{where}: {len(given)} distortion coefficients; give at most 5 [k1, k2, p1, p2, k3]")
-        distortion = _finite(np.pad(given, (0, 5 - len(given))), (5,), f"{where}: distortion")
+        if len(given) > N_COEFFICIENTS:
+            raise RigError(f"{where}: {len(given)} distortion coefficients; give at most {N_COEFFICIENTS}")
+        filled = np.pad(given, (0, N_COEFFICIENTS - len(given)))
+        distortion = _finite(filled, (N_COEFFICIENTS,), f"{where}: distortion")
+        fault = lens_fault(self.model, distortion)
+        if fault:
+            raise RigError(f"{where}: {fault}")
         _set(self, "size_px", (int(width), int(height)))
         _set(self, "intrinsics", intrinsics)
         _set(self, "distortion", distortion)
@@ -76,8 +88,12 @@ class Camera:
 
     @property
     def focal_px(self) -> float:
-        """Mean focal length, pixels: the scale from normalised image units at the image centre."""
-        return float(0.5 * (self.intrinsics[0] + self.intrinsics[1]))
+        """Scale from normalised image units to pixels at the image centre, the mean of both axes.
+
+        It is not that of `intrinsics` where the lens has a sphere that is off the centre.
+        """
+        mean = float(0.5 * (self.intrinsics[0] + self.intrinsics[1]))
+        return mean * central_scale(self.model_number, self.distortion)
 
     @cached_property
     def cam_T_body(self) -> Float:
@@ -271,6 +287,22 @@ class Rig:
         """Replace each camera by what a function makes of it."""
         pairs = [replace(pair, left=change(pair.left), right=change(pair.right)) for pair in self.pairs]
         return replace(self, pairs=tuple(pairs))
+
+
+def with_views(rig: Rig) -> Rig:
+    """Return a rig that was read from a file, after a test that its lenses reach all of their images.
+
+    Cameras with a mask are not tested: images of a fisheye may have black corners.
+
+    Raises:
+        RigError: if one does not.
+    """
+    for camera in rig.cameras:
+        if camera.mask is None:
+            fault = view_fault(camera.model, camera.intrinsics, camera.distortion, camera.size_px)
+            if fault:
+                raise RigError(f"camera {camera.name}: {fault}")
+    return rig
 
 
 def as_written(camera: Camera, body_T_cam: Float) -> Camera:

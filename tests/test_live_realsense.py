@@ -186,7 +186,7 @@ def test_factory_rig_matches_calibration() -> None:
     np.testing.assert_allclose(pair.right_T_left, RIGHT_T_LEFT, atol=1e-6)
     np.testing.assert_allclose(pair.left.cam_T_body, se3_inverse(IMU_T_LEFT), atol=1e-6)
     np.testing.assert_allclose(pair.left.intrinsics, [50.0, 51.0, 31.5, 23.25])
-    np.testing.assert_allclose(pair.right.distortion, [0.1, -0.2, 0.003, 0.004, 0.05], rtol=1e-6)
+    np.testing.assert_allclose(pair.right.distortion[:5], [0.1, -0.2, 0.003, 0.004, 0.05], rtol=1e-6)
     assert (pair.left.model, pair.left.size_px) == ("radial-tangential", SIZE_PX)
     assert rig.imu is not None
     assert rig.imu.rate_hz == 200.0

@@ -17,7 +17,7 @@ from graphvio.errors import RigError
 from graphvio.geometry import se3_exp, so3_exp, so3_log
 from graphvio.linear_algebra import eliminated, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
-from graphvio.rig import Camera, Rig, StereoPair
+from graphvio.rig import Rig
 from graphvio.rig_files import load_rig, save_rig
 from graphvio.self_calibration import online
 from graphvio.self_calibration.bundle import _COLUMNS as COLUMNS
@@ -27,7 +27,17 @@ from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gauss
 from graphvio.self_calibration.findings import described
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.online import FullWindow, SelfCalibration
-from graphvio.self_calibration.parameters import BODY, PAIR, STEREO, RigCalibration, parameter_names
+from graphvio.self_calibration.parameters import (
+    BODY,
+    CAMERA,
+    DISTORTION,
+    INTRINSICS,
+    PAIR,
+    STEREO,
+    RigCalibration,
+    is_linear,
+    parameter_names,
+)
 from graphvio.self_calibration.prior import file_prior
 from graphvio.self_calibration.solver import Solution, States, Window, solve
 from graphvio.self_calibration.window import Keyframe, View, choose_tracks
@@ -37,16 +47,20 @@ from graphvio.simulation.default_rig import default_rig
 CAMERAS = ["focal", "principal-point", "distortion", "left-right-rotation", "baseline", "pair-transform"]
 
 
-def equidistant(camera: Camera) -> Camera:
-    return replace(camera, model="equidistant", distortion=np.array([0.02, -0.01, 0.003, -0.001]))
+LENSES = {
+    "equidistant": [0.02, -0.01, 0.003, -0.001],
+    "rational": [0.3, -0.05, 3e-4, -2e-4, 0.01, 0.4, -0.03, 0.02],
+    "double-sphere": [-0.2, 0.6],
+    "extended-unified": [0.6, 1.1],
+    "omnidirectional": [1.2, -0.1, 0.05, 3e-4, -2e-4],
+}
 
 
 def rig_of(model: str) -> Rig:
     rig = default_rig().without_imu()
     if model == "radial-tangential":
         return rig
-    pairs = [StereoPair(pair.name, equidistant(pair.left), equidistant(pair.right)) for pair in rig.pairs]
-    return replace(rig, pairs=tuple(pairs))
+    return rig.with_cameras(lambda camera: replace(camera, model=model, distortion=np.array(LENSES[model])))
 
 
 # ---------------------------------------------------------------- derivatives and equations
@@ -75,11 +89,25 @@ def test_observe_derivatives_equal_finite_differences(model: str, pair: int) -> 
         return rows
 
     analytic, h = rows_after(np.zeros(6), np.zeros(PAIR), np.zeros(3)), 1e-6
-    for column in range(ERROR_AT):
+    kept = [6 + at + INTRINSICS + np.flatnonzero(~is_linear(rig_of(model).cameras[0])) for at in (0, CAMERA)]
+    assert not analytic[:, np.concatenate(kept)].any()
+    for column in np.setdiff1d(np.arange(ERROR_AT), np.concatenate(kept)):
         step = np.zeros(ERROR_AT)
         step[column] = h
         after, before = (rows_after(*np.split(sign * step, [6, 6 + PAIR]))[:, ERROR_AT] for sign in (1.0, -1.0))
         assert analytic[:, column] == pytest.approx((after - before) / (2.0 * h), abs=1e-5)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_file_prior_keeps_coefficients_that_the_lens_is_not_linear_in(model: str) -> None:
+    rig = rig_of(model)
+    sigmas = np.sqrt(np.diag(file_prior(rig).covariance))
+    of_first = sigmas[INTRINSICS:CAMERA]
+    assert ((of_first > 1e-6) == is_linear(rig.cameras[0])).all()
+    assert (of_first[~is_linear(rig.cameras[0])] <= 1e-9).all()
+    moved = RigCalibration.of(rig).moved(0.01 * sigmas).applied_to(rig)
+    for one, other in zip(moved.cameras, rig.cameras, strict=True):
+        np.testing.assert_array_equal(one.distortion[DISTORTION:], other.distortion[DISTORTION:])
 
 
 def test_eliminate_landmarks_gradient_equals_that_of_the_cost_over_all_unknowns() -> None:
@@ -195,7 +223,9 @@ def difference(written: Rig, true: Rig) -> Float:
     nominal, exact = RigCalibration.of(written), RigCalibration.of(true)
     rows = np.zeros((len(written.pairs), PAIR))
     for j in range(len(rows)):
-        cameras = np.hstack([exact.intrinsics[j] - nominal.intrinsics[j], exact.distortion[j] - nominal.distortion[j]])
+        cameras = np.hstack(
+            [exact.intrinsics[j] - nominal.intrinsics[j], (exact.distortion - nominal.distortion)[j, :, :DISTORTION]]
+        )
         rows[j, :STEREO] = cameras.ravel()
         stereo_R, body_R = (getattr(nominal, name)[j, :3, :3] for name in ("right_T_left", "body_T_left"))
         rows[j, STEREO : STEREO + 3] = so3_log(np.ascontiguousarray(stereo_R.T @ exact.right_T_left[j, :3, :3]))

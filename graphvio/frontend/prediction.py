@@ -22,7 +22,7 @@ def predict_pixels(
         motion: (4, 4) maps points before to points after.
         model: number of the camera's model.
         intrinsics: (4,) of the camera.
-        distortion: (5,) of the camera.
+        distortion: (8,) of the camera.
 
     Returns:
         Pixels (N, 2), inverse depths (N,), and whether each point is in front of the camera (N,).
@@ -55,7 +55,7 @@ def predict_warps(
         motion: (4, 4) maps points before to points after.
         model: number of the camera's model.
         intrinsics: (4,) of the camera.
-        distortion: (5,) of the camera.
+        distortion: (8,) of the camera.
 
     Returns:
         Derivatives (N, 2, 2) of the pixel before by the pixel after; the shift (N, 2) of the affine map's centre from
@@ -111,7 +111,7 @@ def inverse_depths_around(
         right_T_left: (4, 4).
         model: number of the right camera's model.
         intrinsics: (4,) of the right camera.
-        distortion: (5,) of the right camera.
+        distortion: (8,) of the right camera.
 
     Returns:
         Inverse depths (5, N) of the surface's plane; the point's own where the right image does not show it.

@@ -52,7 +52,7 @@ def epipolar_search(
         right_T_left: (4, 4).
         model: number of the right camera's model.
         intrinsics: (4,) of the right camera.
-        distortion: (5,) of the right camera.
+        distortion: (8,) of the right camera.
         min_correlation: smallest normalised cross-correlation.
 
     Returns:
@@ -141,7 +141,7 @@ def epipolar_lines(
         right_T_left: (4, 4).
         model: number of the right camera's model.
         intrinsics: (4,) of the right camera.
-        distortion: (5,) of the right camera.
+        distortion: (8,) of the right camera.
 
     Returns:
         Pixels (N, 2), the directions (N, 2) in which they move when they come nearer, and whether both exist (N,).

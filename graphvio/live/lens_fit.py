@@ -16,6 +16,7 @@ from graphvio.arrays import AnyArray, Float, Image
 from graphvio.cameras import MODEL_NAMES, project_points, unproject_pixels
 from graphvio.errors import RigError
 
+_MODELS = ("radial-tangential", "equidistant")
 _EXACT_PX = 0.02  # less than the error of any calibration
 _MAX_ERROR_PX = 8.0
 _GRID = (32, 20)
@@ -61,11 +62,11 @@ def fit_rational(intrinsics: Float, coefficients: Float, size_px: tuple[int, int
         return FittedLens("radial-tangential", intrinsics, np.pad(coefficients[:5], (0, max(5 - len(coefficients), 0))))
     matrix = np.array([[intrinsics[0], 0.0, intrinsics[2]], [0.0, intrinsics[1], intrinsics[3]], [0.0, 0.0, 1.0]])
     points, pixels = _sample_points(matrix, coefficients, size_px)
-    best = min((_fit(model, intrinsics, points, pixels) for model in MODEL_NAMES), key=lambda fit: fit.error_px)
+    best = min((_fit(model, intrinsics, points, pixels) for model in _MODELS), key=lambda fit: fit.error_px)
     if len(points) < _MIN_SHARE * _GRID[0] * _GRID[1] or best.error_px > _MAX_ERROR_PX:
         raise RigError(
             f"{where}: the factory's lens model of {len(coefficients)} coefficients is like none of "
-            f"{', '.join(MODEL_NAMES)} (off by {best.error_px:.1f} px); calibrate the camera with Kalibr, and give the "
+            f"{', '.join(_MODELS)} (off by {best.error_px:.1f} px); calibrate the camera with Kalibr, and give the "
             "rig file"
         )
     if best.error_px < _EXACT_PX:

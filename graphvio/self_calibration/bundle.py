@@ -120,7 +120,7 @@ def _project(
     to_pixel[1, 2] = -(a * to_pixel[1, 0] + b * to_pixel[1, 1])
     by_camera[0, 0], by_camera[0, 1], by_camera[0, 2], by_camera[0, 3] = u, 0.0, 1.0, 0.0
     by_camera[1, 0], by_camera[1, 1], by_camera[1, 2], by_camera[1, 3] = 0.0, v, 0.0, 1.0
-    basis = distortion_basis(model, a, b)
+    basis = distortion_basis(model, distortion, a, b)
     for i in range(DISTORTION):
         by_camera[0, INTRINSICS + i], by_camera[1, INTRINSICS + i] = fx * basis[i, 0], fy * basis[i, 1]
     return True

@@ -12,11 +12,19 @@ from graphvio.arrays import Float
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.imu_model import ACCEL_MATRIX, GYRO_MATRIX, PARAMETERS, TIME_OFFSET
-from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR, STEREO, relative_to_first
+from graphvio.self_calibration.parameters import (
+    BODY,
+    CAMERA,
+    INTRINSICS,
+    PAIR,
+    STEREO,
+    is_linear,
+    relative_to_first,
+)
 
 _DEG = float(np.rad2deg(1.0))
 _AXES = tuple("xyz")
-_SHOWN_DISTORTION = 2  # coefficients, the first ones, which matter most
+_SHOWN_DISTORTION = 2  # coefficients, the first ones that are estimated, which matter most
 
 
 class Curve(NamedTuple):
@@ -71,7 +79,7 @@ def _of_cameras(rig: Rig) -> Iterator[Curve]:
                 focal = 100.0 / camera.intrinsics[i]
                 yield Curve("focal lengths", "%", camera.name, f"f{axis}", focal * unit[at + i])
                 yield Curve("principal points", "px", camera.name, f"c{axis}", unit[at + 2 + i])
-            for i in range(_SHOWN_DISTORTION):
+            for i in np.flatnonzero(is_linear(camera))[:_SHOWN_DISTORTION]:
                 yield Curve("distortion", "1e-3", camera.name, f"d{i + 1}", 1e3 * unit[at + INTRINSICS + i])
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from graphvio.arrays import Float
-from graphvio.cameras import unproject_pixels
+from graphvio.cameras import central_scale, unproject_pixels
 from graphvio.geometry import skew
 from graphvio.self_calibration.parameters import BODY, PAIR, STEREO, RigCalibration
 from graphvio.self_calibration.window import View
@@ -53,7 +53,8 @@ def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> fl
     right_T_left = calibration.right_T_left[pair]
     lines = rays[0] @ (skew(right_T_left[:3, 3]) @ right_T_left[:3, :3]).T
     distances = np.sum(lines * rays[1], axis=1) / np.hypot(lines[:, 0], lines[:, 1])
-    return float(abs(np.median(distances)) * calibration.intrinsics[pair, 1, 0])
+    scale = central_scale(int(calibration.models[pair, 1]), calibration.distortion[pair, 1])
+    return float(abs(np.median(distances)) * calibration.intrinsics[pair, 1, 0] * scale)
 
 
 def knock_covariance(n_parameters: int, n_pairs: int) -> Float:

@@ -1,5 +1,8 @@
 """Calibration of a rig as one vector of parameters: its layout, its prior, and rigs that differ by such a vector.
 
+Of a lens, the first five coefficients have a place in it. Those that distorted coordinates are not linear in, and all
+others, are kept: see `graphvio.cameras.LINEAR_COEFFICIENTS`.
+
 A vector is the difference from the nominal rig, that of the rig file. Rotations are rotation vectors: that of the right
 camera turns the left camera's frame, ``right_R_left Exp(r)``; that of a pair turns it in body, ``Exp(r) body_R_left``.
 """
@@ -11,11 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import Float, Int
+from graphvio.arrays import Bool, Float, Int
+from graphvio.cameras import COEFFICIENTS, LINEAR_COEFFICIENTS, N_BASIS
 from graphvio.geometry import skew, so3_exp
 from graphvio.rig import Camera, Rig, StereoPair
 
-INTRINSICS, DISTORTION, ROTATION, TRANSLATION = 4, 5, 3, 3
+INTRINSICS, DISTORTION, ROTATION, TRANSLATION = 4, N_BASIS, 3, 3
 CAMERA = INTRINSICS + DISTORTION
 LEFT, RIGHT, STEREO, BODY = 0, CAMERA, 2 * CAMERA, 2 * CAMERA + 6
 PAIR = BODY + 6
@@ -41,6 +45,12 @@ def parameter_names(rig: Rig) -> list[str]:
     return names
 
 
+def is_linear(camera: Camera) -> Bool:
+    """Return which of a camera's first coefficients (DISTORTION,) are estimated: those that the model is linear in."""
+    names, linear = COEFFICIENTS[camera.model], LINEAR_COEFFICIENTS[camera.model]
+    return np.array([i < len(names) and names[i] in linear for i in range(DISTORTION)])
+
+
 def relative_to_first(rig: Rig, j: int) -> Float:
     """Return the derivatives (6, P * PAIR) of pair j's rotation and translation, in body's axes, seen from pair 0.
 
@@ -60,7 +70,7 @@ class RigCalibration(NamedTuple):
     Attributes:
         models: (P, 2) numbers of the camera models.
         intrinsics: (P, 2, 4) ``[fx, fy, cx, cy]``, pixels.
-        distortion: (P, 2, 5).
+        distortion: (P, 2, 8).
         right_T_left: (P, 4, 4).
         body_T_left: (P, 4, 4).
     """
@@ -93,11 +103,12 @@ class RigCalibration(NamedTuple):
             right_T_left[j, :3, 3] += stereo[3:]
             body_T_left[j, :3, :3] = so3_exp(body[:3].copy()) @ body_T_left[j, :3, :3]
             body_T_left[j, :3, 3] += body[3:]
-        cameras = each[:, :STEREO].reshape(-1, 2, CAMERA)
+        cameras, distortion = each[:, :STEREO].reshape(-1, 2, CAMERA), self.distortion.copy()
+        distortion[:, :, :DISTORTION] += cameras[:, :, INTRINSICS:]
         return RigCalibration(
             self.models,
             self.intrinsics + cameras[:, :, :INTRINSICS],
-            self.distortion + cameras[:, :, INTRINSICS:],
+            distortion,
             right_T_left,
             body_T_left,
         )

@@ -17,7 +17,16 @@ from graphvio.self_calibration.imu_model import (
     PARAMETERS,
     TIME_OFFSET,
 )
-from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR, STEREO, relative_to_first
+from graphvio.self_calibration.parameters import (
+    BODY,
+    CAMERA,
+    DISTORTION,
+    INTRINSICS,
+    PAIR,
+    STEREO,
+    is_linear,
+    relative_to_first,
+)
 
 _MIN_DISTORTION = 0.005  # of a coefficient, from which its standard deviation is a share of it
 _MIN_SIGMA = 1e-9
@@ -162,7 +171,8 @@ def _sigmas_of_pair(pair: StereoPair, known: CalibrationSigmas) -> Float:
         at = which * CAMERA
         sigmas[at : at + 2] = known.focal_share * camera.intrinsics[:2]
         sigmas[at + 2 : at + INTRINSICS] = known.principal_point_px
-        size = np.where(camera.distortion != 0.0, np.maximum(np.abs(camera.distortion), _MIN_DISTORTION), 0.0)
+        given = np.where(is_linear(camera), camera.distortion[:DISTORTION], 0.0)
+        size = np.where(given != 0.0, np.maximum(np.abs(given), _MIN_DISTORTION), 0.0)
         sigmas[at + INTRINSICS : at + CAMERA] = known.distortion_share * size
     sigmas[STEREO : STEREO + 3] = np.deg2rad(known.stereo_rotation_deg)
     sigmas[STEREO + 3 :] = known.stereo_baseline_share * pair.baseline_m

@@ -33,6 +33,7 @@ import numpy as np
 import rerun as rr
 
 from graphvio.arrays import Float
+from graphvio.cameras import central_scale
 from graphvio.geometry import quat_wxyz_from_rotation
 from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.events import Event
@@ -168,7 +169,8 @@ class Recording:
         log = self._stream.log
         log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for camera in self._rig.cameras:
-            fx, fy, cx, cy = camera.intrinsics
+            _, _, cx, cy = camera.intrinsics
+            fx, fy = camera.intrinsics[:2] * central_scale(camera.model_number, camera.distortion)
             pose = rr.Transform3D(translation=camera.body_T_cam[:3, 3], mat3x3=camera.body_T_cam[:3, :3])
             pinhole = rr.Pinhole(
                 image_from_camera=np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),

@@ -127,7 +127,7 @@ def _undistorted(camera: Camera, pixels: Any) -> Float:
     if camera.model == "equidistant":
         undistorted = cv2.fisheye.undistortPoints(given, _matrix(camera), camera.distortion[:4])
     else:
-        undistorted = cv2.undistortPoints(given, _matrix(camera), camera.distortion)
+        undistorted = cv2.undistortPoints(given, _matrix(camera), camera.distortion[:5])
     return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
 
 
