@@ -45,6 +45,27 @@ def small_rig(pairs: int = 2, imu: bool = True) -> Rig:
     return Rig(tuple(made), Imu() if imu else None, "small")
 
 
+LENSES = {
+    "rational": [0.3, -0.05, 3e-4, -2e-4, 0.01, 0.4, -0.03, 0.02],
+    "double-sphere": [-0.2, 0.6],
+    "extended-unified": [0.6, 1.1],
+    "omnidirectional": [0.7, -0.1, 0.05, 3e-4, -2e-4],
+}
+"""Coefficients of lens models, by name, for views of about 80 degrees."""
+
+
+def with_lens(rig: Rig, model: str) -> Rig:
+    """The rig with lenses of another model, whose images have the same scale at their centre."""
+    distortion = np.array(LENSES[model])
+
+    def change(camera: Camera) -> Camera:
+        changed = replace(camera, model=model, distortion=distortion)
+        scale = changed.focal_px / camera.focal_px
+        return replace(changed, intrinsics=camera.intrinsics / [scale, scale, 1.0, 1.0])
+
+    return rig.with_cameras(change)
+
+
 def half_size(camera: Camera) -> Camera:
     """The camera with pixels of twice the side: pixel (0, 0) is the centre of one."""
     fx, fy, cx, cy = camera.intrinsics

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from calibration_walks import recorded, walk_simulator
+from recordings import small_rig, with_lens
 
 from graphvio import Config, Odometry, open_source
 from graphvio.arrays import Float
@@ -20,7 +21,7 @@ from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.colmap_export import ColmapModel, export
 from graphvio.optimization.loops.closures import LoopClosure, Place
-from graphvio.optimization.loops.database import FeatureDatabase, image_name
+from graphvio.optimization.loops.database import FeatureDatabase, colmap_camera, image_name
 from graphvio.optimization.loops.features import extract_places
 from graphvio.optimization.loops.matching import alike
 from graphvio.optimization.loops.places import choose_places
@@ -106,6 +107,29 @@ def test_export_cameras_are_the_rig_s(exported: Exported) -> None:
         assert (kept.width, kept.height) == camera.size_px
         np.testing.assert_array_equal(kept.params[:4] - [0.0, 0.0, 0.5, 0.5], camera.intrinsics)
         np.testing.assert_array_equal(kept.params[4:], camera.distortion[:4])
+
+
+@pytest.mark.parametrize(
+    ("model", "of_colmap"),
+    [("rational", "FULL_OPENCV"), ("extended-unified", "EUCM"), ("equidistant", "OPENCV_FISHEYE")],
+)
+def test_colmap_camera_projects_as_the_rig_s(model: str, of_colmap: str) -> None:
+    camera = small_rig(1).cameras[0]
+    if model == "equidistant":
+        camera = replace(camera, model=model, distortion=np.array([0.01, -0.02, 0.003, -0.004]))
+    else:
+        camera = with_lens(small_rig(1), model).cameras[0]
+    made = colmap_camera(camera, 1)
+    assert made.model_name == of_colmap
+    points = np.array([[0.1, 0.2, 1.0], [-0.4, 0.3, 1.2], [0.0, 0.0, 2.0]])
+    pixels, _ = camera.project(points)
+    np.testing.assert_allclose(made.img_from_cam(points) - 0.5, pixels, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", ["double-sphere", "omnidirectional"])
+def test_colmap_camera_of_an_unknown_lens_raises(model: str) -> None:
+    with pytest.raises(OptimizationError, match=f"camera cam0: COLMAP has no model for its {model} lens; .*calibrate"):
+        colmap_camera(with_lens(small_rig(1), model).cameras[0], 1)
 
 
 def test_export_poses_are_the_optimisation_s(exported: Exported) -> None:

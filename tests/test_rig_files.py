@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,8 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recordings import (
     KITTI_P,
+    LENSES,
     REAL_DATA,
     small_rig,
+    with_lens,
     write_euroc,
     write_image,
     write_imu_yaml,
@@ -24,9 +27,10 @@ from recordings import (
 )
 
 from graphvio.errors import RigError
-from graphvio.geometry import se3, se3_exp, se3_inverse
+from graphvio.geometry import quat_wxyz_from_rotation, se3, se3_exp, se3_inverse
 from graphvio.rig import Camera, Imu, Rig, StereoPair
 from graphvio.rig_files import find_rig, load_rig, save_rig
+from graphvio.sessions.euroc_layout import camera_yaml
 
 
 def assert_same(a: Rig, b: Rig) -> None:
@@ -94,6 +98,34 @@ def test_save_rig_then_load_rig_with_any_values_returns_equal_rig(
     rig = Rig((StereoPair(name, left, right),), Imu(*numbers, offset_s), name)
     save_rig(rig, path)
     assert_same(rig, load_rig(path))
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_save_rig_then_load_rig_keeps_the_lens(tmp_path: Path, model: str) -> None:
+    rig = with_lens(small_rig(1), model)
+    save_rig(rig, tmp_path / "rig.yaml")
+    assert_same(rig, load_rig(tmp_path / "rig.yaml"))
+    camera = yaml.safe_load((tmp_path / "rig.yaml").read_text())["pairs"][0]["left"]
+    assert camera["model"] == model
+    assert camera["distortion"] == LENSES[model]
+
+
+def test_load_rig_with_a_wrong_lens_names_the_camera_and_the_remedy(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    save_rig(with_lens(small_rig(1), "double-sphere"), path)
+    text = path.read_text()
+    path.write_text(text.replace("[-0.2, 0.6]", "[0.6, -0.2]", 1))
+    with pytest.raises(RigError, match=r"rig.yaml: camera cam0: alpha is -0.2, and must be between 0 and 1; give .*xi"):
+        load_rig(path)
+    path.write_text(text.replace("[-0.2, 0.6]", "[-0.2, 0.6, 0, 0, 0, 0, 0, 0, 0]", 1))
+    with pytest.raises(RigError, match=r"camera cam0: 9 distortion coefficients; give at most 8"):
+        load_rig(path)
+    path.write_text(text.replace("intrinsics: [40.0", "intrinsics: [10.0", 1))
+    with pytest.raises(RigError, match=r"camera cam0: no ray reaches the image's corner \(0, 0\) by its double-sphere"):
+        load_rig(path)
+    write_image(tmp_path / "mask.png", np.full((48, 64), 255, dtype=np.uint8))
+    path.write_text(path.read_text().replace("distortion:", 'mask: "mask.png"\n      distortion:', 1))
+    assert load_rig(path).cameras[0].mask == (tmp_path / "mask.png").resolve()
 
 
 def test_save_rig_keeps_the_matrices_of_the_imu(tmp_path: Path) -> None:
@@ -292,7 +324,7 @@ def test_load_rig_euroc_odd_number_of_cameras_raises(tmp_path: Path) -> None:
         ),
         ("cam1", r"intrinsics.*\n", "", r"cam1/sensor\.yaml: intrinsics is missing"),
         ("cam1", r"radial-tangential", "fov", r"distortion_model: unknown model 'fov'"),
-        ("cam1", r"pinhole", "omni", r"camera_model: is 'omni'"),
+        ("cam1", r"pinhole", "division", r"camera_model: is 'division'; calibrate with pinhole"),
         ("cam1", r"resolution.*\n", "resolution: 752\n", r"resolution: has shape"),
         ("cam1", r"data: \[[^,]*", "data: [nan", r"T_BS\.data: holds NaN"),
     ],
@@ -352,6 +384,200 @@ def test_load_rig_kalibr(tmp_path: Path, chain: str, imu: str, nested: bool) -> 
     assert loaded.imu == Imu(time_offset_s=-0.0125)
     assert_same(rig.without_imu(), loaded.without_imu())
     assert_same(loaded, load_rig(tmp_path))
+
+
+KALIBR_LENSES = {
+    "double-sphere": ("ds", ["xi", "alpha"]),
+    "extended-unified": ("eucm", ["alpha", "beta"]),
+    "omnidirectional": ("omni", ["xi"]),
+}
+
+
+def kalibr_lens_chain(rig: Rig, change: Callable[[dict], None] = lambda _: None) -> str:  # type: ignore[type-arg]
+    """A chain of cameras whose lenses have a sphere, as Kalibr writes it, after a change of the first."""
+    chain = yaml.safe_load(kalibr_chain(rig))
+    for camera, section in zip(rig.cameras, chain.values(), strict=True):
+        name, of_sphere = KALIBR_LENSES[camera.model]
+        sphere = camera.distortion[: len(of_sphere)].tolist()
+        section.update(camera_model=name, intrinsics=[*sphere, *camera.intrinsics.tolist()])
+        section.update(distortion_model="none", distortion_coeffs=[])
+        if camera.model == "omnidirectional":
+            section.update(distortion_model="radtan", distortion_coeffs=camera.distortion[1:5].tolist())
+    change(chain["cam0"])
+    return yaml.safe_dump(chain)
+
+
+@pytest.mark.parametrize("model", KALIBR_LENSES)
+def test_load_rig_kalibr_reads_lenses_with_a_sphere(tmp_path: Path, model: str) -> None:
+    rig = with_lens(small_rig(2), model)
+    (tmp_path / "camchain-imucam.yaml").write_text(kalibr_lens_chain(rig))
+    (tmp_path / "imu.yaml").write_text(KALIBR_IMU)
+    assert_same(rig, load_rig(tmp_path))
+
+
+def test_load_rig_kalibr_reads_pinholes_and_spheres_without_distortion(tmp_path: Path) -> None:
+    path = tmp_path / "camchain-imucam.yaml"
+    (tmp_path / "imu.yaml").write_text(KALIBR_IMU)
+    path.write_text(kalibr_chain(small_rig(1), model="equidistant"))
+    assert load_rig(path).cameras[0].model == "equidistant"
+    path.write_text(kalibr_chain(small_rig(1), model="none"))
+    assert load_rig(path).cameras[0].model == "radial-tangential"
+    assert not load_rig(path).cameras[0].distortion.any()
+    rig = with_lens(small_rig(1), "omnidirectional")
+    path.write_text(kalibr_lens_chain(rig, lambda d: d.update(distortion_model="none")))
+    assert load_rig(path).cameras[0].distortion.tolist() == [0.7] + 7 * [0.0]
+
+
+@pytest.mark.parametrize(
+    ("model", "change", "message"),
+    [
+        ("double-sphere", {"intrinsics": [50.0, 50.0, 31.5, 23.5]}, r"cam0.intrinsics: has shape \(4,\).* \(6,\)"),
+        ("double-sphere", {"distortion_model": "radtan"}, r"distortion_model: is 'radtan'; with .* ds it must be none"),
+        ("omnidirectional", {"distortion_model": "equi"}, r"with camera_model omni it must be radtan or none"),
+        (
+            "extended-unified",
+            {"intrinsics": [1.1, 0.6, 50.0, 50.0, 31.5, 23.5]},
+            r"camera cam0: alpha is 1.1, and must",
+        ),
+        ("extended-unified", {"intrinsics": [0.9, 1.1, 9.0, 9.0, 31.5, 23.5]}, r"camera cam0: no ray reaches the"),
+        ("omnidirectional", {"camera_model": "fov"}, r"cam0.camera_model: is 'fov'; calibrate with .* ds, eucm, omni"),
+    ],
+)
+def test_load_rig_kalibr_with_a_wrong_lens_says_which(
+    tmp_path: Path, model: str, change: dict[str, object], message: str
+) -> None:
+    chain = kalibr_lens_chain(with_lens(small_rig(1), model), lambda d: d.update(change))
+    (tmp_path / "camchain-imucam.yaml").write_text(chain)
+    (tmp_path / "imu.yaml").write_text(KALIBR_IMU)
+    with pytest.raises(RigError, match=message):
+        load_rig(tmp_path)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_camera_yaml_is_read_back(tmp_path: Path, model: str) -> None:
+    write_euroc(tmp_path, pairs=1, frames=1)
+    rig = with_lens(small_rig(1), model)
+    for camera in rig.cameras:
+        (tmp_path / "mav0" / camera.name / "sensor.yaml").write_text(camera_yaml(camera, 20.0, "of a test"))
+    loaded = load_rig(tmp_path)
+    for one, other in zip(loaded.cameras, rig.cameras, strict=True):
+        assert one.model == other.model
+        np.testing.assert_allclose(one.intrinsics, other.intrinsics, rtol=1e-11)
+        np.testing.assert_array_equal(one.distortion, other.distortion)
+
+
+# ---------------------------------------------------------------- Basalt
+
+
+def basalt_calibration(rig: Rig) -> dict:  # type: ignore[type-arg]
+    """A calibration as Basalt writes it, of lenses that differ from camera to camera."""
+    lenses = [
+        ("ds", [-0.2, 0.6], ["xi", "alpha"]),
+        ("eucm", [0.6, 1.1], ["alpha", "beta"]),
+        ("kb4", [0.01, -0.02, 0.003, -0.004], ["k1", "k2", "k3", "k4"]),
+        ("pinhole-radtan8", LENSES["rational"], ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"]),
+        ("ucm", [0.6], ["alpha"]),
+        ("pinhole", [], []),
+    ]
+    poses, intrinsics = [], []
+    for camera, (kind, coefficients, names) in zip(rig.cameras, lenses, strict=False):
+        w, x, y, z = quat_wxyz_from_rotation(camera.body_T_cam[:3, :3]).tolist()
+        px, py, pz = camera.body_T_cam[:3, 3].tolist()
+        poses.append({"px": px, "py": py, "pz": pz, "qx": x, "qy": y, "qz": z, "qw": w})
+        values = dict(zip(["fx", "fy", "cx", "cy", *names], [*camera.intrinsics, *coefficients], strict=True))
+        if kind == "pinhole-radtan8":
+            values["rpmax"] = 2.0
+        intrinsics.append({"camera_type": kind, "intrinsics": values})
+    return {
+        "T_imu_cam": poses,
+        "intrinsics": intrinsics,
+        "resolution": [list(camera.size_px) for camera in rig.cameras],
+        "calib_accel_bias": [0.1, 0.2, 0.3, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06],
+        "calib_gyro_bias": [0.1, 0.2, 0.3, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07, 0.08, 0.09],
+        "imu_update_rate": 200.0,
+        "accel_noise_std": [0.016, 0.016, 0.017],
+        "gyro_noise_std": [0.000282, 0.000282, 0.000282],
+        "accel_bias_std": [0.001, 0.001, 0.001],
+        "gyro_bias_std": [0.0001, 0.0001, 0.0001],
+        "cam_time_offset_ns": -12_500_000,
+        "vignette": [],
+    }
+
+
+def write_basalt(path: Path, value: object) -> Path:
+    path.write_text(json.dumps({"value0": value}))
+    return path
+
+
+def test_load_rig_basalt(tmp_path: Path) -> None:
+    rig = small_rig(3)
+    path = write_basalt(tmp_path / "calibration.json", basalt_calibration(rig))
+    loaded = load_rig(path)
+    assert [pair.name for pair in loaded.pairs] == ["pair0", "pair1", "pair2"]
+    models = ["double-sphere", "extended-unified", "equidistant", "rational", "extended-unified", "radial-tangential"]
+    assert [camera.model for camera in loaded.cameras] == models
+    for one, other in zip(loaded.cameras, rig.cameras, strict=True):
+        assert (one.name, one.size_px) == (other.name, other.size_px)
+        np.testing.assert_array_equal(one.intrinsics, other.intrinsics)
+        np.testing.assert_allclose(one.body_T_cam, other.body_T_cam, atol=1e-12)
+    assert loaded.cameras[0].distortion.tolist() == [-0.2, 0.6] + 6 * [0.0]
+    assert loaded.cameras[3].distortion.tolist() == LENSES["rational"]
+    assert loaded.cameras[4].distortion.tolist() == [0.6, 1.0] + 6 * [0.0]
+    assert loaded.imu is not None
+    assert (loaded.imu.rate_hz, loaded.imu.time_offset_s) == (200.0, -0.0125)
+    assert (loaded.imu.gyro_noise_density, loaded.imu.gyro_random_walk) == (0.000282, 0.0001)
+    assert (loaded.imu.accel_noise_density, loaded.imu.accel_random_walk) == (0.017, 0.001)
+    gyro, accel = loaded.imu.matrices
+    np.testing.assert_allclose(gyro, [[1.01, 0.04, 0.07], [0.02, 1.05, 0.08], [0.03, 0.06, 1.09]])
+    np.testing.assert_allclose(accel, [[1.01, 0.0, 0.0], [0.02, 1.04, 0.0], [0.03, 0.05, 1.06]])
+    assert_same(loaded, load_rig(tmp_path))
+    save_rig(loaded, tmp_path / "again.yaml")
+    assert_same(loaded, load_rig(tmp_path / "again.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.pop("T_imu_cam"), r"value0.T_imu_cam is missing"),
+        (lambda d: d.update(resolution=7), r"value0.resolution: must be a list"),
+        (lambda d: d["resolution"].pop(), r"2 T_imu_cam, 2 intrinsics, 1 resolution; give one of each"),
+        (lambda d: d["intrinsics"][0].update(camera_type="fov"), r"intrinsics\[0\].camera_type: unknown model 'fov'"),
+        (lambda d: d["intrinsics"][1]["intrinsics"].pop("beta"), r"value0.intrinsics\[1\].intrinsics.beta is missing"),
+        (lambda d: d["intrinsics"][0]["intrinsics"].update(alpha=2.0), r"camera cam0: alpha is 2, and must be between"),
+        (lambda d: d["T_imu_cam"][1].update(qw=2.0), r"T_imu_cam\[1\].qw: the quaternion's norm is .*it must be 1"),
+        (lambda d: d["resolution"].__setitem__(0, [64.5, 48]), r"value0.resolution\[0\]: is .*two whole numbers"),
+        (lambda d: d.pop("gyro_bias_std"), r"value0.gyro_bias_std is missing"),
+        (lambda d: d.update(accel_noise_std=[0.0, 0.0, 0.0]), r"imu: accel_noise_density is 0.0; it must be positive"),
+        (lambda d: d.update(calib_gyro_bias=[0.0] * 3), r"value0.calib_gyro_bias: has shape"),
+        (lambda d: [d[key].pop() for key in ("T_imu_cam", "intrinsics", "resolution")], r"cam0 is left without"),
+    ],
+)
+def test_load_rig_basalt_invalid_value_raises(
+    tmp_path: Path,
+    change: Callable[[dict], object],  # type: ignore[type-arg]
+    message: str,
+) -> None:
+    calibration = basalt_calibration(small_rig(1))
+    change(calibration)
+    with pytest.raises(RigError, match=message):
+        load_rig(write_basalt(tmp_path / "calibration.json", calibration))
+
+
+def test_load_rig_of_other_json_raises(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.json"
+    path.write_text("{")
+    with pytest.raises(RigError, match=r"line 1 is not valid JSON"):
+        load_rig(path)
+    path.write_text("[]")
+    with pytest.raises(RigError, match=r"is no calibration of Basalt"):
+        load_rig(path)
+    path.write_text('{"cameras": 3}')
+    with pytest.raises(RigError, match=r"value0 is missing"):
+        load_rig(path)
+    assert find_rig(tmp_path) is None
+
+
+# ---------------------------------------------------------------- chains without an IMU, and the other formats
 
 
 def test_load_rig_kalibr_without_imu_chains_cameras(tmp_path: Path) -> None:

@@ -8,18 +8,45 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recordings import write_euroc
+from recordings import LENSES, small_rig, with_lens, write_euroc
 from test_bags import Message, bag, messages
 from test_sessions import same
 
 from graphvio import FrameSet, ImuSample, open_source
+from graphvio.errors import RigError
 from graphvio.sessions import cdr
-from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, compressed_image, stamp_of
-from graphvio.sessions.rig_of_topics import stereo_topics
+from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU, camera_info, compressed_image, stamp_of
+from graphvio.sessions.rig_of_topics import _camera, stereo_topics
 from graphvio.sources.description import describe
 
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_camera_info_has_the_lens(model: str) -> None:
+    expected = with_lens(small_rig(1), model).cameras[0]
+    message = camera_info(0, expected)
+    ros = {"rational": "rational_polynomial"}.get(model, model)
+    assert (message.distortion_model, len(message.d)) == (ros, len(LENSES[model]))
+    camera = _camera("cam0", message, expected.body_T_cam)
+    assert camera.model == model
+    np.testing.assert_array_equal(camera.intrinsics, expected.intrinsics)
+    np.testing.assert_array_equal(camera.distortion, expected.distortion)
+
+
+def test_camera_info_of_eight_coefficients_may_be_of_five() -> None:
+    message = camera_info(0, with_lens(small_rig(1), "rational").cameras[0])
+    message.d[5:] = 0.0
+    assert _camera("cam0", message, np.eye(4)).model == "radial-tangential"
+    message.d = np.append(message.d, np.zeros(6))
+    assert _camera("cam0", message, np.eye(4)).model == "radial-tangential"
+    message.d[8] = 0.1  # thin prism
+    with pytest.raises(RigError, match=r"cam0: its camera_info has 14 distortion coefficients; at most 8 are known"):
+        _camera("cam0", message, np.eye(4))
+    message.d, message.distortion_model = np.full(8, 0.01), "plumb_bob"
+    with pytest.raises(RigError, match=r"camera cam0: has 8 distortion coefficients, and radial-tangential has 5"):
+        _camera("cam0", message, np.eye(4))
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Rig files: graphvio's own ``rig.yaml``, and readers for EuRoC/ASL, Kalibr and KITTI calibrations."""
+"""Rig files: graphvio's own ``rig.yaml``, and readers for EuRoC/ASL, Kalibr, Basalt and KITTI calibrations."""
 
 from graphvio.rig_files.loading import find_rig, load_rig
 from graphvio.rig_files.native import save_rig

@@ -15,7 +15,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
-from graphvio.rig import Camera, Imu, Rig, checked_transform
+from graphvio.rig import Camera, Imu, Rig, checked_transform, with_views
 from graphvio.rig_files import kalibr
 from graphvio.rig_files.reading import Section, consecutive_pairs, named, read_yaml
 
@@ -50,7 +50,7 @@ def load(path: Path) -> Rig:
                 imu_T_body = se3_inverse(body_T_imu)
     cameras = [_camera(name, section, imu_T_body) for name, section in sections.items()]
     with named(root):
-        return Rig(consecutive_pairs(cameras, root), imu, _name(root))
+        return with_views(Rig(consecutive_pairs(cameras, root), imu, _name(root)))
 
 
 def sensors_folder(path: Path) -> Path | None:
@@ -70,15 +70,15 @@ def camera_folders(root: Path) -> list[Path]:
 
 
 def _camera(name: str, section: Section, imu_T_body: Float) -> Camera:
-    model = kalibr.model_of(section)
+    lens = kalibr.lens_of(section, "distortion_coefficients")
     with named(section.file):
         body_T_cam = checked_transform(section.matrix("T_BS"), section.where("T_BS"))
         return Camera(
             name=name,
-            model=model,
+            model=lens.model,
             size_px=section.size("resolution"),
-            intrinsics=section.array("intrinsics", (4,)),
-            distortion=section.array("distortion_coefficients"),
+            intrinsics=lens.intrinsics,
+            distortion=lens.distortion,
             body_T_cam=imu_T_body @ body_T_cam,
         )
 
@@ -94,7 +94,7 @@ def _from_chain(chain: Path, names: list[str], has_imu: bool, name: str) -> Rig:
         imu = None
         if has_imu:
             imu = kalibr.imu_of(kalibr.find_imu_file(chain), kalibr.time_offset_of(document))
-        return Rig(pairs, imu, name)
+        return with_views(Rig(pairs, imu, name))
 
 
 def _sensor(folder: Path) -> Section:
@@ -105,7 +105,9 @@ def _sensor(folder: Path) -> Section:
 
 
 def _is_complete(section: Section) -> bool:
-    return all(section.values.get(key) not in (None, [], "") for key in _CAMERA_KEYS)
+    has_sphere = section.values.get("camera_model") in kalibr.SPHERES  # and may be without distortion
+    required = _CAMERA_KEYS[:3] if has_sphere else _CAMERA_KEYS
+    return all(section.values.get(key) not in (None, [], "") for key in required)
 
 
 def _name(root: Path) -> str:

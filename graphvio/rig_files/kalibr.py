@@ -1,22 +1,28 @@
 """Kalibr's ``camchain-imucam.yaml`` with the ``imu.yaml`` next to it, and a camera-only ``camchain.yaml``.
 
 Kalibr's ``T_cam_imu`` maps points from the IMU's frame to the camera's, so ``body_T_cam`` is its inverse;
-``timeshift_cam_imu`` has graphvio's sign, ``t_imu = t_cam + timeshift``.
+``timeshift_cam_imu`` has graphvio's sign, ``t_imu = t_cam + timeshift``. ``intrinsics`` are ``[fu, fv, pu, pv]``, and
+before them ``[xi, alpha]`` for the camera model ``ds``, ``[alpha, beta]`` for ``eucm`` and ``[xi]`` for ``omni``.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.cameras import COEFFICIENTS
 from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
-from graphvio.rig import Camera, Imu, Rig, checked_transform
+from graphvio.rig import Camera, Imu, Rig, checked_transform, with_views
 from graphvio.rig_files.reading import NOISE_KEYS, Section, consecutive_pairs, named, read_yaml
 
+PINHOLE = "pinhole"
+SPHERES = {"ds": "double-sphere", "eucm": "extended-unified", "omni": "omnidirectional"}
+"""Camera model in files of Kalibr -> graphvio's name; the parameters of the sphere come first in ``intrinsics``."""
 _MODELS = {
     "radtan": "radial-tangential",
     "radial-tangential": "radial-tangential",
@@ -24,6 +30,8 @@ _MODELS = {
     "none": "radial-tangential",
     "equidistant": "equidistant",
     "equi": "equidistant",
+    "rational": "rational",
+    "rational_polynomial": "rational",
 }
 """Distortion model in files of Kalibr, EuRoC and ROS -> graphvio's name."""
 IMU_KEYS = {
@@ -51,7 +59,7 @@ def load(path: Path) -> Rig:
         cameras = cameras_of(document)
         pairs = consecutive_pairs(cameras, path)
         imu = imu_of(find_imu_file(path), time_offset_of(document)) if has_imu else None
-        return Rig(pairs, imu, path.stem)
+        return with_views(Rig(pairs, imu, path.stem))
 
 
 def camera_names(document: Section) -> list[str]:
@@ -67,13 +75,14 @@ def cameras_of(document: Section) -> list[Camera]:
     for index, name in enumerate(camera_names(document)):
         section = document.section(name)
         cam_T_body = _cam_T_body(section, previous_T_body, first=index == 0)
+        lens = lens_of(section, "distortion_coeffs")
         cameras.append(
             Camera(
                 name=name,
-                model=model_of(section),
+                model=lens.model,
                 size_px=section.size("resolution"),
-                intrinsics=section.array("intrinsics", (4,)),
-                distortion=_distortion(section),
+                intrinsics=lens.intrinsics,
+                distortion=lens.distortion,
                 body_T_cam=se3_inverse(cam_T_body),
             )
         )
@@ -136,21 +145,76 @@ def find_imu_file(camchain: Path) -> Path:
     )
 
 
-def model_of(section: Section) -> str:
-    """Read a camera's model as graphvio's name.
+class Lens(NamedTuple):
+    """A lens as `graphvio.rig.Camera` takes it."""
+
+    model: str  # graphvio's name
+    intrinsics: Float  # (4,), pixels
+    distortion: Float
+
+
+class WrittenLens(NamedTuple):
+    """A lens in Kalibr's terms."""
+
+    camera_model: str
+    intrinsics: list[float]
+    distortion_model: str
+    coefficients: list[float]
+
+
+def lens_of(section: Section, coefficients_key: str) -> Lens:
+    """Read a camera's lens.
+
+    Args:
+        section: of the camera.
+        coefficients_key: of the distortion coefficients.
 
     Raises:
-        RigError: if it is missing or not supported.
+        RigError: if its model is missing or not supported, or a value is missing.
     """
-    if section.values.get("camera_model", "pinhole") != "pinhole":
+    camera_model = section.text("camera_model") if section.values.get("camera_model") is not None else PINHOLE
+    if camera_model != PINHOLE and camera_model not in SPHERES:
         raise RigError(
-            f"{section.where('camera_model')}: is {section.text('camera_model')!r}; calibrate with pinhole and the "
-            "distortion model radial-tangential (radtan) or equidistant (equi)"
+            f"{section.where('camera_model')}: is {camera_model!r}; calibrate with pinhole and the distortion model "
+            f"radial-tangential (radtan) or equidistant (equi), or with one of {', '.join(SPHERES)}"
         )
-    name = section.text("distortion_model")
+    if camera_model == PINHOLE or section.values.get("distortion_model") is not None:
+        name = section.text("distortion_model")
+    else:
+        name = "none"
     if name not in _MODELS:
         raise RigError(f"{section.where('distortion_model')}: unknown model {name!r}; use one of {', '.join(_MODELS)}")
-    return _MODELS[name]
+    coefficients = np.zeros(0) if name == "none" else section.array(coefficients_key)
+    if camera_model == PINHOLE:
+        return Lens(_MODELS[name], section.array("intrinsics", (4,)), coefficients)
+    model = SPHERES[camera_model]
+    if name != "none" and (model != "omnidirectional" or _MODELS[name] != "radial-tangential"):
+        wanted = "radtan or none" if model == "omnidirectional" else "none"
+        raise RigError(
+            f"{section.where('distortion_model')}: is {name!r}; with camera_model {camera_model} it must be {wanted}"
+        )
+    n_sphere = _n_sphere(model)
+    intrinsics = section.array("intrinsics", (n_sphere + 4,))
+    return Lens(model, intrinsics[n_sphere:], np.concatenate([intrinsics[:n_sphere], coefficients]))
+
+
+def written_lens(camera: Camera) -> WrittenLens:
+    """Return a camera's lens as `lens_of` reads it; zeros at the end of the coefficients are left out."""
+    names, values = COEFFICIENTS[camera.model], camera.distortion.tolist()
+    pinhole = camera.intrinsics.tolist()
+    if camera.model not in SPHERES.values():
+        n = 4 if not any(values[4:]) else len(names)
+        return WrittenLens(PINHOLE, pinhole, camera.model, values[:n])
+    camera_model = next(key for key, model in SPHERES.items() if model == camera.model)
+    n_sphere = _n_sphere(camera.model)
+    coefficients = values[n_sphere : len(names)]
+    distortion_model = "radial-tangential" if coefficients else "none"
+    return WrittenLens(camera_model, [*values[:n_sphere], *pinhole], distortion_model, coefficients)
+
+
+def _n_sphere(model: str) -> int:
+    """Return how many coefficients of a model with a sphere are among Kalibr's intrinsics."""
+    return len([name for name in COEFFICIENTS[model] if name in ("xi", "alpha", "beta")])
 
 
 def _cam_T_body(section: Section, previous_T_body: Float, first: bool) -> Float:
@@ -159,9 +223,3 @@ def _cam_T_body(section: Section, previous_T_body: Float, first: bool) -> Float:
     if first:
         return np.eye(4)
     return checked_transform(section.matrix("T_cn_cnm1"), section.where("T_cn_cnm1")) @ previous_T_body
-
-
-def _distortion(section: Section) -> Float:
-    if section.text("distortion_model") == "none":
-        return np.zeros(5)
-    return section.array("distortion_coeffs")

@@ -6,11 +6,12 @@ from pathlib import Path
 
 from graphvio.errors import RigError
 from graphvio.rig import Rig
-from graphvio.rig_files import euroc, kalibr, kitti, native
+from graphvio.rig_files import basalt, euroc, kalibr, kitti, native
 from graphvio.rig_files.reading import read_yaml
 
 _FORMATS = (
-    "rig.yaml, Kalibr's camchain-imucam.yaml, an EuRoC/ASL folder (mav0), KITTI's calib.txt or calib_cam_to_cam.txt"
+    "rig.yaml, Kalibr's camchain-imucam.yaml, Basalt's calibration.json, an EuRoC/ASL folder (mav0), KITTI's calib.txt "
+    "or calib_cam_to_cam.txt"
 )
 
 
@@ -18,8 +19,9 @@ def load_rig(path: str | Path) -> Rig:
     """Read a rig from a calibration file, or from the folder of a recording that holds one.
 
     Args:
-        path: ``rig.yaml``, a Kalibr camera chain, a ``sensor.yaml`` of an EuRoC/ASL folder, KITTI's
-            ``calib.txt`` or ``calib_cam_to_cam.txt``; or a folder, in which ``rig.yaml`` takes precedence.
+        path: ``rig.yaml``, a Kalibr camera chain, Basalt's ``calibration.json``, a ``sensor.yaml`` of an EuRoC/ASL
+            folder, KITTI's ``calib.txt`` or ``calib_cam_to_cam.txt``; or a folder, in which ``rig.yaml`` takes
+            precedence.
 
     Raises:
         RigError: if there is no such file, it cannot be read, or it does not describe a usable rig.
@@ -45,6 +47,8 @@ def _load(path: Path) -> Rig:
         return kitti.load_odometry(path)
     if path.name == "sensor.yaml":
         return euroc.load(path.parent.parent)
+    if path.suffix == ".json":
+        return basalt.load(path)
     if path.suffix not in (".yaml", ".yml"):
         raise RigError(f"{path}: is no calibration file that graphvio knows; give one of: {_FORMATS}")
     document = read_yaml(path)
@@ -79,4 +83,7 @@ def find_rig(folder: Path) -> Rig | None:
     if len(with_imu or chains) > 1:
         names = ", ".join(chain.name for chain in with_imu or chains)
         raise RigError(f"{folder}: holds several camera chains ({names}); give the path of one of them")
-    return kalibr.load((with_imu or chains)[0]) if chains else None
+    if chains:
+        return kalibr.load((with_imu or chains)[0])
+    calibration = folder / basalt.FILE_NAME
+    return basalt.load(calibration) if basalt.is_calibration(calibration) else None

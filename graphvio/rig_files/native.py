@@ -10,8 +10,9 @@ from dataclasses import fields
 from pathlib import Path
 
 from graphvio.calibration_sigmas import FACTORY, LEVELS, CalibrationSigmas
+from graphvio.cameras import COEFFICIENTS
 from graphvio.errors import RigError
-from graphvio.rig import Camera, Imu, Rig, StereoPair, as_written
+from graphvio.rig import Camera, Imu, Rig, StereoPair, as_written, with_views
 from graphvio.rig_files.reading import NOISE_KEYS, Section, named, parse_yaml, read_text
 
 VERSION = 1
@@ -60,7 +61,7 @@ def parse(text: str, path: Path) -> Rig:
         pairs = tuple(_pair(document.nested(value, f"pairs[{i}]"), i) for i, value in enumerate(given))
         imu = _imu(document.section("imu")) if document.values.get("imu") is not None else None
         name = document.text("name") if document.values.get("name") is not None else path.stem
-        return Rig(pairs, imu, name, _sigmas(document))
+        return with_views(Rig(pairs, imu, name, _sigmas(document)))
 
 
 def save_rig(rig: Rig, path: str | Path) -> None:
@@ -164,7 +165,7 @@ def _camera_lines(camera: Camera, folder: Path) -> Iterable[str]:
     yield f"model: {camera.model}"
     yield f"size_px: [{camera.size_px[0]}, {camera.size_px[1]}]"
     yield f"intrinsics: {_numbers(camera.intrinsics)}  # fx, fy, cx, cy"
-    yield f"distortion: {_numbers(camera.distortion)}"
+    yield f"distortion: {_numbers(camera.distortion[: len(COEFFICIENTS[camera.model])])}"
     yield "body_T_cam:"
     for row in camera.body_T_cam:
         yield f"  - {_numbers(row)}"

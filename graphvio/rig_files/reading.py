@@ -156,7 +156,9 @@ def read_text(path: Path) -> str:
     except OSError as error:
         raise RigError(f"{path}: cannot be read ({error.strerror}); check the path") from None
     except UnicodeDecodeError:
-        raise RigError(f"{path}: is no text file; give a calibration file (rig.yaml, Kalibr, EuRoC, KITTI)") from None
+        raise RigError(
+            f"{path}: is no text file; give a calibration file (rig.yaml, Kalibr, Basalt, EuRoC, KITTI)"
+        ) from None
 
 
 @contextmanager

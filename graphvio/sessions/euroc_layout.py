@@ -11,6 +11,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Image
 from graphvio.rig import Camera, Imu
+from graphvio.rig_files import kalibr
 
 IMU_FOLDER, TRUTH_FOLDER = "imu0", "state_groundtruth_estimate0"
 FRAME_HEADER = "#timestamp [ns],filename"
@@ -53,14 +54,14 @@ def exact_row(stamp_ns: int, values: Iterable[float]) -> str:
 
 def camera_yaml(camera: Camera, rate_hz: float, comment: str) -> str:
     """Return a camera's ``sensor.yaml``."""
-    coefficients = camera.distortion if camera.distortion[4] != 0.0 else camera.distortion[:4]
+    lens = kalibr.written_lens(camera)
     return (
         f"sensor_type: camera\ncomment: {comment}\n{_matrix_yaml(camera.body_T_cam)}"
         f"rate_hz: {rate_hz:g}\nresolution: [{camera.size_px[0]}, {camera.size_px[1]}]\n"
-        "camera_model: pinhole\n"
-        f"intrinsics: [{', '.join(f'{value:.12g}' for value in camera.intrinsics)}]\n"
-        f"distortion_model: {camera.model}\n"
-        f"distortion_coefficients: [{', '.join(f'{value:.12g}' for value in coefficients)}]\n"
+        f"camera_model: {lens.camera_model}\n"
+        f"intrinsics: [{', '.join(f'{value:.12g}' for value in lens.intrinsics)}]\n"
+        f"distortion_model: {lens.distortion_model}\n"
+        f"distortion_coefficients: [{', '.join(f'{value:.12g}' for value in lens.coefficients)}]\n"
     )
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from graphvio.arrays import Float, Image
+from graphvio.cameras import COEFFICIENTS
 from graphvio.errors import SessionError
 from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 from graphvio.measurements.estimate import Estimate
@@ -29,7 +30,8 @@ WORLD = "world"
 _NS_PER_S = 1_000_000_000
 _STAMP_END_S = 2**31
 _UNKNOWN = -1.0  # in the first element of a covariance: the quantity is not measured
-_DISTORTIONS = {"radial-tangential": ("plumb_bob", 5), "equidistant": ("equidistant", 4)}
+ROS_DISTORTIONS = {"radial-tangential": "plumb_bob", "equidistant": "equidistant", "rational": "rational_polynomial"}
+"""ROS's names of lens models; others, for which it has none, have graphvio's."""
 _WARN = 30
 
 
@@ -89,14 +91,13 @@ def imu_sample(message: Any) -> ImuSample:
 def camera_info(stamp_ns: int, camera: Camera) -> Any:
     """Return the ``CameraInfo`` of a camera: intrinsics and distortion."""
     fx, fy, cx, cy = camera.intrinsics
-    model, count = _DISTORTIONS[camera.model]
     return make(
         CAMERA_INFO,
         header=header(stamp_ns, camera.name),
         height=camera.size_px[1],
         width=camera.size_px[0],
-        distortion_model=model,
-        d=camera.distortion[:count].copy(),
+        distortion_model=ROS_DISTORTIONS.get(camera.model, camera.model),
+        d=camera.distortion[: len(COEFFICIENTS[camera.model])].copy(),
         k=np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
         r=np.eye(3).reshape(-1),
         p=np.array([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),

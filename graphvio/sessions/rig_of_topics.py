@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.cameras import MODEL_NAMES, N_COEFFICIENTS
 from graphvio.errors import RigError, SessionError
 from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_inverse
-from graphvio.rig import Camera, Imu, Rig, StereoPair
+from graphvio.rig import Camera, Imu, Rig, StereoPair, with_views
 from graphvio.sessions import cdr
-from graphvio.sessions.messages import CAMERA_INFO, COMPRESSED, IMAGE, IMU, TRANSFORMS
+from graphvio.sessions.messages import CAMERA_INFO, COMPRESSED, IMAGE, IMU, ROS_DISTORTIONS, TRANSFORMS
 from graphvio.sessions.topics import MessageReader, Topic, camera_of, of_type, preference
 
-_MODELS = {"plumb_bob": "radial-tangential", "rational_polynomial": "radial-tangential", "equidistant": "equidistant"}
+_MODELS = {ROS_DISTORTIONS.get(model, model): model for model in MODEL_NAMES}
 _SIDES = (("left", "right"), ("infra1", "infra2"), ("cam0", "cam1"), ("cam2", "cam3"))
 _WORDS = tuple(side for sides in _SIDES for side in sides)
 
@@ -56,7 +57,7 @@ def rig_of_topics(messages: MessageReader, name: str) -> Rig | None:
             left_T_right[0, 3] = -right_info.p[3] / right_info.p[0] if right_info.p[0] else 0.0
         left_camera = _camera(left, left_info, body_T_left)
         pairs.append(StereoPair(pair, left_camera, _camera(right, right_info, body_T_left @ left_T_right)))
-    return Rig(tuple(pairs), Imu() if imu is not None else None, name)
+    return with_views(Rig(tuple(pairs), Imu() if imu is not None else None, name))
 
 
 def stereo_topics(images: Iterable[str]) -> dict[str, tuple[str, str]]:
@@ -117,16 +118,21 @@ def _first(messages: MessageReader, topic: Topic) -> Any:
 def _camera(topic: str, info: Any, body_T_cam: Float) -> Camera:
     if info.distortion_model not in _MODELS:
         raise RigError(f"{topic}: its camera_info has the distortion {info.distortion_model!r}, which is not known")
-    distortion = np.asarray(info.d, dtype=np.float64)
-    if len(distortion) > 5 and np.any(distortion[5:]):
-        raise RigError(f"{topic}: its camera_info has {len(distortion)} distortion coefficients; at most 5 are known")
+    model, distortion = _MODELS[info.distortion_model], np.asarray(info.d, dtype=np.float64)
+    if np.any(distortion[N_COEFFICIENTS:]):
+        raise RigError(
+            f"{topic}: its camera_info has {len(distortion)} distortion coefficients; "
+            f"at most {N_COEFFICIENTS} are known"
+        )
+    if model == "rational" and not np.any(distortion[5:]):
+        model = "radial-tangential"
     k = np.asarray(info.k, dtype=np.float64).reshape(3, 3)
     return Camera(
         name=topic,
-        model=_MODELS[info.distortion_model],
+        model=model,
         size_px=(int(info.width), int(info.height)),
         intrinsics=np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
-        distortion=distortion[:5],
+        distortion=distortion[:N_COEFFICIENTS],
         body_T_cam=body_T_cam,
     )
 

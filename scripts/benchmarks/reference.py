@@ -126,8 +126,10 @@ def _undistorted(camera: Camera, pixels: Any) -> Float:
     given = np.asarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
     if camera.model == "equidistant":
         undistorted = cv2.fisheye.undistortPoints(given, _matrix(camera), camera.distortion[:4])
-    else:
+    elif camera.model == "radial-tangential":
         undistorted = cv2.undistortPoints(given, _matrix(camera), camera.distortion[:5])
+    else:
+        raise ValueError(f"camera {camera.name}: the reference has no {camera.model} lens")
     return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
 
 

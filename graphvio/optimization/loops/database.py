@@ -21,6 +21,15 @@ CENTRE_PX = 0.5
 """COLMAP's coordinate of the centre of an image's first pixel."""
 
 
+_COLMAP_MODELS = {
+    "radial-tangential": "FULL_OPENCV",
+    "equidistant": "OPENCV_FISHEYE",
+    "rational": "FULL_OPENCV",
+    "extended-unified": "EUCM",
+}
+_COLMAP_COEFFICIENTS = {"OPENCV": 4, "FULL_OPENCV": 8, "OPENCV_FISHEYE": 4, "EUCM": 2}
+
+
 def colmap() -> Any:
     """Import pycolmap, with logging from warnings on.
 
@@ -41,16 +50,25 @@ def image_name(session: str, camera: str, stamp_ns: int) -> str:
 
 
 def colmap_camera(camera: Camera, number: int) -> Any:
-    """Return a camera of the rig as a COLMAP camera."""
+    """Return a camera of the rig as a COLMAP camera.
+
+    Raises:
+        OptimizationError: if COLMAP has no model for its lens.
+        MissingExtraError: if the extra ``maps`` is not installed.
+    """
     fx, fy, cx, cy = (float(value) for value in camera.intrinsics)
-    k1, k2, p1, p2, k3 = (float(value) for value in camera.distortion)
+    lens = camera.distortion.tolist()
     centre = [cx + CENTRE_PX, cy + CENTRE_PX]
-    if camera.model == "equidistant":
-        model, lens = "OPENCV_FISHEYE", [k1, k2, p1, p2]
-    elif k3:
-        model, lens = "FULL_OPENCV", [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
+    if camera.model == "radial-tangential" and not camera.distortion[4]:
+        model = "OPENCV"
+    elif camera.model in _COLMAP_MODELS:
+        model = _COLMAP_MODELS[camera.model]
     else:
-        model, lens = "OPENCV", [k1, k2, p1, p2]
+        raise OptimizationError(
+            f"camera {camera.name}: COLMAP has no model for its {camera.model} lens; for loop closure and maps, "
+            f"calibrate it with one of {', '.join(_COLMAP_MODELS)}"
+        )
+    lens = lens[: _COLMAP_COEFFICIENTS[model]]
     width, height = camera.size_px
     return colmap().Camera(
         model=model, width=width, height=height, params=[fx, fy, *centre, *lens], camera_id=number,

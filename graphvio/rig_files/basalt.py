@@ -1,0 +1,122 @@
+"""Basalt's ``calibration.json``: cameras, their places in the IMU's frame, and the IMU.
+
+``T_imu_cam`` is ``body_T_cam``. The IMU's noise is that of continuous time, a density. Its calibrated reading is
+``(I + S) raw - bias``: ``I + S`` is graphvio's matrix of the sensor, and the bias is left out, because graphvio
+estimates it. ``cam_time_offset_ns`` is added to the cameras' stamps, so it has the sign of ``time_offset_s``.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.cameras import COEFFICIENTS
+from graphvio.errors import RigError
+from graphvio.geometry import rotation_from_quat_wxyz, se3
+from graphvio.rig import Camera, Imu, Rig, with_views
+from graphvio.rig_files.reading import NOISE_KEYS, Section, consecutive_pairs, named, read_text
+
+FILE_NAME = "calibration.json"
+_ROOT = "value0"
+_MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "pinhole": ("radial-tangential", ()),
+    "kb4": ("equidistant", COEFFICIENTS["equidistant"]),
+    "pinhole-radtan8": ("rational", COEFFICIENTS["rational"]),
+    "ds": ("double-sphere", COEFFICIENTS["double-sphere"]),
+    "eucm": ("extended-unified", COEFFICIENTS["extended-unified"]),
+    "ucm": ("extended-unified", ("alpha",)),
+}
+"""``camera_type`` -> graphvio's name, and the coefficients that the file has."""
+_NOISE = dict(zip(NOISE_KEYS, ("gyro_noise_std", "gyro_bias_std", "accel_noise_std", "accel_bias_std"), strict=True))
+_MAX_NORM_ERROR = 1e-3
+
+
+def is_calibration(path: Path) -> bool:
+    """Return whether a file is one of Basalt's calibrations, as far as its keys show."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(values, dict) and isinstance(values.get(_ROOT), dict) and "T_imu_cam" in values[_ROOT]
+
+
+def load(path: Path) -> Rig:
+    """Read a calibration; cameras 0 and 1 form the first pair, 2 and 3 the next.
+
+    Raises:
+        RigError: if it cannot be read or lacks a value, or does not describe a usable rig.
+    """
+    try:
+        values = json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise RigError(f"{path}: line {error.lineno} is not valid JSON ({error.msg}); correct it there") from None
+    if not isinstance(values, dict):
+        raise RigError(f"{path}: is no calibration of Basalt; it must be a mapping with {_ROOT}")
+    document = Section(values, path).section(_ROOT)
+    lists = {key: _list(document, key) for key in ("T_imu_cam", "intrinsics", "resolution")}
+    lengths = {key: len(each) for key, each in lists.items()}
+    if len(set(lengths.values())) > 1:
+        raise RigError(
+            f"{path}: has {', '.join(f'{n} {key}' for key, n in lengths.items())}; give one of each a camera"
+        )
+    with named(path):
+        cameras = [_camera(document, lists, i) for i in range(lengths["T_imu_cam"])]
+        return with_views(Rig(consecutive_pairs(cameras, path), _imu(document), path.stem))
+
+
+def _list(section: Section, key: str) -> list[Any]:
+    given = section.get(key)
+    if not isinstance(given, list):
+        raise RigError(f"{section.where(key)}: must be a list with one entry a camera")
+    return given
+
+
+def _camera(document: Section, lists: dict[str, list[Any]], i: int) -> Camera:
+    section = document.nested(lists["intrinsics"][i], f"intrinsics[{i}]")
+    camera_type = section.text("camera_type")
+    if camera_type not in _MODELS:
+        raise RigError(
+            f"{section.where('camera_type')}: unknown model {camera_type!r}; use one of {', '.join(_MODELS)}"
+        )
+    model, names = _MODELS[camera_type]
+    values = section.section("intrinsics")
+    coefficients = [values.number(name) for name in names]
+    if camera_type == "ucm":
+        coefficients.append(1.0)  # beta
+    sizes = Section({f"resolution[{i}]": lists["resolution"][i]}, document.file, document.key)
+    return Camera(
+        name=f"cam{i}",
+        model=model,
+        size_px=sizes.size(f"resolution[{i}]"),
+        intrinsics=np.array([values.number(name) for name in ("fx", "fy", "cx", "cy")]),
+        distortion=np.array(coefficients),
+        body_T_cam=_pose(document.nested(lists["T_imu_cam"][i], f"T_imu_cam[{i}]")),
+    )
+
+
+def _pose(section: Section) -> Float:
+    quat_wxyz = np.array([section.number(f"q{axis}") for axis in "wxyz"])
+    norm = np.linalg.norm(quat_wxyz)
+    if abs(norm - 1.0) > _MAX_NORM_ERROR:
+        raise RigError(f"{section.where('qw')}: the quaternion's norm is {norm:.4g}; it must be 1")
+    rotation = rotation_from_quat_wxyz(quat_wxyz / norm)
+    return se3(rotation, np.array([section.number(f"p{axis}") for axis in "xyz"]))
+
+
+def _imu(document: Section) -> Imu:
+    noise = document.noise("imu_update_rate", {})
+    for name, key in _NOISE.items():
+        given = document.get(key)
+        noise[name] = float(document.array(key, None if isinstance(given, list) else ()).max())  # of the axes
+    if document.values.get("calib_gyro_bias") is not None:
+        scale = document.array("calib_gyro_bias", (12,))[3:].reshape(3, 3).T  # by columns
+        noise["gyro_matrix"] = tuple((np.eye(3) + scale).ravel().tolist())
+    if document.values.get("calib_accel_bias") is not None:
+        scale = np.zeros((3, 3))
+        scale.T[np.triu_indices(3)] = document.array("calib_accel_bias", (9,))[3:]  # lower triangle, by columns
+        noise["accel_matrix"] = tuple((np.eye(3) + scale).ravel().tolist())
+    return Imu(**noise, time_offset_s=1e-9 * document.number("cam_time_offset_ns", 0.0))
