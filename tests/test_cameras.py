@@ -1,6 +1,6 @@
 """Lens models: projection, its inverse and derivatives, where they are valid, and faults of coefficients."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -206,7 +206,7 @@ def omnidirectional(points: Float, xi: float, k1: float, k2: float, p1: float, p
     )
 
 
-FORMULAS = {
+FORMULAS: dict[int, Callable[..., Float]] = {
     DOUBLE_SPHERE: double_sphere,
     EXTENDED_UNIFIED: extended_unified,
     OMNIDIRECTIONAL: omnidirectional,

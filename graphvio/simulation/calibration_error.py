@@ -29,7 +29,7 @@ class CalibrationError:
     Attributes:
         focal_percent: of a camera's focal length: fx and fy have one common factor.
         principal_point_px: of cx and cy of each camera.
-        distortion_percent: of k1 and k2 of each camera, each in percent of itself.
+        distortion_percent: of the first two coefficients of each camera, k1 and k2 of most, each in percent of itself.
         left_right_deg: rotation of the right camera about its own centre, for each axis.
         baseline_percent: length of the baseline.
         cameras_in_body_deg: rotation of all cameras together, about body's origin, for each axis.

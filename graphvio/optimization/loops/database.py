@@ -66,7 +66,7 @@ def colmap_camera(camera: Camera, number: int) -> Any:
     else:
         raise OptimizationError(
             f"camera {camera.name}: COLMAP has no model for its {camera.model} lens; for loop closure and maps, "
-            f"calibrate it with one of {', '.join(_COLMAP_MODELS)}"
+            f"calibrate it with one of {', '.join(_COLMAP_MODELS)}; sessions can be optimised with --no-loops"
         )
     lens = lens[: _COLMAP_COEFFICIENTS[model]]
     width, height = camera.size_px
