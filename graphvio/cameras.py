@@ -65,6 +65,7 @@ LINEAR_COEFFICIENTS = {
 MAX_ANGLE_RAD = np.deg2rad(80.0)
 _MAX_TAN = float(np.tan(MAX_ANGLE_RAD))
 _NEWTON_STEPS = 20
+_MORE_STEPS = 60  # polynomials of high degree approach their solution slowly from far away
 _NEWTON_TOLERANCE = 1e-12
 _ROUNDING = 1e-6
 
@@ -261,9 +262,10 @@ def _inverse_polynomial(model: int, distortion: Float, xd: float, yd: float) -> 
     """Invert `_polynomial` by Newton's method; False where it does not converge."""
     x, y, u, v, is_close = xd, yd, xd, yd, False
     a, b, c, d = 1.0, 0.0, 0.0, 1.0
-    for i in range(_NEWTON_STEPS + 1):
+    steps = _NEWTON_STEPS if model == RADIAL_TANGENTIAL else _MORE_STEPS
+    for i in range(steps + 1):
         u, v, a, b, c, d = _polynomial(model, distortion, x, y)
-        if is_close or i == _NEWTON_STEPS:
+        if is_close or i == steps:
             break
         if model == RATIONAL and a == -1.0:  # beyond a pole
             x, y = 0.5 * x, 0.5 * y
