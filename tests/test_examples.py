@@ -1,36 +1,63 @@
 """The examples run as they are typed."""
 
+import os
 import re
+import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+from calibration_walks import recorded
+
+from graphvio import load_trajectory, open_source
+
+pytestmark = pytest.mark.heavy
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-def _run(name: str, recording: Path) -> str:
-    command = [sys.executable, str(EXAMPLES / name), str(recording)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+def _run(name: str, *arguments: object, folder: Path, search: Path | None = None) -> str:
+    """Run a program of the examples in a folder, and return what it prints."""
+    command = [sys.executable, *(["-m", name] if search else [str(EXAMPLES / name)]), *map(str, arguments)]
+    environment = dict(os.environ)
+    if search is not None:
+        environment["PYTHONPATH"] = os.pathsep.join([str(search), environment.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=400, check=False
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-def test_own_sensors(room_walk: Path) -> None:
-    tracked = re.findall(r"^\d+ tracking (\S+) (\S+) (\S+) m$", _run("own_sensors.py", room_walk), re.MULTILINE)
+def _numbers(pattern: str, text: str) -> list[float]:
+    found = re.search(pattern, text)
+    assert found, text
+    return [float(each) for each in found.groups()]
+
+
+def test_own_sensors(room_walk: Path, tmp_path: Path) -> None:
+    tracked = re.findall(
+        r"^\d+ tracking (\S+) (\S+) (\S+) m$", _run("own_sensors.py", room_walk, folder=tmp_path), re.MULTILINE
+    )
     assert len(tracked) >= 60
     assert max(abs(float(x)) for x, _, _ in tracked) > 0.05
 
 
-def test_evaluate_with_evo(room_walk: Path) -> None:
-    own, evo = (float(value) for value in re.findall(r"ATE rmse (\S+) mm", _run("evaluate_with_evo.py", room_walk)))
+def test_evaluate_with_evo(room_walk: Path, tmp_path: Path) -> None:
+    own, evo = (
+        float(value)
+        for value in re.findall(r"ATE rmse (\S+) mm", _run("evaluate_with_evo.py", room_walk, folder=tmp_path))
+    )
     assert 0.0 < own < 5.0
     assert evo == pytest.approx(own, abs=0.2)
 
 
-def test_slam_front_end(room_walk: Path) -> None:
-    said = _run("slam_front_end.py", room_walk)
+def test_slam_front_end(room_walk: Path, tmp_path: Path) -> None:
+    said = _run("slam_front_end.py", room_walk, folder=tmp_path)
     assert said.count("keyframe ") >= 5
     odom, in_map = (
         [float(value) for value in found.split(",")]
@@ -43,3 +70,62 @@ def test_every_example_is_run_and_described() -> None:
     scripts = {file.name for file in EXAMPLES.glob("*.py")}
     assert scripts == set(re.findall(r"\]\((\w+\.py)\)", (EXAMPLES / "README.md").read_text()))
     assert scripts == set(re.findall(r'_run\("(\w+\.py)"', Path(__file__).read_text()))
+
+
+def test_plot_while_running(room_walk: Path, tmp_path: Path) -> None:
+    source = f"simulator:room?recording={room_walk}&seed=3&legs=1"
+    printed = _run("plot_while_running.py", "path.png", source, folder=tmp_path)
+    plots, poses = _numbers(r"(\d+) plots, the last with (\d+) poses", printed)
+    assert plots >= 5  # replaced on the way: the walk lasts 5 s
+    assert poses > 50
+    picture = cv2.imread(str(tmp_path / "path.png"))
+    assert picture is not None
+    assert np.std(picture) > 10
+    assert [file.name for file in tmp_path.iterdir()] == ["path.png"]
+
+
+def test_calibrate_two_odometries(tmp_path: Path) -> None:
+    turns = recorded(tmp_path / "turns", 12.0)
+    printed = _run("calibrate_two_odometries.py", turns, folder=tmp_path)
+    (ahead,) = _numbers(r"clock is ([\d.]+) s ahead", printed)
+    assert ahead == pytest.approx(12.345, abs=2e-3)
+    angle_deg, distance_mm = _numbers(r"rig file: ([\d.]+) deg, ([\d.]+) mm", printed)
+    assert angle_deg < 0.3
+    assert distance_mm < 20.0
+
+
+def test_batch_to_colmap(room_walk: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap", reason="pycolmap is not installed: the extra maps")
+    printed = _run("batch_to_colmap.py", room_walk, "optimized", folder=tmp_path)
+    frames, images, points = _numbers(r"(\d+) frames, (\d+) images, (\d+) points", printed)
+    assert images == 4 * frames
+    assert points > 100
+    assert _numbers(r"error: ([\d.]+) px", printed) < [2.0]
+
+
+@pytest.fixture
+def installed(tmp_path: Path) -> Path:
+    """A folder with the plug-in and its metadata, as pip leaves them; scripts/check_wheel uses pip."""
+    package = EXAMPLES / "custom_source"
+    project = tomllib.loads((package / "pyproject.toml").read_text())["project"]
+    site = tmp_path / "site"
+    metadata = site / f"graphvio_npz-{project['version']}.dist-info"
+    metadata.mkdir(parents=True)
+    shutil.copy(package / "graphvio_npz.py", site)
+    (metadata / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    )
+    points = project["entry-points"]["graphvio.sources"]
+    lines = [f"{name} = {value}\n" for name, value in points.items()]
+    (metadata / "entry_points.txt").write_text("".join(["[graphvio.sources]\n", *lines]))
+    return site
+
+
+def test_custom_source(room_walk: Path, installed: Path, tmp_path: Path) -> None:
+    _run("graphvio_npz", room_walk, "room-npz", folder=tmp_path, search=installed)
+    assert len(list((tmp_path / "room-npz/frames").glob("*.npz"))) == 100
+    _run("graphvio", "run", "room-npz", "--out", "results", "--to", "2", folder=tmp_path, search=installed)
+    poses = load_trajectory(tmp_path / "results/trajectory.txt")
+    truth = open_source(room_walk)
+    assert len(poses) == 41
+    assert poses.stamps_ns[0] == truth.start_ns

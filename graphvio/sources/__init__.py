@@ -4,5 +4,6 @@ from graphvio.sources.base import Source
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import ImageFiles, Index
 from graphvio.sources.opening import is_recording, open_source
+from graphvio.sources.tables import ImuTable
 
-__all__ = ["FaultLog", "ImageFiles", "Index", "Source", "is_recording", "open_source"]
+__all__ = ["FaultLog", "ImageFiles", "ImuTable", "Index", "Source", "is_recording", "open_source"]
