@@ -289,7 +289,7 @@ class Rig:
         return replace(self, pairs=tuple(pairs))
 
 
-def with_views(rig: Rig) -> Rig:
+def checked_views(rig: Rig) -> Rig:
     """Return a rig that was read from a file, after a test that its lenses reach all of their images.
 
     Cameras with a mask are not tested: images of a fisheye may have black corners.

@@ -4,11 +4,16 @@ from pathlib import Path
 
 import matplotlib
 import pytest
+from hypothesis import settings
 from rendered import rendered_once
 
 from graphvio.simulation import simulate
 
 matplotlib.use("Agg")
+
+# The first example may compile or load kernels: no deadline. The same examples in each run.
+settings.register_profile("graphvio", deadline=None, derandomize=True)
+settings.load_profile("graphvio")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

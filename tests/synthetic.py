@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from functools import cache
 
 import numpy as np
-from hypothesis import settings
 from scipy.spatial.transform import Rotation
 
 from graphvio.arrays import AnyArray, Float
@@ -16,10 +15,6 @@ from graphvio.frontend.stereo import triangulate
 from graphvio.measurements.motion import RelativeMotion
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Camera, Imu, Rig, StereoPair
-
-# A first call may compile; and a test that fails does so every time.
-settings.register_profile("synthetic", deadline=None, derandomize=True)
-settings.load_profile("synthetic")
 
 UP = np.array([0.0, 0.0, GRAVITY_M_S2])  # specific force at a standstill
 CAM_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # body_R_cam of a camera that looks along x

@@ -244,7 +244,7 @@ def test_live_error_in_a_thread_is_raised_and_the_recording_saved(
 
     monkeypatch.setattr(Odometry, "process", wrong)
     out = tmp_path / "walk.mcap"
-    done = live(f"replay:{recording}?speed=max", "--record", out)
+    done = live(f"{recording}?speed=max", "--record", out)
     assert isinstance(done.exception, RigError)
     assert open_store(out).is_whole
     assert framesets_in(out) >= 20

@@ -46,7 +46,7 @@ def printed(process: subprocess.Popen[str], start: str) -> str:
 
 
 def test_serve_sends_keyframes_and_takes_a_correction(room_walk: Path) -> None:
-    process = serve(f"replay:{room_walk}", "--port", 0)
+    process = serve(room_walk, "--port", 0)
     try:
         with Client(address_of(process)) as client:
             map_T_odom = np.eye(4)

@@ -63,7 +63,7 @@ def test_slam_makes_a_map_with_the_odometrys_path(made: Path, room_walk: Path) -
 
 def test_slam_localises_in_a_saved_map(made: Path, room_walk: Path, tmp_path: Path) -> None:
     """From the middle of the walk, where the new odom frame has nothing to do with the map's."""
-    done = slam(f"replay:{room_walk}?from_s=1.5&speed=0.3", "--map", made, "--out", tmp_path / "again")
+    done = slam(f"{room_walk}?from_s=1.5&speed=0.3", "--map", made, "--out", tmp_path / "again")
     assert done.returncode == 0, done.stderr
     online = load_trajectory(tmp_path / "again/online.txt")
     before, known = load_trajectory(made / "odometry.txt").at(online.stamps_ns, 0.1)

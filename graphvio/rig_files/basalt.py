@@ -17,7 +17,7 @@ from graphvio.arrays import Float
 from graphvio.cameras import COEFFICIENTS
 from graphvio.errors import RigError
 from graphvio.geometry import rotation_from_quat_wxyz, se3
-from graphvio.rig import Camera, Imu, Rig, with_views
+from graphvio.rig import Camera, Imu, Rig, checked_views
 from graphvio.rig_files.reading import NOISE_KEYS, Section, consecutive_pairs, named, read_text
 
 FILE_NAME = "calibration.json"
@@ -65,7 +65,7 @@ def load(path: Path) -> Rig:
         )
     with named(path):
         cameras = [_camera(document, lists, i) for i in range(lengths["T_imu_cam"])]
-        return with_views(Rig(consecutive_pairs(cameras, path), _imu(document), path.stem))
+        return checked_views(Rig(consecutive_pairs(cameras, path), _imu(document), path.stem))
 
 
 def _list(section: Section, key: str) -> list[Any]:

@@ -15,7 +15,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
-from graphvio.rig import Camera, Imu, Rig, checked_transform, with_views
+from graphvio.rig import Camera, Imu, Rig, checked_transform, checked_views
 from graphvio.rig_files import kalibr
 from graphvio.rig_files.reading import Section, consecutive_pairs, named, read_yaml
 
@@ -50,7 +50,7 @@ def load(path: Path) -> Rig:
                 imu_T_body = se3_inverse(body_T_imu)
     cameras = [_camera(name, section, imu_T_body) for name, section in sections.items()]
     with named(root):
-        return with_views(Rig(consecutive_pairs(cameras, root), imu, _name(root)))
+        return checked_views(Rig(consecutive_pairs(cameras, root), imu, _name(root)))
 
 
 def sensors_folder(path: Path) -> Path | None:
@@ -94,7 +94,7 @@ def _from_chain(chain: Path, names: list[str], has_imu: bool, name: str) -> Rig:
         imu = None
         if has_imu:
             imu = kalibr.imu_of(kalibr.find_imu_file(chain), kalibr.time_offset_of(document))
-        return with_views(Rig(pairs, imu, name))
+        return checked_views(Rig(pairs, imu, name))
 
 
 def _sensor(folder: Path) -> Section:

@@ -17,7 +17,7 @@ from graphvio.arrays import Float
 from graphvio.cameras import COEFFICIENTS
 from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
-from graphvio.rig import Camera, Imu, Rig, checked_transform, with_views
+from graphvio.rig import Camera, Imu, Rig, checked_transform, checked_views
 from graphvio.rig_files.reading import NOISE_KEYS, Section, consecutive_pairs, named, read_yaml
 
 PINHOLE = "pinhole"
@@ -59,7 +59,7 @@ def load(path: Path) -> Rig:
         cameras = cameras_of(document)
         pairs = consecutive_pairs(cameras, path)
         imu = imu_of(find_imu_file(path), time_offset_of(document)) if has_imu else None
-        return with_views(Rig(pairs, imu, path.stem))
+        return checked_views(Rig(pairs, imu, path.stem))
 
 
 def camera_names(document: Section) -> list[str]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from graphvio.calibration_sigmas import FACTORY, LEVELS, CalibrationSigmas
 from graphvio.cameras import COEFFICIENTS
 from graphvio.errors import RigError
-from graphvio.rig import Camera, Imu, Rig, StereoPair, as_written, with_views
+from graphvio.rig import Camera, Imu, Rig, StereoPair, as_written, checked_views
 from graphvio.rig_files.reading import NOISE_KEYS, Section, named, parse_yaml, read_text
 
 VERSION = 1
@@ -61,7 +61,7 @@ def parse(text: str, path: Path) -> Rig:
         pairs = tuple(_pair(document.nested(value, f"pairs[{i}]"), i) for i, value in enumerate(given))
         imu = _imu(document.section("imu")) if document.values.get("imu") is not None else None
         name = document.text("name") if document.values.get("name") is not None else path.stem
-        return with_views(Rig(pairs, imu, name, _sigmas(document)))
+        return checked_views(Rig(pairs, imu, name, _sigmas(document)))
 
 
 def save_rig(rig: Rig, path: str | Path) -> None:

@@ -94,7 +94,7 @@ def _parts(estimate: CalibrationEstimate) -> Iterator[tuple[str, str, float, Flo
     for j, pair in enumerate(rig.pairs):
         at = j * PAIR
         for camera, start in ((pair.left, at), (pair.right, at + CAMERA)):
-            focal = 200.0 / float(camera.intrinsics[:2].sum())
+            focal = 100.0 / float(camera.intrinsics[:2].mean())
             yield f"{camera.name}, focal lengths", "%", focal, whole[start : start + 2], 0.05, _DEPTHS
             rows = whole[start + 2 : start + INTRINSICS]
             yield f"{camera.name}, principal point", "px", 1.0, rows, 0.3, _DEPTHS

@@ -11,7 +11,7 @@ from graphvio.arrays import Float
 from graphvio.cameras import MODEL_NAMES, N_COEFFICIENTS
 from graphvio.errors import RigError, SessionError
 from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_inverse
-from graphvio.rig import Camera, Imu, Rig, StereoPair, with_views
+from graphvio.rig import Camera, Imu, Rig, StereoPair, checked_views
 from graphvio.sessions import cdr
 from graphvio.sessions.messages import CAMERA_INFO, COMPRESSED, IMAGE, IMU, ROS_DISTORTIONS, TRANSFORMS
 from graphvio.sessions.topics import MessageReader, Topic, camera_of, of_type, preference
@@ -57,7 +57,7 @@ def rig_of_topics(messages: MessageReader, name: str) -> Rig | None:
             left_T_right[0, 3] = -right_info.p[3] / right_info.p[0] if right_info.p[0] else 0.0
         left_camera = _camera(left, left_info, body_T_left)
         pairs.append(StereoPair(pair, left_camera, _camera(right, right_info, body_T_left @ left_T_right)))
-    return with_views(Rig(tuple(pairs), Imu() if imu is not None else None, name))
+    return checked_views(Rig(tuple(pairs), Imu() if imu is not None else None, name))
 
 
 def stereo_topics(images: Iterable[str]) -> dict[str, tuple[str, str]]:

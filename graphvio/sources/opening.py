@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from graphvio.errors import RigError, SourceError
@@ -19,8 +19,6 @@ from graphvio.sources.plug_ins import Layout, plug_ins
 from graphvio.sources.recording import Recording
 
 _MAX_TOLERANCE_MS = 10.0
-
-
 _LAYOUTS: tuple[Layout, ...] = (euroc, kitti_odometry, kitti_raw)
 
 
@@ -99,14 +97,18 @@ def _layout_of(path: Path) -> Layout:
     return layout
 
 
+def _layouts() -> Iterator[Layout]:
+    """Yield all layouts, own ones first: plug-ins are loaded where none of these matches."""
+    yield from _LAYOUTS
+    yield from plug_ins().layouts
+
+
 def _matching(path: Path) -> Layout | None:
-    """Return the layout of a folder; plug-ins are asked, and loaded, where no own layout matches."""
-    own = next((layout for layout in _LAYOUTS if layout.matches(path)), None)
-    return own or next((layout for layout in plug_ins().layouts if layout.matches(path)), None)
+    return next((layout for layout in _layouts() if layout.matches(path)), None)
 
 
 def _known() -> str:
-    return "; ".join(layout.LAYOUT for layout in (*_LAYOUTS, *plug_ins().layouts))
+    return "; ".join(layout.LAYOUT for layout in _layouts())
 
 
 def _required(rig: Rig | None, path: Path) -> Rig:
