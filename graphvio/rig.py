@@ -1,4 +1,4 @@
-"""The calibrated rig: stereo pairs and an IMU, rigidly mounted.
+"""The calibrated rig: stereo pairs, single cameras and an IMU, rigidly mounted.
 
 All extrinsics are ``body_T_cam``. Body is the IMU's frame; a rig without an IMU may choose any. The objects are
 immutable and validate their values on construction.
@@ -165,6 +165,36 @@ class StereoPair:
         """Distance between the optical centres, metres."""
         return float(np.linalg.norm(self.right_T_left[:3, 3]))
 
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Left and right camera."""
+        return self.left, self.right
+
+
+@dataclass(frozen=True, eq=False)
+class SingleCamera:
+    """A camera without a stereo partner: the depth of its points comes from motion.
+
+    Attributes:
+        left: the camera, whose corners are tracked as those of a pair's left camera are.
+    """
+
+    left: Camera
+
+    @property
+    def name(self) -> str:
+        """Name of the camera."""
+        return self.left.name
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The camera."""
+        return (self.left,)
+
+
+CameraGroup = StereoPair | SingleCamera
+"""Cameras whose images are tracked together: two, or one."""
+
 
 @dataclass(frozen=True)
 class Imu:
@@ -227,44 +257,52 @@ class Imu:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Stereo pairs and at most one IMU.
+    """Stereo pairs, cameras without a partner, and at most one IMU.
 
     Attributes:
         pairs: at least one.
         imu: None for vision only.
         name: used in messages and results.
         calibration_sigmas: how far the calibration is known.
+        singles: cameras without a partner.
 
     Raises:
-        RigError: if there is no pair, or two cameras or pairs share a name.
+        RigError: if there is no pair, or two cameras, or two groups of cameras, share a name.
     """
 
     pairs: tuple[StereoPair, ...]
     imu: Imu | None = None
     name: str = "rig"
     calibration_sigmas: CalibrationSigmas = FACTORY
+    singles: tuple[SingleCamera, ...] = ()
 
     def __post_init__(self) -> None:
         _set(self, "pairs", tuple(self.pairs))
+        _set(self, "singles", tuple(self.singles))
         if not self.pairs:
             raise RigError(f"{self.name}: has no stereo pair; graphvio needs at least one")
         names = [camera.name for camera in self.cameras]
-        for kind, all_names in (("camera", names), ("pair", [pair.name for pair in self.pairs])):
+        for kind, all_names in (("camera", names), ("group", [group.name for group in self.groups])):
             twice = {n for n in all_names if all_names.count(n) > 1}
             if twice:
                 raise RigError(f"{self.name}: {kind} {sorted(twice)[0]!r} appears twice; names must differ")
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """All cameras: left and right of the first pair, then of the second, and so on."""
-        return tuple(camera for pair in self.pairs for camera in (pair.left, pair.right))
+        """All cameras: left and right of the first pair, then of the second, and so on; then single ones."""
+        return tuple(camera for group in self.groups for camera in group.cameras)
+
+    @property
+    def groups(self) -> tuple[CameraGroup, ...]:
+        """Pairs, then cameras without a partner: the indices of `graphvio.measurements.sensors.FrameSet.images`."""
+        return (*self.pairs, *self.singles)
 
     def left2_T_left1(self, first: int = 0, second: int = 1) -> Float:
         """Transform (4, 4) from one pair's left camera to another's, ``P_12`` of the paper's eq. (1)."""
         return self.pairs[second].left.cam_T_body @ self.pairs[first].left.body_T_cam
 
     def with_pairs(self, indices: Sequence[int]) -> Rig:
-        """Select pairs of the rig.
+        """Select pairs of the rig, without cameras that have no partner.
 
         Args:
             indices: of the pairs, in the order wanted.
@@ -277,7 +315,27 @@ class Rig:
                 raise RigError(f"{self.name}: there is no pair {index}; choose from 0 to {len(self.pairs) - 1}")
         if len(set(indices)) < len(indices):
             raise RigError(f"{self.name}: a pair is asked for twice; name each once")
-        return replace(self, pairs=tuple(self.pairs[i] for i in indices))
+        return replace(self, pairs=tuple(self.pairs[i] for i in indices), singles=())
+
+    def with_only(self, cameras: Sequence[str]) -> Rig:
+        """Select cameras of the rig: pairs of which both are selected stay pairs, others become single cameras.
+
+        Args:
+            cameras: names, or numbers in `cameras`.
+
+        Raises:
+            RigError: if there is no such camera, or no pair is left.
+        """
+        names = [camera.name for camera in self.cameras]
+        wanted = {name if name in names or not name.isdecimal() else _at(names, int(name)) for name in cameras}
+        for name in sorted(wanted - set(names)):
+            raise RigError(f"{self.name}: there is no camera {name!r}; choose from {', '.join(names)}")
+        pairs = [pair for pair in self.pairs if {camera.name for camera in pair.cameras} <= wanted]
+        if not pairs:
+            raise RigError(f"{self.name}: none of its pairs is among {', '.join(cameras)}; graphvio needs at least one")
+        paired = {camera.name for pair in pairs for camera in pair.cameras}
+        singles = [SingleCamera(camera) for camera in self.cameras if camera.name in wanted - paired]
+        return replace(self, pairs=tuple(pairs), singles=tuple(singles))
 
     def without_imu(self) -> Rig:
         """Drop the IMU."""
@@ -286,7 +344,12 @@ class Rig:
     def with_cameras(self, change: Callable[[Camera], Camera]) -> Rig:
         """Replace each camera by what a function makes of it."""
         pairs = [replace(pair, left=change(pair.left), right=change(pair.right)) for pair in self.pairs]
-        return replace(self, pairs=tuple(pairs))
+        singles = [SingleCamera(change(single.left)) for single in self.singles]
+        return replace(self, pairs=tuple(pairs), singles=tuple(singles))
+
+
+def _at(names: Sequence[str], number: int) -> str:
+    return names[number] if number < len(names) else str(number)
 
 
 def checked_views(rig: Rig) -> Rig:

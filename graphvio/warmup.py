@@ -24,6 +24,7 @@ from graphvio.backend.states import RigState
 from graphvio.backend.time_offset import integrated_rates
 from graphvio.config import Config
 from graphvio.frontend.alignment import learn_from_nothing
+from graphvio.frontend.motion_stereo import FirstSights, MotionHistory
 from graphvio.frontend.observations import Observations, RigArrays, correspond
 from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.tracker import PairTracker
@@ -109,6 +110,10 @@ def _warm_up_tracking(rig: Rig, config: Config) -> None:
         frame = tracker.observe(stamp_ns, noise, noise, np.eye(4), np.eye(4))
         tracker.keep_keyframe_patches()
     correspond({0: frame}, {0: frame})
+    if rig.singles:
+        history = MotionHistory()
+        history.restart(frame.stamp_ns)
+        FirstSights().locate(frame.ids, frame.left, history, np.eye(4), 1.0, 1.0)
     common_rows(frame.ids, frame.ids)
     orientations(noise, np.full((1, 2), 20.0))
     pair.left.project(np.ones((1, 3)))

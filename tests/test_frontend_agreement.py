@@ -11,6 +11,7 @@ from graphvio.arrays import AnyArray, Float
 from graphvio.config import Config
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, _consensus_sets, _in_order, agree
+from graphvio.frontend.alignment import Place
 from graphvio.frontend.frozen import Frozen
 from graphvio.frontend.observations import Correspondences, Observations, RigArrays
 from graphvio.frontend.pair_reports import pair_reports
@@ -40,7 +41,8 @@ def agreement_of(
 ) -> Agreement:
     rng = np.random.default_rng(seed)
     joint = joint_motion(arrays, seen, STILL, CONFIG, rng)
-    return agree(arrays, seen, joint, CONFIG, rng, uncertain or {}, in_doubt)
+    places = {j: Place(covariance) for j, covariance in (uncertain or {}).items()}
+    return agree(arrays, seen, joint, CONFIG, rng, places, in_doubt)
 
 
 def mixed(first: tuple[Float, int], second: tuple[Float, int], seed: int = 0) -> Observations:

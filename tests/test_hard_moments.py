@@ -145,7 +145,7 @@ def frozen(pairs: tuple[int, ...], until_s: float) -> Change:
     def change(seconds: float, frameset: FrameSet) -> FrameSet:
         if not 2.0 <= seconds < until_s:
             return frameset
-        kept.update({} if kept else {j: frameset.images[j] for j in pairs})
+        kept.update({} if kept else {j: frameset.stereo[j] for j in pairs})
         again = {j: (left.copy(), right.copy()) for j, (left, right) in kept.items()}
         return replace(frameset, images={**frameset.images, **again})
 

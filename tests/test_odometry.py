@@ -331,12 +331,12 @@ def test_malformed_measurements_are_refused(odometry: Odometry) -> None:
     with pytest.raises(MeasurementError, match="three components"):
         odometry.process(ImuSample(1, np.zeros(2), np.zeros(3)))
     with pytest.raises(MeasurementError, match=r"\(left, right\)"):
-        odometry.process(FrameSet(1, {0: (np.zeros((480, 640), np.uint8),)}))  # type: ignore[dict-item]
+        odometry.process(FrameSet(1, {0: (np.zeros((480, 640), np.uint8),) * 3}))
     image = np.zeros((480, 640), dtype=np.uint8)
     odometry.process(FrameSet(0, {0: np.stack([image, image])}))  # type: ignore[dict-item]
     for images, message in (
         ([(image, image)], "images is a list"),
-        ({0: None}, "not two images"),
+        ({0: None}, "not one or two images"),
         ({0: (image, [[1, 2], [3, 4]])}, "something else than arrays"),
     ):
         with pytest.raises(MeasurementError, match=message):

@@ -181,7 +181,7 @@ class SeparateMotions:
 
     def add(self, frameset: FrameSet) -> None:
         """Process the next frameset, all pairs in parallel."""
-        list(self._workers.map(lambda j: self._pairs[j].add(j, frameset), sorted(frameset.images)))
+        list(self._workers.map(lambda j: self._pairs[j].add(j, frameset), sorted(frameset.stereo)))
 
     def motions(self) -> list[CameraMotions]:
         """Return the motions of each pair's left camera up to now."""

@@ -26,6 +26,13 @@ Topics = Annotated[
 Pairs = Annotated[
     str | None, typer.Option("--pairs", help="Use only these stereo pairs, such as 0 or 0,1.  [default: all]")
 ]
+Cameras = Annotated[
+    str | None,
+    typer.Option(
+        "--cameras",
+        help="Use only these cameras, by name or number, such as 0,1,2; pairs among them stay pairs.  [default: all]",
+    ),
+]
 NoImu = Annotated[bool, typer.Option("--no-imu", help="Use the cameras alone.")]
 FromS = Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.")]
 ToS = Annotated[float | None, typer.Option("--to", help="End at this second of the recording.")]

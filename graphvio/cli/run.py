@@ -31,6 +31,7 @@ def run(
         Path | None, typer.Option("--out", help="Folder for the results, new or empty.  [default: results/NAME-N]")
     ] = None,
     pairs: options.Pairs = None,
+    cameras: options.Cameras = None,
     no_imu: options.NoImu = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
@@ -64,7 +65,9 @@ def run(
     from graphvio.warmup import warm_up
 
     settings = Config.load(config)
-    opened = open_recording(source, rig, settings, pairs=pairs, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
+    opened = open_recording(
+        source, rig, settings, pairs=pairs, cameras=cameras, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics
+    )
     folder = out if out is not None else ResultWriter.new_folder(Path("results"), opened.name)
     with ExitStack() as stack:
         writer = stack.enter_context(ResultWriter(folder, opened.rig, settings.to_yaml()))

@@ -53,6 +53,10 @@ def simulate(
             metavar="NAME",
         ),
     ] = None,
+    rig: Annotated[
+        str,
+        typer.Option("--rig", help="Rig file; or paper, two stereo pairs, stereo, or stereo+back.", metavar="RIG"),
+    ] = "paper",
     verbose: options.Verbose = False,
 ) -> None:
     """Simulate a walk with four cameras and an IMU, and write it in the EuRoC/ASL layout.
@@ -69,9 +73,12 @@ def simulate(
         graphvio simulate corridor --out corridor --duration 40 --seed 1
 
         graphvio simulate room --out room --calibration-error 2
+
+        graphvio simulate room --out room --rig stereo+back
     """
     from graphvio.simulation import CalibrationError
     from graphvio.simulation import simulate as simulate_recording
+    from graphvio.simulation.named_rigs import rig_of
 
     error = None
     if calibration_error is not None:
@@ -90,6 +97,7 @@ def simulate(
             calibration_error=error,
             calibration_seed=calibration_seed,
             rig_change=rig_change,
+            rig=rig_of(rig),
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     typer.echo(

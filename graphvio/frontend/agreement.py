@@ -12,9 +12,9 @@ from itertools import combinations
 
 import numpy as np
 
-from graphvio.arrays import Bool, Float
+from graphvio.arrays import Bool
 from graphvio.config.stages import MotionConfig
-from graphvio.frontend.alignment import combined, placed
+from graphvio.frontend.alignment import Place, combined, placed
 from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.ransac import search
 from graphvio.frontend.refinement import Refined, refine
@@ -22,7 +22,7 @@ from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.geometry import se3_inverse, se3_log
 
 _T = THRESHOLDS.agreement
-_NONE: Mapping[int, Float] = {}
+_NONE: Mapping[int, Place] = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ def agree(
     joint: Refined,
     config: MotionConfig,
     rng: np.random.Generator,
-    uncertain: Mapping[int, Float] = _NONE,
+    uncertain: Mapping[int, Place] = _NONE,
     in_doubt: bool = False,
 ) -> Agreement:
     """Compare the pairs' own motions, and return the motion of each consensus set.
@@ -78,8 +78,8 @@ def agree(
         joint: `graphvio.frontend.selection.joint_motion` of these.
         config: Configuration of the motion stage.
         rng: Source of random triples.
-        uncertain: Pair index -> covariance (6, 6) of an error d of its extrinsics, which are ``exp(d) body_T_left``, of
-            the pairs whose extrinsics have been corrected.
+        uncertain: Pair index -> how well its extrinsics are known, of pairs whose extrinsics have been corrected or are
+            not known exactly.
         in_doubt: Whether the pairs contradicted each other a moment ago: a smaller distance then separates them.
     """
     everyone = observations.pairs
@@ -97,7 +97,8 @@ def agree(
     max_distance = max((apart[pair] for pairs in sets for pair in combinations(sorted(pairs), 2)), default=0.0)
     if len(sets) > 1:
         hypotheses = _in_order(
-            [_hypothesis(rig, observations, sorted(pairs), own, placed_motions, uncertain, config) for pairs in sets]
+            [_hypothesis(rig, observations, sorted(pairs), own, placed_motions, uncertain, config) for pairs in sets],
+            frozenset(j for j in own if rig.is_single[j] and j in uncertain),
         )
     else:
         if sets and not uncertain.keys().isdisjoint(sets[0]):
@@ -124,15 +125,18 @@ def _consensus_sets(pairs: Sequence[int], apart: Mapping[tuple[int, int], float]
     return sets
 
 
-def _in_order(hypotheses: list[MotionHypothesis]) -> list[MotionHypothesis]:
-    """Sort by support, but comparable ones by their lowest pair.
+def _in_order(hypotheses: list[MotionHypothesis], unknown: frozenset[int] = frozenset()) -> list[MotionHypothesis]:
+    """Sort by support, but comparable ones by their lowest pair, and last those of cameras in unknown places only.
 
     With wrong extrinsics several pairs are right, and alternating between them would accumulate the error.
     """
+    last = [hypothesis for hypothesis in hypotheses if unknown.issuperset(hypothesis.pairs)]
+    hypotheses = [hypothesis for hypothesis in hypotheses if not unknown.issuperset(hypothesis.pairs)] or last
     enough = _T.min_comparable_support * max(hypothesis.support for hypothesis in hypotheses)
     comparable = [hypothesis for hypothesis in hypotheses if hypothesis.support >= enough]
     others = [hypothesis for hypothesis in hypotheses if hypothesis.support < enough]
-    return sorted(comparable, key=lambda each: each.pairs[0]) + sorted(others, key=lambda each: -each.support)
+    ordered = sorted(comparable, key=lambda each: each.pairs[0]) + sorted(others, key=lambda each: -each.support)
+    return ordered if hypotheses is last else ordered + last
 
 
 def disagreement(one: Refined, other: Refined) -> float:
@@ -155,6 +159,8 @@ def _own_motion(
     rng: np.random.Generator,
 ) -> Refined:
     seen, inlier = observations.of_pair(pair), joint.inlier[observations.pair == pair]
+    if rig.is_single[pair]:
+        return _own_motion_of_single(rig, seen, inlier, joint, config)
     share = float(inlier.mean())
     if share >= _T.min_joint_share:
         return refine(rig, seen, joint.cur_T_ref, config, known=inlier)
@@ -164,13 +170,23 @@ def _own_motion(
     return refine(rig, seen, start, config)
 
 
+def _own_motion_of_single(
+    rig: RigArrays, seen: Observations, inlier: Bool, joint: Refined, config: MotionConfig
+) -> Refined:
+    """Refine the joint motion on the points of a single camera whose depth is known; of the others it says nothing."""
+    known = seen.has_known_depth(config.pixel_sigma_px)
+    if not known.any():
+        return replace(joint, inlier=np.zeros(len(known), dtype=bool), errors_px=np.full(len(known), np.nan))
+    return _spread_over(known, refine(rig, seen.of_rows(known), joint.cur_T_ref, config))
+
+
 def _hypothesis(
     rig: RigArrays,
     observations: Observations,
     pairs: list[int],
     own: Mapping[int, Refined],
     placed_motions: Mapping[int, Refined],
-    uncertain: Mapping[int, Float],
+    uncertain: Mapping[int, Place],
     config: MotionConfig,
 ) -> MotionHypothesis:
     """Return the motion of a consensus set."""

@@ -29,7 +29,7 @@ class FrozenImages:
     """Compares each image with the one before it, byte for byte: the noise of a sensor changes every image."""
 
     def __init__(self) -> None:
-        self._last: dict[int, tuple[Image, Image]] = {}
+        self._last: dict[int, tuple[Image, ...]] = {}
         self._changed_ns: dict[int, int] = {}  # when both of a pair's images last were new
         self._seen_ns: dict[int, int] = {}  # when a pair last had images
 
@@ -42,9 +42,9 @@ class FrozenImages:
             repeats[j] = 0 if before is None else sum(_same(a, b) for a, b in zip(before, images, strict=True))
             if repeats[j] == 0:
                 self._changed_ns[j] = frameset.stamp_ns
-            self._last[j] = (images[0], images[1])
+            self._last[j] = tuple(images)
             self._seen_ns[j] = frameset.stamp_ns
-        if repeats and all(count == 2 for count in repeats.values()) and not others_changed:
+        if repeats and all(count == len(frameset.images[j]) for j, count in repeats.items()) and not others_changed:
             return Frozen(frozenset(), max(self._changed_ns[j] for j in repeats), "every image repeats the one before")
         stuck = frozenset(j for j, count in repeats.items() if count)
         return Frozen(stuck, None, f"pairs {sorted(stuck)} repeat an image" if stuck else "")

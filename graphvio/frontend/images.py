@@ -15,13 +15,15 @@ def checked(frameset: FrameSet, rig: Rig) -> FrameSet:
     """Return the frameset with contiguous images.
 
     Raises:
-        RigError: if an image is not of the type and size that the rig says.
+        RigError: if an image is not of the type and size that the rig says, or a group has another number of images.
     """
-    images = {
-        j: (_checked(left, rig.pairs[j].left), _checked(right, rig.pairs[j].right))
-        for j, (left, right) in frameset.images.items()
-    }
-    return FrameSet(frameset.stamp_ns, images)
+    checked_images = {}
+    for j, images in frameset.images.items():
+        cameras = rig.groups[j].cameras
+        if len(images) != len(cameras):
+            raise RigError(f"{rig.groups[j].name}: has {len(images)} images; the rig says {len(cameras)}")
+        checked_images[j] = tuple(_checked(image, camera) for image, camera in zip(images, cameras, strict=True))
+    return FrameSet(frameset.stamp_ns, checked_images)
 
 
 def _checked(image: Image, camera: Camera) -> Image:

@@ -9,7 +9,7 @@ from graphvio.frontend.lucas_kanade import register
 from graphvio.frontend.patches import packed
 from graphvio.frontend.prediction import around, inverse_depths_around, predict_warps
 from graphvio.frontend.tracks import PairFrame
-from graphvio.rig import StereoPair
+from graphvio.rig import CameraGroup, SingleCamera
 
 _MAX_REGISTRATION_PX = 2.0
 _SAME_PATCH = 0.8  # correlation of the patches
@@ -22,11 +22,11 @@ class KeyframePatches:
     predicted motion and the slant of its surface, gives the point's place without that drift.
 
     Args:
-        pair: to which the left images belong.
+        pair: to which the left images belong, or the single camera.
         window_px: side of the patches; an even one counts as the next.
     """
 
-    def __init__(self, pair: StereoPair, window_px: int) -> None:
+    def __init__(self, pair: CameraGroup, window_px: int) -> None:
         self._pair = pair
         self._half = window_px // 2
         side = 2 * self._half + 1
@@ -41,7 +41,7 @@ class KeyframePatches:
         self._image = packed(image)
         self._place(frame)
 
-    def recalibrate(self, pair: StereoPair) -> None:
+    def recalibrate(self, pair: CameraGroup) -> None:
         """Take another calibration of the cameras."""
         self._pair = pair
         self._place(self._frame.recalibrated(pair))
@@ -51,6 +51,9 @@ class KeyframePatches:
         self._frame = frame
         pixels = around(frame.pixels, self._step_px)
         self._rays = self._pair.left.unproject(pixels.reshape(-1, 2))[0].reshape(pixels.shape)
+        if isinstance(self._pair, SingleCamera):
+            self._inverse_depths = np.tile(np.maximum(frame.points[:, 2], 0.0), (5, 1))  # no slant is seen
+            return
         right = self._pair.right
         self._inverse_depths = inverse_depths_around(
             self._rays,

@@ -18,9 +18,13 @@ from graphvio.frontend.tracks import PairFrame, common_rows
 from graphvio.kernels import kernel, put
 from graphvio.rig import Rig
 
+_MAX_RELATIVE_DEPTH_SIGMA = 0.1
+
 
 class RigArrays(NamedTuple):
-    """Calibration of a rig of P pairs, as kernels take it; side 0 is left, 1 right.
+    """Calibration of a rig of P groups of cameras, as kernels take it; side 0 is left, 1 right.
+
+    A single camera is a pair whose right camera, which never sees a point, is the left one again.
 
     Attributes:
         cam_T_body: (P, 2, 4, 4).
@@ -36,10 +40,15 @@ class RigArrays(NamedTuple):
     def of(rig: Rig) -> RigArrays:
         """Collect the arrays of a rig."""
         return RigArrays(
-            np.array([[pair.left.cam_T_body, pair.right.cam_T_body] for pair in rig.pairs]),
-            np.array([pair.left.body_T_cam for pair in rig.pairs]),
-            np.array([[pair.left.focal_px, pair.right.focal_px] for pair in rig.pairs]),
+            np.array([[group.cameras[0].cam_T_body, group.cameras[-1].cam_T_body] for group in rig.groups]),
+            np.array([group.left.body_T_cam for group in rig.groups]),
+            np.array([[group.cameras[0].focal_px, group.cameras[-1].focal_px] for group in rig.groups]),
         )
+
+    @property
+    def is_single(self) -> Bool:
+        """(P,) which groups are single cameras."""
+        return np.array([np.array_equal(left, right) for left, right in self.cam_T_body])
 
     def crossed(self, pairs: Sequence[tuple[int, int]]) -> RigArrays:
         """Return a rig of (a, b): points of pair a's left camera at the reference are seen by pair b's cameras now."""
@@ -77,6 +86,10 @@ class Observations(NamedTuple):
     def pairs(self) -> tuple[int, ...]:
         """Pairs that have points, in order."""
         return tuple(int(j) for j in np.flatnonzero(np.bincount(self.pair)))
+
+    def has_known_depth(self, sigma_px: float) -> Bool:
+        """Select the points (N,) whose depth is known to a tenth, for a pixel noise."""
+        return np.asarray(sigma_px * np.sqrt(self.covariances[:, 2, 2]) < _MAX_RELATIVE_DEPTH_SIGMA * self.points[:, 2])
 
     def of_pair(self, pair: int) -> Observations:
         """Return one pair's points, not copied."""
@@ -128,11 +141,13 @@ class Correspondences:
         observations: of all pairs.
         rows: pair -> (M,) rows of the current `PairFrame` that take part, in order.
         candidates: pair -> number of points that its reference had, of the pairs that take part.
+        singles: which of them are single cameras.
     """
 
     observations: Observations
     rows: Mapping[int, Int]
     candidates: Mapping[int, int]
+    singles: frozenset[int] = frozenset()
 
     def identities(self, frames: Mapping[int, PairFrame], inlier: Bool) -> dict[int, Int]:
         """Return pair -> identities, increasing, of its current tracks that are inliers among all points (N,)."""
@@ -149,12 +164,15 @@ def correspond(reference: Mapping[int, PairFrame], current: Mapping[int, PairFra
         candidates[pair] = int(np.count_nonzero(then.has_depth))
         joined, rows[pair] = _join(
             pair, then.ids, then.has_depth, then.points, then.covariances,
-            now.ids, now.has_depth, now.left, now.right,
+            now.ids, now.has_right, now.left, now.right,
         )  # fmt: skip
         parts.append(joined)
     if not parts:
         return Correspondences(_NOTHING, rows, candidates)
-    return Correspondences(Observations(*(np.concatenate(c) for c in zip(*parts, strict=True))), rows, candidates)
+    singles = frozenset(j for j in rows if current[j].is_single)
+    return Correspondences(
+        Observations(*(np.concatenate(c) for c in zip(*parts, strict=True))), rows, candidates, singles
+    )
 
 
 @kernel

@@ -15,8 +15,8 @@ from graphvio.measurements.motion import PairReport
 
 
 def inliers_of(pair: int, correspondences: Correspondences, agreement: Agreement) -> Bool:
-    """Return which of a pair's points (M,) are inliers of its own motion, or if it has none, of the rig's."""
-    if pair in agreement.own:
+    """Return which of a pair's points (M,) are inliers of its own motion; of a single camera, of the rig's."""
+    if pair in agreement.own and pair not in correspondences.singles:
         return agreement.own[pair].inlier
     return np.asarray(agreement.hypotheses[0].refined.inlier[correspondences.observations.pair == pair])
 

@@ -39,7 +39,7 @@ class References:
 
     def recalibrate(self, rig: Rig) -> None:
         """Take another calibration of the rig: the references' points are triangulated again."""
-        self._frames = {j: frame.recalibrated(rig.pairs[j]) for j, frame in self._frames.items()}
+        self._frames = {j: frame.recalibrated(rig.groups[j]) for j, frame in self._frames.items()}
 
     def clear(self) -> None:
         """Forget all."""

@@ -85,7 +85,12 @@ def refine(
         images_rig, images, rows = image_by_image(rig, observations)
         counted = np.ones(len(rows)) if known is None else known[rows].astype(np.float64)
         return Refined(*_refined_per_image(start, rig, observations, inlier, images_rig, images, counted, *settings))
-    return Refined(*_refined(start, rig, observations, inlier, *settings))
+    refined = Refined(*_refined(start, rig, observations, inlier, *settings))
+    in_front = np.isfinite(refined.errors_px)
+    if in_front[refined.inlier].all():
+        return refined
+    # The last step took points behind a camera, whose depth is hardly known: once more without them.
+    return Refined(*_refined(start, rig, observations, refined.inlier & in_front, *settings))
 
 
 @kernel

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from graphvio.arrays import Float
+from graphvio.arrays import Bool, Float
 from graphvio.config.stages import MotionConfig
 from graphvio.frontend.cost import robust_cost
 from graphvio.frontend.observations import Observations, RigArrays
@@ -24,7 +24,17 @@ def joint_motion(
         config: of this stage.
         rng: source of the random triples.
     """
-    return refine(rig, observations, search(rig, observations, predicted, config, rng), config)
+    known = _is_depth_known(rig, observations, config.pixel_sigma_px)
+    searched = observations if known.all() or not known.any() else observations.of_rows(known)
+    return refine(rig, observations, search(rig, searched, predicted, config, rng), config)
+
+
+def _is_depth_known(rig: RigArrays, observations: Observations, sigma_px: float) -> Bool:
+    """Select the points (N,) that a hypothesis can be scored on: not those of single cameras whose depth is unknown."""
+    is_single = rig.is_single
+    if not is_single.any():
+        return np.ones(len(observations.pair), dtype=bool)
+    return np.asarray(~is_single[observations.pair] | observations.has_known_depth(sigma_px))
 
 
 def best_pair_motion(

@@ -1,4 +1,4 @@
-"""Corners of one stereo pair through time: tracked, matched left to right, triangulated and replenished."""
+"""Corners of one stereo pair or single camera through time: tracked, matched, triangulated and replenished."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from graphvio.frontend.images import allowed_pixels
 from graphvio.frontend.keyframe_patches import KeyframePatches
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
 from graphvio.frontend.matching import StereoMatcher
+from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH, FirstSights, MotionHistory
 from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.tracks import PairFrame, common_rows, passes, usable_at
-from graphvio.rig import StereoPair
+from graphvio.rig import CameraGroup, StereoPair
 from graphvio.timing import Stopwatch
 
 _MAX_TRACKS_PER_CELL = 2
@@ -24,16 +25,26 @@ _LEVELS_AFTER_PREDICTION = 2  # suffice where the motion is predicted; tracks th
 
 
 class PairTracker:
-    """Tracker of the corners of one stereo pair from frame to frame."""
+    """Tracker of the corners of one stereo pair, or of a single camera, from frame to frame.
 
-    def __init__(self, pair: StereoPair, config: Config) -> None:
+    Args:
+        pair: the cameras.
+        config: of all stages.
+        history: motions since the latest keyframes, by which a single camera's points are located.
+    """
+
+    def __init__(self, pair: CameraGroup, config: Config, history: MotionHistory | None = None) -> None:
         self._pair = pair
         self._config = config
         self._cell_px = config.corners.cell_px(pair.left.size_px[0])
         self._allowed = allowed_pixels(pair.left, config.tracking.window_px)
-        self._matcher = StereoMatcher(pair, config, allowed_pixels(pair.right, config.tracking.window_px))
+        self._matcher = None
+        if isinstance(pair, StereoPair):
+            self._matcher = StereoMatcher(pair, config, allowed_pixels(pair.right, config.tracking.window_px))
+        self._history, self._first_sights = history or MotionHistory(), FirstSights()
+        self._body_T_left = pair.left.body_T_cam
         self._next_id = 0
-        self._last = PairFrame.empty()
+        self._last = replace(PairFrame.empty(), is_single=self._matcher is None)
         self._left: Pyramid = ()
         self._right: Pyramid = ()
         self._patches = KeyframePatches(pair, config.tracking.window_px)
@@ -43,7 +54,7 @@ class PairTracker:
         self,
         stamp_ns: int,
         left: Image,
-        right: Image,
+        right: Image | None,
         left_T_left_prev: Float | None,
         left_T_left_keyframe: Float | None,
     ) -> PairFrame:
@@ -51,14 +62,14 @@ class PairTracker:
 
         Args:
             stamp_ns: of these images.
-            left: (height, width), contiguous, of the rig's image size.
-            right: likewise.
+            left: (height, width), contiguous, of the rig's image size; or the image of a single camera.
+            right: likewise, None of a single camera.
             left_T_left_prev: (4, 4) predicted motion of points since the previous images, or None if unknown.
             left_T_left_keyframe: (4, 4) the same since the keyframe of `keep_keyframe_patches`, or None.
         """
         watch = Stopwatch()
         before, levels = self._left, max(self._config.tracking.levels, 2)
-        self._left, self._right = build_pyramid(left, levels), build_pyramid(right, 2)
+        self._left, self._right = build_pyramid(left, levels), () if right is None else build_pyramid(right, 2)
         self._noise_sigma = noise_sigma(left)
         watch.lap("pyramid")
         last, guess, inverse_depths = self._predict(left_T_left_prev)
@@ -91,12 +102,23 @@ class PairTracker:
         self._next_id += n
         watch.lap("stereo")
         self._last = self._last.extended(replace(new, stage_ms=watch.stage_ms))
+        if self._matcher is None and self._history.newest_ns == self._last.stamp_ns:
+            points, covariances = self._first_sights.locate(
+                self._last.ids, self._last.left, self._history, self._body_T_left, self._pair.left.focal_px,
+                self._config.motion.pixel_sigma_px,
+            )  # fmt: skip
+            self._last = replace(self._last, points=points, covariances=covariances)
         return self._last
 
-    def recalibrate(self, pair: StereoPair, epipolar_margin_px: float) -> None:
+    def move(self, body_T_left: Float) -> None:
+        """Take another pose (4, 4) of a single camera from now on."""
+        self._body_T_left = np.ascontiguousarray(body_T_left)
+
+    def recalibrate(self, pair: CameraGroup, epipolar_margin_px: float) -> None:
         """Take another calibration of the cameras from now on, whose epipolar lines may be off by a margin."""
         self._pair = pair
-        self._matcher.recalibrate(pair, epipolar_margin_px)
+        if self._matcher is not None and isinstance(pair, StereoPair):
+            self._matcher.recalibrate(pair, epipolar_margin_px)
         self._patches.recalibrate(pair)
         self._last = self._last.recalibrated(pair)
 
@@ -185,6 +207,8 @@ class PairTracker:
     ) -> PairFrame:  # fmt: skip
         """Match tracks of the newest left image to the right one, and triangulate them."""
         rays, has_ray = self._pair.left.unproject(pixels)
+        if self._matcher is None:
+            return _unmatched(stamp_ns, ids, ages, pixels, rays, inverse_depths, rejected).keep(has_ray)
         matches = self._matcher.match(self._left, self._right, pixels, rays, inverse_depths, slopes, self._min_gradient)
         has_depth = matches.good & has_ray
         return PairFrame(
@@ -219,6 +243,8 @@ class PairTracker:
         """Find corners (M, 2) where no track of a frame constrains translation, weak ones too where there are few."""
         settings, image = self._config.corners, self._left[0]
         tracked, occupying = frame.pixels, frame.constrains_translation(self._config.motion.pixel_sigma_px)
+        if frame.is_single:
+            occupying = np.ones(len(tracked), dtype=bool)  # what is not near yet may turn out to be
         cell_px, border_px = self._cell_px, settings.border_px
         new = find_corners(image, self._allowed, tracked, occupying, cell_px, border_px, settings.min_response)
         admitted = settings.noise_factor * self._noise_sigma
@@ -227,3 +253,28 @@ class PairTracker:
         tracked, occupying = np.concatenate([tracked, new]), np.concatenate([occupying, np.ones(len(new), dtype=bool)])
         weak = find_corners(image, self._allowed, tracked, occupying, cell_px, border_px, admitted)
         return np.concatenate([new, weak])
+
+
+def _unmatched(
+    stamp_ns: int, ids: Int, ages: Int, pixels: Float, rays: Float, inverse_depths: Float, rejected: dict[str, int]
+) -> PairFrame:
+    """Return the tracks of a single camera, with the inverse depths (N,) that are expected where they are known."""
+    n = len(ids)
+    depths = np.where(np.isfinite(inverse_depths), inverse_depths, PRIOR_INVERSE_DEPTH)
+    nothing, unmoved = np.zeros((n, 2)), np.zeros(n, dtype=np.int64)
+    return PairFrame(
+        stamp_ns=stamp_ns,
+        ids=ids,
+        ages=ages,
+        pixels=pixels,
+        left=rays,
+        right=nothing,
+        right_pixels=nothing,
+        points=np.column_stack([rays, depths]),
+        covariances=np.tile(np.eye(3), (n, 1, 1)),
+        slopes=nothing,
+        has_depth=np.ones(n, dtype=bool),
+        flat_for=unmoved,
+        is_single=True,
+        rejected=rejected,
+    )

@@ -1,4 +1,4 @@
-"""Observations of one stereo pair at one instant: its tracks, as columns."""
+"""Observations of one stereo pair or single camera at one instant: its tracks, as columns."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Int
 from graphvio.frontend.stereo import triangulate
 from graphvio.kernels import kernel
-from graphvio.rig import StereoPair
+from graphvio.rig import CameraGroup, SingleCamera
 
 _NEAR_SIGMAS = 10.0  # a depth that is known to a tenth
 
 
 @dataclass(frozen=True, eq=False)
 class PairFrame:
-    """Observations of one pair at one instant: N tracks.
+    """Observations of one pair, or of one single camera, at one instant: N tracks.
 
     Attributes:
         stamp_ns: of the frameset.
@@ -33,6 +33,7 @@ class PairFrame:
         slopes: (N, 2) of the right patch, see `graphvio.frontend.slanted`; meaningful where ``has_depth``.
         has_depth: (N,) whether the stereo match passed all its tests.
         flat_for: (N,) number of frames, up to this one, without depth.
+        is_single: whether the camera has no partner: every track has a depth, though it may be next to unknown.
         rejected: test of tracking or stereo matching -> number of tracks that failed it.
         stage_ms: time by stage.
     """
@@ -49,8 +50,14 @@ class PairFrame:
     slopes: Float
     has_depth: Bool
     flat_for: Int
+    is_single: bool = False
     rejected: Mapping[str, int] = field(default_factory=dict)
     stage_ms: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def has_right(self) -> Bool:
+        """(N,) whether a track is seen in a right image."""
+        return np.zeros(len(self.ids), dtype=bool) if self.is_single else self.has_depth
 
     def constrains_translation(self, sigma_px: float) -> Bool:
         """Select the tracks (N,) so near that their motion constrains more than rotation, for a pixel noise."""
@@ -74,8 +81,10 @@ class PairFrame:
             stage_ms=_added(self.stage_ms, other.stage_ms),
         )
 
-    def recalibrated(self, pair: StereoPair) -> PairFrame:
+    def recalibrated(self, pair: CameraGroup) -> PairFrame:
         """Return the frame as another calibration of its cameras has it: the same pixels, triangulated again."""
+        if isinstance(pair, SingleCamera):
+            return self  # such a camera's lens is not calibrated while it runs
         left, has_ray = pair.left.unproject(self.pixels)
         right, in_right = pair.right.unproject(self.right_pixels)
         points, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
@@ -102,7 +111,7 @@ class PairFrame:
         )
 
 
-_COLUMNS = tuple(f.name for f in fields(PairFrame) if f.name not in ("stamp_ns", "rejected", "stage_ms"))
+_COLUMNS = tuple(f.name for f in fields(PairFrame) if f.name not in ("stamp_ns", "is_single", "rejected", "stage_ms"))
 
 
 def _added(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:

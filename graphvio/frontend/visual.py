@@ -13,9 +13,10 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, agree, is_supported
-from graphvio.frontend.alignment import Misalignment, PairAlignment
+from graphvio.frontend.alignment import Misalignment, PairAlignment, Place
 from graphvio.frontend.frozen import Frozen, FrozenImages
 from graphvio.frontend.images import checked
+from graphvio.frontend.motion_stereo import MotionHistory
 from graphvio.frontend.observations import Correspondences, RigArrays, correspond
 from graphvio.frontend.pair_reports import inliers_of, pair_reports
 from graphvio.frontend.quality import graded, graded_hypothesis, stereo_share
@@ -26,7 +27,7 @@ from graphvio.frontend.standstill import Standstill
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import PairFrame
-from graphvio.geometry import se3_adjoint, se3_inverse, so3_log
+from graphvio.geometry import se3_adjoint, se3_inverse, skew, so3_log
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
@@ -84,8 +85,9 @@ class VisualFrontend:
         self._config = config
         self._rig = rig
         self._arrays = RigArrays.of(rig)  # with the corrections that are in force
-        self._trackers = [PairTracker(pair, config) for pair in rig.pairs]
-        self._baselines_m = [pair.baseline_m for pair in rig.pairs]
+        self._history = MotionHistory()
+        self._trackers = [PairTracker(group, config, self._history) for group in rig.groups]
+        self._baselines_m = _baselines_m(rig)
         self._frozen = FrozenImages()
         self._all_frozen = False
         self._latest: dict[int, PairFrame] = {}
@@ -95,10 +97,13 @@ class VisualFrontend:
         of_file = 0.0 if config.estimates_calibration else config.motion.calibration_error_share
         self._scale_sigma = 0.0 if rig.imu is None else float(np.hypot(config.motion.shared_error_share, of_file))
         self._standstill = Standstill()
-        self._alignments = {j: PairAlignment() for j in range(1, len(rig.pairs))}
-        self._uncertain: Mapping[int, Float] = {}  # covariances of extrinsics that are corrected
+        # Self-calibration finds errors of the pairs; the places of single cameras are monitored here.
+        first_monitored = len(rig.pairs) if config.estimates_calibration else 1
+        self._alignments = {j: PairAlignment(_prior(rig, j, config)) for j in range(first_monitored, len(rig.groups))}
+        self._uncertain: Mapping[int, Place] = {}  # covariances of extrinsics that are corrected, or not tested yet
+        self._correct_places()
         self._contradicted_ns: int | None = None  # when the pairs last were beyond 5 sigma of each other
-        self._workers = ThreadPoolExecutor(len(rig.pairs), thread_name_prefix="graphvio-pair")
+        self._workers = ThreadPoolExecutor(len(rig.groups), thread_name_prefix="graphvio-pair")
 
     @property
     def reference_stamps_ns(self) -> frozenset[int]:
@@ -107,17 +112,17 @@ class VisualFrontend:
 
     @property
     def body_T_left(self) -> Float:
-        """(P, 4, 4) of the pairs' left cameras, with the corrections that are in force."""
+        """(P, 4, 4) of the groups' left cameras, with the corrections that are in force."""
         return self._arrays.body_T_left
 
     @property
     def misaligned(self) -> Mapping[int, Misalignment]:
-        """Pairs whose extrinsics relative to the first pair are wrong in the rig: motions are corrected for it."""
-        return {j: alignment.in_force for j, alignment in self._alignments.items() if alignment.in_force is not None}
+        """Pairs and single cameras whose extrinsics relative to the first pair are wrong: motions are corrected."""
+        return {j: alignment.refuted for j, alignment in self._alignments.items() if alignment.refuted is not None}
 
     def frames_at(self, stamp_ns: int) -> dict[int, PairFrame]:
         """Return the pairs' tracks at the newest frameset, if it has this stamp."""
-        return {j: frame for j, frame in self._latest.items() if frame.stamp_ns == stamp_ns}
+        return {j: frame for j, frame in self._latest.items() if frame.stamp_ns == stamp_ns and not frame.is_single}
 
     def limit_corners(self, share: float) -> None:
         """Follow only a share, above 0 and up to 1, of the corners that the configuration asks for from now on."""
@@ -138,12 +143,13 @@ class VisualFrontend:
         """
         self._rig = rig
         self._arrays = RigArrays.of(rig)
-        self._baselines_m = [pair.baseline_m for pair in rig.pairs]
-        self._uncertain = uncertain
-        for tracker, pair in zip(self._trackers, rig.pairs, strict=True):
-            tracker.recalibrate(pair, epipolar_margin_px)
+        self._baselines_m = _baselines_m(rig)
+        self._uncertain = {j: Place(covariance) for j, covariance in uncertain.items()}
+        for tracker, group in zip(self._trackers, rig.groups, strict=True):
+            tracker.recalibrate(group, epipolar_margin_px)
+        self._correct_places()
         self._references.recalibrate(rig)
-        self._latest = {j: frame.recalibrated(rig.pairs[j]) for j, frame in self._latest.items()}
+        self._latest = {j: frame.recalibrated(rig.groups[j]) for j, frame in self._latest.items()}
 
     def start_keyframe(self) -> None:
         """Measure the next motions from the newest frameset."""
@@ -196,10 +202,12 @@ class VisualFrontend:
             self._references.forget(j)
 
         def observe(j: int) -> PairFrame:
-            left, right = frameset.images[j]
             since_latest = self._predicted(j, self._latest.get(j), predict)
             since_reference = self._predicted(j, self._references.of(j), predict)
-            return self._trackers[j].observe(frameset.stamp_ns, left, right, since_latest, since_reference)
+            left, *right = frameset.images[j]
+            return self._trackers[j].observe(
+                frameset.stamp_ns, left, right[0] if right else None, since_latest, since_reference
+            )
 
         frames = self._in_parallel(observe, frameset.images.keys() - frozen.pairs)
         self._latest.update(frames)
@@ -273,8 +281,8 @@ class VisualFrontend:
         if not self._references.must_be_replaced(seen.frames, seen.correspondences, refined, is_contradicted):
             return {}, {}
         own = self._own_motions(seen, agreement)
-        if not self._config.estimates_calibration:
-            self._learn_alignments(agreement)
+        self._learn_alignments(agreement)
+        self._history.advance(seen.reference_stamp_ns, seen.stamp_ns, refined.cur_T_ref, refined.covariance)
         return self._refer_to(seen.frames), own
 
     # ------------------------------------------------------------------ parts of these steps
@@ -308,6 +316,9 @@ class VisualFrontend:
         """
         if self._all_frozen:
             return dict(frames)
+        newest_ns = max((frame.stamp_ns for frame in frames.values()), default=None)
+        if newest_ns is not None and newest_ns != self._history.newest_ns:
+            self._history.restart(newest_ns)
         replenished = self._in_parallel(lambda j: self._trackers[j].replenish(), frames)
         self._latest.update(replenished)
         self._references.replace(replenished)
@@ -331,11 +342,13 @@ class VisualFrontend:
         )
 
     def _own_motions(self, seen: _Seen, agreement: Agreement) -> dict[int, RelativeMotion]:
-        """Return each pair's own motion without the corrections in force; with a single pair, that is the rig's."""
+        """Return each pair's own motion without the corrections in force; with one pair alone, that is the rig's."""
         first = agreement.hypotheses[0]
-        alone = {first.pairs[0]: first.refined} if len(self._rig.pairs) == 1 else {}
+        alone = {first.pairs[0]: first.refined} if len(self._rig.groups) == 1 else {}
         motions = {}
         for j, refined in (agreement.own or alone).items():
+            if j >= len(self._rig.pairs):
+                continue
             back = se3_inverse(self._alignments[j].correction) if j in self._alignments else np.eye(4)
             adjoint = se3_adjoint(back)
             uncorrected = replace(
@@ -356,5 +369,36 @@ class VisualFrontend:
                 continue
             alignment.add(own[0], own[j])
             if alignment.learn():
-                self._arrays = self._arrays.corrected(RigArrays.of(self._rig), j, alignment.correction)
-                self._uncertain = {i: misalignment.covariance for i, misalignment in self.misaligned.items()}
+                self._correct(j)
+
+    def _correct_places(self) -> None:
+        for j, alignment in self._alignments.items():
+            if alignment.in_force is not None:
+                self._correct(j)
+
+    def _correct(self, j: int) -> None:
+        """Take the correction in force of a pair's or a single camera's place."""
+        self._arrays = self._arrays.corrected(RigArrays.of(self._rig), j, self._alignments[j].correction)
+        in_force = {i: alignment.in_force for i, alignment in self._alignments.items()}
+        learnt = {i: each.place for i, each in in_force.items() if each is not None}
+        others = {i: place for i, place in self._uncertain.items() if i not in self._alignments}
+        self._uncertain = others | learnt
+        self._trackers[j].move(self._arrays.body_T_left[j])
+
+
+def _prior(rig: Rig, j: int, config: Config) -> Float | None:
+    """Return the covariance (6, 6) of a single camera's extrinsics where calibrations are not taken for exact."""
+    if j < len(rig.pairs) or not config.estimates_calibration:
+        return None
+    known, camera = rig.calibration_sigmas, rig.groups[j].left
+    of_lens = np.sqrt(2.0) * known.principal_point_px / camera.focal_px  # of both cameras; it turns their views
+    turn = np.hypot(np.deg2rad(known.pair_rotation_deg), of_lens)
+    about_camera = np.eye(6)
+    about_camera[3:, :3] = skew(camera.body_T_cam[:3, 3])
+    covariance = np.diag(np.repeat([turn, known.pair_translation_m], 3) ** 2)
+    return about_camera @ covariance @ about_camera.T
+
+
+def _baselines_m(rig: Rig) -> list[float]:
+    """Return the baseline of each group of cameras, 0 for a single camera."""
+    return [pair.baseline_m for pair in rig.pairs] + [0.0] * len(rig.singles)

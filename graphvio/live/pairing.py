@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 
 from graphvio.arrays import Image
+from graphvio.errors import RigError
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.sensors import FrameSet
 from graphvio.odometry.synchroniser import JumpGuard
@@ -44,9 +45,17 @@ class FramesetAssembler:
         report: takes events with the stamp of an image that is left out: ``image_without_partner``, ``late_image`` for
             those not after the last frameset, ``duplicate_image``, ``image_future_stamp`` for one far ahead of those
             before and after it, and ``unknown_camera``.
+
+    Raises:
+        RigError: if the rig has single cameras.
     """
 
     def __init__(self, rig: Rig, tolerance_ms: float, max_wait_ms: float, report: Report) -> None:
+        if rig.singles:
+            names = ", ".join(single.name for single in rig.singles)
+            raise RigError(
+                f"{rig.name}: {names} has no partner; live sources take stereo pairs only: give a rig of pairs"
+            )
         self._tolerance_ns = round(1e6 * tolerance_ms)
         self._max_wait_ns = round(1e6 * max_wait_ms)
         self._report = report

@@ -38,17 +38,22 @@ class ImuSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSet:
-    """Images of one instant from any subset of the rig's pairs.
+    """Images of one instant from any subset of the rig's pairs and single cameras.
 
     Attributes:
         stamp_ns: camera clock, nanoseconds.
-        images: pair index -> (left, right), each (height, width) uint8. A pair that delivered nothing is absent. They
-            are kept until the pair's next ones have come, and not copied: a driver that fills the same buffer again
-            has to hand over copies.
+        images: index in `graphvio.rig.Rig.groups` -> (left, right) of a pair, or (image,) of a single camera, each
+            (height, width) uint8. A group that delivered nothing is absent. They are kept until its next ones have
+            come, and not copied: a driver that fills the same buffer again has to hand over copies.
     """
 
     stamp_ns: int
-    images: Mapping[int, tuple[Image, Image]]
+    images: Mapping[int, tuple[Image, ...]]
+
+    @property
+    def stereo(self) -> dict[int, tuple[Image, Image]]:
+        """Pair index -> (left, right), without single cameras."""
+        return {j: (images[0], images[1]) for j, images in self.images.items() if len(images) == 2}
 
 
 Measurement = ImuSample | FrameSet
@@ -94,10 +99,10 @@ def checked_measurement(measurement: Measurement) -> Measurement:
             f"frameset at {stamp_ns}: images is a {type(pairs).__name__}; map pairs to (left, right)"
         )
     for pair, images in pairs.items():
-        if not isinstance(images, Sequence | np.ndarray) or len(images) != 2:
-            raise MeasurementError(f"frameset at {stamp_ns}: pair {pair} has not two images; give (left, right)")
-        if not all(isinstance(image, np.ndarray) for image in images):
+        if not isinstance(images, Sequence | np.ndarray) or len(images) not in (1, 2):
             raise MeasurementError(
-                f"frameset at {stamp_ns}: pair {pair} has something else than arrays; give two images"
+                f"frameset at {stamp_ns}: group {pair} has not one or two images; give (left, right), or (image,)"
             )
+        if not all(isinstance(image, np.ndarray) for image in images):
+            raise MeasurementError(f"frameset at {stamp_ns}: pair {pair} has something else than arrays; give images")
     return FrameSet(stamp_ns, measurement.images)

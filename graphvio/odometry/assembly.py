@@ -101,7 +101,7 @@ def keyframe_of(
             covariance = None
     return NewKeyframe(
         frames=frontend.frames_at(frameset.stamp_ns),
-        images=frameset.images,
+        images=frameset.stereo,
         body_T_left=frontend.body_T_left,
         previous_ns=previous_ns,
         previous_T_body=previous_T_body,

@@ -46,7 +46,7 @@ class Synchroniser:
     """
 
     def __init__(self, rig: Rig, config: Config, report: Report) -> None:
-        self._pairs = len(rig.pairs)
+        self._pairs = len(rig.groups)
         self._has_imu = rig.imu is not None
         self._offset_ns = rig.imu.time_offset_ns if rig.imu is not None else 0
         self._timing = config.timing

@@ -40,7 +40,7 @@ class VisionEvents:
             self._report(
                 stamp_ns,
                 EventKind.CAMERA_FROZEN,
-                f"pair {self._rig.pairs[j].name} is left out: a camera repeats its image while others do not",
+                f"{self._rig.groups[j].name} is left out: a camera repeats its image while others do not",
             )
         self._frozen = visual.frozen
         for j in sorted(misaligned.keys() - self._reported):

@@ -124,7 +124,7 @@ def _write_images(
         missing = {name for name in _names(session, place, database) if not (folder / name).exists()}
         if not missing:
             return
-        for j, images in session.source.frameset_at(place.stamp_ns).images.items():
+        for j, images in session.source.frameset_at(place.stamp_ns).stereo.items():
             pair = session.rig.pairs[j]
             for camera, image in zip((pair.left, pair.right), images, strict=True):
                 name = image_name(session.name, camera.name, place.stamp_ns)

@@ -91,7 +91,7 @@ class ResultWriter:
         self._calibrations = CalibrationHistory()
         self._time_offset: tuple[float | None, float | None] = (None, None)
         self._stage_ms: dict[str, array[float]] = {}
-        self._pair_names = [pair.name for pair in rig.pairs]
+        self._pair_names = [group.name for group in rig.groups]
         self._pair_figures: dict[str, dict[str, array[float]]] = {
             name: {figure.name: array("d") for figure in fields(PairMedians)} for name in self._pair_names
         }

@@ -17,8 +17,9 @@ from graphvio.arrays import Float
 from graphvio.cameras import COEFFICIENTS
 from graphvio.errors import RigError
 from graphvio.geometry import rotation_from_quat_wxyz, se3
-from graphvio.rig import Camera, Imu, Rig, checked_views
-from graphvio.rig_files.reading import NOISE_KEYS, Section, consecutive_pairs, named, read_text
+from graphvio.rig import Camera, Imu, Rig
+from graphvio.rig_files.grouping import grouped_rig
+from graphvio.rig_files.reading import NOISE_KEYS, Section, named, read_text
 
 FILE_NAME = "calibration.json"
 _ROOT = "value0"
@@ -65,7 +66,7 @@ def load(path: Path) -> Rig:
         )
     with named(path):
         cameras = [_camera(document, lists, i) for i in range(lengths["T_imu_cam"])]
-        return checked_views(Rig(consecutive_pairs(cameras, path), _imu(document), path.stem))
+        return grouped_rig(cameras, _imu(document), path.stem, path)
 
 
 def _list(section: Section, key: str) -> list[Any]:

@@ -15,9 +15,10 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
-from graphvio.rig import Camera, Imu, Rig, checked_transform, checked_views
+from graphvio.rig import Camera, Imu, Rig, checked_transform
 from graphvio.rig_files import kalibr
-from graphvio.rig_files.reading import Section, consecutive_pairs, named, read_yaml
+from graphvio.rig_files.grouping import grouped_rig
+from graphvio.rig_files.reading import Section, named, read_yaml
 
 _CAMERA_KEYS = ("T_BS", "resolution", "intrinsics", "distortion_model", "distortion_coefficients")
 
@@ -25,7 +26,7 @@ _CAMERA_KEYS = ("T_BS", "resolution", "intrinsics", "distortion_model", "distort
 def load(path: Path) -> Rig:
     """Read the calibration in ``mav0`` or the folder that contains it.
 
-    Cameras 0 and 1 form the first pair, 2 and 3 the next. Without a folder ``imu0`` the rig has no IMU.
+    Cameras form pairs by `grouped_rig`. Without a folder ``imu0`` the rig has no IMU.
 
     Raises:
         RigError: if a file or value is missing, or they do not describe a usable rig.
@@ -50,7 +51,7 @@ def load(path: Path) -> Rig:
                 imu_T_body = se3_inverse(body_T_imu)
     cameras = [_camera(name, section, imu_T_body) for name, section in sections.items()]
     with named(root):
-        return checked_views(Rig(consecutive_pairs(cameras, root), imu, _name(root)))
+        return grouped_rig(cameras, imu, _name(root), root)
 
 
 def sensors_folder(path: Path) -> Path | None:
@@ -90,11 +91,10 @@ def _from_chain(chain: Path, names: list[str], has_imu: bool, name: str) -> Rig:
         for camera in names:
             if camera not in cameras:
                 raise RigError(f"{camera} is missing; the recording has it: add its calibration")
-        pairs = consecutive_pairs([cameras[camera] for camera in names], chain)
         imu = None
         if has_imu:
             imu = kalibr.imu_of(kalibr.find_imu_file(chain), kalibr.time_offset_of(document))
-        return checked_views(Rig(pairs, imu, name))
+        return grouped_rig([cameras[camera] for camera in names], imu, name, chain)
 
 
 def _sensor(folder: Path) -> Section:

@@ -17,8 +17,9 @@ from graphvio.arrays import Float
 from graphvio.cameras import COEFFICIENTS
 from graphvio.errors import RigError
 from graphvio.geometry import se3_inverse
-from graphvio.rig import Camera, Imu, Rig, checked_transform, checked_views
-from graphvio.rig_files.reading import NOISE_KEYS, Section, consecutive_pairs, named, read_yaml
+from graphvio.rig import Camera, Imu, Rig, checked_transform
+from graphvio.rig_files.grouping import grouped_rig
+from graphvio.rig_files.reading import NOISE_KEYS, Section, named, read_yaml
 
 PINHOLE = "pinhole"
 SPHERES = {"ds": "double-sphere", "eucm": "extended-unified", "omni": "omnidirectional"}
@@ -57,9 +58,8 @@ def load(path: Path) -> Rig:
     has_imu = "T_cam_imu" in document.section(names[0]).values if names else False
     with named(path):
         cameras = cameras_of(document)
-        pairs = consecutive_pairs(cameras, path)
         imu = imu_of(find_imu_file(path), time_offset_of(document)) if has_imu else None
-        return checked_views(Rig(pairs, imu, path.stem))
+        return grouped_rig(cameras, imu, path.stem, path)
 
 
 def camera_names(document: Section) -> list[str]:

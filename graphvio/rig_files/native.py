@@ -1,4 +1,6 @@
-"""graphvio's own ``rig.yaml``, version 1: any number of pairs and at most one IMU.
+"""graphvio's own ``rig.yaml``: any number of pairs and single cameras, and at most one IMU.
+
+Version 2 has ``single_cameras``, version 1 has not. A rig without single cameras is written in version 1.
 
 The format is documented with a full example in ``docs/data-contract.md``.
 """
@@ -12,14 +14,15 @@ from pathlib import Path
 from graphvio.calibration_sigmas import FACTORY, LEVELS, CalibrationSigmas
 from graphvio.cameras import COEFFICIENTS
 from graphvio.errors import RigError
-from graphvio.rig import Camera, Imu, Rig, StereoPair, as_written, checked_views
+from graphvio.rig import Camera, Imu, Rig, SingleCamera, StereoPair, as_written, checked_views
 from graphvio.rig_files.reading import NOISE_KEYS, Section, named, parse_yaml, read_text
 
-VERSION = 1
+VERSIONS = (1, 2)
 VERSION_KEY = "graphvio_rig"
 FILE_NAME = "rig.yaml"
 
 _RIG_KEYS = (VERSION_KEY, "name", "calibration_sigmas", "imu", "pairs")
+_SINGLES_KEY = "single_cameras"
 _IMU_MATRICES = ("gyro_matrix", "accel_matrix")
 _IMU_KEYS = ("rate_hz", *NOISE_KEYS, "time_offset_s", *_IMU_MATRICES)
 _PAIR_KEYS = ("name", "left", "right")
@@ -48,20 +51,23 @@ def parse(text: str, path: Path) -> Rig:
     document = parse_yaml(text, path)
     version = document.values.get(VERSION_KEY)
     if version is None:
-        raise RigError(f"{path}: {VERSION_KEY} is missing; begin the file with  {VERSION_KEY}: {VERSION}")
-    if version != VERSION:
+        raise RigError(f"{path}: {VERSION_KEY} is missing; begin the file with  {VERSION_KEY}: {VERSIONS[-1]}")
+    if version not in VERSIONS:
         raise RigError(
-            f"{path}: {VERSION_KEY} is {version!r}; this graphvio reads version {VERSION}: update graphvio or the file"
+            f"{path}: {VERSION_KEY} is {version!r}; this graphvio reads versions 1 and 2: update graphvio or the file"
         )
-    document.only(_RIG_KEYS)
+    if version == 1 and _SINGLES_KEY in document.values:
+        raise RigError(f"{document.where(_SINGLES_KEY)}: is of version 2; write  {VERSION_KEY}: 2")
+    document.only((*_RIG_KEYS, _SINGLES_KEY))
     given = document.get("pairs")
     if not isinstance(given, list) or not given:
         raise RigError(f"{path}: pairs must be a list of at least one pair, each with left and right")
     with named(path):
         pairs = tuple(_pair(document.nested(value, f"pairs[{i}]"), i) for i, value in enumerate(given))
+        singles = _singles(document)
         imu = _imu(document.section("imu")) if document.values.get("imu") is not None else None
         name = document.text("name") if document.values.get("name") is not None else path.stem
-        return checked_views(Rig(pairs, imu, name, _sigmas(document)))
+        return checked_views(Rig(pairs, imu, name, _sigmas(document), singles))
 
 
 def save_rig(rig: Rig, path: str | Path) -> None:
@@ -81,7 +87,7 @@ def to_text(rig: Rig, folder: Path) -> str:
     """Format a rig as ``rig.yaml`` for a folder; paths of masks inside the folder are relative to it."""
     lines = [
         "# A rig of stereo pairs. Metres, radians, seconds, pixels; body is the frame of the IMU.",
-        f"{VERSION_KEY}: {VERSION}",
+        f"{VERSION_KEY}: {VERSIONS[1] if rig.singles else VERSIONS[0]}",
         f"name: {_quoted(rig.name)}",
     ]
     if rig.calibration_sigmas != FACTORY:
@@ -106,6 +112,11 @@ def to_text(rig: Rig, folder: Path) -> str:
         for side, camera in (("left", pair.left), ("right", pair.right)):
             lines.append(f"    {side}:")
             lines += [f"      {line}" for line in _camera_lines(camera, folder)]
+    if rig.singles:
+        lines.append(f"{_SINGLES_KEY}:")
+        for single in rig.singles:
+            first, *others = _camera_lines(single.left, folder)
+            lines += [f"  - {first}", *(f"    {line}" for line in others)]
     return "\n".join(lines) + "\n"
 
 
@@ -123,6 +134,13 @@ def _sigmas(document: Section) -> CalibrationSigmas:
     section, names = document.section("calibration_sigmas"), [field.name for field in fields(CalibrationSigmas)]
     section.only(names)
     return CalibrationSigmas(**{name: section.number(name, getattr(FACTORY, name)) for name in names})
+
+
+def _singles(document: Section) -> tuple[SingleCamera, ...]:
+    given = document.values.get(_SINGLES_KEY, [])
+    if not isinstance(given, list):
+        raise RigError(f"{document.where(_SINGLES_KEY)}: must be a list of cameras")
+    return tuple(SingleCamera(_camera(document.nested(value, f"{_SINGLES_KEY}[{i}]"))) for i, value in enumerate(given))
 
 
 def _pair(section: Section, index: int) -> StereoPair:

@@ -15,7 +15,7 @@ import yaml
 
 from graphvio.arrays import Float
 from graphvio.errors import RigError
-from graphvio.rig import Camera, Imu, StereoPair
+from graphvio.rig import Imu
 
 NOISE_KEYS = ("gyro_noise_density", "gyro_random_walk", "accel_noise_density", "accel_random_walk")
 _DEFAULTS = {f.name: f.default for f in fields(Imu)}
@@ -170,24 +170,6 @@ def named(path: Path) -> Iterator[None]:
         if str(error).startswith(str(path)):
             raise
         raise RigError(f"{path}: {error}") from None
-
-
-def consecutive_pairs(cameras: list[Camera], path: Path) -> tuple[StereoPair, ...]:
-    """Form pairs (0, 1), (2, 3) and so on.
-
-    Raises:
-        RigError: if there is no camera, or their number is odd.
-    """
-    if not cameras:
-        raise RigError(f"{path}: describes no camera; give a rig.yaml, or a calibration of at least two cameras")
-    if len(cameras) % 2:
-        names = ", ".join(camera.name for camera in cameras)
-        raise RigError(
-            f"{path}: has {len(cameras)} cameras ({names}), so {cameras[-1].name} is left without a partner; "
-            "write a rig.yaml that says which cameras form pairs"
-        )
-    couples = zip(cameras[::2], cameras[1::2], strict=True)
-    return tuple(StereoPair(f"pair{i}", left, right) for i, (left, right) in enumerate(couples))
 
 
 def _shown(value: object) -> str:

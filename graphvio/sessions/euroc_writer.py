@@ -127,8 +127,7 @@ class EurocWriter:
             self._add_row(IMU_FOLDER, euroc_layout.exact_row(measurement.stamp_ns, values))
             return
         for number, images in sorted(measurement.images.items()):
-            pair = self.rig.pairs[number]
-            for camera, image in zip((pair.left, pair.right), images, strict=True):
+            for camera, image in zip(self.rig.groups[number].cameras, images, strict=True):
                 euroc_layout.write_image(self._mav0 / camera.name / "data" / f"{measurement.stamp_ns}.png", image)
                 self._add_row(camera.name, euroc_layout.frame_row(measurement.stamp_ns))
                 self._stamps[camera.name].append(measurement.stamp_ns)

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 
 from graphvio.arrays import Int
+from graphvio.rig import CameraGroup, StereoPair
 
 ImageFormat = Literal["raw", "png"]
 RIG_ATTACHMENT = "rig.yaml"
@@ -58,6 +59,11 @@ class MessageReader(Protocol):
         Raises:
             SessionError: if it is damaged.
         """
+
+
+def sides_of(group: CameraGroup) -> tuple[str, ...]:
+    """Return what the topics of a group's cameras are called: left and right, or mono."""
+    return ("left", "right") if isinstance(group, StereoPair) else ("mono",)
 
 
 def image_topic(pair: str, side: str, image_format: ImageFormat) -> str:

@@ -26,6 +26,7 @@ from graphvio.sessions.topics import (
     TRUTH_TOPIC,
     ImageFormat,
     image_topic,
+    sides_of,
 )
 
 if TYPE_CHECKING:
@@ -129,18 +130,18 @@ class SessionWriter:
             self._has_begun = True
             self._add_calibration(frameset.stamp_ns)
         for number, images in sorted(frameset.images.items()):
-            pair = self.rig.pairs[number]
-            for side, camera, pixels in zip(("left", "right"), (pair.left, pair.right), images, strict=True):
-                topic = image_topic(pair.name, side, self._format)
+            group = self.rig.groups[number]
+            for side, camera, pixels in zip(sides_of(group), group.cameras, images, strict=True):
+                topic = image_topic(group.name, side, self._format)
                 self._add(topic, frameset.stamp_ns, self._image(frameset.stamp_ns, camera.name, pixels))
 
     def _add_calibration(self, stamp_ns: int) -> None:
         if not self._storage.has_attachments:
             self._add(RIG_TOPIC, stamp_ns, messages.text(self._rig_text), is_latched=True)
         self._add(TRANSFORMS_TOPIC, stamp_ns, messages.static_transforms(stamp_ns, self.rig), is_latched=True)
-        for pair in self.rig.pairs:
-            for side, camera in (("left", pair.left), ("right", pair.right)):
-                topic = f"/{pair.name}/{side}/camera_info"
+        for group in self.rig.groups:
+            for side, camera in zip(sides_of(group), group.cameras, strict=True):
+                topic = f"/{group.name}/{side}/camera_info"
                 self._add(topic, stamp_ns, messages.camera_info(stamp_ns, camera), is_latched=True)
 
     def _image(self, stamp_ns: int, frame: str, pixels: Image) -> Any:

@@ -17,7 +17,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.errors import SourceError
 from graphvio.geometry import se3, se3_inverse, so3_exp, so3_log
-from graphvio.rig import Camera, Imu, Rig, StereoPair
+from graphvio.rig import Camera, Imu, Rig, SingleCamera, StereoPair
 
 _STREAM = 3  # of the seed: 1 is the IMU's noise, 2 that of images
 
@@ -201,6 +201,11 @@ def draw(rig: Rig, error: CalibrationError, seed: int) -> SampledError:
             for i, (camera, body_T_cam) in enumerate(each, start=2 * j)
         )
         pairs.append(StereoPair(pair.name, left, right))
+    singles = []
+    for i, single in enumerate(rig.singles, start=2 * len(rig.pairs)):
+        moved = _transform(normal["pair-transform"](6), error.pair_transform_deg, error.pair_transform_mm)
+        body_T_cam = in_body @ single.left.body_T_cam @ moved
+        singles.append(SingleCamera(_camera(single.left, focal[i], centre_px[i], distortion[i], body_T_cam)))
     sign = 1.0 if normal["time-offset"]() > 0.0 else -1.0
     imu = rig.imu if rig.imu is not None else Imu()
     true_imu = replace(
@@ -212,7 +217,11 @@ def draw(rig: Rig, error: CalibrationError, seed: int) -> SampledError:
     scale = 0.01 * error.imu_scale_percent * normal["imu-scale"]((2, 3))
     skewed = np.deg2rad(error.imu_misalignment_deg) * normal["imu-misalignment"]((2, 3, 3))
     gyro, accel = (np.eye(3) + np.diag(scale[i]) + skewed[i] * (1.0 - np.eye(3)) for i in (0, 1))
-    return SampledError(replace(rig, pairs=tuple(pairs), imu=imu), replace(rig, imu=true_imu), ImuError(gyro, accel))
+    return SampledError(
+        replace(rig, pairs=tuple(pairs), singles=tuple(singles), imu=imu),
+        replace(rig, imu=true_imu),
+        ImuError(gyro, accel),
+    )
 
 
 def calibration_differences(rig: Rig, true_rig: Rig) -> dict[str, Float]:
@@ -236,6 +245,8 @@ def calibration_differences(rig: Rig, true_rig: Rig) -> dict[str, Float]:
         lengths.append(pair.baseline_m / true.baseline_m - 1.0)
         if j > 0:
             moves.append(true.left.cam_T_body @ se3_inverse(in_body) @ pair.left.body_T_cam)
+    for single, true_single in zip(rig.singles, true_rig.singles, strict=True):
+        moves.append(true_single.left.cam_T_body @ se3_inverse(in_body) @ single.left.body_T_cam)
     found = {
         "focal_percent": 100.0 * (ratios.mean(axis=1) - 1.0),
         "principal_point_px": np.concatenate([camera.intrinsics[2:] - true.intrinsics[2:] for camera, true in cameras]),

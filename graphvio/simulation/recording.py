@@ -69,6 +69,7 @@ def simulate(
     calibration_error: CalibrationError | None = None,
     calibration_seed: int | None = None,
     rig_change: str | None = None,
+    rig: Rig | None = None,
     progress: Progress | None = None,
 ) -> SimulatedRecording:
     """Simulate a scene and write it as a recording.
@@ -86,6 +87,7 @@ def simulate(
         calibration_seed: by which the error is sampled; None for ``seed``.
         rig_change: one of `graphvio.simulation.RIG_CHANGES`, of the true cameras during the walk, which the files know
             nothing of; None if they stay as they are.
+        rig: true cameras and IMU; None for the default rig.
         progress: called as the framesets are written.
 
     Raises:
@@ -97,7 +99,11 @@ def simulate(
         raise SourceError(f"there is no change {rig_change!r} of the rig; choose from {', '.join(RIG_CHANGES)}")
     sampled = None
     if calibration_error is not None:
-        sampled = draw(default_rig(), calibration_error, seed if calibration_seed is None else calibration_seed)
+        sampled = draw(
+            rig if rig is not None else default_rig(),
+            calibration_error,
+            seed if calibration_seed is None else calibration_seed,
+        )
     simulator = make_simulator(
         name,
         duration_s=duration_s,
@@ -105,7 +111,7 @@ def simulate(
         rate_hz=rate_hz,
         stationary_s=stationary_s,
         trigger_offset_ms=trigger_offset_ms,
-        rig=sampled.true_rig if sampled is not None else None,
+        rig=sampled.true_rig if sampled is not None else rig,
         imu_error=sampled.imu if sampled is not None else None,
         rig_change=RIG_CHANGES[rig_change] if rig_change is not None else None,
     )
@@ -140,7 +146,7 @@ def write_recording(
 
     def write(index: int) -> None:
         surfaces = simulator.surfaces(index)
-        for number in (2 * pair + side for pair in simulator.triggered(index) for side in (0, 1)):
+        for number in (camera for group in simulator.triggered(index) for camera in simulator.cameras_of(group)):
             image = simulator.image(index, number, surfaces=surfaces)
             _write_image(mav0 / cameras[number].name / "data" / f"{stamps[index]}.png", image)
 
@@ -155,7 +161,7 @@ def write_recording(
         path=out,
         scene=simulator.scene.name,
         framesets=len(stamps),
-        images=sum(2 * len(simulator.triggers_ns(pair)) for pair in range(len(simulator.rig.pairs))),
+        images=sum(len(group.cameras) * len(simulator.triggers_ns(j)) for j, group in enumerate(simulator.rig.groups)),
         imu_samples=len(simulator.imu_track.stamps_ns),
         duration_s=simulator.scene.motion.duration_s,
         path_length_m=float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
@@ -191,12 +197,11 @@ def _write_image(path: Path, image: Image) -> None:
 
 
 def _write_sensors(simulator: Simulator, rig: Rig, mav0: Path) -> None:
-    for number, camera in enumerate(rig.cameras):
+    for j, camera in ((j, camera) for j, group in enumerate(rig.groups) for camera in group.cameras):
         folder = mav0 / camera.name
-        pair = number // 2
-        text = euroc_layout.camera_yaml(camera, simulator.rates_hz[pair], f"simulated {camera.name}")
+        text = euroc_layout.camera_yaml(camera, simulator.rates_hz[j], f"simulated {camera.name}")
         (folder / "sensor.yaml").write_text(text)
-        rows = [euroc_layout.frame_row(int(stamp)) for stamp in simulator.triggers_ns(pair)]
+        rows = [euroc_layout.frame_row(int(stamp)) for stamp in simulator.triggers_ns(j)]
         (folder / "data.csv").write_text("\n".join([euroc_layout.FRAME_HEADER, *rows, ""]))
     for name in (IMU_FOLDER, TRUTH_FOLDER):
         (mav0 / name).mkdir()

@@ -12,7 +12,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.geometry import se3, so3_exp
-from graphvio.rig import Camera, Rig, StereoPair
+from graphvio.rig import Camera, Rig, SingleCamera, StereoPair
 
 
 class RigChange(Protocol):
@@ -61,7 +61,8 @@ class ThermalDrift:
             )
             for pair in rig.pairs
         ]
-        return replace(rig, pairs=tuple(pairs))
+        singles = [SingleCamera(grown(single.left, single.left.body_T_cam)) for single in rig.singles]
+        return replace(rig, pairs=tuple(pairs), singles=tuple(singles))
 
 
 @dataclass(frozen=True)

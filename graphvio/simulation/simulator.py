@@ -33,14 +33,14 @@ class Simulator:
         scene: world, motion and light.
         rig: true cameras and IMU; None for the default rig. A rig without an IMU is given the default IMU.
         seed: of all noise and biases. World and walk do not depend on it.
-        rate_hz: framesets per second; or one rate for each pair, the last one also for all pairs after it.
+        rate_hz: framesets per second; or one rate for each pair and single camera, the last one also for all after it.
         atlas: textures of the world; None for the standard textures.
-        trigger_offset_ms: delay of each pair's triggers after those of the pair before it.
+        trigger_offset_ms: delay of each pair's triggers after those of the pair before it; likewise of single cameras.
         imu_error: scale and misalignment of the IMU; None for none.
         rig_change: of the true cameras during the walk; None if they stay as they are.
 
     Attributes:
-        rates_hz: of each pair, images per second.
+        rates_hz: of each pair and single camera, images per second.
 
     Raises:
         SourceError: if a rate or the offset is impossible.
@@ -71,8 +71,8 @@ class Simulator:
         self.rig = rig if rig is not None else default_rig()
         self.imu = self.rig.imu if self.rig.imu is not None else Imu()
         self.seed = seed
-        pairs = len(self.rig.pairs)
-        self.rates_hz = tuple((rates + [rates[-1]] * pairs)[:pairs])
+        groups = len(self.rig.groups)
+        self.rates_hz = tuple((rates + [rates[-1]] * groups)[:groups])
         self._trigger_offset_ms = trigger_offset_ms
         self._stage = Stage(scene.world, atlas if atlas is not None else standard_atlas())
         self._imu_error, self._rig_change = imu_error, rig_change
@@ -82,20 +82,25 @@ class Simulator:
     @cached_property
     def stamps_ns(self) -> Int:
         """Stamps (N,) of the framesets: all instants at which any pair is triggered."""
-        return np.unique(np.concatenate([self.triggers_ns(pair) for pair in range(len(self.rig.pairs))]))
+        return np.unique(np.concatenate([self.triggers_ns(group) for group in range(len(self.rig.groups))]))
 
-    def triggers_ns(self, pair: int) -> Int:
-        """Return the stamps (M,) at which a pair takes images, all within the walk."""
-        rate, duration_s = self.rates_hz[pair], self.scene.motion.duration_s
-        late_ns = round(pair * self._trigger_offset_ms * 1e6)
+    def cameras_of(self, group: int) -> range:
+        """Return the indices in ``rig.cameras`` of a pair or single camera."""
+        first = sum(len(each.cameras) for each in self.rig.groups[:group])
+        return range(first, first + len(self.rig.groups[group].cameras))
+
+    def triggers_ns(self, group: int) -> Int:
+        """Return the stamps (M,) at which a pair or single camera takes images, all within the walk."""
+        rate, duration_s = self.rates_hz[group], self.scene.motion.duration_s
+        late_ns = round(group * self._trigger_offset_ms * 1e6)
         count = int(np.floor(duration_s * rate + 1e-9))
         since_ns = late_ns + np.round(np.arange(max(count, 1)) * (1e9 / rate)).astype(np.int64)
         return np.asarray(EPOCH_NS + since_ns[(since_ns <= round(duration_s * 1e9)) | (since_ns == 0)])
 
     def triggered(self, index: int) -> tuple[int, ...]:
-        """Return the indices of the pairs that take images at a frameset's stamp."""
+        """Return the indices of the pairs and single cameras that take images at a frameset's stamp."""
         stamp = int(self.stamps_ns[index])
-        return tuple(pair for pair, triggers in enumerate(self._triggers) if stamp in triggers)
+        return tuple(group for group, triggers in enumerate(self._triggers) if stamp in triggers)
 
     @cached_property
     def world_T_body(self) -> Float:
@@ -140,7 +145,7 @@ class Simulator:
         """Render the images of the pairs that are triggered at one instant."""
         surfaces = self.surfaces(index)
         images = {
-            k: (self.image(index, 2 * k, noisy, surfaces), self.image(index, 2 * k + 1, noisy, surfaces))
+            k: tuple(self.image(index, camera, noisy, surfaces) for camera in self.cameras_of(k))
             for k in self.triggered(index)
         }
         return FrameSet(int(self.stamps_ns[index]), images)
@@ -158,7 +163,7 @@ class Simulator:
 
     @cached_property
     def _triggers(self) -> list[frozenset[int]]:
-        return [frozenset(self.triggers_ns(pair).tolist()) for pair in range(len(self.rig.pairs))]
+        return [frozenset(self.triggers_ns(group).tolist()) for group in range(len(self.rig.groups))]
 
     @staticmethod
     def _seconds(stamps_ns: Int) -> Float:

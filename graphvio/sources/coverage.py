@@ -23,10 +23,10 @@ def count_image_faults(
     """Count images without partner, framesets without a pair, and gaps, in the time of the framesets."""
     begin_ns, end_ns = int(framesets.stamps_ns[0]), int(framesets.stamps_ns[-1])
     gaps: list[tuple[int, int, str]] = []
-    for number, (pair, index) in enumerate(zip(rig.pairs, pairs, strict=True)):
+    for number, (pair, index) in enumerate(zip(rig.groups, pairs, strict=True)):
         for camera, other, alone in (
-            (pair.left, pair.right, index.left_alone),
-            (pair.right, pair.left, index.right_alone),
+            (pair.cameras[0], pair.cameras[-1], index.left_alone),
+            (pair.cameras[-1], pair.cameras[0], index.right_alone),
         ):
             alone = alone[(alone >= begin_ns) & (alone <= end_ns)]
             if len(alone):
@@ -36,7 +36,7 @@ def count_image_faults(
         absent = framesets.stamps_ns[framesets.rows[:, number, 0] < 0]
         absent = absent[_far_from(absent, index.stamps_ns, _ABSENT_PERIODS)]  # not if triggered at another time
         if len(absent):
-            detail = f"{pair.name} has no images at {absent[0]}, another pair has"
+            detail = f"{pair.name} has no images at {absent[0]}, others have"
             faults.add(EventKind.FRAMESET_INCOMPLETE, int(absent[0]), detail, len(absent))
         inside = (index.stamps_ns >= begin_ns) & (index.stamps_ns <= end_ns)
         for begin, end in _gaps(index.stamps_ns[inside], _FRAME_GAP_PERIODS):

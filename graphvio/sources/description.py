@@ -111,7 +111,8 @@ def _rig(store: Store) -> str:
     if rig is None:
         return ""
     pairs = ", ".join(pair.name for pair in rig.pairs)
-    return f"{rig.name}, pairs {pairs}, {'with' if rig.imu else 'without'} IMU"
+    singles = "".join(f", single camera {single.name}" for single in rig.singles)
+    return f"{rig.name}, pairs {pairs}{singles}, {'with' if rig.imu else 'without'} IMU"
 
 
 def _topic(topic: Topic, header_ns: Int | None) -> TopicDescription:

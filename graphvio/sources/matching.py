@@ -66,6 +66,11 @@ def match_sides(left_ns: Int, right_ns: Int, tolerance_ns: int = TOLERANCE_NS) -
     return PairIndex(left_ns[rows[:, 0]], rows, np.delete(left_ns, rows[:, 0]), np.delete(right_ns, rows[:, 1]))
 
 
+def of_single(stamps_ns: Int) -> PairIndex:
+    """Index the images (N,) of a camera without a partner, as if each were its own right one."""
+    return match_sides(stamps_ns, stamps_ns)
+
+
 def group_pairs(pairs: Sequence[PairIndex], tolerance_ns: int = TOLERANCE_NS) -> FramesetIndex:
     """Join pairs, at least one, of the same instant to framesets.
 

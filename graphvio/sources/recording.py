@@ -18,7 +18,7 @@ from graphvio.rig import Camera, Rig
 from graphvio.sources.coverage import count_image_faults, count_imu_faults
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import Index
-from graphvio.sources.matching import TOLERANCE_NS, FramesetIndex, group_pairs, match_sides
+from graphvio.sources.matching import TOLERANCE_NS, FramesetIndex, group_pairs, match_sides, of_single
 from graphvio.sources.read_ahead import read_ahead
 from graphvio.sources.sequencer import merge
 from graphvio.sources.tables import ImuTable
@@ -29,7 +29,7 @@ _LEAD_NS = 5_000_000_000  # samples from before the first frameset help to initi
 @dataclass(frozen=True, eq=False)
 class _Decoded:
     stamp_ns: int
-    images: Mapping[int, tuple[Image, Image]]
+    images: Mapping[int, tuple[Image, ...]]
     faults: Sequence[tuple[EventKind, str]]
     decode_ms: float
 
@@ -58,6 +58,7 @@ class Recording:
         self._fit_cameras: set[str] = set()
         stamps_ns = {name: images.stamps_ns for name, images in index.images.items()}
         pairs = [match_sides(stamps_ns[pair.left.name], stamps_ns[pair.right.name], tolerance_ns) for pair in rig.pairs]
+        pairs += [of_single(stamps_ns[single.name]) for single in rig.singles]
         self._framesets = _cut(group_pairs(pairs, tolerance_ns), from_s, to_s, index.name)
         self.stamps_ns = self._framesets.stamps_ns
         self.frameset_count = len(self.stamps_ns)
@@ -82,7 +83,7 @@ class Recording:
         at = int(np.searchsorted(self.stamps_ns, stamp_ns))
         if at == self.frameset_count or self.stamps_ns[at] != stamp_ns:
             raise SourceError(f"{self.name}: has no frameset at {stamp_ns}; give the recording that it is from")
-        sizes = [(pair.left.size_px, pair.right.size_px) for pair in self.rig.pairs]
+        sizes = [[camera.size_px for camera in group.cameras] for group in self.rig.groups]
         fits = {
             j: images
             for j, images in self._decode(at).images.items()
@@ -108,7 +109,11 @@ class Recording:
                     is_empty = False
                     yield FrameSet(item.stamp_ns, images)
                 else:
-                    self.faults.add(EventKind.FRAMESET_EMPTY, item.stamp_ns, "no pair has two usable images")
+                    self.faults.add(
+                        EventKind.FRAMESET_EMPTY,
+                        item.stamp_ns,
+                        "no pair has two usable images, and no single camera one",
+                    )
         if is_empty:
             raise SourceError(
                 f"{self.name}: none of its {self.frameset_count} framesets could be read ({self.faults}); "
@@ -117,30 +122,29 @@ class Recording:
 
     def _decode(self, at: int) -> _Decoded:
         begun = time.perf_counter()
-        images: dict[int, tuple[Image, Image]] = {}
+        images: dict[int, tuple[Image, ...]] = {}
         faults: list[tuple[EventKind, str]] = []
-        for number, pair in enumerate(self.rig.pairs):
+        for number, group in enumerate(self.rig.groups):
             if self._framesets.rows[at, number, 0] < 0:
                 continue
-            both = []
-            for camera, row in zip((pair.left, pair.right), self._framesets.rows[at, number], strict=True):
+            read = []
+            for camera, row in zip(group.cameras, self._framesets.rows[at, number], strict=False):
                 try:
-                    both.append(self._images[camera.name].read(int(row)))
+                    read.append(self._images[camera.name].read(int(row)))
                 except ImageError as fault:
                     faults.append((fault.kind, fault.detail))
-            if len(both) == 2:
-                images[number] = (both[0], both[1])
+            if len(read) == len(group.cameras):
+                images[number] = tuple(read)
         decode_ms = 1e3 * (time.perf_counter() - begun)
         return _Decoded(int(self.stamps_ns[at]), images, faults, decode_ms)
 
-    def _checked(self, item: _Decoded) -> dict[int, tuple[Image, Image]]:
+    def _checked(self, item: _Decoded) -> dict[int, tuple[Image, ...]]:
         """Return the images that have the rig's size."""
         good = {}
         for number, images in item.images.items():
-            pair = self.rig.pairs[number]
-            left_fits = self._fits(pair.left, images[0], item.stamp_ns)
-            right_fits = self._fits(pair.right, images[1], item.stamp_ns)
-            if left_fits and right_fits:
+            cameras = self.rig.groups[number].cameras
+            fit = [self._fits(camera, image, item.stamp_ns) for camera, image in zip(cameras, images, strict=True)]
+            if all(fit):  # each one that does not is counted
                 good[number] = images
         return good
 

@@ -19,7 +19,7 @@ from graphvio.sessions.pixels import grey
 from graphvio.sessions.rig_of_topics import rig_of_topics
 from graphvio.sessions.stamps import header_stamps
 from graphvio.sessions.store import Store
-from graphvio.sessions.topics import RIG_ATTACHMENT, RIG_TOPIC, Topic, image_topic, of_type, preference
+from graphvio.sessions.topics import RIG_ATTACHMENT, RIG_TOPIC, Topic, image_topic, of_type, preference, sides_of
 from graphvio.sessions.truth import truth_topic
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import Index
@@ -59,9 +59,9 @@ def read_index(store: Store, rig: Rig, faults: FaultLog, topics: Mapping[str, st
     for detail in store.damages:
         faults.add(EventKind.SESSION_DAMAGED, 0, detail)
     images = {}
-    for pair in rig.pairs:
-        for side, camera in (("left", pair.left), ("right", pair.right)):
-            topic = chosen.get(camera.name) or _topic_of(store, pair.name, side, camera)
+    for group in rig.groups:
+        for side, camera in zip(sides_of(group), group.cameras, strict=True):
+            topic = chosen.get(camera.name) or _topic_of(store, group.name, side, camera)
             images[camera.name] = _Images(store, topic, faults)
     imu = _read_imu(store, chosen.get(_IMU_NAME), faults) if rig.imu is not None else None
     return Index(faults.name, images, imu, store.path if truth_topic(store.topics) is not None else None)

@@ -29,8 +29,8 @@ def as_entity(name: str) -> str:
 def blueprint(rig: Rig) -> Any:
     """Lay out the world on the left, and left cameras, curves and events on the right."""
     cameras = [
-        rrb.Spatial2DView(origin=f"world/rig/{pair.left.name}", name=f"{pair.name}: {pair.left.name}")
-        for pair in rig.pairs
+        rrb.Spatial2DView(origin=f"world/rig/{group.left.name}", name=f"{group.name}: {group.left.name}")
+        for group in rig.groups
     ]
     rates = rrb.Vertical(
         *(rrb.TimeSeriesView(origin=f"rates/{axis}", name=f"rate {axis}, rad/s") for axis in AXES),

@@ -148,9 +148,9 @@ class Recording:
     def add_images(self, frameset: FrameSet, estimate: Estimate) -> None:
         """Log left images with their corners, inliers in green."""
         self._at(frameset.stamp_ns)
-        for index, (left, _) in frameset.images.items():
-            camera = f"world/rig/{self._rig.pairs[index].left.name}"
-            done, jpeg = cv2.imencode(".jpg", left, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+        for index, images in frameset.images.items():
+            camera = f"world/rig/{self._rig.groups[index].left.name}"
+            done, jpeg = cv2.imencode(".jpg", images[0], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
             if done:
                 image = rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg")
                 self._stream.log(f"{camera}/image", image)
@@ -212,7 +212,7 @@ class Recording:
         for stage in sorted({stage for e in estimates for stage in e.stage_ms}):
             self._send_scalars(f"timing/{stage}", estimates, _stage_of(stage))
         for index in sorted({index for e in estimates for index in e.pairs}):
-            name = self._rig.pairs[index].name
+            name = self._rig.groups[index].name
             for entity, figure in _PAIR_CURVES.items():
                 self._send_scalars(entity.format(name), estimates, _reported(index, figure))
 

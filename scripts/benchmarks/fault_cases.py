@@ -127,14 +127,14 @@ def hard_measurements(
             yield measurement, inside is not None
             continue
         stamps.append(measurement.stamp_ns)
-        images = measurement.images
+        images: Images = measurement.stereo
         if inside is not None and case.fault is not None:
             if began[0] != inside:
                 began = inside, len(stamps) - 1
             images = case.fault(
                 _moment(measurement, list(before), source, truth, stamps, began[1], (*case.seed(seed), inside))
             )
-        before.append(measurement.images)
+        before.append(measurement.stereo)
         if images:
             yield FrameSet(measurement.stamp_ns, images), inside is not None
 
@@ -151,7 +151,7 @@ def _moment(
     then, earlier = truth[stamps[first]], truth[stamps[first - 1]]
     period_s = (stamps[first] - stamps[first - 1]) * 1e-9
     return Moment(
-        images=frameset.images,
+        images=frameset.stereo,
         before=before,
         rig=source.rig,
         world_T_body=truth[frameset.stamp_ns],

@@ -61,7 +61,7 @@ class PlaceObserver:
     def look(self, frameset: FrameSet) -> dict[int, PairFeatures]:
         """Return pair index -> features of a frameset."""
         seen = {}
-        for j, images in frameset.images.items():
+        for j, images in frameset.stereo.items():
             observer = self.pairs[j]
             pixels, descriptors = self._extract(images[0])
             usable = observer.usable(pixels)

@@ -26,7 +26,7 @@ def write_image(path: Path, image: Image) -> None:
 
 def write_place(folder: Path, rig: Rig, session: str, frameset: FrameSet) -> None:
     """Write all images of a frameset."""
-    for j, images in frameset.images.items():
+    for j, images in frameset.stereo.items():
         pair = rig.pairs[j]
         for camera, image in zip((pair.left, pair.right), images, strict=True):
             write_image(folder / image_name(session, camera.name, frameset.stamp_ns), image)

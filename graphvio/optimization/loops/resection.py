@@ -83,14 +83,14 @@ def register_patches(
     images of the reference and of the current place.
     """
     then, now = images
-    pairs = sorted({a for a, b in found.pairs if a == b and a in then.images and a in now.images})
+    pairs = sorted({a for a, b in found.pairs if a == b and a in then.stereo and a in now.stereo})
     if not pairs:
         return found
     rig = RigArrays.of(Rig(tuple(observer.pair for observer in observers)))
     patches = {j: KeyframePatches(observers[j].pair, config.tracking.window_px) for j in pairs}
-    known = {j: observers[j].observe(then.stamp_ns, then.images[j], reference[j].pixels) for j in pairs}
+    known = {j: observers[j].observe(then.stamp_ns, then.stereo[j], reference[j].pixels) for j in pairs}
     for j in pairs:
-        patches[j].take(known[j], then.images[j][0])
+        patches[j].take(known[j], then.stereo[j][0])
     best = found
     for _ in range(_ROUNDS):
         seen = {j: _registered(observers[j], patches[j], known[j], now, j, best.cur_T_ref) for j in pairs}
@@ -109,7 +109,7 @@ def _registered(
     observer: PairObserver, patches: KeyframePatches, known: PairFrame, now: FrameSet, j: int, cur_T_ref: Float
 ) -> PairFrame:
     """Register the reference's patches in pair j's images of the current place."""
-    camera, images = observer.pair.left, now.images[j]
+    camera, images = observer.pair.left, now.stereo[j]
     left_T_left = camera.cam_T_body @ cur_T_ref @ camera.body_T_cam
     depth = np.where(known.has_depth, np.maximum(known.points[:, 2], 0.0), 0.0)
     guess, inverse_depths, valid = predict_pixels(

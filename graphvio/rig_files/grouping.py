@@ -1,0 +1,79 @@
+"""Which cameras of a calibration form stereo pairs: those whose views overlap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from graphvio.errors import RigError
+from graphvio.rig import Camera, Imu, Rig, SingleCamera, StereoPair, checked_views
+
+_DISTANCE_M = 5.0
+_MIN_OVERLAP = 0.25
+_GRID = 12
+
+
+def grouped_rig(cameras: Sequence[Camera], imu: Imu | None, name: str, path: Path) -> Rig:
+    """Form a rig of cameras in a file's order: pairs (0, 1), (2, 3) and so on if each of them overlaps.
+
+    Otherwise the cameras that overlap most form pairs, and the others are single cameras.
+
+    Args:
+        cameras: of the file.
+        imu: of the rig, or None.
+        name: of the rig.
+        path: of the file, for messages.
+
+    Raises:
+        RigError: if no two cameras overlap, or the cameras do not describe a usable rig.
+    """
+    if not cameras:
+        raise RigError(f"{path}: describes no camera; give a rig.yaml, or a calibration of at least two cameras")
+    if len(cameras) == 1:
+        raise RigError(f"{path}: has one camera, {cameras[0].name}; graphvio needs at least one stereo pair")
+    couples = [(i, i + 1) for i in range(0, len(cameras) - 1, 2)]
+    if len(cameras) > 2 and (
+        len(cameras) % 2 or any(overlap(cameras[i], cameras[j]) < _MIN_OVERLAP for i, j in couples)
+    ):
+        couples = _overlapping(cameras)
+        if not couples:
+            names = ", ".join(camera.name for camera in cameras)
+            raise RigError(
+                f"{path}: no two of the cameras {names} see the same part of the scene; graphvio needs at least one "
+                "stereo pair: check the direction of body_T_cam, or write a rig.yaml that says which cameras form pairs"
+            )
+    pairs = [StereoPair(f"pair{k}", cameras[i], cameras[j]) for k, (i, j) in enumerate(couples)]
+    paired = {i for couple in couples for i in couple}
+    singles = [SingleCamera(camera) for i, camera in enumerate(cameras) if i not in paired]
+    return checked_views(Rig(tuple(pairs), imu, name, singles=tuple(singles)))
+
+
+def overlap(left: Camera, right: Camera) -> float:
+    """Compute the share of the left image that shows points, 5 m away, which the right camera sees too."""
+    width, height = left.size_px
+    u, v = np.meshgrid((np.arange(_GRID) + 0.5) / _GRID * width, (np.arange(_GRID) + 0.5) / _GRID * height)
+    rays, has_ray = left.unproject(np.column_stack([u.ravel(), v.ravel()]))
+    points = np.column_stack([_DISTANCE_M * rays, np.full((len(rays), 1), _DISTANCE_M)])
+    right_T_left = right.cam_T_body @ left.body_T_cam
+    _, is_seen = right.project(points @ right_T_left[:3, :3].T + right_T_left[:3, 3])
+    return float(np.mean(is_seen & has_ray))
+
+
+def _overlapping(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
+    """Match cameras that overlap, the most overlapping first; each is in one couple at most.
+
+    Raises:
+        RigError: if two cameras are at one place.
+    """
+    shares = {(i, j): overlap(cameras[i], cameras[j]) for i, j in combinations(range(len(cameras)), 2)}
+    for i, j in shares:
+        if np.allclose(cameras[i].body_T_cam, cameras[j].body_T_cam, rtol=0.0, atol=1e-9):
+            raise RigError(f"cameras {cameras[i].name} and {cameras[j].name} have the same body_T_cam; correct one")
+    couples: list[tuple[int, int]] = []
+    for (i, j), share in sorted(shares.items(), key=lambda item: (-item[1], item[0])):
+        if share >= _MIN_OVERLAP and not {i, j} & {k for couple in couples for k in couple}:
+            couples.append((i, j))
+    return sorted(couples)

@@ -1,0 +1,148 @@
+"""Rigs with a camera that has no stereo partner, from rig files to the trajectory."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import half_size
+from rendered import rendered_once
+
+from graphvio import FrameSet, Odometry, RigError, load_rig, save_rig
+from graphvio.config import Config
+from graphvio.geometry import so3_exp
+from graphvio.measurements.events import EventKind
+from graphvio.pipeline import run
+from graphvio.results import ResultWriter
+from graphvio.results.summary import Summary
+from graphvio.rig import Rig, SingleCamera
+from graphvio.sessions.euroc_writer import EurocWriter
+from graphvio.simulation import CalibrationError, Simulator, build_scene, write_recording
+from graphvio.simulation.calibration_error import draw
+from graphvio.simulation.named_rigs import NAMED_RIGS, stereo_and_back
+from graphvio.sources import open_source
+
+DURATION_S = 6.0
+
+
+def half_size_stereo_and_back() -> Rig:
+    return stereo_and_back().with_cameras(half_size)
+
+
+@pytest.fixture(scope="module")
+def walk() -> Path:
+    def write(folder: Path) -> None:
+        write_recording(Simulator(build_scene("room", DURATION_S), half_size_stereo_and_back(), 1), folder)
+
+    return rendered_once("room-stereo-back", write, "320x240", DURATION_S)
+
+
+def summary_of(recording: Path, rig: Rig, out: Path, config: Config | None = None) -> Summary:
+    config = config or Config()
+    source = open_source(recording, rig)
+    with ResultWriter(out, source.rig, config.to_yaml()) as writer:
+        return run(source, config, writer)
+
+
+# ------------------------------------------------------------------ rig files
+
+
+def test_save_rig_with_a_single_camera_is_version_2_and_reads_back(tmp_path: Path) -> None:
+    rig = stereo_and_back()
+    save_rig(rig, tmp_path / "rig.yaml")
+    assert "graphvio_rig: 2" in (tmp_path / "rig.yaml").read_text()
+    loaded = load_rig(tmp_path / "rig.yaml")
+    assert [group.name for group in loaded.groups] == ["front", "cam2"]
+    for one, other in zip(loaded.cameras, rig.cameras, strict=True):
+        np.testing.assert_array_equal(one.body_T_cam, other.body_T_cam)
+        np.testing.assert_array_equal(one.intrinsics, other.intrinsics)
+
+
+def test_load_rig_of_version_1_with_single_cameras_names_the_remedy(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    save_rig(stereo_and_back(), path)
+    path.write_text(path.read_text().replace("graphvio_rig: 2", "graphvio_rig: 1"))
+    with pytest.raises(RigError, match=r"rig.yaml: single_cameras: is of version 2; write  graphvio_rig: 2"):
+        load_rig(path)
+
+
+def test_load_rig_of_three_cameras_pairs_those_that_overlap(tmp_path: Path) -> None:
+    rig = stereo_and_back()
+    left, right, back = rig.cameras
+    renamed = [replace(camera, name=f"cam{k}") for k, camera in enumerate((back, left, right))]
+    with EurocWriter(tmp_path / "three", Rig((replace(rig.pairs[0], left=renamed[1], right=renamed[2]),), rig.imu,
+                                             singles=(SingleCamera(renamed[0]),))) as writer:  # fmt: skip
+        grey = np.zeros((480, 640), dtype=np.uint8)
+        writer.add(FrameSet(0, {0: (grey, grey), 1: (grey,)}))
+    (tmp_path / "three" / "rig.yaml").unlink()
+    loaded = load_rig(tmp_path / "three")
+    assert [(pair.left.name, pair.right.name) for pair in loaded.pairs] == [("cam1", "cam2")]
+    assert [single.name for single in loaded.singles] == ["cam0"]
+
+
+def test_rig_with_two_groups_of_one_name_is_refused() -> None:
+    rig = stereo_and_back()
+    single = SingleCamera(replace(rig.singles[0].left, name="front"))
+    with pytest.raises(RigError, match="group 'front' appears twice"):
+        replace(rig, singles=(single,))
+
+
+def test_with_only_keeps_pairs_and_makes_single_cameras_of_others() -> None:
+    rig = NAMED_RIGS["paper"]()
+    chosen = rig.with_only(["0", "cam1", "3"])
+    assert [group.name for group in chosen.groups] == ["front", "cam3"]
+    with pytest.raises(RigError, match="there is no camera '7'; choose from cam0, cam1, cam2, cam3"):
+        rig.with_only(["0", "1", "7"])
+    with pytest.raises(RigError, match="none of its pairs is among 0, 2"):
+        rig.with_only(["0", "2"])
+
+
+# ------------------------------------------------------------------ odometry
+
+
+@pytest.mark.heavy
+def test_run_with_a_single_camera_is_no_worse_than_the_pair_alone(walk: Path, tmp_path: Path) -> None:
+    """Without IMU, where the second view matters, and with a calibration that is trusted."""
+    rig, config = load_rig(walk).without_imu(), Config.from_yaml("calibration: {online: false}")
+    alone = summary_of(walk, rig.with_pairs([0]), tmp_path / "alone", config).evaluation
+    both = summary_of(walk, rig, tmp_path / "both", config)
+    assert (both.completion, both.resets) == (1.0, 0)
+    assert alone is not None
+    assert both.evaluation is not None
+    assert both.evaluation["ate_percent"] < 0.8 * alone["ate_percent"]
+    kinds = {line.split('"kind": "')[1].split('"')[0] for line in (tmp_path / "both" / "events.jsonl").open()}
+    assert EventKind.EXTRINSICS_OFF not in kinds  # the file is exact
+
+
+@pytest.mark.heavy
+def test_run_with_a_wrong_place_of_the_single_camera_learns_it(walk: Path, tmp_path: Path) -> None:
+    """The camera is half a degree and 1 cm from where the file has it, which is no more than files are wrong by."""
+    rig = load_rig(walk)
+    camera = rig.singles[0].left
+    turned = camera.body_T_cam @ np.block(
+        [[so3_exp(np.deg2rad([0.5, 0.0, 0.0])), np.array([[0.01], [0.0], [0.0]])],
+         [np.zeros((1, 3)), np.ones((1, 1))]]
+    )  # fmt: skip
+    wrong = replace(rig, singles=(SingleCamera(replace(camera, body_T_cam=turned)),))
+    summary = summary_of(walk, wrong, tmp_path / "wrong")
+    assert summary.evaluation is not None
+    alone = summary_of(walk, rig.with_pairs([0]), tmp_path / "alone").evaluation
+    assert alone is not None
+    assert summary.evaluation["ate_percent"] < 1.5 * alone["ate_percent"]
+    assert EventKind.EXTRINSICS_OFF not in (tmp_path / "wrong" / "events.jsonl").read_text()
+
+
+@pytest.mark.heavy
+def test_frameset_with_the_wrong_number_of_images_is_refused(walk: Path) -> None:
+    rig = load_rig(walk)
+    grey = np.zeros((240, 320), dtype=np.uint8)
+    odometry = Odometry(rig.without_imu())
+    with pytest.raises(RigError, match="cam2: has 2 images; the rig says 1"):
+        odometry.process(FrameSet(1, {1: (grey, grey)}))
+
+
+def test_calibration_error_of_a_rig_with_a_single_camera_is_on_it_too() -> None:
+    rig = stereo_and_back()
+    written = draw(rig, CalibrationError.of_level("2"), 3).written_rig
+    assert not np.allclose(written.singles[0].left.body_T_cam, rig.singles[0].left.body_T_cam, atol=1e-4)
+    assert not np.allclose(written.singles[0].left.intrinsics, rig.singles[0].left.intrinsics, atol=1e-2)
