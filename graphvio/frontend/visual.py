@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -13,12 +12,13 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, agree, is_supported
-from graphvio.frontend.alignment import Misalignment, PairAlignment, Place
+from graphvio.frontend.alignment import Misalignment
 from graphvio.frontend.frozen import Frozen, FrozenImages
 from graphvio.frontend.images import checked
 from graphvio.frontend.motion_stereo import MotionHistory
-from graphvio.frontend.observations import Correspondences, RigArrays, correspond
+from graphvio.frontend.observations import Correspondences, correspond
 from graphvio.frontend.pair_reports import inliers_of, pair_reports
+from graphvio.frontend.places import Places
 from graphvio.frontend.quality import graded, graded_hypothesis, stereo_share
 from graphvio.frontend.references import References
 from graphvio.frontend.refinement import Refined
@@ -27,7 +27,7 @@ from graphvio.frontend.standstill import Standstill
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import PairFrame
-from graphvio.geometry import se3_adjoint, se3_inverse, skew, so3_log
+from graphvio.geometry import se3_inverse, so3_log
 from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
@@ -84,7 +84,7 @@ class VisualFrontend:
         self.stage_ms: dict[str, float] = {}
         self._config = config
         self._rig = rig
-        self._arrays = RigArrays.of(rig)  # with the corrections that are in force
+        self._places = Places(rig, config)
         self._history = MotionHistory()
         self._trackers = [PairTracker(group, config, self._history) for group in rig.groups]
         self._baselines_m = _baselines_m(rig)
@@ -97,11 +97,6 @@ class VisualFrontend:
         of_file = 0.0 if config.estimates_calibration else config.motion.calibration_error_share
         self._scale_sigma = 0.0 if rig.imu is None else float(np.hypot(config.motion.shared_error_share, of_file))
         self._standstill = Standstill()
-        # Self-calibration finds errors of the pairs; the places of single cameras are monitored here.
-        first_monitored = len(rig.pairs) if config.estimates_calibration else 1
-        self._alignments = {j: PairAlignment(_prior(rig, j, config)) for j in range(first_monitored, len(rig.groups))}
-        self._uncertain: Mapping[int, Place] = {}  # covariances of extrinsics that are corrected, or not tested yet
-        self._correct_places()
         self._contradicted_ns: int | None = None  # when the pairs last were beyond 5 sigma of each other
         self._workers = ThreadPoolExecutor(len(rig.groups), thread_name_prefix="graphvio-pair")
 
@@ -113,12 +108,12 @@ class VisualFrontend:
     @property
     def body_T_left(self) -> Float:
         """(P, 4, 4) of the groups' left cameras, with the corrections that are in force."""
-        return self._arrays.body_T_left
+        return self._places.arrays.body_T_left
 
     @property
     def misaligned(self) -> Mapping[int, Misalignment]:
         """Pairs and single cameras whose extrinsics relative to the first pair are wrong: motions are corrected."""
-        return {j: alignment.refuted for j, alignment in self._alignments.items() if alignment.refuted is not None}
+        return self._places.misaligned
 
     def frames_at(self, stamp_ns: int) -> dict[int, PairFrame]:
         """Return the pairs' tracks at the newest frameset, if it has this stamp."""
@@ -142,12 +137,11 @@ class VisualFrontend:
             uncertain: pair index -> covariance (6, 6) of its extrinsics relative to the first pair, see `agree`.
         """
         self._rig = rig
-        self._arrays = RigArrays.of(rig)
         self._baselines_m = _baselines_m(rig)
-        self._uncertain = {j: Place(covariance) for j, covariance in uncertain.items()}
+        self._places.recalibrate(rig, uncertain)
         for tracker, group in zip(self._trackers, rig.groups, strict=True):
             tracker.recalibrate(group, epipolar_margin_px)
-        self._correct_places()
+        self._move_trackers()
         self._references.recalibrate(rig)
         self._latest = {j: frame.recalibrated(rig.groups[j]) for j, frame in self._latest.items()}
 
@@ -228,13 +222,13 @@ class VisualFrontend:
         predicted = predict(seen.reference_stamp_ns)
         start = np.eye(4) if predicted is None else predicted
         if config.selection == "joint":
-            refined = joint_motion(self._arrays, observations, start, config, rng)
+            refined = joint_motion(self._places.arrays, observations, start, config, rng)
             in_doubt = self._is_in_doubt(seen.stamp_ns)
-            agreement = agree(self._arrays, observations, refined, config, rng, self._uncertain, in_doubt)
+            agreement = agree(self._places.arrays, observations, refined, config, rng, self._places.uncertain, in_doubt)
             if agreement.contradicts:
                 self._contradicted_ns = seen.stamp_ns
         else:
-            refined = best_pair_motion(self._arrays, observations, start, config, rng)
+            refined = best_pair_motion(self._places.arrays, observations, start, config, rng)
             agreement = Agreement((MotionHypothesis(observations.pairs, refined),), {})
         best = agreement.hypotheses[0]
         rows = np.isin(observations.pair, best.pairs)
@@ -281,7 +275,8 @@ class VisualFrontend:
         if not self._references.must_be_replaced(seen.frames, seen.correspondences, refined, is_contradicted):
             return {}, {}
         own = self._own_motions(seen, agreement)
-        self._learn_alignments(agreement)
+        self._places.learn(agreement.own)
+        self._move_trackers()
         self._history.advance(seen.reference_stamp_ns, seen.stamp_ns, refined.cur_T_ref, refined.covariance)
         return self._refer_to(seen.frames), own
 
@@ -306,7 +301,7 @@ class VisualFrontend:
         cur_T_then = None if then is None else predict(then.stamp_ns)
         if cur_T_then is None:
             return None
-        body_T_left = self._arrays.body_T_left[pair]
+        body_T_left = self._places.arrays.body_T_left[pair]
         return np.asarray(se3_inverse(body_T_left) @ cur_T_then @ body_T_left)
 
     def _refer_to(self, frames: Mapping[int, PairFrame]) -> dict[int, PairFrame]:
@@ -349,54 +344,13 @@ class VisualFrontend:
         for j, refined in (agreement.own or alone).items():
             if j >= len(self._rig.pairs):
                 continue
-            back = se3_inverse(self._alignments[j].correction) if j in self._alignments else np.eye(4)
-            adjoint = se3_adjoint(back)
-            uncorrected = replace(
-                refined,
-                cur_T_ref=back @ refined.cur_T_ref @ se3_inverse(back),
-                covariance=adjoint @ refined.covariance @ adjoint.T,
-            )
-            motions[j] = self._relative_motion(seen, uncorrected)
+            motions[j] = self._relative_motion(seen, self._places.uncorrected(j, refined))
         return motions
 
-    def _learn_alignments(self, agreement: Agreement) -> None:
-        """Compare the pairs' motions over a keyframe with the first pair's, and correct extrinsics that they refute."""
-        own = agreement.own
-        if 0 not in own:
-            return
-        for j, alignment in self._alignments.items():
-            if j not in own:
-                continue
-            alignment.add(own[0], own[j])
-            if alignment.learn():
-                self._correct(j)
-
-    def _correct_places(self) -> None:
-        for j, alignment in self._alignments.items():
-            if alignment.in_force is not None:
-                self._correct(j)
-
-    def _correct(self, j: int) -> None:
-        """Take the correction in force of a pair's or a single camera's place."""
-        self._arrays = self._arrays.corrected(RigArrays.of(self._rig), j, self._alignments[j].correction)
-        in_force = {i: alignment.in_force for i, alignment in self._alignments.items()}
-        learnt = {i: each.place for i, each in in_force.items() if each is not None}
-        others = {i: place for i, place in self._uncertain.items() if i not in self._alignments}
-        self._uncertain = others | learnt
-        self._trackers[j].move(self._arrays.body_T_left[j])
-
-
-def _prior(rig: Rig, j: int, config: Config) -> Float | None:
-    """Return the covariance (6, 6) of a single camera's extrinsics where calibrations are not taken for exact."""
-    if j < len(rig.pairs) or not config.estimates_calibration:
-        return None
-    known, camera = rig.calibration_sigmas, rig.groups[j].left
-    of_lens = np.sqrt(2.0) * known.principal_point_px / camera.focal_px  # of both cameras; it turns their views
-    turn = np.hypot(np.deg2rad(known.pair_rotation_deg), of_lens)
-    about_camera = np.eye(6)
-    about_camera[3:, :3] = skew(camera.body_T_cam[:3, 3])
-    covariance = np.diag(np.repeat([turn, known.pair_translation_m], 3) ** 2)
-    return about_camera @ covariance @ about_camera.T
+    def _move_trackers(self) -> None:
+        """Give the single cameras' trackers the poses by which they locate points."""
+        for j in range(len(self._rig.pairs), len(self._rig.groups)):
+            self._trackers[j].move(self._places.arrays.body_T_left[j])
 
 
 def _baselines_m(rig: Rig) -> list[float]:
