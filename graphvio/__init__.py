@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from graphvio.odometry.recorded_calibration import calibrate_recording
     from graphvio.optimization.optimize import Optimization
     from graphvio.optimization.pipeline import optimize_sessions
-    from graphvio.rig import Camera, Imu, Rig, StereoPair
+    from graphvio.rig import Camera, Imu, Rig, SingleCamera, StereoPair
     from graphvio.rig_files import load_rig, save_rig
     from graphvio.sources import open_source
     from graphvio.trajectory import Trajectory
@@ -53,6 +53,7 @@ _HOME_OF = {
     "Prediction": "measurements.estimate",
     "Rig": "rig",
     "RigError": "errors",
+    "SingleCamera": "rig",
     "SourceError": "errors",
     "Status": "measurements.estimate",
     "StereoPair": "rig",
@@ -87,6 +88,7 @@ __all__ = [
     "Prediction",
     "Rig",
     "RigError",
+    "SingleCamera",
     "SourceError",
     "Status",
     "StereoPair",

@@ -1,11 +1,13 @@
-"""Checks of images, which the kernels rely on."""
+"""Checks of images, which the kernels rely on, and their masks."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 
-from graphvio.arrays import Bool, Image
+from graphvio.arrays import AnyArray, Bool, Image
 from graphvio.errors import RigError
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Camera, Rig
@@ -36,17 +38,54 @@ def _checked(image: Image, camera: Camera) -> Image:
     return np.ascontiguousarray(image)
 
 
-def allowed_pixels(camera: Camera, window_px: int) -> Bool:
-    """Return where (height, width) points of an image may be: where no pixel of their patch is masked.
+ImageMask = Callable[[str, Image], AnyArray | None]
+"""Takes a camera's name and its image (height, width), and returns a mask (height, width), whose zeros (or False) are
+not used, or None to use all of the image. It is called from several threads."""
+
+
+class UsablePixels:
+    """Where points of a camera's images may be: where no pixel of their patch is masked.
+
+    Args:
+        camera: with a mask that is the same for all images, or without.
+        window_px: side of the patches.
+        image_mask: masks of each image, or None.
+
+    Attributes:
+        always: (height, width) where points may be by the camera's own mask.
 
     Raises:
         RigError: if the camera's mask is no image of its size.
     """
-    width, height = camera.size_px
-    if camera.mask is None:
-        return np.ones((height, width), dtype=bool)
-    mask = cv2.imread(str(camera.mask), cv2.IMREAD_GRAYSCALE)
-    if mask is None or mask.shape != (height, width):
-        raise RigError(f"camera {camera.name}: mask {camera.mask} is no image of {width}x{height} pixels")
-    reach = 2 * (window_px // 2 + 1) + 1  # a patch at any sub-pixel place
-    return np.asarray(cv2.erode(mask, np.ones((reach, reach), dtype=np.uint8), borderValue=(255,)) > 0)
+
+    def __init__(self, camera: Camera, window_px: int, image_mask: ImageMask | None = None) -> None:
+        self._camera = camera
+        self._reach = 2 * (window_px // 2 + 1) + 1  # a patch at any sub-pixel place
+        self._image_mask = image_mask
+        width, height = camera.size_px
+        self.always = np.ones((height, width), dtype=bool)
+        if camera.mask is not None:
+            mask = cv2.imread(str(camera.mask), cv2.IMREAD_GRAYSCALE)
+            if mask is None or mask.shape != (height, width):
+                raise RigError(f"camera {camera.name}: mask {camera.mask} is no image of {width}x{height} pixels")
+            self.always = self._shrunk(mask)
+
+    def of(self, image: Image) -> Bool:
+        """Return where (height, width) points of an image may be.
+
+        Raises:
+            RigError: if its mask has another size.
+        """
+        mask = None if self._image_mask is None else self._image_mask(self._camera.name, image)
+        if mask is None:
+            return self.always
+        mask = np.asarray(mask)
+        if mask.shape != image.shape:
+            raise RigError(
+                f"camera {self._camera.name}: the mask of an image has shape {mask.shape}; it must be {image.shape}"
+            )
+        return self.always & self._shrunk((mask != 0).astype(np.uint8))
+
+    def _shrunk(self, mask: AnyArray) -> Bool:
+        kernel = np.ones((self._reach, self._reach), dtype=np.uint8)
+        return np.asarray(cv2.erode(mask, kernel, borderValue=(255,)) > 0)

@@ -54,6 +54,10 @@ class StereoMatcher:
         self._packed_right = np.zeros(allowed_right.shape, dtype=np.uint32)
         self._margin_px = 0.0  # by how much the calibration may move epipolar lines
 
+    def allow(self, allowed_right: Bool) -> None:
+        """Match only where (height, width) the newest right image may be used."""
+        self._allowed = allowed_right
+
     def recalibrate(self, pair: StereoPair, epipolar_margin_px: float) -> None:
         """Take another calibration of the cameras from now on, whose epipolar lines may be off by a margin."""
         self._pair = pair

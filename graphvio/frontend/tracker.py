@@ -9,7 +9,7 @@ import numpy as np
 from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
 from graphvio.frontend.corners import find_corners, noise_sigma, occupied_cells, thinned
-from graphvio.frontend.images import allowed_pixels
+from graphvio.frontend.images import ImageMask, UsablePixels
 from graphvio.frontend.keyframe_patches import KeyframePatches
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
 from graphvio.frontend.matching import StereoMatcher
@@ -31,16 +31,24 @@ class PairTracker:
         pair: the cameras.
         config: of all stages.
         history: motions since the latest keyframes, by which a single camera's points are located.
+        image_mask: masks of each image, or None.
     """
 
-    def __init__(self, pair: CameraGroup, config: Config, history: MotionHistory | None = None) -> None:
+    def __init__(
+        self,
+        pair: CameraGroup,
+        config: Config,
+        history: MotionHistory | None = None,
+        image_mask: ImageMask | None = None,
+    ) -> None:
         self._pair = pair
         self._config = config
         self._cell_px = config.corners.cell_px(pair.left.size_px[0])
-        self._allowed = allowed_pixels(pair.left, config.tracking.window_px)
+        self._usable = [UsablePixels(camera, config.tracking.window_px, image_mask) for camera in pair.cameras]
+        self._allowed = self._usable[0].always  # and what of the newest image is not masked
         self._matcher = None
         if isinstance(pair, StereoPair):
-            self._matcher = StereoMatcher(pair, config, allowed_pixels(pair.right, config.tracking.window_px))
+            self._matcher = StereoMatcher(pair, config, self._usable[1].always)
         self._history, self._first_sights = history or MotionHistory(), FirstSights()
         self._body_T_left = pair.left.body_T_cam
         self._next_id = 0
@@ -70,6 +78,9 @@ class PairTracker:
         watch = Stopwatch()
         before, levels = self._left, max(self._config.tracking.levels, 2)
         self._left, self._right = build_pyramid(left, levels), () if right is None else build_pyramid(right, 2)
+        self._allowed = self._usable[0].of(left)
+        if self._matcher is not None and right is not None:
+            self._matcher.allow(self._usable[1].of(right))
         self._noise_sigma = noise_sigma(left)
         watch.lap("pyramid")
         last, guess, inverse_depths = self._predict(left_T_left_prev)

@@ -14,7 +14,7 @@ from graphvio.config import Config
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, agree, is_supported
 from graphvio.frontend.alignment import Misalignment
 from graphvio.frontend.frozen import Frozen, FrozenImages
-from graphvio.frontend.images import checked
+from graphvio.frontend.images import ImageMask, checked
 from graphvio.frontend.motion_stereo import MotionHistory
 from graphvio.frontend.observations import Correspondences, correspond
 from graphvio.frontend.pair_reports import inliers_of, pair_reports
@@ -75,18 +75,19 @@ class VisualFrontend:
     Args:
         rig: Stereo pairs.
         config: Configuration of all stages.
+        image_mask: Masks of each image, or None.
 
     Attributes:
         stage_ms: Processing time by stage of the newest frameset, milliseconds.
     """
 
-    def __init__(self, rig: Rig, config: Config) -> None:
+    def __init__(self, rig: Rig, config: Config, image_mask: ImageMask | None = None) -> None:
         self.stage_ms: dict[str, float] = {}
         self._config = config
         self._rig = rig
         self._places = Places(rig, config)
         self._history = MotionHistory()
-        self._trackers = [PairTracker(group, config, self._history) for group in rig.groups]
+        self._trackers = [PairTracker(group, config, self._history, image_mask) for group in rig.groups]
         self._baselines_m = _baselines_m(rig)
         self._frozen = FrozenImages()
         self._all_frozen = False

@@ -17,6 +17,7 @@ from graphvio.backend.propagation import Propagator
 from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
 from graphvio.errors import ConfigError, MeasurementError
+from graphvio.frontend.images import ImageMask
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.measurements.estimate import Estimate, Prediction, Status
 from graphvio.measurements.events import Event, EventKind
@@ -55,6 +56,9 @@ class Odometry:
         rig: Cameras and IMU; without an IMU, vision alone is used.
         config: Configuration of all stages.
         on_prediction: Called with the prediction at each IMU sample, within `process`.
+        image_mask: Called with a camera's name and each of its images (height, width), from several threads; returns
+            a mask of that size, whose zeros are not used, or None. What is masked becomes no corner, and tracks that
+            enter it end.
 
     Attributes:
         rig: Cameras and IMU.
@@ -63,12 +67,16 @@ class Odometry:
     """
 
     def __init__(
-        self, rig: Rig, config: Config | None = None, on_prediction: Callable[[Prediction], None] | None = None
+        self,
+        rig: Rig,
+        config: Config | None = None,
+        on_prediction: Callable[[Prediction], None] | None = None,
+        image_mask: ImageMask | None = None,
     ) -> None:
         self.rig = rig
         self.config = config or Config()
         self.stage_ms: dict[str, float] = {}
-        self._frontend = VisualFrontend(rig, self.config)
+        self._frontend = VisualFrontend(rig, self.config, image_mask)
         self._synchroniser = Synchroniser(rig, self.config, self.report)
         estimator = FilterEstimator if self.config.fusion.estimator == "filter" else SmootherEstimator
         self._estimator: StateEstimator = estimator(rig, self.config, self.report)

@@ -6,7 +6,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Image, Int
 from graphvio.config import Config
-from graphvio.frontend.images import allowed_pixels
+from graphvio.frontend.images import UsablePixels
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.tracks import PairFrame, usable_at
@@ -36,8 +36,8 @@ class PairObserver:
     def __init__(self, pair: StereoPair, config: Config) -> None:
         window_px = config.tracking.window_px
         self.pair = pair
-        self._allowed = allowed_pixels(pair.left, window_px)
-        self._matcher = StereoMatcher(pair, config, allowed_pixels(pair.right, window_px))
+        self._allowed = UsablePixels(pair.left, window_px).always
+        self._matcher = StereoMatcher(pair, config, UsablePixels(pair.right, window_px).always)
 
     def usable(self, pixels: Float) -> Bool:
         """Return which pixels (N, 2) are inside the left image and not masked."""
