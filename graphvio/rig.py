@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 _ROTATION_TOLERANCE = 1e-3
 _ROUNDING = 1e-14
 _MIN_BASELINE_M = 1e-3
-_MAX_AXES_ANGLE_DEG = 45.0
+MAX_AXES_ANGLE_DEG = 45.0
+"""Between the cameras of a stereo pair: with more, patches look too different."""
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _MAX_MATRIX_ERROR = 0.2
 
@@ -124,6 +125,11 @@ class Camera:
         return np.asarray(inside_x & (y >= border_px) & (y <= height - 1 - border_px))
 
 
+def axes_angle_deg(left: Camera, right: Camera) -> float:
+    """Compute the angle between the optical axes of two cameras."""
+    return float(np.rad2deg(np.arccos(np.clip((right.cam_T_body @ left.body_T_cam)[2, 2], -1.0, 1.0))))
+
+
 @dataclass(frozen=True, eq=False)
 class StereoPair:
     """Left and right camera with overlapping views.
@@ -148,11 +154,11 @@ class StereoPair:
                 f"{where}: baseline is {1e3 * self.baseline_m:.3f} mm; a stereo pair needs two cameras at "
                 "different places: check body_T_cam of both"
             )
-        axes_deg = np.rad2deg(np.arccos(np.clip(self.right_T_left[2, 2], -1.0, 1.0)))
-        if axes_deg > _MAX_AXES_ANGLE_DEG:
+        axes_deg = axes_angle_deg(self.left, self.right)
+        if axes_deg > MAX_AXES_ANGLE_DEG:
             raise RigError(
                 f"{where}: optical axes are {axes_deg:.0f} degrees apart (at most "
-                f"{_MAX_AXES_ANGLE_DEG:.0f}); check which cameras form a pair and the direction of body_T_cam"
+                f"{MAX_AXES_ANGLE_DEG:.0f}); check which cameras form a pair and the direction of body_T_cam"
             )
 
     @cached_property
@@ -321,13 +327,13 @@ class Rig:
         """Select cameras of the rig: pairs of which both are selected stay pairs, others become single cameras.
 
         Args:
-            cameras: names, or numbers in `cameras`.
+            cameras: names; a number N is short for ``camN``.
 
         Raises:
             RigError: if there is no such camera, or no pair is left.
         """
         names = [camera.name for camera in self.cameras]
-        wanted = {name if name in names or not name.isdecimal() else _at(names, int(name)) for name in cameras}
+        wanted = {f"cam{name}" if name.isdecimal() and name not in names else name for name in cameras}
         for name in sorted(wanted - set(names)):
             raise RigError(f"{self.name}: there is no camera {name!r}; choose from {', '.join(names)}")
         pairs = [pair for pair in self.pairs if {camera.name for camera in pair.cameras} <= wanted]
@@ -346,10 +352,6 @@ class Rig:
         pairs = [replace(pair, left=change(pair.left), right=change(pair.right)) for pair in self.pairs]
         singles = [SingleCamera(change(single.left)) for single in self.singles]
         return replace(self, pairs=tuple(pairs), singles=tuple(singles))
-
-
-def _at(names: Sequence[str], number: int) -> str:
-    return names[number] if number < len(names) else str(number)
 
 
 def checked_views(rig: Rig) -> Rig:

@@ -11,11 +11,13 @@ from rendered import rendered_once
 from graphvio import FrameSet, Odometry, RigError, load_rig, save_rig
 from graphvio.config import Config
 from graphvio.geometry import so3_exp
+from graphvio.live.pairing import FramesetAssembler
 from graphvio.measurements.events import EventKind
 from graphvio.pipeline import run
 from graphvio.results import ResultWriter
 from graphvio.results.summary import Summary
 from graphvio.rig import Rig, SingleCamera
+from graphvio.rig_files.grouping import grouped_rig, overlap
 from graphvio.sessions.euroc_writer import EurocWriter
 from graphvio.simulation import CalibrationError, Simulator, build_scene, write_recording
 from graphvio.simulation.calibration_error import draw
@@ -91,10 +93,40 @@ def test_with_only_keeps_pairs_and_makes_single_cameras_of_others() -> None:
     rig = NAMED_RIGS["paper"]()
     chosen = rig.with_only(["0", "cam1", "3"])
     assert [group.name for group in chosen.groups] == ["front", "cam3"]
-    with pytest.raises(RigError, match="there is no camera '7'; choose from cam0, cam1, cam2, cam3"):
+    with pytest.raises(RigError, match="there is no camera 'cam7'; choose from cam0, cam1, cam2, cam3"):
         rig.with_only(["0", "1", "7"])
     with pytest.raises(RigError, match="none of its pairs is among 0, 2"):
         rig.with_only(["0", "2"])
+
+
+def test_with_only_takes_numbers_for_names_whatever_the_order() -> None:
+    rig = stereo_and_back()
+    names = {"cam0": "cam1", "cam1": "cam2", "cam2": "cam0"}
+    renamed = rig.with_cameras(lambda camera: replace(camera, name=names[camera.name]))
+    assert [camera.name for camera in renamed.with_only(["1", "2"]).cameras] == ["cam1", "cam2"]
+
+
+def test_cameras_that_overlap_but_look_apart_are_single(tmp_path: Path) -> None:
+    """Fisheyes 60 degrees apart see much of the same, but their patches look too different for stereo."""
+    front, right = stereo_and_back().pairs[0].cameras
+    wide = [
+        replace(camera, model="equidistant", intrinsics=np.array([250.0, 250.0, 320.0, 240.0]), distortion=np.zeros(4))
+        for camera in (front, right)
+    ]
+    turned = front.body_T_cam.copy()
+    turned[:3, :3] = turned[:3, :3] @ so3_exp(np.array([0.0, np.pi / 3.0, 0.0]))
+    turned[:3, 3] += 0.1
+    side = replace(wide[0], name="cam2", body_T_cam=turned)
+    assert overlap(wide[0], side) > 0.25
+    rig = grouped_rig([*wide, side], None, "wide", tmp_path)
+    assert [group.name for group in rig.groups] == ["pair0", "cam2"]
+    with pytest.raises(RigError, match="no two of the cameras"):
+        grouped_rig([wide[0], side, replace(stereo_and_back().singles[0].left, name="cam3")], None, "wide", tmp_path)
+
+
+def test_live_sources_refuse_single_cameras() -> None:
+    with pytest.raises(RigError, match="cam2 has no partner; live sources take stereo pairs only"):
+        FramesetAssembler(stereo_and_back(), 2.0, 50.0, lambda *_: None)
 
 
 # ------------------------------------------------------------------ odometry

@@ -30,7 +30,7 @@ Cameras = Annotated[
     str | None,
     typer.Option(
         "--cameras",
-        help="Use only these cameras, by name or number, such as 0,1,2; pairs among them stay pairs.  [default: all]",
+        help="Use only these cameras, such as cam0,cam1,cam2 or 0,1,2; pairs among them stay pairs.  [default: all]",
     ),
 ]
 NoImu = Annotated[bool, typer.Option("--no-imu", help="Use the cameras alone.")]

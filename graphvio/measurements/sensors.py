@@ -104,5 +104,5 @@ def checked_measurement(measurement: Measurement) -> Measurement:
                 f"frameset at {stamp_ns}: group {pair} has not one or two images; give (left, right), or (image,)"
             )
         if not all(isinstance(image, np.ndarray) for image in images):
-            raise MeasurementError(f"frameset at {stamp_ns}: pair {pair} has something else than arrays; give images")
+            raise MeasurementError(f"frameset at {stamp_ns}: group {pair} has something else than arrays; give images")
     return FrameSet(stamp_ns, measurement.images)

@@ -9,7 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from graphvio.errors import RigError
-from graphvio.rig import Camera, Imu, Rig, SingleCamera, StereoPair, checked_views
+from graphvio.rig import (
+    MAX_AXES_ANGLE_DEG,
+    Camera,
+    Imu,
+    Rig,
+    SingleCamera,
+    StereoPair,
+    axes_angle_deg,
+    checked_views,
+)
 
 _DISTANCE_M = 5.0
 _MIN_OVERLAP = 0.25
@@ -63,7 +72,7 @@ def overlap(left: Camera, right: Camera) -> float:
 
 
 def _overlapping(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
-    """Match cameras that overlap, the most overlapping first; each is in one couple at most.
+    """Match cameras that overlap and look nearly the same way, the most overlapping first, each at most once.
 
     Raises:
         RigError: if two cameras are at one place.
@@ -74,6 +83,7 @@ def _overlapping(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
             raise RigError(f"cameras {cameras[i].name} and {cameras[j].name} have the same body_T_cam; correct one")
     couples: list[tuple[int, int]] = []
     for (i, j), share in sorted(shares.items(), key=lambda item: (-item[1], item[0])):
-        if share >= _MIN_OVERLAP and not {i, j} & {k for couple in couples for k in couple}:
+        is_stereo = share >= _MIN_OVERLAP and axes_angle_deg(cameras[i], cameras[j]) <= MAX_AXES_ANGLE_DEG
+        if is_stereo and not {i, j} & {k for couple in couples for k in couple}:
             couples.append((i, j))
     return sorted(couples)
