@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import graphvio
 from recordings import half_size
 from rendered import rendered_once
 
-from graphvio import FrameSet, Odometry, RigError, load_rig, save_rig
+from graphvio import FrameSet, Odometry, RigError, load_rig, load_trajectory, save_rig
 from graphvio.config import Config
 from graphvio.geometry import so3_exp
 from graphvio.live.pairing import FramesetAssembler
@@ -144,6 +145,50 @@ def test_run_with_a_single_camera_is_no_worse_than_the_pair_alone(walk: Path, tm
     assert both.evaluation["ate_percent"] < 0.8 * alone["ate_percent"]
     kinds = {line.split('"kind": "')[1].split('"')[0] for line in (tmp_path / "both" / "events.jsonl").open()}
     assert EventKind.EXTRINSICS_OFF not in kinds  # the file is exact
+
+
+@pytest.mark.heavy
+def test_session_and_folder_of_a_single_camera_give_the_same_trajectory(walk: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    assert graphvio("convert", walk, "--out", tmp_path / "walk.mcap").returncode == 0
+    rig = load_rig(walk)
+    poses = []
+    for recording in (walk, tmp_path / "walk.mcap"):
+        odometry = Odometry(rig)
+        source = open_source(recording, rig, to_s=1.5)
+        poses.append([e.nav_T_body for e in map(odometry.process, source) if e is not None])
+    for one, other in zip(*poses, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.heavy
+def test_a_dark_pair_leaves_the_motion_to_the_single_camera(walk: Path) -> None:
+    """Without IMU the pair's images are black for half a second: motions are of the single camera meanwhile."""
+    source = open_source(walk, load_rig(walk).without_imu())
+    assert source.truth is not None
+    truth = load_trajectory(source.truth)
+    odometry, darkness, errors_m = Odometry(source.rig), (3_000_000_000, 3_500_000_000), []
+    first_ns, before = None, None
+    for measurement in source:
+        assert isinstance(measurement, FrameSet)
+        first_ns = measurement.stamp_ns if first_ns is None else first_ns
+        is_dark = darkness[0] <= measurement.stamp_ns - first_ns < darkness[1]
+        if is_dark:
+            black = np.zeros((240, 320), dtype=np.uint8)
+            noisy = tuple(black + np.uint8(measurement.stamp_ns // 50_000_000 % 2 + k) for k in (0, 1))
+            measurement = FrameSet(measurement.stamp_ns, {**measurement.images, 0: noisy})
+        estimate = odometry.process(measurement)
+        if estimate is None or estimate.nav_T_body is None:
+            continue
+        at = int(np.searchsorted(truth.stamps_ns, estimate.stamp_ns))
+        now = (estimate.nav_T_body, truth.nav_T_body[at])
+        if is_dark and before is not None:
+            moved, really = (np.linalg.inv(b) @ n for b, n in zip(before, now, strict=True))
+            errors_m.append(np.linalg.norm(moved[:3, 3] - really[:3, 3]))
+            assert estimate.pairs[1].inliers > 30
+        before = now
+    assert len(errors_m) == 10
+    assert np.median(errors_m) < 0.005  # 50 mm in each frameset
 
 
 @pytest.mark.heavy

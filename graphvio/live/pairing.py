@@ -54,7 +54,7 @@ class FramesetAssembler:
         if rig.singles:
             names = ", ".join(single.name for single in rig.singles)
             raise RigError(
-                f"{rig.name}: {names} has no partner; live sources take stereo pairs only: give a rig of pairs"
+                f"{rig.name}: {names} has no partner; live sources take stereo pairs only: give a rig of pairs by --rig"
             )
         self._tolerance_ns = round(1e6 * tolerance_ms)
         self._max_wait_ns = round(1e6 * max_wait_ms)
