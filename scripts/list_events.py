@@ -1,4 +1,4 @@
-"""Writes docs/events.md, the kinds of events with their sentences, from `graphvio.measurements.events.EventKind`."""
+"""Writes docs/reference/events.md, the kinds of events with their sentences, from their enumeration."""
 
 import re
 from pathlib import Path
@@ -28,4 +28,4 @@ def page() -> str:
 
 
 if __name__ == "__main__":
-    (ROOT / "docs" / "events.md").write_text(page())
+    (ROOT / "docs" / "reference" / "events.md").write_text(page())

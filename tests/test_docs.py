@@ -17,7 +17,7 @@ from graphvio.rig_files import load_rig
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-SELF_CALIBRATION = (ROOT / "docs/self-calibration.md").read_text()
+SELF_CALIBRATION = (ROOT / "docs/how-to/self-calibration.md").read_text()
 
 
 def test_the_readmes_python_runs_as_typed(room_walk: Path, tmp_path: Path) -> None:
@@ -60,13 +60,13 @@ def test_the_commands_of_self_calibration_run_as_typed(walk: Path) -> None:
 
 
 def test_events_page_lists_every_kind() -> None:
-    text = (ROOT / "docs/events.md").read_text()
+    text = (ROOT / "docs/reference/events.md").read_text()
     assert text == list_events.page()
     assert [kind for kind in EventKind if f"| `{kind}` |" not in text] == []
 
 
 def test_every_configuration_value_is_documented() -> None:
-    text = (ROOT / "docs/configuration.md").read_text()
+    text = (ROOT / "docs/reference/configuration.md").read_text()
     config = Config()
     for stage in fields(config):
         section = text.split(f"## `{stage.name}`\n")[1].split("\n## ")[0]
@@ -79,20 +79,37 @@ def test_every_configuration_value_is_documented() -> None:
         assert f"| `{profile}` |" in text
 
 
+def slug(heading: str) -> str:
+    """Return the identifier of a heading, as sites of code and mkdocs make it."""
+    plain = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading)
+    return re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", plain.lower()).strip())
+
+
+def prose(path: Path) -> str:
+    """Return a document without its blocks of code."""
+    return re.sub(r"^```.*?^```", "", path.read_text(), flags=re.MULTILINE | re.DOTALL)
+
+
 def test_every_link_between_the_documents_leads_somewhere() -> None:
-    for path in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
-        for target in re.findall(r"\]\(([^)#:]+)\)", path.read_text()):
-            assert (path.parent / target).exists(), f"{path.name} links to {target}"
+    documents = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "examples").rglob("*.md")]
+    assert len(documents) > 30
+    for path in documents:
+        for target, identifier in re.findall(r"\]\(([^)#:\s]*)(?:#([^)\s]*))?\)", prose(path)):
+            page = path.parent / target if target else path
+            assert page.exists(), f"{path.relative_to(ROOT)} links to {target}"
+            if identifier:
+                headings = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
+                assert identifier in map(slug, headings), f"{path.relative_to(ROOT)} links to {target}#{identifier}"
 
 
 def test_the_architecture_names_existing_modules() -> None:
-    for name in re.findall(r"`([\w/]+(?:\.py|/))`", (ROOT / "docs/architecture.md").read_text()):
+    for name in re.findall(r"`([\w/]+(?:\.py|/))`", (ROOT / "docs/explanation/architecture.md").read_text()):
         assert list((ROOT / "graphvio").rglob(name)) or (ROOT / "graphvio" / name).exists(), name
 
 
 def test_the_architecture_links_equations_to_existing_functions() -> None:
-    text = (ROOT / "docs/architecture.md").read_text()
-    links = re.findall(r"\[(\w+)\]\(\.\./(graphvio/[\w/]+\.py)\)", text)
+    text = (ROOT / "docs/explanation/architecture.md").read_text()
+    links = re.findall(r"\[(\w+)\]\(\.\./\.\./(graphvio/[\w/]+\.py)\)", text)
     assert len(links) > 13
     for function, path in links:
         assert f"\ndef {function}(" in (ROOT / path).read_text(), f"{path} has no {function}"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from graphvio.cli import shared
 
-PAGE = (Path(__file__).parents[1] / "docs/platforms.md").read_text()
+PAGE = (Path(__file__).parents[1] / "docs/reference/platforms.md").read_text()
 
 
 def test_the_page_has_every_exit_code() -> None:

@@ -255,7 +255,7 @@ def test_load_rig_unreadable_file_raises(tmp_path: Path, name: str, content: byt
 
 
 def test_load_rig_example_of_documentation_is_valid(tmp_path: Path) -> None:
-    text = (Path(__file__).parents[1] / "docs" / "data-contract.md").read_text()
+    text = (Path(__file__).parents[1] / "docs" / "reference" / "data-contract.md").read_text()
     (example,) = re.findall(r"```yaml\n(graphvio_rig.*?)```", text, re.DOTALL)
     (tmp_path / "rig.yaml").write_text(example)
     rig = load_rig(tmp_path / "rig.yaml")

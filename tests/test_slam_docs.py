@@ -1,4 +1,4 @@
-"""What docs/slam-interface.md shows of the client is executed, against a real server in this process."""
+"""What docs/how-to/slam-interface.md shows of the client is executed, against a real server in this process."""
 
 import ast
 import re
@@ -18,7 +18,7 @@ from graphvio.slam.service.options import ServiceOptions
 from graphvio.slam.service.server import GrpcServer
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs/slam-interface.md").read_text()
+PAGE = (ROOT / "docs/how-to/slam-interface.md").read_text()
 
 
 def example() -> str:

@@ -2,7 +2,7 @@
 
 Version 2 has ``single_cameras``, version 1 has not. A rig without single cameras is written in version 1.
 
-The format is documented with a full example in ``docs/data-contract.md``.
+The format is documented with a full example in ``docs/reference/data-contract.md``.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ if __name__ == "__main__":
     sys.exit(
         run_command_line(
             "scripts/benchmark",
-            "Measures speed, accuracy and behaviour under faults. docs/benchmarks.md says what is compared.",
+            "Measures speed, accuracy and behaviour under faults. docs/explanation/benchmarks has what is compared.",
             tuple(
                 module.add_parser
                 for module in (startup, frontend, backend, accuracy, calibration_error, cameras, faults, optimize, slam)

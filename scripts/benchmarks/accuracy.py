@@ -12,7 +12,7 @@ from benchmarks.bench import CLIP_TRUTH, Bench
 from benchmarks.motions import BREAK_SIGMA, BREAK_STATISTIC
 from benchmarks.picture import Panel, draw_trajectories
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import DOCS, Report, log_progress, machine
+from benchmarks.report import DOCS, IMAGES, Report, log_progress, machine
 from benchmarks.runs import HEAD, blinded, with_moved_pair
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
@@ -94,12 +94,12 @@ def run_all(args: argparse.Namespace) -> None:
     link = ""
     if panels:
         draw_trajectories(picture, panels)
-        link = "![Trajectories by all pairs and by each alone, seen from above](images/trajectories.png)"
+        link = "![Trajectories by all pairs and by each alone, seen from above](../../images/trajectories.png)"
     report.save(args.out / "accuracy.md")
     if args.docs:
         report.save_to_docs("accuracy", link)
         if panels:
-            (DOCS / "images" / "trajectories.png").write_bytes(picture.read_bytes())
+            (IMAGES / "trajectories.png").write_bytes(picture.read_bytes())
     log_progress(f"written to {args.out}")
 
 
@@ -117,7 +117,7 @@ def _main_table(report: Report, bench: Bench, cases: list[tuple[str, bool]]) -> 
         for outcome in [bench.outcome(name, profile, pairs, imu)]
     ]
     lengths = ", ".join(_length(bench, name) for name in bench.recordings)
-    report.add("#### Profiles and pairs", f"Recordings: {lengths}.")
+    report.add("### Profiles and pairs", f"Recordings: {lengths}.")
     report.table(["recording", "profile", "pairs", "IMU", *HEAD], rows)
     report.add(
         f"A break is a motion that was used though its squared Mahalanobis distance to the truth is beyond "
@@ -144,7 +144,7 @@ def _together_table(report: Report, bench: Bench, cases: list[tuple[str, bool]])
     if not rows:
         return
     report.add(
-        "#### All pairs and the better one",
+        "### All pairs and the better one",
         f"The same runs: ATE in cm by all pairs and by the better pair alone, each epoch aligned by itself and "
         "without poses in which vision takes no part, of which there may be more or fewer (by vision, %). The aim "
         f"is a ratio of at most {AIM:g} everywhere; in a rich room, all pairs ought to be several times better (a "
@@ -165,7 +165,7 @@ def _reference_table(report: Report, bench: Bench) -> None:
         )
         rows.append([name, _cm(kept), _cm(previous), _ratio(kept, previous)])
     report.add(
-        "#### Keyframe and previous frame",
+        "### Keyframe and previous frame",
         "All pairs by vision alone, motion measured from a keyframe (`motion.reference: keyframe`, the default) and "
         "from the frame before (`previous`); ATE in cm, each epoch aligned by itself.",
     )
@@ -181,7 +181,7 @@ def _filters_table(report: Report, bench: Bench) -> None:
         )
         rows.append([name, _cm(first), _cm(full), _cm(smoother), _ratio(first, full), _ratio(smoother, full)])
     report.add(
-        "#### The paper's filters and the smoother",
+        "### The paper's filters and the smoother",
         "All pairs with the IMU: the paper's first approach (`filter.bias: none`), its filter with the gyro's bias "
         f"(profile `{PAPER}`), and the default; ATE in cm, each epoch aligned by itself.",
     )
@@ -207,7 +207,7 @@ def _moved_table(report: Report, bench: Bench) -> None:
     if not rows:
         return
     report.add(
-        "#### Error in P_12",
+        "### Error in P_12",
         f"All pairs with the default profile, the second pair's extrinsics off by {_ANGLE_DEG:g} degree and "
         f"{100 * _SHIFT_M:g} cm; ATE in cm, next to those of the exact rig and of the better pair alone.",
     )
@@ -230,7 +230,7 @@ def _blind_table(report: Report, bench: Bench, duration_s: float | None) -> None
             outcome = bench.special(_BLIND_SCENE, DEFAULT, rig, imu, blinded(j, from_ns, to_ns))
             rows.append([rig.pairs[j].name, _imu(imu), *outcome.cells()])
     report.add(
-        "#### A blind pair",
+        "### A blind pair",
         f"The {_BLIND_SCENE} with both pairs and the default profile; one pair's images are black from {begin_s:g} to "
         f"{end_s:g} s.",
     )

@@ -59,7 +59,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--out", type=Path, default=_OUT, metavar="CSV", help=f"results are added (default: {_OUT})")
     parser.add_argument("--resume", action="store_true", help="take runs with the same settings from that file")
-    parser.add_argument("--docs", action="store_true", help="put the tables into docs/benchmarks.md")
+    parser.add_argument("--docs", action="store_true", help="put the tables into docs/explanation/benchmarks")
     parser.add_argument(
         "--recordings",
         type=Path,
@@ -179,7 +179,7 @@ def _tables(report: Report, results: dict[Case, CalibrationOutcome]) -> None:
     if not rows:
         return
     report.add(
-        "#### Accuracy",
+        "### Accuracy",
         "ATE in cm and ratio to the better single pair: median / worst of the draws. Ratio to the exact files: of the "
         "medians. With pose: framesets of the worst draw, by all pairs.",
     )
@@ -187,7 +187,7 @@ def _tables(report: Report, results: dict[Case, CalibrationOutcome]) -> None:
     report.table(head, rows)
     if parameter_rows:
         report.add(
-            "#### Calibration parameters",
+            "### Calibration parameters",
             "Rms errors of the files -> of the rig that the odometry estimated with both pairs; medians of the draws.",
         )
         report.table(["scene", "level", "IMU", *_PARAMETERS.values()], parameter_rows)

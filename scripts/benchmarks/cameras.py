@@ -41,7 +41,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of recordings (default: 3)")
     parser.add_argument("--duration", type=float, metavar="S", help="only so much of each walk")
     parser.add_argument("--out", type=Path, metavar="FILE", help="also write the tables to this file")
-    parser.add_argument("--docs", action="store_true", help="put the tables into docs/benchmarks.md")
+    parser.add_argument("--docs", action="store_true", help="put the tables into docs/explanation/benchmarks")
     add_data_option(parser)
     parser.set_defaults(run=run_all)
 

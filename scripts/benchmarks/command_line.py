@@ -50,4 +50,4 @@ def run_command_line(prog: str, description: str, subcommands: Sequence[AddParse
 def add_report_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--out`` and ``--docs``, which also write the report to a file."""
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
-    parser.add_argument("--docs", action="store_true", help="write the report into docs/benchmarks.md")
+    parser.add_argument("--docs", action="store_true", help="write the report into docs/explanation/benchmarks")

@@ -67,7 +67,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report to this file")
     parser.add_argument("--motions", type=Path, metavar="FILE.csv", help="write a line for each motion")
     parser.add_argument("--config", metavar="NAME", help="profile or YAML file to run with (default: the defaults)")
-    parser.add_argument("--docs", action="store_true", help="write the report into docs/benchmarks.md")
+    parser.add_argument("--docs", action="store_true", help="write the report into docs/explanation/benchmarks")
     add_data_option(parser)
 
 
@@ -174,7 +174,7 @@ def _write(report: Report, outcomes: Mapping[str, Mapping[bool, Outcome]]) -> No
         "pairs contradict each other, the motion and covariance of the consensus set that it used."
     )
     for mode, name in _MODES.items():
-        report.add(f"#### {name}")
+        report.add(f"### {name}")
         total = Outcome()
         rows = []
         for case in outcomes:

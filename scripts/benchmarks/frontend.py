@@ -67,7 +67,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--no-growth", action="store_true", help="leave out the tables of growth")
     parser.add_argument("--profile", default="default", metavar="NAME", help="configuration, by name or YAML file")
     parser.add_argument("--out", type=Path, metavar="FILE.md", help="write the report there, too")
-    parser.add_argument("--docs", action="store_true", help="put the report into docs/benchmarks.md")
+    parser.add_argument("--docs", action="store_true", help="put the report into docs/explanation/benchmarks")
     add_data_option(parser)
     parser.set_defaults(run=run)
 

@@ -52,7 +52,7 @@ def _features(report: Report, footage: Footage, config: Config) -> None:
         distance_px = min(_REFERENCE_DISTANCE_PX, 0.5 * dense.corners.cell_px(footage.rig.pairs[0].left.size_px[0]))
         row = _row(footage, dense, ReferenceContender(footage, corners, distance_px))
         rows.append([f"{wanted}", f"{across}", *row])
-    report.add("#### Features", "The reference looks for as many corners as there are tracks.")
+    report.add("### Features", "The reference looks for as many corners as there are tracks.")
     report.table(["tracks wanted", "`corners.cells_across`", *_HEAD], rows)
 
 
@@ -62,7 +62,7 @@ def _hypotheses(report: Report, footage: Footage, config: Config) -> None:
         varied = replace(config, motion=replace(config.motion, hypotheses=count, confidence=1.0))
         rows.append([f"{count}", *_row(footage, varied, ReferenceContender(footage))])
     report.add(
-        "#### Hypotheses",
+        "### Hypotheses",
         "Here all hypotheses are sampled (`motion.confidence` 1); with the default, sampling ends once one is correct "
         "with this probability, mostly after a batch or two. The reference is the same in each row; it shows how much "
         "the load changed.",
@@ -76,7 +76,7 @@ def _pairs(report: Report, footage: Footage, config: Config) -> None:
         several = footage.with_pair_count(count)
         rows.append([f"{count}", *_row(several, config, ReferenceContender(several))])
     own = len(footage.rig.pairs)
-    report.add("#### Pairs", f"The recording has {own}; more are copies of them, images and calibration alike.")
+    report.add("### Pairs", f"The recording has {own}; more are copies of them, images and calibration alike.")
     report.table(["pairs", *_HEAD], rows)
 
 
@@ -87,7 +87,7 @@ def _sizes(report: Report, footage: Footage, config: Config) -> None:
         reference = ReferenceContender(resized, _REFERENCE_CORNERS, scale * _REFERENCE_DISTANCE_PX)
         width, height = resized.rig.pairs[0].left.size_px
         rows.append([f"{width}x{height}", *_row(resized, config, reference)])
-    report.add("#### Image size", "Images are resampled; cells keep their share of the image, windows their pixels.")
+    report.add("### Image size", "Images are resampled; cells keep their share of the image, windows their pixels.")
     report.table(["image, px", *_HEAD], rows)
 
 

@@ -41,7 +41,7 @@ def add_parser(subparsers: Subparsers) -> None:
                         help="a real recording with truth, left out if it is not there (default: "
                         "shared/data/euroc_mh01_clip next to the project)")  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="DIR", help="write a report of each part to this folder")
-    parser.add_argument("--docs", action="store_true", help="put the reports into docs/benchmarks.md")
+    parser.add_argument("--docs", action="store_true", help="put the reports into docs/explanation/benchmarks")
     add_data_option(parser)
 
 

@@ -149,7 +149,7 @@ def _stage(what: str) -> str:
 
 def add_recordings(report: Report, runs: dict[str, Optimized]) -> None:
     """Tables of errors, closures and times."""
-    report.add("#### Recordings", f"All pairs and the IMU; ATE in cm. {_lengths(runs)}")
+    report.add("### Recordings", f"All pairs and the IMU; ATE in cm. {_lengths(runs)}")
     rows = []
     for name, run in runs.items():
         ates = run.ates_m()
@@ -207,7 +207,7 @@ def add_recordings(report: Report, runs: dict[str, Optimized]) -> None:
 def add_pairs(report: Report, runs: dict[str, Optimized]) -> None:
     """Table of one recording by its pairs; ``runs`` has their names."""
     report.add(
-        "#### Pairs of the loop",
+        "### Pairs of the loop",
         "The loop with each pair alone and with both. *Across pairs* are closures by points of one pair which the "
         "other saw, as where a way is walked back. ATE in cm.",
     )

@@ -56,7 +56,7 @@ def add_retrieval(report: Report, runs: dict[str, Optimized]) -> None:
         rows.append(_row(name, f"pycolmap, {_TREE_WORDS} words", views, similarity, seconds))
         log_progress(f"  {name}: {len(views.names)} images, {asked} of them with others that show the same")
     report.add(
-        "#### Retrieval",
+        "### Retrieval",
         f"Images of the places, each asked for those more than {config.optimization.loop_interval_s:g} s away. Two "
         f"show the same where the cameras are less than {_NEAR_M:g} m apart and look less than {_ALIKE_DEG:g} "
         "degrees aside of each other. *Recall at N* is the share, of the images that have such others, for which one "

@@ -65,7 +65,7 @@ def add_hour(report: Report, minutes: Sequence[float]) -> None:
             log_progress(f"  {run.minutes:g} minutes: {run.seconds:.1f} s, {run.memory_mb:.0f} MB")
             runs.append(run)
     report.add(
-        "#### An hour",
+        "### An hour",
         f"{LOOPS_AN_HOUR} closures an hour, {100 * FALSE_SHARE:.0f} % of them false and anywhere. *Time* is that of "
         "`optimize()` by the clock, which other load lengthens; *processor* that of all cores. *Reference* is the "
         f"processor's time for a chain of as many states, blocks of {_BLOCK} variables, factored and solved in plain "
@@ -189,7 +189,7 @@ def add_false_closures(report: Report, seeds: int, jobs: int) -> None:
         )
     online, after = (np.median([getattr(results[each], name) for each in clean]) for name in ("online_m", "ate_m"))
     report.add(
-        "#### False closures",
+        "### False closures",
         f"A walk of {_WALK_S:g} s with {_RIGHT} right closures and more and more false ones, {seeds} seeds. "
         "*Anywhere*: between any two places and off by metres. *All alike*: of places that are seen again, all off by "
         "the same transform along the way, as where a pattern repeats: "

@@ -1,10 +1,11 @@
-"""A report in Markdown: printed as it grows, then written to a file or between two markers of docs/benchmarks.md."""
+"""A report in Markdown: printed as it grows, then written to a file or between two markers of a page in docs."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import platform
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,6 +15,8 @@ from pathlib import Path
 from graphvio.errors import GraphvioError
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGES = DOCS / "explanation" / "benchmarks"
+IMAGES = DOCS / "images"
 _PACKAGES = ("numpy", "numba", "opencv-python-headless", "gtsam")
 
 
@@ -65,27 +68,27 @@ class Report:
             self.save_to_docs(name)
 
     def save_to_docs(self, name: str, extra: str = "") -> None:
-        """Replace what stands between ``<!-- name -->`` and ``<!-- /name -->`` in docs/benchmarks.md.
+        """Replace what stands between ``<!-- name -->`` and ``<!-- /name -->`` in the page that has them.
 
         Args:
             name: of the markers.
             extra: Markdown that follows the report, such as the link to a picture.
 
         Raises:
-            GraphvioError: if the page or a marker is missing.
+            GraphvioError: if not exactly one page has the markers.
         """
-        page = DOCS / "benchmarks.md"
         begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
-        try:
-            text = page.read_text(encoding="utf-8")
-        except OSError as error:
-            raise GraphvioError(f"docs/{page.name}: cannot be read ({error.strerror})") from None
-        if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
-            raise GraphvioError(f"docs/{page.name}: needs one line {begin} and after it one line {end}")
-        before, remaining = text.split(begin)
-        after = remaining.split(end)[1]
+        marker = re.compile(f"{re.escape(begin)}\n.*?{re.escape(end)}", re.DOTALL)
+        texts = {page: page.read_text(encoding="utf-8") for page in sorted(PAGES.glob("*.md"))}
+        found = [(page, match) for page, text in texts.items() for match in marker.finditer(text)]
+        if len(found) != 1:
+            raise GraphvioError(
+                f"docs/explanation/benchmarks: one page needs {begin} and after it {end}; {len(found)} have them"
+            )
+        ((page, match),) = found
         inside = f"{self.text}\n{extra}\n" if extra else self.text
-        page.write_text(f"{before}{begin}\n{inside}{end}{after}", encoding="utf-8")
+        text = texts[page]
+        page.write_text(f"{text[: match.start()]}{begin}\n{inside}{end}{text[match.end() :]}", encoding="utf-8")
 
 
 @contextmanager

@@ -12,7 +12,7 @@ if __name__ == "__main__":
     sys.exit(
         run_command_line(
             "scripts/campaign",
-            "Monte Carlo campaigns and outages. docs/benchmarks.md has their results.",
+            "Monte Carlo campaigns and outages. docs/explanation/benchmarks has their results.",
             tuple(module.add_parser for module in _MODULES),
         )
     )

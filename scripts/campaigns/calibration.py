@@ -58,7 +58,7 @@ def main(args: argparse.Namespace) -> None:
     if args.runs < 1 or args.jobs < 1:
         raise GraphvioError("--runs and --jobs must be 1 or more")
     report = Report()
-    report.add(machine(), "", f"`--runs {args.runs}`.", "", "#### Synthetic errors")
+    report.add(machine(), "", f"`--runs {args.runs}`.", "", "### Synthetic errors")
     low, high = chi2.ppf([0.025, 0.975], 6 * args.runs) / args.runs
     report.add(
         f"{PAIRS} pose pairs a run, along the walk of the scene `calibration`; root mean square errors. NEES of 6 has "
@@ -69,11 +69,11 @@ def main(args: argparse.Namespace) -> None:
     source = open_source(recording)
     whole, rows = _growth(recording)
     report.add(
-        "#### Framesets", f"From images: {_SECONDS:g} s of the scene `calibration`, {source.frameset_count} framesets."
+        "### Framesets", f"From images: {_SECONDS:g} s of the scene `calibration`, {source.frameset_count} framesets."
     )
     report.table(_GROWTH_HEAD, rows)
     report.add(
-        "#### Odometry with the rig that was found",
+        "### Odometry with the rig that was found",
         "ATE in mm, each epoch aligned by itself, with the true rig, with the one found from all these framesets, and "
         f"with one whose second pair is {_WRONG_DEG:g} degrees and {100 * _WRONG_M:g} cm from its place, which the "
         "odometry notices and corrects.",

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from benchmarks.command_line import add_command
 from benchmarks.recordings import add_data_option
-from benchmarks.report import DOCS, Report, log_progress, machine
+from benchmarks.report import IMAGES, Report, log_progress, machine
 
 from campaigns.measures import HEAD, Squares, rows
 from campaigns.model_run import model_run
@@ -74,8 +74,8 @@ def main(args: argparse.Namespace) -> None:
         report.save(args.out)
         draw_consistency(args.out.with_suffix(".png"), synthetic, NAMES)
     if args.docs:
-        report.save_to_docs("consistency", "![NEES over time](consistency.png)")
-        draw_consistency(DOCS / "consistency.png", synthetic, NAMES)
+        report.save_to_docs("consistency", "![NEES over time](../../images/consistency.png)")
+        draw_consistency(IMAGES / "consistency.png", synthetic, NAMES)
 
 
 def _write(
@@ -90,7 +90,7 @@ def _write(
         "that of the mean of all runs at one time; of the times, 95 % are expected in it.",
     )
     report.add(
-        "#### Errors sampled from the model",
+        "### Errors sampled from the model",
         f"{args.seeds} runs on the walks of {', '.join(SCENES)}. Vision's covariances are those that the front-end "
         f"reported for {len(templates)} motions in the rendered {_WHERE}; errors of IMU, biases and initial state are "
         "sampled from the model of the smoother (`smoother.imu_noise_scale` 1). The last row compares the IMU from one "
@@ -100,7 +100,7 @@ def _write(
     report.table(HEAD, rows(synthetic, SYNTHETIC_NAMES))
     if args.rendered:
         report.add(
-            "#### Rendered images",
+            "### Rendered images",
             f"The whole odometry, {args.rendered} IMUs on each of {', '.join(SCENES)}. The defaults allow for an IMU "
             "noisier than its data sheet, which the simulator does not have; here they do not "
             "(`smoother.imu_noise_scale` 1). `motion.shared_error_share` is "

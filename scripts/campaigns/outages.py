@@ -71,9 +71,9 @@ def main(args: argparse.Namespace) -> None:
             rows.append([case.name, *cells])
             broken += [f"- {case.name}: {words}" for words in missed]
             log_progress(f"case {number + 1} of {len(CASES)}")
-    report.add("#### Required", "In all cases, time never goes back and there is no pose while lost.")
+    report.add("### Required", "In all cases, time never goes back and there is no pose while lost.")
     report.table(("case", "required"), [(case.name, case.requirement) for case in CASES])
-    report.add("#### Results", _EXPLANATION)
+    report.add("### Results", _EXPLANATION)
     report.table(_HEAD, rows)
     report.add(
         "Required of every case: each delivered frameset has an estimate, stamps increase, there is no pose while "

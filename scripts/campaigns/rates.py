@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from benchmarks.command_line import Subparsers, add_command
 from benchmarks.recordings import add_data_option, simulated
-from benchmarks.report import DOCS, log_progress, writing
+from benchmarks.report import IMAGES, log_progress, writing
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -43,7 +43,7 @@ def add_parser(subparsers: Subparsers) -> None:
 
 def main(args: argparse.Namespace) -> None:
     """Run and plot."""
-    paths = [path for path in (args.out, DOCS / "images" / "rates.png" if args.docs else None) if path is not None]
+    paths = [path for path in (args.out, IMAGES / "rates.png" if args.docs else None) if path is not None]
     if not paths:
         raise GraphvioError("no output is given: give --out FILE.png or --docs")
     blind_s = build_scene("corridor").events["blank"]

@@ -85,7 +85,7 @@ def _write_truth(report: Report, flight: Flight, found: Reconstruction, at_zero:
     turned_deg = np.rad2deg(turns(recorded, truth))
     moved = np.abs(turns(at_zero.truth, truth)).max(), np.abs(at_zero.truth.accel_bias - truth.accel_bias).max()
     report.add(
-        "#### The truth",
+        "### The truth",
         "The file and the reconstruction, by body axis. Means and, of the rotation from the file's orientations to "
         "the reconstruction's, the standard deviation, over all of the flight.",
     )
@@ -111,7 +111,7 @@ def _write_truth(report: Report, flight: Flight, found: Reconstruction, at_zero:
 def _write_consistency(report: Report, runs: list[RealRun], found: Reconstruction, config: SmootherConfig) -> None:
     plain, added = _squares(runs), _squares(runs, _uncertainty(found, runs))
     report.add(
-        "#### NEES and NIS",
+        "### NEES and NIS",
         f"Means over time and {len(runs)} runs against the reconstruction, with `smoother.imu_noise_scale` "
         f"{config.imu_noise_scale:g}, the default; the aim is within a factor of {_FACTOR:g} of the number of "
         "dimensions. *Shared* is the part due to the mean error of all runs, *scattered* that due to their "
@@ -145,7 +145,7 @@ def _write_causes(
 ) -> None:  # fmt: skip
     plain, other, ideal = _squares(runs), _squares(wider), _squares(synthetic)
     report.add(
-        "#### Causes of large values",
+        "### Causes of large values",
         f"The same runs with `smoother.imu_noise_scale` {_OTHER_SCALE:g}; and with the default on forces that are not "
         "the measured ones, but those of the reconstruction with a constant bias and the white noise of the smoother's "
         "model of the accelerometer, sampled for each run. The gyro's measurements are unchanged.",
@@ -170,7 +170,7 @@ def _write_causes(
 
 def _write_biases(report: Report, recorded: Truth, found: Truth, runs: list[RealRun]) -> None:
     report.add(
-        "#### Biases",
+        "### Biases",
         "Differences of the smoother's from the file's and from the reconstruction's: median and 95th percentile over "
         f"all runs and states after {_AFTER_S} s. The aim for the gyro is {1e3 * _GYRO_BIAS_AIM:g} mrad/s from the "
         "file. The file's accelerometer biases belong to its turned orientations: gravity is in them.",
@@ -197,7 +197,7 @@ def _write_biases(report: Report, recorded: Truth, found: Truth, runs: list[Real
 
 def _write_recorded(report: Report, run: RealRun, by_file: RealRun, recorded: Truth, found: Truth) -> None:
     report.add(
-        "#### With the file's own orientations",
+        "### With the file's own orientations",
         "One run whose vision is sampled around the file's own poses, compared with the file, and the run of the same "
         "seed on the reconstruction.",
     )
