@@ -1,20 +1,29 @@
-"""A mask for each image, as somebody's segmentation makes it."""
+"""Masks of images: by a function, from files beside the images, from topics; and those of cameras."""
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
-from recordings import half_size_rig
+from recordings import half_size_rig, noise_image, small_rig, write_euroc, write_image
 from rendered import rendered_once
 
 from graphvio import FrameSet, Odometry, RigError, Trajectory, load_trajectory, open_source
 from graphvio.arrays import AnyArray, Bool, Float, Image
+from graphvio.errors import MeasurementError
 from graphvio.evaluation import evaluate
-from graphvio.frontend.images import ImageMask
+from graphvio.frontend.images import ImageMask, UsablePixels, checked
 from graphvio.measurements.estimate import Estimate
+from graphvio.measurements.sensors import Measurement
+from graphvio.sessions.euroc_writer import EurocWriter
+from graphvio.sessions.topics import ImageFormat
+from graphvio.sessions.writer import SessionWriter
 from graphvio.simulation import Simulator, build_scene, write_recording
+from graphvio.sources import Source
 
 DURATION_S = 5.0
 
@@ -95,3 +104,113 @@ def test_a_mask_of_another_size_names_the_camera(walk: Path) -> None:
 
     with pytest.raises(RigError, match=r"camera cam\d: the mask of an image has shape \(10, 10\); it must be"):
         list(estimates_of(walk, wrong, 2))
+
+
+def masked_euroc(path: Path, frames: int = 6) -> Path:
+    """A small recording of which cam0 has masks of all images but the last, which is damaged, and cam3 of the first."""
+    write_euroc(path, frames=frames)
+    for camera, masked in (("cam0", frames), ("cam3", 1)):
+        folder = path / "mav0" / camera
+        for number, image in enumerate(sorted((folder / "data").glob("*.png"))[:masked]):
+            mask = (noise_image(1000 + number) > 100).astype(np.uint8) * 255
+            write_image(folder / "masks" / image.name, mask)
+    (path / "mav0/cam0/masks" / image_names(path)[-1]).write_bytes(b"no image")
+    return path
+
+
+def image_names(path: Path) -> list[str]:
+    return sorted(image.name for image in (path / "mav0/cam0/data").glob("*.png"))
+
+
+def masks_of(source: Source) -> list[dict[int, tuple[Image | None, ...]]]:
+    return [dict(each.masks) for each in source if isinstance(each, FrameSet)]
+
+
+def test_masks_beside_images_come_with_their_framesets(tmp_path: Path) -> None:
+    source = open_source(masked_euroc(tmp_path))
+    found = masks_of(source)
+    for number, masks in enumerate(found[:-1]):
+        assert masks[0][1] is None
+        np.testing.assert_array_equal(masks[0][0], (noise_image(1000 + number) > 100) * 255)
+    assert found[-1][0] == (None, None)
+    assert found[0][1][0] is None
+    assert found[0][1][1] is not None
+    assert source.faults.counts == {"mask_missing": 6}
+
+
+@pytest.mark.parametrize("image_format", ["raw", "png"])
+def test_masks_go_through_sessions_and_back(tmp_path: Path, image_format: ImageFormat) -> None:
+    pytest.importorskip("mcap")
+    pytest.importorskip("rosbags")
+    source = open_source(masked_euroc(tmp_path / "walk"))
+
+    def converted(read: Source, writer: SessionWriter | EurocWriter) -> Source:
+        with writer:
+            for measurement in read:
+                writer.add(measurement)
+        return open_source(writer.path)
+
+    session = converted(source, SessionWriter(tmp_path / "walk.mcap", source.rig, image_format))
+    again = converted(session, EurocWriter(tmp_path / "again", session.rig))
+    assert [pair.name for pair in session.rig.pairs] == ["pair0", "pair1"]  # and none of masks
+    for one, other, third in zip(masks_of(source), masks_of(session), masks_of(again), strict=True):
+        for j, masks in one.items():
+            for a, b, c in zip(masks, other[j], third[j], strict=True):
+                assert (a is None) == (b is None) == (c is None)
+                if a is not None:
+                    np.testing.assert_array_equal(a, b)
+                    np.testing.assert_array_equal(a, c)
+
+
+def test_masks_of_a_named_topic(tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    pytest.importorskip("rosbags")
+    source = open_source(masked_euroc(tmp_path / "walk"))
+    with SessionWriter(tmp_path / "walk.mcap", source.rig) as writer:
+        for measurement in source:
+            writer.add(measurement)
+    exchanged = open_source(tmp_path / "walk.mcap", topics={"cam1/mask": "/pair0/left/mask"})
+    masks = masks_of(exchanged)[0][0]
+    np.testing.assert_array_equal(masks[1], masks[0])
+
+
+def test_masks_from_files_act_as_those_of_a_function(walk: Path, tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").symlink_to(walk / "rig.yaml")
+    for sensor in (walk / "mav0").iterdir():
+        if sensor.is_dir():
+            (tmp_path / "mav0" / sensor.name).mkdir(parents=True)
+            for entry in sensor.iterdir():
+                (tmp_path / "mav0" / sensor.name / entry.name).symlink_to(entry)
+    for image in (f for n in range(4) for f in sorted((walk / "mav0" / f"cam{n}" / "data").iterdir())[:12]):
+        mask = person(np.asarray(cv2.imread(str(image), cv2.IMREAD_GRAYSCALE), dtype=np.uint8))
+        write_image(tmp_path / "mav0" / image.parent.parent.name / "masks" / image.name, mask.astype(np.uint8))
+    by_function = list(estimates_of(walk, lambda camera, image: person(image), 10))
+    from_files = list(estimates_of(tmp_path, None, 10))
+    for one, other in zip(by_function, from_files, strict=True):
+        np.testing.assert_array_equal(one.nav_T_body, other.nav_T_body)
+        for j, report in one.pairs.items():
+            np.testing.assert_array_equal(report.pixels, other.pairs[j].pixels)
+
+
+def test_mask_files_of_another_size_name_camera_and_remedy(tmp_path: Path) -> None:
+    rig = small_rig(1)
+    camera = rig.pairs[0].left
+    small = np.ones((10, 10), dtype=np.uint8)
+    image = noise_image(1)
+    frameset = FrameSet(0, {0: (image, image)}, {0: (None, small)})
+    with pytest.raises(
+        RigError, match=r"camera cam1: the mask .* \(10, 10\); it must be \(48, 64\), the size .*: make"
+    ):
+        checked(frameset, rig)
+    with pytest.raises(RigError, match="has 1 masks; give one for each"):
+        checked(FrameSet(0, {0: (image, image)}, {0: (None,)}), rig)
+    write_image(tmp_path / "mask.png", small)
+    with pytest.raises(RigError, match=r"camera cam0: mask .* is 10x10 pixels large; give an image of 64x48 pixels"):
+        UsablePixels(replace(camera, mask=tmp_path / "mask.png"), 5)
+
+
+def test_masks_that_are_no_mapping_are_refused() -> None:
+    masks: Any = [None]
+    measurement: Measurement = FrameSet(0, {}, masks)
+    with pytest.raises(MeasurementError, match="masks is a list"):
+        Odometry(small_rig(1)).process(measurement)

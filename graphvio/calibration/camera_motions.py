@@ -203,7 +203,8 @@ class _PairOdometry:
         self._steady = SteadyMotion()
 
     def add(self, number: int, frameset: FrameSet) -> None:
-        alone = FrameSet(frameset.stamp_ns, {0: frameset.images[number]})
+        masks = {0: frameset.masks[number]} if number in frameset.masks else {}
+        alone = FrameSet(frameset.stamp_ns, {0: frameset.images[number]}, masks)
         self._steady.begin(alone.stamp_ns)
         result = self.frontend.process(alone, self._steady.predict)
         motion = result.motion if result.quality is Quality.GOOD else None

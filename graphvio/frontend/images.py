@@ -17,15 +17,23 @@ def checked(frameset: FrameSet, rig: Rig) -> FrameSet:
     """Return the frameset with contiguous images.
 
     Raises:
-        RigError: if an image is not of the type and size that the rig says, or a group has another number of images.
+        RigError: if an image or its mask is not of the type and size that the rig says, or a group has another number
+            of them.
     """
-    checked_images = {}
+    checked_images, masks = {}, {}
     for j, images in frameset.images.items():
         cameras = rig.groups[j].cameras
         if len(images) != len(cameras):
             raise RigError(f"{rig.groups[j].name}: has {len(images)} images; the rig says {len(cameras)}")
         checked_images[j] = tuple(_checked(image, camera) for image, camera in zip(images, cameras, strict=True))
-    return FrameSet(frameset.stamp_ns, checked_images)
+        given = frameset.masks.get(j)
+        if given is not None:
+            if len(given) != len(cameras):
+                raise RigError(
+                    f"{rig.groups[j].name}: has {len(given)} masks; give one for each of its images, or None"
+                )
+            masks[j] = tuple(_checked_mask(mask, camera) for mask, camera in zip(given, cameras, strict=True))
+    return FrameSet(frameset.stamp_ns, checked_images, masks)
 
 
 def _checked(image: Image, camera: Camera) -> Image:
@@ -36,6 +44,19 @@ def _checked(image: Image, camera: Camera) -> Image:
             f"({height}, {width}), uint8"
         )
     return np.ascontiguousarray(image)
+
+
+def _checked_mask(mask: AnyArray | None, camera: Camera) -> Image | None:
+    """Return a mask as an image whose zeros are not used."""
+    if mask is None:
+        return None
+    mask, (width, height) = np.asarray(mask), camera.size_px
+    if mask.shape != (height, width):
+        raise RigError(
+            f"camera {camera.name}: the mask of an image has shape {mask.shape}; it must be ({height}, {width}), the "
+            "size of the camera's images: make it of images of that size"
+        )
+    return np.asarray(mask != 0, dtype=np.uint8)
 
 
 ImageMask = Callable[[str, Image], AnyArray | None]
@@ -67,24 +88,26 @@ class UsablePixels:
         if camera.mask is not None:
             mask = cv2.imread(str(camera.mask), cv2.IMREAD_GRAYSCALE)
             if mask is None or mask.shape != (height, width):
-                raise RigError(f"camera {camera.name}: mask {camera.mask} is no image of {width}x{height} pixels")
+                is_ = "no image" if mask is None else f"{mask.shape[1]}x{mask.shape[0]} pixels large"
+                raise RigError(
+                    f"camera {camera.name}: mask {camera.mask} is {is_}; give an image of {width}x{height} pixels, the "
+                    "camera's size, or remove the mask from the rig"
+                )
             self.always = self._shrunk(mask)
 
-    def of(self, image: Image) -> Bool:
+    def of(self, image: Image, mask: Image | None = None) -> Bool:
         """Return where (height, width) points of an image may be.
 
+        Args:
+            image: (height, width).
+            mask: (height, width) that came with it, whose zeros are not used, or None.
+
         Raises:
-            RigError: if its mask has another size.
+            RigError: if the mask that the function makes has another size.
         """
-        mask = None if self._image_mask is None else self._image_mask(self._camera.name, image)
-        if mask is None:
-            return self.always
-        mask = np.asarray(mask)
-        if mask.shape != image.shape:
-            raise RigError(
-                f"camera {self._camera.name}: the mask of an image has shape {mask.shape}; it must be {image.shape}"
-            )
-        return self.always & self._shrunk((mask != 0).astype(np.uint8))
+        made = None if self._image_mask is None else self._image_mask(self._camera.name, image)
+        masks = [each for each in (mask, _checked_mask(made, self._camera)) if each is not None]
+        return np.logical_and.reduce([self.always, *map(self._shrunk, masks)]) if masks else self.always
 
     def _shrunk(self, mask: AnyArray) -> Bool:
         kernel = np.ones((self._reach, self._reach), dtype=np.uint8)

@@ -65,6 +65,7 @@ class PairTracker:
         right: Image | None,
         left_T_left_prev: Float | None,
         left_T_left_keyframe: Float | None,
+        masks: tuple[Image | None, ...] = (None, None),
     ) -> PairFrame:
         """Follow the tracks, match them left to right and triangulate; replenish them where few are left.
 
@@ -74,13 +75,14 @@ class PairTracker:
             right: likewise, None of a single camera.
             left_T_left_prev: (4, 4) predicted motion of points since the previous images, or None if unknown.
             left_T_left_keyframe: (4, 4) the same since the keyframe of `keep_keyframe_patches`, or None.
+            masks: of each image, (height, width), whose zeros are not used, or None.
         """
         watch = Stopwatch()
         before, levels = self._left, max(self._config.tracking.levels, 2)
         self._left, self._right = build_pyramid(left, levels), () if right is None else build_pyramid(right, 2)
-        self._allowed = self._usable[0].of(left)
+        self._allowed = self._usable[0].of(left, masks[0])
         if self._matcher is not None and right is not None:
-            self._matcher.allow(self._usable[1].of(right))
+            self._matcher.allow(self._usable[1].of(right, masks[1]))
         self._noise_sigma = noise_sigma(left)
         watch.lap("pyramid")
         last, guess, inverse_depths = self._predict(left_T_left_prev)

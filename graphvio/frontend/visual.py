@@ -200,8 +200,9 @@ class VisualFrontend:
             since_latest = self._predicted(j, self._latest.get(j), predict)
             since_reference = self._predicted(j, self._references.of(j), predict)
             left, *right = frameset.images[j]
+            masks = frameset.masks.get(j, (None, None))
             return self._trackers[j].observe(
-                frameset.stamp_ns, left, right[0] if right else None, since_latest, since_reference
+                frameset.stamp_ns, left, right[0] if right else None, since_latest, since_reference, masks
             )
 
         frames = self._in_parallel(observe, frameset.images.keys() - frozen.pairs)

@@ -129,6 +129,8 @@ class EventKind(StrEnum):
     """An image is empty, cut or damaged; its pair is left out of the frameset."""
     IMAGE_WRONG_SIZE = "image_wrong_size"
     """An image is not of the rig's size; its pair is left out of the frameset."""
+    MASK_MISSING = "mask_missing"
+    """A camera has masks, but none of an image, or a damaged one; all of the image is used."""
     CSV_MISSING = "csv_missing"
     """A camera has no ``data.csv``; stamps are read from the names of its images."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -45,10 +45,13 @@ class FrameSet:
         images: index in `graphvio.rig.Rig.groups` -> (left, right) of a pair, or (image,) of a single camera, each
             (height, width) uint8. A group that delivered nothing is absent. They are kept until its next ones have
             come, and not copied: a driver that fills the same buffer again has to hand over copies.
+        masks: the same index -> a mask for each of its images, (height, width) uint8, whose zeros are not used, or
+            None to use all of the image. A group without masks is absent.
     """
 
     stamp_ns: int
     images: Mapping[int, tuple[Image, ...]]
+    masks: Mapping[int, tuple[Image | None, ...]] = field(default_factory=dict)
 
     @property
     def stereo(self) -> dict[int, tuple[Image, Image]]:
@@ -105,4 +108,7 @@ def checked_measurement(measurement: Measurement) -> Measurement:
             )
         if not all(isinstance(image, np.ndarray) for image in images):
             raise MeasurementError(f"frameset at {stamp_ns}: group {pair} has something else than arrays; give images")
-    return FrameSet(stamp_ns, measurement.images)
+    masks: object = measurement.masks
+    if not isinstance(masks, Mapping):
+        raise MeasurementError(f"frameset at {stamp_ns}: masks is a {type(masks).__name__}; map pairs to (left, right)")
+    return FrameSet(stamp_ns, measurement.images, measurement.masks)

@@ -89,7 +89,9 @@ class Synchroniser:
         if self._newest_ns is not None and frameset.stamp_ns < self._newest_ns + _MIN_INTERVAL_NS:
             if not unknown and self._joins(frameset):
                 held = self._held[-1]
-                self._held[-1] = replace(held, images={**held.images, **frameset.images})
+                self._held[-1] = replace(
+                    held, images={**held.images, **frameset.images}, masks={**held.masks, **frameset.masks}
+                )
                 return
             late = frameset.stamp_ns < self._newest_ns
             kind = EventKind.FRAMESET_BACKWARD_STAMP if late else EventKind.FRAMESET_DUPLICATE_STAMP

@@ -14,6 +14,8 @@ from graphvio.rig import Camera, Imu
 from graphvio.rig_files import kalibr
 
 IMU_FOLDER, TRUTH_FOLDER = "imu0", "state_groundtruth_estimate0"
+MASKS_FOLDER = "masks"
+"""Beside a camera's ``data``: masks of its images, ``STAMP.png``."""
 FRAME_HEADER = "#timestamp [ns],filename"
 IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"

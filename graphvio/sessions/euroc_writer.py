@@ -131,6 +131,11 @@ class EurocWriter:
                 euroc_layout.write_image(self._mav0 / camera.name / "data" / f"{measurement.stamp_ns}.png", image)
                 self._add_row(camera.name, euroc_layout.frame_row(measurement.stamp_ns))
                 self._stamps[camera.name].append(measurement.stamp_ns)
+            for camera, mask in zip(self.rig.groups[number].cameras, measurement.masks.get(number, ()), strict=False):
+                if mask is not None:
+                    folder = self._mav0 / camera.name / euroc_layout.MASKS_FOLDER
+                    folder.mkdir(exist_ok=True)
+                    euroc_layout.write_image(folder / f"{measurement.stamp_ns}.png", mask)
 
     def _write_sensors(self) -> None:
         for camera in self.rig.cameras:

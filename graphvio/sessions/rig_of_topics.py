@@ -14,7 +14,7 @@ from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_inverse
 from graphvio.rig import Camera, Imu, Rig, StereoPair, checked_views
 from graphvio.sessions import cdr
 from graphvio.sessions.messages import CAMERA_INFO, COMPRESSED, IMAGE, IMU, ROS_DISTORTIONS, TRANSFORMS
-from graphvio.sessions.topics import MessageReader, Topic, camera_of, of_type, preference
+from graphvio.sessions.topics import MessageReader, Topic, camera_of, is_mask, of_type, preference
 
 _MODELS = {ROS_DISTORTIONS.get(model, model): model for model in MODEL_NAMES}
 _SIDES = (("left", "right"), ("infra1", "infra2"), ("cam0", "cam1"), ("cam2", "cam3"))
@@ -66,7 +66,7 @@ def stereo_topics(images: Iterable[str]) -> dict[str, tuple[str, str]]:
     Their names differ in one part only. Of several topics of a camera, such as raw and compressed or raw and rectified,
     one is used: see `preference`.
     """
-    names = sorted(images)
+    names = sorted(name for name in images if not is_mask(name))
     made: dict[tuple[str, str], tuple[str, str]] = {}
     for name in sorted(names, key=preference):
         for left, right in _SIDES:

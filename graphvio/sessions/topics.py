@@ -18,6 +18,7 @@ RIG_TOPIC = "/graphvio/rig"
 """Has the text of ``rig.yaml`` in files without attachments."""
 IMU_TOPIC, TRANSFORMS_TOPIC, ODOMETRY_TOPIC, LOG_TOPIC = "/imu", "/tf_static", "/odometry", "/rosout"
 TRUTH_TOPIC = "/ground_truth"
+_MASK = "mask"
 
 
 class Place(NamedTuple):
@@ -69,6 +70,16 @@ def sides_of(group: CameraGroup) -> tuple[str, ...]:
 def image_topic(pair: str, side: str, image_format: ImageFormat) -> str:
     """Return the topic of a camera's images."""
     return f"/{pair}/{side}/image_raw" + ("/compressed" if image_format == "png" else "")
+
+
+def mask_topic(pair: str, side: str, image_format: ImageFormat) -> str:
+    """Return the topic of the masks of a camera's images."""
+    return f"/{pair}/{side}/{_MASK}" + ("/compressed" if image_format == "png" else "")
+
+
+def is_mask(topic: str) -> bool:
+    """Return whether a topic has masks, by its name: ``mask`` is its last part, but for ``compressed``."""
+    return _MASK in topic.split("/")[-2:]
 
 
 def of_type(topics: Mapping[str, Topic], *type_names: str) -> list[Topic]:

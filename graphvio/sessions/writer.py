@@ -26,6 +26,7 @@ from graphvio.sessions.topics import (
     TRUTH_TOPIC,
     ImageFormat,
     image_topic,
+    mask_topic,
     sides_of,
 )
 
@@ -134,6 +135,10 @@ class SessionWriter:
             for side, camera, pixels in zip(sides_of(group), group.cameras, images, strict=True):
                 topic = image_topic(group.name, side, self._format)
                 self._add(topic, frameset.stamp_ns, self._image(frameset.stamp_ns, camera.name, pixels))
+            for side, camera, mask in zip(sides_of(group), group.cameras, frameset.masks.get(number, ()), strict=False):
+                if mask is not None:
+                    topic = mask_topic(group.name, side, self._format)
+                    self._add(topic, frameset.stamp_ns, self._image(frameset.stamp_ns, camera.name, mask))
 
     def _add_calibration(self, stamp_ns: int) -> None:
         if not self._storage.has_attachments:

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from graphvio.arrays import Int
 from graphvio.errors import SourceError
 from graphvio.measurements.events import EventKind
 from graphvio.rig import Rig
 from graphvio.rig_files.euroc import camera_folders, sensors_folder
+from graphvio.sessions.euroc_layout import MASKS_FOLDER
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import ImageFiles, Index
 from graphvio.sources.tables import read_frame_csv, read_imu_csv
@@ -33,7 +35,19 @@ def read_index(path: Path, rig: Rig, faults: FaultLog) -> Index:
     imu = read_imu_csv(imu_csv, faults) if rig.imu is not None and imu_csv.is_file() else None
     truths = [root / name / "data.csv" for name in _TRUTHS]
     truth = next((file for file in truths if file.is_file()), None)
-    return Index(faults.name, images, imu, truth)
+    masks = {camera.name: _masks(root / camera.name / MASKS_FOLDER) for camera in rig.cameras}
+    return Index(faults.name, images, imu, truth, {name: found for name, found in masks.items() if found.names})
+
+
+def _masks(folder: Path) -> ImageFiles:
+    """Index the masks in a folder, which are named by their images' stamps."""
+    stamps, files = _named_by_stamp(folder)
+    return ImageFiles(folder, stamps, files)
+
+
+def _named_by_stamp(folder: Path) -> tuple[Int, list[str]]:
+    files = sorted((p for p in folder.glob("*.png") if p.stem.isdecimal()), key=lambda p: int(p.stem))
+    return np.array([int(p.stem) for p in files], dtype=np.int64), [p.name for p in files]
 
 
 def _images(root: Path, camera: str, faults: FaultLog) -> ImageFiles:
@@ -46,9 +60,7 @@ def _images(root: Path, camera: str, faults: FaultLog) -> ImageFiles:
     if csv.is_file():
         stamps, names = read_frame_csv(csv, faults)
     else:
-        files = sorted((p for p in images.glob("*.png") if p.stem.isdecimal()), key=lambda p: int(p.stem))
-        stamps = np.array([int(p.stem) for p in files], dtype=np.int64)
-        names = [p.name for p in files]
+        stamps, names = _named_by_stamp(images)
         faults.add(EventKind.CSV_MISSING, 0, f"{csv} does not exist; stamps are taken from the names of the images")
     if not names:
         raise SourceError(f"{folder}: lists no image in data.csv, and holds none in data/ that is named by its stamp")

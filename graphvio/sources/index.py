@@ -6,7 +6,7 @@ It takes some 100 bytes an image or sample, and is all that grows with the lengt
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -51,3 +51,4 @@ class Index:
     images: Mapping[str, ImageSequence]  # camera name -> its images
     imu: ImuTable | None = None  # samples, or None if there are none
     truth: Path | None = None  # file with the true trajectory, or None
+    masks: Mapping[str, ImageSequence] = field(default_factory=dict)  # camera name -> masks of its images, by stamp

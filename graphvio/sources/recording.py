@@ -30,6 +30,7 @@ _LEAD_NS = 5_000_000_000  # samples from before the first frameset help to initi
 class _Decoded:
     stamp_ns: int
     images: Mapping[int, tuple[Image, ...]]
+    masks: Mapping[int, tuple[Image | None, ...]]
     faults: Sequence[tuple[EventKind, str]]
     decode_ms: float
 
@@ -54,7 +55,7 @@ class Recording:
         self.truth = index.truth
         self.faults = faults
         self.decode_ms: list[float] = []
-        self._images = index.images
+        self._images, self._masks = index.images, index.masks
         self._fit_cameras: set[str] = set()
         stamps_ns = {name: images.stamps_ns for name, images in index.images.items()}
         pairs = [match_sides(stamps_ns[pair.left.name], stamps_ns[pair.right.name], tolerance_ns) for pair in rig.pairs]
@@ -84,12 +85,13 @@ class Recording:
         if at == self.frameset_count or self.stamps_ns[at] != stamp_ns:
             raise SourceError(f"{self.name}: has no frameset at {stamp_ns}; give the recording that it is from")
         sizes = [[camera.size_px for camera in group.cameras] for group in self.rig.groups]
+        decoded = self._decode(at)
         fits = {
             j: images
-            for j, images in self._decode(at).images.items()
+            for j, images in decoded.images.items()
             if all(image.shape[::-1] == size for image, size in zip(images, sizes[j], strict=True))
         }
-        return FrameSet(stamp_ns, fits)
+        return FrameSet(stamp_ns, fits, decoded.masks)
 
     def _read_imu(self) -> Iterator[ImuSample]:
         if self._imu is None:
@@ -107,7 +109,7 @@ class Recording:
                 images = self._checked(item)
                 if images:
                     is_empty = False
-                    yield FrameSet(item.stamp_ns, images)
+                    yield FrameSet(item.stamp_ns, images, item.masks)
                 else:
                     self.faults.add(
                         EventKind.FRAMESET_EMPTY,
@@ -123,6 +125,7 @@ class Recording:
     def _decode(self, at: int) -> _Decoded:
         begun = time.perf_counter()
         images: dict[int, tuple[Image, ...]] = {}
+        masks: dict[int, tuple[Image | None, ...]] = {}
         faults: list[tuple[EventKind, str]] = []
         for number, group in enumerate(self.rig.groups):
             if self._framesets.rows[at, number, 0] < 0:
@@ -135,8 +138,29 @@ class Recording:
                     faults.append((fault.kind, fault.detail))
             if len(read) == len(group.cameras):
                 images[number] = tuple(read)
+                if any(camera.name in self._masks for camera in group.cameras):
+                    rows = self._framesets.rows[at, number]
+                    masks[number] = tuple(
+                        self._mask(camera.name, int(row), faults)
+                        for camera, row in zip(group.cameras, rows, strict=False)
+                    )
         decode_ms = 1e3 * (time.perf_counter() - begun)
-        return _Decoded(int(self.stamps_ns[at]), images, faults, decode_ms)
+        return _Decoded(int(self.stamps_ns[at]), images, masks, faults, decode_ms)
+
+    def _mask(self, camera: str, row: int, faults: list[tuple[EventKind, str]]) -> Image | None:
+        """Read the mask of a camera's image, which has the image's stamp; None if there is none."""
+        if camera not in self._masks:
+            return None
+        masks, stamp_ns = self._masks[camera], int(self._images[camera].stamps_ns[row])
+        at = int(np.searchsorted(masks.stamps_ns, stamp_ns))
+        detail = f"{camera}: no mask has the stamp {stamp_ns} of its image"
+        if at < len(masks.stamps_ns) and masks.stamps_ns[at] == stamp_ns:
+            try:
+                return masks.read(at)
+            except ImageError as fault:
+                detail = fault.detail
+        faults.append((EventKind.MASK_MISSING, detail))
+        return None
 
     def _checked(self, item: _Decoded) -> dict[int, tuple[Image, ...]]:
         """Return the images that have the rig's size."""

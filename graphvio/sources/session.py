@@ -19,13 +19,25 @@ from graphvio.sessions.pixels import grey
 from graphvio.sessions.rig_of_topics import rig_of_topics
 from graphvio.sessions.stamps import header_stamps
 from graphvio.sessions.store import Store
-from graphvio.sessions.topics import RIG_ATTACHMENT, RIG_TOPIC, Topic, image_topic, of_type, preference, sides_of
+from graphvio.sessions.topics import (
+    RIG_ATTACHMENT,
+    RIG_TOPIC,
+    Topic,
+    camera_of,
+    image_topic,
+    is_mask,
+    mask_topic,
+    of_type,
+    preference,
+    sides_of,
+)
 from graphvio.sessions.truth import truth_topic
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import Index
 from graphvio.sources.tables import ImuTable, clean_stamps
 
 _IMU_NAME = "imu"
+_MASKS = "/mask"  # after a camera's name
 LAYOUT = "sessions and bags: NAME.mcap, NAME.bag, a folder with metadata.yaml"
 
 
@@ -49,22 +61,26 @@ def rig_in(store: Store) -> Rig | None:
 def read_index(store: Store, rig: Rig, faults: FaultLog, topics: Mapping[str, str]) -> Index:
     """Index the cameras of a rig, and the IMU if it has one; ``topics`` gives those with other names by camera."""
     chosen = {name: _named(store, topic) for name, topic in topics.items()}
-    unknown = set(chosen) - {camera.name for camera in rig.cameras} - {_IMU_NAME}
+    names = {camera.name for camera in rig.cameras}
+    unknown = set(chosen) - names - {name + _MASKS for name in names} - {_IMU_NAME}
     if unknown:
-        names = ", ".join([*(camera.name for camera in rig.cameras), _IMU_NAME])
-        raise SourceError(f"{store.path}: the rig has no {min(unknown)} to be mapped to a topic; it has {names}")
+        known = ", ".join([*(camera.name for camera in rig.cameras), _IMU_NAME])
+        raise SourceError(f"{store.path}: the rig has no {min(unknown)} to be mapped to a topic; it has {known}")
     if not store.is_whole:
         detail = f"{store.path} was not finished, or is damaged: it is read as far as it goes"
         faults.add(EventKind.SESSION_CUT, 0, detail)
     for detail in store.damages:
         faults.add(EventKind.SESSION_DAMAGED, 0, detail)
-    images = {}
+    images, masks = {}, {}
     for group in rig.groups:
         for side, camera in zip(sides_of(group), group.cameras, strict=True):
             topic = chosen.get(camera.name) or _topic_of(store, group.name, side, camera)
             images[camera.name] = _Images(store, topic, faults)
+            mask = chosen.get(camera.name + _MASKS) or _topic_of_masks(store, group.name, side, topic)
+            if mask is not None:
+                masks[camera.name] = _Images(store, mask, faults)
     imu = _read_imu(store, chosen.get(_IMU_NAME), faults) if rig.imu is not None else None
-    return Index(faults.name, images, imu, store.path if truth_topic(store.topics) is not None else None)
+    return Index(faults.name, images, imu, store.path if truth_topic(store.topics) is not None else None, masks)
 
 
 def _named(store: Store, name: str) -> Topic:
@@ -103,12 +119,22 @@ def _topic_of(store: Store, pair: str, side: str, camera: Camera) -> Topic:
     for name in (image_topic(pair, side, "raw"), image_topic(pair, side, "png"), camera.name):
         if name in store.topics:
             return store.topics[name]
-    images = [topic for topic in store.topics.values() if topic.type_name in (IMAGE, COMPRESSED)]
+    images = [t for t in store.topics.values() if t.type_name in (IMAGE, COMPRESSED) and not is_mask(t.name)]
     named = [topic for topic in images if camera.name in topic.name.split("/")]
     if not named:
         has = ", ".join(topic.name for topic in images) or "none"
         raise SourceError(f"{store.path}: has no images of camera {camera.name}; topics with images: {has}")
     return min(named, key=lambda topic: preference(topic.name))
+
+
+def _topic_of_masks(store: Store, pair: str, side: str, images: Topic) -> Topic | None:
+    """Return the topic of the masks of a camera's images: as graphvio names it, or beside that of the images."""
+    beside = camera_of(images.name, sides=()) + _MASKS
+    for name in (mask_topic(pair, side, "raw"), mask_topic(pair, side, "png"), beside, f"{beside}/compressed"):
+        topic = store.topics.get(name)
+        if topic is not None and topic.type_name in (IMAGE, COMPRESSED) and topic.places:
+            return topic
+    return None
 
 
 def _read_imu(store: Store, chosen: Topic | None, faults: FaultLog) -> ImuTable | None:
