@@ -284,8 +284,63 @@ def test_grey_of_all_encodings(encoding: str) -> None:
     np.testing.assert_array_equal(found, np.full((height, width), grey_level, np.uint8))
 
 
+RED, GREEN, BLUE = 200, 50, 10
+LAYOUTS = {
+    "rgb": [[RED, GREEN, BLUE]],
+    "bgr": [[BLUE, GREEN, RED]],
+    "8UC3": [[BLUE, GREEN, RED]],
+    "rgba": [[RED, GREEN, BLUE, 9]],
+    "bgra": [[BLUE, GREEN, RED, 9]],
+    "bayer_rggb": [[RED, GREEN], [GREEN, BLUE]],
+    "bayer_bggr": [[BLUE, GREEN], [GREEN, RED]],
+    "bayer_gbrg": [[GREEN, BLUE], [RED, GREEN]],
+    "bayer_grbg": [[GREEN, RED], [BLUE, GREEN]],
+}
+"""Bytes of a few pixels of one colour, as they are repeated over an image, by encoding."""
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("kind", LAYOUTS)
+def test_grey_of_colours_has_the_documented_weights(kind: str, bits: int) -> None:
+    width, height = 8, 6
+    cell = np.array(LAYOUTS[kind], dtype=np.uint16)
+    across = width if not kind.startswith("bayer") else width // 2
+    rows = np.tile(cell, (height // len(cell), across))
+    is_wide = bits == 16 and kind != "8UC3"
+    data = (rows * 256 + 77).astype(">u2") if is_wide else rows.astype(np.uint8)
+    fields = {"height": height, "width": width, "is_bigendian": 1, "step": data[0].nbytes}
+    encoding = kind if kind == "8UC3" else f"{kind}{bits}"
+    message = cdr.make(
+        IMAGE, header=header(0, "cam"), data=data.reshape(-1).view(np.uint8), encoding=encoding, **fields
+    )
+    found = grey(cdr.decode(cdr.encode(message), IMAGE), "here")
+    assert found.shape == (height, width)
+    np.testing.assert_allclose(found, 0.299 * RED + 0.587 * GREEN + 0.114 * BLUE, atol=1.0)
+
+
+@pytest.mark.parametrize("kind", ["bayer_rggb", "bayer_bggr", "bayer_gbrg", "bayer_grbg"])
+def test_grey_of_bayer_patterns_keeps_places(kind: str) -> None:
+    scene = np.tile(np.linspace(20.0, 220.0, 32).astype(np.uint8), (16, 1))  # grey, brighter to the right
+    fields = {"height": 16, "width": 32, "is_bigendian": 0, "step": 32, "encoding": f"{kind}8"}
+    message = cdr.make(IMAGE, header=header(0, "cam"), data=scene.reshape(-1), **fields)
+    np.testing.assert_allclose(grey(message, "here")[2:-2, 2:-2], scene[2:-2, 2:-2], atol=1.0)
+
+
+@pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuv422_yuy2", "yuyv", "nv21", "nv24"])
+def test_grey_of_yuv_is_its_brightness(encoding: str) -> None:
+    brightness = np.arange(24, dtype=np.uint8).reshape(4, 6)
+    data = np.full((4, 12), 128, dtype=np.uint8)
+    if encoding.startswith("nv"):
+        data = np.concatenate([brightness, np.full((4, 6), 128, dtype=np.uint8)])  # colours follow
+    else:
+        data[:, encoding in ("yuv422", "uyvy") :: 2] = brightness
+    fields = {"height": 4, "width": 6, "is_bigendian": 0, "step": data.shape[1], "encoding": encoding}
+    message = cdr.make(IMAGE, header=header(0, "cam"), data=data.reshape(-1), **fields)
+    np.testing.assert_array_equal(grey(message, "here"), brightness)
+
+
 @pytest.mark.parametrize(
-    ("field", "value", "words"), [("encoding", "yuv422", "yuv422, which is not known"), ("height", 9, "cut short")]
+    ("field", "value", "words"), [("encoding", "yuv411", "yuv411, which is not known"), ("height", 9, "cut short")]
 )
 def test_grey_of_invalid_images_raises(field: str, value: object, words: str) -> None:
     fields = {"height": 4, "width": 6, "encoding": "mono8", "is_bigendian": 0, "step": 6} | {field: value}

@@ -525,6 +525,20 @@ def test_pixel_formats_become_grey(tmp_path: Path, kind: str) -> None:
     np.testing.assert_array_equal(got, grey)
 
 
+@pytest.mark.parametrize("suffix", ["png", "png with alpha", "16 bit png"])
+def test_colours_have_the_documented_weights(tmp_path: Path, suffix: str) -> None:
+    write_euroc(tmp_path, pairs=1, frames=1)
+    blue, green, red = (noise_image(seed) for seed in (7, 8, 9))
+    image: np.ndarray[tuple[int, ...], np.dtype[np.uint8 | np.uint16]] = np.stack([blue, green, red], axis=2)
+    if suffix == "png with alpha":
+        image = np.dstack([image, noise_image(10)])
+    if suffix == "16 bit png":
+        image = image.astype(np.uint16) * 256 + 99
+    write_image(image_file(tmp_path, 0, 0), image)
+    got = framesets(open_source(tmp_path))[0].images[0][0]
+    np.testing.assert_allclose(got, 0.299 * red + 0.587 * green + 0.114 * blue, atol=1.0)
+
+
 def test_kitti_odometry_yields_framesets_and_truth(tmp_path: Path) -> None:
     path = write_kitti_odometry(tmp_path / "dataset" / "sequences" / "07")
     write_rows(tmp_path / "dataset" / "poses" / "07.txt", ["1 0 0 0 0 1 0 0 0 0 1 0"])

@@ -11,18 +11,21 @@ from graphvio.arrays import Image
 from graphvio.image_decoding import ImageError, decode_grey
 from graphvio.measurements.events import EventKind
 
-_TO_GREY = {
-    "bgr8": cv2.COLOR_BGR2GRAY,
-    "rgb8": cv2.COLOR_RGB2GRAY,
-    "bgra8": cv2.COLOR_BGRA2GRAY,
-    "rgba8": cv2.COLOR_RGBA2GRAY,
-    "bayer_rggb8": cv2.COLOR_BayerRGGB2GRAY,
-    "bayer_bggr8": cv2.COLOR_BayerBGGR2GRAY,
-    "bayer_gbrg8": cv2.COLOR_BayerGBRG2GRAY,
-    "bayer_grbg8": cv2.COLOR_BayerGRBG2GRAY,
+_TO_GREY = {  # all by 0.299 R + 0.587 G + 0.114 B
+    "bgr": cv2.COLOR_BGR2GRAY,
+    "rgb": cv2.COLOR_RGB2GRAY,
+    "bgra": cv2.COLOR_BGRA2GRAY,
+    "rgba": cv2.COLOR_RGBA2GRAY,
+    "bayer_rggb": cv2.COLOR_BayerRGGB2GRAY,
+    "bayer_bggr": cv2.COLOR_BayerBGGR2GRAY,
+    "bayer_gbrg": cv2.COLOR_BayerGBRG2GRAY,
+    "bayer_grbg": cv2.COLOR_BayerGRBG2GRAY,
 }
-_CHANNELS = {"bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4}
-_GREY, _GREY_16 = ("mono8", "8UC1"), ("mono16", "16UC1")
+_CHANNELS = {"bgr": 3, "rgb": 3, "bgra": 4, "rgba": 4}
+_BRIGHTNESS = {  # where Y is in a row: first byte, and bytes from one to the next
+    "yuv422": (1, 2), "uyvy": (1, 2), "yuv422_yuy2": (0, 2), "yuyv": (0, 2), "nv21": (0, 1), "nv24": (0, 1),
+}  # fmt: skip
+_SYNONYMS = {"8UC1": "mono8", "16UC1": "mono16", "8UC3": "bgr8", "8UC4": "bgra8"}  # OpenCV's order where none is named
 
 
 def grey(message: Any, where: str) -> Image:
@@ -38,14 +41,16 @@ def grey(message: Any, where: str) -> Image:
     if step * height > len(rows) or not height or not width:
         raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} is cut short")
     rows = rows[: step * height].reshape(height, step)
-    if encoding in _GREY_16:
-        order = ">u2" if message.is_bigendian else "<u2"
-        return np.ascontiguousarray(np.right_shift(rows[:, : 2 * width].copy().view(order), 8).astype(np.uint8))
-    if encoding in _GREY:
-        return rows[:, :width].copy()  # a view of the message could not be written to, nor compiled kernels take it
-    if encoding not in _TO_GREY:
+    if encoding in _BRIGHTNESS:
+        first, period = _BRIGHTNESS[encoding]
+        return rows[:, first::period][:, :width].copy()  # a view could not be written to, nor compiled kernels take it
+    encoding = _SYNONYMS.get(encoding, encoding)
+    kind, depth = encoding.rstrip("0123456789"), 2 if encoding.endswith("16") else 1
+    if (kind != "mono" and kind not in _TO_GREY) or encoding not in (f"{kind}8", f"{kind}16"):
         raise ImageError(EventKind.IMAGE_UNDECODABLE, f"{where} is encoded as {encoding}, which is not known")
-    channels = _CHANNELS.get(encoding, 1)
-    pixels = np.ascontiguousarray(rows[:, : channels * width])
+    channels = _CHANNELS.get(kind, 1)
+    pixels = rows[:, : depth * channels * width].copy()
+    if depth == 2:
+        pixels = np.right_shift(pixels.view(">u2" if message.is_bigendian else "<u2"), 8).astype(np.uint8)
     shaped = pixels.reshape(height, width, channels) if channels > 1 else pixels
-    return np.asarray(cv2.cvtColor(shaped, _TO_GREY[encoding]), dtype=np.uint8)
+    return pixels if kind == "mono" else np.asarray(cv2.cvtColor(shaped, _TO_GREY[kind]), dtype=np.uint8)
