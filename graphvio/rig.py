@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 _ROTATION_TOLERANCE = 1e-3
 _ROUNDING = 1e-14
 _MIN_BASELINE_M = 1e-3
+_MAX_READOUT_US = 100e3
+_MAX_READOUT_DIFFERENCE_NS = 1_000_000
 MAX_AXES_ANGLE_DEG = 45.0
 """Between the cameras of a stereo pair: with more, patches look too different."""
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -51,6 +53,8 @@ class Camera:
         distortion: (8,), see `graphvio.cameras.COEFFICIENTS`; shorter input is filled with zeros.
         body_T_cam: (4, 4), metres.
         mask: image file whose black pixels are not used (parts of the rig or of its carrier), or None.
+        line_time_us: time from one line's exposure to the next one's, from the top, microseconds; 0 of a global
+            shutter. An image's stamp is the instant of its first line.
 
     Raises:
         RigError: if a value has the wrong shape, is not finite or out of range.
@@ -63,6 +67,7 @@ class Camera:
     distortion: Float
     body_T_cam: Float
     mask: Path | None = None
+    line_time_us: float = 0.0
 
     def __post_init__(self) -> None:
         where = f"camera {self.name}"
@@ -82,6 +87,11 @@ class Camera:
         fault = lens_fault(self.model, distortion)
         if fault:
             raise RigError(f"{where}: {fault}")
+        if not 0.0 <= self.line_time_us * height <= _MAX_READOUT_US:  # also refuses NaN
+            raise RigError(
+                f"{where}: line_time_us is {self.line_time_us}; it must be in microseconds, and {height} lines take at "
+                f"most {1e-3 * _MAX_READOUT_US:g} ms"
+            )
         _set(self, "size_px", (int(width), int(height)))
         _set(self, "intrinsics", intrinsics)
         _set(self, "distortion", distortion)
@@ -95,6 +105,11 @@ class Camera:
         """
         mean = float(0.5 * (self.intrinsics[0] + self.intrinsics[1]))
         return mean * central_scale(self.model_number, self.distortion)
+
+    @property
+    def readout_ns(self) -> int:
+        """Time from the first line's exposure to the last one's, nanoseconds; 0 of a global shutter."""
+        return round(1e3 * self.line_time_us * (self.size_px[1] - 1))
 
     @cached_property
     def cam_T_body(self) -> Float:
@@ -140,7 +155,8 @@ class StereoPair:
         right: the camera in which they are matched.
 
     Raises:
-        RigError: if the baseline is below 1 mm, or the optical axes are more than 45 degrees apart.
+        RigError: if the baseline is below 1 mm, the optical axes are more than 45 degrees apart, or rolling shutters
+            are read out in times that differ by more than 1 ms.
     """
 
     name: str
@@ -159,6 +175,11 @@ class StereoPair:
             raise RigError(
                 f"{where}: optical axes are {axes_deg:.0f} degrees apart (at most "
                 f"{MAX_AXES_ANGLE_DEG:.0f}); check which cameras form a pair and the direction of body_T_cam"
+            )
+        if abs(self.left.readout_ns - self.right.readout_ns) > _MAX_READOUT_DIFFERENCE_NS:
+            raise RigError(
+                f"{where}: its cameras read their lines out in {1e-6 * self.left.readout_ns:.1f} and "
+                f"{1e-6 * self.right.readout_ns:.1f} ms; a pair needs the same line_time_us: make them single cameras"
             )
 
     @cached_property

@@ -26,6 +26,7 @@ from graphvio.config import Config
 from graphvio.frontend.alignment import learn_from_nothing
 from graphvio.frontend.motion_stereo import FirstSights, MotionHistory
 from graphvio.frontend.observations import Observations, RigArrays, correspond
+from graphvio.frontend.rolling_shutter import ReadoutMotion, pixels_at_lines
 from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import common_rows
@@ -114,6 +115,8 @@ def _warm_up_tracking(rig: Rig, config: Config) -> None:
         history = MotionHistory()
         history.restart(frame.stamp_ns)
         FirstSights().locate(frame.ids, frame.left, history, np.eye(4), 1.0, 1.0)
+    if any(camera.line_time_us for camera in rig.cameras):
+        pixels_at_lines(pair.left, frame.pixels, frame.points[:, 2], ReadoutMotion.steady(np.eye(4), 1.0))
     common_rows(frame.ids, frame.ids)
     orientations(noise, np.full((1, 2), 20.0))
     pair.left.project(np.ones((1, 3)))

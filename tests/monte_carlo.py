@@ -182,7 +182,9 @@ def _cast(
     coefficients = ray_coefficients(walk.corners, se3_inverse(world_T_left))
     extent = np.array([[rays[:, 0].min(), rays[:, 0].max(), rays[:, 1].min(), rays[:, 1].max()]])
     block = np.ascontiguousarray(rays.reshape(TILE_PX, TILE_PX, 2))  # as if they were one tile of an image
-    hit, inverse_depth = (found.ravel() for found in first_hits(coefficients, *tile_lists(coefficients, extent), block))
+    hit, inverse_depth = (
+        found.ravel() for found in first_hits(coefficients[None], *tile_lists(coefficients, extent), block)
+    )
     valid &= (hit >= 0) & (conditions.depth_scale > conditions.min_depth_m * inverse_depth)
     homogeneous = np.column_stack([rays, np.ones(len(rays))])
     points = homogeneous[valid] * (conditions.depth_scale / inverse_depth[valid, None])

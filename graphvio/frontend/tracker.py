@@ -15,6 +15,7 @@ from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid,
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH, FirstSights, MotionHistory
 from graphvio.frontend.prediction import predict_pixels
+from graphvio.frontend.rolling_shutter import ReadoutMotion, as_at_stamp, pixels_at_lines
 from graphvio.frontend.tracks import PairFrame, common_rows, passes, usable_at
 from graphvio.rig import CameraGroup, StereoPair
 from graphvio.timing import Stopwatch
@@ -57,6 +58,7 @@ class PairTracker:
         self._right: Pyramid = ()
         self._patches = KeyframePatches(pair, config.tracking.window_px)
         self._noise_sigma = 0.0
+        self._motion: ReadoutMotion | None = None
 
     def observe(
         self,
@@ -66,6 +68,7 @@ class PairTracker:
         left_T_left_prev: Float | None,
         left_T_left_keyframe: Float | None,
         masks: tuple[Image | None, ...] = (None, None),
+        motion: ReadoutMotion | None = None,
     ) -> PairFrame:
         """Follow the tracks, match them left to right and triangulate; replenish them where few are left.
 
@@ -76,6 +79,7 @@ class PairTracker:
             left_T_left_prev: (4, 4) predicted motion of points since the previous images, or None if unknown.
             left_T_left_keyframe: (4, 4) the same since the keyframe of `keep_keyframe_patches`, or None.
             masks: of each image, (height, width), whose zeros are not used, or None.
+            motion: of body while rolling shutters read the images out, or None if unknown.
         """
         watch = Stopwatch()
         before, levels = self._left, max(self._config.tracking.levels, 2)
@@ -83,6 +87,7 @@ class PairTracker:
         self._allowed = self._usable[0].of(left, masks[0])
         if self._matcher is not None and right is not None:
             self._matcher.allow(self._usable[1].of(right, masks[1]))
+        self._motion = motion if any(camera.line_time_us for camera in self._pair.cameras) else None
         self._noise_sigma = noise_sigma(left)
         watch.lap("pyramid")
         last, guess, inverse_depths = self._predict(left_T_left_prev)
@@ -160,6 +165,8 @@ class PairTracker:
         pixels, inverse_depths, valid = predict_pixels(
             last.left, w, left_T_left_prev, camera.model_number, camera.intrinsics, camera.distortion
         )
+        if self._motion is not None:
+            pixels, inverse_depths = pixels_at_lines(camera, pixels, inverse_depths, self._motion)
         valid &= camera.contains(pixels)
         inverse_depths[~(last.has_depth & valid)] = np.nan
         return last, np.where(valid[:, None], pixels, last.pixels), inverse_depths
@@ -221,10 +228,11 @@ class PairTracker:
         """Match tracks of the newest left image to the right one, and triangulate them."""
         rays, has_ray = self._pair.left.unproject(pixels)
         if self._matcher is None:
-            return _unmatched(stamp_ns, ids, ages, pixels, rays, inverse_depths, rejected).keep(has_ray)
+            frame = _unmatched(stamp_ns, ids, ages, pixels, rays, inverse_depths, rejected).keep(has_ray)
+            return frame if self._motion is None else as_at_stamp(frame, self._pair, self._motion)
         matches = self._matcher.match(self._left, self._right, pixels, rays, inverse_depths, slopes, self._min_gradient)
         has_depth = matches.good & has_ray
-        return PairFrame(
+        frame = PairFrame(
             stamp_ns=stamp_ns,
             ids=ids,
             ages=ages,
@@ -239,6 +247,7 @@ class PairTracker:
             flat_for=np.where(has_depth, 0, flat_for + 1),
             rejected=rejected | matches.rejected,
         ).keep(has_ray)
+        return frame if self._motion is None else as_at_stamp(frame, self._pair, self._motion)
 
     @property
     def _min_gradient(self) -> float:

@@ -36,6 +36,9 @@ class PairFrame:
         is_single: whether the camera has no partner: every track has a depth, though it may be next to unknown.
         rejected: test of tracking or stereo matching -> number of tracks that failed it.
         stage_ms: time by stage.
+        shutter_px: (N, 2, 2) to be added to the pixels in the left and in the right image for where a global shutter
+            would have seen the points at the stamp; normalised coordinates and points are as of there. Zero if not
+            given.
     """
 
     stamp_ns: int
@@ -53,6 +56,21 @@ class PairFrame:
     is_single: bool = False
     rejected: Mapping[str, int] = field(default_factory=dict)
     stage_ms: Mapping[str, float] = field(default_factory=dict)
+    shutter_px: Float = field(default_factory=lambda: np.zeros((0, 2, 2)))
+
+    def __post_init__(self) -> None:
+        if len(self.shutter_px) != len(self.ids):
+            object.__setattr__(self, "shutter_px", np.zeros((len(self.ids), 2, 2)))
+
+    @property
+    def pixels_at_stamp(self) -> Float:
+        """(N, 2) in the left image, where a global shutter would have seen the points at the stamp."""
+        return self.pixels + self.shutter_px[:, 0]
+
+    @property
+    def right_pixels_at_stamp(self) -> Float:
+        """(N, 2) the same in the right image."""
+        return self.right_pixels + self.shutter_px[:, 1]
 
     @property
     def has_right(self) -> Bool:
@@ -85,8 +103,8 @@ class PairFrame:
         """Return the frame as another calibration of its cameras has it: the same pixels, triangulated again."""
         if isinstance(pair, SingleCamera):
             return self  # such a camera's lens is not calibrated while it runs
-        left, has_ray = pair.left.unproject(self.pixels)
-        right, in_right = pair.right.unproject(self.right_pixels)
+        left, has_ray = pair.left.unproject(self.pixels_at_stamp)
+        right, in_right = pair.right.unproject(self.right_pixels_at_stamp)
         points, covariances, _ = triangulate(left, right, pair.right_T_left, pair.left.focal_px, pair.right.focal_px)
         has_depth = self.has_depth & has_ray & in_right
         return replace(self, left=left, right=right, points=points, covariances=covariances, has_depth=has_depth)

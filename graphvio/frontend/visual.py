@@ -22,6 +22,7 @@ from graphvio.frontend.places import Places
 from graphvio.frontend.quality import graded, graded_hypothesis, stereo_share
 from graphvio.frontend.references import References
 from graphvio.frontend.refinement import Refined
+from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.standstill import Standstill
 from graphvio.frontend.thresholds import THRESHOLDS
@@ -98,6 +99,7 @@ class VisualFrontend:
         of_file = 0.0 if config.estimates_calibration else config.motion.calibration_error_share
         self._scale_sigma = 0.0 if rig.imu is None else float(np.hypot(config.motion.shared_error_share, of_file))
         self._standstill = Standstill()
+        self._has_rolling_shutter = any(camera.line_time_us for camera in rig.cameras)
         self._contradicted_ns: int | None = None  # when the pairs last were beyond 5 sigma of each other
         self._workers = ThreadPoolExecutor(len(rig.groups), thread_name_prefix="graphvio-pair")
 
@@ -160,18 +162,21 @@ class VisualFrontend:
 
     # ------------------------------------------------------------------ one frameset
 
-    def process(self, frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
+    def process(
+        self, frameset: FrameSet, predict: MotionPredictor, readout: ReadoutMotion | None = None
+    ) -> VisualResult:
         """Measure the motion of the rig from its reference to a frameset.
 
         Args:
             frameset: Images of any subset of pairs.
             predict: The back-end's prediction, from which the search begins.
+            readout: Motion of body while rolling shutters read the images out; None continues that of the prediction.
 
         Raises:
             RigError: If an image does not fit the rig; nothing has changed then.
         """
         self.stage_ms = {}
-        seen = self._track(checked(frameset, self._rig), predict)
+        seen = self._track(checked(frameset, self._rig), predict, readout)
         agreement, reason = self._estimate_motion(seen, predict)
         graded_motion = self._grade(seen, agreement, reason)
         replenished, own = self._replenish(seen, agreement)
@@ -188,7 +193,7 @@ class VisualFrontend:
         )
 
     @timed("track")
-    def _track(self, frameset: FrameSet, predict: MotionPredictor) -> _Seen:
+    def _track(self, frameset: FrameSet, predict: MotionPredictor, readout: ReadoutMotion | None) -> _Seen:
         """Track the corners of each pair whose images are not repeated, and match them left to right (section 2)."""
         frozen = self._frozen.update(frameset)
         self._all_frozen = frozen.all_since_ns is not None
@@ -196,13 +201,16 @@ class VisualFrontend:
             self._trackers[j].drop(self._latest.pop(j).ids)
             self._references.forget(j)
 
+        if readout is None and self._has_rolling_shutter:
+            readout = self._steady_readout(frameset.stamp_ns, predict)
+
         def observe(j: int) -> PairFrame:
             since_latest = self._predicted(j, self._latest.get(j), predict)
             since_reference = self._predicted(j, self._references.of(j), predict)
             left, *right = frameset.images[j]
             masks = frameset.masks.get(j, (None, None))
             return self._trackers[j].observe(
-                frameset.stamp_ns, left, right[0] if right else None, since_latest, since_reference, masks
+                frameset.stamp_ns, left, right[0] if right else None, since_latest, since_reference, masks, readout
             )
 
         frames = self._in_parallel(observe, frameset.images.keys() - frozen.pairs)
@@ -305,6 +313,12 @@ class VisualFrontend:
             return None
         body_T_left = self._places.arrays.body_T_left[pair]
         return np.asarray(se3_inverse(body_T_left) @ cur_T_then @ body_T_left)
+
+    def _steady_readout(self, stamp_ns: int, predict: MotionPredictor) -> ReadoutMotion | None:
+        """Continue the predicted motion since the images before, or return None where there is none."""
+        before_ns = max((frame.stamp_ns for frame in self._latest.values()), default=stamp_ns)
+        cur_T_before = predict(before_ns) if before_ns < stamp_ns else None
+        return None if cur_T_before is None else ReadoutMotion.steady(cur_T_before, 1e-9 * (stamp_ns - before_ns))
 
     def _refer_to(self, frames: Mapping[int, PairFrame]) -> dict[int, PairFrame]:
         """Measure the next motions from the newest frames of some pairs, and add corners to their tracks.

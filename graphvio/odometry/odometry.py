@@ -18,6 +18,7 @@ from graphvio.backend.smoother_estimator import SmootherEstimator
 from graphvio.config import Config
 from graphvio.errors import ConfigError, MeasurementError
 from graphvio.frontend.images import ImageMask
+from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.measurements.estimate import Estimate, Prediction, Status
 from graphvio.measurements.events import Event, EventKind
@@ -266,7 +267,8 @@ class Odometry:
 
     def _track(self, frameset: FrameSet, predicted: _Predicted) -> VisualResult:
         """Track all pairs and measure the relative motion, eq. (1) to (4)."""
-        visual = self._frontend.process(frameset, self._estimator.motion_since)
+        readout = self._readout_motion(frameset.stamp_ns)
+        visual = self._frontend.process(frameset, self._estimator.motion_since, readout)
         if not predicted.is_initial:
             self._vision_events.update(frameset.stamp_ns, visual, self._frontend.misaligned)
         self.stage_ms.update(visual.stage_ms)
@@ -361,6 +363,19 @@ class Odometry:
                 "no IMU samples since the frameset before: constant velocity instead",
             )
         return interval
+
+    def _readout_motion(self, stamp_ns: int) -> ReadoutMotion | None:
+        """Return how body moves while rolling shutters read a frameset out, by the gyro; None without these."""
+        readout_ns = max(camera.readout_ns for camera in self.rig.cameras)
+        if not readout_ns or not self._estimator.has_imu:
+            return None
+        interval = self._synchroniser.interval(stamp_ns, stamp_ns + readout_ns)
+        if interval is None:
+            return None
+        state = self._estimator.state()
+        body_R_nav = state.nav_T_body[:3, :3].T
+        acceleration = interval.mean_force - state.accel_bias + body_R_nav @ state.gravity_nav
+        return ReadoutMotion.accelerated(interval, state.gyro_bias, body_R_nav @ state.velocity_nav, acceleration)
 
     def _imu_shows_standstill(self, interval: ImuInterval | None) -> bool:
         """Whether the IMU shows a standstill; without an IMU it does, where samples are missing it does not."""

@@ -140,7 +140,7 @@ class OnlineCalibration:
             self._epoch = estimate.epoch
             self._calibration.start_window()
         views = {
-            j: View(frame.ids, frame.pixels, frame.right_pixels, frame.has_depth, frame.points[:, 2])
+            j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_depth, frame.points[:, 2])
             for j, frame in self._frontend.frames_at(estimate.stamp_ns).items()
         }
         self._calibration.add_frameset(estimate.stamp_ns, estimate.nav_T_body, views, estimate.vision is Quality.WEAK)

@@ -34,7 +34,7 @@ Stamped = TypeVar("Stamped", bound=HasStamp)
 
 
 class Synchroniser:
-    """Framesets in time order, each with the IMU up to its instant.
+    """Framesets in time order, each with the IMU up to its instant, or to the last line of a rolling shutter.
 
     Args:
         rig: Has the number of pairs, and the time offset of an IMU if there is one.
@@ -49,6 +49,7 @@ class Synchroniser:
         self._pairs = len(rig.groups)
         self._has_imu = rig.imu is not None
         self._offset_ns = rig.imu.time_offset_ns if rig.imu is not None else 0
+        self._readout_ns = max(camera.readout_ns for camera in rig.cameras)
         self._timing = config.timing
         self._initialisation = config.initialisation
         self._report = report
@@ -184,7 +185,7 @@ class Synchroniser:
             enough = self.initial_interval(frameset.stamp_ns) is not None
             return enough or waited_ns > 2.0 * self._initialisation.min_window_s * 1e9
         at_ns, newest_ns = frameset.stamp_ns + self._offset_ns, self._imu.newest_ns
-        if newest_ns is None or newest_ns >= at_ns:
+        if newest_ns is None or newest_ns >= at_ns + self._readout_ns:
             return True
         longest_ns = self._timing.max_imu_wait_ms * 1e6
         is_silent = at_ns - newest_ns > _MAX_SILENT_WAITS * longest_ns

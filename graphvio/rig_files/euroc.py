@@ -81,6 +81,7 @@ def _camera(name: str, section: Section, imu_T_body: Float) -> Camera:
             intrinsics=lens.intrinsics,
             distortion=lens.distortion,
             body_T_cam=imu_T_body @ body_T_cam,
+            line_time_us=kalibr.line_time_us_of(section),
         )
 
 

@@ -42,6 +42,8 @@ IMU_KEYS = {
     "accel_random_walk": "accelerometer_random_walk",
 }
 """graphvio's name of a noise density -> Kalibr's and EuRoC's key."""
+LINE_DELAY_KEY = "line_delay"
+"""Seconds from one line of a rolling shutter to the next."""
 _MAX_TIME_SHIFT_SPREAD_S = 5e-3
 
 
@@ -84,10 +86,16 @@ def cameras_of(document: Section) -> list[Camera]:
                 intrinsics=lens.intrinsics,
                 distortion=lens.distortion,
                 body_T_cam=se3_inverse(cam_T_body),
+                line_time_us=line_time_us_of(section),
             )
         )
         previous_T_body = cam_T_body
     return cameras
+
+
+def line_time_us_of(section: Section) -> float:
+    """Read a rolling shutter's ``line_delay`` (seconds) of Kalibr's and EuRoC's files; 0 where it is missing."""
+    return 1e6 * section.number(LINE_DELAY_KEY, 0.0)
 
 
 def imu_of(path: Path, time_offset_s: float) -> Imu:

@@ -26,7 +26,8 @@ _SINGLES_KEY = "single_cameras"
 _IMU_MATRICES = ("gyro_matrix", "accel_matrix")
 _IMU_KEYS = ("rate_hz", *NOISE_KEYS, "time_offset_s", *_IMU_MATRICES)
 _PAIR_KEYS = ("name", "left", "right")
-_CAMERA_KEYS = ("name", "model", "size_px", "intrinsics", "distortion", "body_T_cam", "mask")
+_LINE_TIME_KEY = "line_time_us"
+_CAMERA_KEYS = ("name", "model", "size_px", "intrinsics", "distortion", "body_T_cam", "mask", _LINE_TIME_KEY)
 
 
 def load(path: Path) -> Rig:
@@ -67,7 +68,10 @@ def parse(text: str, path: Path) -> Rig:
         singles = _singles(document)
         imu = _imu(document.section("imu")) if document.values.get("imu") is not None else None
         name = document.text("name") if document.values.get("name") is not None else path.stem
-        return checked_views(Rig(pairs, imu, name, _sigmas(document), singles))
+        rig = checked_views(Rig(pairs, imu, name, _sigmas(document), singles))
+    if version == 1 and _has_rolling_shutter(rig):
+        raise RigError(f"{path}: {_LINE_TIME_KEY} is of version 2; write  {VERSION_KEY}: 2")
+    return rig
 
 
 def save_rig(rig: Rig, path: str | Path) -> None:
@@ -87,7 +91,7 @@ def to_text(rig: Rig, folder: Path) -> str:
     """Format a rig as ``rig.yaml`` for a folder; paths of masks inside the folder are relative to it."""
     lines = [
         "# A rig of stereo pairs. Metres, radians, seconds, pixels; body is the frame of the IMU.",
-        f"{VERSION_KEY}: {VERSIONS[1] if rig.singles else VERSIONS[0]}",
+        f"{VERSION_KEY}: {VERSIONS[1] if rig.singles or _has_rolling_shutter(rig) else VERSIONS[0]}",
         f"name: {_quoted(rig.name)}",
     ]
     if rig.calibration_sigmas != FACTORY:
@@ -118,6 +122,10 @@ def to_text(rig: Rig, folder: Path) -> str:
             first, *others = _camera_lines(single.left, folder)
             lines += [f"  - {first}", *(f"    {line}" for line in others)]
     return "\n".join(lines) + "\n"
+
+
+def _has_rolling_shutter(rig: Rig) -> bool:
+    return any(camera.line_time_us for camera in rig.cameras)
 
 
 def _sigmas(document: Section) -> CalibrationSigmas:
@@ -165,6 +173,7 @@ def _camera(section: Section) -> Camera:
         distortion=section.array("distortion"),
         body_T_cam=body_T_cam,
         mask=mask,
+        line_time_us=section.number(_LINE_TIME_KEY, 0.0),
     )
     return as_written(camera, body_T_cam)
 
@@ -187,6 +196,8 @@ def _camera_lines(camera: Camera, folder: Path) -> Iterable[str]:
     yield "body_T_cam:"
     for row in camera.body_T_cam:
         yield f"  - {_numbers(row)}"
+    if camera.line_time_us:
+        yield f"{_LINE_TIME_KEY}: {_number(camera.line_time_us)}  # rolling shutter"
     if camera.mask is not None:
         mask, home = camera.mask.resolve(), folder.resolve()
         yield f"mask: {_quoted(str(mask.relative_to(home) if mask.is_relative_to(home) else mask))}"

@@ -57,6 +57,7 @@ def exact_row(stamp_ns: int, values: Iterable[float]) -> str:
 def camera_yaml(camera: Camera, rate_hz: float, comment: str) -> str:
     """Return a camera's ``sensor.yaml``."""
     lens = kalibr.written_lens(camera)
+    shutter = f"{kalibr.LINE_DELAY_KEY}: {1e-6 * camera.line_time_us:.12g}\n" if camera.line_time_us else ""
     return (
         f"sensor_type: camera\ncomment: {comment}\n{_matrix_yaml(camera.body_T_cam)}"
         f"rate_hz: {rate_hz:g}\nresolution: [{camera.size_px[0]}, {camera.size_px[1]}]\n"
@@ -64,6 +65,7 @@ def camera_yaml(camera: Camera, rate_hz: float, comment: str) -> str:
         f"intrinsics: [{', '.join(f'{value:.12g}' for value in lens.intrinsics)}]\n"
         f"distortion_model: {lens.distortion_model}\n"
         f"distortion_coefficients: [{', '.join(f'{value:.12g}' for value in lens.coefficients)}]\n"
+        f"{shutter}"
     )
 
 

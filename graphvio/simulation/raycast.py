@@ -123,7 +123,7 @@ def first_hits(coefficients: Float, offsets: Int, items: Int, bounds: Float, ray
     """Find the first rectangle on the ray of every pixel's centre.
 
     Args:
-        coefficients: (Q, 9).
+        coefficients: (1, Q, 9), or (H, Q, 9) of each line, whose tiles are then one line high.
         offsets: (T + 1,) from `tile_lists`.
         items: (N,) from `tile_lists`.
         bounds: (N,) from `tile_lists`.
@@ -134,13 +134,15 @@ def first_hits(coefficients: Float, offsets: Int, items: Int, bounds: Float, ray
     """
     height, width = rays.shape[0], rays.shape[1]
     tiles_across = (width + TILE_PX - 1) // TILE_PX
+    tile_height = TILE_PX if len(coefficients) == 1 else 1
     hit = np.empty((height, width), dtype=np.int64)
     inverse_depth = np.empty((height, width))
     for row in range(height):
+        k = coefficients[min(row, len(coefficients) - 1)]
         for column in range(width):
-            tile = (row // TILE_PX) * tiles_across + column // TILE_PX
+            tile = (row // tile_height) * tiles_across + column // TILE_PX
             hit[row, column], inverse_depth[row, column] = _first_hit(
-                coefficients,
+                k,
                 items,
                 bounds,
                 offsets[tile],
@@ -251,7 +253,7 @@ def shade(
     """Compute the radiance (H, W) float32; pixels at the border of two rectangles are averages over a grid of rays.
 
     Args:
-        coefficients: (Q, 9).
+        coefficients: (1, Q, 9), or (H, Q, 9) of each line, whose tiles are then one line high.
         offsets: (T + 1,) from `tile_lists`.
         items: (N,) from `tile_lists`.
         bounds: (N,) from `tile_lists`.
@@ -269,8 +271,10 @@ def shade(
     """
     height, width = hit.shape
     tiles_across = (width + TILE_PX - 1) // TILE_PX
+    tile_height = TILE_PX if len(coefficients) == 1 else 1
     radiance = np.zeros((height, width), dtype=np.float32)
     for row in range(height):
+        k = coefficients[min(row, len(coefficients) - 1)]
         for column in range(width):
             i = hit[row, column]
             border = (
@@ -280,7 +284,7 @@ def shade(
                 or (row < height - 1 and hit[row + 1, column] != i)
             )
             rays_each = _SUBSAMPLES if border else 1
-            tile = (row // TILE_PX) * tiles_across + column // TILE_PX
+            tile = (row // tile_height) * tiles_across + column // TILE_PX
             x_i, x_j = slopes[row, column, 0, 0], slopes[row, column, 0, 1]
             y_i, y_j = slopes[row, column, 1, 0], slopes[row, column, 1, 1]
             total = 0.0
@@ -291,10 +295,10 @@ def shade(
                     x = rays[row, column, 0] + x_i * right + x_j * down
                     y = rays[row, column, 1] + y_i * right + y_j * down
                     if border:
-                        i, _ = _first_hit(coefficients, items, bounds, offsets[tile], offsets[tile + 1], x, y)
+                        i, _ = _first_hit(k, items, bounds, offsets[tile], offsets[tile + 1], x, y)
                     if i >= 0:
                         total += tint[i] * _radiance(
-                            coefficients, i, x, y, x_i, x_j, y_i, y_j,
+                            k, i, x, y, x_i, x_j, y_i, y_j,
                             texture, mapping, texels, level_offsets, sides, values, grid,
                         )  # fmt: skip
             radiance[row, column] = total / (rays_each * rays_each)

@@ -57,12 +57,19 @@ class CameraRays:
         self.rays = rays.reshape(height, width, 2)
         slopes = _ray_slopes(camera.model_number, camera.intrinsics, camera.distortion, rays)
         self.slopes = slopes.reshape(height, width, 2, 2)
-        self.tile_boxes = _tile_boxes(self.rays, self.slopes)
+        self.tile_boxes = _tile_boxes(self.rays, self.slopes, TILE_PX if camera.line_time_us == 0.0 else 1)
 
     def render(self, surfaces: Surfaces, atlas: Atlas, world_T_cam: Float) -> View:
-        """Render the surfaces as seen from ``world_T_cam`` (4, 4)."""
-        coefficients = ray_coefficients(surfaces.corners, se3_inverse(world_T_cam))
-        offsets, items, bounds = tile_lists(coefficients, self.tile_boxes)
+        """Render the surfaces as seen from ``world_T_cam`` (4, 4), or (H, 4, 4) at each line of a rolling shutter."""
+        poses = world_T_cam.reshape(-1, 4, 4)
+        coefficients = np.array([ray_coefficients(surfaces.corners, se3_inverse(pose)) for pose in poses])
+        boxes = np.split(self.tile_boxes, len(poses))
+        lists = [tile_lists(each, tiles) for each, tiles in zip(coefficients, boxes, strict=True)]
+        ends = np.cumsum([0, *(len(items) for _, items, _ in lists)])
+        offsets = np.concatenate(
+            [each[:-1] + end for (each, _, _), end in zip(lists, ends, strict=False)] + [ends[-1:]]
+        )
+        items, bounds = (np.concatenate([each[k] for each in lists]) for k in (1, 2))
         hit, inverse_depth = first_hits(coefficients, offsets, items, bounds, self.rays)
         radiance = shade(
             coefficients, offsets, items, bounds, self.rays, self.slopes, hit,
@@ -88,19 +95,14 @@ def _ray_slopes(model: int, intrinsics: Float, distortion: Float, rays: Float) -
     return slopes
 
 
-def _tile_boxes(rays: Float, slopes: Float) -> Float:
+def _tile_boxes(rays: Float, slopes: Float, tile_height: int) -> Float:
     """Compute the extent (T, 4) ``[x0, x1, y0, y1]`` of the rays of each tile, with half a pixel around it."""
     height, width = rays.shape[:2]
     margin = 0.51 * np.abs(slopes).sum(axis=3)
-    low, high = rays - margin, rays + margin
-    boxes = []
-    for top in range(0, height, TILE_PX):
-        for left in range(0, width, TILE_PX):
-            tile = np.s_[top : top + TILE_PX, left : left + TILE_PX]
-            x0, y0 = low[tile].min(axis=(0, 1))
-            x1, y1 = high[tile].max(axis=(0, 1))
-            boxes.append([x0, x1, y0, y1])
-    return np.array(boxes)
+    tops, lefts = np.arange(0, height, tile_height), np.arange(0, width, TILE_PX)
+    low = np.minimum.reduceat(np.minimum.reduceat(rays - margin, tops), lefts, axis=1)
+    high = np.maximum.reduceat(np.maximum.reduceat(rays + margin, tops), lefts, axis=1)
+    return np.stack([low[..., 0], high[..., 0], low[..., 1], high[..., 1]], axis=-1).reshape(-1, 4)
 
 
 class Film:

@@ -90,8 +90,9 @@ class Simulator:
         return range(first, first + len(self.rig.groups[group].cameras))
 
     def triggers_ns(self, group: int) -> Int:
-        """Return the stamps (M,) at which a pair or single camera takes images, all within the walk."""
-        rate, duration_s = self.rates_hz[group], self.scene.motion.duration_s
+        """Return the stamps (M,) at which a pair or single camera takes images, which end within the walk."""
+        readout_s = 1e-9 * max(camera.readout_ns for camera in self.rig.groups[group].cameras)
+        rate, duration_s = self.rates_hz[group], self.scene.motion.duration_s - readout_s
         late_ns = round(group * self._trigger_offset_ms * 1e6)
         count = int(np.floor(duration_s * rate + 1e-9))
         since_ns = late_ns + np.round(np.arange(max(count, 1)) * (1e9 / rate)).astype(np.int64)
@@ -126,6 +127,9 @@ class Simulator:
     def view(self, index: int, camera: int, surfaces: Surfaces | None = None) -> View:
         """Render the noise-free radiance and true depth of an image.
 
+        Each line of a rolling shutter is seen from where the camera is at that line's instant. What moves in the world
+        stands still meanwhile.
+
         Args:
             index: of the frameset.
             camera: index in ``rig.cameras``.
@@ -133,7 +137,12 @@ class Simulator:
         """
         seen = surfaces if surfaces is not None else self.surfaces(index)
         rays = self._rays_in(self._rig_stage(index))[camera]
-        return rays.render(seen, self._stage.atlas, self.world_T_body[index] @ rays.camera.body_T_cam)
+        world_T_body = self.world_T_body[index]
+        if rays.camera.line_time_us:
+            line_times_s = 1e-6 * rays.camera.line_time_us * np.arange(rays.camera.size_px[1])
+            times_s = float(self._seconds(self.stamps_ns[index])) + line_times_s
+            world_T_body = self.scene.motion.at(np.minimum(times_s, self.scene.motion.duration_s)).world_T_body
+        return rays.render(seen, self._stage.atlas, world_T_body @ rays.camera.body_T_cam)
 
     def image(self, index: int, camera: int, noisy: bool = True, surfaces: Surfaces | None = None) -> Image:
         """Render a grey image (H, W); see `view` for the arguments."""

@@ -76,7 +76,7 @@ def _of_pair(
         frame.ids,
         in_left @ body_T_left[:3, :3].T + body_T_left[:3, 3],
         covariances,
-        frame.pixels,
+        frame.pixels_at_stamp,
         right_px,
         descriptors,
     )

@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks import accuracy, backend, calibration_error, cameras, faults, frontend, optimize, slam, startup
+from benchmarks import accuracy, backend, calibration_error, cameras, faults, frontend, lenses, optimize, slam, startup
 from benchmarks.command_line import run_command_line
 
 if __name__ == "__main__":
@@ -12,7 +12,18 @@ if __name__ == "__main__":
             "Measures speed, accuracy and behaviour under faults. docs/explanation/benchmarks has what is compared.",
             tuple(
                 module.add_parser
-                for module in (startup, frontend, backend, accuracy, calibration_error, cameras, faults, optimize, slam)
+                for module in (
+                    startup,
+                    frontend,
+                    backend,
+                    accuracy,
+                    calibration_error,
+                    cameras,
+                    lenses,
+                    faults,
+                    optimize,
+                    slam,
+                )
             ),
             "Timings mean something only on a machine that does nothing else meanwhile.",
         )

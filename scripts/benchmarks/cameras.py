@@ -15,6 +15,7 @@ from graphvio.config import Config
 from graphvio.errors import GraphvioError, TrajectoryError
 from graphvio.evaluation import evaluate
 from graphvio.odometry import Odometry
+from graphvio.rig import Rig
 from graphvio.simulation import SCENE_NAMES, simulate
 from graphvio.simulation.named_rigs import NAMED_RIGS
 from graphvio.sources import open_source
@@ -57,7 +58,7 @@ def run_all(args: argparse.Namespace) -> None:
     for scene in args.scenes:
         folders = [_rendered(args.data, scene, seed, args.duration) for seed in range(args.seeds)]
         for calibration, text in _CONFIGS.items():
-            ates_mm = {name: [_ate_mm(folder, name, Config.from_yaml(text)) for folder in folders] for name in rigs}
+            ates_mm = {name: [_ate_of(folder, name, Config.from_yaml(text)) for folder in folders] for name in rigs}
             base = median(ates_mm[_BASE])
             rows += [
                 (scene, calibration, name, f"{median(each):.2f}", f"{max(each):.2f}", f"{median(each) / base:.2f}")
@@ -73,10 +74,14 @@ def _rendered(data: Path, scene: str, seed: int, duration_s: float | None) -> Pa
     return rendered_once(data, scene, variant, lambda folder: simulate(scene, folder, seed=seed, duration_s=duration_s))
 
 
-def _ate_mm(folder: Path, name: str, config: Config) -> float:
-    """Run a rig's cameras and return the causal absolute trajectory error; infinite without poses."""
+def _ate_of(folder: Path, name: str, config: Config) -> float:
     wanted = [camera.name for camera in NAMED_RIGS[name]().cameras]
-    source = open_source(folder, open_source(folder).rig.with_only(wanted))
+    return ate_mm(folder, open_source(folder).rig.with_only(wanted), config)
+
+
+def ate_mm(folder: Path, rig: Rig, config: Config) -> float:
+    """Run a rig's cameras and return the causal absolute trajectory error; infinite without poses."""
+    source = open_source(folder, rig)
     assert source.truth is not None
     warm_up(source.rig, config)
     odometry = Odometry(source.rig, config)

@@ -1,0 +1,114 @@
+"""``scripts/benchmark lenses``: accuracy by the lens model at the same field of view, and with rolling shutters."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from benchmarks.cameras import ate_mm
+from benchmarks.recordings import add_data_option, rendered_once
+from benchmarks.report import Report, machine
+from graphvio.cameras import MODEL_NAMES, distort
+from graphvio.config import Config
+from graphvio.errors import GraphvioError
+from graphvio.rig import Camera, Rig
+from graphvio.simulation import simulate
+from graphvio.simulation.named_rigs import stereo
+from graphvio.sources import open_source
+
+_SIZE_PX = (320, 240)
+_FIELD_OF_VIEW_DEG = 78.0
+_READOUT_MS = 20.0
+_PINHOLE = "pinhole"
+_LENSES: Mapping[str, tuple[str, Sequence[float]]] = {
+    _PINHOLE: ("radial-tangential", []),
+    "radial-tangential": ("radial-tangential", [-0.283, 0.074, 1.9e-4, 1.8e-5]),
+    "equidistant": ("equidistant", [0.0034, 0.0007, -0.0020, 0.0002]),
+    "rational": ("rational", [0.3, -0.05, 3e-4, -2e-4, 0.01, 0.4, -0.03, 0.02]),
+    "double-sphere": ("double-sphere", [-0.2, 0.6]),
+    "extended-unified": ("extended-unified", [0.6, 1.1]),
+    "omnidirectional": ("omnidirectional", [0.7, -0.1, 0.05, 3e-4, -2e-4]),
+}
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the subcommand."""
+    parser = subparsers.add_parser(
+        "lenses",
+        help="accuracy by the lens model, and with rolling shutters",
+        description=f"Runs a stereo pair with IMU through the room, with images of {_SIZE_PX[0]}x{_SIZE_PX[1]} pixels: "
+        f"with each lens model at {_FIELD_OF_VIEW_DEG:g} degrees, and with pinhole cameras whose lines are read out in "
+        f"{_READOUT_MS:g} ms, with and without the line time in the rig.",
+        epilog="Example: scripts/benchmark lenses --seeds 1 --duration 10",
+    )
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of recordings (default: 3)")
+    parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="of each walk (default: 20)")
+    parser.add_argument("--lenses", nargs="*", default=list(_LENSES), choices=list(_LENSES), metavar="NAME")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="also write the tables to this file")
+    parser.add_argument("--docs", action="store_true", help="put the tables into docs/benchmarks.md")
+    add_data_option(parser)
+    parser.set_defaults(run=run_all)
+
+
+def run_all(args: argparse.Namespace) -> None:
+    """Measure and report."""
+    if args.seeds < 1:
+        raise GraphvioError("--seeds must be at least 1")
+    report = Report()
+    report.add(machine())
+    lenses = [_PINHOLE, *(name for name in args.lenses if name != _PINHOLE)]
+    ates_mm = {name: _ates_mm(args, name, rig_of(name)) for name in lenses}
+    report.table(("lens", "ATE, mm, median", "worst", "over pinhole"), _rows(ates_mm, _PINHOLE))
+    line_time_us = 1e3 * _READOUT_MS / (_SIZE_PX[1] - 1)
+    rolling = rig_of(_PINHOLE).with_cameras(lambda camera: replace(camera, line_time_us=line_time_us))
+    shutters = {
+        "global": ates_mm[_PINHOLE],
+        f"rolling, {_READOUT_MS:g} ms": _ates_mm(args, "rolling", rolling),
+        f"rolling, {_READOUT_MS:g} ms, not in the rig": _ates_mm(args, "rolling", rolling, has_line_time=False),
+    }
+    report.table(("shutter", "ATE, mm, median", "worst", "over global"), _rows(shutters, "global"))
+    report.write(args, "lenses")
+
+
+def rig_of(lens: str) -> Rig:
+    """Return the simulator's stereo pair with lenses that reach as far to the right and left as the pinhole's."""
+    model, coefficients = _LENSES[lens]
+    width, height = _SIZE_PX
+    distortion = np.pad(np.array(coefficients, dtype=np.float64), (0, 8 - len(coefficients)))
+    edge, *_ = distort(MODEL_NAMES[model], distortion, np.tan(np.deg2rad(_FIELD_OF_VIEW_DEG / 2)), 0.0)
+    focal_px = 0.5 * width / edge
+    intrinsics = np.array([focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1)])
+
+    def change(camera: Camera) -> Camera:
+        return replace(camera, model=model, distortion=distortion, intrinsics=intrinsics, size_px=_SIZE_PX)
+
+    return stereo().with_cameras(change)
+
+
+def _rows(ates_mm: Mapping[str, Sequence[float]], base: str) -> list[tuple[str, ...]]:
+    return [
+        (name, f"{median(each):.2f}", f"{max(each):.2f}", f"{median(each) / median(ates_mm[base]):.2f}")
+        for name, each in ates_mm.items()
+    ]
+
+
+def _ates_mm(args: argparse.Namespace, name: str, rig: Rig, has_line_time: bool = True) -> list[float]:
+    found = []
+    for seed in range(args.seeds):
+        folder = rendered_once(
+            args.data,
+            "room",
+            f"{name}-{args.duration:g}s-seed{seed}",
+            lambda folder, seed=seed: simulate("room", folder, seed=seed, duration_s=args.duration, rig=rig),
+        )
+        known = open_source(folder).rig
+        if not has_line_time:
+            known = known.with_cameras(lambda camera: replace(camera, line_time_us=0.0))
+        found.append(ate_mm(folder, known, Config()))
+        print(f"{name}, seed {seed}: {found[-1]:.2f} mm", flush=True)
+    return found
