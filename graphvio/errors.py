@@ -54,3 +54,7 @@ class ServiceError(GraphvioError):
 
 class MapError(GraphvioError):
     """A map cannot be read or written or does not fit the rig, or keyframes cannot be mapped."""
+
+
+class BenchmarkError(GraphvioError):
+    """A data set is not known, or a folder holds none of its sequences."""

@@ -1,8 +1,8 @@
 """Trajectory files: TUM, EuRoC and KITTI text formats, and the true trajectory in a session or bag.
 
 TUM: ``stamp_s x y z q_x q_y q_z q_w``, separated by blanks, or by commas where stamps have a decimal point. EuRoC:
-``stamp_ns,x,y,z,q_w,q_x,q_y,q_z,...``, separated by commas. Stamps are converted exactly: float64 resolves only
-0.2 microseconds of a Unix time.
+``stamp_ns,x,y,z,q_w,q_x,q_y,q_z,...``, separated by commas. UZH-FPV's truth is TUM's with a row number in front.
+Stamps are converted exactly: float64 resolves only 0.2 microseconds of a Unix time.
 """
 
 from __future__ import annotations
@@ -109,6 +109,8 @@ def _load_text(path: Path) -> Trajectory:
     rows = list(_rows(text))
     if rows and not rows[0][2] and len(rows[0][1]) == _KITTI_COLUMNS:
         return _load_kitti(path, rows)
+    if rows and _is_numbered(rows[0][1]):
+        rows = [(number, fields[1:], is_euroc) for number, fields, is_euroc in rows]
     stamps: list[int] = []
     poses: list[Float] = []
     for number, fields, is_euroc in rows:
@@ -155,6 +157,17 @@ def _rows(text: str) -> Iterator[tuple[int, Sequence[str], bool]]:
             continue  # a header without a comment sign
         first = False
         yield number, fields, is_euroc
+
+
+def _is_numbered(fields: Sequence[str]) -> bool:
+    """Return whether a row has its number before a pose: then only its last four columns are a rotation."""
+    if len(fields) != _COLUMNS + 1 or not fields[0].isdecimal():
+        return False
+    try:
+        norms = [float(np.linalg.norm([float(field) for field in fields[first : first + 4]])) for first in (4, 5)]
+    except ValueError:
+        return False
+    return abs(norms[0] - 1.0) > _NORM_TOLERANCE >= abs(norms[1] - 1.0)
 
 
 def _pose(fields: Sequence[str], is_euroc: bool, where: str) -> tuple[int, Float]:

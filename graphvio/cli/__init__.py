@@ -5,6 +5,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from graphvio.cli.benchmark import benchmark
 from graphvio.cli.calibrate import calibrate, calibrate_trajectories
 from graphvio.cli.compare import compare
 from graphvio.cli.doctor import doctor
@@ -63,6 +64,7 @@ app.command()(convert)
 app.command()(info)
 app.command()(evaluate)
 app.command()(compare)
+app.command()(benchmark)
 app.command()(simulate)
 app.command()(view)
 app.command(name="dump-config")(dump_config)

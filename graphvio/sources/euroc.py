@@ -1,4 +1,4 @@
-"""Reads EuRoC/ASL folders with any number of cameras, and TUM-VI's export in the same layout."""
+"""Reads EuRoC/ASL folders with any number of cameras, and TUM-VI's and Monado's recordings in the same layout."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from graphvio.sources.index import ImageFiles, Index
 from graphvio.sources.tables import read_frame_csv, read_imu_csv
 
 LAYOUT = "EuRoC/ASL and TUM-VI: mav0/cam0/data.csv, mav0/cam0/data/*.png, mav0/imu0/data.csv"
-_TRUTHS = ("state_groundtruth_estimate0", "mocap0")
+_TRUTHS = ("state_groundtruth_estimate0", "gt", "mocap0")  # of EuRoC, Monado and TUM-VI
 
 
 def matches(path: Path) -> bool:

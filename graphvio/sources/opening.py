@@ -10,7 +10,7 @@ from graphvio.errors import RigError, SourceError
 from graphvio.rig import Rig
 from graphvio.rig_files import find_rig
 from graphvio.sessions.store import is_store, open_store
-from graphvio.sources import euroc, kitti_odometry, kitti_raw, session
+from graphvio.sources import euroc, kitti_odometry, kitti_raw, session, uzh_fpv
 from graphvio.sources.base import Source
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import Index
@@ -19,7 +19,7 @@ from graphvio.sources.plug_ins import Layout, plug_ins
 from graphvio.sources.recording import Recording
 
 _MAX_TOLERANCE_MS = 10.0
-_LAYOUTS: tuple[Layout, ...] = (euroc, kitti_odometry, kitti_raw)
+_LAYOUTS: tuple[Layout, ...] = (euroc, kitti_odometry, kitti_raw, uzh_fpv)
 
 
 def is_recording(path: Path) -> bool:

@@ -77,7 +77,7 @@ def read_times(path: Path, parse: Callable[[str], int | None], faults: FaultLog)
         if stamp is not None:
             lines.append(number)
             stamps.append(stamp)
-        elif line.strip():
+        elif line.strip() and not line.startswith("#"):
             _count_garbage(EventKind.FRAME_GARBAGE, path, number + 1, stamps, faults)
     stamps_ns = np.array(stamps, dtype=np.int64)
     kept = clean_stamps(stamps_ns, "frame", path, faults)

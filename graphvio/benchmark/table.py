@@ -1,0 +1,137 @@
+"""The result of a benchmark as one document, and as the rows of the table that papers have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from graphvio.benchmark.datasets import Dataset
+from graphvio.benchmark.published import Published, lengths_m, published_on
+from graphvio.benchmark.run import Outcome
+from graphvio.version import __version__
+
+ALIGNMENT = "rmse of positions after SE(3) alignment of the whole causal trajectory, without scale"
+_WHOLE_SHARE = 0.8  # of a sequence's known length, from which on figures of whole sequences compare
+
+
+@dataclass(frozen=True, eq=False)
+class Benchmark:
+    """All outcomes on one data set."""
+
+    dataset: Dataset
+    folder: str
+    config: str
+    jobs: int
+    outcomes: Sequence[Outcome]
+
+    @property
+    def published(self) -> list[Published]:
+        """Figures of others, of those systems that have some of a sequence that was run."""
+        names = {outcome.sequence for outcome in self.outcomes}
+        return [each for each in published_on(self.dataset.key) if names.intersection(each.ate_m)]
+
+    @property
+    def absent(self) -> list[str]:
+        """Sequences of the data set that the folder does not hold."""
+        names = {outcome.sequence.split("-")[0] for outcome in self.outcomes}
+        return [name for name in self.dataset.sequences if name not in names]
+
+    def note(self, outcome: Outcome) -> str:
+        """Return what is to be known of a row: why it failed, or that it is a part of its sequence only."""
+        if outcome.reason or outcome.evaluation is None:
+            return outcome.reason
+        whole_m = lengths_m(self.dataset.key).get(outcome.sequence)
+        length_m = outcome.evaluation.path_length_m
+        if whole_m is not None and length_m < _WHOLE_SHARE * whole_m:
+            return f"{length_m:.1f} of {whole_m:.0f} m only: published figures are of the whole sequence"
+        return ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Convert to values of JSON."""
+        return {
+            "dataset": self.dataset.key,
+            "folder": self.folder,
+            "graphvio_version": __version__,
+            "config": self.config,
+            "jobs": self.jobs,
+            "ate": ALIGNMENT,
+            "sequences": [self._row(outcome) for outcome in self.outcomes],
+            "absent": self.absent,
+            "published": [asdict(each) for each in self.published],
+        }
+
+    def _row(self, outcome: Outcome) -> dict[str, Any]:
+        summary, found = outcome.summary or {}, outcome.evaluation
+        return {
+            "sequence": outcome.sequence,
+            "recording": str(outcome.recording),
+            "results": str(outcome.results),
+            "failed": outcome.has_failed,
+            "note": self.note(outcome),
+            **{
+                name: summary.get(name)
+                for name in ("framesets", "duration_s", "completion", "wall_s", "realtime_factor")
+            },
+            "length_m": None if found is None else found.path_length_m,
+            "ate_m": outcome.ate_m,
+            "ate_rotation_deg": None if found is None else found.ate_rotation_deg.rmse,
+            "poses_with_truth": None if found is None else found.associated,
+            "kitti_percent": None if found is None else found.kitti_percent,
+            "kitti_deg_per_m": None if found is None else found.kitti_deg_per_m,
+        }
+
+    def head(self) -> list[str]:
+        """Return the heads of the columns of `rows`."""
+        segments = ["t, %", "r, deg/100 m"] if self.dataset.has_segments else []
+        systems = [each.system for each in self.published]
+        return ["sequence", "length, m", "graphvio, m", *segments, "completion, %", "time, s", "x real time", *systems]
+
+    def rows(self) -> list[list[str]]:
+        """Return the cells of the table: a row for each sequence, then the means over those with a figure."""
+        rows = [self._cells(outcome) for outcome in self.outcomes]
+        if len(rows) < 2:
+            return rows
+        means = [_mean([outcome.ate_m for outcome in self.outcomes])]
+        blanks = [""] * (5 if self.dataset.has_segments else 3)
+        for each in self.published:
+            means.append(_mean([each.ate_m.get(outcome.sequence) for outcome in self.outcomes]))
+        return [*rows, ["mean of those", "", means[0], *blanks, *means[1:]]]
+
+    def _cells(self, outcome: Outcome) -> list[str]:
+        row = self._row(outcome)
+        deg_per_m = row["kitti_deg_per_m"]
+        per_100_m = None if deg_per_m is None else 100.0 * deg_per_m
+        segments = [_text(row["kitti_percent"], 2), _text(per_100_m, 3)] if self.dataset.has_segments else []
+        completion = None if row["completion"] is None else 100.0 * row["completion"]
+        return [
+            outcome.sequence,
+            _text(row["length_m"], 1),
+            "failed" if outcome.has_failed else _text(row["ate_m"], 4),
+            *segments,
+            _text(completion, 1),
+            _text(row["wall_s"], 1),
+            _text(row["realtime_factor"], 2),
+            *(_text(each.ate_m.get(outcome.sequence), 3) for each in self.published),
+        ]
+
+    def notes(self) -> list[str]:
+        """Return what must be said below the table: notes on rows, what is absent, and all sources."""
+        lines = [f"{outcome.sequence}: {note}" for outcome in self.outcomes if (note := self.note(outcome))]
+        lines.append(f"graphvio: ATE, {ALIGNMENT}; times with {self.jobs} of the sequences at once")
+        if self.absent:
+            lines.append(f"not in the folder: {', '.join(self.absent)}")
+        for each in self.published:
+            lines.append(f"{each.system}: {each.method}; {each.source} (read from {each.read_from})")
+        if not self.published:
+            lines.append("no published figures of other systems could be verified for these sequences")
+        return lines
+
+
+def _mean(values: Sequence[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    return f"{sum(known) / len(known):.3f} ({len(known)})" if known else ""
+
+
+def _text(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
