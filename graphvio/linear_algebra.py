@@ -1,13 +1,16 @@
-"""Solvers of positive definite systems for kernels, in the thread that calls them.
+"""Products, eigenvectors and solvers of small symmetric matrices for kernels, in the thread that calls them.
 
-LAPACK's start threads of their own for a few hundred unknowns, which take the cores from the odometry and wait for each
-other; and numba compiles its interface to LAPACK for 10 s.
+BLAS and LAPACK choose their code by the processor and, for some processors, by where an array lies in memory: last bits
+would depend on both. They start threads of their own for a few hundred unknowns, which take the cores from the odometry
+and wait for each other; and numba compiles its interface to LAPACK for 10 s.
 """
 
 import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.kernels import kernel, vector_kernel
+
+_MAX_SWEEPS = 30  # five or six suffice for a matrix of six
 
 
 @vector_kernel
@@ -63,3 +66,67 @@ def eliminated(matrix: Float, n_kept: int) -> Float:
             kept[r, c] -= _dot(coupling[r], coupling[c])
             kept[c, r] = kept[r, c]
     return kept
+
+
+@kernel
+def product(a: Float, b: Float) -> Float:
+    """Return ``a b`` (N, M) of matrices (N, K) and (K, M), each element summed in the order of K."""
+    out = np.zeros((len(a), b.shape[1]))
+    for r in range(len(a)):
+        for k in range(len(b)):
+            factor = a[r, k]
+            for c in range(b.shape[1]):
+                out[r, c] += factor * b[k, c]
+    return out
+
+
+@kernel
+def squared_length(vector: Float, covariance: Float) -> float:
+    """Return ``v^T C^-1 v`` of a vector (N,): its squared Mahalanobis length; NaN where C is not positive definite."""
+    white = solve_lower(cholesky(covariance), vector.reshape(1, -1))
+    total = 0.0
+    for i in range(len(vector)):
+        total += white[0, i] * white[0, i]
+    return total
+
+
+@kernel
+def eigen(matrix: Float) -> tuple[Float, Float]:
+    """Return the eigenvalues (N,), in no order, and the eigenvectors (N, N) in columns, of a symmetric matrix.
+
+    By Jacobi's rotations (G. Golub, C. Van Loan, *Matrix Computations*, 2013, section 8.5).
+
+    Raises:
+        LinAlgError: if it is not finite.
+    """
+    n = len(matrix)
+    turned, axes = matrix.copy(), np.eye(n)
+    if not np.isfinite(matrix).all():
+        raise np.linalg.LinAlgError("eigenvectors are asked for of a matrix that is not finite")
+    for _ in range(_MAX_SWEEPS):
+        outside = on_diagonal = 0.0
+        for r in range(n):
+            on_diagonal += turned[r, r] * turned[r, r]
+            for c in range(r):
+                outside += turned[r, c] * turned[r, c]
+        if outside <= 1e-32 * on_diagonal:
+            break
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                if turned[p, q] == 0.0:
+                    continue
+                slope = 0.5 * (turned[q, q] - turned[p, p]) / turned[p, q]
+                tangent = 1.0 / (abs(slope) + np.sqrt(slope * slope + 1.0))
+                if slope < 0.0:
+                    tangent = -tangent
+                cosine = 1.0 / np.sqrt(tangent * tangent + 1.0)
+                sine = tangent * cosine
+                for k in range(n):
+                    a, b = turned[k, p], turned[k, q]
+                    turned[k, p], turned[k, q] = cosine * a - sine * b, sine * a + cosine * b
+                    a, b = axes[k, p], axes[k, q]
+                    axes[k, p], axes[k, q] = cosine * a - sine * b, sine * a + cosine * b
+                for k in range(n):
+                    a, b = turned[p, k], turned[q, k]
+                    turned[p, k], turned[q, k] = cosine * a - sine * b, sine * a + cosine * b
+    return np.diag(turned).copy(), axes

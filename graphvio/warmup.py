@@ -32,6 +32,7 @@ from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import common_rows
 from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, skew, so3_log
 from graphvio.kernels import any_compiled_before, await_compilers, cache_root, compile_elsewhere, is_compiling_elsewhere
+from graphvio.linear_algebra import squared_length
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Imu, Rig
 from graphvio.self_calibration.online import adjust_nothing
@@ -124,6 +125,7 @@ def _warm_up_tracking(rig: Rig, config: Config) -> None:
     se3_exp(np.zeros(6))
     skew(np.zeros(3))
     own_covariance(np.eye(6), np.eye(6))
+    squared_length(np.zeros(6), np.eye(6))
     for pose in (np.eye(4), np.asfortranarray(np.eye(4))):  # gtsam's matrices are in Fortran's order
         se3_log(pose)
         se3_inverse(pose)

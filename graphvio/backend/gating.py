@@ -9,6 +9,7 @@ from scipy.special import gammaincinv  # scipy.stats takes a second to import
 
 from graphvio.arrays import Float
 from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
+from graphvio.linear_algebra import squared_length
 from graphvio.measurements.gate_result import GateResult
 
 _MIN_SIGMAS = 5.0  # of an excess that counts
@@ -42,7 +43,7 @@ def gate_motion(
 
 def gate_innovation(innovation: Float, covariance: Float, probability: float) -> GateResult:
     """Test an innovation (M,) with a covariance (M, M); a share of correct ones given by ``probability`` passes."""
-    statistic = float(innovation @ np.linalg.solve(covariance, innovation))
+    statistic = squared_length(innovation, covariance)
     threshold = chi_square_quantile(probability, len(innovation))
     return GateResult(statistic <= threshold, statistic, threshold, innovation, covariance)
 

@@ -8,7 +8,7 @@ import numpy as np
 from graphvio.arrays import Float
 from graphvio.backend.gating import chi_square_quantile
 from graphvio.kernels import kernel
-from graphvio.linear_algebra import cholesky, solve_lower
+from graphvio.linear_algebra import cholesky, eigen, product, solve_lower
 
 _MIN_OWN_SHARE = 0.001  # of each direction of a motion's covariance: keeps it positive definite
 
@@ -43,7 +43,6 @@ def own_covariance(covariance: Float, shared: Float) -> Float:
     """
     root = cholesky(covariance)
     white = solve_lower(root, solve_lower(root, shared).T)
-    shares, axes = np.linalg.eigh(np.eye(6) - 0.5 * (white + white.T))
-    axes = root @ np.ascontiguousarray(axes)
-    own: Float = (axes * np.maximum(shares, _MIN_OWN_SHARE)) @ np.ascontiguousarray(axes.T)
-    return own
+    shares, axes = eigen(np.eye(6) - 0.5 * (white + white.T))
+    axes = product(root, axes)
+    return product(axes * np.maximum(shares, _MIN_OWN_SHARE), axes.T.copy())

@@ -19,7 +19,8 @@ from graphvio.frontend.observations import Observations, RigArrays
 from graphvio.frontend.ransac import search
 from graphvio.frontend.refinement import Refined, refine
 from graphvio.frontend.thresholds import THRESHOLDS
-from graphvio.geometry import se3_inverse, se3_log
+from graphvio.geometry import se3_compose, se3_inverse, se3_log
+from graphvio.linear_algebra import squared_length
 
 _T = THRESHOLDS.agreement
 _NONE: Mapping[int, Place] = {}
@@ -141,8 +142,8 @@ def _in_order(hypotheses: list[MotionHypothesis], unknown: frozenset[int] = froz
 
 def disagreement(one: Refined, other: Refined) -> float:
     """Return the squared Mahalanobis distance between two independent measurements of one motion of body."""
-    apart = se3_log(np.ascontiguousarray(one.cur_T_ref @ se3_inverse(other.cur_T_ref)))
-    return float(apart @ np.linalg.solve(one.covariance + other.covariance, apart))
+    apart = se3_log(se3_compose(one.cur_T_ref, se3_inverse(other.cur_T_ref)))
+    return squared_length(apart, one.covariance + other.covariance)
 
 
 def is_supported(inlier: Bool, config: MotionConfig) -> bool:

@@ -23,7 +23,7 @@ from graphvio.frontend.noise import influence, influence_slope, inlier_cutoff, n
 from graphvio.frontend.observations import Observations, RigArrays, image_by_image
 from graphvio.geometry import se3_compose, se3_exp
 from graphvio.kernels import kernel
-from graphvio.linear_algebra import cholesky, solve_lower, solve_symmetric
+from graphvio.linear_algebra import cholesky, eigen, product, solve_lower, solve_symmetric
 
 _MAX_ROUNDS = 3
 _MAX_REPETITIONS = 5  # of these rounds, where outliers stay in the cost and make convergence slow
@@ -179,7 +179,7 @@ def _covariances(
     information = hessian / used.factor + np.eye(6) / _WEAK_DIRECTION_SIGMA**2
     lower = cholesky(information)
     root = solve_lower(lower, np.eye(6))
-    covariance = root @ root.T
+    covariance = product(root, root.T.copy())
     factors = np.zeros(len(inlier))
     for i in range(len(inlier)):
         if inlier[i]:
@@ -188,7 +188,7 @@ def _covariances(
         left_motions(pose, rig), rig, blocks, at, sigmas_px, lane_by_lane(blocks, factors)
     )
     gain = covariance / used.factor * (used.weight / used.slope)
-    shared = _bounded(used.variance * gain @ through_points @ gain, root, lower.T)
+    shared = _bounded(product(product(used.variance * gain, through_points), gain), root, lower)
     return covariance, shared
 
 
@@ -214,16 +214,19 @@ def _is_of_an_explained_pair(pair: Int, inlier: Bool, pairs: int) -> Bool:
 
 
 @kernel
-def _bounded(shared: Float, root: Float, inverse: Float) -> Float:
-    """Bound the shared part of a covariance ``root root^T``, so that it and the remainder are positive definite."""
-    shares, axes = np.linalg.eigh(inverse @ shared @ inverse.T)
-    turned, scaled = root @ axes, root @ axes
+def _bounded(shared: Float, root: Float, lower: Float) -> Float:
+    """Bound the shared part of a covariance ``root root^T``, so that it and the remainder are positive definite.
+
+    ``lower`` is the inverse of ``root^T``.
+    """
+    shares, axes = eigen(product(product(lower.T.copy(), shared), lower))
+    turned = product(root, axes)
+    scaled = turned.copy()
     for c in range(6):
         share = min(max(shares[c], _SHARED_BOUNDS[0]), _SHARED_BOUNDS[1])
         for r in range(6):
             scaled[r, c] *= share
-    bounded: Float = scaled @ turned.T
-    return bounded
+    return product(scaled, turned.T.copy())
 
 
 @kernel
