@@ -44,13 +44,21 @@ def solve_lower(lower: Float, right: Float) -> Float:
 
 
 @kernel
+def solve_rows(matrix: Float, right: Float) -> Float:
+    """Solve ``matrix x = right`` for each row of right (M, N), with a positive definite matrix; returns (M, N)."""
+    lower = cholesky(matrix)
+    x = solve_lower(lower, right)
+    upper = lower.T.copy()
+    for m in range(len(right)):
+        for r in range(len(lower) - 1, -1, -1):
+            x[m, r] = (x[m, r] - _dot(upper[r, r + 1 :], x[m, r + 1 :])) / lower[r, r]
+    return x
+
+
+@kernel
 def solve_symmetric(matrix: Float, right: Float) -> Float:
     """Solve ``matrix x = right`` (N,) with a positive definite matrix (N, N)."""
-    lower = cholesky(matrix)
-    x: Float = solve_lower(lower, right.reshape(1, -1))[0]
-    upper = lower.T.copy()
-    for r in range(len(lower) - 1, -1, -1):
-        x[r] = (x[r] - _dot(upper[r, r + 1 :], x[r + 1 :])) / lower[r, r]
+    x: Float = solve_rows(matrix, right.reshape(1, -1))[0]
     return x
 
 

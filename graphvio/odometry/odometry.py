@@ -312,7 +312,15 @@ class Odometry:
         estimator, interval = self._estimator, predicted.interval
         rates = self._rates.update(visual.motion, interval, estimator.state().gyro_bias, estimator.latest_rate())
         estimate = estimate_of(
-            frameset.stamp_ns, status, estimator, visual, is_stationary, rates, self._time_offset, self.stage_ms
+            frameset.stamp_ns,
+            status,
+            estimator,
+            visual,
+            is_stationary,
+            rates,
+            self._time_offset,
+            self._calibration,
+            self.stage_ms,
         )
         references, keyframe = self._frontend.reference_stamps_ns, None
         if frameset.stamp_ns in references:

@@ -67,6 +67,10 @@ class OnlineCalibration:
         """What is known of each part of the calibration; empty where it is not estimated."""
         return [] if self._calibration is None else self._calibration.findings()
 
+    def pose_covariance(self, nav_T_body: Float) -> Float:
+        """Return the covariance (6, 6) that errors of the calibration add to the newest pose (4, 4)."""
+        return np.zeros((6, 6)) if self._calibration is None else self._calibration.pose_covariance(nav_T_body)
+
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
         """Register a function that gets each full window; where the calibration is not estimated there are none."""
         if self._calibration is not None:

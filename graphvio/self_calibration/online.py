@@ -18,6 +18,7 @@ from graphvio.arrays import Float
 from graphvio.kernels import await_compilers
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
+from graphvio.self_calibration.consider import ConsiderCovariance
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.evidence import EXACT, MAX_FACTOR, Evidence, Gaussian
 from graphvio.self_calibration.findings import Finding, findings
@@ -89,6 +90,9 @@ class _Adjusted(NamedTuple):
     evidence: Evidence
     estimate: CalibrationEstimate
     extrinsics: dict[int, Float]
+    covariance: Float  # of the cameras' parameters that come into force
+    by_cameras: Float
+    window: tuple[Keyframe, ...]
     is_full: bool
 
 
@@ -136,6 +140,7 @@ class SelfCalibration:
         self._adjusted_at = 0  # keyframes of this window
         self._pending: Future[_Adjusted] | None = None
         self._due_in = 0  # framesets
+        self._consider = ConsiderCovariance(self._n_cameras)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="graphvio-calibration")
 
     def close(self) -> None:
@@ -175,6 +180,10 @@ class SelfCalibration:
         self._last = Keyframe(stamp_ns, odom_T_body, views)
         self._keyframes.append(self._last)
 
+    def pose_covariance(self, odom_T_body: Float) -> Float:
+        """Return the covariance (6, 6) that errors of the calibration add to the newest pose (4, 4)."""
+        return self._consider.at(odom_T_body)
+
     def start_window(self) -> None:
         """Leave the window that is not full: the poses that come are in another frame, or their clock is another."""
         self._keyframes, self._adjusted_at, self._last = [], 0, None
@@ -211,9 +220,11 @@ class SelfCalibration:
         ):
             noise = float(np.sqrt(np.nanmedian(solution.errors2))) / _RAYLEIGH_MEDIAN * self._sigma_px
             self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
+        self._consider.extend(adjusted.window, adjusted.by_cameras)
+        self._consider.learn(adjusted.estimate.difference[: self._n_cameras], adjusted.covariance)
         was_exact = self.estimate.is_file_exact
         self.estimate, self.extrinsics = adjusted.estimate, adjusted.extrinsics
-        self._in_force = self._nominal.moved(self.estimate.difference[: PAIR * len(self._rig.pairs)])
+        self._in_force = self._nominal.moved(self.estimate.difference[: self._n_cameras])
         return not (was_exact and self.estimate.is_file_exact)
 
     @property
@@ -222,6 +233,11 @@ class SelfCalibration:
         if self.has_full_window:
             return True
         return self.estimate.is_file_exact and self._agreeing >= _MIN_AGREEING
+
+    @property
+    def _n_cameras(self) -> int:
+        """Number of the cameras' parameters, the first ones of all."""
+        return PAIR * len(self._rig.pairs)
 
     @property
     def _pace(self) -> _Pace:
@@ -242,6 +258,7 @@ class SelfCalibration:
         self._keyframes, self._adjusted_at, self._full_windows = [], 0, 0
         self.has_full_window, self._agreeing, self._refused = False, 0, 0
         self.restarts += 1
+        self._consider.forget()
 
     def _is_keyframe(self, stamp_ns: int, views: Mapping[int, View]) -> bool:
         """Whether the images have moved, and time has passed, since the last keyframe."""
@@ -284,13 +301,17 @@ class SelfCalibration:
         evidence = self._evidence.with_window(prior, solution.calibration)
         factors, log_bayes_factor = evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS)
         posterior = evidence.given(self._prior, _assumed(factors))
-        in_force = evidence.given(self._prior, factors).mean if (factors != EXACT).any() else np.zeros_like(difference)
+        n_cameras, in_force = self._n_cameras, np.zeros_like(difference)
+        covariance, extrinsics = np.zeros((n_cameras, n_cameras)), {}
+        if (factors != EXACT).any():
+            of_all = evidence.given(self._prior, factors)
+            in_force, covariance = of_all.mean, of_all.covariance[:n_cameras, :n_cameras]
         estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor)
-        extrinsics = {}
         if not estimate.is_file_exact:
             anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
             extrinsics = extrinsic_covariances(self._rig, anywhere)
-        return _Adjusted(prior, solution, evidence, estimate, extrinsics, is_full)
+        by_cameras = solution.poses_by_cameras(n_cameras)
+        return _Adjusted(prior, solution, evidence, estimate, extrinsics, covariance, by_cameras, window, is_full)
 
     def _samples_of(self, window: tuple[Keyframe, ...]) -> InertialSamples | None:
         """Return the IMU over a window, or None where there is none; older samples are forgotten."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.geometry import so3_exp
-from graphvio.linear_algebra import eliminated, solve_symmetric
+from graphvio.linear_algebra import eliminated, solve_rows, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.self_calibration.bundle import Eliminated, Tracks, eliminate_landmarks, landmarks_after
 from graphvio.self_calibration.evidence import Gaussian
@@ -63,12 +63,27 @@ class Solution(NamedTuple):
         calibration: posterior of the difference from the nominal calibration.
         errors2: (N, 2) squared whitened errors of the tracks, NaN where there is no right image.
         imu_errors2: (K - 1,) squared whitened errors of the IMU, of 9 dimensions, NaN where there is none.
+        hessian: of the cost, over ``[poses 6 K, calibration C, velocities 3 K, gravity 3]``.
     """
 
     states: States
     calibration: Gaussian
     errors2: Float
     imu_errors2: Float
+    hessian: Float
+
+    def poses_by_cameras(self, n_cameras: int) -> Float:
+        """Return how the poses depend on the cameras' parameters, the first ones of the calibration.
+
+        Returns:
+            (K, 6, n_cameras) derivatives of the poses, errors in their own frames; the other unknowns follow.
+        """
+        n = 6 * len(self.states.poses)
+        cameras = np.arange(n, n + n_cameras)
+        others = np.r_[6:n, n + n_cameras : len(self.hessian)]
+        by_cameras = -solve_rows(self.hessian[np.ix_(others, others)], self.hessian[np.ix_(cameras, others)])
+        poses = np.concatenate([np.zeros((n_cameras, 6)), by_cameras[:, : n - 6]], axis=1)
+        return np.ascontiguousarray(poses.T).reshape(-1, 6, n_cameras)
 
 
 class _Linearised(NamedTuple):
@@ -111,7 +126,8 @@ def solve(window: Window, states: States, nominal: RigCalibration, difference: F
                 break
         else:
             found, damping = kept, max(100.0 * damping, 1e-4)
-    return Solution(states, Gaussian(difference, _marginal(at.hessian, calibration)), at.errors2, at.imu_errors2)
+    posterior = Gaussian(difference, _marginal(at.hessian, calibration))
+    return Solution(states, posterior, at.errors2, at.imu_errors2, at.hessian)
 
 
 def _linearise(

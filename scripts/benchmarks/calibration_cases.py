@@ -48,7 +48,7 @@ class Case:
 
 
 _SETTINGS = tuple(Case.__dataclass_fields__)
-_FIGURES = ("ate_cm", "epochs", "posed_percent", "frameset_ms", "before", "after")
+_FIGURES = ("ate_cm", "epochs", "posed_percent", "frameset_ms", "pose_nees", "before", "after")
 
 
 def append_outcome(path: Path, case: Case, outcome: CalibrationOutcome) -> None:
@@ -63,10 +63,14 @@ def append_outcome(path: Path, case: Case, outcome: CalibrationOutcome) -> None:
             writer = csv.writer(file)
             if is_new:
                 writer.writerow((*_SETTINGS, *_FIGURES))
-            figures = (f"{100 * outcome.ate_m:.4f}", outcome.epochs, f"{outcome.posed_percent:.2f}")
-            writer.writerow(
-                [*case.key, *figures, f"{outcome.frameset_ms:.2f}", _json(outcome.before), _json(outcome.after)]
+            figures = (
+                f"{100 * outcome.ate_m:.4f}",
+                outcome.epochs,
+                f"{outcome.posed_percent:.2f}",
+                f"{outcome.frameset_ms:.2f}",
+                f"{outcome.pose_nees:.4f}",
             )
+            writer.writerow([*case.key, *figures, _json(outcome.before), _json(outcome.after)])
 
 
 def load_outcomes(path: Path) -> dict[tuple[str, ...], CalibrationOutcome]:
@@ -87,6 +91,7 @@ def load_outcomes(path: Path) -> dict[tuple[str, ...], CalibrationOutcome]:
             epochs=int(row["epochs"]),
             posed_percent=float(row["posed_percent"]),
             frameset_ms=float(row["frameset_ms"]),
+            pose_nees=float(row["pose_nees"]),
             before=json.loads(row["before"]),
             after=json.loads(row["after"]),
         )

@@ -158,7 +158,8 @@ def _line(case: Case, outcome: CalibrationOutcome) -> str:
     change = "" if case.rig_change == "none" else f", {case.rig_change}"
     return (
         f"{case.scene}{change}, {draw}: {case.pairs}, {'with' if case.imu == 'yes' else 'without'} IMU: "
-        f"ATE {100 * outcome.ate_m:.2f} cm{epochs}{posed}, {outcome.frameset_ms:.1f} ms a frameset"
+        f"ATE {100 * outcome.ate_m:.2f} cm{epochs}{posed}, NEES {outcome.pose_nees:.2f} of each dimension, "
+        f"{outcome.frameset_ms:.1f} ms a frameset"
     )
 
 
@@ -181,9 +182,20 @@ def _tables(report: Report, results: dict[Case, CalibrationOutcome]) -> None:
     report.add(
         "### Accuracy",
         "ATE in cm and ratio to the better single pair: median / worst of the draws. Ratio to the exact files: of the "
-        "medians. With pose: framesets of the worst draw, by all pairs.",
+        "medians. Pose NEES: of poses since the first one, by all pairs, 1 where covariances are right. With pose: "
+        "framesets of the worst draw, by all pairs.",
     )
-    head = ["scene", "level", "IMU", "draws", *_PAIRS, "both / exact files", "both / better single", "with pose, %"]
+    head = [
+        "scene",
+        "level",
+        "IMU",
+        "draws",
+        *_PAIRS,
+        "both / exact files",
+        "both / better single",
+        "pose NEES / 6",
+        "with pose, %",
+    ]
     report.table(head, rows)
     if parameter_rows:
         report.add(
@@ -209,6 +221,7 @@ def _accuracy_cells(runs: dict[str, dict[int, CalibrationOutcome]], exact: Calib
         *(_median_and_worst([100 * run.ate_m for run in each.values()]) for each in (both, front, back)),
         against_exact,
         _median_and_worst(against_single),
+        _median_and_worst([run.pose_nees for run in both.values()]),
         f"{min(run.posed_percent for run in both.values()):.0f}" if both else "-",
     ]
 

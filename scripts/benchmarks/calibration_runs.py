@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -13,6 +13,8 @@ from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.errors import GraphvioError, TrajectoryError
 from graphvio.evaluation import evaluate
+from graphvio.geometry import se3_inverse, se3_log
+from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.odometry import Odometry
 from graphvio.rig import Rig
@@ -24,6 +26,8 @@ from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 from graphvio.warmup import warm_up
 
+_FRAMESETS_OF_NEES = 20  # one of so many
+
 
 @dataclass(frozen=True)
 class CalibrationOutcome:
@@ -34,6 +38,8 @@ class CalibrationOutcome:
         epochs: how many there were.
         posed_percent: framesets that have a pose.
         frameset_ms: mean wall time of a frameset, with its decoding.
+        pose_nees: mean over the poses of each second, of each dimension; 1 where covariances are right. NaN where a
+            second epoch begins.
         before: parameter with unit -> rms of its errors in the files, against the true rig at the end.
         after: the same of what the odometry estimated; nothing of what it does not estimate.
     """
@@ -42,6 +48,7 @@ class CalibrationOutcome:
     epochs: int
     posed_percent: float
     frameset_ms: float
+    pose_nees: float
     before: dict[str, float] = field(default_factory=dict)
     after: dict[str, float] = field(default_factory=dict)
 
@@ -101,8 +108,9 @@ class WronglyCalibrated:
         try:
             estimated = Trajectory(np.array([e.stamp_ns for e in posed], dtype=np.int64), poses)
             ate_m = evaluate(estimated, self._truth).ate_position_m.rmse
+            pose_nees = _pose_nees(posed, self._truth)
         except TrajectoryError:
-            ate_m = np.inf
+            ate_m, pose_nees = np.inf, np.nan
         refined: Rig | None = getattr(odometry, "refined_rig", None)
         after = _rms(refined, true) if refined is not None else {}
         offset_s = estimates[-1].time_offset_s if estimates else None
@@ -113,6 +121,7 @@ class WronglyCalibrated:
             epochs=len({e.epoch for e in posed}),
             posed_percent=100.0 * len(posed) / max(len(estimates), 1),
             frameset_ms=1e3 * wall_s / max(len(estimates), 1),
+            pose_nees=pose_nees,
             before=_rms(written, true),
             after=after,
         )
@@ -124,6 +133,22 @@ class WronglyCalibrated:
         if rig.imu is None:
             return framesets
         return merge(self._samples, framesets, rig.imu.time_offset_ns)
+
+
+def _pose_nees(estimates: Sequence[Estimate], truth: Trajectory) -> float:
+    """Compute the mean NEES of the poses since the first one, which defines nav, for each dimension."""
+    true = dict(zip(truth.stamps_ns.tolist(), truth.nav_T_body, strict=True))
+    first, *others = [e for e in estimates if e.stamp_ns in true][::_FRAMESETS_OF_NEES]
+    if others[-1].epoch != first.epoch:
+        return np.nan
+    assert first.nav_T_body is not None
+    nav_T_world, nees = first.nav_T_body @ se3_inverse(true[first.stamp_ns]), []
+    for estimate in others:
+        assert estimate.nav_T_body is not None
+        assert estimate.covariance is not None
+        error = se3_log(se3_inverse(nav_T_world @ true[estimate.stamp_ns]) @ estimate.nav_T_body)
+        nees.append(float(error @ np.linalg.solve(estimate.covariance, error)) / len(error))
+    return float(np.mean(nees))
 
 
 def _selected(rig: Rig, pairs: tuple[int, ...], imu: bool) -> Rig:

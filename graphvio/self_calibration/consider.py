@@ -1,0 +1,88 @@
+"""What errors of the calibration add to the pose's covariance: consider states.
+
+A wrong calibration bends all motions alike. As noise of each motion it would average out, and the pose would look far
+better known than it is. Here the pose's error is instead ``e = G c + m``, with the error `c` of the calibration that is
+in force now, by which every motion was wrong in its own way, and what its corrections left behind, since poses are not
+corrected with it. Neither is estimated, both are considered (S. F. Schmidt, *Application of state-space methods to
+navigation problems*, 1966; B. D. Tapley et al., *Statistical orbit determination*, 2004, section 6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.geometry import se3_adjoint, se3_inverse
+from graphvio.self_calibration.window import Keyframe
+
+
+class ConsiderCovariance:
+    """Covariance of the pose that comes from the calibration of the cameras.
+
+    Errors of a pose are in its own frame (tangent ``[rotation, translation]``).
+
+    Args:
+        n: number of the cameras' parameters.
+    """
+
+    def __init__(self, n: int) -> None:
+        self._newest: Keyframe | None = None
+        self._gain = np.zeros((6, n))  # G, at the newest keyframe
+        self._left_behind = np.zeros(6)  # m
+        self._before_knock = np.zeros((6, 6))  # covariance of what has nothing to do with the calibration now
+        self._difference = np.zeros(n)  # of the calibration in force from the rig file
+        self._covariance = np.zeros((n, n))  # of c
+
+    def extend(self, keyframes: Sequence[Keyframe], by_cameras: Float) -> None:
+        """Carry the pose's error on to the newest keyframe of a window.
+
+        Args:
+            keyframes: K of them. Those up to the newest one that is known already count no second time; one that
+                follows the window before is as far from it as the keyframes of this one from each other.
+            by_cameras: (K, 6, N) derivatives of the window's poses, of which the first stays, by the calibration.
+        """
+        newest = keyframes[-1]
+        known = keyframes[0] if self._newest is None else self._newest
+        first = next((k for k, keyframe in enumerate(keyframes) if keyframe.stamp_ns == known.stamp_ns), -1)
+        motion = by_cameras[-1] - _carried(keyframes[max(first, 0)], newest) @ by_cameras[max(first, 0)]
+        if first < 0 and len(keyframes) > 1:
+            motion = motion * len(keyframes) / (len(keyframes) - 1)
+        carried = _carried(known, newest)
+        self._gain = carried @ self._gain + motion
+        self._left_behind = carried @ self._left_behind
+        self._before_knock = carried @ self._before_knock @ carried.T
+        self._newest = newest
+
+    def learn(self, difference: Float, covariance: Float) -> None:
+        """Take the calibration that is in force from now on.
+
+        Args:
+            difference: (N,) from the rig file.
+            covariance: (N, N) of it.
+        """
+        self._left_behind = self._left_behind + self._gain @ (difference - self._difference)
+        self._difference, self._covariance = difference, covariance
+
+    def forget(self) -> None:
+        """Note that the cameras were knocked: their errors now are not those by which the motions until now are off."""
+        self._before_knock = self._at_newest
+        self._gain, self._left_behind = np.zeros_like(self._gain), np.zeros(6)
+
+    def at(self, odom_T_body: Float) -> Float:
+        """Return the covariance (6, 6) that it adds to a pose (4, 4), which is not far from the newest keyframe."""
+        if self._newest is None:
+            return np.zeros((6, 6))
+        carried = se3_adjoint(se3_inverse(odom_T_body) @ self._newest.odom_T_body)
+        return np.asarray(carried @ self._at_newest @ carried.T)
+
+    @property
+    def _at_newest(self) -> Float:
+        of_now = self._gain @ self._covariance @ self._gain.T
+        return np.asarray(of_now + np.outer(self._left_behind, self._left_behind) + self._before_knock)
+
+
+def _carried(then: Keyframe, now: Keyframe) -> Float:
+    """Return the matrix (6, 6) that turns an error of one pose into the error of a later one."""
+    return se3_adjoint(se3_inverse(now.odom_T_body) @ then.odom_T_body)
