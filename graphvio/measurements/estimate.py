@@ -32,7 +32,8 @@ class Estimate:
         stamp_ns: Stamp of the frameset.
         status: What the pose is based on.
         nav_T_body: (4, 4) pose, or None while initialising without a state and while lost.
-        covariance: (6, 6) of the pose, tangent ``[rotation, translation]`` in frame body, or None with the pose.
+        covariance: (6, 6) of the pose, tangent ``[rotation, translation]`` in frame body, or None with the pose. Where
+            the calibration is estimated it contains what errors of the cameras add.
         epoch: Number of declared breaks; poses of different epochs do not share a nav frame.
         velocity_nav: (3,) m/s in nav, or None when not estimated.
         gyro_bias: (3,) rad/s, or None without an IMU.

@@ -134,6 +134,16 @@ class Evidence(NamedTuple):
                 break
         return factors, best - exact
 
+    def mean_square(self, prior: FilePrior, in_force: Float) -> Float:
+        """Return the mean square (C, C) of the error of a difference (C,) from the file that is in force.
+
+        Here the file is as wrong as is most likely, be it for good reasons in force as it is.
+        """
+        factors, _ = self.file_factors(prior, np.zeros(prior.n_groups))
+        posterior = self.given(prior, factors)
+        off = posterior.mean - in_force
+        return np.asarray(posterior.covariance + np.outer(off, off))
+
     def _likelihood(self, prior: FilePrior, information: Float, factors: Float) -> float:
         """Return twice the logarithm of the marginal likelihood of factors, up to a constant.
 

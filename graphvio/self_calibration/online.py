@@ -302,10 +302,10 @@ class SelfCalibration:
         factors, log_bayes_factor = evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS)
         posterior = evidence.given(self._prior, _assumed(factors))
         n_cameras, in_force = self._n_cameras, np.zeros_like(difference)
-        covariance, extrinsics = np.zeros((n_cameras, n_cameras)), {}
         if (factors != EXACT).any():
-            of_all = evidence.given(self._prior, factors)
-            in_force, covariance = of_all.mean, of_all.covariance[:n_cameras, :n_cameras]
+            in_force = evidence.given(self._prior, factors).mean
+        covariance = evidence.mean_square(self._prior, in_force)[:n_cameras, :n_cameras]
+        extrinsics = {}
         estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor)
         if not estimate.is_file_exact:
             anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
