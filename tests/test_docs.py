@@ -6,11 +6,13 @@ import sys
 from dataclasses import fields
 from pathlib import Path
 
-import list_events
+import generate_pages
 import plot_layers
 import pytest
+from benchmarks.report import PAGES
 from calibration_walks import recorded
 
+import graphvio
 from graphvio.config import Config, profiles
 from graphvio.measurements.events import EventKind
 from graphvio.rig_files import load_rig
@@ -59,24 +61,50 @@ def test_the_commands_of_self_calibration_run_as_typed(walk: Path) -> None:
         assert (walk / name).exists(), name
 
 
+@pytest.mark.parametrize("name", generate_pages.GENERATED)
+def test_generated_pages_are_those_of_the_code(name: str) -> None:
+    text = (ROOT / f"docs/reference/{name}.md").read_text()
+    assert text == generate_pages.page(name), "run scripts/generate_pages.py"
+
+
 def test_events_page_lists_every_kind() -> None:
     text = (ROOT / "docs/reference/events.md").read_text()
-    assert text == list_events.page()
     assert [kind for kind in EventKind if f"| `{kind}` |" not in text] == []
 
 
-def test_every_configuration_value_is_documented() -> None:
+def test_every_configuration_value_and_profile_is_documented() -> None:
     text = (ROOT / "docs/reference/configuration.md").read_text()
     config = Config()
     for stage in fields(config):
         section = text.split(f"## `{stage.name}`\n")[1].split("\n## ")[0]
-        rows = re.findall(r"^\| `(\w+)` \| (\S+) \| (.+) \|$", section, re.MULTILINE)
+        rows = re.findall(r"^\| `(\w+)` \| (\S+) \| .+ \|$", section, re.MULTILINE)
         values = getattr(config, stage.name)
-        assert [(key, default) for key, default, _ in rows] == [
-            (f.name, str(getattr(values, f.name))) for f in fields(values)
-        ]
+        assert rows == [(f.name, str(getattr(values, f.name))) for f in fields(values)]
     for profile in profiles():
         assert f"| `{profile}` |" in text
+
+
+def test_every_command_is_documented() -> None:
+    text = (ROOT / "docs/reference/commands.md").read_text()
+    for name in ("run", "calibrate-trajectories", "fleet optimize", "doctor"):
+        assert f"\n## {name}\n" in text
+    assert "| `--no-imu` |" in text
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    text = "".join(page.read_text() for page in (ROOT / "docs/reference/api").glob("*.md"))
+    public = [name for name in graphvio.__all__ if name != "__version__" and not name.endswith("Error")]
+    assert [name for name in public if f"::: graphvio.{name}\n" not in text] == []
+    assert "::: graphvio.errors\n" in text
+
+
+def test_every_report_of_a_benchmark_has_its_markers() -> None:
+    sources = "".join(path.read_text() for path in (ROOT / "scripts").rglob("*.py"))
+    names = set(re.findall(r'(?:save_to_docs\(|write\(args, )"([\w-]+)"', sources))
+    assert len(names) > 15
+    marked = [name for page in PAGES for name in re.findall(r"^<!-- ([\w-]+) -->$", page.read_text(), re.MULTILINE)]
+    assert names - set(marked) == set()
+    assert [name for name in set(marked) if marked.count(name) != (2 if name == "figures" else 1)] == []
 
 
 def slug(heading: str) -> str:
@@ -107,14 +135,19 @@ def test_the_architecture_names_existing_modules() -> None:
         assert list((ROOT / "graphvio").rglob(name)) or (ROOT / "graphvio" / name).exists(), name
 
 
-def test_the_architecture_links_equations_to_existing_functions() -> None:
-    text = (ROOT / "docs/explanation/architecture.md").read_text()
-    links = re.findall(r"\[(\w+)\]\(\.\./\.\./(graphvio/[\w/]+\.py)\)", text)
-    assert len(links) > 13
-    for function, path in links:
-        assert f"\ndef {function}(" in (ROOT / path).read_text(), f"{path} has no {function}"
-    rows = "".join(re.findall(r"^\| (\(.*?) \|", text, re.MULTILINE))
-    assert [int(number) for number in re.findall(r"\d+", rows)] == list(range(1, 14))
+def test_every_equation_has_its_functions_and_tests() -> None:
+    text = (ROOT / "docs/explanation/paper.md").read_text()
+    sections = re.split(r"^## ", text, flags=re.MULTILINE)[1:]
+    equations = [section for section in sections if section.startswith("(")]
+    assert [int(number) for each in equations for number in re.findall(r"\((\d+)\)", each.split("\n")[0])] == list(
+        range(1, 14)
+    )
+    sources = (ROOT / "docs/reference/api/paper.md").read_text()
+    for section in equations:
+        links = re.findall(r"\[(\w+)\]\[([\w.]+)\]", section)
+        assert any(target.startswith("graphvio.") for _, target in links), section
+        assert any(target.startswith("test_") for _, target in links), section
+        assert all(f"::: {target}\n" in sources for _, target in links), section
 
 
 def test_the_layers_are_the_packages_that_exist() -> None:

@@ -246,7 +246,7 @@ class KeyframesConfig(Stage):
     """Keyframes for a SLAM system, and the gate of its corrections; unused without one."""
 
     descriptors: Literal["orb", "sift", "none"] = "orb"
-    """Of the landmarks in the left images."""
+    """Of the landmarks in the left images: ``orb`` (32 bytes), ``sift`` (128 bytes) or ``none``."""
     images: bool = False
     """Whether keyframes carry their images."""
     gate_probability: float = 0.999
@@ -263,4 +263,4 @@ class LiveConfig(Stage):
     max_image_wait_ms: float = 50.0
     """Time that an image waits for its partner, and a pair for the others."""
     stuck_s: float = 5.0
-    """A stage that works on one item for longer is stuck."""
+    """A stage that works on one item for longer is stuck; sensors that sent nothing for longer are silent."""

@@ -13,7 +13,7 @@ from benchmarks.motions import BREAK_SIGMA, BREAK_STATISTIC
 from benchmarks.picture import Panel, draw_trajectories
 from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import DOCS, IMAGES, Report, log_progress, machine
-from benchmarks.runs import HEAD, blinded, with_moved_pair
+from benchmarks.runs import HEAD, Outcome, blinded, with_moved_pair
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.simulation import SCENE_NAMES
@@ -41,7 +41,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="errors of every scene and the real clip by profile, with all pairs and with each alone",
         description="Runs every recording with each profile without the IMU, the default and the paper's with it, with "
         "all pairs and with each pair alone; then with an error in the second pair's extrinsics, and with a pair "
-        f"that is blind for {_BLIND_S:g} s. Writes OUT/accuracy.md and OUT/trajectories.png.",
+        f"that is blind for {_BLIND_S:g} s. Writes OUT/accuracy.md, OUT/figures.md and OUT/trajectories.png.",
         epilog="Example: scripts/benchmark accuracy --scenes room --duration 10",
     )
     parser.add_argument(
@@ -57,7 +57,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--profiles", nargs="+", default=[PAPER, DEFAULT, "fast"], metavar="NAME")
     out = Path("results") / "benchmarks"
     parser.add_argument("--out", type=Path, default=out, metavar="DIR", help=f"default: {out}")
-    parser.add_argument("--docs", action="store_true", help="put report and picture into docs, too")
+    parser.add_argument("--docs", action="store_true", help="put report, README's figures and picture into docs")
     add_data_option(parser)
     parser.set_defaults(run=run_all)
 
@@ -96,8 +96,11 @@ def run_all(args: argparse.Namespace) -> None:
         draw_trajectories(picture, panels)
         link = "![Trajectories by all pairs and by each alone, seen from above](../../images/trajectories.png)"
     report.save(args.out / "accuracy.md")
+    figures = _figures(bench)
+    figures.save(args.out / "figures.md")
     if args.docs:
         report.save_to_docs("accuracy", link)
+        figures.save_to_docs("figures")
         if panels:
             (IMAGES / "trajectories.png").write_bytes(picture.read_bytes())
     log_progress(f"written to {args.out}")
@@ -124,6 +127,34 @@ def _main_table(report: Report, bench: Bench, cases: list[tuple[str, bool]]) -> 
         f"{BREAK_STATISTIC:.1f} ({BREAK_SIGMA:.0f} sigma). The truth of simulated recordings is exact; that of a "
         f"real one is taken to be good to {1e3 * CLIP_TRUTH.position_m:g} mm and {1e3 * CLIP_TRUTH.angle_rad:g} mrad."
     )
+
+
+def _figures(bench: Bench) -> Report:
+    """Report what the README shows of these runs: the default configuration, by pairs, with and without the IMU."""
+    names = list(dict.fromkeys(pair.name for name in bench.with_several_pairs for pair in bench.rig(name).pairs))
+    rows = []
+    for name in bench.recordings:
+        truth = bench.outcome(name, DEFAULT, bench.choices(name)[0], False).truth
+        label = f"{name if name == CLIP_NAME else f'simulated {name}'}, {truth.distances[-1]:.0f} m"
+        pairs = {p: bench.pair_names(name, p) for p in bench.choices(name)}
+        for imu in (False, True):
+            errors = {pairs[p]: _figure(bench.outcome(name, DEFAULT, p, imu)) for p in pairs}
+            all_pairs = pairs[bench.choices(name)[0]]
+            rows.append([label, _yes_or_no(imu), errors[all_pairs], *(errors.get(each, "") for each in names)])
+    report = Report()
+    report.table(["recording", "IMU", "all pairs", *(f"{each} alone" for each in names)], rows)
+    return report
+
+
+def _figure(outcome: Outcome) -> str:
+    """ATE and drift of a run, or that its trajectory is in several pieces."""
+    if outcome.evaluation is None:
+        return "no pose"
+    epochs = len(np.unique(outcome.epochs))
+    if epochs > 1:
+        return f"lost, {epochs} pieces"
+    drift = outcome.evaluation.drift_percent
+    return f"{1e3 * outcome.ate_m:.1f} mm" + ("" if drift is None else f", {drift:.2f} %")
 
 
 def _together_table(report: Report, bench: Bench, cases: list[tuple[str, bool]]) -> None:

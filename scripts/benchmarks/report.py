@@ -15,7 +15,13 @@ from pathlib import Path
 from graphvio.errors import GraphvioError
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGES = DOCS / "explanation" / "benchmarks"
+_EXPLANATION = DOCS / "explanation"
+PAGES = (
+    DOCS.parent / "README.md",
+    _EXPLANATION / "benchmarks.md",
+    *sorted((_EXPLANATION / "benchmarks").glob("*.md")),
+)
+"""Where reports have markers."""
 IMAGES = DOCS / "images"
 _PACKAGES = ("numpy", "numba", "opencv-python-headless", "gtsam")
 
@@ -68,27 +74,29 @@ class Report:
             self.save_to_docs(name)
 
     def save_to_docs(self, name: str, extra: str = "") -> None:
-        """Replace what stands between ``<!-- name -->`` and ``<!-- /name -->`` in the page that has them.
+        """Replace what stands between ``<!-- name -->`` and ``<!-- /name -->`` in README and the pages of benchmarks.
 
         Args:
-            name: of the markers.
+            name: of the markers; every page that has them gets the report.
             extra: Markdown that follows the report, such as the link to a picture.
 
         Raises:
-            GraphvioError: if not exactly one page has the markers.
+            GraphvioError: if no page has them, or one has them twice.
         """
         begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
         marker = re.compile(f"{re.escape(begin)}\n.*?{re.escape(end)}", re.DOTALL)
-        texts = {page: page.read_text(encoding="utf-8") for page in sorted(PAGES.glob("*.md"))}
-        found = [(page, match) for page, text in texts.items() for match in marker.finditer(text)]
-        if len(found) != 1:
-            raise GraphvioError(
-                f"docs/explanation/benchmarks: one page needs {begin} and after it {end}; {len(found)} have them"
-            )
-        ((page, match),) = found
-        inside = f"{self.text}\n{extra}\n" if extra else self.text
-        text = texts[page]
-        page.write_text(f"{text[: match.start()]}{begin}\n{inside}{end}{text[match.end() :]}", encoding="utf-8")
+        inside = f"{begin}\n{self.text}\n{extra}\n{end}" if extra else f"{begin}\n{self.text}{end}"
+        changed = {}
+        for page in PAGES:
+            text = page.read_text(encoding="utf-8")
+            if (count := len(marker.findall(text))) > 1:
+                raise GraphvioError(f"{page.name}: has {begin} {count} times; leave one")
+            if count == 1:
+                changed[page] = marker.sub(lambda _: inside, text)
+        if not changed:
+            raise GraphvioError(f"docs/explanation/benchmarks: a page needs {begin} and after it {end}, a line each")
+        for page, text in changed.items():
+            page.write_text(text, encoding="utf-8")
 
 
 @contextmanager
