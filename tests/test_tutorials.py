@@ -23,7 +23,7 @@ PROGRAM = typer.main.get_command(app)
 
 def typed(text: str) -> list[list[str]]:
     """Return the arguments of each command of graphvio in a page's blocks."""
-    lines = re.findall(r"^(?: {4}|)(?:\.venv/bin/)?graphvio (.*)$", text, re.MULTILINE)
+    lines = re.findall(r"^ {4}(?:\.venv/bin/)?graphvio (.*)$", text, re.MULTILINE)
     return [shlex.split(line, comments=True) for line in lines]
 
 
@@ -42,7 +42,7 @@ def follow(name: str, recording: Path, folder: Path) -> str:
         programs.append(["-c", python_of(text)])
     printed = ""
     for arguments in programs:
-        if arguments[2:3] in (["simulate"], ["doctor"]):
+        if arguments[2:3] == ["simulate"]:
             continue
         done = subprocess.run(
             [sys.executable, *arguments], cwd=folder, capture_output=True, text=True, timeout=300, check=False
