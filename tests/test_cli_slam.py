@@ -46,7 +46,7 @@ def made(room_walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     assert f"browser: {web.url}" in done.stderr.splitlines()
     assert "health: http://127.0.0.1:" in done.stderr
-    assert "ROS 2: topics below /graphvio" in done.stderr
+    assert "ROS 2: node /graphvio" in done.stderr
     return out
 
 

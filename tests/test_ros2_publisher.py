@@ -20,10 +20,12 @@ from synthetic import random_covariance, transform
 
 from graphvio.arrays import Float
 from graphvio.errors import ServiceError
-from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_exp
+from graphvio.geometry import rotation_from_quat_wxyz, se3, se3_exp, so3_log
 from graphvio.measurements.estimate import Estimate, Prediction, Status
 from graphvio.measurements.events import Event
 from graphvio.queues import Broadcast
+from graphvio.rig import Camera
+from graphvio.ros2.frames import Frames, optical_frame
 from graphvio.ros2.messages import ThinnedPath
 from graphvio.ros2.publisher import Publisher
 from graphvio.slam.keyframe import CorrectionResult, Keyframe, Landmarks
@@ -31,6 +33,8 @@ from graphvio.slam.keyframe_log import KeyframeLog
 
 ODOMETRY, PATH, LANDMARKS = "/graphvio/odometry", "/graphvio/path", "/graphvio/landmarks"
 MAP_T_ODOM = transform([0.0, 0.0, 0.3], [1.0, 2.0, 0.0])
+BASE_T_BODY = transform([0.0, 0.5, 1.5], [0.4, 0.0, 0.3])
+BODY_T_BASE = np.linalg.inv(BASE_T_BODY)
 
 
 class Running:
@@ -96,7 +100,7 @@ class System:
 
     def __init__(self, domain: int) -> None:
         self.running = Running()
-        self.publisher = Publisher(self.running, domain, body="imu_link")
+        self.publisher = Publisher(self.running, domain, frames=Frames(BASE_T_BODY))
         self.other = Other("slam", domain)
         assert self.other.read() == "True"
         self._taken: dict[str, list[Any]] = {}
@@ -152,6 +156,25 @@ def pose_in(message: dict[str, Any], rotation: str, translation: str) -> Float:
     return se3(rotation_from_quat_wxyz(np.array([q["w"], q["x"], q["y"], q["z"]])), np.array([t["x"], t["y"], t["z"]]))
 
 
+def jacobian_of_base(a_T_body: Float) -> Float:
+    """Errors of base's pose as ROS has them, translation and rotation in a's axes, by those of body's pose."""
+    a_T_base, columns = a_T_body @ BODY_T_BASE, []
+    for k in range(6):
+        step = np.zeros(6)
+        step[k] = 1e-6
+        moved = a_T_body @ se3_exp(step) @ BODY_T_BASE
+        turned = so3_log(moved[:3, :3] @ a_T_base[:3, :3].T)
+        columns.append(np.concatenate([moved[:3, 3] - a_T_base[:3, 3], turned]) / 1e-6)
+    return np.array(columns).T
+
+
+def covariance_of_base(each: Estimate) -> Float:
+    assert each.nav_T_body is not None
+    assert each.covariance is not None
+    jacobian = jacobian_of_base(each.nav_T_body)
+    return jacobian @ each.covariance @ jacobian.T
+
+
 def test_publisher_sends_poses_transforms_and_path(system: System) -> None:
     made = [estimate(number) for number in range(10)]
     for each in made:
@@ -162,22 +185,23 @@ def test_publisher_sends_poses_transforms_and_path(system: System) -> None:
         assert each.covariance is not None
         assert each.velocity_nav is not None
         assert (stamp_of(message["header"]), message["header"]["frame_id"]) == (each.stamp_ns, "odom")
-        assert message["child_frame_id"] == "imu_link"
-        np.testing.assert_allclose(pose_in(message["pose"]["pose"], "orientation", "position"), each.nav_T_body)
+        assert message["child_frame_id"] == "base_link"
+        nav_T_base = each.nav_T_body @ BODY_T_BASE
+        np.testing.assert_allclose(pose_in(message["pose"]["pose"], "orientation", "position"), nav_T_base)
         covariance = np.array(message["pose"]["covariance"]).reshape(6, 6)
-        R = each.nav_T_body[:3, :3]
-        np.testing.assert_allclose(covariance[:3, :3], R @ each.covariance[3:, 3:] @ R.T, atol=1e-12)
-        np.testing.assert_allclose(covariance[3:, :3], R @ each.covariance[:3, 3:] @ R.T, atol=1e-12)
+        np.testing.assert_allclose(covariance, covariance_of_base(each), rtol=1e-4, atol=1e-7)
+        rate = each.rates.get("fused", np.full(3, np.nan))  # of body
+        moved_by_turn = np.cross(rate, BODY_T_BASE[:3, 3])
         linear = message["twist"]["twist"]["linear"]
-        np.testing.assert_allclose([linear["x"], linear["y"], linear["z"]], R.T @ each.velocity_nav)
+        velocity = BASE_T_BODY[:3, :3] @ (each.nav_T_body[:3, :3].T @ each.velocity_nav + moved_by_turn)
+        np.testing.assert_allclose([linear["x"], linear["y"], linear["z"]], velocity)
         angular = message["twist"]["twist"]["angular"]
-        expected = each.rates.get("fused", np.full(3, np.nan))
-        np.testing.assert_array_equal([angular["x"], angular["y"], angular["z"]], expected)
+        np.testing.assert_allclose([angular["x"], angular["y"], angular["z"]], BASE_T_BODY[:3, :3] @ rate)
         assert np.isnan(np.array(message["twist"]["covariance"]).reshape(6, 6)[3:]).all()
         (link,) = moved["transforms"]
-        assert (link["header"]["frame_id"], link["child_frame_id"]) == ("odom", "imu_link")
+        assert (link["header"]["frame_id"], link["child_frame_id"]) == ("odom", "base_link")
         assert stamp_of(link["header"]) == each.stamp_ns
-        np.testing.assert_allclose(pose_in(link["transform"], "rotation", "translation"), each.nav_T_body)
+        np.testing.assert_allclose(pose_in(link["transform"], "rotation", "translation"), nav_T_base)
     assert until(lambda: any(len(each["poses"]) == 10 for each in system.all_of(PATH)))
     poses = system.all_of(PATH)[-1]["poses"]
     assert [stamp_of(each["header"]) for each in poses] == [each.stamp_ns for each in made]
@@ -188,8 +212,12 @@ def test_publisher_sends_poses_transforms_and_path(system: System) -> None:
 def test_publisher_latches_camera_poses(system: System) -> None:
     assert until(lambda: len(system.all_of("/tf_static")) == 1)
     (message,) = system.all_of("/tf_static")
-    for link, camera in zip(message["transforms"], system.running.rig.cameras, strict=True):
-        assert (link["header"]["frame_id"], link["child_frame_id"]) == ("imu_link", camera.name.lstrip("/"))
+    first, *others = message["transforms"]
+    assert (first["header"]["frame_id"], first["child_frame_id"]) == ("base_link", "imu_link")
+    np.testing.assert_allclose(pose_in(first["transform"], "rotation", "translation"), BASE_T_BODY, atol=1e-12)
+    names = ["front/left", "cam1", "cam2", "cam3"]
+    for link, name, camera in zip(others, names, system.running.rig.cameras, strict=True):
+        assert (link["header"]["frame_id"], link["child_frame_id"]) == ("imu_link", f"{name}_optical_frame")
         np.testing.assert_allclose(pose_in(link["transform"], "rotation", "translation"), camera.body_T_cam, atol=1e-12)
 
 
@@ -219,17 +247,16 @@ def test_publisher_sends_keyframes_and_applies_corrections(system: System) -> No
         np.testing.assert_array_equal(rows[:, 12:].copy().view("<u4"), [[7, 0], [8, 0], [7, 1]])
 
     map_T_body = transform([0.2, -0.4, 1.0], [4.0, 5.0, 6.0])
-    R = map_T_body[:3, :3]
+    map_T_base = map_T_body @ BODY_T_BASE
     in_body = random_covariance(np.random.default_rng(5), 6, 0.1)
-    axes = np.zeros((6, 6))  # ROS: translation first, both in the axes of map
-    axes[:3, 3:], axes[3:, :3] = R, R
-    as_ros = axes @ in_body @ axes.T
-    system.correct(keyframes[2].stamp_ns + 400_000, map_T_body, as_ros)
+    to_ros = jacobian_of_base(map_T_body)
+    as_ros = to_ros @ in_body @ to_ros.T
+    system.correct(keyframes[2].stamp_ns + 400_000, map_T_base, as_ros)
     assert until(lambda: len(system.running.corrections) == 1)
     number, pose, covariance = system.running.corrections[0]
     assert number == 2
     np.testing.assert_allclose(pose, map_T_body, atol=1e-12)
-    np.testing.assert_allclose(covariance, in_body, atol=1e-12)
+    np.testing.assert_allclose(covariance, in_body, rtol=1e-4, atol=1e-7)
     system.running.estimates.publish(estimate(30))
     assert until(lambda: any(len(each["transforms"]) == 2 for each in system.all_of("/tf")))
     link = system.all_of("/tf")[-1]["transforms"][1]
@@ -244,7 +271,7 @@ def test_publisher_sends_keyframes_and_applies_corrections(system: System) -> No
         (stamp_ns, np.zeros((6, 6)), "map", "not positive definite"),
     ]
     for count, (when_ns, wrong, frame, why) in enumerate(refused, 1):
-        system.correct(when_ns, map_T_body, wrong, frame)
+        system.correct(when_ns, map_T_base, wrong, frame)
         values = system.wait_for_diagnosis("graphvio: corrections", 1, why)
         assert values == {"accepted": "1", "refused": str(count)}
     assert [number for number, _, _ in system.running.corrections] == [2, 0]
@@ -280,3 +307,27 @@ def test_thinned_path_is_bounded_and_uniform() -> None:
     assert (steps == steps[0]).all()
     path.clear()
     assert path.poses() == []
+
+
+@pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [np.pi / 2, 0.0, 0.0], [0.0, -np.pi / 2, 0.0], [0.0, 0.0, np.pi]])
+def test_base_link_looks_ahead_with_axes_of_the_imu(turn: list[float]) -> None:
+    tilt = transform([0.1, -0.2, 0.15], [0.0, 0.0, 0.0])  # of the cameras, which does not tilt base_link
+    old_T_new = transform(turn, [0.0, 0.0, 0.0])  # another IMU on the same rig
+
+    def turned(camera: Camera) -> Camera:
+        return replace(camera, body_T_cam=old_T_new.T @ tilt @ camera.body_T_cam)
+
+    frames = Frames.of_rig(small_rig().with_cameras(turned))
+    np.testing.assert_allclose(frames.base_T_body, old_T_new, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("camera", "frame"),
+    [
+        ("cam0", "cam0_optical_frame"),
+        ("/front/left/image_raw/compressed", "front/left_optical_frame"),
+        ("left_optical_frame", "left_optical_frame"),
+    ],
+)
+def test_optical_frame_is_named_by_camera(camera: str, frame: str) -> None:
+    assert optical_frame(camera) == frame

@@ -13,6 +13,7 @@ pytest.importorskip("rosbags")
 from rosbags.interfaces import Nodetype
 
 from graphvio.errors import SourceError
+from graphvio.ros2 import interfaces
 from graphvio.ros2.node import domain_of
 from graphvio.ros2.wire import (
     DEFAULT,
@@ -41,6 +42,11 @@ TYPES = [
     "tf2_msgs/msg/TFMessage",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "diagnostic_msgs/msg/DiagnosticArray",
+    "rmw_dds_common/msg/ParticipantEntitiesInfo",
+    "rcl_interfaces/msg/ListParametersResult",
+    "rcl_interfaces/msg/ParameterValue",
+    "rcl_interfaces/msg/ParameterDescriptor",
+    "rcl_interfaces/msg/SetParametersResult",
 ]
 WORDS = ["", "a", "odom", "base_link", "Köln"]
 
@@ -60,19 +66,19 @@ def random_message(rng: np.random.Generator, type_name: str, length: int) -> Any
                 return bool(rng.integers(2))
             return float(rng.normal()) if name.startswith("float") else int(rng.integers(0, 100))
         of, count = what
-        count = count if node == Nodetype.ARRAY else length
-        if of[0] == Nodetype.NAME:
-            return [value(of) for _ in range(count)]
-        return np.array([value(of) for _ in range(count)], dtype=of[1][0])
+        count = count if node == Nodetype.ARRAY else min(length, count or length)
+        made = [value(of) for _ in range(count)]
+        is_list = of[0] == Nodetype.NAME or of[1][0] == "string"
+        return made if is_list else np.array(made, dtype={"char": "uint8", "byte": "uint8"}.get(of[1][0], of[1][0]))
 
-    _, fields = cdr.types().fielddefs[type_name]
-    return cdr.make(type_name, **{name: value(kind) for name, kind in fields})
+    _, fields = interfaces.types().fielddefs[type_name]
+    return interfaces.make(type_name, **{name: value(kind) for name, kind in fields})
 
 
 def same(one: Any, other: Any) -> None:
     """A message of rosbags and one of cyclonedds hold the same."""
     if hasattr(one, "__msgtype__"):
-        for name, _ in cdr.types().fielddefs[one.__msgtype__][1]:
+        for name, _ in interfaces.types().fielddefs[one.__msgtype__][1]:
             same(getattr(one, name), getattr(other, name))
     elif isinstance(one, list | np.ndarray):
         assert len(one) == len(other)
@@ -88,12 +94,12 @@ def test_types_agree_between_libraries(type_name: str, length: int) -> None:
     rng = np.random.default_rng(length)
     for _ in range(10):
         message = random_message(rng, type_name, length)
-        data = cdr.encode(message)
+        data = interfaces.encode(message)
         decoded = idl_struct(type_name).deserialize(data)
         same(message, decoded)
         encoded = decoded.serialize(use_version_2=False)
         assert encoded == data
-        same(cdr.decode(encoded, type_name), decoded)
+        same(cdr.decode(encoded, type_name, known=interfaces.types()), decoded)
 
 
 def test_names_match_ros() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,10 +64,12 @@ class Services:
         lines = [f"gRPC: {address}" + (" (TLS)" if self.certificate else "")]
         if self.ros2_domain is None:
             return Started(address, lines)
-        from graphvio.ros2.publisher import Publisher
+        from graphvio.ros2.parameters import flatten
+        from graphvio.ros2.publisher import NODE, Publisher
 
-        publisher = stack.enter_context(Publisher(running, self.ros2_domain))
-        lines.append(f"ROS 2: topics below /graphvio in domain {self.ros2_domain}")
+        parameters = flatten(asdict(running.config))
+        publisher = stack.enter_context(Publisher(running, self.ros2_domain, parameters=parameters))
+        lines.append(f"ROS 2: node {NODE} in domain {self.ros2_domain}")
         return Started(address, lines, publisher.check)
 
     def _options(self) -> ServiceOptions:

@@ -42,6 +42,7 @@ class LiveOdometry:
 
     Attributes:
         rig: of the source.
+        config: of all stages.
         estimates: of the framesets.
         predictions: at each IMU sample.
         events: of the run.
@@ -62,7 +63,7 @@ class LiveOdometry:
         self.events: Broadcast[Event] = Broadcast()
         self.keyframe_log = KeyframeLog()
         self._source = source
-        self._config = config
+        self.config = config
         self._outputs = list(outputs)
         self._meter = Meter()
         self._odometry = Odometry(rig, config, on_prediction=self.predictions.publish)

@@ -10,9 +10,10 @@ from typing import Final
 import numpy as np
 
 from graphvio.errors import GraphvioError
+from graphvio.ros2.frames import Frames
 from graphvio.ros2.messages import CORRECTION, MAP
 from graphvio.sessions import cdr
-from graphvio.sessions.messages import covariance_of, pose_of, stamp_of
+from graphvio.sessions.messages import stamp_of
 from graphvio.slam.interface import Served
 from graphvio.slam.keyframe import Keyframe
 
@@ -34,8 +35,8 @@ class Outcomes:
 class Corrections:
     """Passes corrections to the odometry; keyframes may be added in another thread."""
 
-    def __init__(self, served: Served) -> None:
-        self._served = served
+    def __init__(self, served: Served, frames: Frames) -> None:
+        self._served, self._frames = served, frames
         self._lock = threading.Lock()
         self._stamps: deque[tuple[int, int]] = deque(maxlen=_MAX_KEYFRAMES)  # with the keyframe's id
         self.outcomes = Outcomes()
@@ -57,12 +58,12 @@ class Corrections:
         message = cdr.decode(data, CORRECTION, "a correction")
         frame = message.header.frame_id.lstrip("/")
         if frame != MAP:
-            raise _RefusedError(f"a correction in frame {frame!r}; give the pose of {MAP} to body")
+            raise _RefusedError(f"a correction in frame {frame!r}; give the pose of {self._frames.base} in {MAP}")
         q = message.pose.pose.orientation
         norm = float(np.linalg.norm([q.x, q.y, q.z, q.w]))
         if not abs(norm - 1.0) < _MAX_NORM_ERROR:
             raise _RefusedError(f"a correction whose orientation has norm {norm:.3g}; give a unit quaternion")
-        map_T_body, covariance = pose_of(message), covariance_of(message)
+        map_T_body, covariance = self._frames.correction_of(message)
         if not np.isfinite(map_T_body).all() or not _is_positive(covariance):
             raise _RefusedError(
                 "a correction whose position is not finite, or whose covariance is not positive definite"

@@ -60,8 +60,8 @@ class ThinnedPath:
         return [*self._poses, self._newest]
 
 
-def landmarks(keyframe: Keyframe, body: str) -> Any:
-    """Make a ``sensor_msgs/PointCloud2`` of a keyframe's landmarks in ROS's frame ``body``, with their identities."""
+def landmarks(keyframe: Keyframe, imu: str) -> Any:
+    """Make a ``sensor_msgs/PointCloud2`` of a keyframe's landmarks, with their identities, in the frame ``imu``."""
     marks = keyframe.landmarks
     points = np.zeros(len(marks), dtype=_POINT)
     for k, axis in enumerate("xyz"):
@@ -73,7 +73,7 @@ def landmarks(keyframe: Keyframe, body: str) -> Any:
     ]
     return make(
         POINTS,
-        header=header(keyframe.stamp_ns, body),
+        header=header(keyframe.stamp_ns, imu),
         height=1,
         width=len(points),
         fields=fields,

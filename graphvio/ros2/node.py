@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from graphvio.errors import ServiceError, SourceError
-from graphvio.ros2.wire import Profile, dds_topic, require_dds, ros_topic, ros_type_name, wire_type
-from graphvio.sessions import cdr
+from graphvio.ros2 import interfaces
+from graphvio.ros2.wire import TF_STATIC, Profile, dds_topic, require_dds, ros_topic, ros_type_name, wire_type
 
 _DOMAIN_VARIABLE: Final = "ROS_DOMAIN_ID"
 _MAX_DOMAIN: Final = 232
@@ -40,19 +40,41 @@ class Publication:
 
 
 class Reader:
-    """Reads samples of one topic, in one thread."""
+    """Reads samples of one topic, in one thread.
 
-    def __init__(self, node: Node, topic: str, type_name: str, profile: Profile) -> None:
+    Args:
+        node: whose it is.
+        topic: such as ``/imu``.
+        type_name: such as ``sensor_msgs/msg/Imu``.
+        profile: quality of service.
+        prefix: of topics in DDS, ``rq`` for the requests of a service.
+        user_data: of a service.
+    """
+
+    def __init__(
+        self, node: Node, topic: str, type_name: str, profile: Profile, prefix: str = "rt", user_data: str = ""
+    ) -> None:
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
         from cyclonedds.sub import DataReader
 
         self.topic, self.type_name, self._depth = topic, type_name, profile.depth
-        self._reader = DataReader(node.participant, node.topic(topic, type_name), qos=profile.dds(type_name))
+        of_dds = node.topic(dds_topic(topic, prefix), type_name)
+        self._reader = DataReader(node.participant, of_dds, qos=profile.dds(type_name, user_data))
         self.ready = ReadCondition(self._reader, SampleState.Any | ViewState.Any | InstanceState.Any)
+        node.reader_gids.append(self._reader.guid.bytes)
 
     def take(self) -> list[bytes]:
         """Return the CDR messages received since the last call, oldest first."""
-        return [each.data for each in self._reader.take(self._depth) if each.sample_info.valid_data]
+        return [data for data, _ in self.take_with_writers()]
+
+    def take_with_writers(self) -> list[tuple[bytes, int]]:
+        """Return the CDR messages received since the last call, oldest first, each with the handle of its writer."""
+        taken = self._reader.take(self._depth)
+        return [(each.data, each.sample_info.publication_handle) for each in taken if each.sample_info.valid_data]
+
+    def user_data_of(self, writer: int) -> dict[str, str]:
+        """Return what a writer has in its user data by name, and nothing if it has gone."""
+        return _user_data(self._reader.get_matched_publication_data(writer))
 
     @property
     def writers(self) -> int:
@@ -71,14 +93,18 @@ class Reader:
 
 
 class Writer:
-    """Publishes messages of one topic; from any thread, and never waits."""
+    """Publishes messages of one topic, with arguments as of a `Reader`; from any thread, and never waits."""
 
-    def __init__(self, node: Node, topic: str, type_name: str, profile: Profile) -> None:
+    def __init__(
+        self, node: Node, topic: str, type_name: str, profile: Profile, prefix: str = "rt", user_data: str = ""
+    ) -> None:
         from cyclonedds.pub import DataWriter
 
         self.topic, self._type = topic, wire_type(type_name)
-        self._writer = DataWriter(node.participant, node.topic(topic, type_name), qos=profile.dds(type_name))
+        of_dds = node.topic(dds_topic(topic, prefix), type_name)
+        self._writer = DataWriter(node.participant, of_dds, qos=profile.dds(type_name, user_data))
         self.refused = 0
+        node.writer_gids.append(self._writer.guid.bytes)
 
     def write(self, message: Any) -> None:
         """Publish a message; if there is no room for it, it is dropped and counted in ``refused``.
@@ -86,10 +112,14 @@ class Writer:
         Raises:
             ServiceError: if DDS refuses it for another reason.
         """
+        self.write_bytes(interfaces.encode(message))
+
+    def write_bytes(self, data: bytes) -> None:
+        """Publish a CDR message; see `write`."""
         from cyclonedds.core import DDSException
 
         try:
-            self._writer.write(self._type(cdr.encode(message)))
+            self._writer.write(self._type(data))
         except DDSException as error:
             if error.code != DDSException.DDS_RETCODE_TIMEOUT:
                 raise ServiceError(f"{self.topic}: cannot be published ({error.msg or error})") from None
@@ -100,9 +130,18 @@ class Writer:
         """Number of matching readers."""
         return len(self._writer.get_matched_subscriptions())
 
+    def user_data_of_readers(self) -> list[dict[str, str]]:
+        """Return what the matching readers have in their user data, by name."""
+        readers = self._writer.get_matched_subscriptions()
+        return [_user_data(self._writer.get_matched_subscription_data(each)) for each in readers]
+
 
 class Node:
-    """A participant of a domain.
+    """A participant of a domain, and one of ROS's nodes once it is announced.
+
+    Attributes:
+        reader_gids: identifiers of its readers, 16 bytes each.
+        writer_gids: identifiers of its writers.
 
     Raises:
         SourceError: if no network can be used.
@@ -113,28 +152,45 @@ class Node:
         require_dds()
         from cyclonedds.core import DDSException, GuardCondition, WaitSet
         from cyclonedds.domain import DomainParticipant
+        from cyclonedds.qos import Policy, Qos
 
         self.domain = domain
         try:
-            self.participant: Any = DomainParticipant(domain)
+            self.participant: Any = DomainParticipant(domain, qos=Qos(Policy.Userdata(b"enclave=/;")))
         except DDSException as error:
             raise SourceError(
                 f"DDS domain {domain}: cannot be joined ({error.msg or error}); check the network and CYCLONEDDS_URI"
             ) from None
         self._lock = threading.Lock()
         self._topics: dict[tuple[str, str], Any] = {}
+        self.reader_gids: list[bytes] = []
+        self.writer_gids: list[bytes] = []
+        self._services = 0
+        self._discovery: Writer | None = None
         self._waitset_class = WaitSet
         self._stop: Any = GuardCondition(self.participant)
 
-    def topic(self, name: str, type_name: str) -> Any:
+    def topic(self, dds_name: str, type_name: str) -> Any:
         """Return the topic of DDS, one object for all its endpoints."""
         from cyclonedds.topic import Topic
 
         with self._lock:
-            key = name, type_name
+            key = dds_name, type_name
             if key not in self._topics:
-                self._topics[key] = Topic(self.participant, dds_topic(name), wire_type(type_name))
+                self._topics[key] = Topic(self.participant, dds_name, wire_type(type_name))
             return self._topics[key]
+
+    def next_service_id(self) -> str:
+        """Return an identity for a service's reader and writer, in the notation of `rmw_cyclonedds`."""
+        self._services += 1
+        identity = self.participant.guid.bytes[:12] + self._services.to_bytes(4, "big")
+        return ".".join(f"{each:x}" for each in identity)
+
+    def announce(self, name: str) -> None:
+        """Publish that the readers and writers so far are those of a node, such as ``/graphvio``."""
+        readers, writers = list(self.reader_gids), list(self.writer_gids)
+        self._discovery = Writer(self, interfaces.DISCOVERY_TOPIC, interfaces.DISCOVERY, TF_STATIC, prefix="")
+        self._discovery.write(interfaces.entities(self.participant.guid.bytes, name, readers, writers))
 
     def waiter(self, readers: Sequence[Reader]) -> Callable[[float], None]:
         """Return a function that waits until a reader has samples, the node is stopped, or so many seconds are over."""
@@ -167,4 +223,15 @@ class Node:
         """Release the domain; it is left when readers and writers are released, too."""
         with self._lock:
             self._topics.clear()
+            self._discovery = None
             self._stop = self.participant = None
+
+
+def _user_data(endpoint: Any) -> dict[str, str]:
+    """Parse the user data of an endpoint, such as ``typehash=...;clientid=...;``."""
+    from cyclonedds.qos import Policy
+
+    if endpoint is None or Policy.Userdata not in endpoint.qos:
+        return {}
+    entries = endpoint.qos[Policy.Userdata].data.decode(errors="replace").split(";")
+    return {name: value for name, _, value in (each.partition("=") for each in entries) if name}

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final
 
 from graphvio.errors import GraphvioError, ServiceError
+from graphvio.geometry import quat_wxyz_from_rotation
 from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.readings import host_ns
 from graphvio.ros2 import messages
 from graphvio.ros2.corrections import Corrections
+from graphvio.ros2.frames import Frames
 from graphvio.ros2.messages import CORRECTION, DIAGNOSTICS, MAP, PATH, POINTS, Level, ThinnedPath
 from graphvio.ros2.node import Node, Reader, Writer, domain_of
+from graphvio.ros2.parameters import SERVICES as PARAMETER_SERVICES
+from graphvio.ros2.parameters import Parameters, Value
+from graphvio.ros2.services import Service
 from graphvio.ros2.wire import DEFAULT, TF, TF_STATIC
 from graphvio.sessions.cdr import make
 from graphvio.sessions.messages import (
-    BODY,
     ODOM,
     ODOMETRY,
     TRANSFORMS,
@@ -27,6 +32,9 @@ from graphvio.sessions.messages import (
     transform,
 )
 from graphvio.slam.interface import Served, map_of_epoch
+
+NODE: Final = "/graphvio"
+"""Name of the node."""
 
 _STATIC: Final = "static"  # the static transforms, among the writers by type
 _DEPTH: Final = 200  # estimates that may be queued: ten seconds
@@ -49,8 +57,9 @@ class Publisher:
     Args:
         served: the odometry.
         domain: of DDS, or None for that of ``ROS_DOMAIN_ID``.
-        namespace: prefix of graphvio's own topics.
-        body: name of the body's frame in ROS, which is the IMU's.
+        namespace: name of the node, which is the prefix of its own topics and services.
+        frames: of the robot; None for `Frames.of_rig`.
+        parameters: what the node's parameter services report, by names with dots.
 
     Raises:
         SourceError: if the domain cannot be joined.
@@ -58,9 +67,15 @@ class Publisher:
     """
 
     def __init__(
-        self, served: Served, domain: int | None = None, namespace: str = "/graphvio", body: str = BODY
+        self,
+        served: Served,
+        domain: int | None = None,
+        namespace: str = NODE,
+        frames: Frames | None = None,
+        parameters: Mapping[str, Value] | None = None,
     ) -> None:
-        self._served, self._body = served, body
+        self._served = served
+        self._frames = frames = Frames.of_rig(served.rig) if frames is None else frames
         self._node = node = Node(domain_of(None) if domain is None else domain)
         self._writers = {
             ODOMETRY: Writer(node, f"{namespace}/odometry", ODOMETRY, DEFAULT),
@@ -70,8 +85,13 @@ class Publisher:
             TRANSFORMS: Writer(node, "/tf", TRANSFORMS, TF),
             _STATIC: Writer(node, "/tf_static", TRANSFORMS, TF_STATIC),
         }
-        self._corrections = Corrections(served)
+        self._corrections = Corrections(served, frames)
         correction_reader = Reader(node, f"{namespace}/correction", CORRECTION, DEFAULT)
+        reported = Parameters({**(parameters or {}), **_of_frames(frames)})
+        self._services = [
+            Service(node, f"{namespace}/{name}", kind, partial(reported.answer, kind))
+            for name, kind in PARAMETER_SERVICES.items()
+        ]
         self._estimates = served.estimates.subscribe(_DEPTH)
         self._path = ThinnedPath(_PATH_POSES)
         self._epoch: int | None = None
@@ -80,12 +100,15 @@ class Publisher:
         self._trouble = ""
         self._failure: tuple[str, Exception] | None = None  # of a thread, with its name
         self._closing = threading.Event()
-        self._attempt(self._publish_camera_poses)
+        self._attempt(self._publish_frames)
+        node.announce(namespace)
         wait = node.waiter([correction_reader])
+        wait_for_requests = node.waiter([each.reader for each in self._services])
         tasks: dict[str, Callable[[], None]] = {
             "poses": self._publish_poses,
             "keyframes": self._publish_keyframes,
             "corrections": lambda: self._take_corrections(wait, correction_reader),
+            "services": lambda: self._serve(wait_for_requests),
         }
         self._threads = [
             threading.Thread(target=self._run, args=(name, task), name=f"graphvio-ros2-{name}", daemon=True)
@@ -113,7 +136,7 @@ class Publisher:
         self._node.stop()
         for thread in self._threads:
             thread.join(_JOIN_S)
-        self._writers = {}
+        self._writers, self._services = {}, []
         self._node.leave()
 
     def __enter__(self) -> Publisher:
@@ -129,13 +152,8 @@ class Publisher:
         except Exception as error:
             self._failure = name, error
 
-    def _publish_camera_poses(self) -> None:
-        now_ns = host_ns()
-        # tf2 refuses names that begin with a slash, as those of cameras named by their topics do
-        stamped = [
-            transform(now_ns, self._body, camera.name.lstrip("/"), camera.body_T_cam)
-            for camera in self._served.rig.cameras
-        ]
+    def _publish_frames(self) -> None:
+        stamped = self._frames.static_transforms(host_ns(), self._served.rig)
         self._writers[_STATIC].write(make(TRANSFORMS, transforms=stamped))
 
     def _publish_poses(self) -> None:
@@ -159,15 +177,17 @@ class Publisher:
         if estimate.epoch != self._epoch:
             self._epoch = estimate.epoch
             self._path.clear()
-        message = odometry(estimate)
-        message.child_frame_id = self._body
+        in_base, base = self._frames.in_base(estimate), self._frames.base
+        assert in_base.nav_T_body is not None
+        message = odometry(in_base)
+        message.child_frame_id = base
         self._writers[ODOMETRY].write(message)
-        stamped = [transform(estimate.stamp_ns, ODOM, self._body, estimate.nav_T_body)]
+        stamped = [transform(estimate.stamp_ns, ODOM, base, in_base.nav_T_body)]
         map_T_odom = map_of_epoch(self._served, estimate.epoch)
         if map_T_odom is not None:
             stamped.append(transform(estimate.stamp_ns, MAP, ODOM, map_T_odom))
         self._writers[TRANSFORMS].write(make(TRANSFORMS, transforms=stamped))
-        self._path.add(pose_stamped(estimate.stamp_ns, ODOM, estimate.nav_T_body))
+        self._path.add(pose_stamped(estimate.stamp_ns, ODOM, in_base.nav_T_body))
 
     def _publish_path(self) -> None:
         if self._newest is not None and self._writers[PATH].readers:
@@ -220,7 +240,7 @@ class Publisher:
             next_id = keyframe.id + 1
             self._corrections.add_keyframe(keyframe)  # first, as a correction may follow the landmarks at once
             if self._writers[POINTS].readers:
-                self._attempt(lambda: self._writers[POINTS].write(messages.landmarks(keyframe, self._body)))  # noqa: B023
+                self._attempt(lambda: self._writers[POINTS].write(messages.landmarks(keyframe, self._frames.imu)))  # noqa: B023
 
     def _take_corrections(self, wait: Callable[[float], None], reader: Reader) -> None:
         while not self._closing.is_set():
@@ -229,9 +249,22 @@ class Publisher:
                 self._corrections.take(data)
                 self._attempt(self._publish_diagnostics)
 
+    def _serve(self, wait: Callable[[float], None]) -> None:
+        while not self._closing.is_set():
+            wait(_PERIOD_S)
+            for service in self._services:
+                self._attempt(service.take)
+
     def _attempt(self, action: Callable[[], Any]) -> None:
         """Run an action; if it fails, the diagnostics say so, and the thread goes on."""
         try:
             action()
         except GraphvioError as error:
             self._trouble = str(error)
+
+
+def _of_frames(frames: Frames) -> dict[str, Value]:
+    """Return the frames as parameters."""
+    x, y, z = frames.base_T_body[:3, 3].tolist()
+    w, *vector = quat_wxyz_from_rotation(frames.base_T_body[:3, :3]).tolist()
+    return {"frames.base": frames.base, "frames.imu": frames.imu, "frames.base_T_imu": [x, y, z, *vector, w]}

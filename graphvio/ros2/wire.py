@@ -7,6 +7,7 @@ from functools import cache
 from typing import Any
 
 from graphvio.errors import MissingExtraError
+from graphvio.ros2 import interfaces
 from graphvio.sessions import cdr
 
 
@@ -32,9 +33,9 @@ def ros_type_name(dds_name: str) -> str | None:
     return f"{parts[0]}/{parts[1]}/{parts[3][:-1]}"
 
 
-def dds_topic(topic: str) -> str:
-    """Convert a topic such as ``/imu`` to its name in DDS, ``rt/imu``."""
-    return f"rt/{topic.lstrip('/')}"
+def dds_topic(topic: str, prefix: str = "rt") -> str:
+    """Convert a topic such as ``/imu`` to its name in DDS, ``rt/imu``; services have ``rq`` and ``rr``."""
+    return f"{prefix}/{topic.lstrip('/')}" if prefix else topic
 
 
 def ros_topic(dds_name: str) -> str | None:
@@ -50,10 +51,11 @@ class Profile:
     is_reliable: bool = True  # whether lost samples are sent again
     is_latched: bool = False  # whether late readers receive the kept samples, too (transient local)
 
-    def dds(self, type_name: str) -> Any:
+    def dds(self, type_name: str, user_data: str = "") -> Any:
         """Return the policies of an endpoint; a writer never waits for slow readers.
 
-        ROS 2 from Iron on expects the type's hash in the user data; older versions ignore it.
+        ROS 2 from Iron on expects the type's hash in the user data, after what services have in it; older versions
+        ignore it.
         """
         from cyclonedds.qos import Policy, Qos
 
@@ -62,7 +64,7 @@ class Profile:
             Policy.Durability.TransientLocal if self.is_latched else Policy.Durability.Volatile,
             Policy.History.KeepLast(self.depth),
             Policy.DataRepresentation(use_cdrv0_representation=True),
-            Policy.Userdata(f"typehash={cdr.types().hash_rihs01(type_name)};".encode()),
+            Policy.Userdata(f"{user_data}typehash={interfaces.types().hash_rihs01(type_name)};".encode()),
         )
 
 
@@ -70,7 +72,7 @@ DEFAULT = Profile()
 SENSOR_DATA = Profile(depth=5, is_reliable=False)
 TF = Profile(depth=100)
 TF_STATIC = Profile(depth=1, is_latched=True)
-"""Of publishers."""
+"""Of publishers; that of nodes is the same."""
 TF_STATIC_READER = Profile(depth=100, is_latched=True)
 """Of subscribers: there may be several publishers."""
 
@@ -121,13 +123,14 @@ def _raw() -> Any:
 
 def _make_type(type_name: str, bases: tuple[Any, ...]) -> Any:
     require_dds()
-    from cyclonedds.idl import make_idl_struct
+    from cyclonedds.idl import make_idl_struct, types
 
-    _, fields = cdr.types().fielddefs[type_name]
+    _, fields = interfaces.types().fielddefs[type_name]
+    header = {"guid": types.uint64, "seq": types.int64} if "/srv/" in type_name else {}
     return make_idl_struct(
         type_name.rpartition("/")[2],
         dds_type_name(type_name).replace("::", "."),
-        {field: _field(kind) for field, kind in fields},
+        {**header, **{field: _field(kind) for field, kind in fields}},
         dataclassify=not bases,
         bases=bases,
     )
@@ -145,7 +148,7 @@ def _field(kind: Any) -> Any:
         name, bound = what
         if name == "string":
             return types.bounded_str[bound] if bound else str
-        return bool if name == "bool" else getattr(types, "uint8" if name == "byte" else name)
+        return bool if name == "bool" else getattr(types, "uint8" if name in ("byte", "char") else name)
     of, count = what
     if node == kinds.ARRAY:
         return types.array[_field(of), count]

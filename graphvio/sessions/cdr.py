@@ -23,6 +23,14 @@ def types() -> Any:
     return typestore("ROS2_HUMBLE")
 
 
+def add_type(store: Any, name: str, text: str) -> None:
+    """Add a type to those of a distribution, such as a service's requests, by the text of its definition."""
+    from rosbags.typesys import get_types_from_msg
+
+    (fields,) = get_types_from_msg(text, name).values()  # whose own name always has "msg" in it
+    store.register({name: fields})
+
+
 def node_types() -> Any:
     """Return rosbags' kinds of fields: ``BASE``, ``NAME``, ``ARRAY`` and ``SEQUENCE``."""
     from rosbags.interfaces import Nodetype
@@ -40,13 +48,15 @@ def encode(message: Any) -> bytes:
     return bytes(types().serialize_cdr(message, message.__msgtype__))
 
 
-def decode(data: bytes, type_name: str, where: object = "a message") -> Any:
+def decode(data: bytes, type_name: str, where: object = "a message", known: Any = None) -> Any:
     """Decode a message from CDR; its arrays are views of the data. ``where`` it is from is for errors.
+
+    ``known`` are rosbags' types, those of `types` by default.
 
     Raises:
         SessionError: if it is damaged.
     """
-    known = types()
+    known = types() if known is None else known
     try:
         return known.deserialize_cdr(data, type_name)
     except Exception as error:  # the library raises errors of many types for damaged bytes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -139,12 +140,11 @@ def odometry(estimate: Estimate) -> Any:
     assert estimate.nav_T_body is not None
     assert estimate.covariance is not None
     R = estimate.nav_T_body[:3, :3]
-    velocity, rate, twist_covariance = np.full(3, np.nan), np.full(3, np.nan), np.full((6, 6), np.nan)
+    rate = angular_rate(estimate.rates)
+    velocity, twist_covariance = np.full(3, np.nan), np.full((6, 6), np.nan)
     if estimate.velocity_nav is not None and estimate.velocity_covariance is not None:
         velocity = R.T @ estimate.velocity_nav
         twist_covariance[:3, :3] = R.T @ estimate.velocity_covariance @ R
-    for kind in ("vision", "gyro", "fused"):
-        rate = estimate.rates.get(kind, rate)
     return make(
         ODOMETRY,
         header=header(estimate.stamp_ns, ODOM),
@@ -156,6 +156,11 @@ def odometry(estimate: Estimate) -> Any:
             covariance=twist_covariance.reshape(-1),
         ),
     )
+
+
+def angular_rate(rates: Mapping[str, Float]) -> Float:
+    """Return the best of an estimate's angular rates (3,), NaN where there is none."""
+    return next((rates[kind] for kind in ("fused", "gyro", "vision") if kind in rates), np.full(3, np.nan))
 
 
 def pose_with_covariance(a_T_body: Float, covariance: Float) -> Any:

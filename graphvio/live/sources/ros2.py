@@ -23,6 +23,7 @@ from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU
 from graphvio.sessions.rig_of_topics import stereo_topics
 from graphvio.sessions.topics import image_topic, preference
 
+_NODE: Final = "/graphvio_source"
 _OPTIONS: Final = ("domain", "imu", "body", "reliable", "wait_s")
 _WAIT_S: Final = 10.0
 _DISCOVERY_S: Final = 1.0  # without a new publication: discovery is complete
@@ -136,6 +137,7 @@ class Ros2Source:
                 raise _no_writer(silent[0], self.name)
         for each in topics:
             each.poll()
+        node.announce(_NODE)
         self._node, self._topics = node, topics
         return rig
 
