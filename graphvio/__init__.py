@@ -3,6 +3,7 @@
 The names below are loaded when they are first used, so that ``import graphvio`` stays fast.
 """
 
+import zlib  # noqa: F401 - before pycolmap, see `graphvio.runtime.has_mixed_zlib`
 from importlib import import_module
 from typing import TYPE_CHECKING
 

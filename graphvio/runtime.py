@@ -53,6 +53,26 @@ def share_heap() -> bool:
     return mallopt is not None and mallopt(_M_ARENA_MAX, 1) == 1
 
 
+def has_mixed_zlib() -> bool:
+    """Return whether the zlib of the system calls functions of pycolmap's, which is of another version.
+
+    pycolmap's wheel exports the functions of its own zlib, and loads the system's as a dependency, which then takes
+    them for its own unless it was there before: whatever Python compresses corrupts the heap. Importing `zlib` before
+    pycolmap keeps them apart, which ``import graphvio`` does; afterwards nothing can.
+    """
+    modules = list(sys.modules)
+    if "pycolmap" not in modules or not sys.platform.startswith("linux"):
+        return False
+    if "zlib" in modules and modules.index("zlib") < modules.index("pycolmap"):
+        return False
+    library = sys.modules["pycolmap"]._core.__file__
+    try:
+        own, of_system = (ctypes.CDLL(name).zlibVersion for name in (library, "libz.so.1"))
+    except (AttributeError, OSError):
+        return False
+    return ctypes.cast(own, ctypes.c_void_p).value != ctypes.cast(of_system, ctypes.c_void_p).value
+
+
 # ---------------------------------------------------------------------- Ctrl-C
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from graphvio.arrays import AnyArray, Float, Int
 from graphvio.errors import MissingExtraError, OptimizationError
 from graphvio.rig import Camera, Rig
+from graphvio.runtime import has_mixed_zlib
 
 CENTRE_PX = 0.5
 """COLMAP's coordinate of the centre of an image's first pixel."""
@@ -34,12 +35,15 @@ def colmap() -> Any:
     """Import pycolmap, with logging from warnings on.
 
     Raises:
+        OptimizationError: if it was imported in an order that corrupts memory.
         MissingExtraError: if the extra ``maps`` is not installed.
     """
     try:
         import pycolmap
     except ImportError:
         raise MissingExtraError("pycolmap", "maps", "loop closure and maps") from None
+    if has_mixed_zlib():
+        raise OptimizationError("pycolmap was imported before zlib, by which Python crashes; import graphvio before it")
     pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
     return pycolmap
 
