@@ -45,7 +45,7 @@ def test_evaluate_writes_table_figures_and_picture(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    code = run(monkeypatch, "evaluate", *files, "--plot", tmp_path / "e.png", "--json", tmp_path / "e.json")
+    code = run(monkeypatch, "evaluate", *files, "--plot", tmp_path / "e.png", "--save-json", tmp_path / "e.json")
     assert code == 0
     shown = capsys.readouterr().out
     assert "400 of 400 poses have a true one" in shown
@@ -84,7 +84,7 @@ def test_evaluate_max_gap_limits_interpolation(
     for gap, expected in ((0.25, 40), (0.6, 391)):
         code = run(
             monkeypatch,
-            *("evaluate", files[0], tmp_path / "sparse.txt", "--max-gap", gap, "--json", tmp_path / "e.json"),
+            *("evaluate", files[0], tmp_path / "sparse.txt", "--max-gap", gap, "--save-json", tmp_path / "e.json"),
         )
         assert code == 0
         assert json.loads((tmp_path / "e.json").read_text())["associated"] == expected
@@ -93,7 +93,7 @@ def test_evaluate_max_gap_limits_interpolation(
 def test_evaluate_unwritable_json_is_an_error(
     files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(monkeypatch, "evaluate", *files, "--json", files[0].parent / "no" / "e.json") == 2
+    assert run(monkeypatch, "evaluate", *files, "--save-json", files[0].parent / "no" / "e.json") == 2
     assert "cannot be written" in capsys.readouterr().err
 
 

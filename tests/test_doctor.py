@@ -7,6 +7,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from graphvio.cli.json_output import with_json
 from graphvio.version import __version__
 
 doctor: Any = importlib.import_module("graphvio.cli.doctor")
@@ -14,7 +15,7 @@ doctor: Any = importlib.import_module("graphvio.cli.doctor")
 
 def output(*arguments: str) -> str:
     app = typer.Typer()
-    app.command()(doctor.doctor)
+    app.command()(with_json(doctor.doctor))
     result = CliRunner().invoke(app, list(arguments), env={"COLUMNS": "160"})
     assert result.exit_code == 0, result.output
     return result.output

@@ -12,6 +12,7 @@ from graphvio.cli.doctor import doctor
 from graphvio.cli.evaluate import evaluate
 from graphvio.cli.fleet import fleet
 from graphvio.cli.info import dump_config, info
+from graphvio.cli.json_output import with_json
 from graphvio.cli.live import live
 from graphvio.cli.optimize import optimize
 from graphvio.cli.record import convert, record
@@ -51,25 +52,25 @@ def _options(
     pass  # the option acts by its callback
 
 
-app.command()(run)
-app.command()(live)
-app.command()(serve)
-app.command()(slam)
-app.command()(calibrate)
-app.command(name="calibrate-trajectories")(calibrate_trajectories)
-app.command()(optimize)
+app.command()(with_json(run))
+app.command()(with_json(live))
+app.command()(with_json(serve))
+app.command()(with_json(slam))
+app.command()(with_json(calibrate))
+app.command(name="calibrate-trajectories")(with_json(calibrate_trajectories))
+app.command()(with_json(optimize))
 app.add_typer(fleet, name="fleet")
-app.command()(record)
-app.command()(convert)
-app.command()(info)
-app.command()(evaluate)
-app.command()(compare)
-app.command()(benchmark)
-app.command()(simulate)
+app.command()(with_json(record))
+app.command()(with_json(convert))
+app.command()(with_json(info))
+app.command()(with_json(evaluate))
+app.command()(with_json(compare))
+app.command()(with_json(benchmark))
+app.command()(with_json(simulate))
 app.command()(view)
-app.command(name="dump-config")(dump_config)
-app.command()(doctor)
-app.command()(warmup)
+app.command(name="dump-config")(with_json(dump_config))
+app.command()(with_json(doctor))
+app.command()(with_json(warmup))
 
 
 def main() -> None:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
-from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, print_json, warn
+from graphvio.cli.json_output import publish
+from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, warn
 
 if TYPE_CHECKING:
     from graphvio.benchmark.table import Benchmark
@@ -35,7 +36,6 @@ def benchmark(
     config: options.ConfigName = "default",
     no_imu: options.NoImu = False,
     to_s: options.ToS = None,
-    as_json: options.Json = False,
     verbose: options.Verbose = False,
 ) -> None:
     """Run the sequences of a public data set that a folder holds, and compare with published figures.
@@ -93,16 +93,14 @@ def benchmark(
         raise typer.Exit(EXIT_INTERRUPTED) from None
     measured = Benchmark(chosen, str(folder), config, at_once, outcomes)
     page = write_report(measured, results)
-    if as_json:
-        print_json(measured.as_dict() | {"report": str(page)})
-    else:
-        console = Console(soft_wrap=True)
-        if not console.is_terminal:
-            console.width = _PLAIN_WIDTH
-        console.print(_table(measured))
-        for line in measured.notes():
-            typer.echo(line)
-        typer.echo(f"report: {page}")
+    publish(measured.as_dict() | {"report": str(page)})
+    console = Console(soft_wrap=True)
+    if not console.is_terminal:
+        console.width = _PLAIN_WIDTH
+    console.print(_table(measured))
+    for line in measured.notes():
+        typer.echo(line)
+    typer.echo(f"report: {page}")
     if any(outcome.has_failed for outcome in outcomes):
         raise typer.Exit(EXIT_INCOMPLETE)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.json_output import publish
 from graphvio.cli.shared import EXIT_INCOMPLETE, names_of, open_recording, warn
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ def calibrate(
         graphvio calibrate walk --what all --out rig-calibrated.yaml --report calibration
     """
     from graphvio.calibration.calibrate import calibrate_pairs
-    from graphvio.calibration.report.document import write_document
+    from graphvio.calibration.report.document import document, write_document
     from graphvio.cli.calibrate_rig import calibrate_rig
     from graphvio.cli.calibration_progress import CalibrationProgress
     from graphvio.config import Config
@@ -94,6 +95,7 @@ def calibrate(
     names = [pair.name for pair in opened.rig.pairs]
     with CalibrationProgress(opened.frameset_count, names if guide else None) as progress:
         found = calibrate_pairs(opened, config=settings, seed=seed, scale_mode=mode, on_frameset=progress.on_frameset)
+    publish(document(found))
     _print_result(found)
     if out is not None:
         numbers = out.with_suffix(".calibration.yaml")
@@ -132,7 +134,7 @@ def calibrate_trajectories(
         graphvio calibrate-trajectories a.csv b.csv c.csv --report calibration
     """
     from graphvio.calibration.calibrate import calibrate_trajectories as calibrate_all
-    from graphvio.calibration.report.document import write_document
+    from graphvio.calibration.report.document import document, write_document
     from graphvio.trajectory_files import load_trajectory
 
     mode = _scale_mode(scale)
@@ -141,6 +143,7 @@ def calibrate_trajectories(
     names = names_of(trajectories)
     with _working("calibrating clocks and cameras"):
         found = calibrate_all(read, names, same_clock=same_clock, seed=seed, scale_mode=mode)
+    publish(document(found))
     _print_result(found)
     if out is not None:
         write_document(found, out)

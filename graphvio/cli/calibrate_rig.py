@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from graphvio.cli.json_output import publish
 from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, stage_bars, warn
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ def calibrate_rig(opened: Source, settings: Config, what: str, out: Path | None,
     except KeyboardInterrupt:
         warn("interrupted; nothing is written")
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    publish(_document(found))
     _print(found)
     if not found.is_consistent:
         warn(
@@ -61,6 +63,32 @@ def show_stages(bars: Progress, totals: dict[str, int]) -> Callable[[str, int, i
         bars.update(tasks[stage], completed=done, total=total)
 
     return show
+
+
+def _document(found: RecordedCalibration) -> dict[str, object]:
+    from graphvio.calibration.report.rig_page import doubts_of
+
+    return {
+        "what": found.what,
+        "complete": found.is_complete,
+        "consistent": found.is_consistent,
+        "parameters": [
+            {
+                "part": each.part,
+                "unit": each.unit,
+                "difference": each.difference.tolist(),
+                "sigmas": each.sigmas.tolist(),
+                "file_sigmas": each.file_sigmas.tolist(),
+                "significant": each.is_significant,
+            }
+            for each in found.findings
+        ],
+        "halves": [
+            {"group": each.group, "chi_square": each.statistic, "dimension": each.dimension, "agree": each.is_good}
+            for each in found.agreements
+        ],
+        "doubts": doubts_of(found),
+    }
 
 
 def _print(found: RecordedCalibration) -> None:

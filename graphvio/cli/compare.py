@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.json_output import publish
 from graphvio.cli.shared import EXIT_ABOVE_LIMIT, names_of, true_trajectory, warn
 
 if TYPE_CHECKING:
@@ -59,6 +60,20 @@ def compare(
     reference = true_trajectory(truth) if truth is not None else trajectories[0]
     first = 0 if truth is not None else 1
     compared = compare_all(names[first:], trajectories[first:], reference)
+    publish(
+        {
+            "reference": str(truth) if truth is not None else names[0],
+            "results": [
+                {
+                    "name": each.name,
+                    "ate_ratio": each.ate_ratio,
+                    "why_not": each.why_not,
+                    "evaluation": None if each.evaluation is None else each.evaluation.as_dict(),
+                }
+                for each in compared
+            ],
+        }
+    )
     Console(soft_wrap=True).print(_table(compared))
     for each in compared:
         if each.evaluation is None:

@@ -6,11 +6,10 @@ import sys
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from graphvio.cli import options
+from graphvio.cli.json_output import publish
 
 _REQUIRED = {"gtsam": "gtsam", "numpy": "numpy", "numba": "numba", "matplotlib": "matplotlib"}
 _OPENCV = ("opencv-python-headless", "opencv-contrib-python-headless", "opencv-python", "opencv-contrib-python")
@@ -23,7 +22,6 @@ _OPTIONAL = {
 
 
 def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
     verbose: options.Verbose = False,
 ) -> None:
     """Show what graphvio finds on this machine: versions, cores, optional parts, compiled kernels.
@@ -34,12 +32,8 @@ def doctor(
 
         graphvio doctor --json
     """
-    import json
-
     findings = examine()
-    if as_json:
-        typer.echo(json.dumps(findings, indent=2))
-        return
+    publish(findings)
     from rich.console import Console
 
     Console(soft_wrap=True).print(_table(findings))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.json_output import publish
 from graphvio.cli.shared import true_trajectory
 
 if TYPE_CHECKING:
@@ -22,7 +23,9 @@ def evaluate(
     plot: Annotated[
         Path | None, typer.Option(help="Plot both, and the error over time: .png, .pdf or .svg.", metavar="FILE")
     ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures here.", metavar="FILE")] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--save-json", help="Write all figures here.", metavar="FILE")
+    ] = None,
     max_gap: Annotated[
         float, typer.Option(help="Longest gap of the truth that is interpolated, seconds.", min=0.0)
     ] = 0.25,
@@ -47,6 +50,7 @@ def evaluate(
     from graphvio.trajectory_files import load_trajectory
 
     figures = measure(load_trajectory(trajectory), true_trajectory(truth), max_gap_s=max_gap)
+    publish(figures.as_dict())
     Console().print(_table(figures))
     if json_file is not None:
         try:

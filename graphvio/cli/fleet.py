@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.json_output import publish, with_json
 from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, warn
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ def _group() -> None:
 
 
 @fleet.command()
+@with_json
 def optimize(
     sessions: Annotated[
         str,
@@ -69,6 +71,7 @@ def optimize(
         graphvio fleet optimize list.txt --out s3://bucket/results --scheduler tcp://10.0.0.5:8786
     """
     import logging
+    from dataclasses import asdict
 
     from graphvio.config import Config
     from graphvio.errors import FleetError
@@ -105,6 +108,7 @@ def optimize(
     except KeyboardInterrupt:
         warn(f"interrupted; the same command with --out {out} continues from there")
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    publish({"results": out, "sessions": [asdict(each) | {"status": each.status} for each in outcomes]})
     failed = [each for each in outcomes if each.error]
     for each in failed:
         warn(f"{each.name} failed in {each.failed_in}: {each.error}")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.json_output import publish
 
 if TYPE_CHECKING:
     from graphvio.sessions.stamps import Clock
@@ -32,6 +33,7 @@ def info(
     from graphvio.sources.description import describe
 
     found = describe(session)
+    publish(found)
     typer.echo(
         f"{found.path}: {found.duration_s:.1f} s, {found.size_bytes / 1e6:.1f} MB"
         + ("" if found.is_whole else ", cut: its recording was not finished, or it is damaged")
@@ -60,7 +62,9 @@ def dump_config(
     """
     from graphvio.config import Config
 
-    typer.echo(Config.load(profile).to_yaml(), nl=False)
+    settings = Config.load(profile)
+    publish(settings)
+    typer.echo(settings.to_yaml(), nl=False)
 
 
 def _regularity(topic: TopicDescription) -> str:

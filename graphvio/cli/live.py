@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.json_output import publish
 from graphvio.cli.shared import EXIT_INCOMPLETE, check_session_name, warn
 
 if TYPE_CHECKING:
@@ -158,6 +159,7 @@ def run_live(
         is_whole = started is None or started.finish()
         if failure is not None:
             raise failure
+    publish({**figures, **({} if recorder is None else {"recording": str(record), **recorder.status()})})
     typer.echo(line_of(figures))
     typer.echo(summary_of(figures))
     if memory is not None and figures.get("status_tracking"):
@@ -265,13 +267,18 @@ def _list() -> None:
     from graphvio.errors import GraphvioError
     from graphvio.live.sources import KINDS, kind_of
 
+    found: list[dict[str, object]] = []
     for kind in KINDS:
         try:
             devices = kind_of(kind).list_devices()
         except GraphvioError as error:
+            found.append({"kind": kind, "devices": [], "error": str(error)})
             typer.echo(f"{kind:<10} {error}")
             continue
+        listed = [{"spec": device.spec, "description": device.description} for device in devices]
+        found.append({"kind": kind, "devices": listed, "error": None})
         for device in devices:
             typer.echo(f"{kind:<10} {device.spec}   {device.description}")
         if not devices:
             typer.echo(f"{kind:<10} nothing is connected")
+    publish(found)

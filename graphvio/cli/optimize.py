@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.json_output import publish
 from graphvio.cli.shared import (
     EXIT_INCOMPLETE,
     EXIT_INTERRUPTED,
@@ -105,6 +106,7 @@ def optimize(
         warn(f"interrupted; the same command with --out {folder} continues from there")
         raise typer.Exit(EXIT_INTERRUPTED) from None
     complete = [_warn_of(folder / session.record.name / "odometry") for session in found.sessions]
+    publish(json.loads((folder / "summary.json").read_text(encoding="utf-8")) | {"results": str(folder)})
     print_summary(found, folder)
     if not all(complete):
         raise typer.Exit(EXIT_INCOMPLETE)

@@ -68,5 +68,4 @@ Scale = Annotated[
     typer.Option("--scale", help="Lengths that a camera measures may be wrong by a factor: auto, estimate or fixed."),
 ]
 Seed = Annotated[int, typer.Option("--seed", help="Of all random choices: the same gives the same result.", min=0)]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON document, and nothing else, on stdout.")]
 Verbose = Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")]

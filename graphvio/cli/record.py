@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.json_output import publish
 from graphvio.cli.shared import (
     EXIT_INCOMPLETE,
     EXIT_INTERRUPTED,
@@ -66,6 +67,7 @@ def record(
     except KeyboardInterrupt:
         warn(f"interrupted; what was recorded until then is in {out}, which can be read")
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    publish({"out": str(out), "size_bytes": out.stat().st_size, "poses": writer.poses, "stopped": writer.stopped})
     typer.echo(f"{out}: {out.stat().st_size / 1e6:.1f} MB, {writer.poses} poses")
     _exit_if_stopped(writer)
 
@@ -110,10 +112,20 @@ def convert(
     _write(opened, truth, writer, None)
     files = [out] if out.is_file() else [file for file in out.rglob("*") if file.is_file()]
     size = sum(file.stat().st_size for file in files)
+    names = {old.name: new.name for old, new in zip(opened.rig.cameras, writer.rig.cameras, strict=True)}
+    publish(
+        {
+            "out": str(out),
+            "format": known,
+            "size_bytes": size,
+            "true_poses": len(truth) if truth else 0,
+            "cameras": names,
+            "stopped": writer.stopped,
+        }
+    )
     typer.echo(f"{out}: {size / 1e6:.1f} MB, {known}, {f'truth of {len(truth)} poses' if truth else 'no truth'}")
-    if [camera.name for camera in writer.rig.cameras] != [camera.name for camera in opened.rig.cameras]:
-        names = zip(opened.rig.cameras, writer.rig.cameras, strict=True)
-        typer.echo("cameras are renamed: " + ", ".join(f"{old.name} is {new.name}" for old, new in names))
+    if any(old != new for old, new in names.items()):
+        typer.echo("cameras are renamed: " + ", ".join(f"{old} is {new}" for old, new in names.items()))
     _exit_if_stopped(writer)
 
 

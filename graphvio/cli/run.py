@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.json_output import publish
 from graphvio.cli.shared import (
     EXIT_INCOMPLETE,
     EXIT_INTERRUPTED,
@@ -55,6 +56,7 @@ def run(
         graphvio run walk --from 10 --to 40 --save-rrd walk.rrd
     """
     from contextlib import ExitStack
+    from dataclasses import asdict
 
     from graphvio.config import Config
     from graphvio.pipeline import RunListener
@@ -86,6 +88,7 @@ def run(
         except KeyboardInterrupt:
             warn(f"interrupted; what was estimated until then is in {folder}")
             raise typer.Exit(EXIT_INTERRUPTED) from None
+    publish(asdict(summary) | {"results": str(folder)})
     _print_summary(summary, folder)
     if summary.completion < MIN_COMPLETION:
         warn(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -27,21 +26,6 @@ MIN_COMPLETION = 0.9  # share of the framesets that have a pose
 def warn(message: str) -> None:
     """Print a line to stderr."""
     typer.echo(f"graphvio: {message}", err=True)
-
-
-def print_json(document: object) -> None:
-    """Print a document to stdout; NaN and infinity, which JSON lacks, become null."""
-    import json
-
-    typer.echo(json.dumps(_finite(document), indent=2))
-
-
-def _finite(value: object) -> object:
-    if isinstance(value, dict):
-        return {str(key): _finite(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:

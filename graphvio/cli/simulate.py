@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.json_output import publish
 from graphvio.cli.shared import framesets_bar
 
 
@@ -100,6 +101,7 @@ def simulate(
             rig=rig_of(rig),
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
+    publish(recording)
     typer.echo(
         f"{recording.path}: {recording.framesets} framesets, {recording.images} images, "
         f"{recording.imu_samples} IMU samples, {recording.path_length_m:.1f} m in {recording.duration_s:g} s"

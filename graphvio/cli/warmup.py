@@ -7,6 +7,7 @@ from time import perf_counter
 import typer
 
 from graphvio.cli import options
+from graphvio.cli.json_output import publish
 
 
 def warmup(config: options.ConfigName = "default", verbose: options.Verbose = False) -> None:
@@ -27,4 +28,6 @@ def warmup(config: options.ConfigName = "default", verbose: options.Verbose = Fa
 
     begun_s = perf_counter()
     warm_up(default_rig(), Config.load(config))
-    typer.echo(f"kernels are compiled in {cache_root()} ({perf_counter() - begun_s:.1f} s)")
+    taken_s = perf_counter() - begun_s
+    publish({"folder": str(cache_root()), "wall_s": taken_s})
+    typer.echo(f"kernels are compiled in {cache_root()} ({taken_s:.1f} s)")

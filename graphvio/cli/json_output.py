@@ -1,0 +1,84 @@
+"""``--json`` of all commands that print a table or a summary: one document on stdout, and nothing else."""
+
+from __future__ import annotations
+
+import inspect
+import io
+import json
+import math
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
+from contextvars import ContextVar
+from dataclasses import asdict, is_dataclass
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import typer
+
+_OPTION = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, and nothing else.")]
+_results: ContextVar[list[object] | None] = ContextVar("results", default=None)
+
+
+def publish(result: object) -> None:
+    """Hand over what a command has found, which is printed if ``--json`` was given."""
+    results = _results.get()
+    if results is not None:
+        results.append(result)
+
+
+def with_json(command: Callable[..., None]) -> Callable[..., None]:
+    """Add ``--json`` to a command that publishes its result; its lines on stdout are then left out.
+
+    A command that ends with an exit code of its own still prints the document; one that fails prints none.
+    """
+
+    @wraps(command)
+    def run(*, as_json: bool = False, **values: Any) -> None:
+        if not as_json:
+            command(**values)
+            return
+        results: list[object] = []
+        token = _results.set(results)
+        code: typer.Exit | None = None
+        try:
+            with redirect_stdout(io.StringIO()):
+                command(**values)
+        except typer.Exit as end:
+            code = end
+        finally:
+            _results.reset(token)
+        if results:
+            typer.echo(json.dumps(plain(results[-1]), indent=2))
+        if code is not None:
+            raise code
+
+    signature = inspect.signature(command)
+    option = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_OPTION)
+    hints = get_type_hints(command, include_extras=True)
+    parameters = [
+        each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[name])
+        for name, each in signature.parameters.items()
+    ]
+    run.__signature__ = signature.replace(parameters=[*parameters, option])  # type: ignore[attr-defined]
+    run.__annotations__ = {**hints, "as_json": _OPTION}
+    return run
+
+
+def plain(value: object) -> object:
+    """Convert to values of JSON; NaN and infinity, which it lacks, become null."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(asdict(value))
+    if isinstance(value, Mapping):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, bool | int | str):
+        return str(value) if isinstance(value, str) else value
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):  # of numpy
+        return plain(value.tolist())
+    raise TypeError(f"{type(value).__name__} is no value of JSON")
