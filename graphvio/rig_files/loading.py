@@ -6,12 +6,12 @@ from pathlib import Path
 
 from graphvio.errors import RigError
 from graphvio.rig import Rig
-from graphvio.rig_files import basalt, euroc, kalibr, kitti, native
+from graphvio.rig_files import basalt, colmap, euroc, kalibr, kitti, native
 from graphvio.rig_files.reading import read_yaml
 
 _FORMATS = (
-    "rig.yaml, Kalibr's camchain-imucam.yaml, Basalt's calibration.json, an EuRoC/ASL folder (mav0), KITTI's calib.txt "
-    "or calib_cam_to_cam.txt"
+    "rig.yaml, Kalibr's camchain-imucam.yaml, Basalt's calibration.json, COLMAP's rig_config.json, an EuRoC/ASL folder "
+    "(mav0), KITTI's calib.txt or calib_cam_to_cam.txt"
 )
 
 
@@ -19,9 +19,9 @@ def load_rig(path: str | Path) -> Rig:
     """Read a rig from a calibration file, or from the folder of a recording that holds one.
 
     Args:
-        path: ``rig.yaml``, a Kalibr camera chain, Basalt's ``calibration.json``, a ``sensor.yaml`` of an EuRoC/ASL
-            folder, KITTI's ``calib.txt`` or ``calib_cam_to_cam.txt``; or a folder, in which ``rig.yaml`` takes
-            precedence.
+        path: ``rig.yaml``, a Kalibr camera chain, Basalt's ``calibration.json``, COLMAP's ``rig_config.json`` with its
+            ``cameras.txt``, a ``sensor.yaml`` of an EuRoC/ASL folder, KITTI's ``calib.txt`` or
+            ``calib_cam_to_cam.txt``; or a folder, in which ``rig.yaml`` takes precedence.
 
     Raises:
         RigError: if there is no such file, it cannot be read, or it does not describe a usable rig.
@@ -48,7 +48,7 @@ def _load(path: Path) -> Rig:
     if path.name == "sensor.yaml":
         return euroc.load(path.parent.parent)
     if path.suffix == ".json":
-        return basalt.load(path)
+        return colmap.load(path) if colmap.is_config(path) else basalt.load(path)
     if path.suffix not in (".yaml", ".yml"):
         raise RigError(f"{path}: is no calibration file that graphvio knows; give one of: {_FORMATS}")
     document = read_yaml(path)
