@@ -37,6 +37,7 @@ def assert_same(a: Rig, b: Rig) -> None:
     assert a.imu == b.imu
     assert [pair.name for pair in a.pairs] == [pair.name for pair in b.pairs]
     for one, other in zip(a.cameras, b.cameras, strict=True):
+        assert one.line_time_us == pytest.approx(other.line_time_us, abs=1e-9)
         assert (one.name, one.model, one.size_px, one.mask) == (
             other.name,
             other.model,
@@ -108,6 +109,27 @@ def test_save_rig_then_load_rig_keeps_the_lens(tmp_path: Path, model: str) -> No
     camera = yaml.safe_load((tmp_path / "rig.yaml").read_text())["pairs"][0]["left"]
     assert camera["model"] == model
     assert camera["distortion"] == LENSES[model]
+
+
+def test_line_times_of_rolling_shutters_are_read_from_every_format(tmp_path: Path) -> None:
+    rig = small_rig(2).with_cameras(lambda camera: replace(camera, line_time_us=41.67))
+    save_rig(rig, tmp_path / "rig.yaml")
+    assert_same(rig, load_rig(tmp_path / "rig.yaml"))
+    first = (tmp_path / "rig.yaml").read_text()
+    assert "graphvio_rig: 2" in first
+    (tmp_path / "rig.yaml").write_text(first.replace("graphvio_rig: 2", "graphvio_rig: 1"))
+    with pytest.raises(RigError, match="line_time_us is of version 2; write  graphvio_rig: 2"):
+        load_rig(tmp_path / "rig.yaml")
+    chain = yaml.safe_load(kalibr_chain(rig))
+    for section in chain.values():
+        section["line_delay"] = 41.67e-6
+    (tmp_path / "camchain-imucam.yaml").write_text(yaml.safe_dump(chain))
+    (tmp_path / "imu.yaml").write_text(KALIBR_IMU)
+    assert_same(rig, load_rig(tmp_path / "camchain-imucam.yaml"))
+    euroc = write_euroc(tmp_path / "euroc", rig=rig, frames=1)
+    for camera in rig.cameras:
+        (euroc / "mav0" / camera.name / "sensor.yaml").write_text(camera_yaml(camera, 20.0, "rolling"))
+    assert_same(rig, load_rig(euroc))
 
 
 def test_load_rig_with_a_wrong_lens_names_the_camera_and_the_remedy(tmp_path: Path) -> None:

@@ -23,7 +23,8 @@ from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 from graphvio.warmup import warm_up
 
-_RENDERED = "paper"  # its cameras include those of all other rigs
+_RENDERED = "paper"  # its cameras include those of the others
+_RIGS = ("paper", "stereo", "stereo+back")
 _BASE = "stereo"
 _CONFIGS = {"estimated": "{}", "trusted": "calibration: {online: false}"}
 
@@ -38,7 +39,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         epilog="Example: scripts/benchmark cameras --scenes room --seeds 1",
     )
     parser.add_argument("--scenes", nargs="+", default=["room", "corridor"], choices=SCENE_NAMES, metavar="NAME")
-    parser.add_argument("--rigs", nargs="+", default=list(NAMED_RIGS), choices=list(NAMED_RIGS), metavar="NAME")
+    parser.add_argument("--rigs", nargs="+", default=list(_RIGS), choices=_RIGS, metavar="NAME")
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of recordings (default: 3)")
     parser.add_argument("--duration", type=float, metavar="S", help="only so much of each walk")
     parser.add_argument("--out", type=Path, metavar="FILE", help="also write the tables to this file")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from benchmarks.cameras import ate_mm
 from benchmarks.recordings import add_data_option, rendered_once
-from benchmarks.report import Report, machine
+from benchmarks.report import Report, log_progress, machine
 from graphvio.cameras import MODEL_NAMES, distort
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
@@ -47,10 +48,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         epilog="Example: scripts/benchmark lenses --seeds 1 --duration 10",
     )
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of recordings (default: 3)")
-    parser.add_argument("--duration", type=float, default=20.0, metavar="S", help="of each walk (default: 20)")
+    parser.add_argument("--duration", type=float, default=16.0, metavar="S", help="of each walk (default: 16)")
     parser.add_argument("--lenses", nargs="*", default=list(_LENSES), choices=list(_LENSES), metavar="NAME")
     parser.add_argument("--out", type=Path, metavar="FILE", help="also write the tables to this file")
-    parser.add_argument("--docs", action="store_true", help="put the tables into docs/benchmarks.md")
+    parser.add_argument("--docs", action="store_true", help="put the tables into docs/explanation/benchmarks")
     add_data_option(parser)
     parser.set_defaults(run=run_all)
 
@@ -76,16 +77,22 @@ def run_all(args: argparse.Namespace) -> None:
 
 
 def rig_of(lens: str) -> Rig:
-    """Return the simulator's stereo pair with lenses that reach as far to the right and left as the pinhole's."""
+    """Return the simulator's stereo pair with lenses that reach as far to each side, up and down as the pinhole's.
+
+    Images are as wide; their height follows from the lens.
+    """
     model, coefficients = _LENSES[lens]
     width, height = _SIZE_PX
     distortion = np.pad(np.array(coefficients, dtype=np.float64), (0, 8 - len(coefficients)))
-    edge, *_ = distort(MODEL_NAMES[model], distortion, np.tan(np.deg2rad(_FIELD_OF_VIEW_DEG / 2)), 0.0)
-    focal_px = 0.5 * width / edge
+    edge = np.tan(np.deg2rad(_FIELD_OF_VIEW_DEG / 2))
+    x, *_ = distort(MODEL_NAMES[model], distortion, edge, 0.0)
+    _, y, *_ = distort(MODEL_NAMES[model], distortion, 0.0, edge * height / width)
+    focal_px = 0.5 * width / x
+    height = round(2.0 * focal_px * y)
     intrinsics = np.array([focal_px, focal_px, 0.5 * (width - 1), 0.5 * (height - 1)])
 
     def change(camera: Camera) -> Camera:
-        return replace(camera, model=model, distortion=distortion, intrinsics=intrinsics, size_px=_SIZE_PX)
+        return replace(camera, model=model, distortion=distortion, intrinsics=intrinsics, size_px=(width, height))
 
     return stereo().with_cameras(change)
 
@@ -100,15 +107,11 @@ def _rows(ates_mm: Mapping[str, Sequence[float]], base: str) -> list[tuple[str, 
 def _ates_mm(args: argparse.Namespace, name: str, rig: Rig, has_line_time: bool = True) -> list[float]:
     found = []
     for seed in range(args.seeds):
-        folder = rendered_once(
-            args.data,
-            "room",
-            f"{name}-{args.duration:g}s-seed{seed}",
-            lambda folder, seed=seed: simulate("room", folder, seed=seed, duration_s=args.duration, rig=rig),
-        )
+        render = partial(simulate, "room", seed=seed, duration_s=args.duration, rig=rig)
+        folder = rendered_once(args.data, "room", f"{name}-{args.duration:g}s-seed{seed}", render)
         known = open_source(folder).rig
         if not has_line_time:
             known = known.with_cameras(lambda camera: replace(camera, line_time_us=0.0))
         found.append(ate_mm(folder, known, Config()))
-        print(f"{name}, seed {seed}: {found[-1]:.2f} mm", flush=True)
+        log_progress(f"{name}, seed {seed}: {found[-1]:.2f} mm")
     return found

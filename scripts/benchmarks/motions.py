@@ -9,6 +9,7 @@ from scipy.stats import chi2, norm
 
 from graphvio.arrays import Float
 from graphvio.backend.estimator import MeasurementUpdate
+from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.visual import MotionPredictor
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.estimate import Estimate, Status
@@ -71,8 +72,8 @@ def log_vision(odometry: Odometry) -> VisionLog:
     process, apply = odometry._frontend.process, odometry._estimator.apply
     vision_log = VisionLog({}, {})
 
-    def processed(frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
-        result = vision_log.results[frameset.stamp_ns] = process(frameset, predict)
+    def processed(frameset: FrameSet, predict: MotionPredictor, readout: ReadoutMotion | None = None) -> VisualResult:
+        result = vision_log.results[frameset.stamp_ns] = process(frameset, predict, readout)
         return result
 
     def applied(visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
