@@ -166,6 +166,8 @@ def another(value: object) -> object:
         return not value
     if isinstance(value, int):
         return value - 1 if value else 1
+    if value is None:
+        return 3.0
     assert isinstance(value, float)
     return 0.5 * value or 0.1
 

@@ -79,7 +79,9 @@ def test_every_configuration_value_and_profile_is_documented() -> None:
         section = text.split(f"## `{stage.name}`\n")[1].split("\n## ")[0]
         rows = re.findall(r"^\| `(\w+)` \| (\S+) \| .+ \|$", section, re.MULTILINE)
         values = getattr(config, stage.name)
-        assert rows == [(f.name, str(getattr(values, f.name))) for f in fields(values)]
+        assert rows == [
+            (f.name, "null" if getattr(values, f.name) is None else str(getattr(values, f.name))) for f in fields(values)
+        ]
     for profile in profiles():
         assert f"| `{profile}` |" in text
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from recordings import START_NS, frame_stamps, half_size_rig, small_rig, write_euroc, write_rows
+from recordings import START_NS, frame_stamps, half_size_rig, noise_image, small_rig, write_euroc, write_rows
 from rendered import rendered_once
 
 from graphvio import Estimate, FrameSet, ImuSample, Odometry, Status, open_source
@@ -142,13 +142,50 @@ def test_pair_images_beyond_the_tolerance_are_not_joined(tmp_path: Path) -> None
     write_euroc(tmp_path)
     shifted = [f"{s + 3 * MS},{s}.png" for s in frame_stamps(10)]
     write_rows(tmp_path / "mav0/cam3/data.csv", shifted)
-    source = open_source(tmp_path)
+    source = open_source(tmp_path, tolerance_ms=2.0)
     assert all(list(measurement.images) == [0] for measurement in source if isinstance(measurement, FrameSet))
     assert source.faults.counts["unpaired_image"] == 19  # the last right image comes after the last frameset
     assert "cam3 has none within 2 ms" in next(i.detail for i in source.faults.events if i.kind == "unpaired_image")
     wider = open_source(tmp_path, tolerance_ms=3.0)
     assert [list(measurement.images) for measurement in wider if isinstance(measurement, FrameSet)] == [[0, 1]] * 10
     assert wider.faults.counts == {}
+
+
+def test_stamps_of_arrival_are_joined_and_the_left_one_counts(tmp_path: Path) -> None:
+    """Left and right images were triggered together, and came up to 6.8 ms apart, as those of KITTI's raw drives."""
+    write_euroc(tmp_path, pairs=1, frames=20)
+    late = np.random.default_rng(3).uniform(-6.8, 6.8, 20)
+    late[4], late[9] = 6.8, -6.8
+    stamps = [s + round(ms * MS) for s, ms in zip(frame_stamps(20), late, strict=True)]
+    write_rows(tmp_path / "mav0/cam1/data.csv", [f"{a},{b}.png" for a, b in zip(stamps, frame_stamps(20), strict=True)])
+    dropped = open_source(tmp_path, tolerance_ms=2.0)
+    assert dropped.frameset_count == np.sum(np.abs(late) <= 2.0) < 20
+    source = open_source(tmp_path)
+    assert source.stamps_ns.tolist() == frame_stamps(20)
+    for number, frameset in enumerate(each for each in source if isinstance(each, FrameSet)):
+        np.testing.assert_array_equal(frameset.images[0][1], noise_image(100 + number))
+    assert source.faults.counts == {}
+
+
+def test_images_with_several_partners_are_counted_and_the_nearest_taken(tmp_path: Path) -> None:
+    write_euroc(tmp_path, pairs=1, frames=10)
+    right = [(s, s) for s in frame_stamps(10)]
+    right.insert(5, (frame_stamps(10)[4] + 10 * MS, frame_stamps(10)[0]))  # an image too many
+    write_rows(tmp_path / "mav0/cam1/data.csv", [f"{stamp},{file}.png" for stamp, file in right])
+    source = open_source(tmp_path)
+    for number, frameset in enumerate(each for each in source if isinstance(each, FrameSet)):
+        np.testing.assert_array_equal(frameset.images[0][1], noise_image(100 + number))
+    assert source.faults.counts == {"pairing_ambiguous": 1, "unpaired_image": 1}
+    (event,) = [each for each in source.faults.events if each.kind == "pairing_ambiguous"]
+    assert event.detail == f"pair0 has several images within 16.7 ms of {frame_stamps(10)[4]}; the nearest are taken"
+
+
+def test_a_missing_image_is_not_replaced_by_its_neighbour() -> None:
+    stamps = np.arange(10) * 100 * MS
+    index = match_sides(stamps, np.delete(stamps, 4) + 5 * MS)
+    assert index.left_alone.tolist() == [400 * MS]
+    assert index.stamps_ns.tolist() == np.delete(stamps, 4).tolist()
+    assert not len(index.ambiguous)
 
 
 @pytest.mark.parametrize("tolerance_ms", [-0.1, 11.0, float("nan"), float("inf")])

@@ -205,8 +205,9 @@ class FilterConfig(Stage):
 class TimingConfig(Stage):
     """Times to wait, and gaps that are tolerated."""
 
-    simultaneous_ms: float = 2.0
-    """Images of a recording whose stamps differ by no more are of the same instant."""
+    simultaneous_ms: float | None = None
+    """Images whose stamps differ by no more are of the same instant. Unset, it is 2 ms, and for left and right of a
+    pair in a recording a third of the median period: stamps of arrival differ though both were triggered together."""
     max_imu_wait_ms: float = 100.0
     """A frameset whose IMU samples are missing is held until a measurement arrives that is newer by this much."""
     max_imu_gap_ms: float = 50.0

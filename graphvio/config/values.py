@@ -74,6 +74,11 @@ def checked(hint: Any, value: object, where: str) -> object:
         ConfigError: if it is of another type, or out of the range that its name implies.
     """
     choices = get_args(hint)
+    if type(None) in choices:
+        if value is None:
+            return None
+        (hint,) = (each for each in choices if each is not type(None))
+        choices = get_args(hint)
     if choices:
         if value not in choices:
             raise ConfigError(f"{where}: is {value!r}; choose one of {', '.join(map(str, choices))}")

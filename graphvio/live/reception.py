@@ -18,6 +18,7 @@ from graphvio.measurements.readings import CameraFrame, ImuReading, Notice, Read
 from graphvio.measurements.sensors import ImuSample, Measurement
 from graphvio.queues import BoundedQueue, WhenFull
 from graphvio.rig import Imu, Rig
+from graphvio.sources.matching import TOLERANCE_NS
 
 _WAITING_IMAGES = 64  # for decoding
 _READ_AHEAD_IMAGES = 8  # likewise, of a source that waits
@@ -67,7 +68,9 @@ class Reception:
         self._clocks = ClockMaps(report)
         self._shared = SharedClock(report)  # of the readings that name no clock
         self._order = SampleOrder(_MISSING_SAMPLE_MS, (rig.imu or Imu()).rate_hz)
-        self._assembler = FramesetAssembler(rig, config.timing.simultaneous_ms, config.live.max_image_wait_ms, report)
+        set_ms = config.timing.simultaneous_ms
+        tolerance_ms = 1e-6 * TOLERANCE_NS if set_ms is None else set_ms
+        self._assembler = FramesetAssembler(rig, tolerance_ms, config.live.max_image_wait_ms, report)
 
     def start(self) -> None:
         """Use readings from now on."""

@@ -119,6 +119,8 @@ class EventKind(StrEnum):
     """The rig has an IMU, but the recording has no samples of it; vision alone is used."""
     UNPAIRED_IMAGE = "unpaired_image"
     """A left image has no right one within the tolerance, or the other way round; it is dropped."""
+    PAIRING_AMBIGUOUS = "pairing_ambiguous"
+    """A left image has several right ones within the tolerance, or the other way round; the nearest are taken."""
     FRAMESET_INCOMPLETE = "frameset_incomplete"
     """A pair has no images at a time when another pair has; the others are used."""
     FRAMESET_EMPTY = "frameset_empty"

@@ -17,10 +17,8 @@ _ABSENT_PERIODS = 0.75
 _IMU_GAP_PERIODS = 5.0
 
 
-def count_image_faults(
-    rig: Rig, pairs: Sequence[PairIndex], framesets: FramesetIndex, tolerance_ns: int, faults: FaultLog
-) -> None:
-    """Count images without partner, framesets without a pair, and gaps, in the time of the framesets."""
+def count_image_faults(rig: Rig, pairs: Sequence[PairIndex], framesets: FramesetIndex, faults: FaultLog) -> None:
+    """Count images without partner or with several, framesets without a pair, and gaps, in the framesets' time."""
     begin_ns, end_ns = int(framesets.stamps_ns[0]), int(framesets.stamps_ns[-1])
     gaps: list[tuple[int, int, str]] = []
     for number, (pair, index) in enumerate(zip(rig.groups, pairs, strict=True)):
@@ -30,9 +28,15 @@ def count_image_faults(
         ):
             alone = alone[(alone >= begin_ns) & (alone <= end_ns)]
             if len(alone):
-                within = f"within {1e-6 * tolerance_ns:g} ms"
+                within = f"within {1e-6 * index.tolerance_ns:.3g} ms"
                 detail = f"{camera.name} has an image at {alone[0]}, {other.name} has none {within}"
                 faults.add(EventKind.UNPAIRED_IMAGE, int(alone[0]), detail, len(alone))
+        ambiguous = index.ambiguous[(index.ambiguous >= begin_ns) & (index.ambiguous <= end_ns)]
+        if len(ambiguous):
+            detail = f"{pair.name} has several images within {1e-6 * index.tolerance_ns:.3g} ms of {ambiguous[0]}"
+            faults.add(
+                EventKind.PAIRING_AMBIGUOUS, int(ambiguous[0]), f"{detail}; the nearest are taken", len(ambiguous)
+            )
         absent = framesets.stamps_ns[framesets.rows[:, number, 0] < 0]
         absent = absent[_far_from(absent, index.stamps_ns, _ABSENT_PERIODS)]  # not if triggered at another time
         if len(absent):

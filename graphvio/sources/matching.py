@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from graphvio.arrays import Int
 
 TOLERANCE_NS = 2_000_000
-"""Images whose stamps differ by no more than this are of one instant, unless `open_source` gets another value."""
+"""Pairs whose stamps differ by no more than this are of one instant, unless `open_source` gets another value."""
+
+_PERIOD_SHARE = 3  # left and right may be a third of a period apart: a neighbour is then always farther away
 
 Rows = NDArray[np.int32]
 
@@ -28,6 +30,8 @@ class PairIndex:
     rows: Rows  # (N, 2) rows of the left and the right image in their cameras' indexes
     left_alone: Int  # (L,) stamps of left images without a right one
     right_alone: Int  # (R,) stamps of right images without a left one
+    ambiguous: Int  # (A,) stamps of left images that were near to more than one right image, or whose right one was
+    tolerance_ns: int  # within which left and right were matched
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +42,25 @@ class FramesetIndex:
     rows: Rows  # (F, P, 2) rows of the left and right image of each pair, -1 where the pair has none
 
 
-def match_sides(left_ns: Int, right_ns: Int, tolerance_ns: int = TOLERANCE_NS) -> PairIndex:
-    """Match left and right images of a pair by their stamps (N,) and (M,), which increase."""
+def tolerance_of(left_ns: Int) -> int:
+    """Return the tolerance between left and right images that suits the rate of the left ones (N,), nanoseconds.
+
+    Stamps of arrival differ by some milliseconds though both images were triggered together.
+    """
+    return int(np.median(np.diff(left_ns))) // _PERIOD_SHARE if len(left_ns) > 1 else TOLERANCE_NS
+
+
+def match_sides(left_ns: Int, right_ns: Int, tolerance_ns: int | None = None) -> PairIndex:
+    """Match left and right images of a pair by their stamps (N,) and (M,), which increase.
+
+    A tolerance of None is that of `tolerance_of`.
+    """
+    if tolerance_ns is None:
+        tolerance_ns = tolerance_of(left_ns)
+    nothing = np.zeros(0, dtype=np.int64)
     if np.array_equal(left_ns, right_ns):
         rows = np.repeat(np.arange(len(left_ns), dtype=np.int32)[:, None], 2, axis=1)
-        nothing = np.zeros(0, dtype=np.int64)
-        return PairIndex(left_ns, rows, nothing, nothing)
+        return PairIndex(left_ns, rows, nothing, nothing, nothing, tolerance_ns)
     matched: list[tuple[int, int]] = []
     i = j = 0
     lefts, rights = left_ns.tolist(), right_ns.tolist()
@@ -63,7 +80,16 @@ def match_sides(left_ns: Int, right_ns: Int, tolerance_ns: int = TOLERANCE_NS) -
         else:
             j += 1
     rows = np.array(matched, dtype=np.int32).reshape(-1, 2)
-    return PairIndex(left_ns[rows[:, 0]], rows, np.delete(left_ns, rows[:, 0]), np.delete(right_ns, rows[:, 1]))
+    stamps, partners = left_ns[rows[:, 0]], right_ns[rows[:, 1]]
+    several = (_near(right_ns, stamps, tolerance_ns) > 1) | (_near(left_ns, partners, tolerance_ns) > 1)
+    left_alone, right_alone = np.delete(left_ns, rows[:, 0]), np.delete(right_ns, rows[:, 1])
+    return PairIndex(stamps, rows, left_alone, right_alone, stamps[several], tolerance_ns)
+
+
+def _near(stamps_ns: Int, at_ns: Int, tolerance_ns: int) -> Int:
+    """Count the stamps (N,), which increase, within the tolerance of each of others (M,)."""
+    first = np.searchsorted(stamps_ns, at_ns - tolerance_ns, side="left")
+    return np.searchsorted(stamps_ns, at_ns + tolerance_ns, side="right") - first
 
 
 def of_single(stamps_ns: Int) -> PairIndex:

@@ -14,7 +14,6 @@ from graphvio.sources import euroc, kitti_odometry, kitti_raw, session, uzh_fpv
 from graphvio.sources.base import Source
 from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import Index
-from graphvio.sources.matching import TOLERANCE_NS
 from graphvio.sources.plug_ins import Layout, plug_ins
 from graphvio.sources.recording import Recording
 
@@ -33,7 +32,7 @@ def open_source(
     *,
     from_s: float | None = None,
     to_s: float | None = None,
-    tolerance_ms: float = 1e-6 * TOLERANCE_NS,
+    tolerance_ms: float | None = None,
     topics: Mapping[str, str] | None = None,
 ) -> Source:
     """Open a recording, whatever its layout.
@@ -44,7 +43,8 @@ def open_source(
         from_s: where to begin, seconds after the recording's first frameset.
         to_s: where to end (inclusive), on the same scale.
         tolerance_ms: images whose stamps differ by no more are of one instant. Left and right images farther apart
-            are no pair, and pairs farther apart make framesets of their own.
+            are no pair, and pairs farther apart make framesets of their own. None takes a third of the left camera's
+            median period for left and right, whose stamps may be those of arrival, and 2 ms for pairs.
         topics: name of a camera, or ``imu`` -> topic, for sessions and bags whose topics have other names.
 
     Raises:
@@ -56,14 +56,15 @@ def open_source(
     for name, value in (("from_s", from_s), ("to_s", to_s)):
         if value is not None and not math.isfinite(value):
             raise SourceError(f"{name} is {value}; give seconds after the first frameset")
-    if not 0.0 <= tolerance_ms <= _MAX_TOLERANCE_MS:
+    if tolerance_ms is not None and not 0.0 <= tolerance_ms <= _MAX_TOLERANCE_MS:
         raise SourceError(
             f"tolerance_ms is {tolerance_ms}; give 0 to {_MAX_TOLERANCE_MS:g}: images that are triggered together"
         )
     path = Path(path)
     try:
         index, rig, faults = _read_index(path, rig, topics or {})
-        return Recording(index, rig, faults, from_s, to_s, round(1e6 * tolerance_ms))
+        tolerance_ns = None if tolerance_ms is None else round(1e6 * tolerance_ms)
+        return Recording(index, rig, faults, from_s, to_s, tolerance_ns)
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
 

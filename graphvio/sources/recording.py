@@ -49,7 +49,7 @@ class Recording:
         faults: FaultLog,
         from_s: float | None = None,
         to_s: float | None = None,
-        tolerance_ns: int = TOLERANCE_NS,
+        tolerance_ns: int | None = None,
     ) -> None:
         self.name = index.name
         self.truth = index.truth
@@ -60,11 +60,13 @@ class Recording:
         stamps_ns = {name: images.stamps_ns for name, images in index.images.items()}
         pairs = [match_sides(stamps_ns[pair.left.name], stamps_ns[pair.right.name], tolerance_ns) for pair in rig.pairs]
         pairs += [of_single(stamps_ns[single.name]) for single in rig.singles]
-        self._framesets = _cut(group_pairs(pairs, tolerance_ns), from_s, to_s, index.name)
+        self._framesets = _cut(
+            group_pairs(pairs, TOLERANCE_NS if tolerance_ns is None else tolerance_ns), from_s, to_s, index.name
+        )
         self.stamps_ns = self._framesets.stamps_ns
         self.frameset_count = len(self.stamps_ns)
         self.start_ns, self.end_ns = int(self.stamps_ns[0]), int(self.stamps_ns[-1])
-        count_image_faults(rig, pairs, self._framesets, tolerance_ns, faults)
+        count_image_faults(rig, pairs, self._framesets, faults)
         self._imu: ImuTable | None = None
         if rig.imu is not None:
             self._imu = self._cut_imu(index.imu, rig.imu.time_offset_ns, is_whole=to_s is None)
