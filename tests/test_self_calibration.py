@@ -22,7 +22,7 @@ from graphvio.rig_files import load_rig, save_rig
 from graphvio.self_calibration import online
 from graphvio.self_calibration.bundle import _COLUMNS as COLUMNS
 from graphvio.self_calibration.bundle import _ERROR_AT as ERROR_AT
-from graphvio.self_calibration.bundle import Eliminated, Tracks, _observe, eliminate_landmarks
+from graphvio.self_calibration.bundle import Eliminated, Tracks, _observe, _scratch, eliminate_landmarks
 from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
 from graphvio.self_calibration.findings import described
 from graphvio.self_calibration.inertial import InertialSamples
@@ -83,7 +83,7 @@ def test_observe_derivatives_equal_finite_differences(model: str, pair: int) -> 
         step[pair] = calibration_step
         filled = _observe(
             moved, calibration.moved(step.ravel()), pair, odom_T_landmark, landmark + point_step, np.zeros(2),
-            np.zeros(2), True, rows,
+            np.zeros(2), True, _scratch(), rows,
         )  # fmt: skip
         assert filled == 4
         return rows

@@ -13,7 +13,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.cameras import distort, distortion_basis
-from graphvio.kernels import kernel, put
+from graphvio.kernels import kernel, put, vector_kernel
 from graphvio.self_calibration.parameters import (
     BODY,
     CAMERA,
@@ -96,6 +96,24 @@ class Eliminated(NamedTuple):
         )
 
 
+class _Scratch(NamedTuple):
+    """Intermediate results of `_observe`, which would be allocated for each observation."""
+
+    of_point: tuple[Float, Float, Float, Float, Float, Float]
+    of_pixel: tuple[Float, Float, Float, Float, Float]
+    error: Float
+
+
+@kernel
+def _scratch() -> _Scratch:
+    """Allocate intermediate results."""
+    return _Scratch(
+        (np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))),
+        (np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, CAMERA))),
+        np.empty(2),
+    )
+
+
 @kernel
 def _project(
     calibration: RigCalibration, j: int, image: int, y: Float, seen: Float, to_pixel: Float, error: Float,
@@ -138,7 +156,7 @@ def _turned(v: Float, matrix: Float, out: Float) -> None:
 @kernel
 def _observe(
     pose: Float, calibration: RigCalibration, j: int, odom_T_landmark: Float, landmark: Float,
-    left_px: Float, right_px: Float, has_right: bool, rows: Float,
+    left_px: Float, right_px: Float, has_right: bool, scratch: _Scratch, rows: Float,
 ) -> int:  # fmt: skip
     """Fill the rows (4, _COLUMNS) of one observation: derivatives by pose, calibration and landmark, and errors.
 
@@ -152,10 +170,9 @@ def _observe(
             rows[r, c] = 0.0
     a, b, w = landmark[0], landmark[1], landmark[2]
     frame, left, right = odom_T_landmark, calibration.body_T_left[j], calibration.right_T_left[j]
-    in_odom, in_body, in_left_body, in_camera = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    by_point, left_by_point = np.empty((3, 3)), np.empty((3, 3))
-    to_pixel, by_left, by_body, turned = np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
-    error, by_camera, seen = np.empty(2), np.empty((2, CAMERA)), left_px
+    in_odom, in_body, in_left_body, in_camera, by_point, left_by_point = scratch.of_point
+    to_pixel, by_left, by_body, turned, by_camera = scratch.of_pixel
+    error, seen = scratch.error, left_px
     for r in range(3):
         in_odom[r] = frame[r, 0] * a + frame[r, 1] * b + frame[r, 2] + w * (frame[r, 3] - pose[r, 3])
     for r in range(3):
@@ -226,7 +243,7 @@ def _observe(
     return 4 if has_right else 2
 
 
-@kernel
+@vector_kernel
 def eliminate_landmarks(
     poses: Float, calibration: RigCalibration, landmarks: Float, tracks: Tracks, sigma_px: float, scale: float,
     damping: float, hessian: Float, gradient: Float, eliminated: Eliminated,
@@ -249,29 +266,28 @@ def eliminate_landmarks(
         Robust cost of all errors, and the squared whitened error of each image's observation (N, 2), NaN without one.
     """
     n_poses = 6 * len(poses)
-    rows = np.zeros((4, _COLUMNS))
-    local = np.zeros((_COLUMNS, _COLUMNS))
-    by_calibration = np.zeros((PAIR, PAIR))
+    rows, weighted, line = np.zeros((4, _COLUMNS)), np.zeros((4, _COLUMNS)), np.zeros(_COLUMNS)
+    (r0, r1, r2, r3), (w0, w1, w2, w3) = _lines(rows), _lines(weighted)
+    totals, of_poses = np.zeros((PAIR + POINT, _COLUMNS)), np.zeros((3, n_poses))
+    vb, vwc, scratch = np.zeros(3), np.zeros((3, PAIR)), _scratch()
+    t0, t1, t2 = of_poses[0], of_poses[1], of_poses[2]
     errors2, cost = np.full((len(tracks.keyframe), 2), np.nan), 0.0
     for point in range(len(landmarks)):
         first, last = tracks.rows[point], tracks.rows[point + 1]
         at = n_poses + PAIR * tracks.pair[point]
         v, bl = np.zeros((3, 3)), np.zeros(3)
         wc = eliminated.by_calibration[point]
-        for c in range(PAIR):
-            for d in range(3):
-                wc[d, c] = 0.0
-            for d in range(PAIR):
-                by_calibration[c, d] = 0.0
+        for c in range(PAIR + POINT):
+            for d in range(_COLUMNS):
+                totals[c, d] = 0.0
         for n in range(first, last):
-            k = 6 * tracks.keyframe[n]
+            k, wp = 6 * tracks.keyframe[n], eliminated.by_pose[n]
             filled = _observe(
                 poses[tracks.keyframe[n]], calibration, tracks.pair[point], tracks.odom_T_landmark[point],
-                landmarks[point], tracks.left_px[n], tracks.right_px[n], tracks.has_right[n], rows,
+                landmarks[point], tracks.left_px[n], tracks.right_px[n], tracks.has_right[n], scratch, rows,
             )  # fmt: skip
             for c in range(_COLUMNS):
-                for d in range(_COLUMNS):
-                    local[c, d] = 0.0
+                w0[c] = w1[c] = w2[c] = w3[c] = 0.0
             for r in range(0, 4 if tracks.has_right[n] else 2, 2):
                 du, dv = rows[r, _ERROR_AT], rows[r + 1, _ERROR_AT]
                 e2 = (du * du + dv * dv) / (sigma_px * sigma_px) if r < filled else _ERROR2_BEHIND
@@ -281,29 +297,35 @@ def eliminate_landmarks(
                     continue
                 weight = 1.0 / ((1.0 + e2 / (scale * scale)) * sigma_px * sigma_px)
                 for one in (r, r + 1):
-                    for c in range(_COLUMNS - 1):
-                        value = weight * rows[one, c]
-                        if value != 0.0:
-                            for d in range(c, _COLUMNS):
-                                local[c, d] += value * rows[one, d]
-            for c in range(6):
-                gradient[k + c] += local[c, _ERROR_AT]
-                for d in range(c, 6):
-                    hessian[k + c, k + d] += local[c, d]
+                    for c in range(_COLUMNS):
+                        weighted[one, c] = weight * rows[one, c]
+            for c in range(POSE):
+                a0, a1, a2, a3 = w0[c], w1[c], w2[c], w3[c]
+                for d in range(_COLUMNS):
+                    line[d] = a0 * r0[d] + a1 * r1[d] + a2 * r2[d] + a3 * r3[d]
+                gradient[k + c] += line[_ERROR_AT]
+                for d in range(c, POSE):
+                    hessian[k + c, k + d] += line[d]
                 for d in range(PAIR):
-                    hessian[k + c, at + d] += local[c, POSE + d]
+                    hessian[k + c, at + d] += line[POSE + d]
                 for d in range(3):
-                    eliminated.by_pose[n, d, c] = local[c, _POINT_AT + d]
-            for c in range(PAIR):
-                gradient[at + c] += local[POSE + c, _ERROR_AT]
-                for d in range(c, PAIR):
-                    by_calibration[c, d] += local[POSE + c, POSE + d]
-                for d in range(3):
-                    wc[d, c] += local[POSE + c, _POINT_AT + d]
-            for c in range(3):
-                bl[c] += local[_POINT_AT + c, _ERROR_AT]
-                for d in range(c, 3):
-                    v[c, d] += local[_POINT_AT + c, _POINT_AT + d]
+                    wp[d, c] = line[_POINT_AT + d]
+            for c in range(POSE, _ERROR_AT):
+                a0, a1, a2, a3, total = w0[c], w1[c], w2[c], w3[c], totals[c - POSE]
+                if a0 != 0.0 or a1 != 0.0:
+                    for d in range(_COLUMNS):
+                        total[d] += a0 * r0[d] + a1 * r1[d] + a2 * r2[d] + a3 * r3[d]
+                elif a2 != 0.0 or a3 != 0.0:  # what belongs to the right image alone
+                    for d in range(_COLUMNS):
+                        total[d] += a2 * r2[d] + a3 * r3[d]
+        for c in range(PAIR):
+            gradient[at + c] += totals[c, _ERROR_AT]
+            for d in range(3):
+                wc[d, c] = totals[c, _POINT_AT + d]
+        for c in range(3):
+            bl[c] = totals[PAIR + c, _ERROR_AT]
+            for d in range(c, 3):
+                v[c, d] = totals[PAIR + c, _POINT_AT + d]
         for c in range(3):
             v[c, c] = v[c, c] * (1.0 + damping) + 1e-9
             for d in range(c):
@@ -311,32 +333,46 @@ def eliminate_landmarks(
         inverse = _inverse3(v)
         put(eliminated.inverse[point], inverse)
         put(eliminated.gradient[point], bl)
-        vb = inverse @ bl
-        vwc = inverse @ wc
+        for r in range(3):
+            vb[r] = inverse[r, 0] * bl[0] + inverse[r, 1] * bl[1] + inverse[r, 2] * bl[2]
+            for c in range(PAIR):
+                vwc[r, c] = inverse[r, 0] * wc[0, c] + inverse[r, 1] * wc[1, c] + inverse[r, 2] * wc[2, c]
         for c in range(PAIR):
             gradient[at + c] -= wc[0, c] * vb[0] + wc[1, c] * vb[1] + wc[2, c] * vb[2]
             for d in range(c, PAIR):
                 hessian[at + c, at + d] += (
-                    by_calibration[c, d] - wc[0, c] * vwc[0, d] - wc[1, c] * vwc[1, d] - wc[2, c] * vwc[2, d]
+                    totals[c, POSE + d] - wc[0, c] * vwc[0, d] - wc[1, c] * vwc[1, d] - wc[2, c] * vwc[2, d]
                 )
+        # The landmark's inverse normal matrix times its couplings, for all poses from its first to its last: zero where
+        # it was not seen, so that one long loop subtracts what belongs to a row.
+        end = 6 * tracks.keyframe[last - 1] + POSE if last > first else 0
+        for c in range(6 * tracks.keyframe[first] if last > first else 0, end):
+            t0[c] = t1[c] = t2[c] = 0.0
         for n in range(first, last):
             k, wp = 6 * tracks.keyframe[n], eliminated.by_pose[n]
-            for c in range(6):
-                gradient[k + c] -= wp[0, c] * vb[0] + wp[1, c] * vb[1] + wp[2, c] * vb[2]
+            for r in range(3):
+                for c in range(POSE):
+                    of_poses[r, k + c] = inverse[r, 0] * wp[0, c] + inverse[r, 1] * wp[1, c] + inverse[r, 2] * wp[2, c]
+        for n in range(first, last):
+            k, wp = 6 * tracks.keyframe[n], eliminated.by_pose[n]
+            for c in range(POSE):
+                a0, a1, a2 = wp[0, c], wp[1, c], wp[2, c]
+                gradient[k + c] -= a0 * vb[0] + a1 * vb[1] + a2 * vb[2]
+                row = hessian[k + c]
                 for d in range(PAIR):
-                    hessian[k + c, at + d] -= wp[0, c] * vwc[0, d] + wp[1, c] * vwc[1, d] + wp[2, c] * vwc[2, d]
-            for other in range(n, last):
-                k2, wq = 6 * tracks.keyframe[other], eliminated.by_pose[other]
-                for d in range(6):
-                    x = inverse[0, 0] * wq[0, d] + inverse[0, 1] * wq[1, d] + inverse[0, 2] * wq[2, d]
-                    y = inverse[1, 0] * wq[0, d] + inverse[1, 1] * wq[1, d] + inverse[1, 2] * wq[2, d]
-                    z = inverse[2, 0] * wq[0, d] + inverse[2, 1] * wq[1, d] + inverse[2, 2] * wq[2, d]
-                    for c in range(6 if k2 > k else d + 1):
-                        hessian[k + c, k2 + d] -= wp[0, c] * x + wp[1, c] * y + wp[2, c] * z
+                    row[at + d] -= a0 * vwc[0, d] + a1 * vwc[1, d] + a2 * vwc[2, d]
+                for d in range(k + c, end):
+                    row[d] -= a0 * t0[d] + a1 * t1[d] + a2 * t2[d]
     for c in range(len(gradient)):
         for d in range(c):
             hessian[c, d] = hessian[d, c]
     return cost, errors2
+
+
+@kernel
+def _lines(rows: Float) -> tuple[Float, Float, Float, Float]:
+    """Return the four lines of a matrix."""
+    return rows[0], rows[1], rows[2], rows[3]
 
 
 @kernel
