@@ -8,6 +8,7 @@ from graphvio.kernels import fast_kernel, kernel, put
 _HARRIS_K = 0.04
 _RADIUS = 3  # of the 7x7 window over which gradients are summed
 _BORDER = 2  # around a cell: one pixel to smooth the response, one to check that it peaks
+_LANES = 32  # numbers that a loop takes at once
 _NOISE_STEP = 6  # pixels and rows from one sample to the next
 _MAX_RESPONSE = 2047
 _NOISE_QUANTILE = 0.5
@@ -69,12 +70,13 @@ def find_corners(
     near = np.empty_like(found)
     count = len(tracked)
     side = cell_px + 2 * _BORDER
-    lines = np.empty((2 * _RADIUS + 1, 3, side + 2 * _RADIUS), dtype=np.float32)
-    sums = np.empty((3, side + 2 * _RADIUS), dtype=np.float32)
+    stride = side + 4 * _RADIUS + _LANES
+    lines = np.empty((2 * _RADIUS + 1, 3, stride), dtype=np.float32)
+    sums = np.empty((5, stride), dtype=np.float32)
     raw, smooth, weaker2 = (
-        np.empty((side, side), dtype=np.float32),
-        np.empty((side, side), dtype=np.float32),
-        np.empty((side, side), dtype=np.float32),
+        np.empty((side, stride), dtype=np.float32),
+        np.empty((side, stride), dtype=np.float32),
+        np.empty((side, stride), dtype=np.float32),
     )
     for row in range(rows):
         for column in range(columns):
@@ -107,31 +109,30 @@ def _harris(
 ) -> None:  # fmt: skip
     """Fill the Harris response, and the mean square gradient along the weaker direction, from pixel (x0, y0) on.
 
-    Sums over the window's columns are carried from row to row; all numbers in them are exact in single precision.
+    Sums over the window's columns are carried from row to row; all numbers in them are exact in single precision. Loops
+    go on to a multiple of what vector instructions take at once, since rows are short; what is beyond means nothing.
     """
     area = np.float32((2 * _RADIUS + 1) ** 2)
     half, k = np.float32(0.5), np.float32(_HARRIS_K)
-    reach = wide + 2 * _RADIUS
+    whole = (wide + 2 * _RADIUS + _LANES - 1) // _LANES * _LANES
     left = x0 - _RADIUS
-    sums[:, :reach] = np.float32(0.0)
-    lines[:, :, :reach] = np.float32(0.0)
-    sxx, sxy, syy = sums[0], sums[1], sums[2]
+    end = min(left + whole, image.shape[1] - 1)
+    sums[:, :] = np.float32(0.0)
+    lines[:, :, :] = np.float32(0.0)
+    sxx, sxy, syy, gx, gy = sums[0], sums[1], sums[2], sums[3], sums[4]
     for j in range(high + 2 * _RADIUS):
         y = y0 - _RADIUS + j
-        above, at, below = image[y - 1, left:], image[y, left - 1 :], image[y + 1, left:]
         line = lines[j % (2 * _RADIUS + 1)]
         xx, xy, yy = line[0], line[1], line[2]
-        for i in range(reach):
-            gx = half * (np.float32(at[i + 2]) - np.float32(at[i]))
-            gy = half * (np.float32(below[i]) - np.float32(above[i]))
-            sxx[i] += gx * gx - xx[i]
-            sxy[i] += gx * gy - xy[i]
-            syy[i] += gy * gy - yy[i]
-            xx[i], xy[i], yy[i] = gx * gx, gx * gy, gy * gy
+        _difference(image[y, left + 1 : end + 1], image[y, left - 1 : end - 1], gx)
+        _difference(image[y + 1, left:end], image[y - 1, left:end], gy)
+        _replace(gx, gx, whole, xx, sxx)  # one loop for all would have too many arrays for vector instructions
+        _replace(gx, gy, whole, xy, sxy)
+        _replace(gy, gy, whole, yy, syy)
         if j < 2 * _RADIUS:
             continue
         strength, weaker = response[j - 2 * _RADIUS], weaker2[j - 2 * _RADIUS]
-        for i in range(wide):
+        for i in range(whole):
             a = b = c = np.float32(0.0)
             for shift in range(2 * _RADIUS + 1):
                 a += sxx[i + shift]
@@ -140,6 +141,23 @@ def _harris(
             a, b, c = a / area, b / area, c / area
             strength[i] = a * c - b * b - k * (a + c) * (a + c)
             weaker[i] = half * (a + c - np.sqrt((a - c) * (a - c) + np.float32(4.0) * b * b))
+
+
+@fast_kernel
+def _difference(one: Image, other: Image, out: AnyArray) -> None:
+    """Fill half the difference of two lines of pixels."""
+    half = np.float32(0.5)
+    for i in range(len(one)):
+        out[i] = half * (np.float32(one[i]) - np.float32(other[i]))
+
+
+@fast_kernel
+def _replace(one: AnyArray, other: AnyArray, size: int, line: AnyArray, sums: AnyArray) -> None:
+    """Fill a line of products in place of the one that leaves the window, and keep the columns' sums up to date."""
+    for i in range(size):
+        product = one[i] * other[i]
+        sums[i] += product - line[i]
+        line[i] = product
 
 
 @fast_kernel
