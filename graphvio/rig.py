@@ -97,7 +97,7 @@ class Camera:
         _set(self, "distortion", distortion)
         _set(self, "body_T_cam", checked_transform(self.body_T_cam, f"{where}: body_T_cam"))
 
-    @property
+    @cached_property
     def focal_px(self) -> float:
         """Scale from normalised image units to pixels at the image centre, the mean of both axes.
 

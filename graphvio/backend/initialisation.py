@@ -96,4 +96,5 @@ def level(up: Float) -> Float:
     forward = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < _STEEP else np.array([0.0, 0.0, 1.0])
     x = forward - (forward @ up) * up
     x /= np.linalg.norm(x)
-    return np.array([x, np.cross(up, x), up])
+    y = up[[1, 2, 0]] * x[[2, 0, 1]] - up[[2, 0, 1]] * x[[1, 2, 0]]  # up cross x, for which numpy takes long
+    return np.array([x, y, up])

@@ -48,7 +48,7 @@ class RigArrays(NamedTuple):
     @property
     def is_single(self) -> Bool:
         """(P,) which groups are single cameras."""
-        return np.array([np.array_equal(left, right) for left, right in self.cam_T_body])
+        return np.asarray((self.cam_T_body[:, 0] == self.cam_T_body[:, 1]).all(axis=(1, 2)))
 
     def crossed(self, pairs: Sequence[tuple[int, int]]) -> RigArrays:
         """Return a rig of (a, b): points of pair a's left camera at the reference are seen by pair b's cameras now."""
