@@ -73,6 +73,16 @@ def test_optimize_false_closures_in_agreement_are_refused(walk: SyntheticSession
     assert [bool(loop.refusal) for loop in found.loops] == [False] * len(right) + [True] * len(wrong)
 
 
+def test_marginals_poses_are_those_of_each_pose(walk: SyntheticSession) -> None:
+    found = optimized(walk, walk.closures)
+    assert any(not loop.refusal for loop in found.loops)
+    marginals = Marginals(found.graph, found.values)
+    together = marginals.poses(len(found.sessions[0].nodes.rows))
+    for k in range(0, len(together), 10):
+        one = marginals.pose(k)
+        np.testing.assert_allclose(together[k], one, rtol=0.0, atol=1e-6 * np.abs(one).max())
+
+
 def test_marginals_motion_is_consistent() -> None:
     """NEES of the last pose seen from the first, over 40 walks with the IMU's noise as it is: 95 % band of its mean."""
     config = replace(CONFIG, smoother=replace(SmootherConfig(), imu_noise_scale=1.0))

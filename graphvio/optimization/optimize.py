@@ -137,7 +137,7 @@ def optimize(
             break
         is_used[again] = True
     solution = poses_of(values, len(whole))
-    covariances = np.array([marginals.pose(k) for k in range(len(whole))]).reshape(-1, 6, 6)
+    covariances = marginals.poses(len(whole))
     frames = [roots.index(number) for number in joined.component]
     return Optimization(
         sessions=[

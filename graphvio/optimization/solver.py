@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -15,9 +16,11 @@ from graphvio.backend.gating import relative_covariance
 from graphvio.backend.noise import gaussian
 from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse, se3_log
+from graphvio.optimization.covariances import covariances
 
 _MAX_ITERATIONS = 50
 _CONVERGED = 1e-5  # relative decrease of the cost
+_FREE = "the session's graph leaves a state free"
 
 
 @contextmanager
@@ -103,7 +106,7 @@ class Marginals:
     """Covariances of the values that solve a graph.
 
     The variables are eliminated by nested dissection: the tree of a long chain is flat then, and the covariance of two
-    states of an hour takes as long as that of two of a minute.
+    states of an hour takes as long as that of two of a minute. Each elimination is made when it is first needed.
 
     Raises:
         OptimizationError: if a variable is not constrained.
@@ -111,13 +114,24 @@ class Marginals:
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         self._values = values
-        ordering = gtsam.Ordering.MetisNonlinearFactorGraph(graph)
-        with gtsam_errors("the session's graph leaves a state free"):
-            self._tree = graph.linearize(values).eliminateMultifrontal(ordering, gtsam.EliminateQR)
+        self._ordering = gtsam.Ordering.MetisNonlinearFactorGraph(graph)
+        self._linear = graph.linearize(values)
+
+    def poses(self, count: int) -> Float:
+        """Return the covariances (N, 6, 6) of the first poses, tangent ``[rotation, translation]`` in body."""
+        with gtsam_errors(_FREE):
+            net = self._linear.eliminateSequential(self._ordering, gtsam.EliminateQR)
+        found = dict(covariances(net))
+        return np.array([found[x(k)] for k in range(count)]).reshape(-1, 6, 6)
 
     def pose(self, k: int) -> Float:
         """Return the covariance (6, 6) of state k's pose, tangent ``[rotation, translation]`` in body."""
         return self.variable(x(k))
+
+    @cached_property
+    def _tree(self) -> gtsam.GaussianBayesTree:
+        with gtsam_errors(_FREE):
+            return self._linear.eliminateMultifrontal(self._ordering, gtsam.EliminateQR)
 
     def variable(self, key: int) -> Float:
         """Return the covariance of a variable."""
