@@ -23,7 +23,8 @@ from graphvio.cli import app
 from graphvio.config import Config
 from graphvio.errors import MissingExtraError, OptimizationError
 from graphvio.geometry import se3_inverse, se3_log
-from graphvio.optimization.pipeline import optimize_sessions
+from graphvio.optimization.loops.database import FeatureDatabase
+from graphvio.optimization.pipeline import DATABASE, Session, Stages, optimize_sessions
 from graphvio.rig_files import load_rig, save_rig
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
@@ -94,12 +95,21 @@ def test_optimize_killed_run_continues_to_equal_results(walk: Path, settings: Pa
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     finished = json.loads((out / "stages.json").read_text())["finished"]
-    assert list(finished) == ["odometry of walk"]
-    record = (out / "walk" / "record.npz").stat().st_mtime_ns
+    assert finished == {}  # features are extracted while the odometry runs
     assert command(walk, "--config", settings, "--out", out).exit_code == 0
-    assert (out / "walk" / "record.npz").stat().st_mtime_ns == record
     for name in ALWAYS_EQUAL:
         assert (out / name).read_bytes() == (done / name).read_bytes(), name
+
+
+def test_record_with_features_extracts_first_places(walk: Path, settings: Path, tmp_path: Path) -> None:
+    source, config = open_source(walk, to_s=3.0), Config.load(settings)
+    stages = Stages([Session("walk", source)], tmp_path / "out", config)
+    record = stages.record(0, with_features=True)
+    with FeatureDatabase(tmp_path / "out" / DATABASE) as database:
+        stored = {int(Path(name).stem) for name in database.names}
+    chosen = [place.stamp_ns for place in stages.places(0, record).places]
+    assert 0 < len(stored) <= len(chosen)
+    assert stored == set(chosen[: len(stored)])
 
 
 def test_optimize_foreign_folder_is_refused_and_unchanged(

@@ -78,7 +78,7 @@ def optimize(
     from graphvio.fleet.cluster import distributed
     from graphvio.fleet.listing import list_sessions
     from graphvio.fleet.run import optimize_fleet
-    from graphvio.optimization.loops.database import colmap
+    from graphvio.optimization.loops.colmap_library import colmap
     from graphvio.rig_files import load_rig
 
     if scheduler is not None and workers is not None:

@@ -73,7 +73,7 @@ def optimize(
         graphvio optimize monday.mcap tuesday.mcap --out both
     """
     from graphvio.config import Config
-    from graphvio.optimization.loops.database import colmap
+    from graphvio.optimization.loops.colmap_library import colmap
     from graphvio.optimization.pipeline import optimize_sessions
     from graphvio.results import ResultWriter
     from graphvio.runtime import interruptible, use_one_opencv_thread

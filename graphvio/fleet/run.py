@@ -15,7 +15,7 @@ from graphvio.fleet.listing import Listed
 from graphvio.fleet.markers import Marker, finished
 from graphvio.fleet.storage import Storage, local_path
 from graphvio.fleet.table import Outcome, write_tables
-from graphvio.optimization.loops.database import colmap
+from graphvio.optimization.loops.colmap_library import colmap
 from graphvio.rig import Rig
 
 PLACES_PER_TASK = 200

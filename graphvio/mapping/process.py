@@ -15,7 +15,7 @@ from graphvio.arrays import Float
 from graphvio.config import Config
 from graphvio.errors import GraphvioError, MapError, ServiceError
 from graphvio.mapping.mapper import Mapper
-from graphvio.optimization.loops.database import colmap
+from graphvio.optimization.loops.colmap_library import colmap
 from graphvio.runtime import ignore_stop_signals, use_one_opencv_thread
 from graphvio.slam.client import Client
 from graphvio.slam.keyframe import Keyframe

@@ -22,7 +22,8 @@ from graphvio.errors import OptimizationError
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.covisibility import verify_matches
 from graphvio.optimization.loops.closures import Place
-from graphvio.optimization.loops.database import FeatureDatabase, colmap, image_name
+from graphvio.optimization.loops.colmap_library import colmap
+from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.place_images import write_image
 from graphvio.optimization.loops.search import SessionInput
 from graphvio.optimization.optimize import Optimization

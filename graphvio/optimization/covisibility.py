@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from graphvio.arrays import Float
+from graphvio.arrays import AnyArray, Float, Int
 from graphvio.geometry import se3_inverse
 from graphvio.optimization.loops.closures import Place
 from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.matching import alike, known_geometry
 from graphvio.optimization.loops.search import SessionInput
 from graphvio.optimization.optimize import Optimization
+from graphvio.optimization.threads import in_threads
 from graphvio.rig import Camera
 
 _NEIGHBOURS = 2  # places after each that it is matched with
@@ -55,19 +57,43 @@ def verify_matches(
             if first in lefts and second in lefts:
                 database.verify(first, second, None)
     listed = sorted(pairs.values(), key=lambda each: each.names)
-    for done, pair in enumerate(listed, start=1):
+    read = (_stored(pair, database) for pair in listed)
+    verified = in_threads(_verified, read, "graphvio-matches")
+    for done, (pair, (rows, is_new, geometry)) in enumerate(zip(listed, verified, strict=True), start=1):
         with database.transaction():
-            _verify(pair, database)
+            if is_new:
+                database.add_matches(*pair.names, rows)
+            database.verify(*pair.names, geometry if len(geometry.inlier_matches) >= _MIN_MATCHES else None)
         on_progress(done, len(listed))
 
 
-def _verify(pair: _ImagePair, database: FeatureDatabase) -> None:
+@dataclass(frozen=True, eq=False)
+class _Stored:
+    """What the database holds of two images: their matches, or else the descriptors to match."""
+
+    pair: _ImagePair
+    pixels: tuple[Float, Float]
+    matches: Int | None
+    descriptors: tuple[AnyArray, AnyArray] | None
+
+
+def _stored(pair: _ImagePair, database: FeatureDatabase) -> _Stored:
     first, second = pair.names
-    if not database.has_matches(first, second):
-        database.add_matches(first, second, alike(database.descriptors(first), database.descriptors(second)))
-    pixels, rows = (database.pixels(first), database.pixels(second)), database.all_matches(first, second)
-    geometry = known_geometry(pair.cameras, pair.second_T_first, pixels, rows, _EPIPOLAR_PX)
-    database.verify(first, second, geometry if len(geometry.inlier_matches) >= _MIN_MATCHES else None)
+    pixels = (database.pixels(first), database.pixels(second))
+    if database.has_matches(first, second):
+        return _Stored(pair, pixels, database.all_matches(first, second), None)
+    return _Stored(pair, pixels, None, (database.descriptors(first), database.descriptors(second)))
+
+
+def _verified(stored: _Stored) -> tuple[Int, bool, Any]:
+    """Return matches (M, 2), whether they are new, and the geometry that verifies them."""
+    rows = stored.matches
+    if rows is None:
+        assert stored.descriptors is not None
+        rows = alike(*stored.descriptors)
+    pair = stored.pair
+    geometry = known_geometry(pair.cameras, pair.second_T_first, stored.pixels, rows, _EPIPOLAR_PX)
+    return rows, stored.matches is None, geometry
 
 
 def _neighbours(

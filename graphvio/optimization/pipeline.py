@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from graphvio.errors import CalibrationError, TrajectoryError
 from graphvio.odometry.recorded_calibration import calibrate_recording
 from graphvio.optimization.colmap_export import export
 from graphvio.optimization.exchange import covariance_text, frames_text, trajectory_text, write_g2o
+from graphvio.optimization.loops.ahead import FeaturesAhead
 from graphvio.optimization.loops.closures import LoopClosure, Place, closures_to_bytes, load_closures
 from graphvio.optimization.loops.database import FeatureDatabase
 from graphvio.optimization.loops.features import extract_places
@@ -76,7 +79,11 @@ def optimize_sessions(
     if calibrates:
         for number in range(len(sessions)):
             stages.calibrate(number)
-    records = [stages.record(number) for number in range(len(sessions))]
+    records = []
+    for number in range(len(sessions)):
+        records.append(stages.record(number, with_features=with_loops))
+        if with_loops:
+            stages.features(number, records[-1])
     return stages.result(records, stages.closures(records) if with_loops else None)
 
 
@@ -146,8 +153,11 @@ class Stages:
             self._space.finish(stage, name)
         self._rigs[number] = load_rig(path)
 
-    def record(self, number: int) -> SessionRecord:
-        """Run the odometry on a session, write its results, and return what it measured."""
+    def record(self, number: int, *, with_features: bool = False) -> SessionRecord:
+        """Run the odometry on a session, write its results, and return what it measured.
+
+        With ``with_features``, features of places are extracted at the same time, as far as they are known until then.
+        """
         session = self._sessions[number]
         name, stage = f"{session.name}/record.npz", f"odometry of {session.name}"
         if not self._space.has_finished(stage):
@@ -161,20 +171,28 @@ class Stages:
             )
             # All motions of a session must be measured with one calibration, that of the rig file.
             config = replace(self._config, calibration=CalibrationConfig(online=False))
-            with ResultWriter(folder, self._rigs[number], config.to_yaml()) as writer:
-                run(session.source, config, writer, [listener], self._rigs[number])
-            self._space.write(name, recorder.record().to_bytes())
+            ahead = self._features_ahead(number) if with_features else None
+            listeners = [listener]
+            if ahead is not None:
+                listeners.append(RunListener(on_step=ahead.add, on_smoothed=ahead.add_smoothed))
+            with ResultWriter(folder, self._rigs[number], config.to_yaml()) as writer, ahead or nullcontext():
+                run(session.source, config, writer, listeners, self._rigs[number])
+            record = recorder.record()
+            if ahead is not None:
+                chosen = [place.stamp_ns for place in self.places(number, record).places]
+                if ahead.stamps_ns != chosen[: len(ahead.stamps_ns)]:  # a place that is none would stay in the map
+                    self._discard_features()
+            self._space.write(name, record.to_bytes())
             self._space.finish(stage, name, f"{session.name}/odometry/summary.json")
         return SessionRecord.load(self._space.folder / name)
 
     def closures(self, records: Sequence[SessionRecord]) -> list[LoopClosure]:
         """Find loop closures within and between the sessions."""
         inputs = [self.places(number, record) for number, record in enumerate(records)]
-        missing = [each for each in inputs if not self._space.has_finished(_features_of(each.name))]
-        if missing or not self._space.has_finished("loops"):
+        for number, record in enumerate(records):
+            self.features(number, record)
+        if not self._space.has_finished("loops"):
             with FeatureDatabase(self._space.folder / DATABASE) as database:
-                for each in missing:
-                    self._extract(each, database)
                 found = find_loops(
                     inputs, database, self._config, lambda done, total: self._on_progress("loops", done, total)
                 )
@@ -206,10 +224,13 @@ class Stages:
             self._space.write(f"{place}covariance.csv", covariance_text(optimized).encode())
             self._space.write(f"{place}frames.csv", frames_text(optimized).encode())
         write_g2o(found, self._space.folder / "graph.g2o")
-        if closures is not None and not self._space.has_finished("map"):
-            self._export(found, records, rigs)
-            self._space.finish("map", "colmap/sparse/0/points3D.bin")
-        write_report(found, self._space.folder, [_truth(each.source) for each in self._sessions])
+        truths = [_truth(each.source) for each in self._sessions]
+        with ThreadPoolExecutor(1, thread_name_prefix="graphvio-report") as pool:
+            report = pool.submit(write_report, found, self._space.folder, truths)
+            if closures is not None and not self._space.has_finished("map"):
+                self._export(found, records, rigs)
+                self._space.finish("map", "colmap/sparse/0/points3D.bin")
+            report.result()
         return found
 
     def _export(self, found: Optimization, records: Sequence[SessionRecord], rigs: Sequence[Rig]) -> None:
@@ -233,18 +254,34 @@ class Stages:
         places = [Place(number, row, int(record.stamps_ns[row])) for row in rows.tolist()]
         return SessionInput(session.name, session.source, self._rigs[number], places)
 
-    def _extract(self, session: SessionInput, database: FeatureDatabase) -> None:
+    def features(self, number: int, record: SessionRecord) -> None:
+        """Extract the features of a session's places."""
+        session = self.places(number, record)
         stage, total = _features_of(session.name), len(session.places)
-        extract_places(
-            session.source,
-            session.rig,
-            session.name,
-            [place.stamp_ns for place in session.places],
-            database,
-            self._config,
-            lambda done: self._on_progress(stage, done, total),
-        )
+        if self._space.has_finished(stage):
+            return
+        with FeatureDatabase(self._space.folder / DATABASE) as database:
+            extract_places(
+                session.source,
+                session.rig,
+                session.name,
+                [place.stamp_ns for place in session.places],
+                database,
+                self._config,
+                lambda done: self._on_progress(stage, done, total),
+            )
         self._space.finish(stage, DATABASE)
+
+    def _discard_features(self) -> None:
+        self._space.forget("loops", *(_features_of(each.name) for each in self._sessions))
+        (self._space.folder / DATABASE).unlink()
+
+    def _features_ahead(self, number: int) -> FeaturesAhead | None:
+        session = self._sessions[number]
+        if self._space.has_finished(_features_of(session.name)):
+            return None
+        database = self._space.folder / DATABASE
+        return FeaturesAhead(session.source, self._rigs[number], session.name, database, self._config)
 
 
 def _features_of(name: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from graphvio.errors import OptimizationError
@@ -45,11 +45,17 @@ class Workspace:
 
     def has_finished(self, stage: str) -> bool:
         """Whether a stage was finished, in this run or an earlier one, and its files exist."""
-        return stage in self._finished and all((self.folder / name).is_file() for name in self._finished[stage])
+        return stage in self._finished and self._exist(self._finished[stage])
 
     def finish(self, stage: str, *files: str) -> None:
         """Record that a stage is finished and has written these files."""
         self._finished[stage] = list(files)
+        self._save()
+
+    def forget(self, *stages: str) -> None:
+        """Let stages be done once more."""
+        for stage in stages:
+            self._finished.pop(stage, None)
         self._save()
 
     def write(self, name: str, data: bytes) -> None:
@@ -71,7 +77,12 @@ class Workspace:
             )
         finished = state["finished"]
         assert isinstance(finished, dict)
-        self._finished = {str(stage): [str(name) for name in files] for stage, files in finished.items()}
+        self._finished = {
+            str(stage): [str(name) for name in files] for stage, files in finished.items() if self._exist(files)
+        }
+
+    def _exist(self, names: Sequence[str]) -> bool:
+        return all((self.folder / name).is_file() for name in names)
 
     def _save(self) -> None:
         state = {"inputs": self._inputs, "finished": self._finished}

@@ -14,7 +14,8 @@ from benchmarks.report import Report, log_progress
 from graphvio.arrays import AnyArray, Bool, Float
 from graphvio.config import Config
 from graphvio.evaluation import MAX_GAP_S
-from graphvio.optimization.loops.database import FeatureDatabase, colmap, image_name
+from graphvio.optimization.loops.colmap_library import colmap
+from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.places import choose_places
 from graphvio.optimization.loops.retrieval import describe, vocabulary
 

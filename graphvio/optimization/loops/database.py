@@ -14,13 +14,9 @@ from typing import Any
 import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Int
-from graphvio.errors import MissingExtraError, OptimizationError
+from graphvio.errors import OptimizationError
+from graphvio.optimization.loops.colmap_library import CENTRE_PX, colmap
 from graphvio.rig import Camera, Rig
-from graphvio.runtime import has_mixed_zlib
-
-CENTRE_PX = 0.5
-"""COLMAP's coordinate of the centre of an image's first pixel."""
-
 
 _COLMAP_MODELS = {
     "radial-tangential": "FULL_OPENCV",
@@ -29,23 +25,6 @@ _COLMAP_MODELS = {
     "extended-unified": "EUCM",
 }
 _COLMAP_COEFFICIENTS = {"OPENCV": 4, "FULL_OPENCV": 8, "OPENCV_FISHEYE": 4, "EUCM": 2}
-
-
-def colmap() -> Any:
-    """Import pycolmap, with logging from warnings on.
-
-    Raises:
-        OptimizationError: if it was imported in an order that corrupts memory.
-        MissingExtraError: if the extra ``maps`` is not installed.
-    """
-    try:
-        import pycolmap
-    except ImportError:
-        raise MissingExtraError("pycolmap", "maps", "loop closure and maps") from None
-    if has_mixed_zlib():
-        raise OptimizationError("pycolmap was imported before zlib, by which Python crashes; import graphvio before it")
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
-    return pycolmap
 
 
 def image_name(session: str, camera: str, stamp_ns: int) -> str:

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Self
 
 import numpy as np
 
 from graphvio.arrays import AnyArray, Float, Image, Int
 from graphvio.config import Config
 from graphvio.measurements.sensors import FrameSet
-from graphvio.optimization.loops.database import CENTRE_PX, FeatureDatabase, colmap, image_name
+from graphvio.optimization.loops.database import FeatureDatabase, image_name
 from graphvio.optimization.loops.places import PairObserver
+from graphvio.optimization.loops.sift import Extractor, SiftExtractor, SiftProcess
+from graphvio.optimization.threads import in_threads
 from graphvio.rig import Rig
 from graphvio.sources import Source
-
-_FIRST_OCTAVE = 0  # full resolution; COLMAP's default of twice that takes three times as long
-_MAX_PENDING = 4  # places that are processed at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,17 +36,28 @@ class PairFeatures:
 
 
 class PlaceObserver:
-    """Extracts the features of a place's images and matches them in stereo, in any thread."""
+    """Extracts the features of a place's images and matches them in stereo, in any thread; a context manager.
 
-    def __init__(self, rig: Rig, config: Config) -> None:
+    Args:
+        rig: of the images.
+        config: of the features.
+        in_processes: whether each thread that asks for features has a process that extracts them, for work in
+            parallel; see `graphvio.optimization.loops.sift`.
+    """
+
+    def __init__(self, rig: Rig, config: Config, *, in_processes: bool = False) -> None:
         self._rig = rig
         self._config = config
         self._of_thread = threading.local()
-        self._options = colmap().FeatureExtractionOptions()
-        self._options.num_threads = 1
-        self._options.sift.max_num_features = config.optimization.features
-        self._options.sift.first_octave = _FIRST_OCTAVE
-        self._options.sift.max_num_orientations = 1
+        self._make: Callable[[int], Extractor] = SiftProcess if in_processes else SiftExtractor
+        self._made: list[Extractor] = []  # appending is atomic
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for extractor in self._made:
+            extractor.close()
 
     @property
     def pairs(self) -> Sequence[PairObserver]:
@@ -73,12 +82,11 @@ class PlaceObserver:
 
     def _extract(self, image: Image) -> tuple[Float, AnyArray]:
         """Return pixels (K, 2) and descriptors (K, 128), uint8, of an image's features."""
-        library = colmap()
         if not hasattr(self._of_thread, "extractor"):
-            self._of_thread.extractor = library.FeatureExtractor.create(self._options, library.Device.cpu)
-        keypoints, descriptors = self._of_thread.extractor.extract_from_uint8_array(np.ascontiguousarray(image))
-        pixels = np.asarray(library.keypoints_to_matrix(keypoints)[:, :2], dtype=np.float64) - CENTRE_PX
-        return pixels.reshape(-1, 2), np.asarray(descriptors.data, dtype=np.uint8).reshape(-1, 128)
+            self._of_thread.extractor = self._make(self._config.optimization.features)
+            self._made.append(self._of_thread.extractor)
+        found: tuple[Float, AnyArray] = self._of_thread.extractor.extract(image)
+        return found
 
 
 def extract_places(
@@ -93,25 +101,25 @@ def extract_places(
     """Extract the features of a session's places into the database.
 
     Places that are in the database already are skipped, so that an interrupted run can be continued.
+
+    Raises:
+        OptimizationError: if a process that extracts features ends.
     """
-    observer = PlaceObserver(rig, config)
-
-    def look(stamp_ns: int) -> dict[int, PairFeatures]:
-        return observer.look(source.frameset_at(stamp_ns))
-
-    missing = [ns for ns in stamps_ns if not _is_there(database, rig, session, ns)]
+    missing = [ns for ns in stamps_ns if not is_stored(database, rig, session, ns)]
     done = len(stamps_ns) - len(missing)
-    with ThreadPoolExecutor(2, thread_name_prefix="graphvio-features") as pool:
-        pending: list[Any] = []
-        for at, stamp_ns in enumerate(missing):
-            while len(pending) < _MAX_PENDING and at + len(pending) < len(missing):
-                pending.append(pool.submit(look, missing[at + len(pending)]))
-            store_place(database, rig, session, stamp_ns, pending.pop(0).result())
+    with PlaceObserver(rig, config, in_processes=True) as observer:
+
+        def look(stamp_ns: int) -> dict[int, PairFeatures]:
+            return observer.look(source.frameset_at(stamp_ns))
+
+        for stamp_ns, seen in zip(missing, in_threads(look, missing, "graphvio-features"), strict=True):
+            store_place(database, rig, session, stamp_ns, seen)
             done += 1
             on_progress(done)
 
 
-def _is_there(database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int) -> bool:
+def is_stored(database: FeatureDatabase, rig: Rig, session: str, stamp_ns: int) -> bool:
+    """Return whether the features of a place are in the database."""
     return any(image_name(session, pair.left.name, stamp_ns) in database.names for pair in rig.pairs)
 
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Int
 from graphvio.geometry import skew
-from graphvio.optimization.loops.database import CENTRE_PX, colmap, colmap_camera
+from graphvio.optimization.loops.colmap_library import CENTRE_PX, colmap
+from graphvio.optimization.loops.database import colmap_camera
 from graphvio.rig import Camera
 
 _UNIT = 512.0**2  # COLMAP scales descriptors to this squared length

@@ -17,16 +17,30 @@ from graphvio.rig import StereoPair
 _LEVELS = 2  # of the pyramid, enough for stereo matching
 
 
+class PlaceChooser:
+    """Chooses keyframes, one after the other, at this distance or angle from the place before."""
+
+    def __init__(self, distance_m: float, angle_deg: float) -> None:
+        self._distance_m = distance_m
+        self._angle_deg = angle_deg
+        self._last: tuple[int, Float] | None = None  # epoch and pose of the place before
+
+    def takes(self, epoch: int, nav_T_body: Float) -> bool:
+        """Return whether the next keyframe, with the pose (4, 4), is a place."""
+        if self._last is not None and epoch == self._last[0]:
+            moved = se3_inverse(self._last[1]) @ nav_T_body
+            angle = np.linalg.norm(so3_log(np.ascontiguousarray(moved[:3, :3])))
+            if np.linalg.norm(moved[:3, 3]) < self._distance_m and np.rad2deg(angle) < self._angle_deg:
+                return False
+        self._last = epoch, nav_T_body
+        return True
+
+
 def choose_places(record: SessionRecord, distance_m: float, angle_deg: float) -> Int:
     """Choose keyframes at this distance or angle from the place before; returns their rows (P,)."""
-    chosen: list[int] = []
-    for row in np.flatnonzero(record.is_keyframe).tolist():
-        if chosen and record.epoch[row] == record.epoch[chosen[-1]]:
-            moved = se3_inverse(record.smoothed[chosen[-1]]) @ record.smoothed[row]
-            angle = np.linalg.norm(so3_log(np.ascontiguousarray(moved[:3, :3])))
-            if np.linalg.norm(moved[:3, 3]) < distance_m and np.rad2deg(angle) < angle_deg:
-                continue
-        chosen.append(row)
+    chooser = PlaceChooser(distance_m, angle_deg)
+    keyframes = np.flatnonzero(record.is_keyframe).tolist()
+    chosen = [row for row in keyframes if chooser.takes(int(record.epoch[row]), record.smoothed[row])]
     return np.array(chosen, dtype=np.int64)
 
 

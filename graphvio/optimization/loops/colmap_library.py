@@ -1,0 +1,28 @@
+"""COLMAP's Python library, an optional dependency."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from graphvio.errors import MissingExtraError, OptimizationError
+from graphvio.runtime import has_mixed_zlib
+
+CENTRE_PX = 0.5
+"""COLMAP's coordinate of the centre of an image's first pixel."""
+
+
+def colmap() -> Any:
+    """Import pycolmap, with logging from warnings on.
+
+    Raises:
+        OptimizationError: if it was imported in an order that corrupts memory.
+        MissingExtraError: if the extra ``maps`` is not installed.
+    """
+    try:
+        import pycolmap
+    except ImportError:
+        raise MissingExtraError("pycolmap", "maps", "loop closure and maps") from None
+    if has_mixed_zlib():
+        raise OptimizationError("pycolmap was imported before zlib, by which Python crashes; import graphvio before it")
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
+    return pycolmap
