@@ -31,7 +31,8 @@ from graphvio.frontend.selection import best_pair_motion, joint_motion
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import common_rows
 from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, skew, so3_log
-from graphvio.kernels import any_compiled_before, await_compilers, cache_root, compile_elsewhere, is_compiling_elsewhere
+from graphvio.kernel_cache import any_compiled_before, cache_root
+from graphvio.kernels import await_compilers, compile_elsewhere, is_compiling_elsewhere
 from graphvio.linear_algebra import squared_length
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Imu, Rig

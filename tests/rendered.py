@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from graphvio.kernels import source_digest
+from graphvio.kernel_cache import source_digest
 
 _HERE = Path(__file__).parent
 _MAKERS = ("recordings.py", "calibration_walks.py", "rendered.py")  # in tests, of what is rendered

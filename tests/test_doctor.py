@@ -42,14 +42,14 @@ def test_doctor_absent_parts_come_with_the_command(monkeypatch: pytest.MonkeyPat
 
 
 def test_doctor_counts_the_kernel_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from graphvio import kernels
+    from graphvio import kernel_cache
 
-    monkeypatch.setattr(kernels, "cache_root", lambda: tmp_path)
+    monkeypatch.setattr(kernel_cache, "cache_root", lambda: tmp_path)
     empty = doctor.examine()["kernel_cache"]
     assert empty["folder"] == str(tmp_path)
     assert empty["files"] == 0
     assert not any(empty["compiled_modules"].values())
-    folder = tmp_path / kernels.source_digest("graphvio.geometry") / "x"
+    folder = tmp_path / kernel_cache.source_digest("graphvio.geometry")
     folder.mkdir(parents=True)
     (folder / "skew.nbc").write_bytes(bytes(100))
     found = doctor.examine()["kernel_cache"]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from graphvio import kernels
+from graphvio import kernel_cache, kernels
 from graphvio.cameras import EQUIDISTANT, project_points
 from graphvio.frontend.resection import real_quartic_roots
 from graphvio.geometry import se3_adjoint, se3_exp, se3_log
@@ -20,37 +20,37 @@ ROOT = Path(kernels.__file__).parents[1]
 @pytest.fixture
 def forgetful() -> Iterator[None]:
     """Nothing that `kernels` remembers of this process' environment or sources leaks in or out."""
-    kernels.cache_root.cache_clear()
-    kernels.source_digest.cache_clear()
+    kernel_cache.cache_root.cache_clear()
+    kernel_cache.source_digest.cache_clear()
     yield
-    kernels.cache_root.cache_clear()
-    kernels.source_digest.cache_clear()
+    kernel_cache.cache_root.cache_clear()
+    kernel_cache.source_digest.cache_clear()
 
 
 @pytest.mark.usefixtures("forgetful")
 def test_cache_root_is_the_users_choice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GRAPHVIO_CACHE_DIR", str(tmp_path / "chosen"))
-    assert kernels.cache_root() == tmp_path / "chosen"
+    assert kernel_cache.cache_root() == tmp_path / "chosen"
     assert (tmp_path / "chosen").is_dir()
     monkeypatch.delenv("GRAPHVIO_CACHE_DIR")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    kernels.cache_root.cache_clear()
-    assert kernels.cache_root() == tmp_path / "xdg" / "graphvio" / "kernels"
+    kernel_cache.cache_root.cache_clear()
+    assert kernel_cache.cache_root() == tmp_path / "xdg" / "graphvio" / "kernels"
 
 
 @pytest.mark.usefixtures("forgetful")
 def test_cache_root_that_cannot_be_written_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("GRAPHVIO_CACHE_DIR", str(tmp_path / "file" / "below"))
-    root = kernels.cache_root()
+    root = kernel_cache.cache_root()
     assert root.is_dir()
     assert tmp_path not in root.parents
 
 
 def test_compiled_code_is_written_once_and_found_again(tmp_path: Path) -> None:
     program = (
-        "import numpy as np; from graphvio import geometry, kernels;"
-        "before = kernels.any_compiled_before('graphvio.geometry'); geometry.skew(np.zeros(3));"
+        "import numpy as np; from graphvio import geometry, kernel_cache;"
+        "before = kernel_cache.any_compiled_before('graphvio.geometry'); geometry.skew(np.zeros(3));"
         "print(before, sum(geometry.skew.stats.cache_hits.values()), sum(geometry.skew.stats.cache_misses.values()))"
     )
     environment = {**os.environ, "GRAPHVIO_CACHE_DIR": str(tmp_path)}
@@ -62,6 +62,55 @@ def test_compiled_code_is_written_once_and_found_again(tmp_path: Path) -> None:
     ]
     assert answers == [["False", "0", "1"], ["True", "1", "0"]]
     assert [path for path in tmp_path.iterdir() if path.name.startswith("graphvio.geometry-")]
+
+
+def test_loaded_kernels_parse_their_intermediate_code_when_a_caller_is_compiled(tmp_path: Path) -> None:
+    setup = "import numpy as np; from graphvio import geometry; skew = geometry.skew; skew(np.zeros(3));"
+    caller = (
+        "library = skew.overloads[skew.signatures[0]].library; parsed = [library._shared_module is not None];"
+        "pose = geometry.se3_exp(np.arange(6.0)); parsed.append(library._shared_module is not None);"
+        "print(skew.stats.cache_hits.total(), *parsed, *pose.ravel())"
+    )
+    environment = {**os.environ, "GRAPHVIO_CACHE_DIR": str(tmp_path)}
+
+    def ran(program: str) -> list[str]:
+        return subprocess.run(
+            [sys.executable, "-c", program], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+        ).stdout.split()
+
+    ran(setup)
+    compiled, loaded = ran(setup + caller), ran(setup + caller)
+    assert compiled[:3] == ["1", "False", "True"]
+    assert loaded[:3] == ["1", "False", "False"]
+    assert loaded[3:] == compiled[3:]
+    assert len(compiled) == 19
+
+
+def test_cache_of_all_users_is_read_where_it_cannot_be_written(tmp_path: Path) -> None:
+    shared, home = tmp_path / "shared", tmp_path / "home"
+    environment = {**os.environ, "GRAPHVIO_CACHE_DIR": str(shared), "XDG_CACHE_HOME": str(home)}
+    read_only = (
+        f"import os; access = os.access; os.access = lambda path, mode: '{shared}' != str(path);"  # root may write
+    )
+    program = (
+        "import numpy as np; from graphvio import geometry, kernel_cache;"
+        "known = kernel_cache.any_compiled_before('graphvio.geometry'); geometry.skew(np.zeros(3));"
+        "geometry.se3_inverse(np.eye(4));"
+        "print(known, geometry.skew.stats.cache_hits.total(), geometry.se3_inverse.stats.cache_hits.total())"
+    )
+
+    def ran(text: str) -> list[str]:
+        return subprocess.run(
+            [sys.executable, "-c", text], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+        ).stdout.split()
+
+    ran("import numpy as np; from graphvio import geometry; geometry.skew(np.zeros(3))")
+    stored = sorted(shared.rglob("*.nbc"))
+    assert stored
+    assert ran(read_only + program) == ["True", "1", "0"]
+    assert ran(read_only + program) == ["True", "1", "1"]  # its own, which the first run compiled
+    assert sorted(shared.rglob("*.nbc")) == stored
+    assert list(home.rglob("*.nbc"))
 
 
 @pytest.mark.usefixtures("forgetful")
@@ -77,11 +126,11 @@ def test_digest_changes_with_whatever_is_imported(tmp_path: Path, monkeypatch: p
     }
     for name, text in files.items():
         (package / name).write_text(text)
-    monkeypatch.setattr(kernels, "_PACKAGE", package)
+    monkeypatch.setattr(kernel_cache, "_PACKAGE", package)
 
     def digest() -> str:
-        kernels.source_digest.cache_clear()
-        return kernels.source_digest("graphvio.top")
+        kernel_cache.source_digest.cache_clear()
+        return kernel_cache.source_digest("graphvio.top")
 
     first = digest()
     assert first.startswith("graphvio.top-")
@@ -105,7 +154,7 @@ def test_digest_of_a_real_kernel_reaches_geometry(monkeypatch: pytest.MonkeyPatc
         return read_bytes(path)
 
     monkeypatch.setattr(Path, "read_bytes", spy)
-    kernels.source_digest("graphvio.frontend.refinement")
+    kernel_cache.source_digest("graphvio.frontend.refinement")
     assert {"refinement.py", "cost.py", "geometry.py", "kernels.py", "observations.py"} <= set(read)
 
 

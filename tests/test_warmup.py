@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import graphvio.kernel_cache
 import graphvio.kernels
 import graphvio.warmup
 from graphvio import FrameSet, ImuSample, Odometry
@@ -78,7 +79,7 @@ def test_other_process_compiles_motion_and_calibration() -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout == graphvio.warmup._MOTION_IS_COMPILED
     assert all(
-        map(graphvio.kernels.any_compiled_before, ("graphvio.frontend.refinement", graphvio.warmup._CALIBRATION))
+        map(graphvio.kernel_cache.any_compiled_before, ("graphvio.frontend.refinement", graphvio.warmup._CALIBRATION))
     )
 
 
@@ -121,4 +122,4 @@ def test_compile_in_parallel_waits_for_another_program(tmp_path: Path, monkeypat
 def test_warmup_command_names_the_folder_of_the_kernels() -> None:
     done = CliRunner().invoke(app, ["warmup"])
     assert done.exit_code == 0, done.output
-    assert done.output.startswith(f"kernels are compiled in {graphvio.kernels.cache_root()} (")
+    assert done.output.startswith(f"kernels are compiled in {graphvio.kernel_cache.cache_root()} (")

@@ -2,8 +2,8 @@
 
 import os
 import platform
+import re
 import sys
-from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -63,7 +63,7 @@ def _table(findings: dict[str, Any]) -> Any:
 
 def examine() -> dict[str, Any]:
     """Return all findings, as JSON can hold them."""
-    from graphvio.kernels import any_compiled_before, cache_root
+    from graphvio.kernel_cache import any_compiled_before, cache_root
     from graphvio.version import __version__
 
     folder = cache_root()
@@ -100,7 +100,7 @@ def kernel_modules() -> list[str]:
     package = Path(graphvio.__file__).parent
     found = []
     for file in sorted(package.rglob("*.py")):
-        if "\n@kernel\n" in file.read_text(encoding="utf-8"):
+        if re.search(r"^@(fast_|vector_)?kernel$", file.read_text(encoding="utf-8"), re.MULTILINE):
             parts = file.relative_to(package.parent).with_suffix("").parts
             found.append(".".join(parts[:-1] if parts[-1] == "__init__" else parts))
     return found
@@ -111,6 +111,8 @@ def _usable_cores() -> int:
 
 
 def _version(package: str) -> str | None:
+    from importlib import metadata
+
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

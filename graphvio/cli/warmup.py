@@ -22,7 +22,7 @@ def warmup(config: options.ConfigName = "default", verbose: options.Verbose = Fa
         GRAPHVIO_CACHE_DIR=/opt/graphvio-kernels graphvio warmup
     """
     from graphvio.config import Config
-    from graphvio.kernels import cache_root
+    from graphvio.kernel_cache import cache_root
     from graphvio.simulation import default_rig
     from graphvio.warmup import warm_up
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from graphvio.calibration_sigmas import CalibrationSigmas
 from graphvio.errors import RigError
-from graphvio.kernels import cache_root
+from graphvio.kernel_cache import cache_root
 from graphvio.odometry import Odometry
 from graphvio.reporting.files import replace_file
 from graphvio.rig import Rig

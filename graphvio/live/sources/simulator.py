@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from graphvio.errors import SourceError
-from graphvio.kernels import cache_root
+from graphvio.kernel_cache import cache_root
 from graphvio.live.source import DeviceInfo
 from graphvio.live.sources import SourceSpec, check_options
 from graphvio.live.sources.replay import Pace, paced, speed_of

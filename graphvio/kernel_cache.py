@@ -1,0 +1,76 @@
+"""Folders of compiled kernels.
+
+numba notices an edit to a kernel's own file but not to a file whose kernels it calls. The cache folder of a module is
+therefore named after a digest of its source and of all that it imports from this package: outdated machine code is
+never run by mistake, and an upgrade compiles only what changed.
+"""
+
+import functools
+import hashlib
+import os
+import re
+import sys
+import tempfile
+from importlib import metadata
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parent
+_IMPORT = re.compile(r"^from (graphvio[\w.]*) import", re.MULTILINE)
+
+
+@functools.cache
+def cache_root() -> Path:
+    """Return the folder to which compiled kernels are written: ``GRAPHVIO_CACHE_DIR``, or one in the user's cache."""
+    chosen = os.environ.get("GRAPHVIO_CACHE_DIR")
+    user_cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "graphvio" / "kernels"
+    for folder in ([Path(chosen)] if chosen else []) + [user_cache]:
+        try:
+            root = folder.expanduser()
+            root.mkdir(parents=True, exist_ok=True)
+            if os.access(root, os.W_OK):
+                return root
+        except (OSError, RuntimeError):
+            pass  # a folder that is read-only, or a home that is unknown
+    root = Path(tempfile.gettempdir()) / f"graphvio-{os.getuid()}-kernels"  # compiled code then lives as long as /tmp
+    root.mkdir(mode=0o700, exist_ok=True)
+    if root.stat().st_uid != os.getuid():  # code is loaded from here: it must be our own
+        return Path(tempfile.mkdtemp(prefix="graphvio-kernels-"))
+    return root
+
+
+def cache_folders(module: str) -> list[Path]:
+    """Return the folders that may hold code of a module's kernels, that which new code is written to first.
+
+    A ``GRAPHVIO_CACHE_DIR`` that cannot be written, as one that all users of a machine share, is read.
+    """
+    roots = [cache_root()]
+    chosen = os.environ.get("GRAPHVIO_CACHE_DIR")
+    if chosen:
+        shared = Path(chosen).expanduser()
+        if shared != roots[0] and shared.is_dir():
+            roots.append(shared)
+    return [root / source_digest(module) for root in roots]
+
+
+def any_compiled_before(module: str) -> bool:
+    """Return whether a cache holds code of a module's kernels, so that a first call need not compile."""
+    return any(any(folder.glob("*.nbc")) for folder in cache_folders(module))
+
+
+@functools.cache
+def source_digest(module: str) -> str:
+    """Return a module's name with a digest of its source and of all that it imports from this package."""
+    sources: dict[str, bytes] = {}
+    pending = [module]
+    while pending:
+        name = pending.pop()
+        if name in sources:
+            continue
+        path = _PACKAGE.parent.joinpath(*name.split("."))
+        file = path.with_suffix(".py") if not path.is_dir() else path / "__init__.py"
+        sources[name] = file.read_bytes() if file.is_file() else b""
+        pending += _IMPORT.findall(sources[name].decode())
+    digest = hashlib.sha256(f"{metadata.version('numba')} {sys.version}".encode())
+    for name in sorted(sources):
+        digest.update(name.encode() + sources[name])
+    return f"{module}-{digest.hexdigest()[:16]}"
