@@ -287,14 +287,15 @@ class Rig:
     """Stereo pairs, cameras without a partner, and at most one IMU.
 
     Attributes:
-        pairs: at least one.
+        pairs: none where there are only single cameras, whose scale an IMU shows.
         imu: None for vision only.
         name: used in messages and results.
         calibration_sigmas: how far the calibration is known.
         singles: cameras without a partner.
 
     Raises:
-        RigError: if there is no pair, or two cameras, or two groups of cameras, share a name.
+        RigError: if there is no camera, or neither a pair nor an IMU, or if two cameras, or two groups of cameras,
+            share a name.
     """
 
     pairs: tuple[StereoPair, ...]
@@ -306,8 +307,14 @@ class Rig:
     def __post_init__(self) -> None:
         _set(self, "pairs", tuple(self.pairs))
         _set(self, "singles", tuple(self.singles))
-        if not self.pairs:
-            raise RigError(f"{self.name}: has no stereo pair; graphvio needs at least one")
+        if not self.groups:
+            raise RigError(f"{self.name}: has no camera; give a stereo pair, or a single camera and an IMU")
+        if not self.pairs and self.imu is None:
+            alone = ", ".join(single.name for single in self.singles)
+            raise RigError(
+                f"{self.name}: {alone} without a stereo pair and without an IMU: the scale cannot be known; "
+                "use an IMU, or add a camera whose view overlaps"
+            )
         names = [camera.name for camera in self.cameras]
         for kind, all_names in (("camera", names), ("group", [group.name for group in self.groups])):
             twice = {n for n in all_names if all_names.count(n) > 1}
@@ -351,21 +358,47 @@ class Rig:
             cameras: names; a number N is short for ``camN``.
 
         Raises:
-            RigError: if there is no such camera, or no pair is left.
+            RigError: if there is no such camera, or neither a pair nor an IMU is left.
         """
         names = [camera.name for camera in self.cameras]
         wanted = {f"cam{name}" if name.isdecimal() and name not in names else name for name in cameras}
         for name in sorted(wanted - set(names)):
             raise RigError(f"{self.name}: there is no camera {name!r}; choose from {', '.join(names)}")
         pairs = [pair for pair in self.pairs if {camera.name for camera in pair.cameras} <= wanted]
-        if not pairs:
-            raise RigError(f"{self.name}: none of its pairs is among {', '.join(cameras)}; graphvio needs at least one")
         paired = {camera.name for pair in pairs for camera in pair.cameras}
         singles = [SingleCamera(camera) for camera in self.cameras if camera.name in wanted - paired]
         return replace(self, pairs=tuple(pairs), singles=tuple(singles))
 
+    def without_pairs(self) -> Rig:
+        """Take each camera for a single one.
+
+        Raises:
+            RigError: if there is no IMU.
+        """
+        return replace(self, pairs=(), singles=tuple(SingleCamera(camera) for camera in self.cameras))
+
+    def need_pairs(self, user: str) -> None:
+        """Refuse a rig of single cameras only.
+
+        Args:
+            user: what needs a stereo pair.
+
+        Raises:
+            RigError: if there is none.
+        """
+        if not self.pairs:
+            names = ", ".join(single.name for single in self.singles)
+            raise RigError(
+                f"{self.name}: has only single cameras ({names}), and {user} needs a stereo pair; graphvio run takes "
+                "such rigs"
+            )
+
     def without_imu(self) -> Rig:
-        """Drop the IMU."""
+        """Drop the IMU.
+
+        Raises:
+            RigError: if no pair is left that shows the scale.
+        """
         return replace(self, imu=None)
 
     def with_cameras(self, change: Callable[[Camera], Camera]) -> Rig:

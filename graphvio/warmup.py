@@ -12,6 +12,7 @@ import os
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -35,6 +36,7 @@ from graphvio.kernel_cache import any_compiled_before, cache_root
 from graphvio.kernels import await_compilers, compile_elsewhere, is_compiling_elsewhere
 from graphvio.linear_algebra import squared_length
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
+from graphvio.monocular.estimator import adjust_no_keyframes
 from graphvio.rig import Imu, Rig
 from graphvio.self_calibration.online import adjust_nothing
 from graphvio.slam.landmarks import orientations
@@ -55,10 +57,14 @@ def warm_up(rig: Rig, config: Config, *, wait_for_calibration: bool = True) -> N
         wait_for_calibration: whether the kernels of the self-calibration are waited for too where they have to be
             compiled; else the self-calibration waits for them when it has seen enough.
     """
+    if not rig.pairs:  # whose calibration is not estimated
+        config = replace(config, calibration=replace(config.calibration, online=False))
     if not _are_compiled(config):
         _compile_in_parallel(rig, config)
     _warm_up_tracking(rig, config)
     _warm_up_motion(rig, config)
+    if not rig.pairs:
+        adjust_no_keyframes(rig)
     if config.estimates_calibration and (wait_for_calibration or not is_compiling_elsewhere()):
         await_compilers()
         adjust_nothing(rig)
@@ -105,7 +111,7 @@ def _compile_in_parallel(rig: Rig, config: Config) -> None:
 def _warm_up_tracking(rig: Rig, config: Config) -> None:
     """Call the kernels of tracking and of geometry."""
     rng = np.random.default_rng(0)
-    pair = rig.pairs[0]
+    pair = rig.groups[0]
     width, height = pair.left.size_px
     tracker = PairTracker(pair, config)
     noise = rng.integers(0, 256, size=(height, width), dtype=np.uint8)

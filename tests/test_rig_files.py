@@ -571,10 +571,6 @@ def test_load_rig_basalt(tmp_path: Path) -> None:
         (lambda d: d.pop("gyro_bias_std"), r"value0.gyro_bias_std is missing"),
         (lambda d: d.update(accel_noise_std=[0.0, 0.0, 0.0]), r"imu: accel_noise_density is 0.0; it must be positive"),
         (lambda d: d.update(calib_gyro_bias=[0.0] * 3), r"value0.calib_gyro_bias: has shape"),
-        (
-            lambda d: [d[key].pop() for key in ("T_imu_cam", "intrinsics", "resolution")],
-            r"has one camera, cam0; graphvio needs at least one stereo pair",
-        ),
     ],
 )
 def test_load_rig_basalt_invalid_value_raises(

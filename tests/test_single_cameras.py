@@ -96,8 +96,9 @@ def test_with_only_keeps_pairs_and_makes_single_cameras_of_others() -> None:
     assert [group.name for group in chosen.groups] == ["front", "cam3"]
     with pytest.raises(RigError, match="there is no camera 'cam7'; choose from cam0, cam1, cam2, cam3"):
         rig.with_only(["0", "1", "7"])
-    with pytest.raises(RigError, match="none of its pairs is among 0, 2"):
-        rig.with_only(["0", "2"])
+    assert [group.name for group in rig.with_only(["0", "2"]).groups] == ["cam0", "cam2"]
+    with pytest.raises(RigError, match="cam0, cam2 without a stereo pair and without an IMU"):
+        rig.without_imu().with_only(["0", "2"])
 
 
 def test_with_only_takes_numbers_for_names_whatever_the_order() -> None:

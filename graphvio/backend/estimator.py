@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Protocol
 
-from graphvio.arrays import Float
+from graphvio.arrays import Float, Int
 from graphvio.backend.states import RigState, StateCovariance
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.gate_result import GateResult
@@ -34,10 +35,12 @@ class StateUpdate:
     Attributes:
         status: What the estimate is based on.
         needs_keyframe: As with `MeasurementUpdate`.
+        outliers: Of a rig without pairs, camera index -> identities of tracks that do not stand still.
     """
 
     status: Status
     needs_keyframe: bool = False
+    outliers: Mapping[int, Int] = field(default_factory=dict)
 
 
 class StateEstimator(Protocol):

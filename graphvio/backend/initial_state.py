@@ -68,7 +68,7 @@ def first_state_at(
         config: Configuration of the initialisation.
     """
     if imu is None:
-        attitude = InitialAttitude(level(-rig.pairs[0].left.body_T_cam[:3, 1]), 1e-3, np.zeros(3), 1.0, False)
+        attitude = InitialAttitude(level(-rig.groups[0].left.body_T_cam[:3, 1]), 1e-3, np.zeros(3), 1.0, False)
         speed_sigma = _UNKNOWN_SPEED_SIGMA
     else:
         attitude = initial_attitude(*imu, config)

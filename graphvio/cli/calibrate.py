@@ -84,6 +84,7 @@ def calibrate(
     is_of_pairs = _is_of_pairs(what, {"--correct-imu": correct_imu, "--guide": guide, "--scale": scale != "auto"})
     settings = Config.load(config)
     opened = open_recording(source, rig, settings, pairs=pairs, from_s=from_s, to_s=to_s, topics=topics)
+    opened.rig.need_pairs("graphvio calibrate")
     if not is_of_pairs:
         calibrate_rig(opened, settings, what, out, report)
         return

@@ -86,6 +86,8 @@ def optimize(
         open_recording(source, rig, settings, pairs=pairs, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics)
         for source in sources
     ]
+    for source in opened:
+        source.rig.need_pairs("graphvio optimize")
     folder = out
     if folder is None:
         folder = ResultWriter.new_folder(Path("results"), f"{opened[0].name}-optimized")

@@ -33,6 +33,9 @@ def run(
     ] = None,
     pairs: options.Pairs = None,
     cameras: options.Cameras = None,
+    no_pairs: Annotated[
+        bool, typer.Option("--no-pairs", help="Take each camera for a single one; the IMU shows the scale.")
+    ] = False,
     no_imu: options.NoImu = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,
@@ -68,8 +71,9 @@ def run(
 
     settings = Config.load(config)
     opened = open_recording(
-        source, rig, settings, pairs=pairs, cameras=cameras, no_imu=no_imu, from_s=from_s, to_s=to_s, topics=topics
-    )
+        source, rig, settings, pairs=pairs, cameras=cameras, no_pairs=no_pairs, no_imu=no_imu, from_s=from_s,
+        to_s=to_s, topics=topics,
+    )  # fmt: skip
     folder = out if out is not None else ResultWriter.new_folder(Path("results"), opened.name)
     with ExitStack() as stack:
         writer = stack.enter_context(ResultWriter(folder, opened.rig, settings.to_yaml()))

@@ -64,6 +64,7 @@ def open_recording(
     *,
     pairs: str | None = None,
     cameras: str | None = None,
+    no_pairs: bool = False,
     no_imu: bool = False,
     from_s: float | None,
     to_s: float | None,
@@ -77,7 +78,7 @@ def open_recording(
     loaded = None if rig is None else load_rig(rig)
     mapped = _topics(topics)
     opened = open_source(source, loaded, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
-    chosen = _choose(opened.rig, pairs, cameras, no_imu)
+    chosen = _choose(opened.rig, pairs, cameras, no_pairs, no_imu)
     if chosen is opened.rig:
         return opened
     return open_source(source, chosen, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
@@ -93,7 +94,7 @@ def _topics(text: str | None) -> dict[str, str]:
     return {name.strip(): topic.strip() for name, topic in pairs}
 
 
-def _choose(rig: Rig, pairs: str | None, cameras: str | None, no_imu: bool) -> Rig:
+def _choose(rig: Rig, pairs: str | None, cameras: str | None, no_pairs: bool, no_imu: bool) -> Rig:
     from graphvio.errors import RigError
 
     if pairs is not None:
@@ -104,6 +105,8 @@ def _choose(rig: Rig, pairs: str | None, cameras: str | None, no_imu: bool) -> R
         rig = rig.with_pairs(indices)
     if cameras is not None:
         rig = rig.with_only([name.strip() for name in cameras.split(",")])
+    if no_pairs:
+        rig = rig.without_pairs()
     return rig.without_imu() if no_imu else rig
 
 

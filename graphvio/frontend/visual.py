@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from graphvio.arrays import Float
+from graphvio.arrays import Float, Int
 from graphvio.config import Config
 from graphvio.frontend.agreement import Agreement, MotionHypothesis, agree, is_supported
 from graphvio.frontend.alignment import Misalignment
@@ -155,6 +155,11 @@ class VisualFrontend:
             return  # no image has come yet
         newest_ns = max(frame.stamp_ns for frame in self._latest.values())
         self._refer_to({j: frame for j, frame in self._latest.items() if frame.stamp_ns == newest_ns})
+
+    def drop(self, outliers: Mapping[int, Int]) -> None:
+        """Drop tracks that do not stand still: index of the pair or camera -> identities."""
+        for j, ids in outliers.items():
+            self._trackers[j].drop(ids)
 
     def close(self) -> None:
         """End the threads."""

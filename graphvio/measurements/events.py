@@ -65,6 +65,8 @@ class EventKind(StrEnum):
     """A motion does not start at the previous frameset, so that the paper's filter cannot use it; it is left out."""
     GATE_RESET = "gate_reset"
     """Vision was gated for too long; the smoother is reinitialised from vision, the filter's velocities are reset."""
+    SCALE_KNOWN = "scale_known"
+    """A rig of single cameras has moved so that the scale is known; poses are estimated from now on."""
     LOST = "lost"
     """The position is too uncertain to be reported."""
     NEW_EPOCH = "new_epoch"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -84,6 +85,18 @@ class RelativeMotion:
         return float(rotation), float(translation)
 
 
+class Sighting(NamedTuple):
+    """What one single camera sees at an instant.
+
+    Attributes:
+        ids: (N,) identities of its tracks, increasing.
+        rays: (N, 2) normalised coordinates.
+    """
+
+    ids: Int
+    rays: Float
+
+
 @dataclass(frozen=True, eq=False)
 class VisualResult:
     """The front-end's result for one frameset.
@@ -97,6 +110,7 @@ class VisualResult:
         own: At the end of a keyframe, pair index -> its own motion of body by the rig's extrinsics.
         is_stationary: Whether the images have shown no motion for a while.
         frozen: Pairs that were left out because a camera of theirs repeats an image.
+        sightings: Of a rig without pairs, camera index -> its tracks; the back-end then measures the motion.
         stage_ms: Processing time by stage, milliseconds: ``track``, with all pairs side by side; its parts ``pyramid``,
             ``register``, ``flow`` and ``stereo``, each of the pair that took longest; then ``motion``, ``quality``, and
             ``replenish``, which is next to nothing unless the reference changes.
@@ -111,3 +125,4 @@ class VisualResult:
     is_stationary: bool = False
     frozen: frozenset[int] = frozenset()
     stage_ms: Mapping[str, float] = field(default_factory=dict)
+    sightings: Mapping[int, Sighting] = field(default_factory=dict)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,12 +20,14 @@ from graphvio.config import Config
 from graphvio.errors import ConfigError, MeasurementError
 from graphvio.frontend.images import ImageMask
 from graphvio.frontend.rolling_shutter import ReadoutMotion
+from graphvio.frontend.singles import SinglesFrontend
 from graphvio.frontend.visual import VisualFrontend
 from graphvio.measurements.estimate import Estimate, Prediction, Status
 from graphvio.measurements.events import Event, EventKind
 from graphvio.measurements.imu_interval import ImuInterval
 from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement, calibrated_sample, checked_measurement
+from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.odometry.angular_rates import AngularRates
 from graphvio.odometry.assembly import estimate_of, estimate_without_pose, keyframe_of
 from graphvio.odometry.online_calibration import OnlineCalibration
@@ -46,6 +49,22 @@ class _Predicted(NamedTuple):
     is_initial: bool  # initialised there, not predicted
     interval: ImuInterval | None
     initialisations: int  # until then
+
+
+def _config_of(rig: Rig, config: Config) -> Config:
+    """Return the configuration as a rig allows it: the calibration of a rig without pairs is not estimated.
+
+    Raises:
+        ConfigError: If the configuration asks for what such a rig does not have.
+    """
+    if rig.pairs:
+        return config
+    if config.fusion.estimator == "filter" or config.fusion.estimate_time_offset:
+        raise ConfigError(
+            "the paper's filter and the estimation of the time offset need a stereo pair, and the rig has none; use "
+            "fusion.estimator: smoother and fusion.estimate_time_offset: false"
+        )
+    return replace(config, calibration=replace(config.calibration, online=False))
 
 
 class Odometry:
@@ -75,12 +94,13 @@ class Odometry:
         image_mask: ImageMask | None = None,
     ) -> None:
         self.rig = rig
-        self.config = config or Config()
+        self.config = _config_of(rig, config or Config())
         self.stage_ms: dict[str, float] = {}
-        self._frontend = VisualFrontend(rig, self.config, image_mask)
+        self._frontend = (VisualFrontend if rig.pairs else SinglesFrontend)(rig, self.config, image_mask)
         self._synchroniser = Synchroniser(rig, self.config, self.report)
+        self._monocular = None if rig.pairs else MonocularEstimator(rig, self.config, self.report)
         estimator = FilterEstimator if self.config.fusion.estimator == "filter" else SmootherEstimator
-        self._estimator: StateEstimator = estimator(rig, self.config, self.report)
+        self._estimator: StateEstimator = self._monocular or estimator(rig, self.config, self.report)
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._time_offset = TimeOffsetCorrection(rig, self.config, self._synchroniser, self.report)
         self._calibration = OnlineCalibration(rig, self.config, self._frontend, self._synchroniser, self.report)
@@ -118,7 +138,10 @@ class Odometry:
                 measurement = calibrated_sample(measurement, self.rig.imu)
             for sample in self._synchroniser.add_sample(measurement):
                 self._calibration.add_sample(sample)
-                self._propagate(*self._synchroniser.corrected(sample))
+                corrected = self._synchroniser.corrected(sample)
+                if self._monocular is not None:
+                    self._monocular.add_sample(*corrected)
+                self._propagate(*corrected)
         else:
             self._synchroniser.add_frameset(measurement)
         return self.process_due()
@@ -251,6 +274,8 @@ class Odometry:
         is_stationary = visual.is_stationary and self._imu_shows_standstill(predicted.interval)
         applied = self._gate(visual, is_stationary)
         status = self._update(predicted, visual, applied)
+        if self._monocular is not None and not self._monocular.has_pose:
+            return estimate_without_pose(frameset.stamp_ns, visual, self.stage_ms)
         return self._publish(frameset, predicted, visual, is_stationary, applied, status)
 
     @timed("predict")
@@ -294,6 +319,7 @@ class Odometry:
         )
         if update.needs_keyframe:
             self._frontend.start_keyframe()
+        self._frontend.drop(update.outliers)
         self._synchroniser.forget_before(stamp_ns)
         self._restart_prediction(stamp_ns, update.status)
         self._time_offset.update(stamp_ns, visual)
@@ -393,7 +419,7 @@ class Odometry:
 
     def _restart_prediction(self, stamp_ns: int, status: Status) -> None:
         """Predict from the new estimate from now on."""
-        if status is Status.LOST:
+        if status is Status.LOST or (self._monocular is not None and not self._monocular.has_pose):
             self._propagator.forget()
             return
         estimator, rate = self._estimator, self._estimator.latest_rate()

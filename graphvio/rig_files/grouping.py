@@ -28,7 +28,7 @@ _GRID = 12
 def grouped_rig(cameras: Sequence[Camera], imu: Imu | None, name: str, path: Path) -> Rig:
     """Form a rig of cameras in a file's order: pairs (0, 1), (2, 3) and so on if each of them overlaps.
 
-    Otherwise the cameras that overlap most form pairs, and the others are single cameras.
+    Otherwise the cameras that overlap most form pairs, and the others are single cameras; with an IMU, all may be.
 
     Args:
         cameras: of the file.
@@ -37,22 +37,26 @@ def grouped_rig(cameras: Sequence[Camera], imu: Imu | None, name: str, path: Pat
         path: of the file, for messages.
 
     Raises:
-        RigError: if no two cameras overlap, or the cameras do not describe a usable rig.
+        RigError: if no two cameras overlap and there is no IMU, or the cameras do not describe a usable rig.
     """
     if not cameras:
         raise RigError(f"{path}: describes no camera; give a rig.yaml, or a calibration of at least two cameras")
-    if len(cameras) == 1:
-        raise RigError(f"{path}: has one camera, {cameras[0].name}; graphvio needs at least one stereo pair")
+    if len(cameras) == 1 and imu is None:
+        raise RigError(
+            f"{path}: has one camera, {cameras[0].name}, and no IMU, so that the scale cannot be known; graphvio needs "
+            "a stereo pair or an IMU"
+        )
     couples = [(i, i + 1) for i in range(0, len(cameras) - 1, 2)]
     if len(cameras) > 2 and (
         len(cameras) % 2 or any(overlap(cameras[i], cameras[j]) < _MIN_OVERLAP for i, j in couples)
     ):
         couples = _overlapping(cameras)
-        if not couples:
+        if not couples and imu is None:
             names = ", ".join(camera.name for camera in cameras)
             raise RigError(
-                f"{path}: no two of the cameras {names} see the same part of the scene; graphvio needs at least one "
-                "stereo pair: check the direction of body_T_cam, or write a rig.yaml that says which cameras form pairs"
+                f"{path}: no two of the cameras {names} see the same part of the scene, and there is no IMU; graphvio "
+                "needs a stereo pair or an IMU: check the direction of body_T_cam, or write a rig.yaml that says "
+                "which cameras form pairs"
             )
     pairs = [StereoPair(f"pair{k}", cameras[i], cameras[j]) for k, (i, j) in enumerate(couples)]
     paired = {i for couple in couples for i in couple}

@@ -60,8 +60,8 @@ def parse(text: str, path: Path) -> Rig:
     if version == 1 and _SINGLES_KEY in document.values:
         raise RigError(f"{document.where(_SINGLES_KEY)}: is of version 2; write  {VERSION_KEY}: 2")
     document.only((*_RIG_KEYS, _SINGLES_KEY))
-    given = document.get("pairs")
-    if not isinstance(given, list) or not given:
+    given = document.values.get("pairs", []) if _SINGLES_KEY in document.values else document.get("pairs")
+    if not isinstance(given, list) or not (given or _SINGLES_KEY in document.values):
         raise RigError(f"{path}: pairs must be a list of at least one pair, each with left and right")
     with named(path):
         pairs = tuple(_pair(document.nested(value, f"pairs[{i}]"), i) for i, value in enumerate(given))
@@ -110,7 +110,8 @@ def to_text(rig: Rig, folder: Path) -> str:
         if rig.imu.has_matrices:
             for key, matrix in zip(_IMU_MATRICES, rig.imu.matrices, strict=True):
                 lines += [f"  {key}:", *(f"    - {_numbers(row)}" for row in matrix)]
-    lines.append("pairs:")
+    if rig.pairs:
+        lines.append("pairs:")
     for pair in rig.pairs:
         lines.append(f"  - name: {_quoted(pair.name)}")
         for side, camera in (("left", pair.left), ("right", pair.right)):

@@ -33,6 +33,7 @@ class FrontEnd:
     """
 
     def __init__(self, odometry: Odometry) -> None:
+        odometry.rig.need_pairs("a SLAM system behind the odometry")
         self.log = KeyframeLog()
         self._odometry = odometry
         self._map_frame = MapFrame(odometry.config.keyframes.gate_probability)

@@ -1,0 +1,96 @@
+"""The front-end of a rig of single cameras: tracks of each camera, and keyframes; motion is the back-end's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from graphvio.frontend.images import checked
+from graphvio.frontend.thresholds import THRESHOLDS
+from graphvio.frontend.tracks import PairFrame, common_rows
+from graphvio.frontend.visual import MotionPredictor, VisualFrontend
+from graphvio.measurements.motion import PairReport, Quality, Sighting, VisualResult
+from graphvio.measurements.sensors import FrameSet
+
+_MIN_PARALLAX = 0.01  # median displacement of rays since a keyframe: with less, the rig has not moved
+_MAX_PARALLAX = 0.06  # with more, a keyframe is due
+_MIN_INTERVAL_NS = 140_000_000  # between keyframes while there is no motion to predict tracks by
+
+
+class SinglesFrontend(VisualFrontend):
+    """Tracks every camera, and decides when a keyframe begins."""
+
+    def process(self, frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
+        """Track the corners of a frameset.
+
+        Args:
+            frameset: Images of any subset of cameras.
+            predict: The back-end's prediction, from which the search begins.
+
+        Raises:
+            RigError: If an image does not fit the rig; nothing has changed then.
+        """
+        self.stage_ms = {}
+        seen = self._track(checked(frameset, self._rig), predict)
+        is_stationary = self._standstill.update(seen.frames, {j: frame.ids for j, frame in seen.frames.items()})
+        reports = {
+            j: PairReport(
+                len(frame.ids), len(frame.ids), frame.pixels, np.ones(len(frame.ids), dtype=bool), frame.ages,
+                frame.rejected,
+            )
+            for j, frame in seen.frames.items()
+        }  # fmt: skip
+        if not self._all_frozen and self._is_keyframe(seen.stamp_ns, seen.frames, predict, is_stationary):
+            reference = next(iter(seen.reference.values()), None)
+            cur_T_reference = None if reference is None else predict(reference.stamp_ns)
+            if reference is not None and cur_T_reference is not None:
+                self._history.advance(reference.stamp_ns, seen.stamp_ns, cur_T_reference, np.zeros((6, 6)))
+            seen = seen._replace(frames=self._refer_to(seen.frames))
+        sightings = {j: Sighting(frame.ids, frame.left) for j, frame in seen.frames.items()}
+        tracked = sum(int((frame.ages > 0).sum()) for frame in seen.frames.values())
+        is_good = tracked >= self._config.motion.min_inliers
+        return VisualResult(
+            None,
+            Quality.GOOD if is_good or not seen.reference else Quality.FAILED,
+            "" if is_good else f"only {tracked} points in view",
+            reports,
+            is_stationary=is_stationary,
+            frozen=seen.frozen.pairs,
+            stage_ms=self.stage_ms,
+            sightings={} if self._all_frozen else sightings,
+        )
+
+    def _is_keyframe(
+        self, stamp_ns: int, frames: dict[int, PairFrame], predict: MotionPredictor, is_stationary: bool
+    ) -> bool:
+        """Decide whether later tracks are registered on these images, and a state of the window stays."""
+        if any(self._references.of(j) is None for j in frames):
+            return True
+        if is_stationary:
+            return False
+        parallaxes = []
+        overlap, of_reference = 0, 0
+        since_ns, cur_T_reference = 0, None
+        for j, frame in frames.items():
+            reference = self._references.of(j)
+            assert reference is not None
+            if cur_T_reference is None:
+                since_ns = stamp_ns - reference.stamp_ns
+                cur_T_reference = predict(reference.stamp_ns)
+            then, now = common_rows(reference.ids, frame.ids)
+            overlap, of_reference = overlap + len(then), of_reference + len(reference.ids)
+            share = self._config.motion.keyframe_overlap * THRESHOLDS.reference.min_pair_share
+            if len(then) < share * len(reference.ids):
+                return True
+            rays = np.column_stack([reference.left[then], np.ones(len(then))])
+            if cur_T_reference is not None:
+                body_R_cam = self._places.arrays.body_T_left[j][:3, :3]
+                rays = rays @ (body_R_cam.T @ cur_T_reference[:3, :3] @ body_R_cam).T
+            ahead = rays[:, 2] > 0.1
+            moved = frame.left[now][ahead] - rays[ahead, :2] / rays[ahead, 2:]
+            parallaxes.append(np.hypot(moved[:, 0], moved[:, 1]))
+        if overlap < self._config.motion.keyframe_overlap * of_reference:
+            return True
+        parallax = float(np.median(np.concatenate(parallaxes))) if parallaxes else 0.0
+        if cur_T_reference is None:
+            return parallax > _MIN_PARALLAX and since_ns >= _MIN_INTERVAL_NS
+        return parallax > _MAX_PARALLAX

@@ -1,0 +1,315 @@
+"""Adjustment of the states of a window: reprojection errors, the IMU between states, and what left the window before.
+
+Unknowns are ``[poses 6 K, velocities 3 K, gravity 3, gyro and accelerometer bias 6]`` of K states; the landmarks are
+eliminated. Biases are the same in the whole window; they walk when a state leaves it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.geometry import so3_exp, so3_log
+from graphvio.linear_algebra import cholesky, solve_lower, solve_symmetric
+from graphvio.measurements.sensors import GRAVITY_M_S2
+from graphvio.monocular.structure import (
+    Cameras,
+    Eliminated,
+    Structure,
+    landmarks_after,
+    located,
+    visual_equations,
+)
+from graphvio.self_calibration.imu_model import PARAMETERS
+from graphvio.self_calibration.inertial import InertialSamples, InertialStates, inertial_equations
+
+BIASES, GRAVITY = 6, 3
+_ROBUST_SCALE = 2.5  # of the Cauchy cost, in standard deviations
+_CONVERGED = 1e-4  # radians, metres, m/s
+_GRAVITY_NORM_SIGMA = 0.02
+ZERO_VELOCITY_SIGMA = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """K states of a window, in time order.
+
+    Attributes:
+        stamps_ns: (K,).
+        poses: (K, 4, 4) ``odom_T_body``.
+        velocities: (K, 3) m/s, frame odom.
+        gravity: (3,) m/s^2, frame odom, downwards.
+        biases: (6,) of gyro, rad/s, and accelerometer, m/s^2.
+    """
+
+    stamps_ns: Int
+    poses: Float
+    velocities: Float
+    gravity: Float
+    biases: Float
+
+    @property
+    def parameters(self) -> Float:
+        """Parameters (25,) of the IMU, see `graphvio.self_calibration.imu_model`."""
+        return np.concatenate([self.biases, np.zeros(PARAMETERS - BIASES)])
+
+    def of(self, kept: Int) -> States:
+        """Return some of the states, by their indices."""
+        return replace(self, stamps_ns=self.stamps_ns[kept], poses=self.poses[kept], velocities=self.velocities[kept])
+
+    def moved(self, step: Float) -> States:
+        """Return the states after a step of all unknowns."""
+        n = len(self.poses)
+        poses = self.poses.copy()
+        for pose, of_pose in zip(poses, step[: 6 * n].reshape(n, 6), strict=True):
+            pose[:3, 3] += pose[:3, :3] @ of_pose[3:]
+            pose[:3, :3] = pose[:3, :3] @ so3_exp(of_pose[:3].copy())
+        velocities = step[6 * n : 9 * n].reshape(n, 3)
+        gravity, biases = step[9 * n : 9 * n + GRAVITY], step[9 * n + GRAVITY :]
+        return replace(
+            self,
+            poses=poses,
+            velocities=self.velocities + velocities,
+            gravity=self.gravity + gravity,
+            biases=self.biases + biases,
+        )
+
+    def since(self, other: States) -> Float:
+        """Return the difference of all unknowns from other values of the same states."""
+        n = len(self.poses)
+        difference = np.empty(9 * n + GRAVITY + BIASES)
+        for k in range(n):
+            then_R_odom = other.poses[k, :3, :3].T
+            difference[6 * k : 6 * k + 3] = so3_log(np.ascontiguousarray(then_R_odom @ self.poses[k, :3, :3]))
+            difference[6 * k + 3 : 6 * k + 6] = then_R_odom @ (self.poses[k, :3, 3] - other.poses[k, :3, 3])
+        difference[6 * n : 9 * n] = (self.velocities - other.velocities).ravel()
+        difference[9 * n :] = np.concatenate([self.gravity - other.gravity, self.biases - other.biases])
+        return difference
+
+
+class Prior(NamedTuple):
+    """What is known of the first states of a window, of gravity and of the biases.
+
+    Attributes:
+        at: the m states at which it was linearised.
+        information: (9 m + 9, 9 m + 9).
+        gradient: (9 m + 9,) of the cost at these.
+    """
+
+    at: States
+    information: Float
+    gradient: Float
+
+
+class Measurements(NamedTuple):
+    """Measurements of a window.
+
+    Attributes:
+        cameras: of the rig.
+        structure: views of landmarks.
+        sigma_px: noise of a corner's position.
+        samples: of the IMU, whose keyframes are the states.
+        stationary: (K,) of states, which do not move.
+    """
+
+    cameras: Cameras
+    structure: Structure
+    sigma_px: float
+    samples: InertialSamples
+    stationary: Int
+
+
+class Equations(NamedTuple):
+    """Normal equations of all unknowns; a step is ``-solve(hessian, gradient)``."""
+
+    hessian: Float
+    gradient: Float
+    cost: float
+    errors2: Float
+    imu_errors2: Float
+    eliminated: Eliminated
+
+
+class Adjusted(NamedTuple):
+    """The outcome of an adjustment.
+
+    Attributes:
+        states: adjusted.
+        landmarks: (L, 3).
+        equations: at these.
+    """
+
+    states: States
+    landmarks: Float
+    equations: Equations
+
+
+def equations(measured: Measurements, states: States, landmarks: Float, prior: Prior | None) -> Equations:
+    """Linearise all errors of a window."""
+    n = len(states.poses)
+    eliminated = Eliminated.empty(measured.structure)
+    by_poses, gradient_of_poses, cost, errors2 = visual_equations(
+        states.poses, measured.cameras, landmarks, measured.structure, measured.sigma_px, _ROBUST_SCALE, eliminated
+    )
+    inertial = inertial_equations(
+        measured.samples, InertialStates(states.poses, states.velocities, states.gravity, states.parameters)
+    )
+    size = 9 * n + GRAVITY + BIASES
+    hessian, gradient = inertial.hessian[:size, :size].copy(), inertial.gradient[:size].copy()
+    hessian[: 6 * n, : 6 * n] += by_poses
+    gradient[: 6 * n] += gradient_of_poses
+    cost += inertial.cost
+    for k in measured.stationary:
+        at = 6 * n + 3 * int(k) + np.arange(3)
+        hessian[at, at] += 1.0 / ZERO_VELOCITY_SIGMA**2
+        gradient[at] += states.velocities[k] / ZERO_VELOCITY_SIGMA**2
+        cost += 0.5 * float(states.velocities[k] @ states.velocities[k]) / ZERO_VELOCITY_SIGMA**2
+    norm = float(np.linalg.norm(states.gravity))
+    along, excess = states.gravity / norm, norm - GRAVITY_M_S2
+    of_gravity = slice(9 * n, 9 * n + GRAVITY)
+    hessian[of_gravity, of_gravity] += np.outer(along, along) / _GRAVITY_NORM_SIGMA**2
+    gradient[of_gravity] += along * excess / _GRAVITY_NORM_SIGMA**2
+    cost += 0.5 * (excess / _GRAVITY_NORM_SIGMA) ** 2
+    if prior is not None:
+        m = len(prior.at.poses)
+        off = states.of(np.arange(m)).since(prior.at)
+        columns = _columns(n, np.arange(m))
+        pull = prior.information @ off
+        hessian[np.ix_(columns, columns)] += prior.information
+        gradient[columns] += prior.gradient + pull
+        cost += float(prior.gradient @ off + 0.5 * off @ pull)
+    return Equations(hessian, gradient, cost, errors2, inertial.errors2, eliminated)
+
+
+def adjust(measured: Measurements, states: States, landmarks: Float, prior: Prior | None, max_steps: int) -> Adjusted:
+    """Minimise all errors of a window by Levenberg and Marquardt.
+
+    Raises:
+        numpy.linalg.LinAlgError: if the equations have no solution.
+    """
+    landmarks = located(states.poses, measured.cameras, landmarks, measured.structure, measured.sigma_px, False)
+    at = equations(measured, states, landmarks, prior)
+    damping = 1e-8
+    for _ in range(max_steps):
+        diagonal = np.diag(np.diag(at.hessian))
+        step = -solve_symmetric(at.hessian + damping * diagonal, at.gradient)
+        if not np.isfinite(step).all():
+            raise np.linalg.LinAlgError("the window's solution is not finite")
+        moved = states.moved(step)
+        shifted = landmarks_after(landmarks, measured.structure, at.eliminated, step)
+        new = equations(measured, moved, shifted, prior)
+        if new.cost <= at.cost:
+            states, landmarks, at = moved, shifted, new
+            damping = max(0.1 * damping, 1e-9)
+            if np.abs(step).max() < _CONVERGED:
+                break
+        else:
+            damping = max(100.0 * damping, 1e-5)
+    return Adjusted(states, landmarks, at)
+
+
+def without_first(measured: Measurements, states: States, landmarks: Float, prior: Prior | None, walk: Float) -> Prior:
+    """Eliminate the first state of a window, with the landmarks that it sees.
+
+    Args:
+        measured: with the landmarks that the first state sees, and no others.
+        states: all K of the window.
+        landmarks: (L, 3).
+        prior: until now.
+        walk: (6,) variances by which the biases walk until the second state.
+
+    Returns:
+        What is known of the other states.
+    """
+    n = len(states.poses)
+    eliminated = Eliminated.empty(measured.structure)
+    by_poses, of_poses, _, _ = visual_equations(
+        states.poses, measured.cameras, landmarks, measured.structure, measured.sigma_px, _ROBUST_SCALE, eliminated
+    )
+    size = 9 * n + GRAVITY + BIASES
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    hessian[: 6 * n, : 6 * n] += by_poses
+    gradient[: 6 * n] += of_poses
+    if n > 1:
+        two = states.of(np.arange(2))
+        first = measured.samples._replace(keyframes_ns=measured.samples.keyframes_ns[:2])
+        inertial = inertial_equations(first, InertialStates(two.poses, two.velocities, two.gravity, two.parameters))
+        columns, known = _columns(n, np.arange(2)), 18 + GRAVITY + BIASES
+        hessian[np.ix_(columns, columns)] += inertial.hessian[:known, :known]
+        gradient[columns] += inertial.gradient[:known]
+    if 0 in measured.stationary:
+        at = 6 * n + np.arange(3)
+        hessian[at, at] += 1.0 / ZERO_VELOCITY_SIGMA**2
+        gradient[at] += states.velocities[0] / ZERO_VELOCITY_SIGMA**2
+    if prior is not None:
+        m = len(prior.at.poses)
+        off = states.of(np.arange(m)).since(prior.at)
+        columns = _columns(n, np.arange(m))
+        hessian[np.ix_(columns, columns)] += prior.information
+        gradient[columns] += prior.gradient + prior.information @ off
+    leaving, kept = _columns(n, np.arange(1))[:9], _columns(n, np.arange(1, n))
+    gain = np.linalg.solve(hessian[np.ix_(leaving, leaving)], hessian[np.ix_(leaving, kept)]).T
+    information = hessian[np.ix_(kept, kept)] - gain @ hessian[np.ix_(leaving, kept)]
+    pulled = gradient[kept] - gain @ gradient[leaving]
+    information, pulled = _walked(information, pulled, walk)
+    return Prior(states.of(np.arange(1, n)), 0.5 * (information + information.T), pulled)
+
+
+def _walked(information: Float, gradient: Float, walk: Float) -> tuple[Float, Float]:
+    """Let the biases, the last unknowns, walk by variances (6,)."""
+    steps = np.diag(1.0 / walk)
+    own, others = slice(-BIASES, None), slice(0, -BIASES)
+    inverse = np.linalg.inv(information[own, own] + steps)
+    walked = information.copy()
+    coupled = information[others, own]
+    walked[others, others] -= coupled @ inverse @ coupled.T
+    walked[others, own] = coupled @ inverse @ steps
+    walked[own, others] = walked[others, own].T
+    walked[own, own] = steps - steps @ inverse @ steps
+    pulled = gradient.copy()
+    pulled[others] -= coupled @ inverse @ gradient[own]
+    pulled[own] = steps @ inverse @ gradient[own]
+    return walked, pulled
+
+
+def first_prior(states: States, bias_sigmas: Float, biases: Float, pose_sigmas: Float) -> Prior:
+    """Return what is known of a window's first state: its pose defines the frame; and of the biases."""
+    first = replace(states.of(np.arange(1)), biases=biases)
+    information = np.diag(np.concatenate([1.0 / pose_sigmas**2, np.zeros(6), 1.0 / bias_sigmas**2]))
+    return Prior(first, information, np.zeros(len(information)))
+
+
+def covariance_of(hessian: Float, unknowns: Int) -> Float:
+    """Return the joint covariance of some unknowns, from the Hessian of all.
+
+    Raises:
+        numpy.linalg.LinAlgError: if it is not positive definite.
+    """
+    chosen = np.zeros((len(unknowns), len(hessian)))
+    chosen[np.arange(len(unknowns)), unknowns] = 1.0
+    whitened = solve_lower(cholesky(hessian), chosen)
+    if not np.isfinite(whitened).all():
+        raise np.linalg.LinAlgError("the window's equations determine no covariance")
+    return np.asarray(whitened @ whitened.T)
+
+
+def scale_sigma(states: States, hessian: Float) -> float:
+    """Return the standard deviation of the scale of the positions, as a share, from the Hessian of all unknowns."""
+    n = len(states.poses)
+    centred = states.poses[:, :3, 3] - states.poses[:, :3, 3].mean(axis=0)
+    along = np.zeros(6 * n)
+    for k in range(n):  # the perturbation is in body's axes
+        along[6 * k + 3 : 6 * k + 6] = states.poses[k, :3, :3].T @ centred[k]
+    size2 = float((centred**2).sum())
+    covariance = covariance_of(hessian, np.arange(6 * n))
+    return float(np.sqrt(along @ covariance @ along)) / max(size2, 1e-12)
+
+
+def _columns(n: int, states: Int) -> Int:
+    """Return where ``[poses, velocities, gravity, biases]`` of some of n states are among all unknowns."""
+    poses = (6 * states[:, None] + np.arange(6)).ravel()
+    velocities = (6 * n + 3 * states[:, None] + np.arange(3)).ravel()
+    return np.concatenate([poses, velocities, 9 * n + np.arange(GRAVITY + BIASES)])

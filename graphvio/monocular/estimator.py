@@ -1,0 +1,398 @@
+"""State of a rig of single cameras and an IMU: a window of keyframes with landmarks, solved at each frameset.
+
+Scale is part of the state: positions are in metres by the accelerometer, and their covariance has what is not known of
+the scale. Until an `Initialiser` knows it there is no pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from graphvio.arrays import Float, Int
+from graphvio.backend.estimator import MeasurementUpdate, StateUpdate
+from graphvio.backend.initialisation import initial_attitude
+from graphvio.backend.states import RigState, StateCovariance, level_gravity, tilt_covariance
+from graphvio.config import Config
+from graphvio.geometry import se3, se3_inverse
+from graphvio.measurements.estimate import Status
+from graphvio.measurements.events import EventKind, Report
+from graphvio.measurements.gate_result import GateResult
+from graphvio.measurements.imu_interval import ImuInterval
+from graphvio.measurements.motion import Sighting, VisualResult
+from graphvio.measurements.sensors import GRAVITY_M_S2
+from graphvio.monocular.adjustment import (
+    Adjusted,
+    Measurements,
+    States,
+    adjust,
+    covariance_of,
+    first_prior,
+    without_first,
+)
+from graphvio.monocular.initialiser import MAX_ERROR2, MAX_KEYFRAMES, POSE_SIGMAS, Initialiser, Window
+from graphvio.monocular.sightings import far_off
+from graphvio.monocular.structure import Cameras, Structure, located
+from graphvio.rig import Rig
+from graphvio.self_calibration.inertial import InertialSamples
+from graphvio.self_calibration.preintegration import covering_samples, preintegrate
+
+_FIRST_SIGMA_PX, _MIN_SIGMA_PX, _MAX_SIGMA_PX = 0.3, 0.12, 0.6
+_NOISE_FACTOR = 2.0  # on the noise that residuals show: views of one track are correlated
+_NOISE_GAIN = 0.1  # of one keyframe
+_RAYLEIGH_MEDIAN = 1.1774
+_STEPS, _KEYFRAME_STEPS = 2, 3
+_MAX_OFF = 0.3
+_MIN_LANDMARKS = 8  # that constrain the newest state
+_MIN_FITTING = 0.3  # share of the landmarks
+_MAX_CONTRADICTION_NS = 1_000_000_000
+_MAX_IMU_ERROR2 = 150.0
+_MARGIN_NS = 100_000_000
+_REPORT_AFTER_NS = 5_000_000_000
+_POSE_AND_GRAVITY = np.r_[0:6, 9:12]
+_NO_COVARIANCE = StateCovariance(np.zeros((6, 6)))
+
+
+class MonocularEstimator:
+    """A `graphvio.backend.estimator.StateEstimator` of single cameras and an IMU.
+
+    Args:
+        rig: Single cameras and an IMU.
+        config: Configuration of all stages.
+        report: Receives events.
+    """
+
+    def __init__(self, rig: Rig, config: Config, report: Report) -> None:
+        assert rig.imu is not None
+        self.epoch = 0
+        self.covariance = _NO_COVARIANCE
+        self.gate_results: dict[str, GateResult] = {}
+        self.initialisations = 0
+        self._config = config
+        self._imu = rig.imu
+        self._report = report
+        self._cameras = Cameras(
+            np.array([single.left.body_T_cam for single in rig.singles]),
+            np.array([single.left.focal_px for single in rig.singles]),
+        )
+        self._stamps: list[int] = []  # of the IMU's samples, on the framesets' clock
+        self._readings: list[Float] = []
+        self._samples: tuple[Int, Float] = (np.zeros(0, dtype=np.int64), np.zeros((0, 6)))  # of the step before
+        self._noise = config.smoother.imu_noise_scale * np.array(
+            [rig.imu.gyro_noise_density, rig.imu.accel_noise_density]
+        )
+        self._has_imu = self._is_initialised = False
+        self._max_gap_ns = round(config.timing.max_imu_gap_ms * 1e6)
+        self._sigma_px = _FIRST_SIGMA_PX
+        self._initialiser = self._new_initialiser()
+        self._window: Window | None = None
+        self._latest_ns = 0
+        self._since_ns = 0  # of the initialisation
+        self._is_reported = False
+        self._is_keyframe = True  # the newest state of the window
+        self._before: tuple[int, Float] | None = None  # the state before the newest one, where it has left the window
+        self._sightings: dict[int, Sighting] = {}
+        self._is_stationary = False
+        self._tracked_sigma_m = 0.0
+        self._contradicted_since_ns: int | None = None
+        self._rate: Float | None = None
+        self._final: list[tuple[int, Float]] = []
+
+    # ------------------------------------------------------------------ what is known
+
+    @property
+    def is_initialised(self) -> bool:
+        """Whether keyframes are collected, at least."""
+        return self._is_initialised
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the scale is known, and with it a pose."""
+        return self._window is not None
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether the IMU has come."""
+        return self._has_imu
+
+    @property
+    def latest_ns(self) -> int:
+        """Stamp of the newest frameset."""
+        return self._latest_ns
+
+    def state(self) -> RigState:
+        """Return the newest state."""
+        if self._window is None:
+            return RigState(np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3))
+        states = self._window.states
+        return RigState(states.poses[-1], states.velocities[-1], states.biases[:3], states.biases[3:], states.gravity)
+
+    def latest_rate(self) -> Float | None:
+        """Return the mean angular rate (3,) rad/s over the newest step, or None if it is not known."""
+        return self._rate
+
+    def motion_since(self, then_ns: int) -> Float | None:
+        """Return ``now_T_then`` (4, 4) of body from a state of the window, or the one before the newest."""
+        if self._window is None:
+            return None
+        states = self._window.states
+        found = np.flatnonzero(states.stamps_ns == then_ns)
+        if len(found):
+            then = states.poses[found[0]]
+        elif self._before is not None and self._before[0] == then_ns:
+            then = self._before[1]
+        else:
+            return None
+        return np.ascontiguousarray(se3_inverse(states.poses[-1]) @ then)
+
+    def covariance_since(self, then_ns: int) -> Float | None:
+        """Return None: relative motions are not used."""
+        return None
+
+    def take_final(self) -> list[tuple[int, Float]]:
+        """Return stamps and poses ``nav_T_body`` of keyframes that left the window since the last call."""
+        taken, self._final = self._final, []
+        return taken
+
+    def finish(self) -> None:
+        """Declare all poses of the window final."""
+        if self._window is not None:
+            states = self._window.states
+            self._final += [(int(ns), pose) for ns, pose in zip(states.stamps_ns, states.poses, strict=True)]
+
+    # ------------------------------------------------------------------ one frameset
+
+    def add_sample(self, stamp_ns: int, values: Float) -> None:
+        """Take an IMU sample (6,), stamped on the framesets' clock."""
+        self._stamps.append(stamp_ns)
+        self._readings.append(values)
+
+    def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
+        """Begin to collect keyframes."""
+        if imu is None and not self._is_initialised:
+            self._report(stamp_ns, EventKind.STARTED_WITHOUT_IMU, "no IMU samples came: the scale cannot be known")
+        self._is_initialised, self._has_imu = True, imu is not None
+        self._latest_ns = self._since_ns = stamp_ns
+        if imu is not None:
+            attitude = initial_attitude(*imu, self._config.initialisation)
+            if attitude.is_stationary:
+                self._initialiser.know_gyro_bias(attitude.gyro_bias, attitude.gyro_bias_sigma)
+
+    def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
+        """Add a state by the IMU; where it does not cover the step, the epoch ends."""
+        self.gate_results = {}
+        self._rate = None
+        window, before_ns = self._window, self._latest_ns
+        self._collect_samples()
+        self._latest_ns = stamp_ns
+        if not self._covers(before_ns, stamp_ns):
+            self._lose(stamp_ns, "the IMU does not cover the step to this frameset")
+            return False
+        if window is None:
+            return False
+        states = window.states
+        step = preintegrate(*self._samples, before_ns, stamp_ns, states.parameters, self._noise, self._max_gap_ns)
+        pose, velocity, dt = states.poses[-1], states.velocities[-1], step.duration_s
+        moved = pose[:3, 3] + dt * velocity + 0.5 * dt**2 * states.gravity + pose[:3, :3] @ step.position
+        if interval is not None:
+            self._rate = interval.mean_rate - states.biases[:3]
+        self._before = int(states.stamps_ns[-1]), pose
+        n = len(states.poses) if self._is_keyframe or len(states.poses) < 2 else len(states.poses) - 1
+        del window.views[n:], window.stationary[n:]
+        window.states = replace(
+            states,
+            stamps_ns=np.append(states.stamps_ns[:n], stamp_ns),
+            poses=np.concatenate([states.poses[:n], se3(pose[:3, :3] @ step.rotation, moved)[None]]),
+            velocities=np.concatenate(
+                [states.velocities[:n], (velocity + dt * states.gravity + pose[:3, :3] @ step.velocity)[None]]
+            ),
+        )
+        return False
+
+    def apply(self, visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
+        """Take what the cameras see; it is tested when the window is solved."""
+        self._sightings, self._is_stationary = dict(visual.sightings), is_stationary
+        return MeasurementUpdate(None)
+
+    def update(self, stamp_ns: int, is_constrained: bool, keep: frozenset[int]) -> StateUpdate:
+        """Solve the window, or look for the scale."""
+        is_keyframe = stamp_ns in keep
+        if self._window is None:
+            return self._initialising(stamp_ns, is_keyframe)
+        try:
+            return self._solve(self._window, stamp_ns, is_keyframe)
+        except np.linalg.LinAlgError as error:
+            self._lose(stamp_ns, str(error))
+            return StateUpdate(Status.LOST)
+
+    def _initialising(self, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
+        """Collect keyframes, and begin the window once the scale is known."""
+        if self._has_imu and (is_keyframe or self._is_stationary):
+            window = self._initialiser.add(stamp_ns, self._sightings, self._is_stationary)
+            if window is not None:
+                self._window, self._is_keyframe, self._before = window, True, None
+                self.initialisations += 1
+                self._report(
+                    stamp_ns,
+                    EventKind.SCALE_KNOWN,
+                    f"the scale is known to 5 % after {(stamp_ns - self._since_ns) * 1e-9:.1f} s",
+                )
+                return self._solve(window, stamp_ns, is_keyframe, is_new=True)
+        if not self._is_reported and stamp_ns - self._since_ns > _REPORT_AFTER_NS:
+            self._is_reported = True
+            self._report(
+                stamp_ns,
+                EventKind.NOT_INITIALISED,
+                f"{(stamp_ns - self._since_ns) * 1e-9:.1f} s after the initialisation {self._initialiser.reason}; go "
+                "on moving: speed up, brake and turn",
+            )
+        return StateUpdate(Status.INITIALISING)
+
+    def _solve(self, window: Window, stamp_ns: int, is_keyframe: bool, is_new: bool = False) -> StateUpdate:
+        if not is_new:
+            window.views.append(window.names.join(self._sightings))
+            window.stationary.append(self._is_stationary)
+        self._is_keyframe = is_keyframe
+        structure, places, ids = window.landmarks.structure(window.views, window.states.poses, self._cameras)
+        measured = self._measured(window, structure)
+        adjusted = adjust(measured, window.states, places, window.prior, _KEYFRAME_STEPS if is_keyframe else _STEPS)
+        window.states = adjusted.states
+        window.landmarks.put(adjusted.landmarks)
+        off = far_off(structure, adjusted.equations.errors2, MAX_ERROR2, _MAX_OFF)
+        newest = window.views[-1]
+        seen = np.isin(ids, newest.landmark)
+        fitting = int((seen & ~off).sum())
+        is_tracking = fitting >= max(_MIN_LANDMARKS, _MIN_FITTING * int(seen.sum()))
+        outliers = newest.ids[np.isin(newest.landmark, ids[off])], newest.camera[np.isin(newest.landmark, ids[off])]
+        window.names.end(ids[off])
+        window.views = [views.without(ids[off]) for views in window.views]
+        self._set_covariance(adjusted)
+        if is_keyframe:
+            self._finish_keyframe(window, adjusted)
+        status = self._status(stamp_ns, is_tracking, adjusted)
+        dropped = {int(j): np.sort(outliers[0][outliers[1] == j]) for j in np.unique(outliers[1])}
+        return StateUpdate(status, outliers=dropped)
+
+    def _finish_keyframe(self, window: Window, adjusted: Adjusted) -> None:
+        """Let the oldest keyframe leave where the window is full, and follow the noise of the images."""
+        window.names.note_keyframe()
+        if len(adjusted.equations.errors2):
+            noise = np.sqrt(np.median(adjusted.equations.errors2)) / _RAYLEIGH_MEDIAN * self._sigma_px
+            wanted = float(np.clip(_NOISE_FACTOR * noise, _MIN_SIGMA_PX, _MAX_SIGMA_PX))
+            self._sigma_px += _NOISE_GAIN * (wanted - self._sigma_px)
+        while len(window.states.poses) > MAX_KEYFRAMES:
+            self._forget_first(window)
+
+    def _forget_first(self, window: Window) -> None:
+        states = window.states
+        structure, places, ids = window.landmarks.structure(window.views, states.poses, self._cameras)
+        leaving = np.isin(ids, window.views[0].landmark)
+        measured = self._measured(window, structure.of(leaving))
+        step_s = (states.stamps_ns[1] - states.stamps_ns[0]) * 1e-9
+        walks = np.repeat([self._imu.gyro_random_walk, self._imu.accel_random_walk], 3)
+        window.prior = without_first(measured, states, places[leaving], window.prior, walks**2 * step_s)
+        window.names.end(window.views[0].landmark)
+        window.views = [views.without(window.views[0].landmark) for views in window.views[1:]]
+        del window.stationary[0]
+        self._final.append((int(states.stamps_ns[0]), states.poses[0]))
+        window.states = states.of(np.arange(1, len(states.poses)))
+
+    def _measured(self, window: Window, structure: Structure) -> Measurements:
+        samples = self._samples_of(window.states.stamps_ns)
+        return Measurements(self._cameras, structure, self._sigma_px, samples, np.flatnonzero(window.stationary))
+
+    def _set_covariance(self, adjusted: Adjusted) -> None:
+        """Keep the covariance of the newest state."""
+        n = len(adjusted.states.poses)
+        pose, velocity, common = 6 * (n - 1) + np.arange(6), 9 * n - 3 + np.arange(3), 9 * n + np.arange(9)
+        joint = covariance_of(adjusted.equations.hessian, np.concatenate([pose, velocity, common]))
+        self.covariance = StateCovariance(
+            pose=joint[:6, :6],
+            velocity=joint[6:9, 6:9],
+            gravity=joint[9:12, 9:12],
+            gyro_bias=joint[12:15, 12:15],
+            accel_bias=joint[15:, 15:],
+            tilt=tilt_covariance(self.state(), joint[np.ix_(_POSE_AND_GRAVITY, _POSE_AND_GRAVITY)]),
+        )
+
+    def _status(self, stamp_ns: int, is_tracking: bool, adjusted: Adjusted) -> Status:
+        """Return the status; images and IMU that contradict each other for long end the epoch."""
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(self.covariance.pose[3:, 3:])[-1]))
+        errors2 = adjusted.equations.imu_errors2
+        contradicts = bool(len(errors2) and not errors2[-1] < _MAX_IMU_ERROR2)
+        if contradicts:
+            since_ns = self._contradicted_since_ns or stamp_ns
+            self._contradicted_since_ns = since_ns
+            if stamp_ns - since_ns > _MAX_CONTRADICTION_NS:
+                self._lose(stamp_ns, "images and IMU contradict each other")
+                return Status.LOST
+        else:
+            self._contradicted_since_ns = None
+        if is_tracking:
+            self._tracked_sigma_m = sigma_m
+            return Status.TRACKING
+        gained_m = float(np.sqrt(max(sigma_m**2 - self._tracked_sigma_m**2, 0.0)))
+        if gained_m > self._config.smoother.lost_position_sigma_m:
+            self._lose(stamp_ns, f"position uncertain by {gained_m:.2f} m since vision last constrained it")
+            return Status.LOST
+        return Status.COASTING
+
+    # ------------------------------------------------------------------ breaks, and the IMU
+
+    def _lose(self, stamp_ns: int, why: str) -> None:
+        """End the epoch: the next one begins once the scale is known again."""
+        if self._window is not None:
+            self.finish()
+            self.epoch += 1
+            self._report(stamp_ns, EventKind.LOST, why)
+        self._window, self._before, self._contradicted_since_ns = None, None, None
+        self._initialiser = self._new_initialiser()
+        self.covariance = _NO_COVARIANCE
+        self._since_ns, self._is_reported = stamp_ns, False
+
+    def _new_initialiser(self) -> Initialiser:
+        return Initialiser(self._cameras, self._samples_of, _FIRST_SIGMA_PX)
+
+    def _collect_samples(self) -> None:
+        """Add the samples that have come to those before, and forget what no window needs."""
+        stamps, readings = self._samples
+        if self._stamps:
+            stamps = np.concatenate([stamps, self._stamps])
+            readings = np.concatenate([readings, self._readings])
+            self._stamps, self._readings = [], []
+            order = np.argsort(stamps, kind="stable")  # a corrected time offset may have moved the newest ones
+            stamps, readings = stamps[order], readings[order]
+        oldest_ns = self._latest_ns if self._window is None else int(self._window.states.stamps_ns[0])
+        if self._window is None and self._initialiser.oldest_ns is not None:
+            oldest_ns = self._initialiser.oldest_ns
+        first = max(int(np.searchsorted(stamps, oldest_ns - _MARGIN_NS)) - 1, 0)
+        self._samples = stamps[first:], readings[first:]
+
+    def _samples_of(self, stamps_ns: Int) -> InertialSamples:
+        """Return the IMU over some states."""
+        return InertialSamples(*self._samples, stamps_ns, self._noise, self._max_gap_ns)
+
+    def _covers(self, start_ns: int, end_ns: int) -> bool:
+        return bool(covering_samples(self._samples[0], start_ns, end_ns, 0.0, self._max_gap_ns)[1] >= 0)
+
+
+def adjust_no_keyframes(rig: Rig) -> None:
+    """Call the kernels of the adjustment on a window without landmarks, so that they are compiled or loaded."""
+    second = 1_000_000_000
+    stamps = np.arange(-second // 10, second, 5_000_000)
+    readings = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY_M_S2], (len(stamps), 1))
+    keyframes = np.array([0, second // 10])
+    samples = InertialSamples(stamps, readings, keyframes, np.array([1e-3, 1e-2]), 50_000_000)
+    states = States(keyframes, np.tile(np.eye(4), (2, 1, 1)), np.zeros((2, 3)), level_gravity(), np.zeros(6))
+    prior = first_prior(states, np.ones(6), np.zeros(6), POSE_SIGMAS)
+    cameras = Cameras(
+        np.array([single.left.body_T_cam for single in rig.singles]),
+        np.array([single.left.focal_px for single in rig.singles]),
+    )
+    structure = Structure(
+        np.zeros(1, dtype=np.int64), np.eye(4)[None], np.array([0, 2]), np.array([0, 1]), np.zeros((2, 2))
+    )
+    places = located(states.poses, cameras, np.zeros((1, 3)), structure, 1.0, True)
+    adjust(Measurements(cameras, structure, 1.0, samples, np.zeros(0, dtype=np.int64)), states, places, prior, 1)
+    covariance_of(np.eye(6), np.arange(6))

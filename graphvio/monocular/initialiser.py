@@ -1,0 +1,179 @@
+"""Initialisation: scale, gravity, velocity and biases of a first window, from keyframes in any motion.
+
+Until the scale is known nothing is estimated; keyframes are collected, and with each new one a window is solved: first
+in closed form, then by adjustment. It is accepted once its covariance says that the scale is known, and its errors are
+those that the noise accounts for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from graphvio.arrays import Float
+from graphvio.backend.initialisation import level
+from graphvio.errors import MeasurementError
+from graphvio.geometry import se3, se3_inverse
+from graphvio.measurements.motion import Sighting
+from graphvio.measurements.sensors import GRAVITY_M_S2
+from graphvio.monocular.adjustment import Adjusted, Measurements, Prior, States, adjust, first_prior, scale_sigma
+from graphvio.monocular.closed_form import first_guess
+from graphvio.monocular.sightings import LandmarkNames, Landmarks, Views, far_off
+from graphvio.monocular.structure import Cameras, located
+from graphvio.self_calibration.inertial import InertialSamples
+
+MAX_KEYFRAMES = 14
+MAX_SCALE_SIGMA = 0.05
+MAX_ERROR2 = 16.0  # squared whitened error of a view of what stands still
+_MIN_KEYFRAMES = 8
+_MIN_DURATION_S = 1.0
+_MAX_DURATION_S = 5.0
+_MIN_LANDMARKS = 20
+_MAX_OFF = 0.3  # share of a landmark's views that may be farther off
+_MIN_FITTING = 0.7  # share of the landmarks
+_MAX_IMU_ERROR2 = 60.0  # squared whitened error of an interval, of 9 dimensions
+_MAX_GRAVITY_EXCESS = 0.1  # m/s^2
+_STEPS = 12
+ACCEL_BIAS_SIGMA = 0.15
+POSE_SIGMAS = np.full(6, 1e-3)  # of the pose that defines nav
+
+
+@dataclass(eq=False)
+class Window:
+    """States of a window with what was seen from them.
+
+    Attributes:
+        states: in time order.
+        views: of each.
+        stationary: whether the rig stood there.
+        names: joins tracks to landmarks.
+        landmarks: where these are.
+        prior: what is known from before.
+    """
+
+    states: States
+    views: list[Views]
+    stationary: list[bool]
+    names: LandmarkNames
+    landmarks: Landmarks
+    prior: Prior | None
+
+
+class Initialiser:
+    """Collects keyframes until their scale is known.
+
+    Args:
+        cameras: of the rig.
+        samples_of: Returns the IMU's samples of some instants.
+        sigma_px: noise of a corner's position.
+    """
+
+    def __init__(self, cameras: Cameras, samples_of: Callable[[np.ndarray], InertialSamples], sigma_px: float) -> None:
+        self._cameras = cameras
+        self._samples_of = samples_of
+        self._sigma_px = sigma_px
+        self._gyro_bias, self._gyro_bias_sigma = np.zeros(3), 0.1
+        self._keyframes: list[tuple[int, Mapping[int, Sighting], bool]] = []
+        self.reason = "no image has come"
+
+    def know_gyro_bias(self, gyro_bias: Float, sigma: float) -> None:
+        """Take the gyro's bias (3,) rad/s as a standstill shows it."""
+        self._gyro_bias, self._gyro_bias_sigma = gyro_bias, sigma
+
+    @property
+    def oldest_ns(self) -> int | None:
+        """Stamp of the first keyframe, or None."""
+        return self._keyframes[0][0] if self._keyframes else None
+
+    def add(self, stamp_ns: int, sightings: Mapping[int, Sighting], is_stationary: bool) -> Window | None:
+        """Take a keyframe, and return the window if its scale is known."""
+        if is_stationary and self._keyframes and self._keyframes[-1][2]:
+            self._keyframes.pop()  # of a standstill the newest keyframe stays
+        self._keyframes.append((stamp_ns, sightings, is_stationary))
+        del self._keyframes[:-MAX_KEYFRAMES]
+        while (stamp_ns - self._keyframes[0][0]) * 1e-9 > _MAX_DURATION_S:
+            del self._keyframes[0]
+        duration_s = (stamp_ns - self._keyframes[0][0]) * 1e-9
+        if is_stationary or len(self._keyframes) < _MIN_KEYFRAMES or duration_s < _MIN_DURATION_S:
+            self.reason = "the images show too little motion"
+            return None
+        try:
+            return self._solved()
+        except (np.linalg.LinAlgError, MeasurementError) as error:
+            self.reason = str(error)
+            return None
+
+    def _solved(self) -> Window | None:
+        """Solve for a window of all keyframes, and test it."""
+        stamps = np.array([stamp for stamp, _, _ in self._keyframes])
+        samples = self._samples_of(stamps)
+        names, landmarks = LandmarkNames(len(self._cameras.focal_px), MAX_KEYFRAMES - 1), Landmarks()
+        views = []
+        for _, sightings, _ in self._keyframes:
+            views.append(names.join(sightings))
+            names.note_keyframe()
+        n = len(stamps)
+        structure, _, ids = landmarks.structure(views, np.tile(np.eye(4), (n, 1, 1)), self._cameras)
+        if len(ids) < _MIN_LANDMARKS:
+            self.reason = f"only {len(ids)} points stay in view"
+            return None
+        guess = first_guess(samples, structure, self._cameras, self._gyro_bias)
+        biases = np.concatenate([guess.gyro_bias, np.zeros(3)])
+        states = States(stamps, guess.poses, guess.velocities, guess.gravity, biases)
+        bias_sigmas = np.repeat([self._gyro_bias_sigma, ACCEL_BIAS_SIGMA], 3)
+        prior = first_prior(states, bias_sigmas, np.concatenate([self._gyro_bias, np.zeros(3)]), POSE_SIGMAS)
+        stationary = np.flatnonzero([still for _, _, still in self._keyframes])
+        landmarks = Landmarks()
+        fitting = 1.0
+        for _ in range(2):
+            structure, places, ids = landmarks.structure(views, states.poses, self._cameras)
+            if len(ids) < _MIN_LANDMARKS:
+                self.reason = f"only {len(ids)} points stand still"
+                return None
+            places = located(states.poses, self._cameras, places, structure, self._sigma_px, True)
+            measured = Measurements(self._cameras, structure, self._sigma_px, samples, stationary)
+            adjusted = adjust(measured, states, places, prior, _STEPS)
+            states = adjusted.states
+            landmarks.put(adjusted.landmarks)
+            off = far_off(structure, adjusted.equations.errors2, MAX_ERROR2, _MAX_OFF)
+            fitting *= 1.0 - float(off.mean())
+            names.end(ids[off])
+            views = [each.without(ids[off]) for each in views]
+        self.reason = self._fault(adjusted, fitting)
+        if self.reason:
+            return None
+        return self._in_nav(Window(states, views, [k in stationary for k in range(n)], names, landmarks, prior))
+
+    def _fault(self, adjusted: Adjusted, fitting: float) -> str:
+        """Say why a window is not accepted, or nothing."""
+        states, at = adjusted.states, adjusted.equations
+        if fitting < _MIN_FITTING:
+            return f"only {100 * fitting:.0f} % of the points fit one motion"
+        if not (at.imu_errors2 < _MAX_IMU_ERROR2).all():
+            return "images and IMU contradict each other"
+        if abs(float(np.linalg.norm(states.gravity)) - GRAVITY_M_S2) > _MAX_GRAVITY_EXCESS:
+            return "images and IMU contradict each other about gravity"
+        sigma = scale_sigma(states, at.hessian)
+        if not sigma < MAX_SCALE_SIGMA:
+            return f"the scale is known to {100 * sigma:.0f} % only"
+        return ""
+
+    def _in_nav(self, window: Window) -> Window:
+        """Turn a window level: its first pose has heading zero, and is the origin."""
+        states = window.states
+        body_T_odom = se3_inverse(states.poses[0])
+        nav_T_odom = se3(level(-body_T_odom[:3, :3] @ states.gravity), np.zeros(3)) @ body_T_odom
+        turn = nav_T_odom[:3, :3]
+        window.landmarks.turn(nav_T_odom)
+        assert window.prior is not None
+        turned = replace(
+            states,
+            poses=nav_T_odom @ states.poses,
+            velocities=states.velocities @ turn.T,
+            gravity=turn @ states.gravity,
+        )
+        known = window.prior.at
+        at = replace(turned.of(np.arange(1)), biases=known.biases)
+        return replace(window, states=turned, prior=window.prior._replace(at=at))

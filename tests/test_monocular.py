@@ -1,0 +1,418 @@
+"""Rigs of single cameras with an IMU: equations, initialisation in motion and after a standstill, whole runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from command_line import graphvio
+from recordings import REAL_DATA, half_size
+from rendered import rendered_once
+
+from graphvio import Odometry, RigError, load_rig, save_rig
+from graphvio.arrays import Float
+from graphvio.config import Config
+from graphvio.geometry import so3_exp, so3_log
+from graphvio.measurements.estimate import Status
+from graphvio.measurements.events import EventKind
+from graphvio.measurements.motion import Sighting
+from graphvio.measurements.sensors import GRAVITY_M_S2
+from graphvio.monocular.adjustment import (
+    Measurements,
+    Prior,
+    States,
+    adjust,
+    covariance_of,
+    equations,
+    first_prior,
+    without_first,
+)
+from graphvio.monocular.closed_form import first_guess
+from graphvio.monocular.estimator import MonocularEstimator
+from graphvio.monocular.initialiser import POSE_SIGMAS
+from graphvio.monocular.sightings import LandmarkNames, Landmarks
+from graphvio.monocular.structure import Cameras, Eliminated, located, visual_equations
+from graphvio.rig import Rig
+from graphvio.rig_files.grouping import grouped_rig
+from graphvio.self_calibration.inertial import InertialSamples
+from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
+from graphvio.simulation.named_rigs import stereo_and_back
+from graphvio.slam import FrontEnd
+
+FRAME_NS, IMU_NS = 50_000_000, 5_000_000
+GYRO_BIAS, ACCEL_BIAS = np.array([-0.01, 0.02, 0.08]), np.array([-0.02, 0.08, 0.05])
+PIXEL_SIGMA_PX = 0.2
+
+
+def single_rig() -> Rig:
+    return default_rig().with_only(["cam0"])
+
+
+class Flight(NamedTuple):
+    """A smooth motion among points, as functions of the time in seconds."""
+
+    position: Callable[[float], Float]
+    turned: Callable[[float], Float]  # rotation vector of body
+
+    def pose(self, t: float) -> Float:
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = so3_exp(self.turned(t)), self.position(t)
+        return pose
+
+    def reading(self, t: float) -> Float:
+        """Return what a perfect IMU with constant biases measures (6,)."""
+        h = 1e-3
+        rotation = self.pose(t)[:3, :3]
+        rate = so3_log(np.ascontiguousarray(self.pose(t - h)[:3, :3].T @ self.pose(t + h)[:3, :3])) / (2.0 * h)
+        accel = (self.position(t + h) - 2.0 * self.position(t) + self.position(t - h)) / h**2
+        force = rotation.T @ (accel + np.array([0.0, 0.0, GRAVITY_M_S2]))
+        return np.concatenate([rate + GYRO_BIAS, force + ACCEL_BIAS])
+
+
+def moving() -> Flight:
+    return Flight(
+        lambda t: np.array([0.8 * t + 0.15 * np.sin(3.0 * t), 0.5 * np.sin(1.4 * t), 0.25 * np.sin(2.3 * t + 0.5)]),
+        lambda t: np.array([0.1 * np.sin(1.7 * t), 0.15 * np.cos(1.3 * t), 0.3 * np.sin(0.7 * t)]),
+    )
+
+
+def after_a_standstill(until_s: float) -> Flight:
+    """Stand, and then move off smoothly."""
+    flight = moving()
+
+    def clock(t: float) -> float:
+        late = max(t - until_s, 0.0)
+        return late**3 / (late**2 + 0.3)
+
+    start = flight.position(0.0)
+    return Flight(lambda t: flight.position(clock(t)) - start, lambda t: flight.turned(clock(t)))
+
+
+class Tracks:
+    """Points around the flight, seen by a rig's cameras with noise; a track ends when its point leaves the image."""
+
+    def __init__(self, rig: Rig, flight: Flight) -> None:
+        self._rng = np.random.default_rng(5)
+        self._cameras = [single.left for single in rig.singles]
+        self._flight = flight
+        self._points = self._rng.uniform([-8.0, -6.0, -3.0], [20.0, 6.0, 3.0], size=(4000, 3))
+        self._ids = [np.full(len(self._points), -1) for _ in self._cameras]
+        self._next = 0
+
+    def sightings(self, t: float, share: float = 1.0) -> dict[int, Sighting]:
+        found = {}
+        for j, camera in enumerate(self._cameras):
+            odom_T_cam = self._flight.pose(t) @ camera.body_T_cam
+            in_cam = (self._points - odom_T_cam[:3, 3]) @ odom_T_cam[:3, :3]
+            near = (in_cam[:, 2] > 0.7) & (in_cam[:, 2] < 8.0)
+            pixels, seen = camera.project(in_cam)
+            seen &= near
+            known, ids = self._ids[j], np.full(len(self._points), -1)
+            ids[seen] = known[seen]
+            room = round(150 * share) - int((ids >= 0).sum())
+            new = np.flatnonzero(seen & (ids < 0))[: max(room, 0)]
+            ids[new] = self._next + np.arange(len(new))
+            self._next += len(new)
+            self._ids[j] = ids if share > 0.0 else np.full(len(self._points), -1)
+            rows = np.flatnonzero(self._ids[j] >= 0)
+            rows = rows[np.argsort(ids[rows])]
+            noisy = pixels[rows] + PIXEL_SIGMA_PX * self._rng.normal(size=(len(rows), 2))
+            rays, _ = camera.unproject(noisy)
+            found[j] = Sighting(ids[rows].astype(np.int64), rays)
+        return found
+
+
+class Flown(NamedTuple):
+    stamps_s: Float
+    poses: Float  # of the estimate
+    truth: Float
+    statuses: list[Status]
+    events: list[tuple[str, str]]
+    estimator: MonocularEstimator
+
+
+def fly(flight: Flight, duration_s: float, share: Callable[[float], float] | None = None) -> Flown:
+    """Run the estimator alone, on perfect associations; with every third frameset a keyframe."""
+    rig = single_rig()
+    assert rig.imu is not None
+    rng, events = np.random.default_rng(1), list[tuple[str, str]]()
+    estimator = MonocularEstimator(rig, Config(), lambda _, kind, detail: events.append((kind, detail)))
+    tracks, stamps, poses, statuses, next_ns = Tracks(rig, flight), [], [], [], -500_000_000
+    noise = np.repeat([rig.imu.gyro_noise_density, rig.imu.accel_noise_density], 3) / np.sqrt(IMU_NS * 1e-9)
+    before: Float | None = None
+    for k in range(round(duration_s * 20)):
+        stamp_ns = k * FRAME_NS
+        while next_ns <= stamp_ns + 2 * IMU_NS:
+            estimator.add_sample(next_ns, flight.reading(next_ns * 1e-9) + noise * rng.normal(size=6))
+            next_ns += IMU_NS
+        t = stamp_ns * 1e-9
+        is_still = before is not None and bool(np.abs(flight.pose(t) - before).max() < 1e-9)
+        if estimator.is_initialised:
+            estimator.predict(stamp_ns, None)
+        else:
+            estimator.initialise(stamp_ns, (SimpleNamespace(**_still_interval()), 0.0))  # type: ignore[arg-type]
+        visual = SimpleNamespace(sightings=tracks.sightings(t, 1.0 if share is None else share(t)))
+        estimator.apply(visual, is_still)  # type: ignore[arg-type]
+        keep = frozenset({stamp_ns} if k % 3 == 0 and not is_still else set())
+        statuses.append(estimator.update(stamp_ns, is_constrained=False, keep=keep).status)
+        if estimator.has_pose:
+            stamps.append(t)
+            poses.append(estimator.state().nav_T_body)
+        before = flight.pose(t)
+    truth = np.array([flight.pose(t) for t in stamps])
+    return Flown(np.array(stamps), np.array(poses), truth, statuses, events, estimator)
+
+
+def _still_interval() -> dict[str, object]:
+    """An interval that shows neither a standstill nor a bias."""
+    rates = np.tile([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]], (50, 1))
+    forces = np.tile([0.0, 0.0, GRAVITY_M_S2], (100, 1))
+    steps = np.full(100, 0.005)
+    return {
+        "steps_s": steps, "angular_velocity": rates, "linear_acceleration": forces, "mean_rate": np.zeros(3),
+        "mean_force": forces[0],
+    }  # fmt: skip
+
+
+def aligned(flown: Flown) -> tuple[float, float]:
+    """Return the rmse after alignment without scale, m, and the scale that would fit best."""
+    estimate, truth = flown.poses[:, :3, 3], flown.truth[:, :3, 3]
+    one, other = estimate - estimate.mean(axis=0), truth - truth.mean(axis=0)
+    u, sizes, v = np.linalg.svd(other.T @ one)
+    flip = np.diag([1.0, 1.0, np.linalg.det(u @ v)])
+    scale = float((sizes * np.diag(flip)).sum() / (one**2).sum())
+    errors = other - one @ (u @ flip @ v).T
+    return float(np.sqrt((errors**2).sum(axis=1).mean())), scale
+
+
+# ------------------------------------------------------------------ equations
+
+
+class Problem(NamedTuple):
+    measured: Measurements
+    states: States
+    landmarks: Float
+    prior: Prior
+
+
+def problem(n_keyframes: int = 5, is_exact: bool = False) -> Problem:
+    """A window around the truth."""
+    rig, flight, rng = single_rig(), moving(), np.random.default_rng(2)
+    assert rig.imu is not None
+    times = np.arange(n_keyframes) * 0.15
+    stamps = np.round(times * 1e9).astype(np.int64)
+    sample_ns = np.arange(-20_000_000, stamps[-1] + 20_000_000, IMU_NS)
+    noise = np.array([rig.imu.gyro_noise_density, rig.imu.accel_noise_density])
+    readings = np.array([flight.reading(ns * 1e-9) for ns in sample_ns])
+    samples = InertialSamples(sample_ns, readings, stamps, noise, 50_000_000)
+    velocity = np.array([(flight.position(t + 1e-4) - flight.position(t - 1e-4)) / 2e-4 for t in times])
+    poses = np.array([flight.pose(t) for t in times])
+    gravity = np.array([0.0, 0.0, -GRAVITY_M_S2])
+    states = States(stamps, poses, velocity, gravity, np.concatenate([GYRO_BIAS, ACCEL_BIAS]))
+    prior = first_prior(states, np.full(6, 0.1), states.biases, POSE_SIGMAS)
+    if not is_exact:
+        states = states.moved(1e-3 * rng.normal(size=9 * n_keyframes + 9))
+    cameras = Cameras(np.array([rig.singles[0].left.body_T_cam]), np.array([rig.singles[0].left.focal_px]))
+    tracks, names, landmarks = Tracks(rig, flight), LandmarkNames(1, n_keyframes), Landmarks()
+    views = [names.join(tracks.sightings(t, 0.3)) for t in times]
+    structure, places, _ = landmarks.structure(views, states.poses, cameras)
+    places = located(states.poses, cameras, places, structure, PIXEL_SIGMA_PX, True)
+    measured = Measurements(cameras, structure, PIXEL_SIGMA_PX, samples, np.zeros(0, dtype=np.int64))
+    return Problem(measured, states, places, prior)
+
+
+def test_visual_equations_gradient_is_the_derivative_of_the_cost_with_landmarks_at_their_best() -> None:
+    measured, states, landmarks, _ = problem(4)
+
+    def at(poses: Float) -> tuple[float, Float]:
+        places, eliminated = landmarks, Eliminated.empty(measured.structure)
+        for _ in range(5):
+            places = located(poses, measured.cameras, places, measured.structure, 2.0, True)
+        _, gradient, cost, _ = visual_equations(
+            poses, measured.cameras, places, measured.structure, 2.0, 1e4, eliminated
+        )
+        return cost, gradient
+
+    _, gradient = at(states.poses)
+    step = 1e-5
+    for unknown in range(24):
+        moved = []
+        for sign in (1.0, -1.0):
+            change = np.zeros(9 * 4 + 9)
+            change[unknown] = sign * step
+            moved.append(at(states.moved(change).poses)[0])
+        assert (moved[0] - moved[1]) / (2.0 * step) == pytest.approx(gradient[unknown], rel=2e-3, abs=0.5)
+
+
+def test_adjust_from_a_perturbed_window_finds_the_truth_within_its_covariance() -> None:
+    measured, states, landmarks, prior = problem(8)
+    truth = problem(8, is_exact=True).states
+    adjusted = adjust(measured, states, landmarks, prior, 10)
+    off = adjusted.states.since(truth)
+    sigmas = np.sqrt(np.diag(covariance_of(adjusted.equations.hessian, np.arange(len(off)))))
+    assert adjusted.equations.cost < equations(measured, states, landmarks, prior).cost
+    assert np.abs(off / sigmas).max() < 4.5
+    assert np.abs(off[: 6 * 8]).max() < 0.02
+
+
+def test_without_first_gives_the_same_solution_as_the_whole_window() -> None:
+    measured, states, landmarks, prior = problem(6)
+    adjusted = adjust(measured, states, landmarks, prior, 12)
+    states, landmarks = adjusted.states, adjusted.landmarks
+    n = len(states.poses)
+    sees = np.zeros(len(landmarks), dtype=bool)
+    firsts = measured.structure.rows[:-1]
+    sees[:] = measured.structure.state[firsts] == 0
+    walk = np.full(6, 1e-14)
+    known = without_first(
+        measured._replace(structure=measured.structure.of(sees)), states, landmarks[sees], prior, walk
+    )
+    others = measured.structure.of(~sees)
+    left = measured._replace(
+        structure=others._replace(state=others.state - 1),
+        samples=measured.samples._replace(keyframes_ns=measured.samples.keyframes_ns[1:]),
+    )
+    remaining = adjust(left, states.of(np.arange(1, n)), landmarks[~sees], known, 5)
+    off = remaining.states.since(states.of(np.arange(1, n)))
+    whole = covariance_of(adjusted.equations.hessian, np.r_[6 : 6 * n, 6 * n + 3 : 9 * n + 9])
+    part = covariance_of(remaining.equations.hessian, np.arange(len(off)))
+    assert np.abs(off / np.sqrt(np.diag(part))).max() < 0.05
+    np.testing.assert_allclose(np.sqrt(np.diag(part)), np.sqrt(np.diag(whole)), rtol=1e-3)
+
+
+def test_first_guess_in_motion_finds_velocity_gravity_and_gyro_bias() -> None:
+    measured, _, _, _ = problem(12)
+    truth = problem(12, is_exact=True).states
+    guess = first_guess(measured.samples, measured.structure, measured.cameras, np.zeros(3))
+    body_R_nav = truth.poses[0, :3, :3].T
+    np.testing.assert_allclose(guess.gyro_bias, GYRO_BIAS, atol=5e-3)
+    assert np.rad2deg(np.arccos(guess.gravity @ body_R_nav @ truth.gravity / GRAVITY_M_S2**2)) < 2.0
+    np.testing.assert_allclose(guess.velocities[0], body_R_nav @ truth.velocities[0], atol=0.15)
+
+
+# ------------------------------------------------------------------ the estimator
+
+
+def test_estimator_in_motion_knows_the_scale_and_stays_consistent() -> None:
+    flown = fly(moving(), 8.0)
+    assert [kind for kind, _ in flown.events] == [EventKind.SCALE_KNOWN]
+    assert flown.statuses[0] is Status.INITIALISING
+    assert set(flown.statuses[-60:]) == {Status.TRACKING}
+    assert flown.stamps_s[0] < 4.0
+    rmse, scale = aligned(flown)
+    assert rmse < 0.03
+    assert abs(scale - 1.0) < 0.01
+    state, covariance = flown.estimator.state(), flown.estimator.covariance
+    assert covariance.accel_bias is not None
+    assert np.abs(state.gyro_bias - GYRO_BIAS).max() < 2e-3
+    assert (np.abs(state.accel_bias - ACCEL_BIAS) < 4.0 * np.sqrt(np.diag(covariance.accel_bias))).all()
+
+
+def test_estimator_at_a_standstill_waits_for_motion() -> None:
+    flown = fly(after_a_standstill(3.0), 9.0)
+    assert set(flown.statuses[:60]) == {Status.INITIALISING}
+    assert flown.stamps_s[0] > 3.0
+    rmse, scale = aligned(flown)
+    assert rmse < 0.03
+    assert abs(scale - 1.0) < 0.01
+
+
+def test_estimator_that_only_stands_reports_what_is_missing() -> None:
+    flown = fly(after_a_standstill(100.0), 6.0)
+    assert not len(flown.poses)
+    assert [kind for kind, _ in flown.events] == [EventKind.NOT_INITIALISED]
+    assert "little motion; go on moving" in flown.events[0][1]
+
+
+def test_estimator_without_points_coasts_and_goes_on() -> None:
+    flown = fly(moving(), 8.0, share=lambda t: 0.0 if 5.0 < t < 5.6 else 1.0)
+    assert Status.COASTING in flown.statuses
+    assert flown.statuses[-1] is Status.TRACKING
+    assert flown.estimator.epoch == 0
+    assert aligned(flown)[0] < 0.05
+
+
+# ------------------------------------------------------------------ rigs and commands
+
+
+def test_rig_of_single_cameras_without_an_imu_names_camera_and_remedy() -> None:
+    with pytest.raises(RigError, match=r"cam0 without .* IMU: the scale cannot be known; use an IMU, or add a camera"):
+        default_rig().with_only(["0"]).without_imu()
+
+
+def test_rig_without_cameras_is_refused() -> None:
+    with pytest.raises(RigError, match="has no camera"):
+        replace(default_rig(), pairs=())
+
+
+def test_save_rig_of_single_cameras_reads_back(tmp_path: Path) -> None:
+    save_rig(default_rig().without_pairs(), tmp_path / "rig.yaml")
+    loaded = load_rig(tmp_path / "rig.yaml")
+    assert not loaded.pairs
+    assert [single.name for single in loaded.singles] == ["cam0", "cam1", "cam2", "cam3"]
+
+
+def test_grouped_rig_of_one_camera_or_cameras_that_look_apart_needs_an_imu() -> None:
+    rig = default_rig()
+    apart = [rig.cameras[0], rig.cameras[2], replace(rig.cameras[0], name="cam9", body_T_cam=_turned(rig))]
+    for cameras in (apart[:1], apart):
+        assert not grouped_rig(cameras, rig.imu, "rig", Path("file")).pairs
+        with pytest.raises(RigError, match="IMU"):
+            grouped_rig(cameras, None, "rig", Path("file"))
+
+
+def _turned(rig: Rig) -> Float:
+    pose = rig.cameras[0].body_T_cam.copy()
+    pose[:3, :3] = so3_exp(np.array([0.0, 0.0, np.pi / 2])) @ pose[:3, :3]
+    return pose
+
+
+def test_front_end_of_slam_refuses_a_rig_of_single_cameras() -> None:
+    odometry = Odometry(single_rig())
+    with pytest.raises(RigError, match=r"only single cameras \(cam0\), and a SLAM system .* needs a stereo pair"):
+        FrontEnd(odometry)
+    odometry.finish()
+
+
+@pytest.fixture(scope="module")
+def walk() -> Path:
+    def write(folder: Path) -> None:
+        rig = stereo_and_back().with_cameras(half_size)
+        write_recording(Simulator(build_scene("room", 6.0), rig, 1), folder)
+
+    return rendered_once("room-stereo-back", write, "320x240", 6.0)
+
+
+def test_run_without_pairs_estimates_in_metres(walk: Path, tmp_path: Path) -> None:
+    ran = graphvio("run", walk, "--no-pairs", "--out", tmp_path / "out")
+    assert ran.returncode == 0, ran.stderr
+    error_mm = float(ran.stdout.partition("ATE rmse ")[2].partition(" mm")[0])
+    assert error_mm < 20.0
+
+
+def test_run_without_pairs_and_imu_is_refused(walk: Path, tmp_path: Path) -> None:
+    ran = graphvio("run", walk, "--no-pairs", "--no-imu", "--out", tmp_path / "out")
+    assert ran.returncode == 2
+    assert "the scale cannot be known" in ran.stderr
+
+
+def test_calibrate_of_single_cameras_is_refused(walk: Path, tmp_path: Path) -> None:
+    rig = load_rig(walk / "rig.yaml").without_pairs()
+    save_rig(rig, tmp_path / "rig.yaml")
+    for command in ("calibrate", "optimize"):
+        ran = graphvio(command, walk, "--rig", tmp_path / "rig.yaml", "--out", tmp_path / f"{command}.yaml")
+        assert ran.returncode == 2
+        assert f"graphvio {command} needs a stereo pair" in ran.stderr
+
+
+@pytest.mark.skipif(not (REAL_DATA / "euroc_mh01_clip").exists(), reason="the recording is not here")
+def test_run_one_camera_of_euroc_from_a_moving_start(tmp_path: Path) -> None:
+    ran = graphvio("run", REAL_DATA / "euroc_mh01_clip", "--cameras", "0", "--to", "8", "--out", tmp_path / "out")
+    assert ran.returncode == 0, ran.stderr
+    error_mm = float(ran.stdout.partition("ATE rmse ")[2].partition(" mm")[0])
+    assert error_mm < 15.0
