@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from graphvio.frontend.images import checked
+from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracks import PairFrame, common_rows
 from graphvio.frontend.visual import MotionPredictor, VisualFrontend
@@ -19,18 +20,21 @@ _MIN_INTERVAL_NS = 140_000_000  # between keyframes while there is no motion to 
 class SinglesFrontend(VisualFrontend):
     """Tracks every camera, and decides when a keyframe begins."""
 
-    def process(self, frameset: FrameSet, predict: MotionPredictor) -> VisualResult:
+    def process(
+        self, frameset: FrameSet, predict: MotionPredictor, readout: ReadoutMotion | None = None
+    ) -> VisualResult:
         """Track the corners of a frameset.
 
         Args:
             frameset: Images of any subset of cameras.
             predict: The back-end's prediction, from which the search begins.
+            readout: Motion of body while rolling shutters read the images out, or None.
 
         Raises:
             RigError: If an image does not fit the rig; nothing has changed then.
         """
         self.stage_ms = {}
-        seen = self._track(checked(frameset, self._rig), predict)
+        seen = self._track(checked(frameset, self._rig), predict, readout)
         is_stationary = self._standstill.update(seen.frames, {j: frame.ids for j, frame in seen.frames.items()})
         reports = {
             j: PairReport(

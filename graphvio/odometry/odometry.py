@@ -406,6 +406,8 @@ class Odometry:
         interval = self._synchroniser.interval(stamp_ns, stamp_ns + readout_ns)
         if interval is None:
             return None
+        if self._monocular is not None and not self._monocular.has_pose:
+            return ReadoutMotion.accelerated(interval, np.zeros(3), np.zeros(3), np.zeros(3))  # only how it turns
         state = self._estimator.state()
         body_R_nav = state.nav_T_body[:3, :3].T
         acceleration = interval.mean_force - state.accel_bias + body_R_nav @ state.gravity_nav
