@@ -80,7 +80,8 @@ def test_every_configuration_value_and_profile_is_documented() -> None:
         rows = re.findall(r"^\| `(\w+)` \| (\S+) \| .+ \|$", section, re.MULTILINE)
         values = getattr(config, stage.name)
         assert rows == [
-            (f.name, "null" if getattr(values, f.name) is None else str(getattr(values, f.name))) for f in fields(values)
+            (f.name, "null" if getattr(values, f.name) is None else str(getattr(values, f.name)))
+            for f in fields(values)
         ]
     for profile in profiles():
         assert f"| `{profile}` |" in text
