@@ -57,11 +57,12 @@ def configuration() -> Iterator[str]:
         docs = _docs_of_fields(described)
         hints = get_type_hints(type(values))
         for value in fields(values):
-            choices = get_args(hints[value.name])
+            choices = [choice for choice in get_args(hints[value.name]) if isinstance(choice, str)]
             meaning = _cell(docs[value.name])
             if not all(f"`{choice}`" in meaning for choice in choices):
                 meaning = f"One of {', '.join(f'`{choice}`' for choice in choices)}. {meaning}"
-            yield f"| `{value.name}` | {getattr(values, value.name)} | {meaning} |"
+            default = getattr(values, value.name)
+            yield f"| `{value.name}` | {'null' if default is None else default} | {meaning} |"
 
 
 def _docs_of_fields(described: ast.ClassDef) -> dict[str, str]:

@@ -46,6 +46,7 @@ def main() -> None:
         for row, (camera, title) in enumerate(zip(files, ("front", "back"), strict=True)):
             axes = figure.add_axes((0.075 + 0.31 * column, 0.715 - 0.255 * row, 0.295, 0.25))
             image = cv2.imread(str(min(camera, key=lambda file: abs(int(file.stem) - at_ns))), cv2.IMREAD_GRAYSCALE)
+            assert image is not None
             axes.imshow(image[60:420], cmap="gray", vmin=0, vmax=255, aspect="auto")
             axes.set_xticks([])
             axes.set_yticks([])
