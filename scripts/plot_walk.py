@@ -44,7 +44,7 @@ def main() -> None:
     for column, name in enumerate(names):
         at_ns = begin_ns + int(0.5e9 * sum(moments[name]))
         for row, (camera, title) in enumerate(zip(files, ("front", "back"), strict=True)):
-            axes = figure.add_axes((0.075 + 0.31 * column, 0.715 - 0.255 * row, 0.295, 0.25))
+            axes = figure.add_axes((0.075 + 0.31 * column, 0.695 - 0.255 * row, 0.295, 0.25))
             image = cv2.imread(str(min(camera, key=lambda file: abs(int(file.stem) - at_ns))), cv2.IMREAD_GRAYSCALE)
             assert image is not None
             axes.imshow(image[60:420], cmap="gray", vmin=0, vmax=255, aspect="auto")
@@ -54,7 +54,7 @@ def main() -> None:
                 axes.set_title(TITLES[name], fontsize=10)
             if column == 0:
                 axes.set_ylabel(title, fontsize=10)
-    axes = add_axes(figure, (0.075, 0.09, 0.915, 0.33))
+    axes = add_axes(figure, (0.075, 0.09, 0.915, 0.315))
     for name, pairs, colour in RUNS:
         found = evaluated(recording, pairs)
         label = f"{name}: ATE {100 * found.ate_position_m.rmse:.1f} cm"
@@ -69,7 +69,7 @@ def main() -> None:
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("time, s")
     axes.set_ylabel("position error, cm")
-    axes.legend(loc="upper left", fontsize=9)
+    axes.legend(loc="center", fontsize=9)
     out.write_bytes(png(figure))
 
 

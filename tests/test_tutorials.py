@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import typer
 from calibration_walks import recorded
+from command_line import graphvio
 
 from graphvio.cli import app
 
@@ -37,19 +38,17 @@ def follow(name: str, recording: Path, folder: Path) -> str:
     """Run all commands and the Python of a tutorial in a folder; what it simulates is there already."""
     text = (TUTORIALS / f"{name}.md").read_text()
     shutil.copytree(recording, folder / "walk")
-    programs = [["-c", "from graphvio.cli import main; main()", *arguments] for arguments in typed(text)]
-    if "```python" in text:
-        programs.append(["-c", python_of(text)])
-    printed = ""
-    for arguments in programs:
-        if arguments[2:3] == ["simulate"]:
-            continue
-        done = subprocess.run(
-            [sys.executable, *arguments], cwd=folder, capture_output=True, text=True, timeout=300, check=False
-        )
-        assert done.returncode == 0, f"{arguments[2:]}: {done.stderr}"
-        printed += done.stdout
-    return printed
+    for arguments in typed(text):
+        if arguments[0] != "simulate":
+            ran = graphvio(*arguments, folder=folder)
+            assert ran.returncode == 0, f"{arguments}: {ran.stderr}"
+    if "```python" not in text:
+        return ""
+    done = subprocess.run(
+        [sys.executable, "-c", python_of(text)], cwd=folder, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def test_first_trajectory_as_typed(room_walk: Path, tmp_path: Path) -> None:
