@@ -1,4 +1,4 @@
-"""Trajectory files: TUM, EuRoC and KITTI text formats, and the true trajectory in a session or bag.
+"""Trajectory files: TUM, EuRoC and KITTI text formats, and topics with poses in a session or bag.
 
 TUM: ``stamp_s x y z q_x q_y q_z q_w``, separated by blanks, or by commas where stamps have a decimal point. EuRoC:
 ``stamp_ns,x,y,z,q_w,q_x,q_y,q_z,...``, separated by commas. UZH-FPV's truth is TUM's with a row number in front.
@@ -17,7 +17,7 @@ from graphvio.arrays import Float
 from graphvio.errors import SessionError, TrajectoryError
 from graphvio.geometry import quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 from graphvio.sessions.store import is_store
-from graphvio.sessions.truth import read_truth
+from graphvio.sessions.truth import read_poses
 from graphvio.trajectory import Trajectory
 
 _NS_PER_S = 1_000_000_000
@@ -28,21 +28,26 @@ _MAX_STAMP_NS = 2**62
 _SESSION_SUFFIXES = (".mcap", ".bag")
 
 
-def load_trajectory(path: str | Path) -> Trajectory:
-    """Read a trajectory file, or the true trajectory in a session or bag.
+def load_trajectory(path: str | Path, times: Path | None = None) -> Trajectory:
+    """Read a trajectory file, or a trajectory in a session or bag.
 
     Args:
         path: TUM, EuRoC or KITTI poses, distinguished by separator and number of columns; KITTI's take their stamps
-            from ``times.txt`` next to them or in ``../sequences/NAME``. Or a session or bag.
+            from ``times.txt`` next to them or in ``../sequences/NAME``. Or a session or bag, with its true trajectory
+            or only topic with poses; ``PATH:TOPIC`` names another.
+        times: stamps in seconds, one a line, of KITTI poses elsewhere.
 
     Raises:
         TrajectoryError: if the file cannot be read, a line is no pose, or the stamps do not increase; or if a
             session has no truth.
     """
     path = Path(path)
+    if not path.exists() and ":/" in str(path):
+        store, _, topic = str(path).partition(":/")
+        return _load_from_session(Path(store), f"/{topic}")
     if path.suffix in _SESSION_SUFFIXES or path.is_dir():
         return _load_from_session(path)
-    return _load_text(path)
+    return _load_text(path, times)
 
 
 def save_trajectory(trajectory: Trajectory, path: str | Path) -> None:
@@ -88,16 +93,16 @@ def stamp_ns_from_seconds(text: str) -> int:
         raise ValueError(f"{text!r} is no time") from None
 
 
-def _load_from_session(path: Path) -> Trajectory:
+def _load_from_session(path: Path, topic: str | None = None) -> Trajectory:
     if not is_store(path):
         raise TrajectoryError(f"{path}: is no trajectory file, and no session; give a TUM or EuRoC trajectory file")
     try:
-        return Trajectory(*read_truth(path))
+        return Trajectory(*read_poses(path, topic))
     except SessionError as error:
         raise TrajectoryError(str(error)) from None
 
 
-def _load_text(path: Path) -> Trajectory:
+def _load_text(path: Path, times: Path | None) -> Trajectory:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -108,7 +113,7 @@ def _load_text(path: Path) -> Trajectory:
         raise TrajectoryError(f"{path}: is not a text file; give a TUM or EuRoC trajectory file") from None
     rows = list(_rows(text))
     if rows and not rows[0][2] and len(rows[0][1]) == _KITTI_COLUMNS:
-        return _load_kitti(path, rows)
+        return _load_kitti(path, rows, times)
     if rows and _is_numbered(rows[0][1]):
         rows = [(number, fields[1:], is_euroc) for number, fields, is_euroc in rows]
     stamps: list[int] = []
@@ -127,12 +132,12 @@ def _load_text(path: Path) -> Trajectory:
     return Trajectory(np.array(stamps, dtype=np.int64), np.array(poses))
 
 
-def _load_kitti(path: Path, rows: Sequence[tuple[int, Sequence[str], bool]]) -> Trajectory:
+def _load_kitti(path: Path, rows: Sequence[tuple[int, Sequence[str], bool]], times: Path | None) -> Trajectory:
     """Read KITTI odometry poses, upper 3x4 blocks by rows, with the stamps of the sequence's ``times.txt``."""
     places = (path.with_name("times.txt"), path.parent.parent / "sequences" / path.stem / "times.txt")
-    times = next((place for place in places if place.is_file()), None)
+    times = times or next((place for place in places if place.is_file()), None)
     if times is None:
-        raise TrajectoryError(f"{path}: KITTI poses carry no stamps; put the sequence's times.txt next to them")
+        raise TrajectoryError(f"{path}: KITTI poses carry no stamps; give --times FILE, or put times.txt next to them")
     try:
         stamps = [stamp_ns_from_seconds(line) for line in times.read_text(encoding="utf-8").split()]
         blocks = np.array([[float(field) for field in fields] for _, fields, _ in rows]).reshape(-1, 3, 4)

@@ -280,7 +280,7 @@ def test_missing_or_invalid_truth_is_reported(recording: Path, tmp_path: Path) -
     plain = write_euroc(tmp_path / "plain", frames=2)
     session = converted(plain, tmp_path / "plain.mcap")
     assert open_source(session).truth is None
-    with pytest.raises(TrajectoryError, match="holds no true trajectory"):
+    with pytest.raises(TrajectoryError, match="holds no trajectory"):
         load_trajectory(session)
     with pytest.raises(TrajectoryError, match="is no trajectory file, and no session"):
         load_trajectory(plain)

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 def compare(
     results: Annotated[
         list[Path],
-        typer.Argument(help="Result folders of `graphvio run` and `graphvio optimize`, or trajectory files."),
+        typer.Argument(
+            help="Result folders of `graphvio run` and `graphvio optimize`, or trajectory files, or BAG:TOPIC."
+        ),
     ],
     truth: Annotated[
         Path | None,
@@ -36,6 +38,7 @@ def compare(
     max_ate: Annotated[
         float | None, typer.Option("--max-ate", help="Exit with code 4 if an ATE exceeds these metres.", min=0.0)
     ] = None,
+    times: options.Times = None,
     verbose: options.Verbose = False,
 ) -> None:
     """Compare several results: ATE, RPE, drift and completion, and the ratio of each ATE to the first one.
@@ -54,10 +57,10 @@ def compare(
     from graphvio.evaluation import compare as compare_all
     from graphvio.trajectory_files import load_trajectory
 
-    names, trajectories = names_of(results), [load_trajectory(_file(path, smoothed)) for path in results]
+    names, trajectories = names_of(results), [load_trajectory(_file(path, smoothed), times) for path in results]
     if truth is None and len(results) < 2:
         raise GraphvioError("one result and no truth: there is nothing to compare; give --truth FILE or more results")
-    reference = true_trajectory(truth) if truth is not None else trajectories[0]
+    reference = true_trajectory(truth, times) if truth is not None else trajectories[0]
     first = 0 if truth is not None else 1
     compared = compare_all(names[first:], trajectories[first:], reference)
     publish(
@@ -90,7 +93,9 @@ def compare(
 
 
 def _file(path: Path, smoothed: bool) -> Path:
-    if not path.is_dir():
+    from graphvio.sessions.store import is_store
+
+    if not path.is_dir() or is_store(path):
         return path
     optimized = path / "trajectory_optimized.txt"
     if optimized.is_file():

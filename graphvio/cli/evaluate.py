@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    trajectory: Annotated[Path, typer.Argument(help="Estimated trajectory, TUM or EuRoC (detected).")],
-    truth: Annotated[Path, typer.Argument(help="True trajectory, TUM or EuRoC, or a recording that has one.")],
+    trajectory: Annotated[Path, typer.Argument(help="Estimated trajectory: TUM, EuRoC, KITTI, or BAG:TOPIC.")],
+    truth: Annotated[Path, typer.Argument(help="True trajectory: the same, or a recording that has one.")],
     plot: Annotated[
         Path | None, typer.Option(help="Plot both, and the error over time: .png, .pdf or .svg.", metavar="FILE")
     ] = None,
@@ -29,6 +29,7 @@ def evaluate(
     max_gap: Annotated[
         float, typer.Option(help="Longest gap of the truth that is interpolated, seconds.", min=0.0)
     ] = 0.25,
+    times: options.Times = None,
     verbose: options.Verbose = False,
 ) -> None:
     """Compare a trajectory with the truth: ATE, RPE, drift and loop-closure error.
@@ -38,6 +39,8 @@ def evaluate(
     Examples:
 
         graphvio evaluate results/corridor-1/trajectory.txt data/corridor
+
+        graphvio evaluate walk.bag:/odometry truth.bag:/vicon
 
         graphvio evaluate results/mh01-1/trajectory.txt mav0/state_groundtruth_estimate0/data.csv --plot mh01.png
     """
@@ -49,7 +52,7 @@ def evaluate(
     from graphvio.evaluation import evaluate as measure
     from graphvio.trajectory_files import load_trajectory
 
-    figures = measure(load_trajectory(trajectory), true_trajectory(truth), max_gap_s=max_gap)
+    figures = measure(load_trajectory(trajectory, times), true_trajectory(truth, times), max_gap_s=max_gap)
     publish(figures.as_dict())
     Console().print(_table(figures))
     if json_file is not None:

@@ -68,4 +68,8 @@ Scale = Annotated[
     typer.Option("--scale", help="Lengths that a camera measures may be wrong by a factor: auto, estimate or fixed."),
 ]
 Seed = Annotated[int, typer.Option("--seed", help="Of all random choices: the same gives the same result.", min=0)]
+Times = Annotated[
+    Path | None,
+    typer.Option("--times", help="Stamps of KITTI poses, seconds, one a line.  [default: times.txt next to them]"),
+]
 Verbose = Annotated[bool, typer.Option("--verbose", help="Show the traceback of an error.")]

@@ -37,7 +37,7 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 # ---------------------------------------------------------------------- recordings
 
 
-def true_trajectory(path: Path) -> Trajectory:
+def true_trajectory(path: Path, times: Path | None = None) -> Trajectory:
     """Read a trajectory file, or the truth of a recording.
 
     Raises:
@@ -54,7 +54,7 @@ def true_trajectory(path: Path) -> Trajectory:
         if truth is None:
             raise TrajectoryError(f"{path}: this recording has no true trajectory; give a file, TUM or EuRoC")
         path = truth
-    return load_trajectory(path)
+    return load_trajectory(path, times)
 
 
 def open_recording(

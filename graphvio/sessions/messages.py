@@ -20,6 +20,8 @@ from graphvio.sessions.cdr import make
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 IMU, CAMERA_INFO, TRANSFORMS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
+POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
 LOG, TEXT = "rcl_interfaces/msg/Log", "std_msgs/msg/String"
 STAMPED = (IMAGE, COMPRESSED, IMU, CAMERA_INFO, ODOMETRY, POSE)
 """Types that begin with a header."""
@@ -190,9 +192,12 @@ def pose_stamped(stamp_ns: int, frame: str, frame_T_body: Float) -> Any:
 
 
 def pose_of(message: Any) -> Float:
-    """Return the pose (4, 4) in a ``PoseStamped``, a ``PoseWithCovarianceStamped`` or an ``Odometry``."""
-    pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
-    q, t = pose.orientation, pose.position
+    """Return the pose (4, 4) in a message of a pose, of a pose with covariance, of an odometry or of a transform."""
+    if hasattr(message, "transform"):
+        q, t = message.transform.rotation, message.transform.translation
+    else:
+        pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+        q, t = pose.orientation, pose.position
     return se3(rotation_from_quat_wxyz(np.array([q.w, q.x, q.y, q.z])), np.array([t.x, t.y, t.z]))
 
 

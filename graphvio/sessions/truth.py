@@ -1,9 +1,9 @@
-"""Reads the true trajectory in a session or bag."""
+"""Reads trajectories in a session or bag: the true one, or that of any topic with poses."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +11,12 @@ import numpy as np
 from graphvio.arrays import Float, Int
 from graphvio.errors import SessionError, TrajectoryError
 from graphvio.sessions import cdr
-from graphvio.sessions.messages import ODOMETRY, POSE, pose_of, stamp_of
+from graphvio.sessions.messages import ODOMETRY, POSE, POSE_WITH_COVARIANCE, TRANSFORM, pose_of, stamp_of
 from graphvio.sessions.store import open_store
-from graphvio.sessions.topics import TRUTH_TOPIC, Topic
+from graphvio.sessions.topics import TRUTH_TOPIC, Topic, of_type
 
 _log = logging.getLogger(__name__)
+_TYPES = (POSE, POSE_WITH_COVARIANCE, ODOMETRY, TRANSFORM)
 
 
 def truth_topic(topics: Mapping[str, Topic]) -> Topic | None:
@@ -24,29 +25,49 @@ def truth_topic(topics: Mapping[str, Topic]) -> Topic | None:
     return topic if topic is not None and topic.type_name in (POSE, ODOMETRY) and topic.places else None
 
 
-def read_truth(path: Path) -> tuple[Int, Float]:
-    """Return stamps (N,), increasing, and poses ``world_T_body`` (N, 4, 4) of the true trajectory.
+def read_poses(path: Path, topic: str | None = None) -> tuple[Int, Float]:
+    """Return stamps (N,), increasing, and poses ``world_T_body`` (N, 4, 4) of a topic.
+
+    Args:
+        path: session or bag.
+        topic: with poses, an odometry or transforms; None takes the true trajectory, or the only such topic.
 
     Raises:
-        TrajectoryError: if it holds none.
+        TrajectoryError: if it holds none, or several and no true one.
         SessionError: if it cannot be read.
     """
-    store = open_store(path, lambda topic: topic == TRUTH_TOPIC)
-    topic = truth_topic(store.topics)
-    if topic is None:
-        raise TrajectoryError(f"{path}: holds no true trajectory, which would be poses on the topic {TRUTH_TOPIC}")
+    wanted = TRUTH_TOPIC if topic is None else topic
+    store = open_store(path, lambda each: each == wanted)
+    chosen = truth_topic(store.topics) if topic is None else store.topics.get(topic)
+    if chosen is None or not chosen.places:
+        store = open_store(path)
+        chosen = _only_topic(path, of_type(store.topics, *_TYPES), topic)
+    if chosen.type_name not in _TYPES:
+        raise TrajectoryError(f"{path}: {chosen.name} has messages of {chosen.type_name}; give a topic with poses")
     poses: dict[int, Float] = {}
     damaged: list[SessionError] = []
-    for place in topic.places:
+    for place in chosen.places:
         try:
-            message = cdr.decode(store.read(place), topic.type_name, path)
+            message = cdr.decode(store.read(place), chosen.type_name, path)
         except SessionError as error:
             damaged.append(error)
         else:
             poses[stamp_of(message.header)] = pose_of(message)
     if damaged:
-        _log.warning("%s: %d true poses are left out; the first: %s", path, len(damaged), damaged[0])
+        _log.warning("%s: %d poses are left out; the first: %s", path, len(damaged), damaged[0])
     if not poses:
-        raise TrajectoryError(f"{path}: not one pose on {TRUTH_TOPIC} can be read; copy the file again")
+        raise TrajectoryError(f"{path}: not one pose on {chosen.name} can be read; copy the file again")
     stamps = sorted(poses)
     return np.array(stamps, dtype=np.int64), np.array([poses[stamp] for stamp in stamps])
+
+
+def _only_topic(path: Path, found: Sequence[Topic], asked: str | None) -> Topic:
+    """Return the topic to take where there is no true trajectory, or where the one asked for has no poses."""
+    names = ", ".join(each.name for each in found) or "none"
+    if asked is not None:
+        raise TrajectoryError(f"{path}: has no poses on {asked}; topics with poses: {names}")
+    if not found:
+        raise TrajectoryError(f"{path}: holds no trajectory, which would be poses or an odometry on some topic")
+    if len(found) > 1:
+        raise TrajectoryError(f"{path}: has poses on several topics ({names}); give one as {path}:TOPIC")
+    return found[0]
