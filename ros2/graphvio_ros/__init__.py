@@ -1,0 +1,1 @@
+"""graphvio as a ROS 2 node."""
