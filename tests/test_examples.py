@@ -1,5 +1,6 @@
 """The examples run as they are typed."""
 
+import json
 import os
 import re
 import shutil
@@ -23,7 +24,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 def _run(name: str, *arguments: object, folder: Path, search: Path | None = None) -> str:
     """Run a program of the examples in a folder, and return what it prints."""
     command = [sys.executable, *(["-m", name] if search else [str(EXAMPLES / name)]), *map(str, arguments)]
-    environment = dict(os.environ)
+    environment = dict(os.environ) | {"MPLBACKEND": "Agg"}
     if search is not None:
         environment["PYTHONPATH"] = os.pathsep.join([str(search), environment.get("PYTHONPATH", "")])
     done = subprocess.run(
@@ -45,6 +46,22 @@ def test_own_sensors(room_walk: Path, tmp_path: Path) -> None:
     )
     assert len(tracked) >= 60
     assert max(abs(float(x)) for x, _, _ in tracked) > 0.05
+
+
+def test_notebook_runs_from_top_to_bottom(room_walk: Path, tmp_path: Path) -> None:
+    """Its cells of code in one process, as a kernel runs them; the recording is there already."""
+    notebook = json.loads((EXAMPLES / "first_look.ipynb").read_text())
+    assert (notebook["nbformat"], notebook["metadata"]["kernelspec"]["language"]) == (4, "python")
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(not cell["outputs"] for cell in notebook["cells"] if cell["cell_type"] == "code")
+    (tmp_path / "first_look.py").write_text("\n\n".join(cells))
+    (tmp_path / "room").symlink_to(room_walk)
+    said = _run(str(tmp_path / "first_look.py"), folder=tmp_path)
+    assert "100 estimates, 100 with a pose; the last one is tracking" in said
+    (path_m, ate_mm) = _numbers(r"path (\S+) m, ATE rmse (\S+) mm", said)
+    assert path_m > 0.5
+    assert ate_mm < 5.0
+    assert cv2.imread(str(tmp_path / "first_look.png")).shape[0] > 200
 
 
 def test_evaluate_with_evo(room_walk: Path, tmp_path: Path) -> None:
