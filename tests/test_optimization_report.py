@@ -27,7 +27,7 @@ from graphvio.optimization.optimize import JudgedLoop, Optimization, optimize
 from graphvio.optimization.record import Inertial, Motions, SessionRecord
 from graphvio.optimization.report.calibration import calibrations
 from graphvio.optimization.report.page import length, plain
-from graphvio.optimization.report.write import write_report
+from graphvio.optimization.report.write import write_plan, write_report
 from graphvio.optimization.solver import Residuals
 from graphvio.trajectory import Trajectory
 
@@ -218,6 +218,19 @@ def test_write_report_pictures_show_everything(written: tuple[Page, dict[str, An
     for half in (slice(None, pixels.shape[1] // 2), slice(pixels.shape[1] // 2, None)):
         assert blue[:, half].sum() > 300
         assert faint[:, half].sum() > 100
+
+
+def test_write_plan_shows_trajectory_loops_and_points(one: Optimization, tmp_path: Path) -> None:
+    counts = {}
+    few = np.random.default_rng(0).normal([3.0, 5.0, 0.0], 1.0, (500, 3))
+    for name, points in {"none": None, "empty": np.zeros((0, 3)), "some": few}.items():
+        (tmp_path / name).mkdir()
+        image = matplotlib.image.imread(write_plan(one, tmp_path / name, points))[..., :3]
+        red, green, blue = np.moveaxis(image, 2, 0)
+        grey = (np.ptp(image, axis=2) < 0.02) & (red > 0.4) & (red < 0.7)
+        counts[name] = [int(each.sum()) for each in (grey, blue - red > 0.3, green - red > 0.2)]
+    assert all(min(each[1], each[2]) > 100 for each in counts.values())
+    assert counts["some"][0] > counts["none"][0] + 500
 
 
 def test_write_report_unjoined_parts_are_listed(truth: Trajectory, tmp_path: Path) -> None:

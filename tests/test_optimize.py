@@ -34,7 +34,15 @@ pytestmark = pytest.mark.heavy
 CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 SECONDS = 7.0
 SETTINGS = "optimization: {loop_interval_s: 3.0, place_distance_m: 0.2, features: 500}\n"
-ALWAYS_EQUAL = ("trajectory_optimized.txt", "covariance.csv", "graph.g2o", "loops.npz", "walk/record.npz")
+ALWAYS_EQUAL = (
+    "trajectory_optimized.txt",
+    "covariance.csv",
+    "points.ply",
+    "plan.png",
+    "graph.g2o",
+    "loops.npz",
+    "walk/record.npz",
+)
 
 
 def to_and_fro(t: Float) -> Float:
@@ -78,7 +86,7 @@ def test_optimize_rendered_walk_improves_on_online(done: Path) -> None:
     assert errors["optimized"] < 0.002
     assert summary["loops"]["used"] >= 5
     assert summary["cost"]["after"] < summary["cost"]["before"]
-    for name in (*ALWAYS_EQUAL, "report.html", "database.db", "colmap/sparse/0/points3D.bin"):
+    for name in (*ALWAYS_EQUAL, "report.html", "plan.png", "points.ply", "database.db", "colmap/sparse/0/points3D.bin"):
         assert (done / name).stat().st_size > 100, name
     trajectory = load_trajectory(done / "trajectory_optimized.txt")
     assert len(trajectory) == session["framesets"]

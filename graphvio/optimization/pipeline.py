@@ -23,8 +23,9 @@ from graphvio.optimization.loops.features import extract_places
 from graphvio.optimization.loops.places import choose_places
 from graphvio.optimization.loops.search import SessionInput, find_loops
 from graphvio.optimization.optimize import Optimization, optimize
+from graphvio.optimization.point_cloud import model_points, ply
 from graphvio.optimization.record import Recorder, SessionRecord
-from graphvio.optimization.report.write import write_report
+from graphvio.optimization.report.write import write_plan, write_report
 from graphvio.optimization.workspace import Workspace, digest
 from graphvio.pipeline import RunListener, run
 from graphvio.results import ResultWriter
@@ -151,7 +152,11 @@ class Stages:
                 _log.warning("%s: %s", session.name, error)
             self._space.write(name, to_text(rig, path.parent).encode())
             self._space.finish(stage, name)
-        self._rigs[number] = load_rig(path)
+        self.use_calibrated(number)
+
+    def use_calibrated(self, number: int) -> None:
+        """Use the rig that `calibrate` has written, in this folder or in another one that it was copied from."""
+        self._rigs[number] = load_rig(self._space.folder / f"{self._sessions[number].name}/rig-refined.yaml")
 
     def record(self, number: int, *, with_features: bool = False) -> SessionRecord:
         """Run the odometry on a session, write its results, and return what it measured.
@@ -231,6 +236,11 @@ class Stages:
                 self._export(found, records, rigs)
                 self._space.finish("map", "colmap/sparse/0/points3D.bin")
             report.result()
+        points = None
+        if closures is not None:
+            points = model_points(self._space.folder / "colmap/sparse/0")
+            self._space.write("points.ply", ply(points))
+        write_plan(found, self._space.folder, None if points is None else points.positions)
         return found
 
     def _export(self, found: Optimization, records: Sequence[SessionRecord], rigs: Sequence[Rig]) -> None:

@@ -1,4 +1,4 @@
-"""Figures of an optimisation's report: maps, residuals, and changes and uncertainty over time."""
+"""Figures of an optimisation's report: maps, a plan, residuals, and changes and uncertainty over time."""
 
 from __future__ import annotations
 
@@ -24,6 +24,9 @@ _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _GAP_IN = 0.75, 0.15, 0.55, 0.3
 _LEGEND_ROW_IN, _HEADING_IN, _PER_ROW = 0.22, 0.4, 6
 _REFUSED, _REFUSED_ALPHA = "loop, refused", 0.15  # there may be hundreds
 _EDGE = {"markeredgecolor": "#111111", "markeredgewidth": 0.9, "linestyle": "none", "zorder": 5}
+
+_PLAN_IN, _MIN_PLAN_IN, _PLAN_PER_ROW = 7.0, 3.2, 4
+_PLAN_TAIL = 0.05  # of the points on each side
 
 _COLUMNS = 3
 _MIN_SQUARE, _MAX_SQUARE = 1e-4, 1e6  # squared distances per dimension within the bins
@@ -63,6 +66,53 @@ def plot_map(found: Optimization, numbers: Numbers, frame: int) -> Figure:
     for text, handle in zip(legend.get_texts(), legend.get_lines(), strict=True):
         if text.get_text() == _REFUSED:
             handle.set(alpha=0.6, linewidth=1.0)  # faint in the plot, but legible here
+    return figure
+
+
+def plot_plan(found: Optimization, numbers: Numbers, frame: int, points: Float | None) -> Figure:
+    """Plot a frame from above: points of its map (N, 3), optimised trajectories, and loop closures.
+
+    A few points are far off; the plan ends where few more points would be seen.
+    """
+    lines = list(_lines(found, numbers, frame))
+    shown = np.concatenate([line.columns[1][line.inside, :2] for line in lines])
+    if points is not None and len(points):
+        near = np.quantile(points[:, :2], [_PLAN_TAIL, 1.0 - _PLAN_TAIL], axis=0)
+        shown = np.concatenate([shown, near])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    margin = 0.05 * max(float((high - low).max()), 0.1)
+    extent = high - low + 2.0 * margin
+    inch_per_m = _PLAN_IN / float(extent.max())
+    width, height = np.maximum(inch_per_m * extent, _MIN_PLAN_IN)
+    rows = -(-_labels(found, lines) // _PLAN_PER_ROW)
+    total_width, total_height = (
+        _LEFT_IN + width + _RIGHT_IN,
+        _BOTTOM_IN + height + _GAP_IN + _LEGEND_ROW_IN * rows,
+    )
+    figure = empty_figure(total_width, total_height)
+    place = (_LEFT_IN / total_width, _BOTTOM_IN / total_height, width / total_width, height / total_height)
+    axes = add_axes(figure, place)
+    if points is not None:
+        style = {"color": GREY, "markersize": 2.0, "markeredgewidth": 0.0, "zorder": 1}
+        axes.plot(points[:, 0], points[:, 1], ".", label="points", **style)
+    _plot_loops(axes, found, lines, 1, 1)
+    for line in lines:
+        _plot_line(axes, line, 1, 1)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - margin, high[1] + margin)
+    axes.set_xlabel("x, m", fontsize=9)
+    axes.set_ylabel("y, m", fontsize=9)
+    axes.tick_params(labelsize=8.5)
+    handles, labels = axes.get_legend_handles_labels()
+    kept = dict(zip(labels, handles, strict=True))
+    legend = axes.legend(
+        kept.values(), kept.keys(), loc="lower left", bbox_to_anchor=(0.0, 1.0), ncol=_PLAN_PER_ROW,
+        frameon=False, fontsize=9, borderaxespad=0.3, handlelength=1.6, columnspacing=1.4,
+    )  # fmt: skip
+    for text, handle in zip(legend.get_texts(), legend.get_lines(), strict=True):
+        if text.get_text() == "points":
+            handle.set(markersize=6.0)  # smaller ones are not legible
     return figure
 
 

@@ -24,7 +24,7 @@ from graphvio.reporting.figures import png
 from graphvio.reporting.files import replace_file
 from graphvio.trajectory import Trajectory
 
-PAGE, SUMMARY = "report.html", "summary.json"
+PAGE, SUMMARY, PLAN = "report.html", "summary.json", "plan.png"
 VERSION = 1
 _MAX_MAPS = 6
 
@@ -55,6 +55,26 @@ def write_report(found: Optimization, folder: Path, truths: Sequence[Trajectory 
     except OSError as error:
         raise OptimizationError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
     return folder / PAGE
+
+
+def write_plan(found: Optimization, folder: Path, points: Float | None) -> Path:
+    """Write a picture of the frame with most framesets from above, whose path is returned.
+
+    Args:
+        found: the optimisation.
+        folder: where to write, with the odometry's results.
+        points: (N, 3) of that frame's map, or None.
+
+    Raises:
+        OptimizationError: if the folder cannot be written.
+    """
+    numbers = numbers_of(found, [None] * len(found.sessions), folder)
+    plan = png(figures.plot_plan(found, numbers, _largest_frames(numbers)[0], points))
+    try:
+        replace_file(folder / PLAN, plan)
+    except OSError as error:
+        raise OptimizationError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
+    return folder / PLAN
 
 
 def _largest_frames(numbers: Numbers) -> list[int]:
