@@ -24,7 +24,7 @@ from graphvio.self_calibration.bundle import _COLUMNS as COLUMNS
 from graphvio.self_calibration.bundle import _ERROR_AT as ERROR_AT
 from graphvio.self_calibration.bundle import Eliminated, Tracks, _observe, _scratch, eliminate_landmarks
 from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
-from graphvio.self_calibration.findings import described
+from graphvio.self_calibration.findings import contradiction, described
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.self_calibration.online import FullWindow, SelfCalibration
 from graphvio.self_calibration.parameters import (
@@ -325,6 +325,26 @@ class Crowd(Walk):
     def views(self, world_T_body: Float) -> dict[int, View]:
         self._points[::3] += np.array([0.02, 0.01, 0.0])
         return super().views(world_T_body)
+
+
+@pytest.mark.parametrize("level", [0, 1, 3])
+def test_contradiction_is_never_a_false_alarm(level: int) -> None:
+    """A part that is right is not called wrong, and what is called wrong is off by what is said."""
+    named = []
+    for seed in range(3):
+        written, true, _ = sampled(level, seed) if level else (default_rig().without_imu(),) * 2 + (None,)
+        right = written.pairs[1]  # its cameras are as in the file, those of the first pair are not
+        true = replace(true, pairs=(true.pairs[0], right))
+        calibration = calibrated(SelfCalibration(written), Walk(true, seed=seed), 6.0)
+        assert calibration.is_confirmed
+        found = calibration.findings()
+        wrong = contradiction(found)
+        significant = [finding for finding in found if finding.is_significant]
+        assert (wrong is None) == (not significant)
+        assert not [each.part for each in significant if each.part.startswith((right.left.name, right.right.name))]
+        assert all(each.distance > 5.0 for each in significant)
+        named += [each.part for each in significant]
+    assert bool(named) == (level == 3)
 
 
 @pytest.mark.parametrize("walk", [Straight, OnTheSpot, Blind, Crowd])

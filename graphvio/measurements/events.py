@@ -46,7 +46,7 @@ class EventKind(StrEnum):
     CAMERA_FROZEN = "camera_frozen"
     """A camera repeats its image while others do not; its pair is left out until the image changes."""
     CALIBRATION_CORRECTED = "calibration_corrected"
-    """The images contradict the rig file beyond doubt; the calibration is corrected from now on."""
+    """A part of the rig file is wrong beyond 5 sigma by two windows of keyframes; it is corrected from now on."""
     CALIBRATION_CHANGED = "calibration_changed"
     """For some time the images contradict the calibration that was known, as after a knock; it is estimated again."""
     EXTRINSICS_OFF = "extrinsics_off"

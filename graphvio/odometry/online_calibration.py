@@ -16,7 +16,7 @@ from graphvio.measurements.sensors import ImuSample
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
-from graphvio.self_calibration.findings import Finding
+from graphvio.self_calibration.findings import Finding, contradiction
 from graphvio.self_calibration.imu_correction import ImuCorrection
 from graphvio.self_calibration.online import FullWindow, SelfCalibration
 from graphvio.self_calibration.window import View
@@ -100,15 +100,7 @@ class OnlineCalibration:
             return
         self._margin_px = margin_px
         estimate = self._calibration.estimate
-        if not estimate.is_file_exact and not self._is_reported:
-            self._is_reported = True
-            self._report(
-                stamp_ns,
-                EventKind.CALIBRATION_CORRECTED,
-                f"the images contradict the rig file (its errors are {estimate.file_factors.max():.1g} times its "
-                "standard deviations): the calibration is corrected from now on",
-            )
-        self._report_places(stamp_ns)
+        self._report_findings(stamp_ns)
         self._frontend.recalibrate(estimate.rig, margin_px, self._calibration.extrinsics)
         if self._rig.imu is None:
             return
@@ -117,10 +109,15 @@ class OnlineCalibration:
             wanted_s = self._rig.imu.time_offset_s + estimate.time_offset_s
             self._synchroniser.shift_imu(wanted_s - self._synchroniser.time_offset_s)
 
-    def _report_places(self, stamp_ns: int) -> None:
-        """Report each pair that is not where the rig file has it, once."""
+    def _report_findings(self, stamp_ns: int) -> None:
+        """Report once that the rig file is wrong beyond 5 sigma, and each pair that is not where the file has it."""
         assert self._calibration is not None
-        for finding in self._calibration.findings():
+        found = self._calibration.findings()
+        wrong = contradiction(found)
+        if wrong is not None and self._calibration.is_confirmed and not self._is_reported:
+            self._is_reported = True
+            self._report(stamp_ns, EventKind.CALIBRATION_CORRECTED, f"{wrong}; corrected from now on")
+        for finding in found:
             pair, _, kind = finding.part.partition(", ")
             if finding.is_significant and " against " in kind and pair not in self._reported:
                 self._reported.add(pair)

@@ -49,6 +49,11 @@ class Finding:
         """Whether the measurements said more of all of it than the rig file."""
         return bool((self.sigmas < _OBSERVED * self.file_sigmas).all())
 
+    @property
+    def distance(self) -> float:
+        """Norm of the difference, in its standard deviations."""
+        return float(np.linalg.norm(self.difference / self.sigmas))
+
     def __str__(self) -> str:
         size, sigma = float(np.linalg.norm(self.difference)), float(np.sqrt(np.mean(self.sigmas**2)))
         return f"{self.part}: {size:.3g} {self.unit} from the rig file (sigma {sigma:.2g})"
@@ -72,6 +77,12 @@ def findings(estimate: CalibrationEstimate, file_covariance: Float) -> list[Find
         is_significant = distance > float(chdtri(len(difference), _FIVE_SIGMA))
         found.append(Finding(part, unit, difference, np.sqrt(np.diag(of_part)), of_file, is_significant, motion))
     return found
+
+
+def contradiction(found: list[Finding]) -> str | None:
+    """Return the part in which the rig file is wrong most clearly, in words, or None where none is beyond 5 sigma."""
+    wrong = [finding for finding in found if finding.is_significant]
+    return str(max(wrong, key=lambda finding: finding.distance)) if wrong else None
 
 
 def described(found: list[Finding]) -> list[str]:

@@ -42,6 +42,7 @@ _MIN_LOG_BAYES_FACTORS = np.array([30.0, 40.0])
 _MAX_SIGMAS = 4.0  # of a parameter, by the file's standard deviations times the largest factor
 _MIN_AGREEING = 3  # keyframes whose pairs agreed, from which contradictions are the scene's
 _MAX_REFUSED = 3  # full windows
+_MIN_CONFIRMING = 2  # full windows; one is at times off by more than its covariance says
 WALK = 0.01  # in one second, as a share of the prior's standard deviations
 _MAX_WALK_S = 10.0  # in a window
 _IMU_NOISE_FACTOR = 2.0  # on the stated densities, since biases walk within a window, too
@@ -238,6 +239,11 @@ class SelfCalibration:
     def _n_cameras(self) -> int:
         """Number of the cameras' parameters, the first ones of all."""
         return PAIR * len(self._rig.pairs)
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether what is known comes from two full windows at least, which share no observation."""
+        return self.has_full_window and self._full_windows >= _MIN_CONFIRMING
 
     @property
     def _pace(self) -> _Pace:
