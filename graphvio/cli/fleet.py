@@ -8,7 +8,7 @@ import typer
 
 from graphvio.cli import options
 from graphvio.cli.json_output import publish, with_json
-from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, warn
+from graphvio.cli.shared import EXIT_INCOMPLETE, EXIT_INTERRUPTED, parsed_pairs, parsed_topics, warn
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -54,8 +54,17 @@ def optimize(
         ),
     ] = None,
     rig: options.RigFile = None,
+    topics: options.Topics = None,
     config: options.ConfigName = "default",
+    pairs: options.Pairs = None,
+    no_imu: options.NoImu = False,
     no_loops: Annotated[bool, typer.Option("--no-loops", help="Look for no loop closures.")] = False,
+    refine_calibration: Annotated[
+        bool,
+        typer.Option("--refine-calibration", help="Calibrate each rig first, as calibrate --what all does."),
+    ] = False,
+    from_s: options.FromS = None,
+    to_s: options.ToS = None,
     verbose: options.Verbose = False,
 ) -> None:
     """Optimise many recorded sessions, each by itself, and write a table of all.
@@ -78,6 +87,7 @@ def optimize(
     from graphvio.fleet.cluster import distributed
     from graphvio.fleet.listing import list_sessions
     from graphvio.fleet.run import optimize_fleet
+    from graphvio.fleet.tasks import Reading
     from graphvio.optimization.loops.colmap_library import colmap
     from graphvio.rig_files import load_rig
 
@@ -88,6 +98,8 @@ def optimize(
         colmap()
     settings = Config.load(config)
     loaded = None if rig is None else load_rig(rig)
+    numbers = None if pairs is None else tuple(parsed_pairs(pairs))
+    reading = Reading(numbers, not no_imu, tuple(parsed_topics(topics).items()), from_s, to_s)
     listed = list_sessions(sessions)
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors are printed below
     try:
@@ -99,6 +111,8 @@ def optimize(
                 settings,
                 rig=loaded,
                 with_loops=not no_loops,
+                calibrates=refine_calibration,
+                reading=reading,
                 scheduler=scheduler,
                 workers=workers,
                 on_progress=lambda progress: bars.update(

@@ -76,7 +76,7 @@ def open_recording(
 
     tolerance_ms = settings.timing.simultaneous_ms
     loaded = None if rig is None else load_rig(rig)
-    mapped = _topics(topics)
+    mapped = parsed_topics(topics)
     opened = open_source(source, loaded, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
     chosen = _choose(opened.rig, pairs, cameras, no_pairs, no_imu)
     if chosen is opened.rig:
@@ -84,8 +84,8 @@ def open_recording(
     return open_source(source, chosen, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
 
 
-def _topics(text: str | None) -> dict[str, str]:
-    """Name of a camera or ``imu`` -> topic."""
+def parsed_topics(text: str | None) -> dict[str, str]:
+    """Parse names of cameras, or ``imu``, with their topics."""
     from graphvio.errors import SourceError
 
     pairs = [each.split("=") for each in (text or "").split(",") if each]
@@ -94,15 +94,19 @@ def _topics(text: str | None) -> dict[str, str]:
     return {name.strip(): topic.strip() for name, topic in pairs}
 
 
-def _choose(rig: Rig, pairs: str | None, cameras: str | None, no_pairs: bool, no_imu: bool) -> Rig:
+def parsed_pairs(text: str) -> list[int]:
+    """Parse the numbers of stereo pairs."""
     from graphvio.errors import RigError
 
+    try:
+        return [int(each) for each in text.split(",")]
+    except ValueError:
+        raise RigError(f"--pairs {text}: give numbers separated by commas, such as 0,1") from None
+
+
+def _choose(rig: Rig, pairs: str | None, cameras: str | None, no_pairs: bool, no_imu: bool) -> Rig:
     if pairs is not None:
-        try:
-            indices = [int(text) for text in pairs.split(",")]
-        except ValueError:
-            raise RigError(f"--pairs {pairs}: give numbers separated by commas, such as 0,1") from None
-        rig = rig.with_pairs(indices)
+        rig = rig.with_pairs(parsed_pairs(pairs))
     if cameras is not None:
         rig = rig.with_only([name.strip() for name in cameras.split(",")])
     if no_pairs:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from graphvio.errors import FleetError
-from graphvio.fleet.storage import file_system, local_path
+from graphvio.fleet.storage import file_system, local_path, reaching
 from graphvio.sources import is_recording
 
 _FILES = (".mcap", ".bag")
@@ -32,7 +32,8 @@ def list_sessions(where: str) -> list[Listed]:
     """
     local = local_path(where)
     try:
-        recordings = _in_local(local) if local is not None else _in_remote(where.rstrip("/"))
+        with reaching():
+            recordings = _in_local(local) if local is not None else _in_remote(where.rstrip("/"))
     except UnicodeDecodeError:
         raise FleetError(f"{where}: is neither a folder nor a list of recordings in text") from None
     except OSError as error:

@@ -45,6 +45,8 @@ def optimize_fleet(
     *,
     rig: Rig | None = None,
     with_loops: bool = True,
+    calibrates: bool = False,
+    reading: tasks.Reading | None = None,
     scheduler: str | None = None,
     workers: int | None = None,
     places_per_task: int = PLACES_PER_TASK,
@@ -61,6 +63,8 @@ def optimize_fleet(
         config: configuration of all stages.
         rig: rig of all sessions; None takes the recordings' own.
         with_loops: whether loop closures are searched, which needs the extra ``maps``.
+        calibrates: whether each rig is calibrated first, see `graphvio.optimization.pipeline.optimize_sessions`.
+        reading: what is read of each recording; None for all of it.
         scheduler: address of a Dask scheduler; None takes workers on this machine.
         workers: processes on this machine; None takes `default_workers`.
         places_per_task: maximum number of places whose features one task extracts.
@@ -79,7 +83,17 @@ def optimize_fleet(
     where = local_path(out)
     out = out.rstrip("/") if where is None else str(where)
     jobs = [
-        tasks.Job(each.name, each.recording, f"{out}/{each.name}", config, rig, with_loops, places_per_task)
+        tasks.Job(
+            each.name,
+            each.recording,
+            f"{out}/{each.name}",
+            config,
+            rig,
+            with_loops,
+            places_per_task,
+            reading or tasks.Reading(),
+            calibrates,
+        )
         for each in sessions
     ]
     fleet = _Fleet([_Session(job) for job in jobs], on_progress)

@@ -30,6 +30,8 @@ def file_system(url: str) -> tuple[Any, str]:
     try:
         files, path = url_to_fs(url)
     except (ImportError, ValueError) as error:
+        if isinstance(error, ImportError) and url.startswith(("s3:", "s3a:")):
+            raise MissingExtraError("s3fs", "s3", "an S3 store") from None
         raise FleetError(f"{url}: cannot be reached ({error})") from None
     return files, str(path)
 
@@ -39,6 +41,17 @@ def local_path(url: str) -> Path | None:
     files, path = file_system(url)
     protocol = (files.protocol,) if isinstance(files.protocol, str) else files.protocol
     return Path(path) if "file" in protocol else None
+
+
+@contextmanager
+def reaching() -> Iterator[None]:
+    """Raise what S3's client says of the network or credentials as an `OSError`, as fsspec does elsewhere."""
+    try:
+        yield
+    except Exception as error:
+        if type(error).__module__.partition(".")[0] not in ("botocore", "aiobotocore", "aiohttp"):
+            raise
+        raise OSError(f"{type(error).__name__}: {error}") from None
 
 
 class Storage:
@@ -122,7 +135,8 @@ class Storage:
     @contextmanager
     def _reaching(self, name: str, what: str) -> Iterator[None]:
         try:
-            yield
+            with reaching():
+                yield
         except OSError as error:
             raise FleetError(
                 f"{self.url}: {name} cannot be {what} ({error.strerror or error}); check the place of the results"
@@ -148,10 +162,11 @@ def fetch_recording(url: str, scratch: Path) -> Path:
     unfinished = kept / "unfinished" / copy.name
     try:
         unfinished.parent.mkdir(parents=True)
-        if files.isdir(path):
-            files.get(f"{path}/", f"{unfinished}/", recursive=True)
-        else:
-            files.get_file(path, str(unfinished))
+        with reaching():
+            if files.isdir(path):
+                files.get(f"{path}/", f"{unfinished}/", recursive=True)
+            else:
+                files.get_file(path, str(unfinished))
         unfinished.parent.replace(folder)
     except OSError as error:
         shutil.rmtree(kept, ignore_errors=True)

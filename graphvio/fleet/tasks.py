@@ -39,6 +39,29 @@ _ONE_AT_A_TIME = threading.Lock()  # the odometry has threads of its own, and re
 _STATE = "stages.json"  # of a folder that one process works in from the first stage to the last
 
 
+@dataclass(frozen=True)
+class Reading:
+    """What is read of each recording, as by the options of ``graphvio optimize``."""
+
+    pairs: tuple[int, ...] | None = None  # numbers of the stereo pairs; None for all
+    with_imu: bool = True  # whether the IMU is used
+    topics: tuple[tuple[str, str], ...] = ()  # cameras of the rig, or ``imu``, with their topics
+    from_s: float | None = None  # second of the recording to begin at
+    to_s: float | None = None  # second to end at
+
+    def open(self, path: Path, rig: Rig | None, config: Config) -> Source:
+        """Open a recording."""
+
+        def opened(of: Rig | None) -> Source:
+            tolerance_ms, topics = config.timing.simultaneous_ms, dict(self.topics)
+            return open_source(path, of, from_s=self.from_s, to_s=self.to_s, tolerance_ms=tolerance_ms, topics=topics)
+
+        source = opened(rig)
+        chosen = source.rig if self.pairs is None else source.rig.with_pairs(list(self.pairs))
+        chosen = chosen if self.with_imu else chosen.without_imu()
+        return source if chosen is source.rig else opened(chosen)
+
+
 @dataclass(frozen=True, eq=False)
 class Job:
     """A session to optimise."""
@@ -50,6 +73,8 @@ class Job:
     rig: Rig | None  # rig, or None for the recording's own
     with_loops: bool  # whether loop closures are searched
     places_per_task: int  # maximum number of places whose features one task extracts
+    reading: Reading = Reading()  # what is read of the recording
+    calibrates: bool = False  # whether the rig is calibrated from the whole recording first
     version: str = __version__  # version of graphvio
 
     @property
@@ -61,6 +86,8 @@ class Job:
             "graphvio": self.version,
             "rig": "" if self.rig is None else digest(to_text(self.rig, Path())),
             "loops": str(self.with_loops),
+            "calibration": str(self.calibrates),
+            "reading": str(self.reading),
         }
 
 
@@ -73,6 +100,8 @@ def odometry(job: Job) -> Marker:
     """Run the odometry; its figures are those of the summary, and ``parts``, the number of tasks for features."""
 
     def work(task: _Task) -> dict[str, Any]:
+        if job.calibrates:
+            task.stages.calibrate(0)
         record = task.stages.record(0)
         summary = json.loads((task.folder / job.name / "odometry" / "summary.json").read_text(encoding="utf-8"))
         places = len(task.stages.places(0, record).places)
@@ -170,6 +199,8 @@ class _Task:
             for name in self.done[stage].files:
                 self.fetched.add(name)
                 self.storage.fetch(name, self.folder / name)
+        if ODOMETRY in stages and self.job.calibrates:
+            self.stages.use_calibrated(0)
 
     def record(self) -> SessionRecord:
         """Load the odometry's record, which has been fetched."""
@@ -187,8 +218,10 @@ def _perform(job: Job, stage: str, work: Callable[[_Task], dict[str, Any]], chan
         if stage in done:
             return done[stage]
         recording = fetch_recording(job.recording, kept)
-        source = open_source(recording, job.rig, tolerance_ms=job.config.timing.simultaneous_ms)
-        stages = Stages([Session(job.name, source)], scratch, job.config, with_loops=job.with_loops)
+        source = job.reading.open(recording, job.rig, job.config)
+        stages = Stages(
+            [Session(job.name, source)], scratch, job.config, with_loops=job.with_loops, calibrates=job.calibrates
+        )
         inputs = stages.inputs | job.inputs
         refuse_others(storage, done.values(), inputs)
         task = _Task(job, scratch, source, stages, storage, done)
