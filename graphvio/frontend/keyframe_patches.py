@@ -88,8 +88,8 @@ class KeyframePatches:
         wanted = (frame.ids[rows] == ids) & frame.has_depth[rows]
         camera = self._pair.left
         warps, shifts, usable = predict_warps(
-            self._rays[:, rows],
-            self._inverse_depths[:, rows],
+            np.take(self._rays, rows, axis=1),  # indexing would have another layout, and for one row yet another
+            np.take(self._inverse_depths, rows, axis=1),
             self._step_px,
             left_T_left_keyframe,
             camera.model_number,
