@@ -44,10 +44,10 @@ class _Clique:
 
 def covariances(net: gtsam.GaussianBayesNet) -> Iterator[tuple[int, Float]]:
     """Yield key and covariance of each variable of a system after its elimination, one variable a row."""
-    conditionals = [net.at(row) for row in range(net.size())]
-    keys = [list(each.keys()) for each in conditionals]
-    square_roots = [each.R() for each in conditionals]
-    dims = {each[0]: len(square_root) for each, square_root in zip(keys, square_roots, strict=True)}
+    conditionals = dict(enumerate(net.at(row) for row in range(net.size())))
+    del net  # each row is freed when it has been used
+    keys = [list(each.keys()) for each in conditionals.values()]
+    dims = {each[0]: len(conditionals[row].R()) for row, each in enumerate(keys)}
     for clique in _cliques(keys):
         rows = clique.rows[::-1]
         frontal = [keys[row][0] for row in rows]
@@ -60,8 +60,9 @@ def covariances(net: gtsam.GaussianBayesNet) -> Iterator[tuple[int, Float]]:
         for row in rows:
             key, *others = keys[row]
             own = system[clique.columns[key]]
-            own[:, clique.columns[key]] = square_roots[row]
-            coupling, at = conditionals[row].S(), 0
+            conditional = conditionals.pop(row)
+            own[:, clique.columns[key]] = conditional.R()
+            coupling, at = conditional.S(), 0
             for other in others:
                 own[:, clique.columns[other]] = coupling[:, at : at + dims[other]]
                 at += dims[other]

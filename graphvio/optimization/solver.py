@@ -114,15 +114,19 @@ class Marginals:
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         self._values = values
+        self._graph = graph
         self._ordering = gtsam.Ordering.MetisNonlinearFactorGraph(graph)
-        self._linear = graph.linearize(values)
 
     def poses(self, count: int) -> Float:
         """Return the covariances (N, 6, 6) of the first poses, tangent ``[rotation, translation]`` in body."""
+        found = np.zeros((count, 6, 6))
+        numbers = {x(k): k for k in range(count)}
+        linear = self._graph.linearize(self._values)
         with gtsam_errors(_FREE):
-            net = self._linear.eliminateSequential(self._ordering, gtsam.EliminateQR)
-        found = dict(covariances(net))
-        return np.array([found[x(k)] for k in range(count)]).reshape(-1, 6, 6)
+            for key, covariance in covariances(linear.eliminateSequential(self._ordering, gtsam.EliminateQR)):
+                if key in numbers:
+                    found[numbers[key]] = covariance
+        return found
 
     def pose(self, k: int) -> Float:
         """Return the covariance (6, 6) of state k's pose, tangent ``[rotation, translation]`` in body."""
@@ -131,7 +135,8 @@ class Marginals:
     @cached_property
     def _tree(self) -> gtsam.GaussianBayesTree:
         with gtsam_errors(_FREE):
-            return self._linear.eliminateMultifrontal(self._ordering, gtsam.EliminateQR)
+            linear = self._graph.linearize(self._values)
+            return linear.eliminateMultifrontal(self._ordering, gtsam.EliminateQR)
 
     def variable(self, key: int) -> Float:
         """Return the covariance of a variable."""
