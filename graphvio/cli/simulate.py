@@ -56,7 +56,11 @@ def simulate(
     ] = None,
     rig: Annotated[
         str,
-        typer.Option("--rig", help="Rig file; or paper, two stereo pairs, stereo, or stereo+back.", metavar="RIG"),
+        typer.Option(
+            "--rig",
+            help="Rig file; or paper, two stereo pairs, stereo, stereo+back, headset, surround or phone.",
+            metavar="RIG",
+        ),
     ] = "paper",
     verbose: options.Verbose = False,
 ) -> None:

@@ -6,10 +6,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from graphvio.arrays import Float
 from graphvio.errors import SourceError
-from graphvio.rig import Rig, SingleCamera
+from graphvio.geometry import se3
+from graphvio.rig import Camera, Imu, Rig, SingleCamera, StereoPair
 from graphvio.rig_files import load_rig
 from graphvio.simulation.default_rig import default_rig
+
+_SIZE_PX = (640, 480)
 
 
 def stereo() -> Rig:
@@ -23,7 +29,60 @@ def stereo_and_back() -> Rig:
     return replace(stereo(), singles=(SingleCamera(back.left),))
 
 
-NAMED_RIGS: dict[str, Callable[[], Rig]] = {"paper": default_rig, "stereo": stereo, "stereo+back": stereo_and_back}
+def headset() -> Rig:
+    """Return four fisheyes, 126 degrees wide and 158 diagonally: a pair in front, and a camera on each side."""
+    lens = ("equidistant", np.array([290.0, 290.0, 319.5, 239.5]), np.array([0.0034, 0.0007, -0.0020, 0.0002]))
+    left, right, to_left, to_right = (
+        Camera(f"cam{k}", lens[0], _SIZE_PX, *lens[1:], _body_T_cam(position_m, yaw_deg, pitch_deg))
+        for k, (position_m, yaw_deg, pitch_deg) in enumerate(
+            [
+                ((0.06, 0.05, 0.02), 8.0, 12.0),
+                ((0.06, -0.05, 0.02), -8.0, 12.0),
+                ((0.03, 0.08, 0.0), 70.0, 20.0),
+                ((0.03, -0.08, 0.0), -70.0, 20.0),
+            ]
+        )
+    )
+    sides = SingleCamera(to_left), SingleCamera(to_right)
+    return Rig((StereoPair("front", left, right),), Imu(), "headset", singles=sides)
+
+
+def surround() -> Rig:
+    """Return six cameras on a circle, 90 degrees wide, none of which is a pair with another."""
+    lens = ("radial-tangential", np.array([320.0, 320.0, 319.5, 239.5]), np.array([-0.05, 0.01, 0.0, 0.0]))
+    cameras = []
+    for k in range(6):
+        yaw_deg = 60.0 * k
+        yaw = np.deg2rad(yaw_deg)
+        body_T_cam = _body_T_cam((0.15 * np.cos(yaw), 0.15 * np.sin(yaw), 0.0), yaw_deg, 10.0)
+        cameras.append(SingleCamera(Camera(f"cam{k}", lens[0], _SIZE_PX, *lens[1:], body_T_cam)))
+    return Rig((), Imu(), "surround", singles=tuple(cameras))
+
+
+def phone() -> Rig:
+    """Return one camera, 66 degrees wide, whose rolling shutter takes 20 ms."""
+    lens = ("radial-tangential", np.array([495.0, 495.0, 321.3, 237.8]), np.array([0.08, -0.12, 3e-4, -2e-4]))
+    line_time_us = 20e3 / _SIZE_PX[1]
+    camera = Camera("cam0", lens[0], _SIZE_PX, *lens[1:], _body_T_cam((0.0, 0.02, 0.06), 0.0, 5.0), None, line_time_us)
+    return Rig((), Imu(), "phone", singles=(SingleCamera(camera),))
+
+
+def _body_T_cam(position_m: tuple[float, float, float], yaw_deg: float, pitch_deg: float) -> Float:
+    """Return the pose of a camera that looks to the left of forward by a yaw, and down by a pitch."""
+    yaw, pitch = np.deg2rad(yaw_deg), np.deg2rad(pitch_deg)
+    forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), -np.sin(pitch)])
+    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+    return se3(np.column_stack([right, np.cross(forward, right), forward]), np.array(position_m))
+
+
+NAMED_RIGS: dict[str, Callable[[], Rig]] = {
+    "paper": default_rig,
+    "stereo": stereo,
+    "stereo+back": stereo_and_back,
+    "headset": headset,
+    "surround": surround,
+    "phone": phone,
+}
 """Rigs by name; ``paper`` is the default."""
 
 
