@@ -35,8 +35,10 @@ _MAX_OFF = 0.3  # share of a landmark's views that may be farther off
 _MIN_FITTING = 0.7  # share of the landmarks
 _MAX_IMU_ERROR2 = 60.0  # squared whitened error of an interval, of 9 dimensions
 _MAX_GRAVITY_EXCESS = 0.1  # m/s^2
-_STEPS = 12
+_STEPS = 40
 ACCEL_BIAS_SIGMA = 0.15
+_OTHER_SCALES = (0.6, 1.7)
+_MIN_WORSE = 12.5  # of the cost: another scale is five standard deviations off
 POSE_SIGMAS = np.full(6, 1e-3)  # of the pose that defines nav
 
 
@@ -141,7 +143,7 @@ class Initialiser:
             fitting *= 1.0 - float(off.mean())
             names.end(ids[off])
             views = [each.without(ids[off]) for each in views]
-        self.reason = self._fault(adjusted, fitting)
+        self.reason = self._fault(adjusted, fitting) or _ambiguity(measured, adjusted, prior)
         if self.reason:
             return None
         return self._in_nav(Window(states, views, [k in stationary for k in range(n)], names, landmarks, prior))
@@ -177,3 +179,29 @@ class Initialiser:
         known = window.prior.at
         at = replace(turned.of(np.arange(1)), biases=known.biases)
         return replace(window, states=turned, prior=window.prior._replace(at=at))
+
+
+def _ambiguity(measured: Measurements, adjusted: Adjusted, prior: Prior) -> str:
+    """Say whether another scale fits as well as the one that was found, or nothing.
+
+    A covariance is of one minimum, and says nothing of others: the window is adjusted again from other scales.
+    """
+    states, cost = adjusted.states, adjusted.equations.cost
+    for factor in _OTHER_SCALES:
+        scaled = states.poses.copy()
+        scaled[:, :3, 3] *= factor
+        frames = measured.structure.odom_T_landmark.copy()
+        frames[:, :3, 3] *= factor
+        other = measured._replace(structure=measured.structure._replace(odom_T_landmark=frames))
+        start = replace(states, poses=scaled, velocities=factor * states.velocities)
+        found = adjust(other, start, adjusted.landmarks * np.array([1.0, 1.0, 1.0 / factor]), prior, _STEPS)
+        apart = abs(_size(found.states) / _size(states) - 1.0)
+        if apart > MAX_SCALE_SIGMA and found.equations.cost < cost + _MIN_WORSE:
+            return f"scales {100 * apart:.0f} % apart fit as well as each other"
+    return ""
+
+
+def _size(states: States) -> float:
+    """Return the rms distance of the positions from their mean, m."""
+    positions = states.poses[:, :3, 3]
+    return float(np.sqrt(((positions - positions.mean(axis=0)) ** 2).sum(axis=1).mean()))
