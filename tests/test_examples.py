@@ -61,7 +61,9 @@ def test_notebook_runs_from_top_to_bottom(room_walk: Path, tmp_path: Path) -> No
     (path_m, ate_mm) = _numbers(r"path (\S+) m, ATE rmse (\S+) mm", said)
     assert path_m > 0.5
     assert ate_mm < 5.0
-    assert cv2.imread(str(tmp_path / "first_look.png")).shape[0] > 200
+    plot = cv2.imread(str(tmp_path / "first_look.png"))
+    assert plot is not None
+    assert plot.shape[0] > 200
 
 
 def test_evaluate_with_evo(room_walk: Path, tmp_path: Path) -> None:
