@@ -2,7 +2,19 @@
 
 import sys
 
-from benchmarks import accuracy, backend, calibration_error, cameras, faults, frontend, lenses, optimize, slam, startup
+from benchmarks import (
+    accuracy,
+    backend,
+    calibration_error,
+    cameras,
+    faults,
+    frontend,
+    lenses,
+    optimize,
+    slam,
+    stages,
+    startup,
+)
 from benchmarks.command_line import run_command_line
 
 if __name__ == "__main__":
@@ -15,6 +27,7 @@ if __name__ == "__main__":
                 for module in (
                     startup,
                     frontend,
+                    stages,
                     backend,
                     accuracy,
                     calibration_error,
