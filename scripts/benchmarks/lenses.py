@@ -42,9 +42,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "lenses",
         help="accuracy by the lens model, and with rolling shutters",
-        description=f"Runs a stereo pair with IMU through the room, with images of {_SIZE_PX[0]}x{_SIZE_PX[1]} pixels: "
-        f"with each lens model at {_FIELD_OF_VIEW_DEG:g} degrees, and with pinhole cameras whose lines are read out in "
-        f"{_READOUT_MS:g} ms, with and without the line time in the rig.",
+        description=f"Runs a stereo pair with IMU through the room, with images that are {_SIZE_PX[0]} pixels wide: "
+        f"with each lens model at {_FIELD_OF_VIEW_DEG:g} degrees, and as high as a pinhole's view of {_SIZE_PX[1]} "
+        f"pixels; and with pinhole cameras whose lines are read out in {_READOUT_MS:g} ms, with and without the line "
+        "time in the rig.",
         epilog="Example: scripts/benchmark lenses --seeds 1 --duration 10",
     )
     parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of recordings (default: 3)")
