@@ -16,6 +16,7 @@ import numpy as np
 
 from graphvio.arrays import Float
 from graphvio.kernels import await_compilers
+from graphvio.linear_algebra import cholesky, solve_lower, solve_rows
 from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
 from graphvio.rig import Rig
 from graphvio.self_calibration.consider import ConsiderCovariance
@@ -382,6 +383,9 @@ def adjust_nothing(rig: Rig) -> None:
     prior = calibration.estimate.posterior
     adjusted(keyframes, calibration._samples_of(keyframes), calibration._nominal, prior.mean, prior, _FIRST_SIGMA_PX)
     calibration.close()
+    information, right = np.eye(2), np.zeros((2, 2))  # of the evidence, and of what all cameras have in common
+    solve_lower(cholesky(information), right)
+    solve_rows(information, right)
 
 
 def _assumed(factors: Float) -> Float:
