@@ -9,7 +9,7 @@ program that embeds graphvio makes those that suit it:
 - `StopSignals`, `HeldInterrupt`, `on_interrupt` and the functions below them, for loops that must end cleanly.
 
 Compiled kernels are cached in the folder that the environment variable ``GRAPHVIO_CACHE_DIR`` names, see
-`graphvio.kernels.cache_root`.
+`graphvio.kernel_cache.cache_root`.
 """
 
 from __future__ import annotations
