@@ -37,12 +37,12 @@ class _Kind(IntEnum):
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Value]:
-    """Return nested values by names with dots, as ROS 2 has them."""
+    """Return nested values by names with dots, as ROS 2 has them, without those that are None."""
     flat: dict[str, Value] = {}
     for name, value in values.items():
         if isinstance(value, Mapping):
             flat.update(flatten(value, f"{prefix}{name}{_SEPARATOR}"))
-        else:
+        elif value is not None:
             flat[prefix + name] = value
     return flat
 
