@@ -67,6 +67,10 @@ class StateEstimator(Protocol):
         """Whether there is a state."""
 
     @property
+    def has_pose(self) -> bool:
+        """Whether the newest state has a pose. One of single cameras has none until the scale is known."""
+
+    @property
     def has_imu(self) -> bool:
         """Whether there is a state, and it was initialised with an IMU."""
 
@@ -92,6 +96,14 @@ class StateEstimator(Protocol):
 
     def take_final(self) -> list[tuple[int, Float]]:
         """Return stamps and poses ``nav_T_body`` that became final since the last call, not always in time order."""
+
+    def add_sample(self, stamp_ns: int, values: Float) -> None:
+        """Take an IMU sample, if single ones are needed beside the intervals between framesets.
+
+        Args:
+            stamp_ns: On the framesets' clock.
+            values: (6,) angular velocity, rad/s, and specific force, m/s^2.
+        """
 
     def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
         """Initialise the state at a frameset, with roll and pitch from the IMU if there is one.

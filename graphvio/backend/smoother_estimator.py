@@ -69,6 +69,11 @@ class SmootherEstimator:
         return self._smoother is not None
 
     @property
+    def has_pose(self) -> bool:
+        """Whether the smoother has a state, which always has a pose."""
+        return self.is_initialised
+
+    @property
     def has_imu(self) -> bool:
         """Whether velocities and biases are estimated."""
         return self._smoother is not None and self._smoother.has_imu
@@ -114,6 +119,9 @@ class SmootherEstimator:
             self._final += self._smoother.all_poses()
 
     # ------------------------------------------------------------------ one frameset
+
+    def add_sample(self, stamp_ns: int, values: Float) -> None:
+        """Take no single samples: the intervals between framesets have them."""
 
     def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
         """Make a smoother with one state, at the newest position if there is one, which then ends the epoch."""

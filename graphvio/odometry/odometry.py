@@ -67,6 +67,12 @@ def _config_of(rig: Rig, config: Config) -> Config:
     return replace(config, calibration=replace(config.calibration, online=False))
 
 
+def _estimator_class(rig: Rig, config: Config) -> type[SmootherEstimator | FilterEstimator | MonocularEstimator]:
+    if not rig.pairs:
+        return MonocularEstimator
+    return FilterEstimator if config.fusion.estimator == "filter" else SmootherEstimator
+
+
 class Odometry:
     """Visual-inertial odometry of a rig of stereo pairs.
 
@@ -98,9 +104,7 @@ class Odometry:
         self.stage_ms: dict[str, float] = {}
         self._frontend = (VisualFrontend if rig.pairs else SinglesFrontend)(rig, self.config, image_mask)
         self._synchroniser = Synchroniser(rig, self.config, self.report)
-        self._monocular = None if rig.pairs else MonocularEstimator(rig, self.config, self.report)
-        estimator = FilterEstimator if self.config.fusion.estimator == "filter" else SmootherEstimator
-        self._estimator: StateEstimator = self._monocular or estimator(rig, self.config, self.report)
+        self._estimator: StateEstimator = _estimator_class(rig, self.config)(rig, self.config, self.report)
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._time_offset = TimeOffsetCorrection(rig, self.config, self._synchroniser, self.report)
         self._calibration = OnlineCalibration(rig, self.config, self._frontend, self._synchroniser, self.report)
@@ -139,8 +143,7 @@ class Odometry:
             for sample in self._synchroniser.add_sample(measurement):
                 self._calibration.add_sample(sample)
                 corrected = self._synchroniser.corrected(sample)
-                if self._monocular is not None:
-                    self._monocular.add_sample(*corrected)
+                self._estimator.add_sample(*corrected)
                 self._propagate(*corrected)
         else:
             self._synchroniser.add_frameset(measurement)
@@ -274,7 +277,7 @@ class Odometry:
         is_stationary = visual.is_stationary and self._imu_shows_standstill(predicted.interval)
         applied = self._gate(visual, is_stationary)
         status = self._update(predicted, visual, applied)
-        if self._monocular is not None and not self._monocular.has_pose:
+        if not self._estimator.has_pose:
             return estimate_without_pose(frameset.stamp_ns, visual, self.stage_ms)
         return self._publish(frameset, predicted, visual, is_stationary, applied, status)
 
@@ -406,7 +409,7 @@ class Odometry:
         interval = self._synchroniser.interval(stamp_ns, stamp_ns + readout_ns)
         if interval is None:
             return None
-        if self._monocular is not None and not self._monocular.has_pose:
+        if not self._estimator.has_pose:
             return ReadoutMotion.accelerated(interval, np.zeros(3), np.zeros(3), np.zeros(3))  # only how it turns
         state = self._estimator.state()
         body_R_nav = state.nav_T_body[:3, :3].T
@@ -421,7 +424,7 @@ class Odometry:
 
     def _restart_prediction(self, stamp_ns: int, status: Status) -> None:
         """Predict from the new estimate from now on."""
-        if status is Status.LOST or (self._monocular is not None and not self._monocular.has_pose):
+        if status is Status.LOST or not self._estimator.has_pose:
             self._propagator.forget()
             return
         estimator, rate = self._estimator, self._estimator.latest_rate()

@@ -71,6 +71,11 @@ class FilterEstimator:
         return self._filter is not None
 
     @property
+    def has_pose(self) -> bool:
+        """Whether the filter has a state, which always has a pose."""
+        return self.is_initialised
+
+    @property
     def has_imu(self) -> bool:
         """Whether gyro and accelerometer are measured."""
         return self._has_imu
@@ -119,6 +124,9 @@ class FilterEstimator:
         """Do nothing, as all poses are final."""
 
     # ------------------------------------------------------------------ one frameset
+
+    def add_sample(self, stamp_ns: int, values: Float) -> None:
+        """Take no single samples: the intervals between framesets have them."""
 
     def initialise(self, stamp_ns: int, imu: tuple[ImuInterval, float] | None) -> None:
         """Make a filter with a first state, at the newest position if there is one, which then ends the epoch."""
