@@ -67,6 +67,8 @@ _MAX_TAN = float(np.tan(MAX_ANGLE_RAD))
 _NEWTON_STEPS = 20
 _MORE_STEPS = 60  # polynomials of high degree approach their solution slowly from far away
 _NEWTON_TOLERANCE = 1e-12
+_BISECTIONS = 20
+_CHECKS = 8
 _ROUNDING = 1e-6
 
 
@@ -258,9 +260,64 @@ def ray_of(model: int, distortion: Float, xd: float, yd: float) -> tuple[float, 
 
 
 @kernel
+def fold_radius(model: int, distortion: Float) -> float:
+    """Find the normalised radius from which distortion maps outer points inwards again, at most tan(80 degrees).
+
+    It ends there for a model whose domain is less than that.
+    """
+    radius = 0.0
+    while radius < _MAX_TAN:
+        for axis in range(2):
+            x, y = (radius, 0.0) if axis == 0 else (0.0, radius)
+            _, _, slope_x, _, _, slope_y = distort(model, distortion, x, y)
+            if (slope_x if axis == 0 else slope_y) <= 0.0:
+                return radius
+        radius += 0.01
+    return _MAX_TAN
+
+
+@kernel
 def _inverse_polynomial(model: int, distortion: Float, xd: float, yd: float) -> tuple[float, float, bool]:
     """Invert `_polynomial` by Newton's method; False where it does not converge."""
-    x, y, u, v, is_close = xd, yd, xd, yd, False
+    x, y = xd, yd
+    for attempt in range(2 if model == RATIONAL else 1):
+        if attempt == 1:  # a quotient bends so much that the method may leave the domain, or go to and fro
+            x, y = _within_fold(model, distortion, xd, yd)
+        x, y, found = _newton(model, distortion, xd, yd, x, y)
+        if found and (model != RATIONAL or _is_before_fold(model, distortion, x, y)):
+            return x, y, True
+    return x, y, False
+
+
+@kernel
+def _is_before_fold(model: int, distortion: Float, x: float, y: float) -> bool:
+    """Check at some points between the axis and (x, y) that distortion does not map outer points inwards."""
+    for i in range(1, _CHECKS):
+        share = i / _CHECKS
+        _, _, a, b, c, d = _polynomial(model, distortion, share * x, share * y)
+        if not (a > 0.0 and a * d - b * c > 0.0):
+            return False
+    return True
+
+
+@kernel
+def _within_fold(model: int, distortion: Float, xd: float, yd: float) -> tuple[float, float]:
+    """Bisect for the point on the ray to (xd, yd), within the fold, that is distorted as far out."""
+    distance, inner, outer = np.sqrt(xd * xd + yd * yd), 0.0, fold_radius(model, distortion)
+    for _ in range(_BISECTIONS):
+        radius = 0.5 * (inner + outer)
+        u, v, _, _, _, _ = _polynomial(model, distortion, radius * xd / distance, radius * yd / distance)
+        if u * xd + v * yd < distance * distance:
+            inner = radius
+        else:
+            outer = radius
+    return inner * xd / distance, inner * yd / distance
+
+
+@kernel
+def _newton(model: int, distortion: Float, xd: float, yd: float, x: float, y: float) -> tuple[float, float, bool]:
+    """Invert `_polynomial` by Newton's method from (x, y)."""
+    u, v, is_close = xd, yd, False
     a, b, c, d = 1.0, 0.0, 0.0, 1.0
     steps = _NEWTON_STEPS if model == RADIAL_TANGENTIAL else _MORE_STEPS
     for i in range(steps + 1):
@@ -279,23 +336,6 @@ def _inverse_polynomial(model: int, distortion: Float, xd: float, yd: float) -> 
         is_close = abs(step_x) + abs(step_y) < _NEWTON_TOLERANCE
     # Beyond the radius where distortion folds back, Newton lands on a point whose Jacobian is not positive.
     return x, y, abs(u - xd) + abs(v - yd) < 1e-8 and a * d - b * c > 0.0 and a > 0.0
-
-
-@kernel
-def fold_radius(model: int, distortion: Float) -> float:
-    """Find the normalised radius from which distortion maps outer points inwards again, at most tan(80 degrees).
-
-    It ends there for a model whose domain is less than that.
-    """
-    radius = 0.0
-    while radius < _MAX_TAN:
-        for axis in range(2):
-            x, y = (radius, 0.0) if axis == 0 else (0.0, radius)
-            _, _, slope_x, _, _, slope_y = distort(model, distortion, x, y)
-            if (slope_x if axis == 0 else slope_y) <= 0.0:
-                return radius
-        radius += 0.01
-    return _MAX_TAN
 
 
 @kernel
