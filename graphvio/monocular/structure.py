@@ -10,6 +10,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float, Int
 from graphvio.kernels import kernel
+from graphvio.self_calibration.bundle import rows_of
 
 PRIOR_INVERSE_DEPTH = 0.2
 _PRIOR_INFORMATION = 1e-2  # of an inverse depth, known to 10 / m: more would pull the scale of all landmarks
@@ -50,12 +51,11 @@ class Structure(NamedTuple):
 
     def of(self, kept: Bool) -> "Structure":
         """Return those of the landmarks (L,) that are kept."""
-        lengths = np.diff(self.rows)
-        rows = np.repeat(kept, lengths)
+        rows, begins = rows_of(self.rows, kept)
         return Structure(
             self.camera[kept],
             self.odom_T_landmark[kept],
-            np.r_[0, np.cumsum(lengths[kept])],
+            begins,
             self.state[rows],
             self.rays[rows],
         )

@@ -74,7 +74,7 @@ def _estimator_class(rig: Rig, config: Config) -> type[SmootherEstimator | Filte
 
 
 class Odometry:
-    """Visual-inertial odometry of a rig of stereo pairs.
+    """Visual-inertial odometry of a rig of stereo pairs and single cameras.
 
     Feed measurements in time order with `process`. A frameset is held until the IMU samples that cover it have come.
 

@@ -56,17 +56,27 @@ class Tracks(NamedTuple):
 
     def of(self, kept: Bool) -> "Tracks":
         """Return those of the landmarks (L,) that are kept."""
-        lengths = np.diff(self.rows)
-        rows = np.repeat(kept, lengths)
+        rows, begins = rows_of(self.rows, kept)
         return Tracks(
             self.pair[kept],
             self.odom_T_landmark[kept],
-            np.r_[0, np.cumsum(lengths[kept])],
+            begins,
             self.keyframe[rows],
             self.left_px[rows],
             self.right_px[rows],
             self.has_right[rows],
         )
+
+
+def rows_of(rows: Int, kept: Bool) -> tuple[Bool, Int]:
+    """Return which observations (N,) belong to the landmarks (L,) that are kept, and where these landmarks' begin.
+
+    Args:
+        rows: (L + 1,) the observations of landmark l are ``rows[l]`` to ``rows[l + 1]``.
+        kept: (L,).
+    """
+    lengths = np.diff(rows)
+    return np.repeat(kept, lengths), np.r_[0, np.cumsum(lengths[kept])]
 
 
 class Eliminated(NamedTuple):
