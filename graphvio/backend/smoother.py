@@ -182,6 +182,8 @@ class Smoother:
         """Test the innovation of a motion that ends in the newest state against the window's prediction."""
         newest = x(self._index_of[motion.stamp_ns])
         reference, covariance = self._views.seen(self._index_of[motion.reference_stamp_ns], motion)
+        if motion.calibration_covariance is not None:
+            covariance = covariance + motion.calibration_covariance
         nav_T_reference = np.asarray(self._window.values.atPose3(reference).matrix())
         predicted = se3_inverse(nav_T_reference) @ self.pose(motion.stamp_ns)
         return gate_motion(

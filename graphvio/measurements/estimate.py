@@ -31,7 +31,8 @@ class Estimate:
     Attributes:
         stamp_ns: Stamp of the frameset.
         status: What the pose is based on.
-        nav_T_body: (4, 4) pose, or None while initialising without a state and while lost.
+        nav_T_body: (4, 4) pose, or None while initialising without a state and while lost. Its position goes on from
+            frameset to frameset within an epoch; its attitude turns where that of the cameras in body is corrected.
         covariance: (6, 6) of the pose, tangent ``[rotation, translation]`` in frame body, or None with the pose. Where
             the calibration is estimated it contains what errors of the cameras add.
         epoch: Number of declared breaks; poses of different epochs do not share a nav frame.

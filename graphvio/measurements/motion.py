@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -63,6 +64,8 @@ class RelativeMotion:
         covariance: (6, 6), tangent ``[rotation, translation]`` in the body frame of the later instant.
         shared_covariance: (6, 6) the part of it that all motions from this reference have in common, same tangent.
         inliers: Number of points that it explains.
+        calibration_covariance: (6, 6) of what errors of the calibration add to its innovation, same tangent, or None
+            where they add nothing. Innovation tests allow for it.
     """
 
     reference_stamp_ns: int
@@ -71,13 +74,14 @@ class RelativeMotion:
     covariance: Float
     shared_covariance: Float
     inliers: int
+    calibration_covariance: Float | None = None
 
     @property
     def duration_s(self) -> float:
         """Time between the two framesets."""
         return (self.stamp_ns - self.reference_stamp_ns) * 1e-9
 
-    @property
+    @cached_property
     def weakest_sigmas(self) -> tuple[float, float]:
         """Standard deviations in the least known directions: of the rotation, rad, and the translation, m."""
         blocks = np.stack([self.covariance[:3, :3], self.covariance[3:, 3:]])

@@ -11,6 +11,7 @@ from graphvio.geometry import se3_inverse
 from graphvio.measurements.estimate import Estimate, Status
 from graphvio.measurements.motion import VisualResult
 from graphvio.measurements.sensors import FrameSet
+from graphvio.odometry.nav_frame import NavFrame
 from graphvio.odometry.online_calibration import OnlineCalibration
 from graphvio.odometry.step import NewKeyframe
 from graphvio.odometry.time_offset_correction import TimeOffsetCorrection
@@ -39,6 +40,7 @@ def estimate_of(
     rates: Mapping[str, Float],
     time_offset: TimeOffsetCorrection,
     calibration: OnlineCalibration,
+    nav: NavFrame,
     stage_ms: Mapping[str, float],
 ) -> Estimate:
     """Return the estimate of a frameset, without a pose where it is lost.
@@ -52,15 +54,17 @@ def estimate_of(
         rates: Angular rates (3,) rad/s of body by source.
         time_offset: Estimate of the offset between cameras and IMU.
         calibration: Knows what its errors add to the covariance of the pose.
+        nav: Frame of the estimate.
         stage_ms: Processing time by stage.
     """
-    state, covariance = estimator.state(), estimator.covariance
+    of_calibration = calibration.pose_covariance(estimator.state().nav_T_body)
+    state, covariance = nav.state(estimator.state()), nav.covariance(estimator.covariance)
     has_pose = status is not Status.LOST
     return Estimate(
         stamp_ns=stamp_ns,
         status=status,
         nav_T_body=state.nav_T_body if has_pose else None,
-        covariance=covariance.pose + calibration.pose_covariance(state.nav_T_body) if has_pose else None,
+        covariance=covariance.pose + of_calibration if has_pose else None,
         epoch=estimator.epoch,
         velocity_nav=state.velocity_nav if has_pose else None,
         gyro_bias=state.gyro_bias if estimator.has_imu else None,

@@ -30,6 +30,7 @@ from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement, cali
 from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.odometry.angular_rates import AngularRates
 from graphvio.odometry.assembly import estimate_of, estimate_without_pose, keyframe_of
+from graphvio.odometry.nav_frame import NavFrame
 from graphvio.odometry.online_calibration import OnlineCalibration
 from graphvio.odometry.step import Step
 from graphvio.odometry.synchroniser import Synchroniser
@@ -108,6 +109,7 @@ class Odometry:
         self._propagator = Propagator(self.config.timing.max_prediction_ms, self.config.timing.max_imu_gap_ms)
         self._time_offset = TimeOffsetCorrection(rig, self.config, self._synchroniser, self.report)
         self._calibration = OnlineCalibration(rig, self.config, self._frontend, self._synchroniser, self.report)
+        self._nav = NavFrame()
         self._vision_events = VisionEvents(rig, self.report)
         self._rates = AngularRates()
         self._on_prediction = on_prediction
@@ -206,7 +208,7 @@ class Odometry:
 
     def take_smoothed(self) -> list[tuple[int, Float]]:
         """Return stamps and poses ``nav_T_body`` that became final since the last call, not always in time order."""
-        return self._estimator.take_final()
+        return [(stamp_ns, self._nav.pose(stamp_ns, pose)) for stamp_ns, pose in self._estimator.take_final()]
 
     @property
     def rig_warnings(self) -> list[str]:
@@ -265,13 +267,12 @@ class Odometry:
     # ------------------------------------------------------------------ one frameset
 
     def _estimate(self, frameset: FrameSet) -> Estimate:
-        """Predict the state at a frameset, measure the motion, gate it, update, and publish (sections 3 and 5)."""
+        """Predict the state, measure the motion, gate it, update, publish, and recalibrate (sections 3 and 5)."""
         self.stage_ms = {}
         if self._must_wait_for_imu(frameset.stamp_ns):
             visual = self._frontend.process(frameset, self._estimator.motion_since)
             self.stage_ms.update(visual.stage_ms)
             return estimate_without_pose(frameset.stamp_ns, visual, self.stage_ms)
-        self._calibration.update(frameset.stamp_ns)
         predicted = self._predict(frameset.stamp_ns)
         visual = self._track(frameset, predicted)
         is_stationary = visual.is_stationary and self._imu_shows_standstill(predicted.interval)
@@ -279,7 +280,9 @@ class Odometry:
         status = self._update(predicted, visual, applied)
         if not self._estimator.has_pose:
             return estimate_without_pose(frameset.stamp_ns, visual, self.stage_ms)
-        return self._publish(frameset, predicted, visual, is_stationary, applied, status)
+        estimate = self._publish(frameset, predicted, visual, is_stationary, applied, status)
+        self._recalibrate(estimate)
+        return estimate
 
     @timed("predict")
     def _predict(self, stamp_ns: int) -> _Predicted:
@@ -305,7 +308,7 @@ class Odometry:
     @timed("update")
     def _gate(self, visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
         """Test the innovations, and insert the measurements that pass (section 5)."""
-        applied = self._estimator.apply(visual, is_stationary)
+        applied = self._estimator.apply(self._calibration.with_innovation_errors(visual), is_stationary)
         if applied.needs_keyframe:
             self._frontend.start_keyframe()
         return applied
@@ -349,6 +352,7 @@ class Odometry:
             rates,
             self._time_offset,
             self._calibration,
+            self._nav,
             self.stage_ms,
         )
         references, keyframe = self._frontend.reference_stamps_ns, None
@@ -368,8 +372,15 @@ class Odometry:
         )
         for on_step in self._on_step:
             on_step(step)
-        self._calibration.add(estimate)
         return estimate
+
+    def _recalibrate(self, estimate: Estimate) -> None:
+        """Use the calibration that comes into force, from the next frameset on: it waits for the IMU by its offset."""
+        odom_T_body = self._estimator.state().nav_T_body
+        old_R_new = self._calibration.update(estimate.stamp_ns)
+        if old_R_new is not None:
+            self._calibration.correct_pose(self._nav.turn(estimate.stamp_ns + 1, odom_T_body, old_R_new))
+        self._calibration.add(estimate, odom_T_body)
 
     # ------------------------------------------------------------------ the IMU's part
 
@@ -430,7 +441,11 @@ class Odometry:
         estimator, rate = self._estimator, self._estimator.latest_rate()
         samples = self._synchroniser.samples_since(stamp_ns) if estimator.has_imu else NO_SAMPLES
         self._propagator.restart(
-            stamp_ns, estimator.state(), estimator.epoch, np.zeros(3) if rate is None else rate, *samples
+            stamp_ns,
+            self._nav.state(estimator.state()),
+            estimator.epoch,
+            np.zeros(3) if rate is None else rate,
+            *samples,
         )
 
     def _propagate(self, stamp_ns: int, sample: Float) -> None:

@@ -65,6 +65,10 @@ class ConsiderCovariance:
         self._left_behind = self._left_behind + self._gain @ (difference - self._difference)
         self._difference, self._covariance = difference, covariance
 
+    def correct(self, change: Float) -> None:
+        """Take note that the newest pose has been changed by a tangent (6,) in its own frame."""
+        self._left_behind = self._left_behind - change
+
     def forget(self) -> None:
         """Note that the cameras were knocked: their errors now are not those by which the motions until now are off."""
         self._before_knock = self._at_newest

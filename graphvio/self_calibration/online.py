@@ -92,6 +92,7 @@ class _Adjusted(NamedTuple):
     evidence: Evidence
     estimate: CalibrationEstimate
     extrinsics: dict[int, Float]
+    widest: Float
     covariance: Float  # of the cameras' parameters that come into force
     by_cameras: Float
     window: tuple[Keyframe, ...]
@@ -109,6 +110,7 @@ class SelfCalibration:
         extrinsics: pair index -> covariance (6, 6) of its place relative to the first pair, see
             `graphvio.self_calibration.prior.extrinsic_covariances`; empty while the rig file is as good as exact. The
             file may be as wrong there as any: a few windows may show that it is wrong long before they show how wrong.
+        widest: (C, C) covariance of what is known, if the file may be as wrong as any.
         has_full_window: whether it is based on a full window at least.
         restarts: how often what was known has been forgotten, since later windows contradicted it.
         on_full_window: called with each window that is full, before it is adjusted.
@@ -127,6 +129,7 @@ class SelfCalibration:
         exact = np.full(n_groups, EXACT)
         self.estimate = CalibrationEstimate(rig, posterior, np.zeros_like(posterior.mean), exact)
         self.extrinsics: dict[int, Float] = {}
+        self.widest = widest
         self.has_full_window = False
         self.restarts = 0
         self.on_full_window: Callable[[FullWindow], None] = lambda _: None
@@ -186,12 +189,16 @@ class SelfCalibration:
         """Return the covariance (6, 6) that errors of the calibration add to the newest pose (4, 4)."""
         return self._consider.at(odom_T_body)
 
+    def correct_pose(self, turned: Float) -> None:
+        """Take note that the newest pose has been changed by a tangent (6,) in body, as the calibration asked for."""
+        self._consider.correct(turned)
+
     def start_window(self) -> None:
         """Leave the window that is not full: the poses that come are in another frame, or their clock is another."""
         self._keyframes, self._adjusted_at, self._last = [], 0, None
 
     def update(self) -> bool:
-        """Take the result that comes into force with this frameset, if there is one.
+        """Take the result that comes into force after this frameset, if there is one.
 
         Returns:
             Whether the calibration in force has changed.
@@ -225,7 +232,7 @@ class SelfCalibration:
         self._consider.extend(adjusted.window, adjusted.by_cameras)
         self._consider.learn(adjusted.estimate.difference[: self._n_cameras], adjusted.covariance)
         was_exact = self.estimate.is_file_exact
-        self.estimate, self.extrinsics = adjusted.estimate, adjusted.extrinsics
+        self.estimate, self.extrinsics, self.widest = adjusted.estimate, adjusted.extrinsics, adjusted.widest
         self._in_force = self._nominal.moved(self.estimate.difference[: self._n_cameras])
         return not (was_exact and self.estimate.is_file_exact)
 
@@ -314,11 +321,22 @@ class SelfCalibration:
         covariance = evidence.mean_square(self._prior, in_force)[:n_cameras, :n_cameras]
         extrinsics = {}
         estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor)
+        anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
         if not estimate.is_file_exact:
-            anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
             extrinsics = extrinsic_covariances(self._rig, anywhere)
         by_cameras = solution.poses_by_cameras(n_cameras)
-        return _Adjusted(prior, solution, evidence, estimate, extrinsics, covariance, by_cameras, window, is_full)
+        return _Adjusted(
+            prior,
+            solution,
+            evidence,
+            estimate,
+            extrinsics,
+            anywhere.covariance,
+            covariance,
+            by_cameras,
+            window,
+            is_full,
+        )
 
     def _samples_of(self, window: tuple[Keyframe, ...]) -> InertialSamples | None:
         """Return the IMU over a window, or None where there is none; older samples are forgotten."""
