@@ -38,17 +38,18 @@ def cache_root() -> Path:
     return root
 
 
-def cache_folders(module: str) -> list[Path]:
-    """Return the folders that may hold code of a module's kernels, that which new code is written to first.
-
-    A ``GRAPHVIO_CACHE_DIR`` that cannot be written, as one that all users of a machine share, is read.
-    """
-    roots = [cache_root()]
+def shared_root() -> Path | None:
+    """Return a ``GRAPHVIO_CACHE_DIR`` that can only be read, as one that all users of a machine share."""
     chosen = os.environ.get("GRAPHVIO_CACHE_DIR")
-    if chosen:
-        shared = Path(chosen).expanduser()
-        if shared != roots[0] and shared.is_dir():
-            roots.append(shared)
+    if not chosen:
+        return None
+    shared = Path(chosen).expanduser()
+    return shared if shared != cache_root() and shared.is_dir() else None
+
+
+def cache_folders(module: str) -> list[Path]:
+    """Return the folders that may hold code of a module's kernels, that which new code is written to first."""
+    roots = [root for root in (cache_root(), shared_root()) if root is not None]
     return [root / source_digest(module) for root in roots]
 
 

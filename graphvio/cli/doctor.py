@@ -15,9 +15,15 @@ _REQUIRED = {"gtsam": "gtsam", "numpy": "numpy", "numba": "numba", "matplotlib":
 _OPENCV = ("opencv-python-headless", "opencv-contrib-python-headless", "opencv-python", "opencv-contrib-python")
 _OPTIONAL = {
     "viewer": ("rerun", "rerun-sdk", "live view and recordings"),
-    "maps": ("pycolmap", "pycolmap", "maps"),
-    "sessions": ("mcap", "mcap", "sessions on disk"),
+    "maps": ("pycolmap", "pycolmap", "loops and COLMAP models"),
+    "sessions": ("mcap", "mcap", "MCAP sessions and bags"),
     "fleet": ("distributed", "dask", "many sessions side by side"),
+    "s3": ("s3fs", "s3fs", "sessions on S3"),
+    "live": ("prometheus_client", "prometheus-client", "metrics and serial IMUs"),
+    "realsense": ("pyrealsense2", "pyrealsense2", "RealSense cameras"),
+    "oak": ("depthai", "depthai", "OAK cameras"),
+    "ros2": ("cyclonedds", "cyclonedds", "ROS 2 topics"),
+    "serve": ("grpc", "grpcio", "gRPC"),
 }
 
 
@@ -55,18 +61,22 @@ def _table(findings: dict[str, Any]) -> Any:
     table.add_section()
     cache = findings["kernel_cache"]
     table.add_row("kernel cache", f"{escape(cache['folder'])}, {cache['files']} files, {cache['megabytes']:.1f} MB")
+    if cache["shared_folder"]:
+        table.add_row("", f"{escape(cache['shared_folder'])} is read, too")
     modules = cache["compiled_modules"]
-    missing = "" if all(modules.values()) else "; the others compile when first used, which takes about a minute"
+    missing = "" if all(modules.values()) else "; the others compile when first used"
+    if not any(modules.values()):
+        missing = "; graphvio warmup compiles those of the odometry, in about a minute"
     table.add_row("modules compiled", f"{sum(modules.values())} of {len(modules)}{missing}")
     return table
 
 
 def examine() -> dict[str, Any]:
     """Return all findings, as JSON can hold them."""
-    from graphvio.kernel_cache import any_compiled_before, cache_root
+    from graphvio.kernel_cache import any_compiled_before, cache_root, shared_root
     from graphvio.version import __version__
 
-    folder = cache_root()
+    folder, shared = cache_root(), shared_root()
     kernels = [file.stat().st_size for file in folder.rglob("*.nbc")]
     versions: dict[str, str | None] = {"graphvio": __version__, "python": platform.python_version()}
     versions |= {name: _version(package) for name, package in _REQUIRED.items()}
@@ -88,6 +98,7 @@ def examine() -> dict[str, Any]:
             "folder": str(folder),
             "files": len(kernels),
             "megabytes": sum(kernels) / 1e6,
+            "shared_folder": str(shared) if shared else None,
             "compiled_modules": {module: any_compiled_before(module) for module in kernel_modules()},
         },
     }

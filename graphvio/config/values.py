@@ -108,7 +108,7 @@ def checked(hint: Any, value: object, where: str) -> object:
 
 def nearest(key: str, names: Iterable[str]) -> str:
     """Suggest, for the end of a message, the known name that is most like an unknown one."""
-    close = difflib.get_close_matches(key, list(names), n=1, cutoff=0.3)
+    close = difflib.get_close_matches(key, list(names), n=1, cutoff=0.5)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 

@@ -14,6 +14,7 @@ from benchmarks import (
     slam,
     stages,
     startup,
+    walk,
 )
 from benchmarks.command_line import run_command_line
 
@@ -30,6 +31,7 @@ if __name__ == "__main__":
                     stages,
                     backend,
                     accuracy,
+                    walk,
                     calibration_error,
                     cameras,
                     lenses,

@@ -14,6 +14,7 @@ from benchmarks.picture import Panel, draw_trajectories
 from benchmarks.recordings import add_data_option, simulated
 from benchmarks.report import DOCS, IMAGES, Report, log_progress, machine
 from benchmarks.runs import HEAD, Outcome, blinded, with_moved_pair
+from benchmarks.walk import SCENE, draw_walk
 from graphvio.config import Config
 from graphvio.errors import GraphvioError
 from graphvio.simulation import SCENE_NAMES
@@ -57,7 +58,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--profiles", nargs="+", default=[PAPER, DEFAULT, "fast"], metavar="NAME")
     out = Path("results") / "benchmarks"
     parser.add_argument("--out", type=Path, default=out, metavar="DIR", help=f"default: {out}")
-    parser.add_argument("--docs", action="store_true", help="put report, README's figures and picture into docs")
+    parser.add_argument("--docs", action="store_true", help="put report, README's figures and pictures into docs")
     add_data_option(parser)
     parser.set_defaults(run=run_all)
 
@@ -103,6 +104,8 @@ def run_all(args: argparse.Namespace) -> None:
         figures.save_to_docs("figures")
         if panels:
             (IMAGES / "trajectories.png").write_bytes(picture.read_bytes())
+        if SCENE in recordings and args.duration is None:
+            draw_walk(bench, IMAGES)
     log_progress(f"written to {args.out}")
 
 

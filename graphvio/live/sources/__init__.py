@@ -36,8 +36,8 @@ class SourceSpec:
         if kind not in KINDS:
             if not head or not Path(head).exists():
                 raise SourceError(
-                    f"{text}: there is no live source {kind!r}{nearest(kind, KINDS)}; there are {', '.join(KINDS)}, "
-                    "and recordings by their path"
+                    f"{text}: there is no live source {kind!r} and no recording at that path{nearest(kind, KINDS)}; "
+                    f"live sources are {', '.join(KINDS)}; a recording is replayed by its path or replay:PATH"
                 )
             kind, what = "replay", head
         options: dict[str, str] = {}

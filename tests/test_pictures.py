@@ -1,0 +1,29 @@
+"""The README's picture of the corridor and the README's table are of one run."""
+
+import json
+import re
+from pathlib import Path
+
+from benchmarks.report import DOCS, IMAGES
+from benchmarks.walk import ANIMATION_NAME, FIGURES_KEY, PNG_NAME, SCENE
+from PIL import Image
+
+README = (DOCS.parent / "README.md").read_text()
+
+
+def test_picture_and_table_have_the_same_figures() -> None:
+    with Image.open(IMAGES / PNG_NAME) as picture:
+        ates_mm = json.loads(picture.info[FIGURES_KEY])
+    (row,) = re.findall(rf"^\| simulated {SCENE}, .* \| yes \| (.*) \|$", README, re.MULTILINE)
+    shown = [float(cell.split(" mm")[0]) for cell in row.split(" | ")]
+    assert shown == list(ates_mm.values()), "scripts/benchmark accuracy --docs writes both"
+
+
+def test_animation_is_of_the_whole_walk_and_small() -> None:
+    with Image.open(IMAGES / ANIMATION_NAME) as animation:
+        assert animation.n_frames == 120
+        first = animation.convert("L").histogram()
+        animation.seek(60)
+        assert animation.convert("L").histogram() != first
+    assert (IMAGES / ANIMATION_NAME).stat().st_size < 1.5e6
+    assert f"images/{ANIMATION_NAME}" in README + (DOCS / "index.md").read_text()
