@@ -17,6 +17,7 @@ from graphvio.cli.json_output import with_json
 from graphvio.cli.live import live
 from graphvio.cli.optimize import optimize
 from graphvio.cli.record import convert, record
+from graphvio.cli.rig import rig
 from graphvio.cli.run import run
 from graphvio.cli.serve import serve
 from graphvio.cli.shared import EXIT_BAD_INPUT, EXIT_INTERRUPTED, warn
@@ -64,6 +65,7 @@ _add(with_json(serve))
 _add(with_json(slam))
 _add(with_json(calibrate))
 _add(with_json(calibrate_trajectories), "calibrate-trajectories")
+_add(with_json(rig))
 _add(with_json(optimize))
 app.add_typer(fleet, name="fleet", short_help=fleet.info.help)
 _add(with_json(record))

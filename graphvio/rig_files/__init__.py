@@ -1,6 +1,7 @@
 """Rig files: graphvio's own ``rig.yaml``, and readers for EuRoC/ASL, Kalibr, Basalt and KITTI calibrations."""
 
+from graphvio.rig_files.joining import joined_rig
 from graphvio.rig_files.loading import find_rig, load_rig
 from graphvio.rig_files.native import save_rig
 
-__all__ = ["find_rig", "load_rig", "save_rig"]
+__all__ = ["find_rig", "joined_rig", "load_rig", "save_rig"]

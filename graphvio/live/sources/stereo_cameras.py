@@ -5,20 +5,17 @@ from __future__ import annotations
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from graphvio.errors import RigError, SourceError
-from graphvio.geometry import se3, se3_inverse, so3_exp
 from graphvio.live.devices import Counts, DeviceLostError, DeviceSource, HandOver
 from graphvio.live.imu_merging import AccelOntoGyro
 from graphvio.live.sources import SourceSpec
 from graphvio.live.spec_options import choice_of, names_of
 from graphvio.measurements.readings import host_ns
-from graphvio.rig import Rig, StereoPair
+from graphvio.rig import Rig
+from graphvio.rig_files import joined_rig
 
 _POLL_S = 0.1
 _MAX_SILENCE_NS = 5_000_000_000
@@ -183,19 +180,8 @@ def _refuse_unknown_poses(kind: str, ids: Sequence[str]) -> Rig:
 
 
 def _guessed_rig(rigs: Sequence[Rig], name: str) -> Rig:
-    """Combine rigs of one pair each to one that only serves to record a session for `graphvio calibrate`.
+    """Join rigs of one pair each to one that only serves to record a session for `graphvio calibrate`.
 
-    The first keeps its pose and its IMU; the others are at the same position, rotated about the vertical by equal
-    steps: two look forwards and backwards. Cameras are named ``cam0``, ``cam1`` and so on.
+    The first keeps its pose and its IMU; each of the others has an IMU of its own, which is not used.
     """
-    body_T_left0 = rigs[0].pairs[0].left.body_T_cam
-    pairs = []
-    for k, rig in enumerate(rigs):
-        pair = rig.pairs[0]
-        left0_R_leftk = so3_exp(np.array([0.0, 2.0 * np.pi * k / len(rigs), 0.0]))
-        body_T_left = body_T_left0 @ se3(left0_R_leftk, np.zeros(3))
-        body_T_right = body_T_left @ se3_inverse(pair.right_T_left)
-        left = replace(pair.left, name=f"cam{2 * k}", body_T_cam=body_T_left)
-        right = replace(pair.right, name=f"cam{2 * k + 1}", body_T_cam=body_T_right)
-        pairs.append(StereoPair(f"pair{k}", left, right))
-    return Rig(tuple(pairs), rigs[0].imu, name)
+    return joined_rig([rigs[0], *(rig.without_imu() for rig in rigs[1:])], name)[0]

@@ -1,0 +1,98 @@
+"""``graphvio rig``: a calibration as graphvio understands it, and several of them as one rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from graphvio.cli import options
+from graphvio.cli.json_output import publish
+
+if TYPE_CHECKING:
+    from graphvio.arrays import Float
+    from graphvio.rig import Rig
+
+
+def rig(
+    files: Annotated[list[Path], typer.Argument(help="Calibration file or recording; several are joined.")],
+    out: Annotated[Path | None, typer.Option(help="Write the rig to this rig.yaml.")] = None,
+    verbose: options.Verbose = False,
+) -> None:
+    """Show a calibration as graphvio understands it, join those of several pairs, and write rig.yaml.
+
+    Pairs that share no view are calibrated one by one, such as by Kalibr: give the file of each, first one with the
+    IMU. Those with the IMU are at their places; of the others the place is guessed, and `graphvio calibrate` finds it.
+
+    Examples:
+
+        graphvio rig camchain-imucam.yaml
+
+        graphvio rig front-camchain-imucam.yaml back-camchain.yaml --out rig.yaml
+    """
+    from graphvio.errors import RigError
+    from graphvio.rig_files import joined_rig, load_rig, save_rig
+
+    if out is not None and out.exists():
+        raise RigError(f"{out}: exists already; remove it, or choose another name")
+    joined, guessed = joined_rig([load_rig(file) for file in files], files[0].stem if out is None else out.stem)
+    found = _description(joined, guessed)
+    publish(found)
+    for group in found["groups"]:
+        typer.echo(_group_line(group))
+    typer.echo(_imu_line(joined))
+    if out is not None:
+        save_rig(joined, out)
+        typer.echo(f"rig: {out}")
+    if guessed:
+        named = "rig.yaml" if out is None else out
+        typer.echo(
+            f"the place of {', '.join(guessed)} is not known, and guessed; find it from a recording in which the rig "
+            f"turns about two axes: graphvio calibrate RECORDING --rig {named} --out rig-pairs.yaml"
+        )
+
+
+def _description(joined: Rig, guessed: tuple[str, ...]) -> dict[str, Any]:
+    """Return what the rig consists of, as JSON can hold it."""
+    from graphvio.rig import StereoPair
+
+    return {
+        "name": joined.name,
+        "groups": [
+            {
+                "name": group.name,
+                "cameras": [camera.name for camera in group.cameras],
+                "model": group.left.model,
+                "size_px": list(group.left.size_px),
+                "baseline_m": group.baseline_m if isinstance(group, StereoPair) else None,
+                "position_in_body_m": group.left.body_T_cam[:3, 3].tolist(),
+                "viewing_direction_in_body": group.left.body_T_cam[:3, 2].tolist(),
+                "place_is_guessed": group.name in guessed,
+            }
+            for group in joined.groups
+        ],
+        "imu": None
+        if joined.imu is None
+        else {"rate_hz": joined.imu.rate_hz, "time_offset_s": joined.imu.time_offset_s},
+    }
+
+
+def _group_line(group: dict[str, Any]) -> str:
+    width, height = group["size_px"]
+    pair = "single camera" if group["baseline_m"] is None else f"baseline {1e3 * group['baseline_m']:.1f} mm"
+    return (
+        f"{group['name']}: {' and '.join(group['cameras'])}, {width}x{height} {group['model']}, {pair}, at "
+        f"{_vector(group['position_in_body_m'])} m in body, looks along {_vector(group['viewing_direction_in_body'])}"
+        + (" (guessed)" if group["place_is_guessed"] else "")
+    )
+
+
+def _imu_line(joined: Rig) -> str:
+    if joined.imu is None:
+        return "no IMU"
+    return f"IMU: {joined.imu.rate_hz:g} Hz, time offset {1e3 * joined.imu.time_offset_s:.2f} ms; its frame is body"
+
+
+def _vector(values: list[float] | Float) -> str:
+    return "(" + ", ".join(f"{value:.3f}" for value in values) + ")"
