@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from graphvio.pipeline import Progress
     from graphvio.results import Summary
 
+_DOUBTFUL = ("vision_failed", "vision_weak", "vision_gated")
+_MAX_DOUBTFUL_SHARE = 0.3  # of all framesets
+
 
 def run(
     source: options.Source,
@@ -150,6 +153,13 @@ def _print_summary(summary: Summary, folder: Path) -> None:
         typer.echo(sentence)
     for warning in summary.warnings:
         warn(f"{warning}; graphvio calibrate --what all finds by how much")
+    doubtful = sum(summary.events.get(kind, 0) for kind in _DOUBTFUL)
+    if doubtful > _MAX_DOUBTFUL_SHARE * summary.framesets:
+        warn(
+            f"vision failed, was weak, or contradicted the IMU {doubtful} times in {summary.framesets} framesets: see "
+            f"{folder / 'events.jsonl'}. Where images are good, check the calibration ('graphvio rig' shows it), the "
+            "IMU's units (rad/s, m/s^2) and axes, and compare with --no-imu"
+        )
     if summary.resets:
         typer.echo(f"reinitialised {summary.resets} times: see {folder / 'events.jsonl'}")
     typer.echo(f"results: {folder}")

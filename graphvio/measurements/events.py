@@ -93,6 +93,8 @@ class EventKind(StrEnum):
     """Parts of a session cannot be read; what is left is read."""
     IMU_GARBAGE = "imu_garbage"
     """A row or message of the IMU is not valid; it is dropped."""
+    IMU_UNITS = "imu_units"
+    """The accelerometer's readings are far from gravity, as if they were in g; they are used as they are."""
     FRAME_GARBAGE = "frame_garbage"
     """A row or message of a camera is not valid; it is dropped."""
     IMU_DUPLICATE = "imu_duplicate"

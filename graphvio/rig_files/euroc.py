@@ -20,6 +20,8 @@ from graphvio.rig_files import kalibr
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.rig_files.reading import Section, named, read_yaml
 
+_CHAIN = Path("dso/camchain.yaml")
+"""TUM-VI's calibration, next to ``mav0``."""
 _CAMERA_KEYS = ("T_BS", "resolution", "intrinsics", "distortion_model", "distortion_coefficients")
 
 
@@ -37,7 +39,7 @@ def load(path: Path) -> Rig:
     folders = camera_folders(root)
     sections = {folder.name: _sensor(folder) for folder in folders}
     imu_folder = root / "imu0"
-    chain = root.parent / "dso" / "camchain.yaml"
+    chain = root.parent / _CHAIN
     if chain.is_file() and any(not _is_complete(section) for section in sections.values()):
         return _from_chain(chain, [folder.name for folder in folders], has_imu=imu_folder.is_dir(), name=_name(root))
     imu_T_body = np.eye(4)
@@ -60,6 +62,11 @@ def sensors_folder(path: Path) -> Path | None:
         if camera_folders(folder):
             return folder
     return None
+
+
+def has_calibration(sensors: Path) -> bool:
+    """Whether a folder of sensors has a calibration of its own: any ``sensor.yaml``, or TUM-VI's chain."""
+    return any(sensors.glob("*/sensor.yaml")) or (sensors.parent / _CHAIN).is_file()
 
 
 def camera_folders(root: Path) -> list[Path]:

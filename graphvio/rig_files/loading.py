@@ -70,7 +70,7 @@ def find_rig(folder: Path) -> Rig | None:
     for place in places:
         if (place / native.FILE_NAME).is_file():
             return native.load(place / native.FILE_NAME)
-    if sensors is not None:
+    if sensors is not None and euroc.has_calibration(sensors):
         return euroc.load(folder)
     if (folder / kitti.ODOMETRY_FILE).is_file():
         return kitti.load_odometry(folder / kitti.ODOMETRY_FILE)

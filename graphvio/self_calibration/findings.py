@@ -15,6 +15,7 @@ from graphvio.self_calibration.parameters import BODY, CAMERA, INTRINSICS, PAIR,
 
 _FIVE_SIGMA = 5.7e-7  # probability of a normal variable beyond 5 standard deviations
 _OBSERVED = 0.5  # of the prior's standard deviation
+_MAX_HIDDEN_SHARE = 0.5  # of all parts; where more are hidden, no motion by itself is what lacks
 _TURN = "turn about two axes near textured surfaces"
 _DEPTHS = "walk past things at many distances, and let them move across the image"
 SCALE_MOTION = "accelerate: walk briskly with turns, or shake the rig"
@@ -91,6 +92,10 @@ def described(found: list[Finding]) -> list[str]:
         return []
     wrong = [finding.part for finding in found if finding.is_significant]
     sentences = [f"calibration corrected: {'; '.join(wrong)}"] if wrong else ["calibration: as in the rig file"]
+    n_hidden = sum(not finding.is_observed for finding in found)
+    if n_hidden > _MAX_HIDDEN_SHARE * len(found):
+        shown = f"{len(found) - n_hidden} of {len(found)} parts of the calibration"
+        return [*sentences, f"this recording shows {shown}: it is short, or moves little"]
     for motion in dict.fromkeys(finding.motion for finding in found):
         hidden = [finding.part for finding in found if finding.motion == motion and not finding.is_observed]
         if hidden:

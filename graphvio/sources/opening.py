@@ -114,5 +114,7 @@ def _known() -> str:
 
 def _required(rig: Rig | None, path: Path) -> Rig:
     if rig is None:
-        raise RigError(f"{path}: carries no calibration; write a rig.yaml into it, or give a rig of your own")
+        raise RigError(
+            f"{path}: carries no calibration; write a rig.yaml into it, or give a calibration of your own by --rig"
+        )
     return rig

@@ -20,6 +20,9 @@ from graphvio.sources.faults import FaultLog
 _MAX_STAMP_NS = 2**62  # the year 2116; offsets can be added without an overflow of int64
 _HOUR_NS = 3_600_000_000_000
 _MAX_OUTLIERS = 2
+_MIN_PERIOD_NS, _MIN_ROWS = 20_000, 10  # no camera or IMU is faster than 50 kHz
+_FORCE_M_S2 = (5.0, 20.0)
+"""Plausible median of the magnitude of specific force: gravity, and what a walk, a car or a drone adds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +48,15 @@ def read_imu_csv(path: Path, faults: FaultLog) -> ImuTable:
             int(np.sum(~finite)),
         )
     kept = finite.copy()
+    _refuse_other_units(table.stamps_ns[finite], path)
     kept[finite] = clean_stamps(table.stamps_ns[finite], "imu", path, faults)
-    return ImuTable(table.stamps_ns[kept], table.values[kept])
+    samples = ImuTable(table.stamps_ns[kept], table.values[kept])
+    if len(samples.stamps_ns) >= _MIN_ROWS:
+        force = float(np.median(np.linalg.norm(samples.values[:, 3:], axis=1)))
+        if not _FORCE_M_S2[0] <= force <= _FORCE_M_S2[1]:
+            detail = f"{path}: the accelerometer's median is {force:.3g} m/s^2, far from gravity; is it in other units?"
+            faults.add(EventKind.IMU_UNITS, int(samples.stamps_ns[0]), detail)
+    return samples
 
 
 def read_frame_csv(path: Path, faults: FaultLog) -> tuple[Int, list[str]]:
@@ -61,6 +71,7 @@ def read_frame_csv(path: Path, faults: FaultLog) -> tuple[Int, list[str]]:
         stamps.append(stamp)
         names.append(cells[1] if len(cells) > 1 and cells[1] else f"{stamp}.png")
     all_stamps = np.array(stamps, dtype=np.int64)
+    _refuse_other_units(all_stamps, path)
     kept = clean_stamps(all_stamps, "frame", path, faults)
     return all_stamps[kept], [name for name, keep in zip(names, kept, strict=True) if keep]
 
@@ -102,6 +113,15 @@ def decimal_ns(text: str, unit_ns: int) -> int | None:
     if not value.is_finite() or not 0 <= value < _MAX_STAMP_NS:
         return None
     return int(value.to_integral_value())
+
+
+def _refuse_other_units(stamps_ns: Int, path: Path) -> None:
+    """Refuse stamps of a whole table that can only be in seconds, milliseconds or microseconds."""
+    if len(stamps_ns) >= _MIN_ROWS and (period_ns := float(np.median(np.diff(stamps_ns)))) < _MIN_PERIOD_NS:
+        raise SourceError(
+            f"{path}: rows are {max(period_ns, 0.0):g} ns apart in the median; stamps have to be whole nanoseconds, "
+            "not seconds, milliseconds or microseconds"
+        )
 
 
 def clean_stamps(stamps_ns: Int, sensor: Literal["imu", "frame"], path: Path, faults: FaultLog) -> Bool:
