@@ -145,7 +145,7 @@ class _Walk:
         axes.set_ylim(0.0, 1.2 * highest)
         axes.set_xlabel("time, s")
         axes.set_ylabel("position error, cm")
-        axes.legend(loc="upper right", fontsize=8.5)
+        axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.9), fontsize=8.5)
         return lines
 
     def save_animation(self, path: Path) -> None:
