@@ -7,6 +7,7 @@ other sign, accelerations are the same. Where a walk begins and ends stationary,
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import shutil
 import subprocess
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 _OPTIONS = ("speed", "duration_s", "legs", "seed", "rate_hz", "recording", *FAULT_OPTIONS)
 _MAX_END_SPEED_M_S = 1e-3
+_log = logging.getLogger(__name__)
 
 
 def list_devices() -> Sequence[DeviceInfo]:
@@ -185,7 +187,8 @@ class SimulatedRig:
         command = [sys.executable, "-c", "from graphvio.cli import main; main()", *map(str, arguments)]
         root.mkdir(parents=True, exist_ok=True)
         try:
-            if subprocess.run(command, check=False).returncode:
+            _log.warning("rendering the simulated scene %s, once; it takes about three times its length", self._scene)
+            if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode:
                 raise SourceError(
                     f"simulator: {self._scene} could not be rendered; try  graphvio simulate {self._scene}"
                 )
