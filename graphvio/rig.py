@@ -32,11 +32,14 @@ if TYPE_CHECKING:
 
 _ROTATION_TOLERANCE = 1e-3
 _ROUNDING = 1e-14
-_MIN_BASELINE_M = 1e-3
+_OVERLAP_DISTANCE_M = 5.0
+_GRID = 12  # points of an image, across and down
 _MAX_READOUT_US = 100e3
 _MAX_READOUT_DIFFERENCE_NS = 1_000_000
 MAX_AXES_ANGLE_DEG = 45.0
 """Between the cameras of a stereo pair: with more, patches look too different."""
+MIN_BASELINE_M = 1e-3
+"""Between these cameras."""
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _MAX_MATRIX_ERROR = 0.2
 
@@ -145,6 +148,17 @@ def axes_angle_deg(left: Camera, right: Camera) -> float:
     return float(np.rad2deg(np.arccos(np.clip((right.cam_T_body @ left.body_T_cam)[2, 2], -1.0, 1.0))))
 
 
+def overlap(left: Camera, right: Camera) -> float:
+    """Compute the share of the left image that shows points, 5 m away, which the right camera sees too."""
+    width, height = left.size_px
+    u, v = np.meshgrid((np.arange(_GRID) + 0.5) / _GRID * width, (np.arange(_GRID) + 0.5) / _GRID * height)
+    rays, has_ray = left.unproject(np.column_stack([u.ravel(), v.ravel()]))
+    points = np.column_stack([_OVERLAP_DISTANCE_M * rays, np.full((len(rays), 1), _OVERLAP_DISTANCE_M)])
+    right_T_left = right.cam_T_body @ left.body_T_cam
+    _, is_seen = right.project(points @ right_T_left[:3, :3].T + right_T_left[:3, 3])
+    return float(np.mean(is_seen & has_ray))
+
+
 @dataclass(frozen=True, eq=False)
 class StereoPair:
     """Left and right camera with overlapping views.
@@ -165,7 +179,7 @@ class StereoPair:
 
     def __post_init__(self) -> None:
         where = f"pair {self.name} ({self.left.name}, {self.right.name})"
-        if self.baseline_m < _MIN_BASELINE_M:
+        if self.baseline_m < MIN_BASELINE_M:
             raise RigError(
                 f"{where}: baseline is {1e3 * self.baseline_m:.3f} mm; a stereo pair needs two cameras at "
                 "different places: check body_T_cam of both"

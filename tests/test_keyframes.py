@@ -324,7 +324,8 @@ def test_covariances_of_landmarks_are_consistent() -> None:
         )  # fmt: skip
         black = np.zeros((480, 640), dtype=np.uint8)
         body_T_left = np.stack([each.left.body_T_cam for each in rig.pairs])
-        marks = landmarks_of(rig, body_T_left, {j: frame}, {j: (black, black)}, sigma_px, None)
+        keyframe = NewKeyframe({j: frame}, {j: (black, black)}, body_T_left, None, None, None)
+        marks = landmarks_of(rig, keyframe, sigma_px, None)
         assert (marks.pair == j).all()
         true = points @ pair.left.body_T_cam[:3, :3].T + pair.left.body_T_cam[:3, 3]
         errors = marks.points_body - true[marks.track_id]

@@ -14,13 +14,13 @@ from command_line import graphvio
 from recordings import REAL_DATA, half_size
 from rendered import rendered_once
 
-from graphvio import Odometry, RigError, load_rig, save_rig
-from graphvio.arrays import Float
+from graphvio import RigError, load_rig, save_rig
+from graphvio.arrays import Float, Int
 from graphvio.config import Config
-from graphvio.geometry import so3_exp, so3_log
+from graphvio.geometry import se3_inverse, so3_exp, so3_log
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind
-from graphvio.measurements.motion import Sighting
+from graphvio.measurements.motion import Elsewhere, Sighting
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.adjustment import (
     Measurements,
@@ -30,6 +30,7 @@ from graphvio.monocular.adjustment import (
     covariance_of,
     equations,
     first_prior,
+    scale_sigma,
     without_first,
 )
 from graphvio.monocular.closed_form import first_guess
@@ -37,12 +38,11 @@ from graphvio.monocular.estimator import MonocularEstimator
 from graphvio.monocular.initialiser import POSE_SIGMAS
 from graphvio.monocular.sightings import LandmarkNames, Landmarks
 from graphvio.monocular.structure import Cameras, Eliminated, located, visual_equations
-from graphvio.rig import Rig
+from graphvio.rig import Camera, Rig
 from graphvio.rig_files.grouping import grouped_rig
 from graphvio.self_calibration.inertial import InertialSamples
 from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
 from graphvio.simulation.named_rigs import stereo_and_back
-from graphvio.slam import FrontEnd
 
 FRAME_NS, IMU_NS = 50_000_000, 5_000_000
 GYRO_BIAS, ACCEL_BIAS = np.array([-0.01, 0.02, 0.08]), np.array([-0.02, 0.08, 0.05])
@@ -51,6 +51,11 @@ PIXEL_SIGMA_PX = 0.2
 
 def single_rig() -> Rig:
     return default_rig().with_only(["cam0"])
+
+
+def overlapping_rig() -> Rig:
+    """Return two cameras that see the same, and are no pair."""
+    return default_rig().with_pairs([0]).without_pairs()
 
 
 class Flight(NamedTuple):
@@ -94,10 +99,18 @@ def after_a_standstill(until_s: float) -> Flight:
 
 
 class Tracks:
-    """Points around the flight, seen by a rig's cameras with noise; a track ends when its point leaves the image."""
+    """Points around the flight, seen by a rig's cameras with noise; a track ends when its point leaves the image.
 
-    def __init__(self, rig: Rig, flight: Flight) -> None:
-        self._rng = np.random.default_rng(5)
+    Args:
+        rig: of single cameras.
+        flight: of body.
+        shares: whether each camera's tracks are found in the others, too.
+        seed: of the noise, and of the points.
+    """
+
+    def __init__(self, rig: Rig, flight: Flight, shares: bool = False, seed: int = 5) -> None:
+        self._rng = np.random.default_rng(seed)
+        self._shares = shares
         self._cameras = [single.left for single in rig.singles]
         self._flight = flight
         self._points = self._rng.uniform([-8.0, -6.0, -3.0], [20.0, 6.0, 3.0], size=(4000, 3))
@@ -121,10 +134,24 @@ class Tracks:
             self._ids[j] = ids if share > 0.0 else np.full(len(self._points), -1)
             rows = np.flatnonzero(self._ids[j] >= 0)
             rows = rows[np.argsort(ids[rows])]
-            noisy = pixels[rows] + PIXEL_SIGMA_PX * self._rng.normal(size=(len(rows), 2))
-            rays, _ = camera.unproject(noisy)
-            found[j] = Sighting(ids[rows].astype(np.int64), rays)
+            elsewhere = [self._elsewhere(t, k, rows) for k in range(len(self._cameras)) if self._shares and k != j]
+            found[j] = Sighting(ids[rows].astype(np.int64), self._rays(camera, pixels[rows]), tuple(elsewhere))
         return found
+
+    def points_of(self, j: int, t: float) -> dict[int, Float]:
+        """Return where the points of a camera's tracks are in body, by the identities of the tracks."""
+        pose, rows = self._flight.pose(t), np.flatnonzero(self._ids[j] >= 0)
+        in_body = (self._points[rows] - pose[:3, 3]) @ pose[:3, :3]
+        return dict(zip(self._ids[j][rows].tolist(), in_body, strict=True))
+
+    def _rays(self, camera: Camera, pixels: Float) -> Float:
+        return camera.unproject(pixels + PIXEL_SIGMA_PX * self._rng.normal(size=pixels.shape))[0]
+
+    def _elsewhere(self, t: float, k: int, rows: Int) -> Elsewhere:
+        """See points in another camera."""
+        odom_T_cam = self._flight.pose(t) @ self._cameras[k].body_T_cam
+        pixels, seen = self._cameras[k].project((self._points[rows] - odom_T_cam[:3, 3]) @ odom_T_cam[:3, :3])
+        return Elsewhere(k, np.flatnonzero(seen), self._rays(self._cameras[k], pixels[seen]))
 
 
 class Flown(NamedTuple):
@@ -136,13 +163,21 @@ class Flown(NamedTuple):
     estimator: MonocularEstimator
 
 
-def fly(flight: Flight, duration_s: float, share: Callable[[float], float] | None = None) -> Flown:
+def fly(
+    flight: Flight,
+    duration_s: float,
+    share: Callable[[float], float] | None = None,
+    *,
+    rig: Rig | None = None,
+    on_keyframe: Callable[[float, MonocularEstimator, Tracks], None] | None = None,
+    seed: int = 5,
+) -> Flown:
     """Run the estimator alone, on perfect associations; with every third frameset a keyframe."""
-    rig = single_rig()
+    shares, rig = rig is not None, rig or single_rig()
     assert rig.imu is not None
-    rng, events = np.random.default_rng(1), list[tuple[str, str]]()
+    rng, events = np.random.default_rng(seed - 4), list[tuple[str, str]]()
     estimator = MonocularEstimator(rig, Config(), lambda _, kind, detail: events.append((kind, detail)))
-    tracks, stamps, poses, statuses, next_ns = Tracks(rig, flight), [], [], [], -500_000_000
+    tracks, stamps, poses, statuses, next_ns = Tracks(rig, flight, shares, seed), [], [], [], -500_000_000
     noise = np.repeat([rig.imu.gyro_noise_density, rig.imu.accel_noise_density], 3) / np.sqrt(IMU_NS * 1e-9)
     before: Float | None = None
     for k in range(round(duration_s * 20)):
@@ -160,6 +195,8 @@ def fly(flight: Flight, duration_s: float, share: Callable[[float], float] | Non
         estimator.apply(visual, is_still)  # type: ignore[arg-type]
         keep = frozenset({stamp_ns} if k % 3 == 0 and not is_still else set())
         statuses.append(estimator.update(stamp_ns, is_constrained=False, keep=keep).status)
+        if estimator.has_pose and keep and on_keyframe is not None:
+            on_keyframe(t, estimator, tracks)
         if estimator.has_pose:
             stamps.append(t)
             poses.append(estimator.state().nav_T_body)
@@ -200,9 +237,9 @@ class Problem(NamedTuple):
     prior: Prior
 
 
-def problem(n_keyframes: int = 5, is_exact: bool = False) -> Problem:
-    """A window around the truth."""
-    rig, flight, rng = single_rig(), moving(), np.random.default_rng(2)
+def problem(n_keyframes: int = 5, is_exact: bool = False, shares: bool = False) -> Problem:
+    """A window around the truth, of one camera or of two whose views overlap."""
+    rig, flight, rng = overlapping_rig() if shares else single_rig(), moving(), np.random.default_rng(2)
     assert rig.imu is not None
     times = np.arange(n_keyframes) * 0.15
     stamps = np.round(times * 1e9).astype(np.int64)
@@ -217,8 +254,12 @@ def problem(n_keyframes: int = 5, is_exact: bool = False) -> Problem:
     prior = first_prior(states, np.full(6, 0.1), states.biases, POSE_SIGMAS)
     if not is_exact:
         states = states.moved(1e-3 * rng.normal(size=9 * n_keyframes + 9))
-    cameras = Cameras(np.array([rig.singles[0].left.body_T_cam]), np.array([rig.singles[0].left.focal_px]))
-    tracks, names, landmarks = Tracks(rig, flight), LandmarkNames(1, n_keyframes), Landmarks()
+    cameras = Cameras(
+        np.array([single.left.body_T_cam for single in rig.singles]),
+        np.array([single.left.focal_px for single in rig.singles]),
+    )
+    tracks, landmarks = Tracks(rig, flight, shares), Landmarks()
+    names = LandmarkNames(len(rig.singles), n_keyframes)
     views = [names.join(tracks.sightings(t, 0.3)) for t in times]
     structure, places, _ = landmarks.structure(views, states.poses, cameras)
     places = located(states.poses, cameras, places, structure, PIXEL_SIGMA_PX, True)
@@ -226,8 +267,9 @@ def problem(n_keyframes: int = 5, is_exact: bool = False) -> Problem:
     return Problem(measured, states, places, prior)
 
 
-def test_visual_equations_gradient_is_the_derivative_of_the_cost_with_landmarks_at_their_best() -> None:
-    measured, states, landmarks, _ = problem(4)
+@pytest.mark.parametrize("shares", [False, True])
+def test_visual_equations_gradient_is_the_derivative_of_the_cost_with_landmarks_at_their_best(shares: bool) -> None:
+    measured, states, landmarks, _ = problem(4, shares=shares)
 
     def at(poses: Float) -> tuple[float, Float]:
         places, eliminated = landmarks, Eliminated.empty(measured.structure)
@@ -249,9 +291,32 @@ def test_visual_equations_gradient_is_the_derivative_of_the_cost_with_landmarks_
         assert (moved[0] - moved[1]) / (2.0 * step) == pytest.approx(gradient[unknown], rel=2e-3, abs=0.5)
 
 
-def test_adjust_from_a_perturbed_window_finds_the_truth_within_its_covariance() -> None:
-    measured, states, landmarks, prior = problem(8)
-    truth = problem(8, is_exact=True).states
+def test_hessian_with_several_views_from_one_state_is_that_of_all_unknowns() -> None:
+    """The landmarks eliminated by blocks, against numerical derivatives of the gradient."""
+    measured, states, landmarks, _ = problem(3, is_exact=True, shares=True)
+    assert len(np.unique(measured.structure.camera)) == 2
+    landmarks = located(states.poses, measured.cameras, landmarks, measured.structure, 2.0, True)
+
+    def gradient_at(poses: Float) -> Float:
+        places = landmarks
+        for _ in range(4):
+            places = located(poses, measured.cameras, places, measured.structure, 2.0, True)
+        return visual_equations(poses, measured.cameras, places, measured.structure, 2.0, 1e4, eliminated)[1]
+
+    eliminated = Eliminated.empty(measured.structure)
+    hessian = visual_equations(states.poses, measured.cameras, landmarks, measured.structure, 2.0, 1e4, eliminated)[0]
+    for unknown in (1, 4, 9, 17):
+        change = np.zeros(9 * 3 + 9)
+        change[unknown] = 1e-5
+        by_step = (gradient_at(states.moved(change).poses) - gradient_at(states.moved(-change).poses)) / 2e-5
+        scale = np.sqrt(np.diag(hessian) * hessian[unknown, unknown])
+        assert np.abs((by_step - hessian[unknown]) / scale).max() < 0.02
+
+
+@pytest.mark.parametrize("shares", [False, True])
+def test_adjust_from_a_perturbed_window_finds_the_truth_within_its_covariance(shares: bool) -> None:
+    measured, states, landmarks, prior = problem(8, shares=shares)
+    truth = problem(8, is_exact=True, shares=shares).states
     adjusted = adjust(measured, states, landmarks, prior, 10)
     off = adjusted.states.since(truth)
     sigmas = np.sqrt(np.diag(covariance_of(adjusted.equations.hessian, np.arange(len(off)))))
@@ -260,8 +325,17 @@ def test_adjust_from_a_perturbed_window_finds_the_truth_within_its_covariance() 
     assert np.abs(off[: 6 * 8]).max() < 0.02
 
 
-def test_without_first_gives_the_same_solution_as_the_whole_window() -> None:
-    measured, states, landmarks, prior = problem(6)
+def test_a_baseline_knows_the_scale_better_than_the_accelerometer() -> None:
+    sigmas = []
+    for shares in (False, True):
+        measured, states, landmarks, prior = problem(8, is_exact=True, shares=shares)
+        sigmas.append(scale_sigma(states, equations(measured, states, landmarks, prior).hessian))
+    assert sigmas[1] < 0.2 * sigmas[0]
+
+
+@pytest.mark.parametrize("shares", [False, True])
+def test_without_first_gives_the_same_solution_as_the_whole_window(shares: bool) -> None:
+    measured, states, landmarks, prior = problem(6, shares=shares)
     adjusted = adjust(measured, states, landmarks, prior, 12)
     states, landmarks = adjusted.states, adjusted.landmarks
     n = len(states.poses)
@@ -311,6 +385,35 @@ def test_estimator_in_motion_knows_the_scale_and_stays_consistent() -> None:
     assert covariance.accel_bias is not None
     assert np.abs(state.gyro_bias - GYRO_BIAS).max() < 2e-3
     assert (np.abs(state.accel_bias - ACCEL_BIAS) < 4.0 * np.sqrt(np.diag(covariance.accel_bias))).all()
+
+
+@pytest.mark.parametrize("shares", [False, True])
+def test_points_and_motions_of_keyframes_are_consistent(shares: bool) -> None:
+    """Errors of what a SLAM system gets; the noise of tracks is taken for twice as large, as that of images lasts."""
+    flight, of_points, of_motions = moving(), list[float](), list[float]()
+    before: list[int] = []
+
+    def compare(t: float, estimator: MonocularEstimator, tracks: Tracks) -> None:
+        stamp_ns = round(t * 1e9)
+        for j, (ids, points, covariances) in estimator.located_points().items():
+            truth = tracks.points_of(j, t)
+            errors = points - np.array([truth[number] for number in ids.tolist()])
+            of_points.extend(np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors) / 3.0)
+        if before:
+            motion, covariance = estimator.motion_since(before[-1]), estimator.covariance_since(before[-1])
+            assert motion is not None
+            assert covariance is not None
+            off = se3_inverse(flight.pose(t)) @ flight.pose(before[-1] * 1e-9) @ se3_inverse(motion)
+            error = np.concatenate([so3_log(np.ascontiguousarray(off[:3, :3])), off[:3, 3]])
+            of_motions.append(float(error @ np.linalg.solve(covariance, error)) / 6.0)
+        before.append(stamp_ns)
+
+    for seed in (5, 6):
+        before.clear()
+        fly(flight, 5.0, rig=overlapping_rig() if shares else None, on_keyframe=compare, seed=seed)
+    assert len(of_points) > 1000
+    assert 0.2 < float(np.mean(of_points)) < 0.8
+    assert 0.1 < float(np.mean(of_motions)) < 0.8
 
 
 def test_estimator_at_a_standstill_waits_for_motion() -> None:
@@ -366,17 +469,20 @@ def test_grouped_rig_of_one_camera_or_cameras_that_look_apart_needs_an_imu() -> 
             grouped_rig(cameras, None, "rig", Path("file"))
 
 
+def test_two_cameras_that_look_apart_are_single_with_an_imu_and_refused_without() -> None:
+    rig = default_rig()
+    for apart in (rig.cameras[2], replace(rig.cameras[0], name="cam9", body_T_cam=_turned(rig))):
+        grouped = grouped_rig([rig.cameras[0], apart], rig.imu, "rig", Path("file"))
+        assert [group.name for group in grouped.groups] == [rig.cameras[0].name, apart.name]
+        with pytest.raises(RigError, match="degrees apart"):
+            grouped_rig([rig.cameras[0], apart], None, "rig", Path("file"))
+    assert len(grouped_rig(rig.cameras[:2], rig.imu, "rig", Path("file")).pairs) == 1
+
+
 def _turned(rig: Rig) -> Float:
     pose = rig.cameras[0].body_T_cam.copy()
     pose[:3, :3] = so3_exp(np.array([0.0, 0.0, np.pi / 2])) @ pose[:3, :3]
     return pose
-
-
-def test_front_end_of_slam_refuses_a_rig_of_single_cameras() -> None:
-    odometry = Odometry(single_rig())
-    with pytest.raises(RigError, match=r"only single cameras \(cam0\), and a SLAM system .* needs a stereo pair"):
-        FrontEnd(odometry)
-    odometry.finish()
 
 
 @pytest.fixture(scope="module")

@@ -69,7 +69,7 @@ def ns(ms: float) -> int:
 
 def images_held(assembler: FramesetAssembler) -> int:
     unpaired = sum(len(camera.waiting) for camera in assembler._cameras())
-    return unpaired + sum(2 * len(pair.matched) for pair in assembler._pairs)
+    return unpaired + sum(len(group.cameras) * len(group.matched) for group in assembler._groups)
 
 
 def play(shots: Sequence[Shot], pairs: int = 2, wait_ms: float = WAIT_MS, *, flush: bool = True) -> Run:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from graphvio.rig_files.grouping import overlap
+from graphvio.rig import overlap
 from graphvio.simulation import Simulator, build_scene
 from graphvio.simulation.named_rigs import NAMED_RIGS, headset, phone, surround
 

@@ -17,8 +17,8 @@ from graphvio.measurements.events import EventKind
 from graphvio.pipeline import run
 from graphvio.results import ResultWriter
 from graphvio.results.summary import Summary
-from graphvio.rig import Rig, SingleCamera
-from graphvio.rig_files.grouping import grouped_rig, overlap
+from graphvio.rig import Rig, SingleCamera, overlap
+from graphvio.rig_files.grouping import grouped_rig
 from graphvio.sessions.euroc_writer import EurocWriter
 from graphvio.simulation import CalibrationError, Simulator, build_scene, write_recording
 from graphvio.simulation.calibration_error import draw
@@ -126,9 +126,23 @@ def test_cameras_that_overlap_but_look_apart_are_single(tmp_path: Path) -> None:
         grouped_rig([wide[0], side, replace(stereo_and_back().singles[0].left, name="cam3")], None, "wide", tmp_path)
 
 
-def test_live_sources_refuse_single_cameras() -> None:
-    with pytest.raises(RigError, match="cam2 has no partner; live sources take stereo pairs only"):
-        FramesetAssembler(stereo_and_back(), 2.0, 50.0, lambda *_: None)
+def test_framesets_of_live_images_hold_single_cameras_as_recordings_do() -> None:
+    """Images in any order; the pair's right image of one instant and the single camera's of another are missing."""
+    reports: list[tuple[int, str]] = []
+    assembler = FramesetAssembler(stereo_and_back(), 2.0, 50.0, lambda ns, kind, _: reports.append((ns, kind)))
+    missing, framesets = {("cam1", 3), ("cam2", 5)}, []
+    image = np.zeros((480, 640), dtype=np.uint8)
+    for k in range(8):
+        for camera in ("cam2", "cam1", "cam0"):
+            if (camera, k) not in missing:
+                stamp_ns = 50_000_000 * k + (500_000 if camera == "cam2" else 0)
+                framesets += assembler.add(camera, stamp_ns, image, 50_000_000 * k + 5_000_000)
+    framesets += assembler.flush()
+    assert [each.stamp_ns // 1_000_000 for each in framesets] == [50 * k for k in range(8)]
+    assert [{j: len(images) for j, images in each.images.items()} for each in framesets] == [
+        {1: 1} if k == 3 else {0: 2} if k == 5 else {0: 2, 1: 1} for k in range(8)
+    ]
+    assert reports == [(150_000_000, EventKind.IMAGE_WITHOUT_PARTNER)]
 
 
 # ------------------------------------------------------------------ odometry

@@ -11,7 +11,7 @@ from graphvio.backend.states import RigState, StateCovariance
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
-from graphvio.measurements.motion import RelativeMotion, VisualResult
+from graphvio.measurements.motion import LocatedPoints, RelativeMotion, VisualResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +92,12 @@ class StateEstimator(Protocol):
 
         Returns:
             (6, 6), tangent ``[rotation, translation]`` in the newest body frame, or None if it is not known.
+        """
+
+    def located_points(self) -> dict[int, LocatedPoints]:
+        """Return the points of known distance that single cameras see at the newest state, by camera.
+
+        Empty where the front-end locates the points.
         """
 
     def take_final(self) -> list[tuple[int, Float]]:

@@ -28,7 +28,7 @@ from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
-from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
+from graphvio.measurements.motion import LocatedPoints, Quality, RelativeMotion, VisualResult
 from graphvio.rig import Rig
 
 _MIN_TRUSTED_MOTIONS = 20  # an attitude that was lost again after fewer motions is not taken over
@@ -107,6 +107,10 @@ class SmootherEstimator:
             return smoother.covariance_since(then_ns)
         except SOLVER_ERRORS:
             return None
+
+    def located_points(self) -> dict[int, LocatedPoints]:
+        """Return nothing: the front-end locates the points."""
+        return {}
 
     def take_final(self) -> list[tuple[int, Float]]:
         """Return stamps and poses ``nav_T_body`` that left the window since the last call."""

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from graphvio.frontend.images import checked
+from graphvio.config import Config
+from graphvio.frontend.images import ImageMask, checked
+from graphvio.frontend.overlaps import Overlaps
 from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracks import PairFrame, common_rows
 from graphvio.frontend.visual import MotionPredictor, VisualFrontend
-from graphvio.measurements.motion import PairReport, Quality, Sighting, VisualResult
+from graphvio.measurements.motion import Elsewhere, PairReport, Quality, Sighting, VisualResult
 from graphvio.measurements.sensors import FrameSet
+from graphvio.rig import Rig
+from graphvio.timing import timed
 
 _MIN_PARALLAX = 0.01  # median displacement of rays since a keyframe: with less, the rig has not moved
 _MAX_PARALLAX = 0.06  # with more, a keyframe is due
@@ -19,6 +23,10 @@ _MIN_INTERVAL_NS = 140_000_000  # between keyframes while there is no motion to 
 
 class SinglesFrontend(VisualFrontend):
     """Tracks every camera, and decides when a keyframe begins."""
+
+    def __init__(self, rig: Rig, config: Config, image_mask: ImageMask | None = None) -> None:
+        super().__init__(rig, config, image_mask)
+        self._overlaps = Overlaps(rig, config)
 
     def process(
         self, frameset: FrameSet, predict: MotionPredictor, readout: ReadoutMotion | None = None
@@ -43,13 +51,15 @@ class SinglesFrontend(VisualFrontend):
             )
             for j, frame in seen.frames.items()
         }  # fmt: skip
-        if not self._all_frozen and self._is_keyframe(seen.stamp_ns, seen.frames, predict, is_stationary):
+        is_keyframe = not self._all_frozen and self._is_keyframe(seen.stamp_ns, seen.frames, predict, is_stationary)
+        if is_keyframe:
             reference = next(iter(seen.reference.values()), None)
             cur_T_reference = None if reference is None else predict(reference.stamp_ns)
             if reference is not None and cur_T_reference is not None:
                 self._history.advance(reference.stamp_ns, seen.stamp_ns, cur_T_reference, np.zeros((6, 6)))
             seen = seen._replace(frames=self._refer_to(seen.frames))
-        sightings = {j: Sighting(frame.ids, frame.left) for j, frame in seen.frames.items()}
+        elsewhere = self._find_elsewhere(seen.frames, predict, is_keyframe)
+        sightings = {j: Sighting(frame.ids, frame.left, elsewhere[j]) for j, frame in seen.frames.items()}
         tracked = sum(int((frame.ages > 0).sum()) for frame in seen.frames.values())
         is_good = tracked >= self._config.motion.min_inliers
         return VisualResult(
@@ -62,6 +72,18 @@ class SinglesFrontend(VisualFrontend):
             stage_ms=self.stage_ms,
             sightings={} if self._all_frozen else sightings,
         )
+
+    @timed("elsewhere")
+    def _find_elsewhere(
+        self, frames: dict[int, PairFrame], predict: MotionPredictor, searches: bool
+    ) -> dict[int, tuple[Elsewhere, ...]]:
+        """Find each camera's tracks in the other cameras that see the same part of the scene."""
+        views = {j: self._trackers[j].view for j in frames}
+
+        def find(j: int) -> tuple[Elsewhere, ...]:
+            return self._overlaps.find(j, views, lambda then_ns: self._moved(j, predict(then_ns)), searches)
+
+        return self._in_parallel(find, frames)
 
     def _is_keyframe(
         self, stamp_ns: int, frames: dict[int, PairFrame], predict: MotionPredictor, is_stationary: bool

@@ -14,6 +14,7 @@ from graphvio.frontend.keyframe_patches import KeyframePatches
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
 from graphvio.frontend.matching import StereoMatcher
 from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH, FirstSights, MotionHistory
+from graphvio.frontend.overlaps import View
 from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.rolling_shutter import ReadoutMotion, as_at_stamp, pixels_at_lines
 from graphvio.frontend.tracks import PairFrame, common_rows, passes, usable_at
@@ -127,6 +128,11 @@ class PairTracker:
             )  # fmt: skip
             self._last = replace(self._last, points=points, covariances=covariances)
         return self._last
+
+    @property
+    def view(self) -> View:
+        """The newest left image, and what is tracked in it."""
+        return View(self._last, self._left, self._allowed, self._min_gradient)
 
     def move(self, body_T_left: Float) -> None:
         """Take another pose (4, 4) of a single camera from now on."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -36,6 +36,8 @@ from graphvio.timing import timed
 
 MotionPredictor = Callable[[int], Float | None]
 """Takes an earlier stamp and returns the predicted ``cur_T_then`` (4, 4) of body, or None if unknown."""
+
+_Result = TypeVar("_Result")
 
 
 class _Seen(NamedTuple):
@@ -119,8 +121,8 @@ class VisualFrontend:
         return self._places.misaligned
 
     def frames_at(self, stamp_ns: int) -> dict[int, PairFrame]:
-        """Return the pairs' tracks at the newest frameset, if it has this stamp."""
-        return {j: frame for j, frame in self._latest.items() if frame.stamp_ns == stamp_ns and not frame.is_single}
+        """Return the tracks of pairs and single cameras at the newest frameset, if it has this stamp."""
+        return {j: frame for j, frame in self._latest.items() if frame.stamp_ns == stamp_ns}
 
     def limit_corners(self, share: float) -> None:
         """Follow only a share, above 0 and up to 1, of the corners that the configuration asks for from now on."""
@@ -304,7 +306,7 @@ class VisualFrontend:
         """Whether the pairs contradicted each other a moment ago."""
         return self._contradicted_ns is not None and 0 <= now_ns - self._contradicted_ns < THRESHOLDS.agreement.doubt_ns
 
-    def _in_parallel(self, work: Callable[[int], PairFrame], pairs: Iterable[int]) -> dict[int, PairFrame]:
+    def _in_parallel(self, work: Callable[[int], _Result], pairs: Iterable[int]) -> dict[int, _Result]:
         """Work on each pair, all but the first in threads of their own."""
         ordered = sorted(pairs)
         others = [(j, self._workers.submit(work, j)) for j in ordered[1:]]
@@ -312,8 +314,11 @@ class VisualFrontend:
         return frames | {j: other.result() for j, other in others}
 
     def _predicted(self, pair: int, then: PairFrame | None, predict: MotionPredictor) -> Float | None:
-        """Predict the motion of points in a pair's left camera since one of its frames, by eq. (1)."""
-        cur_T_then = None if then is None else predict(then.stamp_ns)
+        """Predict the motion of points in a pair's left camera since one of its frames."""
+        return None if then is None else self._moved(pair, predict(then.stamp_ns))
+
+    def _moved(self, pair: int, cur_T_then: Float | None) -> Float | None:
+        """Return the motion of points in a pair's left camera for one of body, by eq. (1)."""
         if cur_T_then is None:
             return None
         body_T_left = self._places.arrays.body_T_left[pair]

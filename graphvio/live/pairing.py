@@ -1,4 +1,4 @@
-"""From images of single cameras to framesets: which belong together, and how long others are waited for."""
+"""From images of cameras to framesets: which belong together, and how long others are waited for."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 
 from graphvio.arrays import Image
-from graphvio.errors import RigError
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.sensors import FrameSet
 from graphvio.odometry.synchroniser import JumpGuard
@@ -25,10 +24,10 @@ _by_stamp = attrgetter("stamp_ns")
 class FramesetAssembler:
     """Assembles framesets that increase in time, by the rules by which `graphvio.sources.matching` joins recordings.
 
-    The left image's stamp is its pair's, and that of the first pair is the frameset's. A mean would depend on the pairs
-    that happen to be there, and be the time of no image; so a live run and the session that it recorded have the same
-    framesets. Only where another image follows so closely that it would lie within the tolerance of this stamp is the
-    frameset's that of its earliest pair.
+    The left image's stamp is its pair's, and that of the first pair is the frameset's; a camera without a partner
+    counts as a pair that has no right image. A mean would depend on the pairs that happen to be there, and be the time
+    of no image; so a live run and the session that it recorded have the same framesets. Only where another image
+    follows so closely that it would lie within the tolerance of this stamp is the frameset's that of its earliest pair.
 
     A frameset is complete once no image can join it any more, if each camera delivers its own images in order; cameras
     may come in any order among each other. A camera that is past an instant has no image of it: one that lost an image,
@@ -45,22 +44,14 @@ class FramesetAssembler:
         report: takes events with the stamp of an image that is left out: ``image_without_partner``, ``late_image`` for
             those not after the last frameset, ``duplicate_image``, ``image_future_stamp`` for one far ahead of those
             before and after it, and ``unknown_camera``.
-
-    Raises:
-        RigError: if the rig has single cameras.
     """
 
     def __init__(self, rig: Rig, tolerance_ms: float, max_wait_ms: float, report: Report) -> None:
-        if rig.singles:
-            names = ", ".join(single.name for single in rig.singles)
-            raise RigError(
-                f"{rig.name}: {names} has no partner; live sources take stereo pairs only: give a rig of pairs by --rig"
-            )
         self._tolerance_ns = round(1e6 * tolerance_ms)
         self._max_wait_ns = round(1e6 * max_wait_ms)
         self._report = report
-        self._pairs = [_Pair(_Camera(p.left.name, report), _Camera(p.right.name, report)) for p in rig.pairs]
-        self._places = {each.name: (pair, each) for pair in self._pairs for each in (pair.left, pair.right)}
+        self._groups = [_Group(tuple(_Camera(each.name, report) for each in group.cameras)) for group in rig.groups]
+        self._places = {each.name: (group, each) for group in self._groups for each in group.cameras}
         self._now_ns: int | None = None
         self._given_ns: int | None = None
 
@@ -109,9 +100,9 @@ class FramesetAssembler:
         self._now_ns = arrival_ns if self._now_ns is None else max(self._now_ns, arrival_ns)
 
     def _cameras(self) -> Iterator[_Camera]:
-        return (camera for pair in self._pairs for camera in (pair.left, pair.right))
+        return (camera for group in self._groups for camera in group.cameras)
 
-    def _take(self, pair: _Pair, camera: _Camera, image: _Arrived) -> None:
+    def _take(self, pair: _Group, camera: _Camera, image: _Arrived) -> None:
         camera.last_ns = image.stamp_ns
         if image.stamp_ns in camera.seen:
             detail = f"{camera.name}: a second image of this stamp, left out"
@@ -123,6 +114,9 @@ class FramesetAssembler:
             late_ms = 1e-6 * (self._given_ns - image.stamp_ns)
             detail = f"{camera.name}: {late_ms:.1f} ms before the newest frameset, left out"
             self._report(image.stamp_ns, EventKind.LATE_IMAGE, detail)
+            return
+        if pair.right is None:
+            insort(pair.matched, _Matched(image.stamp_ns, (image.image,), image.arrival_ns), key=_by_stamp)
             return
         partner = pair.right if camera is pair.left else pair.left
         match = min(
@@ -139,7 +133,7 @@ class FramesetAssembler:
             key=_by_stamp,
         )
 
-    def _is_too_late(self, pair: _Pair, camera: _Camera, image: _Arrived) -> bool:
+    def _is_too_late(self, pair: _Group, camera: _Camera, image: _Arrived) -> bool:
         """Whether an image cannot be in a frameset any more; the left one of a pair is what counts."""
         if self._given_ns is None:
             return False
@@ -164,37 +158,39 @@ class FramesetAssembler:
         return self._now_ns - arrival_ns >= self._max_wait_ns
 
     def _earliest(self) -> _Matched | None:
-        return min((pair.matched[0] for pair in self._pairs if pair.matched), key=_by_stamp, default=None)
+        return min((pair.matched[0] for pair in self._groups if pair.matched), key=_by_stamp, default=None)
 
     def _group(self, begin_ns: int) -> dict[int, _Matched]:
         """Images of the frameset that begins with the earliest matched ones, by pair."""
         group: dict[int, _Matched] = {}
-        entries = ((entry.stamp_ns, number) for number, pair in enumerate(self._pairs) for entry in pair.matched[:2])
+        entries = ((entry.stamp_ns, number) for number, pair in enumerate(self._groups) for entry in pair.matched[:2])
         for stamp_ns, number in sorted(entries):
             if stamp_ns - begin_ns > self._tolerance_ns or number in group:
                 break
-            group[number] = self._pairs[number].matched[0]
+            group[number] = self._groups[number].matched[0]
         return group
 
     def _is_due(self, begin_ns: int) -> bool:
         group = self._group(begin_ns)
         if any(self._has_waited(entry.arrival_ns) for entry in group.values()):
             return True
-        if any(len(pair.matched) > _MAX_WAITING for pair in self._pairs):
+        if any(len(pair.matched) > _MAX_WAITING for pair in self._groups):
             return True
         until_ns = begin_ns + self._tolerance_ns
         return not any(
             self._is_alive(pair) and self._may_deliver(pair, until_ns, number in group)
-            for number, pair in enumerate(self._pairs)
+            for number, pair in enumerate(self._groups)
         )
 
-    def _is_alive(self, pair: _Pair) -> bool:
+    def _is_alive(self, pair: _Group) -> bool:
         assert self._now_ns is not None
-        newest = (pair.left.newest_ns, pair.right.newest_ns)
+        newest = [camera.newest_ns for camera in pair.cameras]
         return all(at is not None and self._now_ns - at < _SILENT_NS for at in newest)
 
-    def _may_deliver(self, pair: _Pair, until_ns: int, is_in_group: bool) -> bool:
+    def _may_deliver(self, pair: _Group, until_ns: int, is_in_group: bool) -> bool:
         """Whether a pair may still have matched images up to a stamp, or up to what it has in the group."""
+        if pair.right is None:
+            return not (is_in_group or pair.left.is_past(until_ns))
         slack_ns = self._tolerance_ns
         for camera, other, latest_ns in (
             (pair.left, pair.right, until_ns),
@@ -208,17 +204,17 @@ class FramesetAssembler:
     def _give(self, begin_ns: int) -> FrameSet:
         group = self._group(begin_ns)
         for number in group:
-            del self._pairs[number].matched[0]
+            del self._groups[number].matched[0]
         stamp_ns = group[min(group)].stamp_ns
-        following = [entry.stamp_ns for pair in self._pairs for entry in pair.matched[:1]]
+        following = [entry.stamp_ns for pair in self._groups for entry in pair.matched[:1]]
         following += [
-            image.stamp_ns for pair in self._pairs for image in pair.left.waiting if image.stamp_ns > begin_ns
+            image.stamp_ns for pair in self._groups for image in pair.left.waiting if image.stamp_ns > begin_ns
         ]
         if any(each - stamp_ns <= self._tolerance_ns for each in following):
             stamp_ns = begin_ns
         self._given_ns = stamp_ns
-        for pair in self._pairs:
-            for camera in (pair.left, pair.right):
+        for pair in self._groups:
+            for camera in pair.cameras:
                 self._abandon(camera, [image for image in camera.waiting if self._is_too_late(pair, camera, image)])
         return FrameSet(stamp_ns, {number: entry.images for number, entry in group.items()})
 
@@ -234,10 +230,10 @@ class _Arrived:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Matched:
-    """Both images of a pair, and the host time of the first one's arrival."""
+    """The images of a pair, or of a camera without a partner, and the host time of the first one's arrival."""
 
     stamp_ns: int
-    images: tuple[Image, Image]
+    images: tuple[Image, ...]
     arrival_ns: int
 
 
@@ -269,9 +265,16 @@ class _Camera:
 
 
 @dataclass(slots=True)
-class _Pair:
-    """The cameras of a pair, and its matched images by stamp."""
+class _Group:
+    """The cameras of a pair, or one without a partner, and matched images by stamp."""
 
-    left: _Camera
-    right: _Camera
+    cameras: tuple[_Camera, ...]
     matched: list[_Matched] = field(default_factory=list)
+
+    @property
+    def left(self) -> _Camera:
+        return self.cameras[0]
+
+    @property
+    def right(self) -> _Camera | None:
+        return self.cameras[1] if len(self.cameras) > 1 else None

@@ -55,6 +55,7 @@ class Mapper:
     ) -> None:
         self._front_end = front_end
         self._rig = front_end.rig
+        self._rig.need_pairs("recognition of places")
         self._config = config
         self._folder = Path(tempfile.mkdtemp(prefix="graphvio-map-")) if folder is None else folder
         try:

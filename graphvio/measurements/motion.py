@@ -89,16 +89,46 @@ class RelativeMotion:
         return float(rotation), float(translation)
 
 
+class Elsewhere(NamedTuple):
+    """Where another camera sees tracks of a single camera at the same instant.
+
+    Attributes:
+        camera: index of the other camera.
+        rows: (M,) of the tracks.
+        rays: (M, 2) normalised coordinates in the other camera.
+    """
+
+    camera: int
+    rows: Int
+    rays: Float
+
+
 class Sighting(NamedTuple):
     """What one single camera sees at an instant.
 
     Attributes:
         ids: (N,) identities of its tracks, increasing.
         rays: (N, 2) normalised coordinates.
+        elsewhere: the same tracks in other cameras whose views overlap.
     """
 
     ids: Int
     rays: Float
+    elsewhere: tuple[Elsewhere, ...] = ()
+
+
+class LocatedPoints(NamedTuple):
+    """Points that one single camera sees at an instant, and where they are.
+
+    Attributes:
+        ids: (N,) identities of its tracks, increasing.
+        points_body: (N, 3) metres, in body.
+        covariances: (N, 3, 3) m^2 of these.
+    """
+
+    ids: Int
+    points_body: Float
+    covariances: Float
 
 
 @dataclass(frozen=True, eq=False)

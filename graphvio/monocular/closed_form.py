@@ -77,9 +77,9 @@ def first_guess(samples: InertialSamples, structure: Structure, cameras: Cameras
     n_views = len(structure.state)
     rays = np.column_stack([structure.rays, np.ones(n_views)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    landmark = np.repeat(np.arange(len(structure.camera)), np.diff(structure.rows))
-    in_body = np.einsum("nij,nj->ni", cameras.body_T_cam[structure.camera[landmark], :3, :3], rays)
-    levers = cameras.body_T_cam[structure.camera[landmark], :3, 3]
+    landmark = np.repeat(np.arange(len(structure.odom_T_landmark)), np.diff(structure.rows))
+    in_body = np.einsum("nij,nj->ni", cameras.body_T_cam[structure.camera, :3, :3], rays)
+    levers = cameras.body_T_cam[structure.camera, :3, 3]
     weights, bias = np.ones(n_views), gyro_bias.copy()
 
     def fit(bias: Float) -> _Fit:
@@ -161,7 +161,7 @@ def _fit(
         constant = constant + by_motion[:, :, 3:] @ gravity[0]
         by_motion = np.concatenate([by_motion[:, :, :3], by_motion[:, :, 3:] @ gravity[1]], axis=2)
     by_distance = np.einsum("nij,nj->ni", across, d_first)
-    n = len(structure.camera)
+    n = len(structure.odom_T_landmark)
     size = by_motion.shape[2]
 
     def of_landmarks(values: Float) -> Float:

@@ -20,7 +20,7 @@ from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
-from graphvio.measurements.motion import Sighting, VisualResult
+from graphvio.measurements.motion import LocatedPoints, Sighting, VisualResult
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.adjustment import (
     Adjusted,
@@ -32,6 +32,7 @@ from graphvio.monocular.adjustment import (
     without_first,
 )
 from graphvio.monocular.initialiser import MAX_ERROR2, MAX_KEYFRAMES, POSE_SIGMAS, Initialiser, Window
+from graphvio.monocular.points import Solved, covariance_since, located_points
 from graphvio.monocular.sightings import far_off
 from graphvio.monocular.structure import Cameras, Structure, located
 from graphvio.rig import Rig
@@ -97,6 +98,7 @@ class MonocularEstimator:
         self._tracked_sigma_m = 0.0
         self._contradicted_since_ns: int | None = None
         self._rate: Float | None = None
+        self._solved: Solved | None = None
         self._final: list[tuple[int, Float]] = []
 
     # ------------------------------------------------------------------ what is known
@@ -147,8 +149,12 @@ class MonocularEstimator:
         return np.ascontiguousarray(se3_inverse(states.poses[-1]) @ then)
 
     def covariance_since(self, then_ns: int) -> Float | None:
-        """Return None: relative motions are not used."""
-        return None
+        """Return the covariance (6, 6) of the motion since a keyframe of the window, in body at the newest state."""
+        return None if self._solved is None else covariance_since(self._solved, then_ns)
+
+    def located_points(self) -> dict[int, LocatedPoints]:
+        """Return the points that the newest state sees, by camera."""
+        return {} if self._solved is None else located_points(self._solved)
 
     def take_final(self) -> list[tuple[int, Float]]:
         """Return stamps and poses ``nav_T_body`` of keyframes that left the window since the last call."""
@@ -264,14 +270,15 @@ class MonocularEstimator:
         seen = np.isin(ids, newest.landmark)
         fitting = int((seen & ~off).sum())
         is_tracking = fitting >= max(_MIN_LANDMARKS, _MIN_FITTING * int(seen.sum()))
-        outliers = newest.ids[np.isin(newest.landmark, ids[off])], newest.camera[np.isin(newest.landmark, ids[off])]
+        outliers = newest.of(ids[off])
         window.names.end(ids[off])
         window.views = [views.without(ids[off]) for views in window.views]
+        self._solved = Solved(adjusted, structure, ids, window.views[-1])
         self._set_covariance(adjusted)
         if is_keyframe:
             self._finish_keyframe(window, adjusted)
         status = self._status(stamp_ns, is_tracking, adjusted)
-        dropped = {int(j): np.sort(outliers[0][outliers[1] == j]) for j in np.unique(outliers[1])}
+        dropped = {int(j): np.unique(outliers.ids[outliers.owner == j]) for j in np.unique(outliers.owner)}
         return StateUpdate(status, outliers=dropped)
 
     def _finish_keyframe(self, window: Window, adjusted: Adjusted) -> None:
@@ -347,6 +354,7 @@ class MonocularEstimator:
             self.epoch += 1
             self._report(stamp_ns, EventKind.LOST, why)
         self._window, self._before, self._contradicted_since_ns = None, None, None
+        self._solved = None
         self._initialiser = self._new_initialiser()
         self.covariance = _NO_COVARIANCE
         self._since_ns, self._is_reported = stamp_ns, False
@@ -391,7 +399,7 @@ def adjust_no_keyframes(rig: Rig) -> None:
         np.array([single.left.focal_px for single in rig.singles]),
     )
     structure = Structure(
-        np.zeros(1, dtype=np.int64), np.eye(4)[None], np.array([0, 2]), np.array([0, 1]), np.zeros((2, 2))
+        np.eye(4)[None], np.array([0, 2]), np.array([0, 1]), np.zeros(2, dtype=np.int64), np.zeros((2, 2))
     )
     places = located(states.poses, cameras, np.zeros((1, 3)), structure, 1.0, True)
     adjust(Measurements(cameras, structure, 1.0, samples, np.zeros(0, dtype=np.int64)), states, places, prior, 1)

@@ -23,21 +23,29 @@ class Views(NamedTuple):
     """Sightings of one state, joined to landmarks: M of all cameras.
 
     Attributes:
-        camera: (M,) index.
-        ids: (M,) identities of the tracks.
+        camera: (M,) index of the camera that sees them.
+        owner: (M,) index of the camera whose track it is.
+        ids: (M,) identities of its tracks.
         landmark: (M,) identities of the landmarks.
         rays: (M, 2) normalised coordinates.
     """
 
     camera: Int
+    owner: Int
     ids: Int
     landmark: Int
     rays: Float
 
+    def of(self, landmarks: Int) -> Views:
+        """Return the views of some landmarks."""
+        return self._rows(np.isin(self.landmark, landmarks))
+
     def without(self, landmarks: Int) -> Views:
         """Return the views of all but some landmarks."""
-        kept = ~np.isin(self.landmark, landmarks)
-        return Views(self.camera[kept], self.ids[kept], self.landmark[kept], self.rays[kept])
+        return self._rows(~np.isin(self.landmark, landmarks))
+
+    def _rows(self, kept: Bool) -> Views:
+        return Views(self.camera[kept], self.owner[kept], self.ids[kept], self.landmark[kept], self.rays[kept])
 
 
 class LandmarkNames:
@@ -72,11 +80,12 @@ class LandmarkNames:
             mixed = (ids[new] * _MIX + landmarks[new] * 40503) % 2**32 >> 16
             left[new] = shortest + mixed % (self._max_keyframes - shortest + 1)
             self._ids[j], self._landmarks[j], self._left[j] = ids, landmarks, left
-            parts.append((np.full(n, j, dtype=np.int64), ids, landmarks, sighting.rays))
-        if not parts:
-            return _NO_VIEWS
-        camera, ids, landmarks, rays = (np.concatenate(each) for each in zip(*parts, strict=True))
-        return Views(camera, ids, landmarks, rays)
+            own = np.full(n, j, dtype=np.int64)
+            parts.append(Views(own, own, ids, landmarks, sighting.rays))
+            for seen in sighting.elsewhere:
+                other = np.full(len(seen.rows), seen.camera, dtype=np.int64)
+                parts.append(Views(other, own[seen.rows], ids[seen.rows], landmarks[seen.rows], seen.rays))
+        return Views(*(np.concatenate(each) for each in zip(*parts, strict=True))) if parts else _NO_VIEWS
 
     def note_keyframe(self) -> None:
         """Take note that the newest sightings are those of a keyframe."""
@@ -97,7 +106,7 @@ class Landmarks:
         self._frames = np.zeros((0, 4, 4))
 
     def structure(self, views: Sequence[Views], poses: Float, cameras: Cameras) -> tuple[Structure, Float, Int]:
-        """Collect the landmarks that two states see at least.
+        """Collect the landmarks that have two views at least, from two states or in two cameras.
 
         Args:
             views: of the K states, in time order.
@@ -111,7 +120,7 @@ class Landmarks:
         state = np.concatenate([np.full(len(each.landmark), k) for k, each in enumerate(views)])
         camera = np.concatenate([each.camera for each in views])
         rays = np.concatenate([each.rays for each in views])
-        order = np.lexsort((state, landmark))
+        order = np.lexsort((camera, state, landmark))
         landmark, state, camera, rays = landmark[order], state[order], camera[order], rays[order]
         ids, firsts, counts = np.unique(landmark, return_index=True, return_counts=True)
         seen_twice = counts > 1
@@ -125,7 +134,7 @@ class Landmarks:
             frames[known], places[known] = self._frames[at[known]], self._places[at[known]]
         self._ids, self._frames, self._places = ids, frames, places
         bounds = np.r_[0, np.cumsum(counts[seen_twice])]
-        structure = Structure(camera[firsts], frames, bounds, state[rows], np.ascontiguousarray(rays[rows]))
+        structure = Structure(frames, bounds, state[rows], camera[rows], np.ascontiguousarray(rays[rows]))
         return structure, places, ids
 
     def put(self, places: Float) -> None:
@@ -139,11 +148,11 @@ class Landmarks:
 
 def far_off(structure: Structure, errors2: Float, max_error2: float, max_share: float) -> Bool:
     """Find the landmarks (L,) of which too large a share of the views has a squared whitened error beyond a bound."""
-    if not len(structure.camera):
+    if not len(structure.odom_T_landmark):
         return np.zeros(0, dtype=bool)
     off = np.add.reduceat(errors2 > max_error2, structure.rows[:-1], dtype=np.int64)
     return np.asarray(off > max_share * np.diff(structure.rows))
 
 
 _NONE = np.zeros(0, dtype=np.int64)
-_NO_VIEWS = Views(_NONE, _NONE, _NONE, np.zeros((0, 2)))
+_NO_VIEWS = Views(_NONE, _NONE, _NONE, _NONE, np.zeros((0, 2)))

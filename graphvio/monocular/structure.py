@@ -1,7 +1,8 @@
-"""Landmarks that single cameras see in several states of a window: reprojection errors with the landmarks eliminated.
+"""Landmarks that single cameras see from the states of a window: reprojection errors with the landmarks eliminated.
 
 A landmark is ``[a, b, w]``, the homogeneous point ``[a, b, 1, w]`` of a fixed frame, that of the camera which saw it
 first as it was estimated then: `w` is its inverse depth there. Before there is a baseline a wide prior stands for `w`.
+Where views overlap, several cameras see a landmark from one state, and know its distance in metres.
 """
 
 from typing import NamedTuple
@@ -36,29 +37,23 @@ class Structure(NamedTuple):
     """Views of L landmarks from K states: N rows, sorted by landmark.
 
     Attributes:
-        camera: (L,) index of the camera that sees each landmark.
         odom_T_landmark: (L, 4, 4) fixed frame of each.
-        rows: (L + 1,) the views of landmark l are ``rows[l]`` to ``rows[l + 1]``.
+        rows: (L + 1,) the views of landmark l are ``rows[l]`` to ``rows[l + 1]``, in the order of states and cameras.
         state: (N,) index of the state.
+        camera: (N,) index of the camera.
         rays: (N, 2) normalised coordinates.
     """
 
-    camera: Int
     odom_T_landmark: Float
     rows: Int
     state: Int
+    camera: Int
     rays: Float
 
     def of(self, kept: Bool) -> "Structure":
         """Return those of the landmarks (L,) that are kept."""
         rows, begins = rows_of(self.rows, kept)
-        return Structure(
-            self.camera[kept],
-            self.odom_T_landmark[kept],
-            begins,
-            self.state[rows],
-            self.rays[rows],
-        )
+        return Structure(self.odom_T_landmark[kept], begins, self.state[rows], self.camera[rows], self.rays[rows])
 
 
 class Eliminated(NamedTuple):
@@ -77,7 +72,7 @@ class Eliminated(NamedTuple):
     @staticmethod
     def empty(structure: Structure) -> "Eliminated":
         """Allocate for a structure."""
-        n = len(structure.camera)
+        n = len(structure.odom_T_landmark)
         return Eliminated(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((len(structure.state), 3, 6)))
 
 
@@ -164,7 +159,6 @@ def visual_equations(
     errors2, cost, rows, v, bl = np.zeros(len(structure.state)), 0.0, np.zeros((2, 10)), np.zeros((3, 3)), np.zeros(3)
     for point in range(len(landmarks)):
         first, last = structure.rows[point], structure.rows[point + 1]
-        whitened = cameras.focal_px[structure.camera[point]] / sigma_px
         away = landmarks[point, 2] - PRIOR_INVERSE_DEPTH
         cost += 0.5 * _PRIOR_INFORMATION * away * away
         for c in range(3):
@@ -172,10 +166,10 @@ def visual_equations(
             for d in range(3):
                 v[c, d] = _PRIOR_INFORMATION if c == 2 and d == 2 else 0.0
         for n in range(first, last):
-            k, couplings = 6 * structure.state[n], eliminated.by_pose[n]
+            k, j, couplings = 6 * structure.state[n], structure.camera[n], eliminated.by_pose[n]
             in_front = _view(
-                poses[structure.state[n]], cameras.body_T_cam[structure.camera[point]],
-                structure.odom_T_landmark[point], landmarks[point], structure.rays[n], whitened, rows,
+                poses[structure.state[n]], cameras.body_T_cam[j], structure.odom_T_landmark[point], landmarks[point],
+                structure.rays[n], cameras.focal_px[j] / sigma_px, rows,
             )  # fmt: skip
             e2 = rows[0, 9] ** 2 + rows[1, 9] ** 2 if in_front else _ERROR2_BEHIND
             errors2[n] = e2
@@ -207,7 +201,11 @@ def visual_equations(
                 for m in range(n, last):
                     other, k2 = eliminated.by_pose[m], 6 * structure.state[m]
                     for d in range(c if m == n else 0, 6):
-                        hessian[k + c, k2 + d] -= x * other[0, d] + y * other[1, d] + z * other[2, d]
+                        product = x * other[0, d] + y * other[1, d] + z * other[2, d]
+                        if k == k2 and m > n:  # of one state: the block's other half is this one's transpose
+                            hessian[k + min(c, d), k + max(c, d)] -= 2.0 * product if c == d else product
+                        else:
+                            hessian[k + c, k2 + d] -= product
     for c in range(size):
         for d in range(c):
             hessian[c, d] = hessian[d, c]
@@ -240,16 +238,16 @@ def located(
         first, last = structure.rows[point], structure.rows[point + 1]
         if last - first > _FEW and not everywhere:
             continue
-        whitened = cameras.focal_px[structure.camera[point]] / sigma_px
         for _ in range(_STEPS):
             for c in range(3):
                 bl[c] = _PRIOR_INFORMATION * (moved[point, 2] - PRIOR_INVERSE_DEPTH) if c == 2 else 0.0
                 for d in range(3):
                     v[c, d] = _PRIOR_INFORMATION if c == 2 and d == 2 else 0.0
             for n in range(first, last):
+                j = structure.camera[n]
                 if not _view(
-                    poses[structure.state[n]], cameras.body_T_cam[structure.camera[point]],
-                    structure.odom_T_landmark[point], moved[point], structure.rays[n], whitened, rows,
+                    poses[structure.state[n]], cameras.body_T_cam[j], structure.odom_T_landmark[point], moved[point],
+                    structure.rays[n], cameras.focal_px[j] / sigma_px, rows,
                 ):  # fmt: skip
                     continue
                 for c in range(3):

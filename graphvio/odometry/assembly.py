@@ -108,9 +108,10 @@ def keyframe_of(
             covariance = None
     return NewKeyframe(
         frames=frontend.frames_at(frameset.stamp_ns),
-        images=frameset.stereo,
+        images=frameset.images,
         body_T_left=frontend.body_T_left,
         previous_ns=previous_ns,
         previous_T_body=previous_T_body,
         covariance=covariance,
+        located_points=estimator.located_points,
     )

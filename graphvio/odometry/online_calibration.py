@@ -189,6 +189,7 @@ class OnlineCalibration:
         views = {
             j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_depth, frame.points[:, 2])
             for j, frame in self._frontend.frames_at(estimate.stamp_ns).items()
+            if not frame.is_single
         }
         self._calibration.add_frameset(estimate.stamp_ns, odom_T_body, views, estimate.vision is Quality.WEAK)
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from graphvio.arrays import Float, Image
 from graphvio.frontend.tracks import PairFrame
 from graphvio.measurements.estimate import Estimate
 from graphvio.measurements.imu_interval import ImuInterval
-from graphvio.measurements.motion import RelativeMotion
+from graphvio.measurements.motion import LocatedPoints, RelativeMotion
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,20 +17,22 @@ class NewKeyframe:
     """A frameset from which later motions are measured.
 
     Attributes:
-        frames: Pair index -> its tracks.
-        images: Pair index -> (left, right).
-        body_T_left: (P, 4, 4) of all pairs, with the corrections that are in force.
+        frames: Index of the pair or camera -> its tracks.
+        images: The same index -> (left, right) of a pair, (image,) of a single camera.
+        body_T_left: (P, 4, 4) of all pairs and single cameras, with the corrections that are in force.
         previous_ns: Stamp of the keyframe before, or None.
         previous_T_body: (4, 4) motion since the keyframe before, or None if it is not known.
         covariance: (6, 6) of that motion, tangent ``[rotation, translation]`` in body, or None with it.
+        located_points: Called within the step, returns the points of single cameras that the state locates, by camera.
     """
 
     frames: Mapping[int, PairFrame]
-    images: Mapping[int, tuple[Image, Image]]
+    images: Mapping[int, tuple[Image, ...]]
     body_T_left: Float
     previous_ns: int | None
     previous_T_body: Float | None
     covariance: Float | None
+    located_points: Callable[[], Mapping[int, LocatedPoints]] = dict
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,17 +18,17 @@ from graphvio.rig import (
     StereoPair,
     axes_angle_deg,
     checked_views,
+    overlap,
 )
 
-_DISTANCE_M = 5.0
 _MIN_OVERLAP = 0.25
-_GRID = 12
 
 
 def grouped_rig(cameras: Sequence[Camera], imu: Imu | None, name: str, path: Path) -> Rig:
     """Form a rig of cameras in a file's order: pairs (0, 1), (2, 3) and so on if each of them overlaps.
 
-    Otherwise the cameras that overlap most form pairs, and the others are single cameras; with an IMU, all may be.
+    Otherwise the cameras that overlap most form pairs, and the others are single cameras; with an IMU, all may be. Two
+    cameras with an IMU are a pair unless they share no view.
 
     Args:
         cameras: of the file.
@@ -47,7 +47,9 @@ def grouped_rig(cameras: Sequence[Camera], imu: Imu | None, name: str, path: Pat
             "a stereo pair or an IMU"
         )
     couples = [(i, i + 1) for i in range(0, len(cameras) - 1, 2)]
-    if len(cameras) > 2 and (
+    if len(cameras) == 2 and imu is not None and _look_apart(*cameras):
+        couples = []
+    elif len(cameras) > 2 and (
         len(cameras) % 2 or any(overlap(cameras[i], cameras[j]) < _MIN_OVERLAP for i, j in couples)
     ):
         couples = _overlapping(cameras)
@@ -64,15 +66,9 @@ def grouped_rig(cameras: Sequence[Camera], imu: Imu | None, name: str, path: Pat
     return checked_views(Rig(tuple(pairs), imu, name, singles=tuple(singles)))
 
 
-def overlap(left: Camera, right: Camera) -> float:
-    """Compute the share of the left image that shows points, 5 m away, which the right camera sees too."""
-    width, height = left.size_px
-    u, v = np.meshgrid((np.arange(_GRID) + 0.5) / _GRID * width, (np.arange(_GRID) + 0.5) / _GRID * height)
-    rays, has_ray = left.unproject(np.column_stack([u.ravel(), v.ravel()]))
-    points = np.column_stack([_DISTANCE_M * rays, np.full((len(rays), 1), _DISTANCE_M)])
-    right_T_left = right.cam_T_body @ left.body_T_cam
-    _, is_seen = right.project(points @ right_T_left[:3, :3].T + right_T_left[:3, 3])
-    return float(np.mean(is_seen & has_ray))
+def _look_apart(one: Camera, other: Camera) -> bool:
+    """Whether two cameras cannot be a pair, as they share no view or look too different ways."""
+    return axes_angle_deg(one, other) > MAX_AXES_ANGLE_DEG or overlap(one, other) == 0.0
 
 
 def _overlapping(cameras: Sequence[Camera]) -> list[tuple[int, int]]:

@@ -33,7 +33,6 @@ class FrontEnd:
     """
 
     def __init__(self, odometry: Odometry) -> None:
-        odometry.rig.need_pairs("a SLAM system behind the odometry")
         self.log = KeyframeLog()
         self._odometry = odometry
         self._map_frame = MapFrame(odometry.config.keyframes.gate_probability)
@@ -123,10 +122,8 @@ class FrontEnd:
             previous_id=None if previous is None else previous.id,
             previous_T_body=None if motion is None else motion[0],
             relative_covariance=None if motion is None else motion[1],
-            landmarks=landmarks_of(
-                self.rig, new.body_T_left, new.frames, new.images, config.motion.pixel_sigma_px, self._describe
-            ),
-            images={j: (np.copy(left), np.copy(right)) for j, (left, right) in new.images.items()}
+            landmarks=landmarks_of(self.rig, new, config.motion.pixel_sigma_px, self._describe),
+            images={j: tuple(np.copy(image) for image in images) for j, images in new.images.items()}
             if config.keyframes.images
             else {},
         )

@@ -13,15 +13,15 @@ from graphvio.measurements.estimate import Status
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
-    """N points that the stereo pairs see at a keyframe.
+    """N points that stereo pairs and single cameras see at a keyframe.
 
     Attributes:
-        pair: (N,) index of the pair that sees each.
-        track_id: (N,) identity within the pair: the same in all keyframes in which the corner is tracked.
+        pair: (N,) index in `graphvio.rig.Rig.groups` of the pair, or single camera, that sees each.
+        track_id: (N,) identity within it: the same in all keyframes in which the corner is tracked.
         points_body: (N, 3) metres, in body at the keyframe.
         covariances: (N, 3, 3) m^2 of ``points_body``.
-        left_px: (N, 2) pixels in the pair's left image.
-        right_px: (N, 2) pixels in its right image.
+        left_px: (N, 2) pixels in the pair's left image, or the single camera's.
+        right_px: (N, 2) pixels in its right image; NaN of a single camera.
         descriptors: (N, D) uint8 of the left image; D is 32 for ORB, 128 for SIFT, 0 without descriptors.
     """
 
@@ -60,8 +60,9 @@ class Keyframe:
         previous_T_body: (4, 4) motion of body since the previous keyframe, as estimated now: the smoother may have
             corrected the previous keyframe since it was reported. None for the first one.
         relative_covariance: (6, 6) of ``previous_T_body``, tangent in body at this keyframe, or None.
-        landmarks: Landmarks of all pairs in the frameset.
-        images: Pair index -> (left, right) uint8; empty unless requested.
+        landmarks: Landmarks of all pairs and single cameras in the frameset.
+        images: Index in `graphvio.rig.Rig.groups` -> (left, right) of a pair or (image,) of a single camera, uint8;
+            empty unless requested.
     """
 
     id: int
@@ -74,7 +75,7 @@ class Keyframe:
     previous_T_body: Float | None
     relative_covariance: Float | None
     landmarks: Landmarks
-    images: Mapping[int, tuple[Image, Image]] = field(default_factory=dict)
+    images: Mapping[int, tuple[Image, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Literal
 
 import cv2
 import numpy as np
 
-from graphvio.arrays import AnyArray, Float, Image
-from graphvio.frontend.tracks import PairFrame
+from graphvio.arrays import AnyArray, Float, Image, Int
+from graphvio.frontend.tracks import PairFrame, common_rows
 from graphvio.kernels import kernel
+from graphvio.measurements.motion import LocatedPoints
+from graphvio.odometry.step import NewKeyframe
 from graphvio.rig import Rig, StereoPair
 from graphvio.slam.keyframe import Landmarks
 
@@ -21,44 +23,43 @@ _MIN_DEPTH_SIGMAS = 3.0  # a more uncertain depth has no covariance in metres
 _RADIUS = 15  # of ORB's patch
 _BORDER_PX = 40  # added, so that no corner is too near to the edge of the image
 _SIFT_SIZE_PX = 7.0
+_NOWHERE = LocatedPoints(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
-def landmarks_of(
-    rig: Rig,
-    body_T_left: Float,
-    frames: Mapping[int, PairFrame],
-    images: Mapping[int, tuple[Image, Image]],
-    pixel_sigma_px: float,
-    describe: Describe | None,
-) -> Landmarks:
+def landmarks_of(rig: Rig, keyframe: NewKeyframe, pixel_sigma_px: float, describe: Describe | None) -> Landmarks:
     """Return the tracks whose inverse depth exceeds three standard deviations.
 
+    Those of single cameras are where the state has them, if it locates points, or where the front-end does.
+
     Args:
-        rig: The rig with P pairs.
-        body_T_left: (P, 4, 4) poses of the left cameras, with the corrections in force.
-        frames: Pair index -> its tracks.
-        images: Pair index -> (left, right).
+        rig: The rig.
+        keyframe: Tracks and images.
         pixel_sigma_px: Standard deviation of a tracked corner in one image.
         describe: Computes descriptors in a left image, or None for no descriptors.
     """
-    parts = [
-        _of_pair(j, rig.pairs[j], body_T_left[j], frame, images[j][0], pixel_sigma_px, describe)
-        for j, frame in sorted(frames.items())
-    ]
+    located, parts = keyframe.located_points() if not rig.pairs else {}, []
+    for j, frame in sorted(keyframe.frames.items()):
+        if rig.pairs:
+            frame, points, covariances = _located(frame, keyframe.body_T_left[j], pixel_sigma_px)
+        else:
+            _, points, covariances = of_state = located.get(j, _NOWHERE)
+            in_frame, in_state = common_rows(frame.ids, of_state.ids)
+            frame, points, covariances = _rows(frame, in_frame), points[in_state], covariances[in_state]
+        group, n = rig.groups[j], len(frame.ids)
+        right_px = np.full((n, 2), np.nan)
+        if isinstance(group, StereoPair):
+            right_px, _ = group.right.project(np.column_stack([frame.right, np.ones(n)]))
+        image = keyframe.images[j][0]
+        descriptors = np.zeros((n, 0), dtype=np.uint8) if describe is None else describe(image, frame.pixels)
+        which = np.full(n, j, dtype=np.int64)
+        parts.append((which, frame.ids, points, covariances, frame.pixels_at_stamp, right_px, descriptors))
     if not parts:
         return Landmarks.none()
     return Landmarks(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def _of_pair(
-    j: int,
-    pair: StereoPair,
-    body_T_left: Float,
-    frame: PairFrame,
-    left: Image,
-    pixel_sigma_px: float,
-    describe: Describe | None,
-) -> tuple[AnyArray, ...]:
+def _located(frame: PairFrame, body_T_left: Float, pixel_sigma_px: float) -> tuple[PairFrame, Float, Float]:
+    """Return the tracks of known depth, and their places (N, 3) in body with covariances, by the front-end."""
     sigma_w = pixel_sigma_px * np.sqrt(frame.covariances[:, 2, 2])
     frame = frame.keep(frame.has_depth & (frame.points[:, 2] > _MIN_DEPTH_SIGMAS * sigma_w))
     n = len(frame.ids)
@@ -69,17 +70,13 @@ def _of_pair(
     by_point[:, :, 2] = -in_left / w[:, None]
     turned = body_T_left[:3, :3] @ by_point
     covariances = turned @ (pixel_sigma_px**2 * frame.covariances) @ turned.transpose(0, 2, 1)
-    right_px, _ = pair.right.project(np.column_stack([frame.right, np.ones(n)]))
-    descriptors = np.zeros((n, 0), dtype=np.uint8) if describe is None else describe(left, frame.pixels)
-    return (
-        np.full(n, j, dtype=np.int64),
-        frame.ids,
-        in_left @ body_T_left[:3, :3].T + body_T_left[:3, 3],
-        covariances,
-        frame.pixels_at_stamp,
-        right_px,
-        descriptors,
-    )
+    return frame, in_left @ body_T_left[:3, :3].T + body_T_left[:3, 3], covariances
+
+
+def _rows(frame: PairFrame, rows: Int) -> PairFrame:
+    chosen = np.zeros(len(frame.ids), dtype=bool)
+    chosen[rows] = True
+    return frame.keep(chosen)
 
 
 def describer(kind: Literal["orb", "sift", "none"]) -> Describe | None:

@@ -20,7 +20,7 @@ from graphvio.geometry import se3_adjoint, se3_inverse, skew
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.gate_result import GateResult
 from graphvio.measurements.imu_interval import ImuInterval
-from graphvio.measurements.motion import RelativeMotion, VisualResult
+from graphvio.measurements.motion import LocatedPoints, RelativeMotion, VisualResult
 from graphvio.rig import Rig
 
 _RESET_SIGMA_M = 1e-3  # what a reset leaves of the position's own uncertainty
@@ -114,6 +114,10 @@ class FilterEstimator:
         growth = (now - to_now @ self._covariances[then_ns] @ to_now.T) / np.outer(sigmas, sigmas)
         sizes, directions = np.linalg.eigh(growth)
         return np.asarray((directions * np.maximum(sizes, _MIN_GROWTH)) @ directions.T * np.outer(sigmas, sigmas))
+
+    def located_points(self) -> dict[int, LocatedPoints]:
+        """Return nothing: the front-end locates the points."""
+        return {}
 
     def take_final(self) -> list[tuple[int, Float]]:
         """Return stamps and poses ``nav_T_body`` since the last call: a filter does not correct them later."""

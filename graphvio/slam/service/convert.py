@@ -140,8 +140,8 @@ def keyframe_message(keyframe: Keyframe, with_images: bool, with_descriptors: bo
         relative_covariance=packed(keyframe.relative_covariance),
         landmarks=_landmarks_message(keyframe.landmarks, with_descriptors),
     )
-    for pair, (left, right) in sorted(keyframe.images.items()) if with_images else ():
-        message.images.add(pair=pair, left=_image_message(left), right=_image_message(right))
+    for pair, (left, *right) in sorted(keyframe.images.items()) if with_images else ():
+        message.images.add(pair=pair, left=_image_message(left), right=_image_message(right[0]) if right else None)
     return message
 
 
@@ -159,7 +159,7 @@ def keyframe_of(message: Any) -> Keyframe:
         previous_T_body=maybe_floats(message.previous_T_body, (4, 4), f"{where}: previous_T_body"),
         relative_covariance=maybe_floats(message.relative_covariance, (6, 6), f"{where}: relative_covariance"),
         landmarks=_landmarks_of(message.landmarks, where),
-        images={each.pair: (_image_of(each.left, where), _image_of(each.right, where)) for each in message.images},
+        images={each.pair: _images_of(each, where) for each in message.images},
     )
 
 
@@ -193,6 +193,11 @@ def _landmarks_of(message: Any, where: str) -> Landmarks:
 def _image_message(image: Image) -> Any:
     height, width = image.shape
     return messages.Image(width=width, height=height, pixels=np.ascontiguousarray(image).tobytes())
+
+
+def _images_of(message: Any, where: str) -> tuple[AnyArray, ...]:
+    sides = (message.left, message.right) if message.HasField("right") else (message.left,)
+    return tuple(_image_of(side, where) for side in sides)
 
 
 def _image_of(message: Any, where: str) -> AnyArray:

@@ -1,0 +1,142 @@
+"""Tracks of single cameras in other cameras whose views overlap, at the same instant: their distance in metres."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from graphvio.arrays import Bool, Float
+from graphvio.config import Config
+from graphvio.frontend.lucas_kanade import Pyramid
+from graphvio.frontend.matching import StereoMatcher
+from graphvio.frontend.prediction import predict_pixels
+from graphvio.frontend.tracks import PairFrame
+from graphvio.measurements.motion import Elsewhere
+from graphvio.rig import MAX_AXES_ANGLE_DEG, MIN_BASELINE_M, Camera, Rig, StereoPair, axes_angle_deg, overlap
+
+MIN_OVERLAP = 0.1
+"""Smallest share of an image that is searched for in another camera's."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The newest image of a camera, and what is tracked in it.
+
+    Attributes:
+        frame: the tracks.
+        pyramid: of the image, of two levels at least.
+        allowed: (height, width) where it may be used.
+        min_gradient: smallest rms gradient of a patch along its weaker direction, grey levels per pixel.
+    """
+
+    frame: PairFrame
+    pyramid: Pyramid
+    allowed: Bool
+    min_gradient: float
+
+
+@dataclass(eq=False)
+class _Partner:
+    """A camera in which tracks of another one are found, and what was found there last."""
+
+    camera: int
+    pair: StereoPair  # whose left camera has the tracks
+    matcher: StereoMatcher
+    found: PairFrame = field(default_factory=PairFrame.empty)
+
+
+class Overlaps:
+    """Finds the tracks of each single camera in the other cameras that see the same part of the scene.
+
+    A track that was found before is found again near where its distance and the predicted motion put it; others are
+    searched for along their epipolar lines. Rolling shutters are left out: their lines are of different instants.
+
+    Args:
+        rig: single cameras.
+        config: of all stages.
+    """
+
+    def __init__(self, rig: Rig, config: Config) -> None:
+        cameras = [single.left for single in rig.singles]
+        self._partners = [
+            [_partner(own, k, other, config) for k, other in enumerate(cameras) if _is_shared(own, other)]
+            for own in cameras
+        ]
+
+    def find(
+        self, camera: int, views: Mapping[int, View], cam_T_before: Callable[[int], Float | None], searches: bool
+    ) -> tuple[Elsewhere, ...]:
+        """Find the tracks of one camera in the others.
+
+        Args:
+            camera: index of the camera.
+            views: of all cameras that have an image at this instant.
+            cam_T_before: returns the camera's predicted motion of points (4, 4) since a stamp, None where unknown.
+            searches: whether tracks that were not found before are searched for.
+        """
+        own = views[camera]
+        return tuple(
+            self._found(partner, own, views[partner.camera], cam_T_before, searches)
+            for partner in self._partners[camera]
+            if partner.camera in views
+        )
+
+    def _found(
+        self,
+        partner: _Partner,
+        own: View,
+        other: View,
+        cam_T_before: Callable[[int], Float | None],
+        searches: bool,
+    ) -> Elsewhere:
+        frame, before = own.frame, partner.found
+        inverse_depths, slopes = _expected(partner, frame, cam_T_before(before.stamp_ns) if len(before.ids) else None)
+        rows = np.arange(len(frame.ids)) if searches else np.flatnonzero(np.isfinite(inverse_depths))
+        partner.matcher.allow(other.allowed)
+        matches = partner.matcher.match(
+            own.pyramid, other.pyramid, frame.pixels[rows], frame.left[rows], inverse_depths[rows], slopes[rows],
+            own.min_gradient,
+        )  # fmt: skip
+        good = matches.good
+        rows = rows[good]
+        chosen = np.zeros(len(frame.ids), dtype=bool)
+        chosen[rows] = True
+        found = frame.keep(chosen)
+        partner.found = PairFrame(
+            found.stamp_ns, found.ids, found.ages, found.pixels, found.left, matches.right[good],
+            matches.right_pixels[good], matches.points[good], matches.covariances[good], matches.slopes[good],
+            np.ones(len(rows), dtype=bool), found.flat_for,
+        )  # fmt: skip
+        return Elsewhere(partner.camera, rows, matches.right[good])
+
+
+def _is_shared(own: Camera, other: Camera) -> bool:
+    """Whether tracks of a camera can be found in another one."""
+    if own is other or own.line_time_us or other.line_time_us or overlap(own, other) < MIN_OVERLAP:
+        return False
+    is_apart = bool(np.linalg.norm((other.cam_T_body @ own.body_T_cam)[:3, 3]) >= MIN_BASELINE_M)
+    return is_apart and axes_angle_deg(own, other) <= MAX_AXES_ANGLE_DEG
+
+
+def _partner(own: Camera, number: int, other: Camera, config: Config) -> _Partner:
+    pair, (width, height) = StereoPair(f"{own.name} in {other.name}", own, other), other.size_px
+    return _Partner(number, pair, StereoMatcher(pair, config, np.ones((height, width), dtype=bool)))
+
+
+def _expected(partner: _Partner, frame: PairFrame, motion: Float | None) -> tuple[Float, Float]:
+    """Return the inverse depths (N,), NaN where unknown, and slopes (N, 2) that tracks were last found with."""
+    inverse_depths, slopes, before = np.full(len(frame.ids), np.nan), np.zeros((len(frame.ids), 2)), partner.found
+    if not len(before.ids):
+        return inverse_depths, slopes
+    moved, in_front = np.maximum(before.points[:, 2], 0.0), np.ones(len(before.ids), dtype=bool)
+    if motion is not None:
+        camera = partner.pair.left
+        _, moved, in_front = predict_pixels(
+            before.left, moved, motion, camera.model_number, camera.intrinsics, camera.distortion
+        )
+    rows = np.minimum(np.searchsorted(before.ids, frame.ids), len(before.ids) - 1)
+    known = (before.ids[rows] == frame.ids) & in_front[rows]
+    inverse_depths[known], slopes[known] = moved[rows[known]], before.slopes[rows[known]]
+    return inverse_depths, slopes
