@@ -11,13 +11,14 @@ import typer
 
 from graphvio.cli import options
 from graphvio.cli.json_output import publish
-from graphvio.cli.shared import EXIT_INCOMPLETE, check_session_name, warn
+from graphvio.cli.shared import EXIT_INCOMPLETE, check_session_name, chosen_rig, warn
 
 if TYPE_CHECKING:
     from graphvio.cli.services import Services
     from graphvio.config import Config
     from graphvio.live.calibration_memory import CalibrationMemory
     from graphvio.live.running import LiveOdometry
+    from graphvio.live.source import LiveSource
     from graphvio.rig import Rig
     from graphvio.viewer import Viewer
 
@@ -31,6 +32,8 @@ def live(
     ] = None,
     list_devices: Annotated[bool, typer.Option("--list", help="List the connected devices, and end.")] = False,
     rig: options.RigFile = None,
+    cameras: options.Cameras = None,
+    no_pairs: options.NoPairs = False,
     config: options.ConfigName = "default",
     record: options.Record = None,
     png: options.Png = False,
@@ -57,6 +60,8 @@ def live(
         graphvio live realsense --record walk.mcap
 
         graphvio live "replay:walk.mcap?speed=2" --view
+
+        graphvio live realsense --cameras 0
     """
     from graphvio.cli.services import Services
 
@@ -66,8 +71,9 @@ def live(
     if source is None:
         raise typer.BadParameter("give a SOURCE, or --list to see the connected devices")
     run_live(
-        source, rig, config, record=record, png=png, view=view, health_port=health_port, duration_s=duration,
-        forget_calibration=forget_calibration, services=Services() if serve else None,
+        source, rig, config, cameras=cameras, no_pairs=no_pairs, record=record, png=png, view=view,
+        health_port=health_port, duration_s=duration, forget_calibration=forget_calibration,
+        services=Services() if serve else None,
     )  # fmt: skip
 
 
@@ -76,6 +82,8 @@ def run_live(
     rig: Path | None,
     config: str,
     *,
+    cameras: str | None = None,
+    no_pairs: bool = False,
     record: Path | None,
     png: bool,
     view: bool,
@@ -92,6 +100,7 @@ def run_live(
     from graphvio.live.health import HealthServer
     from graphvio.live.outputs import ViewOutput
     from graphvio.live.running import LiveOdometry
+    from graphvio.live.selection import SelectedCameras
     from graphvio.live.session_recorder import SessionRecorder
     from graphvio.live.sources import open_live_source
     from graphvio.rig_files import load_rig
@@ -108,7 +117,9 @@ def run_live(
     settings = Config.load(config)
     if services is not None:
         settings = services.settings(settings)
-    opened = open_live_source(source, None if rig is None else load_rig(rig))
+    opened: LiveSource = open_live_source(source, None if rig is None else load_rig(rig))
+    if cameras is not None or no_pairs:
+        opened = SelectedCameras(opened, lambda whole: chosen_rig(whole, cameras=cameras, no_pairs=no_pairs))
     recorder: SessionRecorder | None = None
     if services is not None:
         services.check()
@@ -175,7 +186,7 @@ def _memory(source: str, name: str, rig: Rig, settings: Config, forget_calibrati
     from graphvio.live.calibration_memory import CalibrationMemory, devices_of
 
     devices = devices_of(source, name)
-    if devices is None or not settings.estimates_calibration:
+    if devices is None or not rig.pairs or not settings.estimates_calibration:
         return None
     memory = CalibrationMemory(devices, rig)
     if forget_calibration:

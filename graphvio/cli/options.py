@@ -33,6 +33,9 @@ Cameras = Annotated[
         help="Use only these cameras, such as cam0,cam1,cam2 or 0,1,2; pairs among them stay pairs.  [default: all]",
     ),
 ]
+NoPairs = Annotated[
+    bool, typer.Option("--no-pairs", help="Take each camera for a single one; the IMU shows the scale.")
+]
 NoImu = Annotated[bool, typer.Option("--no-imu", help="Use the cameras alone.")]
 FromS = Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.")]
 ToS = Annotated[float | None, typer.Option("--to", help="End at this second of the recording.")]

@@ -36,9 +36,7 @@ def run(
     ] = None,
     pairs: options.Pairs = None,
     cameras: options.Cameras = None,
-    no_pairs: Annotated[
-        bool, typer.Option("--no-pairs", help="Take each camera for a single one; the IMU shows the scale.")
-    ] = False,
+    no_pairs: options.NoPairs = False,
     no_imu: options.NoImu = False,
     from_s: options.FromS = None,
     to_s: options.ToS = None,

@@ -14,6 +14,8 @@ from graphvio.cli.live import run_live
 def serve(
     source: options.LiveSource,
     rig: options.RigFile = None,
+    cameras: options.Cameras = None,
+    no_pairs: options.NoPairs = False,
     config: options.ConfigName = "default",
     host: Annotated[str, typer.Option("--host", help="Address of gRPC; others need TLS and a token.")] = "127.0.0.1",
     port: Annotated[
@@ -54,6 +56,8 @@ def serve(
         source,
         rig,
         config,
+        cameras=cameras,
+        no_pairs=no_pairs,
         record=record,
         png=png,
         view=False,

@@ -78,7 +78,7 @@ def open_recording(
     loaded = None if rig is None else load_rig(rig)
     mapped = parsed_topics(topics)
     opened = open_source(source, loaded, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
-    chosen = _choose(opened.rig, pairs, cameras, no_pairs, no_imu)
+    chosen = chosen_rig(opened.rig, pairs, cameras, no_pairs, no_imu)
     if chosen is opened.rig:
         return opened
     return open_source(source, chosen, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
@@ -104,7 +104,10 @@ def parsed_pairs(text: str) -> list[int]:
         raise RigError(f"--pairs {text}: give numbers separated by commas, such as 0,1") from None
 
 
-def _choose(rig: Rig, pairs: str | None, cameras: str | None, no_pairs: bool, no_imu: bool) -> Rig:
+def chosen_rig(
+    rig: Rig, pairs: str | None = None, cameras: str | None = None, no_pairs: bool = False, no_imu: bool = False
+) -> Rig:
+    """Return the rig as the options of a command ask for it."""
     if pairs is not None:
         rig = rig.with_pairs(parsed_pairs(pairs))
     if cameras is not None:

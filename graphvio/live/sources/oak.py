@@ -140,7 +140,7 @@ def open_source(spec: SourceSpec, rig: Rig | None, connect: Connect = DepthAiCon
     if iso is not None and exposure_us is None:
         raise SourceError("oak: iso= needs exposure_us=; give both, or neither for automatic exposure")
     settings = StreamSettings(
-        size_px=size_of(spec, "size") or (rig.pairs[0].left.size_px if rig is not None else _SIZE_PX),
+        size_px=size_of(spec, "size") or (rig.cameras[0].size_px if rig is not None else _SIZE_PX),
         fps=number_of(spec, "fps", 1, 240) or _FPS,
         imu_hz=round(number_of(spec, "imu_hz", 1, 1000) or _IMU_HZ),
         exposure_us=None if exposure_us is None else round(exposure_us),

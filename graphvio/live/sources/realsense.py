@@ -119,7 +119,7 @@ def open_source(spec: SourceSpec, rig: Rig | None, bus: Bus | None = None) -> Li
     check_options(spec, _OPTIONS)
     is_synchronised = choice_of(spec, "sync", ("none", "hardware")) == "hardware"
     settings = StreamSettings(
-        size_px=size_of(spec, "size") or (rig.pairs[0].left.size_px if rig is not None else _SIZE_PX),
+        size_px=size_of(spec, "size") or (rig.cameras[0].size_px if rig is not None else _SIZE_PX),
         fps=round(number_of(spec, "fps", 1, 300) or _FPS),
         gyro_hz=round(number_of(spec, "gyro_hz", 1, 2000) or _GYRO_HZ),
         accel_hz=round(number_of(spec, "accel_hz", 1, 2000) or _ACCEL_HZ),

@@ -124,5 +124,5 @@ def paced(measurements: Iterable[Measurement], rig: Rig, pace: Pace) -> Iterator
             yield ImuReading(stamp_ns, measurement.angular_velocity, measurement.linear_acceleration, now_ns)
             continue
         for j, images in sorted(measurement.images.items()):
-            for camera, image in zip((rig.pairs[j].left, rig.pairs[j].right), images, strict=True):
+            for camera, image in zip(rig.groups[j].cameras, images, strict=True):
                 yield CameraFrame(camera.name, stamp_ns, partial(np.asarray, image), now_ns)

@@ -21,7 +21,7 @@ from graphvio.ros2.wire import require_dds
 from graphvio.sessions import cdr
 from graphvio.sessions.messages import COMPRESSED, IMAGE, IMU
 from graphvio.sessions.rig_of_topics import stereo_topics
-from graphvio.sessions.topics import image_topic, preference
+from graphvio.sessions.topics import image_topic, preference, sides_of
 
 _NODE: Final = "/graphvio_source"
 _OPTIONS: Final = ("domain", "imu", "body", "reliable", "wait_s")
@@ -220,9 +220,9 @@ def _topics_of(rig: Rig, chosen: Mapping[str, str], types: Mapping[str, str], wh
     """
     images = _images(types)
     found = dict(chosen)
-    for pair in rig.pairs:
-        for side, camera in (("left", pair.left), ("right", pair.right)):
-            usual = [image_topic(pair.name, side, "raw"), image_topic(pair.name, side, "png"), camera.name]
+    for group in rig.groups:
+        for side, camera in zip(sides_of(group), group.cameras, strict=True):
+            usual = [image_topic(group.name, side, "raw"), image_topic(group.name, side, "png"), camera.name]
             named = [name for name in usual if name in images]
             named += sorted((name for name in images if camera.name in name.split("/")), key=preference)
             if camera.name not in found and not named:

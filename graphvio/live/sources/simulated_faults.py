@@ -71,8 +71,8 @@ class DeviceFaults:
 
 
 def devices_of(rig: Rig) -> tuple[str, ...]:
-    """Return the names of the pairs and, if there is one, the IMU."""
-    return (*(pair.name for pair in rig.pairs), *((IMU,) if rig.imu is not None else ()))
+    """Return the names of the pairs and single cameras and, if there is one, the IMU."""
+    return (*(group.name for group in rig.groups), *((IMU,) if rig.imu is not None else ()))
 
 
 def with_faults(
@@ -80,7 +80,7 @@ def with_faults(
 ) -> Iterator[Reading]:
     """Apply faults to readings of one clock, whose outages count from the stamp ``start_ns``."""
     devices = devices_of(rig)
-    device_of = {camera.name: pair.name for pair in rig.pairs for camera in (pair.left, pair.right)}
+    device_of = {camera.name: group.name for group in rig.groups for camera in group.cameras}
     rng, number = np.random.default_rng(seed), count()
     late: list[tuple[int, int, Reading]] = []
     last_ns = dict.fromkeys(devices, 0)  # readings of a device keep their order

@@ -26,11 +26,12 @@ from graphvio.live.sources import SourceSpec, check_options
 from graphvio.live.sources.replay import Pace, paced, speed_of
 from graphvio.live.sources.simulated_faults import OPTIONS as FAULT_OPTIONS
 from graphvio.live.sources.simulated_faults import DeviceFaults, devices_of, with_faults
-from graphvio.live.spec_options import number_of, whole_number_of
+from graphvio.live.spec_options import choice_of, number_of, whole_number_of
 from graphvio.measurements.readings import DeviceHealth, Reading
 from graphvio.measurements.sensors import FrameSet, ImuSample, Measurement
 from graphvio.rig import Rig
 from graphvio.simulation import SCENE_NAMES
+from graphvio.simulation.named_rigs import NAMED_RIGS
 from graphvio.sources import Source
 from graphvio.sources import open_source as open_recording
 from graphvio.sources.read_ahead import read_ahead
@@ -39,7 +40,7 @@ from graphvio.sources.sequencer import merge
 if TYPE_CHECKING:
     from graphvio.simulation.imu import ImuTrack
 
-_OPTIONS = ("speed", "duration_s", "legs", "seed", "rate_hz", "recording", *FAULT_OPTIONS)
+_OPTIONS = ("speed", "duration_s", "legs", "seed", "rate_hz", "recording", "rig", *FAULT_OPTIONS)
 _MAX_END_SPEED_M_S = 1e-3
 _log = logging.getLogger(__name__)
 
@@ -60,6 +61,7 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
     if "drift_ppm" in spec.options and speed != 1.0:
         raise SourceError("simulator: drifting clocks are estimated from arrival times: drift_ppm needs speed=1")
     recording = Path(spec.options["recording"]) if "recording" in spec.options else None
+    rig_name = choice_of(spec, "rig", tuple(NAMED_RIGS))
     return SimulatedRig(
         scene,
         rig,
@@ -69,6 +71,7 @@ def open_source(spec: SourceSpec, rig: Rig | None) -> SimulatedRig:
         seed=whole_number_of(spec, "seed", 0, 2**31) or 0,
         rate_hz=rate_hz or 20.0,
         recording=recording,
+        rig_name=rig_name,
         faults=spec.options,
     )
 
@@ -86,6 +89,7 @@ class SimulatedRig:
         rate_hz: framesets per second.
         recording: folder of `graphvio simulate` with the same scene, seed and rate; None renders it once, into
             graphvio's folder of the user's cache.
+        rig_name: of the rig that is rendered.
         faults: options of `DeviceFaults.parse`.
     """
 
@@ -100,6 +104,7 @@ class SimulatedRig:
         seed: int = 0,
         rate_hz: float = 20.0,
         recording: Path | None = None,
+        rig_name: str = "paper",
         faults: Mapping[str, str] | None = None,
     ) -> None:
         self.name = f"simulator-{scene}"
@@ -112,6 +117,7 @@ class SimulatedRig:
         self._seed = seed
         self._rate_hz = rate_hz
         self._folder = recording
+        self._rig_name = rig_name
         self._fault_options = faults or {}
         self._faults = DeviceFaults()
         self._opened: Source | None = None
@@ -179,11 +185,13 @@ class SimulatedRig:
     def _rendered(self) -> Path:
         """Return the folder of the rendered scene, after rendering it if need be."""
         root = cache_root().parent / "simulator"
-        folder = root / f"{self._scene}-seed{self._seed}-{self._rate_hz:g}hz-{_digest()}"
+        rig = "" if self._rig_name == "paper" else f"-{self._rig_name}"
+        folder = root / f"{self._scene}{rig}-seed{self._seed}-{self._rate_hz:g}hz-{_digest()}"
         if folder.is_dir():
             return folder
         unfinished = folder.with_name(f"{folder.name}.{os.getpid()}")
         arguments = ["simulate", self._scene, "--out", unfinished, "--seed", self._seed, "--rate", f"{self._rate_hz:g}"]
+        arguments += ["--rig", self._rig_name]
         command = [sys.executable, "-c", "from graphvio.cli import main; main()", *map(str, arguments)]
         root.mkdir(parents=True, exist_ok=True)
         try:

@@ -134,8 +134,15 @@ def open_cameras(
 
     Raises:
         SourceError: if the number of cameras is not that of the rig's pairs.
+        RigError: if the rig has single cameras.
     """
     ids = names_of(spec) or [_only_id(spec.kind, list_ids())]
+    if rig is not None and rig.singles:
+        names = ", ".join(single.name for single in rig.singles)
+        raise RigError(
+            f"{spec.kind}: delivers stereo pairs, and the rig has {names} without a partner; give a rig of pairs, and by "
+            "--cameras those that are to be used"
+        )
     if rig is not None and len(ids) != len(rig.pairs):
         raise SourceError(
             f"{spec.kind}: {len(ids)} cameras, but the rig has {len(rig.pairs)} pairs; name one for each pair, in the "

@@ -318,19 +318,20 @@ def _checked_rig(rig: Rig, has_imu: bool) -> Rig:
 def _cameras(
     paths: list[str], layout: str | None, settings: CaptureSettings, rig: Rig, open_capture: OpenCapture
 ) -> list[V4l2Camera]:
-    pairs, cameras = rig.pairs, rig.cameras
-    count = len(cameras) if layout == "separate" else len(pairs)
+    cameras = rig.cameras
+    count = len(cameras) if layout == "separate" else len(rig.groups)
     if layout is None and len(paths) == len(cameras):
         layout, count = "separate", len(cameras)
     if len(paths) != count:
         each = "a device for each camera" if layout == "separate" else "a device for each pair, or for each camera,"
+        has = f"{len(rig.pairs)} pairs" + (f" and {len(rig.singles)} single cameras" if rig.singles else "")
         raise SourceError(
-            f"v4l2: {len(paths)} devices are named, but the rig has {len(pairs)} pairs; name {each} in the rig's order"
+            f"v4l2: {len(paths)} devices are named, but the rig has {has}; name {each} in the rig's order"
         )
     if layout == "separate":
         groups: list[tuple[Camera, ...]] = [(camera,) for camera in cameras]
     else:
-        groups = [(p.right, p.left) if layout == "right_left" else (p.left, p.right) for p in pairs]
+        groups = [each.cameras[::-1] if layout == "right_left" else each.cameras for each in rig.groups]
     found = []
     for path, group in zip(paths, groups, strict=True):
         size_px, parts = _parts(group)
