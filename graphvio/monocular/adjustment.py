@@ -13,7 +13,7 @@ import numpy as np
 
 from graphvio.arrays import Float, Int
 from graphvio.geometry import so3_exp, so3_log
-from graphvio.linear_algebra import cholesky, solve_lower, solve_symmetric
+from graphvio.linear_algebra import cholesky, product, solve_lower, solve_rows, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.structure import (
     Cameras,
@@ -177,10 +177,10 @@ def equations(measured: Measurements, states: States, landmarks: Float, prior: P
         m = len(prior.at.poses)
         off = states.of(np.arange(m)).since(prior.at)
         columns = _columns(n, np.arange(m))
-        pull = prior.information @ off
+        pull = _times(prior.information, off)
         hessian[np.ix_(columns, columns)] += prior.information
         gradient[columns] += prior.gradient + pull
-        cost += float(prior.gradient @ off + 0.5 * off @ pull)
+        cost += float((prior.gradient * off + 0.5 * off * pull).sum())
     return Equations(hessian, gradient, cost, errors2, inertial.errors2, eliminated)
 
 
@@ -223,6 +223,9 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
 
     Returns:
         What is known of the other states.
+
+    Raises:
+        numpy.linalg.LinAlgError: if nothing determines the first state.
     """
     n = len(states.poses)
     eliminated = Eliminated.empty(measured.structure)
@@ -249,11 +252,13 @@ def without_first(measured: Measurements, states: States, landmarks: Float, prio
         off = states.of(np.arange(m)).since(prior.at)
         columns = _columns(n, np.arange(m))
         hessian[np.ix_(columns, columns)] += prior.information
-        gradient[columns] += prior.gradient + prior.information @ off
+        gradient[columns] += prior.gradient + _times(prior.information, off)
     leaving, kept = _columns(n, np.arange(1))[:9], _columns(n, np.arange(1, n))
-    gain = np.linalg.solve(hessian[np.ix_(leaving, leaving)], hessian[np.ix_(leaving, kept)]).T
-    information = hessian[np.ix_(kept, kept)] - gain @ hessian[np.ix_(leaving, kept)]
-    pulled = gradient[kept] - gain @ gradient[leaving]
+    gain = solve_rows(hessian[np.ix_(leaving, leaving)], hessian[np.ix_(kept, leaving)])
+    if not np.isfinite(gain).all():
+        raise np.linalg.LinAlgError("the window's first state is not determined")
+    information = hessian[np.ix_(kept, kept)] - product(gain, hessian[np.ix_(leaving, kept)])
+    pulled = gradient[kept] - _times(gain, gradient[leaving])
     information, pulled = _walked(information, pulled, walk)
     return Prior(states.of(np.arange(1, n)), 0.5 * (information + information.T), pulled)
 
@@ -262,16 +267,17 @@ def _walked(information: Float, gradient: Float, walk: Float) -> tuple[Float, Fl
     """Let the biases, the last unknowns, walk by variances (6,)."""
     steps = np.diag(1.0 / walk)
     own, others = slice(-BIASES, None), slice(0, -BIASES)
-    inverse = np.linalg.inv(information[own, own] + steps)
+    coupled = information[others, own].copy()
+    gain = solve_rows(information[own, own] + steps, np.vstack([coupled, steps]))  # of the others, and of the biases
+    of_others, of_biases = gain[:-BIASES].copy(), gain[-BIASES:].copy()
     walked = information.copy()
-    coupled = information[others, own]
-    walked[others, others] -= coupled @ inverse @ coupled.T
-    walked[others, own] = coupled @ inverse @ steps
+    walked[others, others] -= product(of_others, coupled.T.copy())
+    walked[others, own] = product(of_others, steps)
     walked[own, others] = walked[others, own].T
-    walked[own, own] = steps - steps @ inverse @ steps
+    walked[own, own] = steps - product(of_biases, steps)
     pulled = gradient.copy()
-    pulled[others] -= coupled @ inverse @ gradient[own]
-    pulled[own] = steps @ inverse @ gradient[own]
+    pulled[others] -= _times(of_others, gradient[own])
+    pulled[own] = _times(of_biases, gradient[own])
     return walked, pulled
 
 
@@ -293,7 +299,7 @@ def covariance_of(hessian: Float, unknowns: Int) -> Float:
     whitened = solve_lower(cholesky(hessian), chosen)
     if not np.isfinite(whitened).all():
         raise np.linalg.LinAlgError("the window's equations determine no covariance")
-    return np.asarray(whitened @ whitened.T)
+    return product(whitened, whitened.T.copy())
 
 
 def scale_sigma(states: States, hessian: Float) -> float:
@@ -306,6 +312,11 @@ def scale_sigma(states: States, hessian: Float) -> float:
     size2 = float((centred**2).sum())
     covariance = covariance_of(hessian, np.arange(6 * n))
     return float(np.sqrt(along @ covariance @ along)) / max(size2, 1e-12)
+
+
+def _times(matrix: Float, vector: Float) -> Float:
+    """Multiply in a fixed order: a library's last digits depend on where arrays lie in memory."""
+    return product(np.ascontiguousarray(matrix), vector.reshape(-1, 1))[:, 0]
 
 
 def _columns(n: int, states: Int) -> Int:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from graphvio.arrays import Float, Int
+from graphvio.linear_algebra import product, solve_symmetric
 from graphvio.measurements.sensors import GRAVITY_M_S2
 from graphvio.monocular.structure import Cameras, Structure
 from graphvio.self_calibration.imu_model import PARAMETERS
@@ -95,9 +96,8 @@ def first_guess(samples: InertialSamples, structure: Structure, cameras: Cameras
         columns = [(fit(bias + _BIAS_STEP * axis).errors - at.errors).ravel() / _BIAS_STEP for axis in np.eye(3)]
         jacobian = np.column_stack(columns)
         held = (_ANGLE_SIGMA / _BIAS_SIGMA) ** 2
-        step = -np.linalg.solve(
-            jacobian.T @ jacobian + held * np.eye(3), jacobian.T @ at.errors.ravel() + held * (bias - gyro_bias)
-        )
+        normal = product(jacobian.T.copy(), np.column_stack([jacobian, at.errors.ravel()]))
+        step = -_solved(normal[:, :3] + held * np.eye(3), normal[:, 3] + held * (bias - gyro_bias))
         bias = bias + step * min(1.0, _MAX_BIAS_STEP / max(float(np.linalg.norm(step)), 1e-12))
         if np.linalg.norm(step) < _CONVERGED:
             break
@@ -158,8 +158,9 @@ def _fit(
     by_motion = np.concatenate([across * dt[:, None, None], across * dt2[:, None, None]], axis=2)
     constant = np.einsum("nij,nj->ni", across, apart)
     if gravity is not None:
-        constant = constant + by_motion[:, :, 3:] @ gravity[0]
-        by_motion = np.concatenate([by_motion[:, :, :3], by_motion[:, :, 3:] @ gravity[1]], axis=2)
+        by_gravity = by_motion[:, :, 3:]
+        constant = constant + np.einsum("nij,j->ni", by_gravity, gravity[0])
+        by_motion = np.concatenate([by_motion[:, :, :3], np.einsum("nij,jk->nik", by_gravity, gravity[1])], axis=2)
     by_distance = np.einsum("nij,nj->ni", across, d_first)
     n = len(structure.odom_T_landmark)
     size = by_motion.shape[2]
@@ -170,12 +171,25 @@ def _fit(
     s = of_landmarks((by_distance**2).sum(axis=1)) + 1e-12
     r = of_landmarks(np.einsum("nij,ni->nj", by_motion, by_distance))
     h = of_landmarks((by_distance * constant).sum(axis=1))
-    normal = np.einsum("nij,nik->jk", by_motion, by_motion) - (r / s[:, None]).T @ r
-    right = np.einsum("nij,ni->j", by_motion, constant) - (r / s[:, None]).T @ h
-    solution = -np.linalg.solve(normal + 1e-12 * np.trace(normal) * np.eye(size), right)
-    distances = -(h + r @ solution) / s
-    errors = by_motion @ solution + by_distance * distances[landmark][:, None] + constant
+    of_depths = product((r / s[:, None]).T.copy(), np.column_stack([r, h]))
+    normal = np.einsum("nij,nik->jk", by_motion, by_motion) - of_depths[:, :-1]
+    right = np.einsum("nij,ni->j", by_motion, constant) - of_depths[:, -1]
+    solution = -_solved(normal + 1e-12 * np.trace(normal) * np.eye(size), right)
+    distances = -(h + np.einsum("lj,j->l", r, solution)) / s
+    errors = np.einsum("nij,j->ni", by_motion, solution) + by_distance * distances[landmark][:, None] + constant
     if gravity is not None:
         solution = np.concatenate([solution[:3], gravity[0] + gravity[1] @ solution[3:]])
     assert len(distances) == n
     return _Fit(solution, distances, errors)
+
+
+def _solved(matrix: Float, right: Float) -> Float:
+    """Solve positive definite equations.
+
+    Raises:
+        numpy.linalg.LinAlgError: if the matrix is singular.
+    """
+    solution = solve_symmetric(matrix, right)
+    if not np.isfinite(solution).all():
+        raise np.linalg.LinAlgError("the images show too little motion")
+    return solution

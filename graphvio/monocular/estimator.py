@@ -48,6 +48,7 @@ _MAX_OFF = 0.3
 _MIN_LANDMARKS = 8  # that constrain the newest state
 _MIN_FITTING = 0.3  # share of the landmarks
 _MAX_CONTRADICTION_NS = 1_000_000_000
+_MAX_AWAITED_NS = 1_000_000_000
 _MAX_IMU_ERROR2 = 150.0
 _MARGIN_NS = 100_000_000
 _REPORT_AFTER_NS = 5_000_000_000
@@ -97,6 +98,7 @@ class MonocularEstimator:
         self._is_stationary = False
         self._tracked_sigma_m = 0.0
         self._contradicted_since_ns: int | None = None
+        self._awaits_imu = False
         self._rate: Float | None = None
         self._solved: Solved | None = None
         self._final: list[tuple[int, Float]] = []
@@ -186,13 +188,18 @@ class MonocularEstimator:
                 self._initialiser.know_gyro_bias(attitude.gyro_bias, attitude.gyro_bias_sigma)
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
-        """Add a state by the IMU; where it does not cover the step, the epoch ends."""
+        """Add a state by the IMU: late samples are awaited for a second, and where some are missing, the epoch ends."""
         self.gate_results = {}
         self._rate = None
         window, before_ns = self._window, self._latest_ns
-        self._collect_samples()
+        self._collect_samples(stamp_ns)
+        is_covered = self._covers(before_ns, stamp_ns)
+        is_late = not is_covered and not (self._samples[0][-1:] >= stamp_ns).any()
+        self._awaits_imu = is_late and window is not None and stamp_ns - before_ns < _MAX_AWAITED_NS
+        if self._awaits_imu:
+            return False
         self._latest_ns = stamp_ns
-        if not self._covers(before_ns, stamp_ns):
+        if not is_covered:
             self._lose(stamp_ns, "the IMU does not cover the step to this frameset")
             return False
         if window is None:
@@ -224,6 +231,8 @@ class MonocularEstimator:
     def update(self, stamp_ns: int, is_constrained: bool, keep: frozenset[int]) -> StateUpdate:
         """Solve the window, or look for the scale."""
         is_keyframe = stamp_ns in keep
+        if self._awaits_imu:
+            return StateUpdate(Status.LOST)  # there is no state at this frameset
         if self._window is None:
             return self._initialising(stamp_ns, is_keyframe)
         try:
@@ -362,8 +371,11 @@ class MonocularEstimator:
     def _new_initialiser(self) -> Initialiser:
         return Initialiser(self._cameras, self._samples_of, _FIRST_SIGMA_PX)
 
-    def _collect_samples(self) -> None:
-        """Add the samples that have come to those before, and forget what no window needs."""
+    def _collect_samples(self, until_ns: int) -> None:
+        """Add the samples that have come to those before, up to the first one after a stamp; forget what is not needed.
+
+        Later ones would change the integration next to the stamp, and results would depend on when they came.
+        """
         stamps, readings = self._samples
         if self._stamps:
             stamps = np.concatenate([stamps, self._stamps])
@@ -375,7 +387,9 @@ class MonocularEstimator:
         if self._window is None and self._initialiser.oldest_ns is not None:
             oldest_ns = self._initialiser.oldest_ns
         first = max(int(np.searchsorted(stamps, oldest_ns - _MARGIN_NS)) - 1, 0)
-        self._samples = stamps[first:], readings[first:]
+        end = int(np.searchsorted(stamps, until_ns)) + 1
+        self._stamps, self._readings = stamps[end:].tolist(), list(readings[end:])
+        self._samples = stamps[first:end], readings[first:end]
 
     def _samples_of(self, stamps_ns: Int) -> InertialSamples:
         """Return the IMU over some states."""

@@ -144,7 +144,10 @@ class Synchroniser:
         return stamps - self._offset_ns, self.imu_correction.applied(values)
 
     def initial_interval(self, stamp_ns: int) -> tuple[ImuInterval, float] | None:
-        """Return the IMU around a frameset and the frameset's place in it in seconds, once it is long enough."""
+        """Return the IMU around a frameset and the frameset's place in it in seconds, once it is long enough.
+
+        What came beyond that is left out, so that the result does not depend on how early samples come.
+        """
         at_ns = stamp_ns + self._offset_ns
         window_ns, min_ns = (round(s * 1e9) for s in (self._initialisation.window_s, self._initialisation.min_window_s))
         if not self._has_imu or not self._imu.covers(at_ns):
@@ -152,7 +155,13 @@ class Synchroniser:
         for end_ns in (at_ns, at_ns + min_ns):
             found = self._imu.segment(at_ns - window_ns, end_ns)
             if found is not None and found[0].steps_s.sum() >= 0.95e-9 * min_ns:
-                return self.imu_correction.applied_to(found[0]), (at_ns - found[1]) * 1e-9
+                interval, n = found[0], len(found[0].steps_s)
+                if end_ns > at_ns:
+                    n = next(k for k in range(1, n + 1) if interval.steps_s[:k].sum() >= 0.95e-9 * min_ns)
+                interval = ImuInterval(
+                    interval.steps_s[:n], interval.angular_velocity[:n], interval.linear_acceleration[:n]
+                )
+                return self.imu_correction.applied_to(interval), (at_ns - found[1]) * 1e-9
         return None
 
     def shift_imu(self, seconds: float) -> None:

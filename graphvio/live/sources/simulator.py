@@ -165,7 +165,8 @@ class SimulatedRig:
 
         if recording.rig.imu is None:
             return None
-        simulator = make_simulator(self._scene, seed=self._seed, rate_hz=self._rate_hz)
+        rig = NAMED_RIGS[self._rig_name]()
+        simulator = make_simulator(self._scene, seed=self._seed, rate_hz=self._rate_hz, rig=rig)
         first_ns = simulator.stamps_ns[0]
         ends_s = 1e-9 * np.array([recording.start_ns - first_ns, recording.end_ns - first_ns])
         ends = simulator.scene.motion.at(np.clip(ends_s, 0.0, simulator.scene.motion.duration_s)).velocity

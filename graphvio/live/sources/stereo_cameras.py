@@ -138,10 +138,10 @@ def open_cameras(
     """
     ids = names_of(spec) or [_only_id(spec.kind, list_ids())]
     if rig is not None and rig.singles:
-        names = ", ".join(single.name for single in rig.singles)
+        alone = ", ".join(single.name for single in rig.singles)
         raise RigError(
-            f"{spec.kind}: delivers stereo pairs, and the rig has {names} without a partner; give a rig of pairs, and by "
-            "--cameras those that are to be used"
+            f"{spec.kind}: delivers stereo pairs, and the rig has {alone} without a partner; give a rig of pairs, and "
+            "by --cameras those that are to be used"
         )
     if rig is not None and len(ids) != len(rig.pairs):
         raise SourceError(
