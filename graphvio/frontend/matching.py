@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from graphvio.frontend.patches import pack
 from graphvio.frontend.slanted import align_slanted
 from graphvio.frontend.stereo import epipolar_lines, epipolar_search, triangulate
 from graphvio.frontend.tracks import passes, usable_at
-from graphvio.rig import StereoPair
+from graphvio.rig import Camera
 
 _SEARCH_CORRELATION = 0.6  # of undeformed patches; aligned ones must reach `StereoConfig.min_correlation`
 _MAX_REFINEMENT_PX = 3.0
@@ -44,10 +45,26 @@ class StereoMatches:
     rejected: dict[str, int]
 
 
+class TwoCameras(Protocol):
+    """Cameras between which is matched: a stereo pair, or others that see the same."""
+
+    @property
+    def left(self) -> Camera:
+        """The camera that has the corners."""
+
+    @property
+    def right(self) -> Camera:
+        """The camera in which they are matched."""
+
+    @property
+    def right_T_left(self) -> Float:
+        """Transform (4, 4) from one to the other."""
+
+
 class StereoMatcher:
     """Matcher of one pair's left corners in the right image."""
 
-    def __init__(self, pair: StereoPair, config: Config, allowed_right: Bool) -> None:
+    def __init__(self, pair: TwoCameras, config: Config, allowed_right: Bool) -> None:
         self._pair = pair
         self._config = config
         self._allowed = allowed_right
@@ -58,7 +75,7 @@ class StereoMatcher:
         """Match only where (height, width) the newest right image may be used."""
         self._allowed = allowed_right
 
-    def recalibrate(self, pair: StereoPair, epipolar_margin_px: float) -> None:
+    def recalibrate(self, pair: TwoCameras, epipolar_margin_px: float) -> None:
         """Take another calibration of the cameras from now on, whose epipolar lines may be off by a margin."""
         self._pair = pair
         self._margin_px = epipolar_margin_px

@@ -10,9 +10,10 @@ import numpy as np
 from graphvio.arrays import Bool, Float
 from graphvio.config import Config
 from graphvio.frontend.lucas_kanade import Pyramid
-from graphvio.frontend.matching import StereoMatcher
+from graphvio.frontend.matching import StereoMatcher, TwoCameras
 from graphvio.frontend.prediction import predict_pixels
 from graphvio.frontend.tracks import PairFrame
+from graphvio.frontend.warped_matching import WarpedMatcher
 from graphvio.measurements.motion import Elsewhere
 from graphvio.rig import MAX_AXES_ANGLE_DEG, MIN_BASELINE_M, Camera, Rig, StereoPair, axes_angle_deg, overlap
 
@@ -37,12 +38,24 @@ class View:
     min_gradient: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Apart:
+    """Two cameras that look too different ways for a stereo pair."""
+
+    left: Camera
+    right: Camera
+
+    @property
+    def right_T_left(self) -> Float:
+        return np.ascontiguousarray(self.right.cam_T_body @ self.left.body_T_cam)
+
+
 @dataclass(eq=False)
 class _Partner:
     """A camera in which tracks of another one are found, and what was found there last."""
 
     camera: int
-    pair: StereoPair  # whose left camera has the tracks
+    cameras: TwoCameras  # of which the left one has the tracks
     matcher: StereoMatcher
     found: PairFrame = field(default_factory=PairFrame.empty)
 
@@ -51,7 +64,8 @@ class Overlaps:
     """Finds the tracks of each single camera in the other cameras that see the same part of the scene.
 
     A track that was found before is found again near where its distance and the predicted motion put it; others are
-    searched for along their epipolar lines. Rolling shutters are left out: their lines are of different instants.
+    searched for along their epipolar lines, by patches that are warped where the cameras look different ways. Rolling
+    shutters are left out: their lines are of different instants.
 
     Args:
         rig: single cameras.
@@ -116,11 +130,13 @@ def _is_shared(own: Camera, other: Camera) -> bool:
     """Whether tracks of a camera can be found in another one."""
     if own is other or own.line_time_us or other.line_time_us or overlap(own, other) < MIN_OVERLAP:
         return False
-    is_apart = bool(np.linalg.norm((other.cam_T_body @ own.body_T_cam)[:3, 3]) >= MIN_BASELINE_M)
-    return is_apart and axes_angle_deg(own, other) <= MAX_AXES_ANGLE_DEG
+    return bool(np.linalg.norm((other.cam_T_body @ own.body_T_cam)[:3, 3]) >= MIN_BASELINE_M)
 
 
 def _partner(own: Camera, number: int, other: Camera, config: Config) -> _Partner:
+    if axes_angle_deg(own, other) > MAX_AXES_ANGLE_DEG:
+        apart = _Apart(own, other)
+        return _Partner(number, apart, WarpedMatcher(apart, config))
     pair, (width, height) = StereoPair(f"{own.name} in {other.name}", own, other), other.size_px
     return _Partner(number, pair, StereoMatcher(pair, config, np.ones((height, width), dtype=bool)))
 
@@ -132,7 +148,7 @@ def _expected(partner: _Partner, frame: PairFrame, motion: Float | None) -> tupl
         return inverse_depths, slopes
     moved, in_front = np.maximum(before.points[:, 2], 0.0), np.ones(len(before.ids), dtype=bool)
     if motion is not None:
-        camera = partner.pair.left
+        camera = partner.cameras.left
         _, moved, in_front = predict_pixels(
             before.left, moved, motion, camera.model_number, camera.intrinsics, camera.distortion
         )
