@@ -115,7 +115,7 @@ class StereoMatcher:
             rays, normalised, pair.right_T_left, pair.left.focal_px, pair.right.focal_px
         )
         good = passes(good, errors <= settings.max_epipolar_px + self._margin_px, "epipolar", rejected)
-        sigma = np.sqrt(covariances[:, 2, 2]) * self._config.motion.pixel_sigma_px
+        sigma = np.sqrt(np.maximum(covariances[:, 2, 2], 0.0)) * self._config.motion.pixel_sigma_px
         in_range = (points[:, 2] <= 1.0 / settings.min_depth_m) & (points[:, 2] >= -3.0 * sigma)
         good = passes(good, in_range, "depth_range", rejected)
         return StereoMatches(normalised, matched_px, points, covariances, slopes, good, rejected)

@@ -95,7 +95,9 @@ class Reception:
                 except SourceError as error:
                     self._report(stamp_ns, EventKind.IMAGE_DAMAGED, str(error))
                     continue
-                for frameset in self._assembler.add(frame.camera, stamp_ns, image, frame.arrival_ns):
+                # A source that waits delivers when it is read: how long others are waited for counts in its own time.
+                at_ns = frame.arrival_ns if self._source.is_realtime else stamp_ns
+                for frameset in self._assembler.add(frame.camera, stamp_ns, image, at_ns):
                     self._deliver(stage, frameset, frame.arrival_ns)
         for frameset in self._assembler.flush():
             self._deliver(stage, frameset, host_ns())

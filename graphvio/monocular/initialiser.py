@@ -27,8 +27,8 @@ from graphvio.self_calibration.inertial import InertialSamples
 MAX_KEYFRAMES = 14
 MAX_SCALE_SIGMA = 0.05
 MAX_ERROR2 = 16.0  # squared whitened error of a view of what stands still
-_MIN_KEYFRAMES = 8
-_MIN_DURATION_S = 1.0
+_MIN_KEYFRAMES, _MIN_METRIC_KEYFRAMES = 8, 5  # the latter where baselines know the scale
+_MIN_DURATION_S, _MIN_METRIC_DURATION_S = 1.0, 0.5
 _MAX_DURATION_S = 5.0
 _MIN_LANDMARKS = 20
 _MAX_OFF = 0.3  # share of a landmark's views that may be farther off
@@ -98,7 +98,10 @@ class Initialiser:
         while (stamp_ns - self._keyframes[0][0]) * 1e-9 > _MAX_DURATION_S:
             del self._keyframes[0]
         duration_s = (stamp_ns - self._keyframes[0][0]) * 1e-9
-        if is_stationary or len(self._keyframes) < _MIN_KEYFRAMES or duration_s < _MIN_DURATION_S:
+        is_metric = _shared(sightings) >= _MIN_LANDMARKS
+        min_keyframes = _MIN_METRIC_KEYFRAMES if is_metric else _MIN_KEYFRAMES
+        min_duration_s = _MIN_METRIC_DURATION_S if is_metric else _MIN_DURATION_S
+        if is_stationary or len(self._keyframes) < min_keyframes or duration_s < min_duration_s:
             self.reason = "the images show too little motion"
             return None
         try:
@@ -179,6 +182,11 @@ class Initialiser:
         known = window.prior.at
         at = replace(turned.of(np.arange(1)), biases=known.biases)
         return replace(window, states=turned, prior=window.prior._replace(at=at))
+
+
+def _shared(sightings: Mapping[int, Sighting]) -> int:
+    """Count the points that two cameras see."""
+    return sum(len(seen.rows) for sighting in sightings.values() for seen in sighting.elsewhere)
 
 
 def _ambiguity(measured: Measurements, adjusted: Adjusted, prior: Prior) -> str:

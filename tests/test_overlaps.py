@@ -1,0 +1,82 @@
+"""Tracks of single cameras in others that see the same: places against the renderer's depth, warped patches, scale."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from recordings import half_size
+
+from graphvio.arrays import Float
+from graphvio.config import Config
+from graphvio.frontend.overlaps import MIN_OVERLAP
+from graphvio.frontend.singles import SinglesFrontend
+from graphvio.rig import Camera, Rig, axes_angle_deg, overlap
+from graphvio.simulation import Simulator, build_scene, default_rig
+from graphvio.simulation.named_rigs import headset, phone, surround
+
+
+def four_cameras() -> Rig:
+    return default_rig().without_pairs().with_cameras(half_size)
+
+
+def surrounding() -> Rig:
+    return surround().with_cameras(half_size)
+
+
+def fisheyes() -> Rig:
+    return headset().without_pairs().with_cameras(half_size)
+
+
+def true_pixels(own: Camera, rays: Float, depths: Float, other: Camera) -> Float:
+    """Project points of a camera, of known depth, into another one."""
+    in_own = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None]
+    other_T_own = other.cam_T_body @ own.body_T_cam
+    return other.project(in_own @ other_T_own[:3, :3].T + other_T_own[:3, 3])[0]
+
+
+@pytest.mark.parametrize(("make_rig", "max_median_px"), [(four_cameras, 0.1), (surrounding, 0.2), (fisheyes, 0.2)])
+def test_tracks_are_found_where_other_cameras_see_their_points(
+    make_rig: Callable[[], Rig], max_median_px: float
+) -> None:
+    """At the first frameset they are searched for; at the second, of a rig that stands, they are found again."""
+    rig = make_rig()
+    cameras = [single.left for single in rig.singles]
+    simulator = Simulator(build_scene("room", 2.0), rig, 1)
+    frontend, counts = SinglesFrontend(rig, Config()), []
+    depths = [simulator.view(0, j).depth for j in range(len(cameras))]
+    for k in range(2):
+        visual = frontend.process(simulator.frameset(k), lambda _: np.eye(4))
+        errors, found = [], 0
+        for j, sighting in visual.sightings.items():
+            frame = frontend.frames_at(simulator.stamps_ns[0] if k == 0 else simulator.stamps_ns[1])[j]
+            columns, rows = np.rint(frame.pixels).astype(int).T
+            for seen in sighting.elsewhere:
+                assert overlap(cameras[j], cameras[seen.camera]) >= MIN_OVERLAP
+                assert make_rig is not surrounding or axes_angle_deg(cameras[j], cameras[seen.camera]) > 45.0
+                of_own = depths[j][rows[seen.rows], columns[seen.rows]]
+                other = cameras[seen.camera]
+                in_other = np.column_stack([seen.rays, np.ones(len(seen.rays))])
+                expected = true_pixels(cameras[j], sighting.rays[seen.rows], of_own, other)
+                errors.append(np.linalg.norm(other.project(in_other)[0] - expected, axis=1))
+                found += len(seen.rows)
+        assert np.median(np.concatenate(errors)) < max_median_px
+        assert np.mean(np.concatenate(errors) > 1.0) < 0.06  # some corners are of edges in depth
+        counts.append(found)
+    assert counts[0] > 20 * len(cameras)
+    assert counts[1] > 0.9 * counts[0]
+    frontend.close()
+
+
+def test_rolling_shutters_and_cameras_that_look_apart_share_nothing() -> None:
+    rig = phone().with_cameras(half_size)
+    simulator = Simulator(build_scene("room", 1.0), rig, 1)
+    frontend = SinglesFrontend(rig, Config())
+    assert frontend.process(simulator.frameset(0), lambda _: None).sightings[0].elsewhere == ()
+    frontend.close()
+    apart = default_rig().with_only(["cam0", "cam2"]).with_cameras(half_size)
+    frontend = SinglesFrontend(apart, Config())
+    frameset = Simulator(build_scene("room", 1.0), apart, 1).frameset(0)
+    assert all(each.elsewhere == () for each in frontend.process(frameset, lambda _: None).sightings.values())
+    frontend.close()
