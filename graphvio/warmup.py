@@ -29,13 +29,14 @@ from graphvio.frontend.motion_stereo import FirstSights, MotionHistory
 from graphvio.frontend.observations import Observations, RigArrays, correspond
 from graphvio.frontend.rolling_shutter import ReadoutMotion, pixels_at_lines
 from graphvio.frontend.selection import best_pair_motion, joint_motion
+from graphvio.frontend.singles import SinglesFrontend
 from graphvio.frontend.tracker import PairTracker
 from graphvio.frontend.tracks import common_rows
 from graphvio.geometry import se3, se3_adjoint, se3_exp, se3_inverse, se3_log, skew, so3_log
 from graphvio.kernel_cache import any_compiled_before, cache_root
 from graphvio.kernels import await_compilers, compile_elsewhere, is_compiling_elsewhere
 from graphvio.linear_algebra import squared_length
-from graphvio.measurements.sensors import GRAVITY_M_S2, ImuSample
+from graphvio.measurements.sensors import GRAVITY_M_S2, FrameSet, ImuSample
 from graphvio.monocular.estimator import adjust_no_keyframes
 from graphvio.rig import Imu, Rig
 from graphvio.self_calibration.online import adjust_nothing
@@ -108,6 +109,15 @@ def _compile_in_parallel(rig: Rig, config: Config) -> None:
         other.stdout.read(len(_MOTION_IS_COMPILED))
 
 
+def _track_singles(rig: Rig, config: Config, rng: np.random.Generator) -> None:
+    """Call the kernels by which single cameras find each other's tracks."""
+    frontend = SinglesFrontend(rig, config)
+    for stamp_ns in range(2):
+        images = [rng.integers(0, 256, size=camera.size_px[::-1], dtype=np.uint8) for camera in rig.cameras]
+        frontend.process(FrameSet(stamp_ns, {j: (image,) for j, image in enumerate(images)}), lambda _: np.eye(4))
+    frontend.close()
+
+
 def _warm_up_tracking(rig: Rig, config: Config) -> None:
     """Call the kernels of tracking and of geometry."""
     rng = np.random.default_rng(0)
@@ -123,6 +133,8 @@ def _warm_up_tracking(rig: Rig, config: Config) -> None:
         history = MotionHistory()
         history.restart(frame.stamp_ns)
         FirstSights().locate(frame.ids, frame.left, history, np.eye(4), 1.0, 1.0)
+    if not rig.pairs:
+        _track_singles(rig, config, rng)
     if any(camera.line_time_us for camera in rig.cameras):
         pixels_at_lines(pair.left, frame.pixels, frame.points[:, 2], ReadoutMotion.steady(np.eye(4), 1.0))
     common_rows(frame.ids, frame.ids)

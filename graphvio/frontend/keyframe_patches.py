@@ -6,6 +6,7 @@ import numpy as np
 
 from graphvio.arrays import AnyArray, Bool, Float, Image, Int
 from graphvio.frontend.lucas_kanade import register
+from graphvio.frontend.matching import TwoCameras
 from graphvio.frontend.patches import packed
 from graphvio.frontend.prediction import around, inverse_depths_around, predict_warps
 from graphvio.frontend.tracks import PairFrame
@@ -61,6 +62,33 @@ class KeyframePatches:
             frame.slopes,
             self._step_px,
             self._pair.right_T_left,
+            right.model_number,
+            right.intrinsics,
+            right.distortion,
+        )
+
+    def slant(self, found: PairFrame, cameras: TwoCameras, is_slope_known: bool) -> None:
+        """Take the depth of patches of a single camera, and their slant, as another camera sees them.
+
+        Args:
+            found: tracks of the keyframe, matched in the other camera.
+            cameras: this one, and the other.
+            is_slope_known: whether the matches' slopes mean something; else the surfaces face the camera.
+        """
+        rows = np.minimum(np.searchsorted(self._frame.ids, found.ids), max(len(self._frame.ids) - 1, 0))
+        kept = self._frame.ids[rows] == found.ids if len(self._frame.ids) else np.zeros(len(rows), dtype=bool)
+        if not kept.any():
+            return
+        rows, depths, right = rows[kept], np.maximum(found.points[kept, 2], 0.0), cameras.right
+        if not is_slope_known:
+            self._inverse_depths[:, rows] = depths
+            return
+        self._inverse_depths[:, rows] = inverse_depths_around(
+            np.take(self._rays, rows, axis=1),
+            depths,
+            found.slopes[kept],
+            self._step_px,
+            cameras.right_T_left,
             right.model_number,
             right.intrinsics,
             right.distortion,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from graphvio.frontend.tracks import PairFrame
 from graphvio.frontend.warped_matching import WarpedMatcher
 from graphvio.measurements.motion import Elsewhere
 from graphvio.rig import MAX_AXES_ANGLE_DEG, MIN_BASELINE_M, Camera, Rig, StereoPair, axes_angle_deg, overlap
+
+if TYPE_CHECKING:
+    from graphvio.frontend.tracker import PairTracker
 
 MIN_OVERLAP = 0.1
 """Smallest share of an image that is searched for in another camera's."""
@@ -96,6 +100,13 @@ class Overlaps:
             for partner in self._partners[camera]
             if partner.camera in views
         )
+
+    def slant(self, camera: int, tracker: PairTracker) -> None:
+        """Give a camera's tracker the depth of what was found last in the other cameras, and the slant where known."""
+        for is_slope_known in (False, True):
+            for partner in self._partners[camera]:
+                if isinstance(partner.matcher, WarpedMatcher) is not is_slope_known:
+                    tracker.slant_keyframe_patches(partner.found, partner.cameras, is_slope_known)
 
     def _found(
         self,

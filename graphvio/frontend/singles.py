@@ -59,6 +59,8 @@ class SinglesFrontend(VisualFrontend):
                 self._history.advance(reference.stamp_ns, seen.stamp_ns, cur_T_reference, np.zeros((6, 6)))
             seen = seen._replace(frames=self._refer_to(seen.frames))
         elsewhere = self._find_elsewhere(seen.frames, predict, is_keyframe)
+        for j in seen.frames if is_keyframe else ():
+            self._overlaps.slant(j, self._trackers[j])
         sightings = {j: Sighting(frame.ids, frame.left, elsewhere[j]) for j, frame in seen.frames.items()}
         tracked = sum(int((frame.ages > 0).sum()) for frame in seen.frames.values())
         is_good = tracked >= self._config.motion.min_inliers

@@ -12,7 +12,7 @@ from graphvio.frontend.corners import find_corners, noise_sigma, occupied_cells,
 from graphvio.frontend.images import ImageMask, UsablePixels
 from graphvio.frontend.keyframe_patches import KeyframePatches
 from graphvio.frontend.lucas_kanade import MIN_GRADIENT, Pyramid, build_pyramid, track
-from graphvio.frontend.matching import StereoMatcher
+from graphvio.frontend.matching import StereoMatcher, TwoCameras
 from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH, FirstSights, MotionHistory
 from graphvio.frontend.overlaps import View
 from graphvio.frontend.prediction import predict_pixels
@@ -154,6 +154,10 @@ class PairTracker:
         """Register the tracks on the newest frame's patches from now on."""
         if self._left:
             self._patches.take(self._last, self._left[0])
+
+    def slant_keyframe_patches(self, found: PairFrame, cameras: TwoCameras, is_slope_known: bool) -> None:
+        """Take depth and slant of the patches as another camera sees them, see `KeyframePatches.slant`."""
+        self._patches.slant(found, cameras, is_slope_known)
 
     def drop(self, ids: Int) -> None:
         """Drop tracks, so that new corners may take their place."""
