@@ -1,6 +1,7 @@
 """One pair's tracks, on images of a textured wall that faces the cameras: where each point goes is known."""
 
 from dataclasses import replace
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -51,12 +52,19 @@ def seen(points: Float, left_T_wall: Float) -> Float:
     return np.asarray(FOCAL * moved[:, :2] / moved[:, 2:] + [0.5 * WIDTH, 0.5 * HEIGHT])
 
 
+@lru_cache(64)
+def _texture(camera_T_wall: bytes) -> Float:
+    """The wall without noise, as most tests see it from the same poses."""
+    points = on_wall(np.column_stack([X.ravel(), Y.ravel()]), np.frombuffer(camera_T_wall).reshape(4, 4))
+    scale = FOCAL / DISTANCE  # one pixel of wall at the start
+    return waves(points[:, 0].reshape(X.shape) * scale, points[:, 1].reshape(X.shape) * scale)
+
+
 def view(camera_T_wall: Float, seed: int, noise: float) -> Image:
     """What a camera sees of the wall."""
-    points = on_wall(np.column_stack([X.ravel(), Y.ravel()]), camera_T_wall)
-    scale = FOCAL / DISTANCE  # one pixel of wall at the start
-    grey = waves(points[:, 0].reshape(X.shape) * scale, points[:, 1].reshape(X.shape) * scale)
-    return picture(grey + noise / 45.0 * np.random.default_rng(seed).standard_normal(X.shape))
+    return picture(
+        _texture(camera_T_wall.tobytes()) + noise / 45.0 * np.random.default_rng(seed).standard_normal(X.shape)
+    )
 
 
 def views(left_T_wall: Float, seed: int = 0, noise: float = 1.5) -> tuple[Image, Image]:

@@ -32,6 +32,8 @@ from graphvio.simulation import default_rig
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
+pytestmark = pytest.mark.heavy(25)
+
 IMU = Imu()
 CONFIG = Config()
 
@@ -42,6 +44,12 @@ def walk() -> SyntheticSession:
     return make_session(225.0, 1, IMU, 40, 0.3)
 
 
+@pytest.fixture(scope="module")
+def mixed(walk: SyntheticSession) -> Optimization:
+    """From all its closures."""
+    return optimized(walk, walk.closures)
+
+
 def ate_m(poses: Float, session: SyntheticSession) -> float:
     return evaluate(Trajectory(session.record.stamps_ns, poses), session.truth).ate_position_m.rmse
 
@@ -50,10 +58,10 @@ def optimized(session: SyntheticSession, closures: list[LoopClosure]) -> Optimiz
     return optimize([session.record], [IMU], closures, CONFIG)
 
 
-def test_optimize_false_closures_are_refused(walk: SyntheticSession) -> None:
+def test_optimize_false_closures_are_refused(walk: SyntheticSession, mixed: Optimization) -> None:
     """With 30 % false closures the error is within a tenth of that with the true ones alone."""
     right = walk.closures[: -walk.false]
-    clean, mixed, alone = optimized(walk, right), optimized(walk, walk.closures), optimized(walk, [])
+    clean, alone = optimized(walk, right), optimized(walk, [])
     assert ate_m(clean.sessions[0].nav_T_body, walk) < 0.5 * ate_m(alone.sessions[0].nav_T_body, walk)
     assert ate_m(alone.sessions[0].nav_T_body, walk) < ate_m(walk.record.online, walk)
     assert ate_m(mixed.sessions[0].nav_T_body, walk) < 1.1 * ate_m(clean.sessions[0].nav_T_body, walk)
@@ -73,11 +81,10 @@ def test_optimize_false_closures_in_agreement_are_refused(walk: SyntheticSession
     assert [bool(loop.refusal) for loop in found.loops] == [False] * len(right) + [True] * len(wrong)
 
 
-def test_marginals_poses_are_those_of_each_pose(walk: SyntheticSession) -> None:
-    found = optimized(walk, walk.closures)
-    assert any(not loop.refusal for loop in found.loops)
-    marginals = Marginals(found.graph, found.values)
-    together = marginals.poses(len(found.sessions[0].nodes.rows))
+def test_marginals_poses_are_those_of_each_pose(mixed: Optimization) -> None:
+    assert any(not loop.refusal for loop in mixed.loops)
+    marginals = Marginals(mixed.graph, mixed.values)
+    together = marginals.poses(len(mixed.sessions[0].nodes.rows))
     for k in range(0, len(together), 10):
         one = marginals.pose(k)
         np.testing.assert_allclose(together[k], one, rtol=0.0, atol=1e-6 * np.abs(one).max())
@@ -238,23 +245,23 @@ def test_own_motion_derivatives_are_numerical_ones() -> None:
     np.testing.assert_allclose(found, np.array(columns).T, atol=1e-6)
 
 
-def test_record_and_closures_files_are_lossless(walk: SyntheticSession, tmp_path: Path) -> None:
+def test_record_and_closures_files_are_lossless(walk: SyntheticSession, mixed: Optimization, tmp_path: Path) -> None:
     record, closures = tmp_path / "record.npz", tmp_path / "loops.npz"
     record.write_bytes(walk.record.to_bytes())
     closures.write_bytes(closures_to_bytes(walk.closures))
     again, loops = SessionRecord.load(record), load_closures(closures)
     assert again.to_bytes() == walk.record.to_bytes()
     assert closures_to_bytes(loops) == closures_to_bytes(walk.closures)
-    first, second = optimized(walk, walk.closures), optimize([again], [IMU], loops, CONFIG)
+    first, second = mixed, optimize([again], [IMU], loops, CONFIG)
     assert np.array_equal(first.sessions[0].nav_T_body, second.sessions[0].nav_T_body)
     record.write_bytes(record.read_bytes()[:-100])
     with pytest.raises(OptimizationError, match="is no record of a session"):
         SessionRecord.load(record)
 
 
-def test_write_g2o_optimum_is_that_of_full_graph(walk: SyntheticSession, tmp_path: Path) -> None:
+def test_write_g2o_optimum_is_that_of_full_graph(walk: SyntheticSession, mixed: Optimization, tmp_path: Path) -> None:
     """The pose graph's optimum is near that of the full graph, which has correlations by the IMU in addition."""
-    found = optimized(walk, walk.closures)
+    found = mixed
     write_g2o(found, tmp_path / "graph.g2o")
     graph, values = gtsam.readG2o(str(tmp_path / "graph.g2o"), True)
     nodes = found.sessions[0].nodes
