@@ -1,11 +1,13 @@
-"""The command as it is typed: in this process, where kernels are loaded already, or in one of its own."""
+"""Commands and programs as they are typed: in this process, where kernels are loaded already, or in one of its own."""
 
 from __future__ import annotations
 
 import io
+import runpy
 import subprocess
 import sys
 import traceback
+from collections.abc import Callable
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,15 +29,24 @@ class Ran:
 
 def graphvio(*arguments: object, folder: Path = Path()) -> Ran:
     """Run a command in a folder."""
-    out, err, code = io.StringIO(), io.StringIO(), 1
-    typed = ["graphvio", *map(str, arguments)]
+    return _ran(main, ["graphvio", *map(str, arguments)], folder)
+
+
+def python(file: Path, *arguments: object, folder: Path) -> Ran:
+    """Run a program of Python in a folder."""
+    return _ran(lambda: runpy.run_path(str(file), run_name="__main__"), [str(file), *map(str, arguments)], folder)
+
+
+def _ran(call: Callable[[], object], typed: list[str], folder: Path) -> Ran:
+    out, err, code = io.StringIO(), io.StringIO(), 0
     with redirect_stdout(out), redirect_stderr(err), chdir(folder), patch.object(sys, "argv", typed):
         try:
-            main()
+            call()
         except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
         except Exception:  # as the interpreter does
             traceback.print_exc()
+            code = 1
     return Ran(code, out.getvalue(), err.getvalue())
 
 

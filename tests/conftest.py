@@ -1,11 +1,14 @@
 """Fixtures that several test files share."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import matplotlib
 import pytest
 from hypothesis import settings
-from rendered import rendered_once
+from recordings import half_size_rig
+from rendered import copy_part, rendered_once
+from undrawn import undrawn
 
 from graphvio.simulation import simulate
 
@@ -17,11 +20,34 @@ settings.load_profile("graphvio")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files that take minutes come first, so that no process is left with one at the end."""
-    items.sort(key=lambda item: item.get_closest_marker("heavy") is None)
+    """The files that take longest come first, so that no process is left with one at the end."""
+    items.sort(key=lambda item: -sum(mark.args[0] for mark in item.iter_markers("heavy")))
+
+
+@pytest.fixture
+def without_plots() -> Iterator[None]:
+    """Results have empty plots."""
+    with undrawn():
+        yield
 
 
 @pytest.fixture(scope="session")
-def room_walk() -> Path:
-    """A simulated recording: 5 s in the room, the first of them at a standstill, both pairs and the IMU."""
-    return rendered_once("room", lambda out: simulate("room", out, duration_s=5.0, seed=3), 5.0, 3)
+def long_room_walk() -> Path:
+    """A simulated recording: 10 s in the room, the first of them at a standstill, both pairs of 320x240 and the IMU."""
+
+    def write(folder: Path) -> None:
+        simulate("room", folder, duration_s=10.0, rig=half_size_rig())
+
+    return rendered_once("room", write, "320x240", 10.0)
+
+
+@pytest.fixture(scope="session")
+def room_walk(long_room_walk: Path) -> Path:
+    """The first half of the recording."""
+    return rendered_once("room", lambda folder: copy_part(long_room_walk, folder, 5.0), "320x240", 5.0)
+
+
+@pytest.fixture(scope="session")
+def vga_walk() -> Path:
+    """The same five seconds with images of 640x480, the simulator's own, for claims on accuracy that depend on them."""
+    return rendered_once("room", lambda folder: simulate("room", folder, duration_s=5.0, seed=3), "640x480", 5.0)

@@ -40,3 +40,18 @@ def rendered_once(name: str, write: Callable[[Path], object], *options: object) 
             write(unfinished)
             unfinished.rename(folder)
     return folder
+
+
+def copy_part(whole: Path, folder: Path, duration_s: float) -> None:
+    """Copy the first seconds of a simulated recording, as if it had ended then, into a folder that does not exist."""
+    frames = [int(image.stem) for image in (whole / "mav0/cam0/data").iterdir()]
+    end_ns = min(frames) + round(duration_s * 1e9)
+
+    def later(path: str, names: list[str]) -> set[str]:
+        return {name for name in names if name.endswith(".png") and int(name[:-4]) >= end_ns}
+
+    shutil.copytree(whole, folder, ignore=later)
+    for table in (folder / "mav0").glob("*/data.csv"):
+        last_ns = end_ns - 1 if (table.parent / "data").is_dir() else end_ns  # an interval of samples is closed
+        header, *rows = table.read_text().splitlines()
+        table.write_text("\n".join([header, *(row for row in rows if int(row.split(",")[0]) <= last_ns), ""]))

@@ -20,6 +20,8 @@ from graphvio.rig_files import load_rig, save_rig
 from graphvio.simulation.calibration_error import CalibrationError, calibration_differences, draw
 from graphvio.simulation.default_rig import default_rig
 
+pytestmark = pytest.mark.heavy(20)
+
 KEPT, LEARNT, OTHER = "kept for the next run of simulator-room", "as learnt by the run of ", "is of another rig file"
 
 
@@ -42,9 +44,9 @@ def live(source: str, *arguments: object) -> Any:
     return done.output
 
 
-def test_live_begins_with_what_the_last_run_of_the_device_learnt(room_walk: Path, tmp_path: Path, folder: Path) -> None:
-    simulator = f"simulator:room?recording={room_walk}&seed=3&legs=1&speed=max"
-    true = load_rig(room_walk)
+def test_live_begins_with_what_the_last_run_of_the_device_learnt(vga_walk: Path, tmp_path: Path, folder: Path) -> None:
+    simulator = f"simulator:room?recording={vga_walk}&legs=1&speed=max"
+    true = load_rig(vga_walk)
     rig = wrong(tmp_path / "rig.yaml", true, 0)
     first = live(simulator, "--rig", rig)
     assert KEPT in first
@@ -55,7 +57,7 @@ def test_live_begins_with_what_the_last_run_of_the_device_learnt(room_walk: Path
         assert np.linalg.norm(after[name]) < 0.5 * np.linalg.norm(before[name]), name
     assert load_rig(memory).calibration_sigmas.stereo_rotation_deg < 0.5 * FACTORY.stereo_rotation_deg
 
-    second = live(simulator, "--rig", rig)
+    second = live(f"{simulator}&duration_s=1", "--rig", rig)
     assert second.count(LEARNT) == 1
     assert [path.name for path in folder.iterdir()] == [memory.name]
 
@@ -82,7 +84,7 @@ def test_live_keeps_nothing_of_recordings_and_where_the_calibration_is_not_estim
     rig = wrong(tmp_path / "rig.yaml", load_rig(room_walk), 0)
     assert "kept for the next run" not in live(f"replay:{room_walk}?speed=max&to_s=3", "--rig", rig)
     (tmp_path / "fixed.yaml").write_text("calibration: {online: false}\n")
-    simulator = f"simulator:room?recording={room_walk}&seed=3&duration_s=3&speed=max"
+    simulator = f"simulator:room?recording={room_walk}&duration_s=3&speed=max"
     assert KEPT not in live(simulator, "--rig", rig, "--config", tmp_path / "fixed.yaml")
     assert not folder.exists()
 

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import command_line
 import pytest
 from recordings import write_euroc
 from rich.console import Console
@@ -32,6 +33,8 @@ from graphvio.sessions.store import open_store
 
 pytest.importorskip("mcap")
 pytest.importorskip("prometheus_client")
+
+pytestmark = pytest.mark.heavy(20)
 
 SOON_S = 100.0  # only a test that fails takes so long
 MAIN = """
@@ -63,7 +66,7 @@ def live(*arguments: object) -> Any:
 
 def refused(*arguments: object) -> str:
     """Return the one line that `graphvio.cli.main` prints with exit code 2."""
-    done = subprocess.run(graphvio("live", *arguments), capture_output=True, text=True, timeout=SOON_S)
+    done = command_line.graphvio("live", *arguments)
     assert done.returncode == 2, (done.stdout, done.stderr)
     (line,) = done.stderr.splitlines()
     assert line.startswith("graphvio: ")

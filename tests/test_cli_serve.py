@@ -61,7 +61,7 @@ def test_serve_sends_keyframes_and_takes_a_correction(room_walk: Path) -> None:
         process.kill()
     assert [each.id for each in keyframes] == list(range(len(keyframes)))
     assert len(keyframes) > 3
-    assert keyframes[0].images[0][0].shape == (480, 640)
+    assert keyframes[0].images[0][0].shape == (240, 320)
     assert results[0].accepted
     assert results[0].map_T_odom is not None
     np.testing.assert_allclose(results[0].map_T_odom, map_T_odom, atol=1e-9)

@@ -25,7 +25,7 @@ from graphvio.geometry import se3_inverse
 pytest.importorskip("pycolmap")
 pytest.importorskip("grpc")
 pytest.importorskip("cyclonedds")
-pytestmark = pytest.mark.heavy
+pytestmark = pytest.mark.heavy(40)
 
 SOON_S = 200.0
 
@@ -42,7 +42,7 @@ def made(room_walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("slam") / "map"
     web = free_options()
     shown = ("--save-rrd", out.parent / "shown.rrd", "--web", web.port)
-    done = slam(f"replay:{room_walk}?speed=0.5", "--out", out, *shown, "--health-port", 0, "--ros2", free_domain())
+    done = slam(f"replay:{room_walk}?speed=1", "--out", out, *shown, "--health-port", 0, "--ros2", free_domain())
     assert done.returncode == 0, done.stderr
     assert f"browser: {web.url}" in done.stderr.splitlines()
     assert "health: http://127.0.0.1:" in done.stderr
@@ -63,7 +63,7 @@ def test_slam_makes_a_map_with_the_odometrys_path(made: Path, room_walk: Path) -
 
 def test_slam_localises_in_a_saved_map(made: Path, room_walk: Path, tmp_path: Path) -> None:
     """From the middle of the walk, where the new odom frame has nothing to do with the map's."""
-    done = slam(f"{room_walk}?from_s=1.5&speed=0.3", "--map", made, "--out", tmp_path / "again")
+    done = slam(f"{room_walk}?from_s=1.5&speed=0.6", "--map", made, "--out", tmp_path / "again")
     assert done.returncode == 0, done.stderr
     online = load_trajectory(tmp_path / "again/online.txt")
     before, known = load_trajectory(made / "odometry.txt").at(online.stamps_ns, 0.1)
@@ -135,7 +135,7 @@ def slam_of(process: subprocess.Popen[str]) -> int | None:
 def test_slam_killed_leaves_the_odometry_running(room_walk: Path, tmp_path: Path) -> None:
     out, temporary = tmp_path / "map", tmp_path / "temporary"
     web, to_s = free_options(), 3.0
-    spec = f"replay:{room_walk}?speed=0.5&to_s={to_s}"
+    spec = f"replay:{room_walk}?speed=1&to_s={to_s}"
     with running(_MAIN, temporary, spec, "--out", out, "--web", web.port) as process:
         assert process.stderr is not None
         next(line for line in process.stderr if line.startswith("tracking"))
@@ -156,7 +156,7 @@ def test_slam_killed_leaves_the_odometry_running(room_walk: Path, tmp_path: Path
 
 def test_slam_failing_source_saves_the_map(room_walk: Path, tmp_path: Path) -> None:
     out, temporary = tmp_path / "map", tmp_path / "temporary"
-    with running(_FAILING, temporary, f"replay:{room_walk}?speed=0.5", "--out", out) as process:
+    with running(_FAILING, temporary, f"replay:{room_walk}?speed=1", "--out", out) as process:
         _, errors = process.communicate(timeout=SOON_S)
         assert process.returncode == 2, errors
     assert errors.splitlines()[-1] == "graphvio: the device is broken"
@@ -185,7 +185,7 @@ def test_slam_ctrl_c_at_initialisation_ends_both_silently(room_walk: Path, tmp_p
 def test_slam_signal_to_both_processes_saves_the_map(room_walk: Path, tmp_path: Path) -> None:
     """Service managers send signals so."""
     out = tmp_path / "map"
-    with running(_MAIN, tmp_path / "temporary", f"replay:{room_walk}?speed=0.5", "--out", out) as process:
+    with running(_MAIN, tmp_path / "temporary", f"replay:{room_walk}?speed=1", "--out", out) as process:
         assert process.stderr is not None
         for line in process.stderr:
             if line.startswith("tracking"):

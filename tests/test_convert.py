@@ -13,6 +13,7 @@ import pytest
 from recordings import frame_stamps, small_rig, write_euroc, write_kitti_odometry, write_rows
 from test_sessions import same
 from typer.testing import CliRunner
+from undrawn import undrawn
 
 from graphvio import FrameSet, Odometry, Rig, load_rig, open_source, save_rig
 from graphvio.cli import app
@@ -29,6 +30,8 @@ from graphvio.trajectory_files import load_trajectory, tum_line
 
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
+
+pytestmark = pytest.mark.heavy(30)
 
 CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 CLIP_PIECE = ("--to", "6")
@@ -201,6 +204,7 @@ def test_odometry_is_equal_on_all_formats(kind: str, room_walk: Path, expected: 
     assert trajectory(converted(room_walk, out_of(kind, tmp_path), "--to", str(PIECE_S))) == expected
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_run_is_evaluated_with_the_truth_in_a_session(room_walk: Path, tmp_path: Path) -> None:
     session = converted(room_walk, tmp_path / "room.mcap", "--to", str(PIECE_S))
     figures = []
@@ -308,7 +312,8 @@ def trajectory_of_the_clip(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 def trajectory_of(source: Path, out: Path, *options: str) -> bytes:
-    done = CliRunner().invoke(app, ["run", str(source), "--out", str(out), *options])
+    with undrawn():
+        done = CliRunner().invoke(app, ["run", str(source), "--out", str(out), *options])
     assert done.exit_code == 0, done.output
     return (out / "trajectory.txt").read_bytes()
 

@@ -1,11 +1,10 @@
 """What README and docs claim of code is executed or compared here."""
 
 import re
-import subprocess
-import sys
 from dataclasses import fields
 from pathlib import Path
 
+import command_line
 import generate_pages
 import plot_layers
 import pytest
@@ -17,6 +16,8 @@ from graphvio.config import Config, profiles
 from graphvio.measurements.events import EventKind
 from graphvio.rig_files import load_rig
 
+pytestmark = pytest.mark.heavy(25)
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 SELF_CALIBRATION = (ROOT / "docs/how-to/self-calibration.md").read_text()
@@ -27,7 +28,8 @@ def test_the_readmes_python_runs_as_typed(room_walk: Path, tmp_path: Path) -> No
     assert len(blocks) == 1
     (tmp_path / "recording").symlink_to(room_walk)
     (tmp_path / "rig.yaml").write_text((room_walk / "rig.yaml").read_text())
-    done = subprocess.run([sys.executable, "-c", blocks[0]], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    (tmp_path / "typed.py").write_text(blocks[0])
+    done = command_line.python(tmp_path / "typed.py", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("tracking") == 100
 
@@ -42,7 +44,8 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_python_of_self_calibration_runs_as_typed(walk: Path) -> None:
     (block,) = re.findall(r"```python\n(.*?)```", SELF_CALIBRATION, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", block], cwd=walk, capture_output=True, text=True, timeout=300)
+    (walk / "typed.py").write_text(block)
+    done = command_line.python(walk / "typed.py", folder=walk)
     assert done.returncode == 0, done.stderr
     assert "pair back, rotation against front: " in done.stdout
     assert "CalibrationSigmas(focal_share=" in done.stdout
@@ -54,8 +57,7 @@ def test_the_commands_of_self_calibration_run_as_typed(walk: Path) -> None:
     assert len(lines) == 3
     for line in lines:
         arguments = line.replace("RECORDING", "recording").split()
-        command = [sys.executable, "-c", "from graphvio.cli import main; main()", *arguments]
-        done = subprocess.run(command, cwd=walk, capture_output=True, text=True, timeout=300, check=False)
+        done = command_line.graphvio(*arguments, folder=walk)
         assert done.returncode == 0, done.stderr
     for name in ("walk/calibration.png", "again/rig-refined.yaml", "rig-calibrated.yaml", "calibration/report.html"):
         assert (walk / name).exists(), name

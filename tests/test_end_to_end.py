@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +14,23 @@ import numpy as np
 import pytest
 from command_line import Ran, graphvio, graphvio_alone
 from recordings import REAL_DATA
+from undrawn import undrawn
 
 from graphvio import FrameSet, load_rig, open_source
 from graphvio.trajectory_files import load_trajectory
 
-pytestmark = pytest.mark.heavy
+pytestmark = pytest.mark.heavy(40)
 
 CLIP = REAL_DATA / "euroc_mh01_clip"
 needs_clip = pytest.mark.skipif(not CLIP.is_dir(), reason=f"the real recording {CLIP.name} is not next to the project")
 
 
-def run(source: Path, out: Path, *options: object, command: Callable[..., Ran] = graphvio) -> dict[str, Any]:
+def run(
+    source: Path, out: Path, *options: object, command: Callable[..., Ran] = graphvio, plots: bool = False
+) -> dict[str, Any]:
     """Run, expect success, and return the summary."""
-    done = command("run", source, "--out", out, *options)
+    with nullcontext() if plots else undrawn():
+        done = command("run", source, "--out", out, *options)
     assert done.returncode == 0, done.stderr
     summary: dict[str, Any] = json.loads((out / "summary.json").read_text())
     return summary
@@ -92,7 +97,7 @@ def assert_gravity_and_gyro_bias_are_found(out: Path) -> None:
 
 
 def test_run_is_complete_accurate_and_repeatable(room_walk: Path, tmp_path: Path) -> None:
-    summary = run(room_walk, tmp_path / "a")
+    summary = run(room_walk, tmp_path / "a", plots=True)
     run(room_walk, tmp_path / "b", command=graphvio_alone)
     for name in ("trajectory.txt", "pairs.csv"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
@@ -103,6 +108,8 @@ def test_run_is_complete_accurate_and_repeatable(room_walk: Path, tmp_path: Path
         "calibration.csv", "calibration.png", "rig-refined.yaml",
     }  # fmt: skip
     assert load_rig(tmp_path / "a/rig-refined.yaml").pairs[0].name == load_rig(tmp_path / "a/rig.yaml").pairs[0].name
+    for plot in ("trajectory.png", "calibration.png"):
+        assert (tmp_path / "a" / plot).stat().st_size > 1000
     assert summary["completion"] == 1.0
     assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.01
     assert {"predict", "track", "stereo", "motion", "update"} <= set(summary["stage_ms"])
@@ -113,6 +120,14 @@ def test_run_is_complete_accurate_and_repeatable(room_walk: Path, tmp_path: Path
     for medians in summary["pair_medians"].values():
         assert medians["inliers"] > 50
         assert 0.0 < medians["own_rms_px"] <= 1.05 * medians["rms_px"] < 1.0
+
+
+def test_run_of_vga_images_is_accurate(vga_walk: Path, tmp_path: Path) -> None:
+    """The simulator's own rig; other recordings have images of half its size."""
+    summary = run(vga_walk, tmp_path / "out")
+    assert load_rig(tmp_path / "out/rig.yaml").cameras[0].size_px == (640, 480)
+    assert summary["status"] == {"tracking": 100}
+    assert summary["evaluation"]["ate_position_m"]["rmse"] < 0.01
 
 
 @pytest.mark.parametrize("pair", [0, 1])
@@ -195,7 +210,7 @@ def test_run_with_grey_images_exits_with_3(room_walk: Path, tmp_path: Path) -> N
 
 
 def _grey_png() -> bytes:
-    return cv2.imencode(".png", np.full((480, 640), 128, dtype=np.uint8))[1].tobytes()
+    return cv2.imencode(".png", np.full((240, 320), 128, dtype=np.uint8))[1].tobytes()
 
 
 def test_run_with_unreadable_truth_has_no_evaluation(room_walk: Path, tmp_path: Path) -> None:
@@ -263,8 +278,8 @@ def test_run_saves_viewer_recording_in_results(room_walk: Path, tmp_path: Path) 
 
 def test_run_that_cannot_start_leaves_no_folder(room_walk: Path, tmp_path: Path) -> None:
     other = copy_of(room_walk, tmp_path / "other")
-    (other / "rig.yaml").write_text((other / "rig.yaml").read_text().replace("[640, 480]", "[752, 480]"))
-    assert "image is 640x480, the rig says 752x480" in refused(graphvio("run", other, "--out", tmp_path / "out"))
+    (other / "rig.yaml").write_text((other / "rig.yaml").read_text().replace("[320, 240]", "[752, 480]"))
+    assert "image is 320x240, the rig says 752x480" in refused(graphvio("run", other, "--out", tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
@@ -306,6 +321,7 @@ def test_run_verbose_shows_traceback(tmp_path: Path) -> None:
     assert "Traceback" in done.stderr
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_run_without_out_numbers_folders(room_walk: Path, tmp_path: Path) -> None:
     for number in (1, 2):
         done = graphvio("run", room_walk, "--to", 0.5, folder=tmp_path)

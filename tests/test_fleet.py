@@ -28,11 +28,12 @@ from graphvio.fleet.listing import Listed, list_sessions
 from graphvio.fleet.run import FleetProgress, optimize_fleet
 from graphvio.fleet.storage import Storage
 from graphvio.fleet.table import COLUMNS, Outcome
+from graphvio.optimization.loops.sift import SiftExtractor
 from graphvio.optimization.pipeline import optimize_sessions
 from graphvio.sources import open_source
 from graphvio.warmup import warm_up
 
-pytestmark = pytest.mark.heavy
+pytestmark = pytest.mark.heavy(65)
 
 
 SESSIONS, FRAMES, CORRUPT = 20, 18, "walk-07"
@@ -87,11 +88,16 @@ def config(folder: Path) -> Config:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    undrawn = str(Path(__file__).with_name("undrawn.py"))
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", preload=[undrawn]
-    ) as made:
+    with local_cluster() as made:
         yield made
+
+
+def local_cluster() -> Any:
+    """Two workers, whose short runs would mostly plot."""
+    preload = [str(Path(__file__).with_name("undrawn.py"))]
+    return LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0", preload=preload
+    )
 
 
 class Killer:
@@ -138,6 +144,7 @@ def done(folder: Path, config: Config, cluster: Any) -> Done:
     return Done(out, outcomes, killer)
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_fleet_killed_worker_leaves_equal_results(
     done: Done, folder: Path, config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -145,8 +152,8 @@ def test_fleet_killed_worker_leaves_equal_results(
     assert done.killer.pid != done.killer.cluster.workers[0].pid
     assert [each.name for each in done.outcomes] == [f"walk-{number:02d}" for number in range(SESSIONS)]
     assert [each.name for each in done.outcomes if each.error] == [CORRUPT]
-    for drawing in ("graphvio.results.writer.plot_run", "graphvio.optimization.pipeline.write_report"):
-        monkeypatch.setattr(drawing, lambda *_, **__: None)  # most of the time
+    monkeypatch.setattr("graphvio.optimization.pipeline.write_report", lambda *_, **__: None)
+    monkeypatch.setattr("graphvio.optimization.loops.features.SiftProcess", SiftExtractor)  # features are the same
     parts, loops = set(), 0
     for each in done.outcomes:
         if each.error:
@@ -236,6 +243,7 @@ def test_fleet_other_input_is_refused(folder: Path, tmp_path: Path) -> None:
     assert "holds results of other input (different: loops)" in other.output
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_fleet_remote_storage_has_equal_results(
     done: Done, folder: Path, config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,9 +11,8 @@ pytest.importorskip("s3fs", reason="s3fs is not installed: the extra s3")
 pytest.importorskip("moto.server")
 
 from calibration_walks import recorded
-from distributed import LocalCluster
 from moto.server import ThreadedMotoServer
-from test_fleet import CONFIG, Killer
+from test_fleet import CONFIG, Killer, local_cluster
 from typer.testing import CliRunner
 
 from graphvio.cli import app
@@ -25,7 +24,7 @@ from graphvio.fleet.storage import Storage, file_system
 from graphvio.fleet.tasks import Reading
 from graphvio.rig_files import load_rig
 
-pytestmark = pytest.mark.heavy
+pytestmark = pytest.mark.heavy(30)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +62,7 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_fleet_in_s3_survives_a_killed_worker(recordings: str, config: Path, tmp_path: Path) -> None:
     listed = list_sessions(recordings)
     assert [each.name for each in listed] == ["one", "two"]
-    with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0") as cluster:
+    with local_cluster() as cluster:
         killer = Killer(cluster, after=1)
         outcomes = optimize_fleet(
             listed, "s3://fleet/results", Config.load(config), scheduler=cluster.scheduler_address, on_progress=killer,

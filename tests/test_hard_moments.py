@@ -22,6 +22,8 @@ from graphvio.measurements.sensors import Measurement
 from graphvio.rig import Rig
 from graphvio.trajectory_files import load_trajectory
 
+pytestmark = pytest.mark.heavy(20)
+
 Change = Callable[[float, FrameSet], FrameSet]
 """Takes seconds since the first frameset, and a frameset."""
 
@@ -117,8 +119,8 @@ class Walk:
 
 
 @pytest.fixture(scope="module")
-def measurements(room_walk: Path) -> list[Measurement]:
-    return list(open_source(room_walk))
+def measurements(vga_walk: Path) -> list[Measurement]:
+    return list(open_source(vga_walk))
 
 
 def as_it_is(_: float, frameset: FrameSet) -> FrameSet:
@@ -156,8 +158,8 @@ def noise_like(image: Image, level: float, seed: int) -> Image:
     return np.asarray(np.random.default_rng(seed).normal(level, 2.0, image.shape).clip(0, 255), dtype=np.uint8)
 
 
-def test_the_walk_as_it_is(room_walk: Path, measurements: list[Measurement]) -> None:
-    walk = Walk(room_walk, measurements, as_it_is)
+def test_the_walk_as_it_is(vga_walk: Path, measurements: list[Measurement]) -> None:
+    walk = Walk(vga_walk, measurements, as_it_is)
     assert walk.end_error_m < 0.004
     assert walk.worst < 45.0
     assert walk.kinds() <= {"vision_weak"}
@@ -170,19 +172,19 @@ def test_the_walk_as_it_is(room_walk: Path, measurements: list[Measurement]) -> 
     assert np.mean(stationary[6:19]) > 0.9  # the first second, of which a quarter goes by before it can be detected
     assert not any(stationary[:5])
     assert not any(stationary[40:])  # and then it has begun to walk
-    again = Walk(room_walk, measurements, as_it_is)
+    again = Walk(vga_walk, measurements, as_it_is)
     for one, other in zip(walk.estimates, again.estimates, strict=True):
         assert np.array_equal(one.nav_T_body, other.nav_T_body)  # type: ignore[arg-type]
         assert np.array_equal(one.covariance, other.covariance)  # type: ignore[arg-type]
 
 
-def test_error_of_p12_is_reported_and_corrected(room_walk: Path, measurements: list[Measurement]) -> None:
+def test_error_of_p12_is_reported_and_corrected(vga_walk: Path, measurements: list[Measurement]) -> None:
     """1 degree and 3 cm: over each second the two pairs stay better than the better one of them.
 
     The ATE of so short a walk, half a millimetre, is partly luck: it stays below a multiple of the better pair's.
     """
-    rig = open_source(room_walk).rig.without_imu()
-    walk = Walk(room_walk, measurements, as_it_is, rig=with_wrong_place(rig, 1.0, 0.03))
+    rig = open_source(vga_walk).rig.without_imu()
+    walk = Walk(vga_walk, measurements, as_it_is, rig=with_wrong_place(rig, 1.0, 0.03))
     reported = [event for event in walk.events if event.kind == "extrinsics_off"]
     assert len(reported) == 1
     assert "pair back" in reported[0].detail
@@ -194,8 +196,8 @@ def test_error_of_p12_is_reported_and_corrected(room_walk: Path, measurements: l
     def only(pair: int) -> Change:
         return lambda _, frameset: replace(frameset, images={0: frameset.images[pair]})
 
-    alone = [Walk(room_walk, measurements, only(pair), rig=rig.with_pairs([pair])) for pair in (0, 1)]
-    exact = Walk(room_walk, measurements, as_it_is)
+    alone = [Walk(vga_walk, measurements, only(pair), rig=rig.with_pairs([pair])) for pair in (0, 1)]
+    exact = Walk(vga_walk, measurements, as_it_is)
     assert exact.error_over_1s_m < 0.6 * min(single.error_over_1s_m for single in alone)
     assert exact.ate_m < 1.05 * min(single.ate_m for single in alone)
     assert walk.error_over_1s_m < 1.05 * min(single.error_over_1s_m for single in alone)
@@ -205,7 +207,7 @@ def test_error_of_p12_is_reported_and_corrected(room_walk: Path, measurements: l
 
 
 def test_all_that_stereo_matching_threw_out_is_reported(
-    room_walk: Path, measurements: list[Measurement], monkeypatch: pytest.MonkeyPatch
+    vga_walk: Path, measurements: list[Measurement], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also of the search for new corners, when the reference changes."""
     thrown_out: Counter[str] = Counter()
@@ -217,7 +219,7 @@ def test_all_that_stereo_matching_threw_out_is_reported(
         return matches
 
     monkeypatch.setattr(StereoMatcher, "match", counted)
-    walk = Walk(room_walk, measurements, as_it_is)
+    walk = Walk(vga_walk, measurements, as_it_is)
     reported: Counter[str] = Counter()
     for estimate in walk.estimates:
         for report in estimate.pairs.values():
@@ -227,26 +229,26 @@ def test_all_that_stereo_matching_threw_out_is_reported(
 
 
 @pytest.mark.parametrize("pair", [0, 1])
-def test_a_blinded_pair_breaks_nothing(room_walk: Path, measurements: list[Measurement], pair: int) -> None:
+def test_a_blinded_pair_breaks_nothing(vga_walk: Path, measurements: list[Measurement], pair: int) -> None:
     """For 2 s, which is what the walk has room for; the benchmark of faults blinds pairs for 5 s."""
     numbers = iter(range(1000))
-    walk = Walk(room_walk, measurements, altered(pair, lambda image: noise_like(image, 3.0, next(numbers))))
+    walk = Walk(vga_walk, measurements, altered(pair, lambda image: noise_like(image, 3.0, next(numbers))))
     assert all(estimate.status is Status.TRACKING for estimate in walk.estimates[1:])
     assert walk.end_error_m < 0.012
     assert walk.worst < 45.0
 
 
 @pytest.mark.parametrize("pair", [0, 1])
-def test_a_frozen_pair_is_left_out(room_walk: Path, measurements: list[Measurement], pair: int) -> None:
-    walk = Walk(room_walk, measurements, frozen((pair,), 4.0))
+def test_a_frozen_pair_is_left_out(vga_walk: Path, measurements: list[Measurement], pair: int) -> None:
+    walk = Walk(vga_walk, measurements, frozen((pair,), 4.0))
     assert walk.end_error_m < 0.02
     assert walk.worst < 45.0
     left_out = [result for result in walk.results if pair not in result.pairs]
     assert len(left_out) == 39  # the first of forty is new
 
 
-def test_all_frozen_is_never_sure(room_walk: Path, measurements: list[Measurement]) -> None:
-    walk = Walk(room_walk, measurements, frozen((0, 1), 2.5))
+def test_all_frozen_is_never_sure(vga_walk: Path, measurements: list[Measurement]) -> None:
+    walk = Walk(vga_walk, measurements, frozen((0, 1), 2.5))
     during = [result for result in walk.results if "repeats" in result.reason]
     assert len(during) == 9
     assert all(result.quality is Quality.WEAK for result in during)
@@ -255,10 +257,10 @@ def test_all_frozen_is_never_sure(room_walk: Path, measurements: list[Measuremen
 
 @pytest.mark.parametrize("reference", ["keyframe", "previous"])
 def test_what_is_measured_after_a_freeze_is_measured_from_before_it(
-    room_walk: Path, measurements: list[Measurement], reference: Literal["keyframe", "previous"]
+    vga_walk: Path, measurements: list[Measurement], reference: Literal["keyframe", "previous"]
 ) -> None:
     config = replace(Config(), motion=replace(Config().motion, reference=reference))
-    walk = Walk(room_walk, measurements, frozen((0, 1), 2.3), config=config)
+    walk = Walk(vga_walk, measurements, frozen((0, 1), 2.3), config=config)
     assert walk.worst < 60.0  # one in 10,000,000; from frame to frame the covariances have longer tails
     frozen_ns = {e.stamp_ns for e in walk.estimates if "repeats" in e.vision_reason}
     assert len(frozen_ns) == 5
@@ -267,7 +269,7 @@ def test_what_is_measured_after_a_freeze_is_measured_from_before_it(
 
 
 @pytest.mark.parametrize("pair", [0, 1])
-def test_a_pair_that_comes_back_interrupts_nothing(room_walk: Path, measurements: list[Measurement], pair: int) -> None:
+def test_a_pair_that_comes_back_interrupts_nothing(vga_walk: Path, measurements: list[Measurement], pair: int) -> None:
     """Be it the first or the second: what stayed in view counts, not what the pair saw before it went."""
 
     def without(seconds: float, frameset: FrameSet) -> FrameSet:
@@ -275,7 +277,7 @@ def test_a_pair_that_comes_back_interrupts_nothing(room_walk: Path, measurements
             return frameset
         return replace(frameset, images={j: both for j, both in frameset.images.items() if j != pair})
 
-    walk = Walk(room_walk, measurements, without)
+    walk = Walk(vga_walk, measurements, without)
     assert all(result.motion is not None for result in walk.results[1:])
     assert {len(result.pairs) for result in walk.results} == {1, 2}
     assert all(result.pairs[pair].inliers > 40 for result in walk.results[-10:])
@@ -283,35 +285,35 @@ def test_a_pair_that_comes_back_interrupts_nothing(room_walk: Path, measurements
     assert walk.end_error_m < 0.006
 
 
-def test_left_and_right_swapped(room_walk: Path, measurements: list[Measurement]) -> None:
+def test_left_and_right_swapped(vga_walk: Path, measurements: list[Measurement]) -> None:
     def swap(seconds: float, frameset: FrameSet) -> FrameSet:
         if not 2.0 <= seconds < 4.0:
             return frameset
         left, right = frameset.images[0]
         return replace(frameset, images={**frameset.images, 0: (right, left)})
 
-    walk = Walk(room_walk, measurements, swap)
+    walk = Walk(vga_walk, measurements, swap)
     assert walk.end_error_m < 0.012
     assert all(estimate.status is Status.TRACKING for estimate in walk.estimates[1:])
 
 
-def test_exposure_that_jumps(room_walk: Path, measurements: list[Measurement]) -> None:
+def test_exposure_that_jumps(vga_walk: Path, measurements: list[Measurement]) -> None:
     numbers = iter(range(1000))
 
     def dim(image: Image) -> Image:
         gain = (1.0, 0.6)[(next(numbers) // 2) % 2]
         return np.asarray((gain * image).clip(0, 255), dtype=np.uint8)
 
-    walk = Walk(room_walk, measurements, altered(0, dim))
+    walk = Walk(vga_walk, measurements, altered(0, dim))
     assert walk.end_error_m < 0.012
     assert all(estimate.status is Status.TRACKING for estimate in walk.estimates[1:])
 
 
-def test_a_poster_that_is_carried_across_one_view(room_walk: Path, measurements: list[Measurement]) -> None:
+def test_a_poster_that_is_carried_across_one_view(vga_walk: Path, measurements: list[Measurement]) -> None:
     """A textured plane, 1 m away, fills the first pair's view and moves: its motion is not the rig's."""
     noise = np.random.default_rng(5).integers(0, 256, (480, 2000), dtype=np.uint8)
     poster = np.asarray(cv2.equalizeHist(cv2.GaussianBlur(noise, (0, 0), 3)), dtype=np.uint8)
-    pair = open_source(room_walk).rig.pairs[0]
+    pair = open_source(vga_walk).rig.pairs[0]
     disparity = round(pair.left.focal_px * pair.baseline_m / 1.0)
 
     def carry(seconds: float, frameset: FrameSet) -> FrameSet:
@@ -321,6 +323,6 @@ def test_a_poster_that_is_carried_across_one_view(room_walk: Path, measurements:
         left, right = (np.ascontiguousarray(poster[:, at + shift : at + shift + 640]) for shift in (0, disparity))
         return replace(frameset, images={**frameset.images, 0: (left, right)})
 
-    walk = Walk(room_walk, measurements, carry)
+    walk = Walk(vga_walk, measurements, carry)
     assert walk.worst < 45.0
     assert walk.end_error_m < 0.02

@@ -9,8 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from recordings import half_size_rig, noise_image, small_rig, write_euroc, write_image
-from rendered import rendered_once
+from recordings import noise_image, small_rig, write_euroc, write_image
 
 from graphvio import FrameSet, Odometry, RigError, Trajectory, load_trajectory, open_source
 from graphvio.arrays import AnyArray, Bool, Float, Image
@@ -22,18 +21,7 @@ from graphvio.measurements.sensors import Measurement
 from graphvio.sessions.euroc_writer import EurocWriter
 from graphvio.sessions.topics import ImageFormat
 from graphvio.sessions.writer import SessionWriter
-from graphvio.simulation import Simulator, build_scene, write_recording
 from graphvio.sources import Source
-
-DURATION_S = 5.0
-
-
-@pytest.fixture(scope="module")
-def walk() -> Path:
-    def write(folder: Path) -> None:
-        write_recording(Simulator(build_scene("room", DURATION_S), half_size_rig(), 2), folder)
-
-    return rendered_once("room-masks", write, "320x240", DURATION_S)
 
 
 def estimates_of(walk: Path, image_mask: ImageMask | None, frames: int | None = None) -> Iterator[Estimate]:
@@ -52,10 +40,9 @@ def person(image: Image) -> Bool:
     return mask
 
 
-@pytest.mark.heavy
-def test_masked_pixels_hold_no_tracks(walk: Path) -> None:
+def test_masked_pixels_hold_no_tracks(room_walk: Path) -> None:
     masks: dict[int, dict[str, Bool]] = {}
-    source = open_source(walk)
+    source = open_source(room_walk)
     odometry = Odometry(source.rig, image_mask=lambda camera, image: person(image))
     for measurement in itertools.islice(source, 400):
         if isinstance(measurement, FrameSet):
@@ -71,18 +58,17 @@ def test_masked_pixels_hold_no_tracks(walk: Path) -> None:
             assert len(columns) > 20
 
 
-@pytest.mark.heavy
-def test_a_mask_over_a_third_of_each_image_costs_little_accuracy(walk: Path) -> None:
+def test_a_mask_over_a_third_of_each_image_costs_little_accuracy(room_walk: Path) -> None:
     def standing(camera: str, image: Image) -> Bool:
         mask = np.ones(image.shape, dtype=bool)
         mask[:, image.shape[1] // 3 : 2 * image.shape[1] // 3] = False
         return mask
 
-    truth_file = open_source(walk).truth
+    truth_file = open_source(room_walk).truth
     assert truth_file is not None
     ates_m = []
     for image_mask in (None, standing):
-        posed = [e for e in estimates_of(walk, image_mask) if e.nav_T_body is not None]
+        posed = [e for e in estimates_of(room_walk, image_mask) if e.nav_T_body is not None]
         poses: Float = np.array([e.nav_T_body for e in posed])
         estimated = Trajectory(np.array([e.stamp_ns for e in posed], dtype=np.int64), poses)
         ates_m.append(evaluate(estimated, load_trajectory(truth_file)).ate_position_m.rmse)
@@ -90,20 +76,20 @@ def test_a_mask_over_a_third_of_each_image_costs_little_accuracy(walk: Path) -> 
     assert ates_m[1] < 0.003
 
 
-def test_none_is_no_mask(walk: Path) -> None:
+def test_none_is_no_mask(room_walk: Path) -> None:
     without, with_none = (
-        [e.nav_T_body for e in estimates_of(walk, mask, 20)] for mask in (None, lambda camera, image: None)
+        [e.nav_T_body for e in estimates_of(room_walk, mask, 20)] for mask in (None, lambda camera, image: None)
     )
     for one, other in zip(without, with_none, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_mask_of_another_size_names_the_camera(walk: Path) -> None:
+def test_a_mask_of_another_size_names_the_camera(room_walk: Path) -> None:
     def wrong(camera: str, image: Image) -> AnyArray:
         return np.ones((10, 10), dtype=np.uint8)
 
     with pytest.raises(RigError, match=r"camera cam\d: the mask of an image has shape \(10, 10\); it must be"):
-        list(estimates_of(walk, wrong, 2))
+        list(estimates_of(room_walk, wrong, 2))
 
 
 def masked_euroc(path: Path, frames: int = 6) -> Path:
@@ -174,17 +160,17 @@ def test_masks_of_a_named_topic(tmp_path: Path) -> None:
     np.testing.assert_array_equal(masks[1], masks[0])
 
 
-def test_masks_from_files_act_as_those_of_a_function(walk: Path, tmp_path: Path) -> None:
-    (tmp_path / "rig.yaml").symlink_to(walk / "rig.yaml")
-    for sensor in (walk / "mav0").iterdir():
+def test_masks_from_files_act_as_those_of_a_function(room_walk: Path, tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").symlink_to(room_walk / "rig.yaml")
+    for sensor in (room_walk / "mav0").iterdir():
         if sensor.is_dir():
             (tmp_path / "mav0" / sensor.name).mkdir(parents=True)
             for entry in sensor.iterdir():
                 (tmp_path / "mav0" / sensor.name / entry.name).symlink_to(entry)
-    for image in (f for n in range(4) for f in sorted((walk / "mav0" / f"cam{n}" / "data").iterdir())[:12]):
+    for image in (f for n in range(4) for f in sorted((room_walk / "mav0" / f"cam{n}" / "data").iterdir())[:12]):
         mask = person(np.asarray(cv2.imread(str(image), cv2.IMREAD_GRAYSCALE), dtype=np.uint8))
         write_image(tmp_path / "mav0" / image.parent.parent.name / "masks" / image.name, mask.astype(np.uint8))
-    by_function = list(estimates_of(walk, lambda camera, image: person(image), 10))
+    by_function = list(estimates_of(room_walk, lambda camera, image: person(image), 10))
     from_files = list(estimates_of(tmp_path, None, 10))
     for one, other in zip(by_function, from_files, strict=True):
         np.testing.assert_array_equal(one.nav_T_body, other.nav_T_body)

@@ -21,6 +21,8 @@ from graphvio.geometry import se3, so3_exp
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory, save_trajectory
 
+pytestmark = pytest.mark.heavy(25)
+
 WITHOUT = {"view"}  # opens a window
 
 
@@ -118,6 +120,7 @@ NEEDS = {"serve": "grpc", "slam": "grpc", "record": "mcap"}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.usefixtures("without_plots")
 def test_every_command_prints_one_document(command: str, walk: Path, results: Path, tmp_path: Path) -> None:
     if command in NEEDS:
         pytest.importorskip(NEEDS[command])

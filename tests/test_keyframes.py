@@ -29,6 +29,8 @@ from graphvio.slam.map_frame import MapFrame
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
+pytestmark = pytest.mark.heavy(40)
+
 SOON_S = 30.0  # until then a thread is waited for; only a test that fails takes so long
 TIGHT = np.diag(np.repeat([1e-3, 1e-2], 3) ** 2)
 
@@ -44,18 +46,18 @@ class Run:
 
 
 @pytest.fixture(scope="module")
-def measurements(room_walk: Path) -> list[Measurement]:
-    return list(open_source(room_walk))
+def measurements(vga_walk: Path) -> list[Measurement]:
+    return list(open_source(vga_walk))
 
 
 @pytest.fixture(scope="module")
-def rig(room_walk: Path) -> Rig:
-    return open_source(room_walk).rig
+def rig(vga_walk: Path) -> Rig:
+    return open_source(vga_walk).rig
 
 
 @pytest.fixture(scope="module")
-def truth(room_walk: Path) -> Trajectory:
-    return load_trajectory(room_walk / "mav0/state_groundtruth_estimate0/data.csv")
+def truth(vga_walk: Path) -> Trajectory:
+    return load_trajectory(vga_walk / "mav0/state_groundtruth_estimate0/data.csv")
 
 
 @pytest.fixture(scope="module")

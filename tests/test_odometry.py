@@ -30,6 +30,8 @@ from graphvio.measurements.sensors import Measurement
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
+pytestmark = pytest.mark.heavy(25)
+
 
 @pytest.fixture(scope="module")
 def measurements(room_walk: Path) -> list[Measurement]:
@@ -178,7 +180,7 @@ def _without_early_imu(measurement: Measurement, first_ns: int) -> Measurement |
 
 
 @pytest.mark.parametrize(
-    "wrong", [np.zeros((240, 320), np.uint8), np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640))]
+    "wrong", [np.zeros((120, 160), np.uint8), np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320))]
 )
 def test_images_that_are_not_the_rigs_are_refused(room_walk: Path, wrong: Image) -> None:
     odometry = Odometry(open_source(room_walk).rig.without_imu())
@@ -261,7 +263,7 @@ def test_a_blackout_coasts_on_the_imu_with_growing_covariance(
     odometry: Odometry, measurements: list[Measurement]
 ) -> None:
     def darkened(measurement: Measurement) -> Measurement:
-        black = np.zeros((480, 640), dtype=np.uint8)
+        black = np.zeros((240, 320), dtype=np.uint8)
         begin, end = framesets(measurements)[30].stamp_ns, framesets(measurements)[44].stamp_ns
         if not isinstance(measurement, FrameSet) or not begin <= measurement.stamp_ns <= end:
             return measurement
@@ -299,7 +301,7 @@ def test_predictions_come_at_the_imus_rate(room_walk: Path, measurements: list[M
 
 def test_nothing_is_predicted_while_lost(room_walk: Path, measurements: list[Measurement]) -> None:
     without_imu = [measurement for measurement in measurements if isinstance(measurement, FrameSet)]
-    black = np.zeros((480, 640), dtype=np.uint8)
+    black = np.zeros((240, 320), dtype=np.uint8)
     dark = [replace(each, images=dict.fromkeys(each.images, (black, black))) for each in without_imu[10:]]
     config = Config.from_yaml("smoother: {lost_position_sigma_m: 0.2}")
     odometry, status = Odometry(open_source(room_walk).rig.without_imu(), config), Status.TRACKING
@@ -331,8 +333,8 @@ def test_malformed_measurements_are_refused(odometry: Odometry) -> None:
     with pytest.raises(MeasurementError, match="three components"):
         odometry.process(ImuSample(1, np.zeros(2), np.zeros(3)))
     with pytest.raises(MeasurementError, match=r"\(left, right\)"):
-        odometry.process(FrameSet(1, {0: (np.zeros((480, 640), np.uint8),) * 3}))
-    image = np.zeros((480, 640), dtype=np.uint8)
+        odometry.process(FrameSet(1, {0: (np.zeros((240, 320), np.uint8),) * 3}))
+    image = np.zeros((240, 320), dtype=np.uint8)
     odometry.process(FrameSet(0, {0: np.stack([image, image])}))  # type: ignore[dict-item]
     for images, message in (
         ([(image, image)], "images is a list"),

@@ -256,6 +256,7 @@ def correction(angle_rad: float, shift_m: float, offset_s: float | None) -> RigC
     return RigCorrection(pairs, {0: first, 1: covariance}, offset_s or 0.0, None if offset_s is None else 1e-3)
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_write_report_calibration_contradicts_rig_file(one: Optimization, tmp_path: Path) -> None:
     page, summary = report(replace(one, corrections=[correction(0.01, 0.0, -0.005)]), tmp_path, [None])
     (each,) = summary["calibrations"]
@@ -275,6 +276,7 @@ def test_write_report_calibration_contradicts_rig_file(one: Optimization, tmp_pa
     assert "the calibration contradicts" in page.text
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_write_report_calibration_consistent_with_rig_file(one: Optimization, tmp_path: Path) -> None:
     found = replace(one, corrections=[correction(0.001, 0.003, None)])
     page, summary = report(found, tmp_path, [None])
@@ -317,12 +319,14 @@ def test_calibrations_rotation_about_left_camera_is_no_displacement(one: Optimiz
     assert calibrations(one, [rig]) == [None]
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_write_report_good_result_has_no_doubts(one: Optimization, tmp_path: Path) -> None:
     page, summary = report(replace(one, loops=one.loops[:1]), tmp_path, [None])
     assert "no check speaks against the result" in page.text
     assert summary["sessions"][0]["completion"] is None
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_write_report_many_refused_loops_are_a_doubt(one: Optimization, tmp_path: Path) -> None:
     half, _ = report(one, tmp_path / "half", [None])
     assert "places look alike" not in half.text
@@ -331,6 +335,7 @@ def test_write_report_many_refused_loops_are_a_doubt(one: Optimization, tmp_path
     assert "2 of 3 loop closures that were found are refused: places look alike here" in page.text
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_write_report_contradicting_loops_are_a_doubt(one: Optimization, tmp_path: Path) -> None:
     after = one.after | {"loop": Residuals(np.array([7.2]), 6)}
     page, _ = report(replace(one, loops=one.loops[:1], after=after), tmp_path, [None])
@@ -338,6 +343,7 @@ def test_write_report_contradicting_loops_are_a_doubt(one: Optimization, tmp_pat
     assert "their mean square per dimension is 1.2, that of motions" in page.text
 
 
+@pytest.mark.usefixtures("without_plots")
 @pytest.mark.parametrize(("completion", "is_doubtful"), [(0.89, True), (0.9, False)])
 def test_write_report_incomplete_session_is_a_doubt(
     one: Optimization, tmp_path: Path, completion: float, is_doubtful: bool
@@ -370,6 +376,7 @@ def test_calibrations_of_one_session_only() -> None:
     assert second.session == "second"
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_write_report_many_loops_are_truncated(one: Optimization, tmp_path: Path) -> None:
     many = replace(one, loops=[one.loops[0]] * 230)
     page, summary = report(many, tmp_path, [None])
@@ -379,6 +386,7 @@ def test_write_report_many_loops_are_truncated(one: Optimization, tmp_path: Path
     assert len(summary["loops"]["all"]) == 230
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_write_report_bad_arguments_raise(one: Optimization, tmp_path: Path) -> None:
     with pytest.raises(OptimizationError, match="2 truths for 1 sessions"):
         write_report(one, tmp_path, [None, None])

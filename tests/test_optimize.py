@@ -30,7 +30,7 @@ from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
 pycolmap: Any = pytest.importorskip("pycolmap", reason="loop closure needs the extra maps")
-pytestmark = pytest.mark.heavy
+pytestmark = pytest.mark.heavy(50)
 CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 SECONDS = 7.0
 SETTINGS = "optimization: {loop_interval_s: 3.0, place_distance_m: 0.2, features: 500}\n"
@@ -92,6 +92,7 @@ def test_optimize_rendered_walk_improves_on_online(done: Path) -> None:
     assert len(trajectory) == session["framesets"]
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_optimize_killed_run_continues_to_equal_results(walk: Path, settings: Path, done: Path, tmp_path: Path) -> None:
     out = tmp_path / "walk"
     line = [sys.executable, "-c", "from graphvio.cli import main; main()", "optimize", walk, "--config", settings]
@@ -134,6 +135,7 @@ def test_optimize_foreign_folder_is_refused_and_unchanged(
     assert "is not empty" in str(refused.exception)
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_optimize_missing_files_are_written_again(done: Path, walk: Path, settings: Path, tmp_path: Path) -> None:
     out = tmp_path / "walk"
     shutil.copytree(done, out)
@@ -145,6 +147,7 @@ def test_optimize_missing_files_are_written_again(done: Path, walk: Path, settin
         assert (out / name).read_bytes() == (done / name).read_bytes(), name
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_optimize_refined_calibration_is_used_for_map(walk: Path, settings: Path, tmp_path: Path) -> None:
     rig = open_source(walk).rig
     save_rig(with_wrong_place(rig, 1.0, 0.03), tmp_path / "wrong.yaml")
@@ -169,6 +172,7 @@ def test_optimize_refined_calibration_is_used_for_map(walk: Path, settings: Path
     np.testing.assert_allclose(other.matrix(), expected[:3], atol=1e-6)
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_optimize_sessions_overlapping_recordings_share_frame(walk: Path, tmp_path: Path) -> None:
     """Two parts of one recording that overlap by a second."""
     sources = [open_source(walk, from_s=0.0, to_s=4.0), open_source(walk, from_s=3.0)]
@@ -184,6 +188,7 @@ def test_optimize_sessions_overlapping_recordings_share_frame(walk: Path, tmp_pa
         assert (tmp_path / "both" / name / "trajectory_optimized.txt").exists()
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_optimize_without_loops_needs_no_extra(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     assert command(walk, "--to", "3", "--no-loops", "--out", tmp_path / "walk").exit_code == 0
@@ -195,6 +200,7 @@ def test_optimize_without_loops_needs_no_extra(walk: Path, tmp_path: Path, monke
 
 
 @pytest.mark.skipif(not CLIP.is_dir(), reason="shared/data/euroc_mh01_clip is absent")
+@pytest.mark.usefixtures("without_plots")
 def test_optimize_real_recording_improves_on_online(tmp_path: Path) -> None:
     done = command(CLIP, "--out", tmp_path / "clip")
     assert done.exit_code == 0, done.output

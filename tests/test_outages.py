@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import half_size_rig
-from rendered import rendered_once
 
 from graphvio import Config, Estimate, FrameSet, ImuSample, Odometry, Status, open_source
 from graphvio.arrays import Float
@@ -17,23 +15,18 @@ from graphvio.backend.window import Window, WindowError
 from graphvio.geometry import se3_inverse, se3_log
 from graphvio.measurements.sensors import Measurement
 from graphvio.rig import Rig
-from graphvio.simulation import Simulator, build_scene, write_recording
 from graphvio.trajectory_files import load_trajectory
 
-pytestmark = pytest.mark.heavy
+pytestmark = pytest.mark.heavy(65)
 
 START_S = 3.0  # of what goes wrong
 PERIOD_S = 0.05
-DURATION_S = 10.0
 MS = 1_000_000
 
 
 @pytest.fixture(scope="module")
-def walk_folder() -> Path:
-    def write(folder: Path) -> None:
-        write_recording(Simulator(build_scene("room", DURATION_S), half_size_rig(), 0), folder)
-
-    return rendered_once("room", write, "320x240", DURATION_S)
+def walk_folder(long_room_walk: Path) -> Path:
+    return long_room_walk
 
 
 @pytest.fixture(scope="module")

@@ -29,6 +29,8 @@ from graphvio.simulation.calibration_error import calibration_differences, draw
 from graphvio.simulation.default_rig import default_rig
 from graphvio.sources import open_source
 
+pytestmark = pytest.mark.heavy(30)
+
 SECONDS = 12.0
 OF_CAMERAS = ["focal", "principal-point", "distortion", "left-right-rotation", "baseline", "pair-transform"]
 
@@ -172,7 +174,7 @@ def test_command_writes_rig_and_report(walk: Path, tmp_path: Path) -> None:
 
 
 def test_command_insufficient_motion_is_diagnosed(tmp_path: Path) -> None:
-    source = recorded(tmp_path / "walk", SECONDS, planar)
+    source = recorded(tmp_path / "walk", 6.0, planar)
     done = command(source, "--what", "imu", "--out", tmp_path / "out.yaml")
     assert done.exit_code == 3, done.output
     assert "hardly better known than by the file: " in done.stderr

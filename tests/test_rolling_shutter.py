@@ -23,6 +23,8 @@ from graphvio.rig import Camera, SingleCamera
 from graphvio.simulation import Simulator, build_scene, write_recording
 from graphvio.simulation.named_rigs import stereo
 
+pytestmark = pytest.mark.heavy(20)
+
 DURATION_S, READOUT_US = 5.0, 20e3
 MOTION = ReadoutMotion(
     np.array([0.8, -1.5, 1.1]), np.array([0.9, -0.4, 0.3]), np.array([4.0, 2.0, -3.0]), np.array([-2.0, 3.0, 1.0])
@@ -186,7 +188,6 @@ def ate_m(walk: Path, rig: Rig) -> float:
     return evaluate(estimated, load_trajectory(source.truth)).ate_position_m.rmse
 
 
-@pytest.mark.heavy
 def test_the_line_time_in_the_rig_restores_the_accuracy(walk: Path) -> None:
     rig = open_source(walk).rig
     known = ate_m(walk, rig)

@@ -8,6 +8,7 @@ import pytest
 from command_line import graphvio
 from recordings import half_size
 from rendered import rendered_once
+from undrawn import undrawn
 
 from graphvio import FrameSet, Odometry, RigError, load_rig, load_trajectory, save_rig
 from graphvio.config import Config
@@ -24,6 +25,8 @@ from graphvio.simulation import CalibrationError, Simulator, build_scene, write_
 from graphvio.simulation.calibration_error import draw
 from graphvio.simulation.named_rigs import NAMED_RIGS, stereo_and_back
 from graphvio.sources import open_source
+
+pytestmark = pytest.mark.heavy(20)
 
 DURATION_S = 6.0
 
@@ -43,7 +46,7 @@ def walk() -> Path:
 def summary_of(recording: Path, rig: Rig, out: Path, config: Config | None = None) -> Summary:
     config = config or Config()
     source = open_source(recording, rig)
-    with ResultWriter(out, source.rig, config.to_yaml()) as writer:
+    with undrawn(), ResultWriter(out, source.rig, config.to_yaml()) as writer:
         return run(source, config, writer)
 
 
@@ -148,7 +151,6 @@ def test_framesets_of_live_images_hold_single_cameras_as_recordings_do() -> None
 # ------------------------------------------------------------------ odometry
 
 
-@pytest.mark.heavy
 def test_run_with_a_single_camera_is_no_worse_than_the_pair_alone(walk: Path, tmp_path: Path) -> None:
     """Without IMU, where the second view matters, and with a calibration that is trusted."""
     rig, config = load_rig(walk).without_imu(), Config.from_yaml("calibration: {online: false}")
@@ -162,7 +164,6 @@ def test_run_with_a_single_camera_is_no_worse_than_the_pair_alone(walk: Path, tm
     assert EventKind.EXTRINSICS_OFF not in kinds  # the file is exact
 
 
-@pytest.mark.heavy
 def test_session_and_folder_of_a_single_camera_give_the_same_trajectory(walk: Path, tmp_path: Path) -> None:
     pytest.importorskip("mcap")
     assert graphvio("convert", walk, "--out", tmp_path / "walk.mcap").returncode == 0
@@ -176,7 +177,6 @@ def test_session_and_folder_of_a_single_camera_give_the_same_trajectory(walk: Pa
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.heavy
 def test_a_dark_pair_leaves_the_motion_to_the_single_camera(walk: Path) -> None:
     """Without IMU the pair's images are black for half a second: motions are of the single camera meanwhile."""
     source = open_source(walk, load_rig(walk).without_imu())
@@ -206,7 +206,6 @@ def test_a_dark_pair_leaves_the_motion_to_the_single_camera(walk: Path) -> None:
     assert np.median(errors_m) < 0.005  # 50 mm in each frameset
 
 
-@pytest.mark.heavy
 def test_run_with_a_wrong_place_of_the_single_camera_learns_it(walk: Path, tmp_path: Path) -> None:
     """The camera is half a degree and 1 cm from where the file has it, which is no more than files are wrong by."""
     rig = load_rig(walk)
@@ -224,7 +223,6 @@ def test_run_with_a_wrong_place_of_the_single_camera_learns_it(walk: Path, tmp_p
     assert EventKind.EXTRINSICS_OFF not in (tmp_path / "wrong" / "events.jsonl").read_text()
 
 
-@pytest.mark.heavy
 def test_frameset_with_the_wrong_number_of_images_is_refused(walk: Path) -> None:
     rig = load_rig(walk)
     grey = np.zeros((240, 320), dtype=np.uint8)

@@ -3,19 +3,17 @@
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
 from calibration_walks import recorded
-from command_line import graphvio
+from command_line import graphvio, python
 
 from graphvio.cli import app
 
-pytestmark = pytest.mark.heavy
+pytestmark = pytest.mark.heavy(25)
 
 ROOT = Path(__file__).parents[1]
 TUTORIALS = ROOT / "docs/tutorials"
@@ -44,9 +42,8 @@ def follow(name: str, recording: Path, folder: Path) -> str:
             assert ran.returncode == 0, f"{arguments}: {ran.stderr}"
     if "```python" not in text:
         return ""
-    done = subprocess.run(
-        [sys.executable, "-c", python_of(text)], cwd=folder, capture_output=True, text=True, timeout=300
-    )
+    (folder / "typed.py").write_text(python_of(text))
+    done = python(folder / "typed.py", folder=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -60,6 +57,7 @@ def test_first_trajectory_as_typed(room_walk: Path, tmp_path: Path) -> None:
     assert (tmp_path / "error.png").exists()
 
 
+@pytest.mark.usefixtures("without_plots")
 def test_calibrate_your_rig_as_typed(tmp_path: Path) -> None:
     follow("calibrate-your-rig", recorded(tmp_path / "turns", 6.0), tmp_path)
     for name in ("rig-pairs.yaml", "pairs/report.html", "rig-calibrated.yaml", "all/report.html"):

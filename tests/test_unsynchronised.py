@@ -26,7 +26,7 @@ from graphvio.sources.sequencer import merge
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
-pytestmark = pytest.mark.heavy
+pytestmark = pytest.mark.heavy(35)
 
 
 MS = 1_000_000
