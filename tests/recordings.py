@@ -66,12 +66,17 @@ def with_lens(rig: Rig, model: str) -> Rig:
     return rig.with_cameras(change)
 
 
-def half_size(camera: Camera) -> Camera:
-    """The camera with pixels of twice the side: pixel (0, 0) is the centre of one."""
-    fx, fy, cx, cy = camera.intrinsics
+def scaled(camera: Camera, scale: float) -> Camera:
+    """The camera with images of another size and the same view: pixel (0, 0) is the centre of one."""
+    corner = np.array([0.0, 0.0, 0.5, 0.5])
     width, height = camera.size_px
-    smaller = np.array([fx / 2, fy / 2, (cx - 0.5) / 2, (cy - 0.5) / 2])
-    return replace(camera, intrinsics=smaller, size_px=(width // 2, height // 2))
+    size_px = (round(scale * width), round(scale * height))
+    return replace(camera, intrinsics=scale * (camera.intrinsics + corner) - corner, size_px=size_px)
+
+
+def half_size(camera: Camera) -> Camera:
+    """The camera with pixels of twice the side."""
+    return scaled(camera, 0.5)
 
 
 def half_size_rig() -> Rig:

@@ -4,13 +4,13 @@ import json
 from pathlib import Path
 
 import pytest
-from recordings import half_size_rig
+from recordings import scaled
 from rendered import rendered_once
 
 from graphvio.config import Config
 from graphvio.pipeline import run
 from graphvio.results import ResultWriter
-from graphvio.simulation import Simulator, build_scene, write_recording
+from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
 from graphvio.sources import open_source
 
 pytestmark = [pytest.mark.heavy(75), pytest.mark.usefixtures("without_plots")]
@@ -24,9 +24,10 @@ def corridor() -> Path:
     assert {"door", "people", "blank"} <= {name for name, (_, end) in scene.events.items() if end < DURATION_S}
 
     def write(folder: Path) -> None:
-        write_recording(Simulator(scene, half_size_rig(), 0), folder)
+        rig = default_rig().with_cameras(lambda camera: scaled(camera, 0.375))
+        write_recording(Simulator(scene, rig, 0), folder)
 
-    return rendered_once("corridor", write, "320x240", DURATION_S)
+    return rendered_once("corridor", write, "240x180", DURATION_S)
 
 
 @pytest.mark.parametrize(("pairs", "max_drift_percent"), [([0, 1], 0.2), ([0], 1.0), ([1], 1.0)])

@@ -38,7 +38,7 @@ def test_the_readmes_python_runs_as_typed(room_walk: Path, tmp_path: Path) -> No
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder to work in, with a recording of turns that calibration takes."""
     folder: Path = tmp_path_factory.mktemp("docs")
-    recorded(folder / "recording", 6.0)
+    recorded(folder / "recording", 4.0)
     return folder
 
 

@@ -152,7 +152,8 @@ def test_fleet_killed_worker_leaves_equal_results(
     assert done.killer.pid != done.killer.cluster.workers[0].pid
     assert [each.name for each in done.outcomes] == [f"walk-{number:02d}" for number in range(SESSIONS)]
     assert [each.name for each in done.outcomes if each.error] == [CORRUPT]
-    monkeypatch.setattr("graphvio.optimization.pipeline.write_report", lambda *_, **__: None)
+    for drawing in ("write_report", "write_plan"):
+        monkeypatch.setattr(f"graphvio.optimization.pipeline.{drawing}", lambda *_, **__: None)
     monkeypatch.setattr("graphvio.optimization.loops.features.SiftProcess", SiftExtractor)  # features are the same
     parts, loops = set(), 0
     for each in done.outcomes:

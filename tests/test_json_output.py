@@ -76,7 +76,7 @@ def public(folder: Path) -> list[object]:
 
 ARGUMENTS: dict[str, Callable[[Path, Path, Path], list[object]]] = {
     "benchmark": lambda folder, walk, results: public(folder),
-    "calibrate": lambda folder, walk, results: [recorded(folder / "walk", 6.0), "--to", 3],
+    "calibrate": lambda folder, walk, results: [recorded(folder / "walk", 3.0)],
     "calibrate-trajectories": lambda folder, walk, results: turned(folder),
     "compare": lambda folder, walk, results: [results, "--truth", walk],
     "convert": lambda folder, walk, results: [walk, "--to", 0.5, "--out", folder / "again", "--format", "euroc"],

@@ -59,7 +59,7 @@ def test_first_trajectory_as_typed(room_walk: Path, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("without_plots")
 def test_calibrate_your_rig_as_typed(tmp_path: Path) -> None:
-    follow("calibrate-your-rig", recorded(tmp_path / "turns", 6.0), tmp_path)
+    follow("calibrate-your-rig", recorded(tmp_path / "turns", 4.0), tmp_path)
     for name in ("rig-pairs.yaml", "pairs/report.html", "rig-calibrated.yaml", "all/report.html"):
         assert (tmp_path / name).exists(), name
 

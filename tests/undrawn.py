@@ -54,6 +54,6 @@ def undrawn() -> Iterator[None]:
 
 
 def dask_setup(_: Any) -> None:
-    """Leave the plots of results empty in a worker, from now on."""
-    for module, name, instead in _PLOTS:
+    """Leave the plots of results empty in a worker, from now on; that of the map, too."""
+    for module, name, instead in (*_PLOTS, (figures, "plot_plan", _nothing)):
         setattr(module, name, instead)
