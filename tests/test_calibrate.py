@@ -143,7 +143,7 @@ def test_command_wrong_rig_is_corrected(walk: Path, tmp_path: Path) -> None:
     ids=["planar", "on the spot", "straight"],
 )
 def test_command_insufficient_motion_is_diagnosed(course: Course, words: list[str], code: int, tmp_path: Path) -> None:
-    source = recorded(tmp_path / "walk", 3.0, course)
+    source = recorded(tmp_path / "walk", 4.0, course)
     done = command("calibrate", source, "--out", tmp_path / "out.yaml", "--guide")
     for each in words:
         assert each in " ".join(done.output.split()) or each in str(done.exception), done.output

@@ -1,6 +1,7 @@
 """Initialisation in motion: attitude, velocity and biases come from the first motions by vision and the IMU."""
 
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -152,10 +153,16 @@ def run(
     return out
 
 
+@cache
+def walked(seed: int, accel_m_s2: float, hertz: float) -> Outcome:
+    """The outcome of a run with an IMU, of which several tests look at one thing each."""
+    return run(seed, accel_m_s2, hertz)
+
+
 @pytest.mark.parametrize(("accel_m_s2", "hertz"), [(1.0, 0.5), (5.0, 0.5), (5.0, 0.16), (15.0, 1.0)])
 def test_it_is_known_within_two_seconds_and_rightly(accel_m_s2: float, hertz: float) -> None:
     """On foot, in a take-off or a braking of a second, and shaken; the mean force is up to 40 deg off the vertical."""
-    outcomes = [run(seed, accel_m_s2, hertz) for seed in range(8)]
+    outcomes = [walked(seed, accel_m_s2, hertz) for seed in range(8)]
     for out in outcomes:
         assert out.initialised_s <= 1.0  # asked for: 2 s
         k = round(out.initialised_s / STEP_S)
@@ -173,7 +180,7 @@ def test_it_is_known_within_two_seconds_and_rightly(accel_m_s2: float, hertz: fl
 @pytest.mark.parametrize(("accel_m_s2", "hertz"), [(1.0, 0.5), (5.0, 0.5), (15.0, 1.0)])
 def test_gravity_turns_and_the_poses_do_not(accel_m_s2: float, hertz: float) -> None:
     """What is level is learnt by many degrees, and the motion from the first pose is right all along."""
-    outcomes = [run(seed, accel_m_s2, hertz) for seed in range(8)]
+    outcomes = [walked(seed, accel_m_s2, hertz) for seed in range(8)]
     learnt = [out.tilt_deg[0] - out.tilt_deg[-1] for out in outcomes]
     assert max(learnt) > (1.0 if accel_m_s2 == 1.0 else 10.0)
     for out in outcomes:
@@ -183,7 +190,7 @@ def test_gravity_turns_and_the_poses_do_not(accel_m_s2: float, hertz: float) -> 
 
 def test_level_is_known_as_well_as_it_is_said_to_be() -> None:
     """Biases of this IMU are half as large as is allowed for, and its noise a third: the mean may be below 2."""
-    squares = np.array([run(seed, accel, 0.5).tilt_square for accel in (1.0, 5.0) for seed in range(20)])
+    squares = np.array([walked(seed, accel, 0.5).tilt_square for accel in (1.0, 5.0) for seed in range(20)])
     for seconds in (1.0, 2.0, 3.9):
         mean = squares[:, round(seconds / STEP_S)].mean()
         assert 0.2 < mean < 2.7  # 95 % of such means are below 2.65
