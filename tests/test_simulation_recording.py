@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import typer
+from recordings import half_size_rig
 from typer.testing import CliRunner
 
 from graphvio.cli.simulate import simulate as simulate_command
@@ -20,7 +21,7 @@ SCENE = "corridor"
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> SimulatedRecording:
     out = tmp_path_factory.mktemp("simulated") / "one"
-    return simulate(SCENE, out, duration_s=DURATION_S, seed=5, stationary_s=0.0)
+    return simulate(SCENE, out, duration_s=DURATION_S, seed=5, stationary_s=0.0, rig=half_size_rig())
 
 
 def digest(folder: Path) -> dict[str, str]:
@@ -41,7 +42,7 @@ def test_simulate_writes_euroc_layout(recording: SimulatedRecording) -> None:
         for row in rows[1:]:
             image = cv2.imread(str(mav0 / f"cam{k}" / "data" / row.split(",")[1]), cv2.IMREAD_UNCHANGED)
             assert image is not None
-            assert image.shape == (480, 640)
+            assert image.shape == (240, 320)
             assert image.dtype == np.uint8
         assert (mav0 / f"cam{k}" / "sensor.yaml").is_file()
     imu = np.loadtxt(mav0 / "imu0" / "data.csv", delimiter=",")
@@ -57,7 +58,7 @@ def test_simulate_writes_euroc_layout(recording: SimulatedRecording) -> None:
 
 
 def test_simulate_files_equal_simulator(recording: SimulatedRecording) -> None:
-    simulator = make_simulator(SCENE, duration_s=DURATION_S, seed=5, stationary_s=0.0)
+    simulator = make_simulator(SCENE, duration_s=DURATION_S, seed=5, stationary_s=0.0, rig=half_size_rig())
     stamp = simulator.stamps_ns[4]
     path = recording.path / "mav0" / "cam2" / "data" / f"{stamp}.png"
     written = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
@@ -76,18 +77,19 @@ def test_simulate_same_seed_same_bytes_for_any_threads(
         duration_s=DURATION_S,
         seed=5,
         stationary_s=0.0,
+        rig=half_size_rig(),
         progress=lambda a, b: calls.append((a, b)),
     )
     assert digest(tmp_path / "b") == digest(recording.path)
     assert calls[-1] == (10, 10)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(5)), raising=False)
-    simulate(SCENE, tmp_path / "c", duration_s=DURATION_S, seed=5, stationary_s=0.0)
+    simulate(SCENE, tmp_path / "c", duration_s=DURATION_S, seed=5, stationary_s=0.0, rig=half_size_rig())
     assert digest(tmp_path / "c") == digest(recording.path)
 
 
 @pytest.mark.parametrize("where", ["rig.yaml", "mav0/cam0/sensor.yaml"])
 def test_simulate_rig_is_read_back(recording: SimulatedRecording, where: str) -> None:
-    expected = make_simulator(SCENE, duration_s=DURATION_S).rig
+    expected = half_size_rig()
     rig = load_rig(recording.path / where)
     assert len(rig.pairs) == 2
     assert rig.imu == expected.imu
