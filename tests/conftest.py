@@ -19,9 +19,22 @@ settings.register_profile("graphvio", deadline=None, derandomize=True)
 settings.load_profile("graphvio")
 
 
+# Files that take from a minute to ten seconds of a processor, in this order.
+_LONGEST = (
+    "corridor", "fleet", "outages", "optimize", "calibrate", "end_to_end", "frontend_covariance", "keyframes",
+    "unsynchronised", "cli_slam", "recorded_calibration", "fleet_s3", "convert", "optimization", "examples",
+    "self_calibration", "docs", "tutorials", "odometry", "live", "json_output", "calibration_trajectories",
+    "calibration_methods", "calibration_several", "rolling_shutter", "start_in_motion", "mapping", "hard_moments",
+    "single_cameras", "calibration_memory", "cli_live", "benchmark", "simulation_scenes", "monocular",
+    "self_calibration_inertial", "live_sources", "backend_shared_error", "calibration_pair", "cli_serve", "map_frame",
+    "lens_models", "sessions", "kernels", "viewer_web", "backend_smoother", "frontend_lucas_kanade", "image_masks",
+)  # fmt: skip
+_RANKS = {f"test_{name}": rank for rank, name in enumerate(_LONGEST)}
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The files that take longest come first, so that no process is left with one at the end."""
-    items.sort(key=lambda item: -sum(mark.args[0] for mark in item.iter_markers("heavy")))
+    items.sort(key=lambda item: _RANKS.get(item.path.stem, len(_RANKS)))
 
 
 @pytest.fixture

@@ -21,8 +21,6 @@ from graphvio.geometry import se3_adjoint, se3_inverse, se3_log
 from graphvio.measurements.motion import RelativeMotion
 from graphvio.rig import Imu
 
-pytestmark = pytest.mark.heavy(15)
-
 IMU = Imu(accel_random_walk=1e-5, gyro_random_walk=1e-7)  # biases are sampled once
 PERIOD_NS = 200_000_000  # a keyframe then lasts long enough that errors look different from its two ends
 KEYFRAMES = 5  # framesets from one to the next

@@ -25,8 +25,6 @@ from graphvio.rig_files import load_rig
 from graphvio.sources import open_source
 from graphvio.trajectory_files import load_trajectory
 
-pytestmark = pytest.mark.heavy(20)
-
 
 def hilti_bag(recording: Path, path: Path) -> Path:
     pytest.importorskip("mcap")

@@ -22,9 +22,6 @@ from graphvio.cli import app
 from graphvio.config import Config
 from graphvio.geometry import se3_exp, se3_inverse, se3_log, so3_exp, so3_log
 
-pytestmark = pytest.mark.heavy(50)
-
-
 SECONDS = 6.0
 
 

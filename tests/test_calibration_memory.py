@@ -20,8 +20,6 @@ from graphvio.rig_files import load_rig, save_rig
 from graphvio.simulation.calibration_error import CalibrationError, calibration_differences, draw
 from graphvio.simulation.default_rig import default_rig
 
-pytestmark = pytest.mark.heavy(20)
-
 KEPT, LEARNT, OTHER = "kept for the next run of simulator-room", "as learnt by the run of ", "is of another rig file"
 
 

@@ -18,8 +18,6 @@ from graphvio.calibration.pose_pairs import PosePairs
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_exp, se3_inverse, se3_log, so3_exp
 
-pytestmark = pytest.mark.heavy(20)
-
 ANGLE, STEP_M = 2e-3, 3e-3
 
 

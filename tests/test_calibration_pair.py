@@ -13,8 +13,6 @@ from graphvio.calibration.segments import Segments, all_segments
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_exp, se3_inverse, se3_log
 
-pytestmark = pytest.mark.heavy(15)
-
 
 def segments(walk: Walk, seed: int, moved: Float | None = None) -> Segments:
     rng = np.random.default_rng(seed)

@@ -17,8 +17,6 @@ from graphvio.calibration.several import Places, pairwise, place_all
 from graphvio.errors import CalibrationError
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 
-pytestmark = pytest.mark.heavy(20)
-
 LEFT3_T_LEFT1 = se3_exp(np.array([0.2, -1.5, 0.3, -0.2, 0.1, 0.3]))
 TRUTH = np.array([np.eye(4), LEFT2_T_LEFT1, LEFT3_T_LEFT1])
 NAMES = ("front", "back", "side")

@@ -18,8 +18,6 @@ from graphvio.geometry import se3_exp, se3_inverse, se3_log
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
-pytestmark = pytest.mark.heavy(25)
-
 SECONDS = 40.0
 OFFSET_S = 123.4567
 WORLD_T_WORLD = se3_exp(np.array([0.3, -0.2, 2.0, 5.0, -3.0, 1.0]))

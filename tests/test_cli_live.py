@@ -34,8 +34,6 @@ from graphvio.sessions.store import open_store
 pytest.importorskip("mcap")
 pytest.importorskip("prometheus_client")
 
-pytestmark = pytest.mark.heavy(20)
-
 SOON_S = 100.0  # only a test that fails takes so long
 MAIN = """
 import signal, sys

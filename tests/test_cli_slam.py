@@ -25,8 +25,6 @@ from graphvio.geometry import se3_inverse
 pytest.importorskip("pycolmap")
 pytest.importorskip("grpc")
 pytest.importorskip("cyclonedds")
-pytestmark = pytest.mark.heavy(40)
-
 SOON_S = 200.0
 
 

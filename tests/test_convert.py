@@ -31,8 +31,6 @@ from graphvio.trajectory_files import load_trajectory, tum_line
 pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
 
-pytestmark = pytest.mark.heavy(30)
-
 CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 CLIP_PIECE = ("--to", "6")
 FRAMES = 8

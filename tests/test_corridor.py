@@ -13,7 +13,7 @@ from graphvio.results import ResultWriter
 from graphvio.simulation import Simulator, build_scene, default_rig, write_recording
 from graphvio.sources import open_source
 
-pytestmark = [pytest.mark.heavy(75), pytest.mark.usefixtures("without_plots")]
+pytestmark = pytest.mark.usefixtures("without_plots")
 
 DURATION_S = 30.0
 

@@ -16,8 +16,6 @@ from graphvio.config import Config, profiles
 from graphvio.measurements.events import EventKind
 from graphvio.rig_files import load_rig
 
-pytestmark = pytest.mark.heavy(25)
-
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 SELF_CALIBRATION = (ROOT / "docs/how-to/self-calibration.md").read_text()

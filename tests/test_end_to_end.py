@@ -19,8 +19,6 @@ from undrawn import undrawn
 from graphvio import FrameSet, load_rig, open_source
 from graphvio.trajectory_files import load_trajectory
 
-pytestmark = pytest.mark.heavy(40)
-
 CLIP = REAL_DATA / "euroc_mh01_clip"
 needs_clip = pytest.mark.skipif(not CLIP.is_dir(), reason=f"the real recording {CLIP.name} is not next to the project")
 

@@ -17,8 +17,6 @@ from command_line import python
 
 from graphvio import load_trajectory, open_source
 
-pytestmark = pytest.mark.heavy(25)
-
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 

@@ -33,9 +33,6 @@ from graphvio.optimization.pipeline import optimize_sessions
 from graphvio.sources import open_source
 from graphvio.warmup import warm_up
 
-pytestmark = pytest.mark.heavy(65)
-
-
 SESSIONS, FRAMES, CORRUPT = 20, 18, "walk-07"
 PLACES_PER_TASK = 2
 CONFIG = """

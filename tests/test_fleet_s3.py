@@ -24,8 +24,6 @@ from graphvio.fleet.storage import Storage, file_system
 from graphvio.fleet.tasks import Reading
 from graphvio.rig_files import load_rig
 
-pytestmark = pytest.mark.heavy(30)
-
 
 @pytest.fixture(scope="module")
 def endpoint() -> Iterator[str]:

@@ -23,8 +23,6 @@ from graphvio.frontend.observations import Observations
 from graphvio.frontend.refinement import refine
 from graphvio.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 
-pytestmark = pytest.mark.heavy(35)
-
 CONFIG = replace(MotionConfig(), sigma_inflation=1.0, hypotheses=60)
 FRAMES = 500
 RICH = Conditions()

@@ -22,8 +22,6 @@ from graphvio.measurements.sensors import Measurement
 from graphvio.rig import Rig
 from graphvio.trajectory_files import load_trajectory
 
-pytestmark = pytest.mark.heavy(20)
-
 Change = Callable[[float, FrameSet], FrameSet]
 """Takes seconds since the first frameset, and a frameset."""
 

@@ -21,8 +21,6 @@ from graphvio.geometry import se3, so3_exp
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory, save_trajectory
 
-pytestmark = pytest.mark.heavy(25)
-
 WITHOUT = {"view"}  # opens a window
 
 

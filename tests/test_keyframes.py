@@ -29,8 +29,6 @@ from graphvio.slam.map_frame import MapFrame
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
-pytestmark = pytest.mark.heavy(40)
-
 SOON_S = 30.0  # until then a thread is waited for; only a test that fails takes so long
 TIGHT = np.diag(np.repeat([1e-3, 1e-2], 3) ** 2)
 

@@ -13,7 +13,7 @@ from graphvio.results import ResultWriter
 from graphvio.simulation import Simulator, build_scene, write_recording
 from graphvio.sources import open_source
 
-pytestmark = [pytest.mark.heavy(12), pytest.mark.usefixtures("without_plots")]
+pytestmark = pytest.mark.usefixtures("without_plots")
 
 DURATION_S = 5.0
 

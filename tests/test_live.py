@@ -36,8 +36,6 @@ from graphvio.measurements.readings import Notice, Reading
 from graphvio.measurements.sensors import ImuSample, Measurement
 from graphvio.sessions.store import open_store
 
-pytestmark = pytest.mark.heavy(25)
-
 
 def until(is_so: Callable[[], Any]) -> None:
     """Wait; only a test that fails waits long."""

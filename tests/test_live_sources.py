@@ -25,8 +25,6 @@ from graphvio.measurements.sensors import ImuSample, Measurement
 from graphvio.simulation import simulate
 from graphvio.simulation.simulator import make_simulator
 
-pytestmark = pytest.mark.heavy(15)
-
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:

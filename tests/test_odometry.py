@@ -30,8 +30,6 @@ from graphvio.measurements.sensors import Measurement
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
-pytestmark = pytest.mark.heavy(25)
-
 
 @pytest.fixture(scope="module")
 def measurements(room_walk: Path) -> list[Measurement]:

@@ -32,8 +32,6 @@ from graphvio.simulation import default_rig
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
-pytestmark = pytest.mark.heavy(25)
-
 IMU = Imu()
 CONFIG = Config()
 

@@ -30,7 +30,6 @@ from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
 pycolmap: Any = pytest.importorskip("pycolmap", reason="loop closure needs the extra maps")
-pytestmark = pytest.mark.heavy(50)
 CLIP = Path(__file__).parents[2] / "shared" / "data" / "euroc_mh01_clip"
 SECONDS = 7.0
 SETTINGS = "optimization: {loop_interval_s: 3.0, place_distance_m: 0.2, features: 500}\n"

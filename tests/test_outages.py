@@ -17,8 +17,6 @@ from graphvio.measurements.sensors import Measurement
 from graphvio.rig import Rig
 from graphvio.trajectory_files import load_trajectory
 
-pytestmark = pytest.mark.heavy(65)
-
 START_S = 3.0  # of what goes wrong
 PERIOD_S = 0.05
 MS = 1_000_000

@@ -29,8 +29,6 @@ from graphvio.simulation.calibration_error import calibration_differences, draw
 from graphvio.simulation.default_rig import default_rig
 from graphvio.sources import open_source
 
-pytestmark = pytest.mark.heavy(30)
-
 SECONDS = 12.0
 OF_CAMERAS = ["focal", "principal-point", "distortion", "left-right-rotation", "baseline", "pair-transform"]
 

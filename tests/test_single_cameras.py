@@ -26,8 +26,6 @@ from graphvio.simulation.calibration_error import draw
 from graphvio.simulation.named_rigs import NAMED_RIGS, stereo_and_back
 from graphvio.sources import open_source
 
-pytestmark = pytest.mark.heavy(20)
-
 DURATION_S = 6.0
 
 

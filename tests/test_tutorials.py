@@ -13,8 +13,6 @@ from command_line import graphvio, python
 
 from graphvio.cli import app
 
-pytestmark = pytest.mark.heavy(25)
-
 ROOT = Path(__file__).parents[1]
 TUTORIALS = ROOT / "docs/tutorials"
 PROGRAM = typer.main.get_command(app)

@@ -26,9 +26,6 @@ from graphvio.sources.sequencer import merge
 from graphvio.trajectory import Trajectory
 from graphvio.trajectory_files import load_trajectory
 
-pytestmark = pytest.mark.heavy(35)
-
-
 MS = 1_000_000
 DURATION_S = 3.0
 CONFIG = Config()
