@@ -23,7 +23,7 @@ from graphvio.rig import Camera, SingleCamera
 from graphvio.simulation import Simulator, build_scene, write_recording
 from graphvio.simulation.named_rigs import stereo
 
-DURATION_S, READOUT_US = 5.0, 20e3
+DURATION_S, READOUT_US = 3.0, 20e3
 MOTION = ReadoutMotion(
     np.array([0.8, -1.5, 1.1]), np.array([0.9, -0.4, 0.3]), np.array([4.0, 2.0, -3.0]), np.array([-2.0, 3.0, 1.0])
 )
