@@ -144,7 +144,7 @@ def installed(tmp_path: Path) -> Path:
 
 
 def test_custom_source(room_walk: Path, installed: Path, tmp_path: Path) -> None:
-    _run_alone("graphvio_npz", room_walk, "room-npz", folder=tmp_path, search=installed)
+    _run_alone("write_npz", room_walk, "room-npz", folder=tmp_path, search=EXAMPLES / "custom_source")
     assert len(list((tmp_path / "room-npz/frames").glob("*.npz"))) == 100
     _run_alone("graphvio", "run", "room-npz", "--out", "results", "--to", "2", folder=tmp_path, search=installed)
     poses = load_trajectory(tmp_path / "results/trajectory.txt")

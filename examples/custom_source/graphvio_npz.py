@@ -1,15 +1,12 @@
 """A layout of recordings as a plug-in of graphvio: all images of an instant in one ``.npz`` file.
 
-    frames/STAMP_NS.npz    an array for each camera, by its name
-    imu.npz                arrays stamps_ns, and values: angular velocity in degrees per second, specific force in g
-    rig.yaml               graphvio's own rig file
-
-``python -m graphvio_npz RECORDING NEW_FOLDER`` writes a recording of any other layout in this one.
+frames/STAMP_NS.npz    an array for each camera, by its name
+imu.npz                arrays stamps_ns, and values: angular velocity in degrees per second, specific force in g
+rig.yaml               graphvio's own rig file
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,24 +55,3 @@ def read_index(path: Path, rig: graphvio.Rig, faults: FaultLog) -> Index:
     with np.load(path / "imu.npz") as samples:
         imu = ImuTable(samples["stamps_ns"], samples["values"] * UNITS)
     return Index(faults.name, images, imu)
-
-
-def write(source: str, folder: Path) -> None:
-    """Write a recording of another layout in this one."""
-    recording = graphvio.open_source(source)
-    (folder / "frames").mkdir(parents=True)
-    graphvio.save_rig(recording.rig, folder / "rig.yaml")
-    imu_stamps, values = [], []
-    for measurement in recording:
-        if isinstance(measurement, graphvio.ImuSample):
-            imu_stamps.append(measurement.stamp_ns)
-            values.append(np.concatenate([measurement.angular_velocity, measurement.linear_acceleration]) / UNITS)
-            continue
-        pairs = [(recording.rig.pairs[number], images) for number, images in measurement.images.items()]
-        arrays = {pair.left.name: left for pair, (left, _) in pairs} | {pair.right.name: r for pair, (_, r) in pairs}
-        np.savez(folder / "frames" / f"{measurement.stamp_ns}.npz", allow_pickle=False, **arrays)
-    np.savez(folder / "imu.npz", stamps_ns=np.array(imu_stamps), values=np.array(values))
-
-
-if __name__ == "__main__":
-    write(sys.argv[1], Path(sys.argv[2]))
