@@ -13,10 +13,10 @@ from graphvio.arrays import AnyArray, Bool, Float, Image
 from graphvio.cameras import distort, fold_radius
 from graphvio.kernels import fast_kernel, kernel, put
 
-_HALF_PATCH = 5
-_HALF_COARSE_PATCH = 4
+HALF_PATCH = 5
+HALF_COARSE_PATCH = 4
 _MAX_STEPS = 400
-_FINE_STEPS = 2  # of the half-sized image, to either side
+FINE_STEPS = 2  # of the half-sized image, to either side
 _AMBIGUOUS = 0.97
 _GAUSS_NEWTON_STEPS = 4
 _HALVINGS = 6
@@ -61,20 +61,20 @@ def epipolar_search(
     n = len(pixels)
     depths = np.zeros(n)
     found = np.zeros(n, dtype=np.bool_)
-    coarse, fine = _square(_HALF_COARSE_PATCH), _square(_HALF_PATCH)
+    coarse, fine = empty_patch(HALF_COARSE_PATCH), empty_patch(HALF_PATCH)
     scores = np.empty(_MAX_STEPS + 1)
     camera = (right_T_left, model, intrinsics, distortion, fold_radius(model, distortion))
     for i in range(n):
         x, y, w0, w1 = pixels[i, 0], pixels[i, 1], inverse_depths[i, 0], inverse_depths[i, 1]
         if not (_normalised_patch(left[1], 0.5 * x, 0.5 * y, coarse) and _normalised_patch(left[0], x, y, fine)):
             continue
-        w1 = _nearest_in_reach(rays[i], w0, w1, camera)
-        best, steps = _scan(right[1], 0.5, coarse, rays[i], w0, w1, camera, scores)
-        if steps == 0 or scores[best] < min_correlation or _is_ambiguous(scores[: steps + 1], best):
+        w1 = nearest_in_reach(rays[i], w0, w1, camera)
+        best, steps = scan_curve(right[1], 0.5, coarse, rays[i], w0, w1, camera, scores)
+        if steps == 0 or scores[best] < min_correlation or is_ambiguous(scores[: steps + 1], best):
             continue
         step = (w1 - w0) / steps
-        w0, w1 = w0 + (best - _FINE_STEPS) * step, w0 + (best + _FINE_STEPS) * step
-        best, steps = _scan(right[0], 1.0, fine, rays[i], w0, w1, camera, scores)
+        w0, w1 = w0 + (best - FINE_STEPS) * step, w0 + (best + FINE_STEPS) * step
+        best, steps = scan_curve(right[0], 1.0, fine, rays[i], w0, w1, camera, scores)
         if steps == 0 or scores[best] < min_correlation:
             continue
         depths[i], found[i] = w0 + (w1 - w0) * best / steps, True
@@ -82,7 +82,7 @@ def epipolar_search(
 
 
 @kernel
-def _nearest_in_reach(ray: Float, w0: float, w1: float, camera: _Camera) -> float:
+def nearest_in_reach(ray: Float, w0: float, w1: float, camera: _Camera) -> float:
     """Find, roughly, the largest inverse depth up to ``w1`` at which the right camera's model holds."""
     for _ in range(_HALVINGS):
         if _on_curve(ray, w1, camera)[2]:
@@ -92,7 +92,7 @@ def _nearest_in_reach(ray: Float, w0: float, w1: float, camera: _Camera) -> floa
 
 
 @kernel
-def _scan(
+def scan_curve(
     image: Image, scale: float, patch: AnyArray, ray: Float, w0: float, w1: float, camera: _Camera, scores: Float,
 ) -> tuple[int, int]:  # fmt: skip
     """Fill a patch's correlations along its epipolar curve, a pixel apart, in an image scaled by ``scale``.
@@ -121,10 +121,10 @@ def _scan(
 
 
 @kernel
-def _is_ambiguous(scores: Float, best: int) -> bool:
+def is_ambiguous(scores: Float, best: int) -> bool:
     """Check whether another place of the curve is as good as the best, as in a texture that repeats."""
     for k in range(len(scores)):  # noqa: SIM110 (numba knows no generators)
-        if abs(k - best) > _FINE_STEPS and scores[k] > _AMBIGUOUS * scores[best]:
+        if abs(k - best) > FINE_STEPS and scores[k] > _AMBIGUOUS * scores[best]:
             return True
     return False
 
@@ -249,7 +249,8 @@ def _on_curve(ray: Float, w: float, camera: _Camera) -> tuple[float, float, bool
 
 
 @kernel
-def _square(half: int) -> AnyArray:
+def empty_patch(half: int) -> AnyArray:
+    """Return room for a patch that reaches ``half`` pixels to each side."""
     return np.empty((2 * half + 1, 2 * half + 1), dtype=np.float32)
 
 

@@ -15,14 +15,14 @@ from graphvio.frontend.motion_stereo import PRIOR_INVERSE_DEPTH
 from graphvio.frontend.patches import pack
 from graphvio.frontend.prediction import around, predict_warps
 from graphvio.frontend.stereo import (
-    _FINE_STEPS,
-    _HALF_COARSE_PATCH,
-    _HALF_PATCH,
-    _is_ambiguous,
-    _nearest_in_reach,
-    _scan,
-    _square,
+    FINE_STEPS,
+    HALF_COARSE_PATCH,
+    HALF_PATCH,
+    empty_patch,
     epipolar_lines,
+    is_ambiguous,
+    nearest_in_reach,
+    scan_curve,
 )
 from graphvio.frontend.tracks import passes
 from graphvio.kernels import kernel
@@ -103,7 +103,7 @@ def _warped_search(
     """
     n = len(pixels)
     depths, found = np.zeros(n), np.zeros(n, dtype=np.bool_)
-    coarse, fine, scores = _square(_HALF_COARSE_PATCH), _square(_HALF_PATCH), np.empty(401)
+    coarse, fine, scores = empty_patch(HALF_COARSE_PATCH), empty_patch(HALF_PATCH), np.empty(401)
     camera = (right_T_left, model, intrinsics, distortion, fold_radius(model, distortion))
     for i in range(n):
         x, y, w0 = pixels[i, 0], pixels[i, 1], 0.0
@@ -111,13 +111,13 @@ def _warped_search(
             _warped_patch(left[1], 0.5 * x, 0.5 * y, warps[i], coarse) and _warped_patch(left[0], x, y, warps[i], fine)
         ):
             continue
-        w1 = _nearest_in_reach(rays[i], w0, nearest, camera)
-        best, steps = _scan(right[1], 0.5, coarse, rays[i], w0, w1, camera, scores)
-        if steps == 0 or scores[best] < _SEARCH_CORRELATION or _is_ambiguous(scores[: steps + 1], best):
+        w1 = nearest_in_reach(rays[i], w0, nearest, camera)
+        best, steps = scan_curve(right[1], 0.5, coarse, rays[i], w0, w1, camera, scores)
+        if steps == 0 or scores[best] < _SEARCH_CORRELATION or is_ambiguous(scores[: steps + 1], best):
             continue
         step = (w1 - w0) / steps
-        w0, w1 = w0 + (best - _FINE_STEPS) * step, w0 + (best + _FINE_STEPS) * step
-        best, steps = _scan(right[0], 1.0, fine, rays[i], w0, w1, camera, scores)
+        w0, w1 = w0 + (best - FINE_STEPS) * step, w0 + (best + FINE_STEPS) * step
+        best, steps = scan_curve(right[0], 1.0, fine, rays[i], w0, w1, camera, scores)
         if steps == 0 or scores[best] < _SEARCH_CORRELATION:
             continue
         depths[i], found[i] = max(w0 + (w1 - w0) * best / steps, 0.0), True
