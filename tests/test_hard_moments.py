@@ -159,7 +159,7 @@ def noise_like(image: Image, level: float, seed: int) -> Image:
 def test_the_walk_as_it_is(vga_walk: Path, measurements: list[Measurement]) -> None:
     walk = Walk(vga_walk, measurements, as_it_is)
     assert walk.end_error_m < 0.004
-    assert walk.worst < 50.0
+    assert walk.worst < 45.0
     assert walk.kinds() <= {"vision_weak"}
     assert walk.estimates[0].vision_sigmas is None
     for estimate in walk.estimates[1:]:
@@ -233,14 +233,14 @@ def test_a_blinded_pair_breaks_nothing(vga_walk: Path, measurements: list[Measur
     walk = Walk(vga_walk, measurements, altered(pair, lambda image: noise_like(image, 3.0, next(numbers))))
     assert all(estimate.status is Status.TRACKING for estimate in walk.estimates[1:])
     assert walk.end_error_m < 0.012
-    assert walk.worst < 50.0
+    assert walk.worst < 45.0
 
 
 @pytest.mark.parametrize("pair", [0, 1])
 def test_a_frozen_pair_is_left_out(vga_walk: Path, measurements: list[Measurement], pair: int) -> None:
     walk = Walk(vga_walk, measurements, frozen((pair,), 4.0))
     assert walk.end_error_m < 0.02
-    assert walk.worst < 50.0
+    assert walk.worst < 45.0
     left_out = [result for result in walk.results if pair not in result.pairs]
     assert len(left_out) == 39  # the first of forty is new
 
@@ -250,7 +250,7 @@ def test_all_frozen_is_never_sure(vga_walk: Path, measurements: list[Measurement
     during = [result for result in walk.results if "repeats" in result.reason]
     assert len(during) == 9
     assert all(result.quality is Quality.WEAK for result in during)
-    assert walk.worst < 50.0  # also of those that are measured when the images come alive again
+    assert walk.worst < 45.0  # also of those that are measured when the images come alive again
 
 
 @pytest.mark.parametrize("reference", ["keyframe", "previous"])
@@ -279,7 +279,7 @@ def test_a_pair_that_comes_back_interrupts_nothing(vga_walk: Path, measurements:
     assert all(result.motion is not None for result in walk.results[1:])
     assert {len(result.pairs) for result in walk.results} == {1, 2}
     assert all(result.pairs[pair].inliers > 40 for result in walk.results[-10:])
-    assert walk.worst < 50.0
+    assert walk.worst < 45.0
     assert walk.end_error_m < 0.006
 
 
@@ -322,5 +322,5 @@ def test_a_poster_that_is_carried_across_one_view(vga_walk: Path, measurements: 
         return replace(frameset, images={**frameset.images, 0: (left, right)})
 
     walk = Walk(vga_walk, measurements, carry)
-    assert walk.worst < 50.0
+    assert walk.worst < 45.0
     assert walk.end_error_m < 0.02

@@ -377,10 +377,10 @@ class Odometry:
     def _recalibrate(self, estimate: Estimate) -> None:
         """Use the calibration that comes into force, from the next frameset on: it waits for the IMU by its offset."""
         odom_T_body = self._estimator.state().nav_T_body
+        self._calibration.add(estimate, odom_T_body)
         old_R_new = self._calibration.update(estimate.stamp_ns)
         if old_R_new is not None:
             self._calibration.correct_pose(self._nav.turn(estimate.stamp_ns + 1, odom_T_body, old_R_new))
-        self._calibration.add(estimate, odom_T_body)
 
     # ------------------------------------------------------------------ the IMU's part
 
