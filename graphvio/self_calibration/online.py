@@ -174,6 +174,7 @@ class SelfCalibration:
             are_contradicting: whether the pairs' motions contradict each other. It is the calibration if they always
                 did, and the scene if they once agreed.
         """
+        self._adjust_when_due()
         if not self._is_keyframe(stamp_ns, views):
             return
         if self.is_trusted:
@@ -203,12 +204,10 @@ class SelfCalibration:
         Returns:
             Whether the calibration in force has changed.
         """
-        self._due_in -= 1
         if self._pending is None:
-            if len(self._keyframes) >= min(size for size in self._pace.adjusted_at if size > self._adjusted_at):
-                self._begin_adjustment()  # the IMU has by now covered the last keyframe, whatever its time offset
             return False
         if self._due_in > 0:
+            self._due_in -= 1
             return False
         pending, self._pending = self._pending, None
         try:
@@ -286,8 +285,16 @@ class SelfCalibration:
             median_displacement_px(last.views[j], views[j]) >= _MIN_DISPLACEMENT_PX for j in common
         )
 
-    def _begin_adjustment(self) -> None:
-        """Adjust the window as it is now; a full one is followed by a new one."""
+    def _adjust_when_due(self) -> None:
+        """Begin to adjust the window as it is now, if it has grown enough; a full one is followed by a new one.
+
+        It is done when the frameset after the last keyframe has come: by then the IMU covers the last keyframe,
+        whatever its time offset.
+        """
+        if self._pending is not None:
+            return
+        if len(self._keyframes) < min(size for size in self._pace.adjusted_at if size > self._adjusted_at):
+            return
         window = tuple(self._keyframes)
         self._due_in = self._pace.delay_framesets
         self._adjusted_at = len(window)
