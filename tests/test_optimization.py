@@ -280,13 +280,10 @@ def test_write_g2o_optimum_is_that_of_full_graph(walk: SyntheticSession, mixed: 
 
 
 def test_optimize_wrong_imu_is_not_used(room_walk: Path) -> None:
-    """Its biases jump at 2.5 s: vision is gated for a second, and then used, also for that second.
-
-    The calibration is taken for known: in the first seconds it could else be that which contradicts vision.
-    """
+    """Its biases jump at 2.5 s: vision is gated for a second, and then used, also for that second."""
     source = open_source(room_walk)
     recorder = Recorder("walk")
-    odometry = Odometry(source.rig, replace(CONFIG, calibration=replace(CONFIG.calibration, online=False)))
+    odometry = Odometry(source.rig, CONFIG)
     odometry.subscribe(recorder.add)
     kinds = []
     for measurement in source:

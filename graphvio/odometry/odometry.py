@@ -267,7 +267,7 @@ class Odometry:
     # ------------------------------------------------------------------ one frameset
 
     def _estimate(self, frameset: FrameSet) -> Estimate:
-        """Predict the state, measure the motion, gate it, update, publish, and recalibrate (sections 3 and 5)."""
+        """Predict the state, measure the motion, gate it, update, recalibrate, and publish (sections 3 and 5)."""
         self.stage_ms = {}
         if self._must_wait_for_imu(frameset.stamp_ns):
             visual = self._frontend.process(frameset, self._estimator.motion_since)
@@ -278,11 +278,11 @@ class Odometry:
         is_stationary = visual.is_stationary and self._imu_shows_standstill(predicted.interval)
         applied = self._gate(visual, is_stationary)
         status = self._update(predicted, visual, applied)
+        self._recalibrate(frameset.stamp_ns, visual, status)
+        self._restart_prediction(frameset.stamp_ns, status)
         if not self._estimator.has_pose:
             return estimate_without_pose(frameset.stamp_ns, visual, self.stage_ms)
-        estimate = self._publish(frameset, predicted, visual, is_stationary, applied, status)
-        self._recalibrate(estimate)
-        return estimate
+        return self._publish(frameset, predicted, visual, is_stationary, applied, status)
 
     @timed("predict")
     def _predict(self, stamp_ns: int) -> _Predicted:
@@ -308,14 +308,15 @@ class Odometry:
     @timed("update")
     def _gate(self, visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
         """Test the innovations, and insert the measurements that pass (section 5)."""
-        applied = self._estimator.apply(self._calibration.with_innovation_errors(visual), is_stationary)
+        visual = self._calibration.with_allowance(visual, self._estimator)
+        applied = self._estimator.apply(visual, is_stationary)
         if applied.needs_keyframe:
             self._frontend.start_keyframe()
         return applied
 
     @timed("update")
     def _update(self, predicted: _Predicted, visual: VisualResult, applied: MeasurementUpdate) -> Status:
-        """Solve for the state, and let the predictor and the time offset follow."""
+        """Solve for the state, and let the time offset follow."""
         stamp_ns = predicted.stamp_ns
         previous_keyframe = set() if self._keyframe_ns is None else {self._keyframe_ns}
         update = self._estimator.update(
@@ -327,9 +328,15 @@ class Odometry:
             self._frontend.start_keyframe()
         self._frontend.drop(update.outliers)
         self._synchroniser.forget_before(stamp_ns)
-        self._restart_prediction(stamp_ns, update.status)
         self._time_offset.update(stamp_ns, visual)
         return update.status
+
+    def _recalibrate(self, stamp_ns: int, visual: VisualResult, status: Status) -> None:
+        """Let the calibration take what the cameras see, and use the one that comes into force."""
+        self._calibration.add(stamp_ns, visual.quality, status, self._estimator)
+        old_R_new = self._calibration.update(stamp_ns)
+        if old_R_new is not None:
+            self._calibration.correct_pose(self._nav.turn(stamp_ns, self._estimator.state().nav_T_body, old_R_new))
 
     def _publish(
         self,
@@ -373,14 +380,6 @@ class Odometry:
         for on_step in self._on_step:
             on_step(step)
         return estimate
-
-    def _recalibrate(self, estimate: Estimate) -> None:
-        """Use the calibration that comes into force, from the next frameset on: it waits for the IMU by its offset."""
-        odom_T_body = self._estimator.state().nav_T_body
-        self._calibration.add(estimate, odom_T_body)
-        old_R_new = self._calibration.update(estimate.stamp_ns)
-        if old_R_new is not None:
-            self._calibration.correct_pose(self._nav.turn(estimate.stamp_ns + 1, odom_T_body, old_R_new))
 
     # ------------------------------------------------------------------ the IMU's part
 

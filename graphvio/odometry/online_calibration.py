@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
 from graphvio.arrays import Float
+from graphvio.backend.estimator import StateEstimator
 from graphvio.config import Config
 from graphvio.frontend.visual import VisualFrontend
-from graphvio.measurements.estimate import Estimate, Status
+from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind, Report
-from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
+from graphvio.measurements.motion import Quality, VisualResult
 from graphvio.measurements.sensors import ImuSample
+from graphvio.odometry.innovation_allowance import InnovationAllowance
 from graphvio.odometry.synchroniser import Synchroniser
 from graphvio.rig import Rig
 from graphvio.self_calibration.estimate import CalibrationEstimate
 from graphvio.self_calibration.findings import Finding, contradiction
 from graphvio.self_calibration.imu_correction import ImuCorrection
-from graphvio.self_calibration.innovation import InnovationErrors
 from graphvio.self_calibration.online import FullWindow, SelfCalibration
 from graphvio.self_calibration.window import View
 
@@ -55,15 +55,12 @@ class OnlineCalibration:
         self._reported: set[str] = set()  # pairs
         self._calibration = SelfCalibration(rig) if config.estimates_calibration else None
         self._margin_px = 0.0
-        self._innovation: InnovationErrors | None = None
-        self._innovation_of: Float | None = None  # covariance of the calibration
-        self._velocities: dict[
-            int, Float
-        ] = {}  # (6,) of body, at framesets that motions are measured from, and the newest
         if self._calibration is not None:
             self._body_R_first_left: Float = rig.pairs[0].left.body_T_cam[:3, :3]
             self._margin_px = self._epipolar_margin_px()
             frontend.recalibrate(rig, self._margin_px)
+        has_allowance = self._calibration is not None and rig.imu is not None
+        self._allowance = InnovationAllowance(len(rig.pairs)) if has_allowance else None
 
     @property
     def estimate(self) -> CalibrationEstimate | None:
@@ -93,6 +90,31 @@ class OnlineCalibration:
             self._averaged += 1
             self._mean_force = self._mean_force + (sample.linear_acceleration - self._mean_force) / self._averaged
 
+    def add(self, stamp_ns: int, quality: Quality, status: Status, estimator: StateEstimator) -> None:
+        """Take a frameset's pose, and the tracks that belong to it.
+
+        Args:
+            stamp_ns: of the frameset.
+            quality: of vision.
+            status: what the pose is based on.
+            estimator: has been updated by the frameset.
+        """
+        if self._calibration is None:
+            return
+        if self._allowance is not None:
+            self._allowance.add(stamp_ns, estimator, self._frontend.reference_stamps_ns, self._calibration.widest)
+        if status not in (Status.TRACKING, Status.INITIALISING) or quality is Quality.FAILED:
+            return
+        if estimator.epoch != self._epoch:
+            self._epoch = estimator.epoch
+            self._calibration.start_window()
+        views = {
+            j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_depth, frame.points[:, 2])
+            for j, frame in self._frontend.frames_at(stamp_ns).items()
+            if not frame.is_single
+        }
+        self._calibration.add_frameset(stamp_ns, estimator.state().nav_T_body, views, quality is Quality.WEAK)
+
     def update(self, stamp_ns: int) -> Float | None:
         """Let the other stages use the calibration that comes into force after a frameset.
 
@@ -104,9 +126,6 @@ class OnlineCalibration:
             return None
         old_R_left = self._body_R_first_left
         has_changed = self._calibration.update()
-        if self._rig.imu is not None and self._innovation_of is not self._calibration.widest:
-            self._innovation_of = self._calibration.widest
-            self._innovation = InnovationErrors(self._innovation_of, len(self._rig.pairs))
         if self._calibration.restarts > self._restarts:
             self._restarts = self._calibration.restarts
             self._report(
@@ -119,6 +138,9 @@ class OnlineCalibration:
         estimate = self._calibration.estimate
         self._report_findings(stamp_ns)
         self._frontend.recalibrate(estimate.rig, margin_px, self._calibration.extrinsics)
+        if has_changed:
+            # The way from an older reference, measured anew, would be a jump that no IMU can follow.
+            self._frontend.start_keyframe()
         if self._rig.imu is not None:
             self._synchroniser.imu_correction = ImuCorrection(*estimate.imu_matrices, self._mean_force)
             if self._corrects_time_offset:
@@ -129,20 +151,9 @@ class OnlineCalibration:
             return None
         return old_R_left @ self._body_R_first_left.T
 
-    def with_innovation_errors(self, visual: VisualResult) -> VisualResult:
-        """Return a frameset's result with what errors of the calibration add to the innovations of its motions."""
-        errors = self._innovation
-        if errors is None or visual.motion is None:
-            return visual
-        now = self._velocities[max(self._velocities)] if self._velocities else None
-
-        def with_errors(motion: RelativeMotion) -> RelativeMotion:
-            before = self._velocities.get(motion.reference_stamp_ns)
-            added = errors.covariance(motion.reference_T_current, before, now)
-            return replace(motion, calibration_covariance=added)
-
-        alternatives = tuple(map(with_errors, visual.alternatives))
-        return replace(visual, motion=with_errors(visual.motion), alternatives=alternatives)
+    def with_allowance(self, visual: VisualResult, estimator: StateEstimator) -> VisualResult:
+        """Return a frameset's result with what innovation tests of its motions allow for errors of the calibration."""
+        return visual if self._allowance is None else self._allowance.allow(visual, estimator)
 
     def correct_pose(self, turned: Float) -> None:
         """Take note that the newest pose has been changed by a tangent (6,) in body."""
@@ -170,36 +181,6 @@ class OnlineCalibration:
             return 0.0
         sigma_px = max(self._rig.calibration_sigmas.epipolar_px(pair.left.focal_px) for pair in self._rig.pairs)
         return min(_MARGIN_SIGMAS * sigma_px, _MAX_MARGIN_PX)
-
-    def add(self, estimate: Estimate, odom_T_body: Float) -> None:
-        """Take a frameset's estimate, and the tracks that belong to it.
-
-        Args:
-            estimate: of the frameset.
-            odom_T_body: (4, 4) its pose in the frame of the estimator.
-        """
-        if self._calibration is None or estimate.nav_T_body is None:
-            return
-        self._note_velocity(estimate)
-        if estimate.status not in (Status.TRACKING, Status.INITIALISING) or estimate.vision is Quality.FAILED:
-            return
-        if estimate.epoch != self._epoch:
-            self._epoch = estimate.epoch
-            self._calibration.start_window()
-        views = {
-            j: View(frame.ids, frame.pixels_at_stamp, frame.right_pixels_at_stamp, frame.has_depth, frame.points[:, 2])
-            for j, frame in self._frontend.frames_at(estimate.stamp_ns).items()
-            if not frame.is_single
-        }
-        self._calibration.add_frameset(estimate.stamp_ns, odom_T_body, views, estimate.vision is Quality.WEAK)
-
-    def _note_velocity(self, estimate: Estimate) -> None:
-        """Keep how body moves now, and at the framesets that motions are measured from."""
-        references, rate = self._frontend.reference_stamps_ns, estimate.rates.get("fused")
-        self._velocities = {ns: each for ns, each in self._velocities.items() if ns in references}
-        if rate is not None and estimate.velocity_nav is not None and estimate.nav_T_body is not None:
-            linear = estimate.nav_T_body[:3, :3].T @ estimate.velocity_nav
-            self._velocities[estimate.stamp_ns] = np.concatenate([rate, linear])
 
     def close(self) -> None:
         """End the thread."""

@@ -220,6 +220,9 @@ class SelfCalibration:
             return False
         if not (np.abs(solution.calibration.mean) <= self._largest).all():  # also rejects NaN
             return False  # no rig file is so wrong: the measurements are
+        was_exact = self.estimate.is_file_exact
+        if self.has_full_window and was_exact and not (is_full or adjusted.estimate.is_file_exact):
+            return False  # what a full window has confirmed, a part of one does not refute: it may be the scene's fault
         if is_full:
             self._evidence, self.has_full_window, self._refused = evidence, True, 0
         if (
@@ -230,7 +233,6 @@ class SelfCalibration:
             self._sigma_px = max(_NOISE_FACTOR * noise, _MIN_SIGMA_PX)
         self._consider.extend(adjusted.window, adjusted.by_cameras)
         self._consider.learn(adjusted.estimate.difference[: self._n_cameras], adjusted.covariance)
-        was_exact = self.estimate.is_file_exact
         self.estimate, self.extrinsics, self.widest = adjusted.estimate, adjusted.extrinsics, adjusted.widest
         self._in_force = self._nominal.moved(self.estimate.difference[: self._n_cameras])
         return not (was_exact and self.estimate.is_file_exact)
