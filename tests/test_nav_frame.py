@@ -99,11 +99,14 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return recorded(tmp_path_factory.mktemp("nav_frame") / "walk", SECONDS)
 
 
-def test_path_with_a_wrong_attitude_of_the_cameras_in_body_does_not_bend(walk: Path) -> None:
+@pytest.mark.parametrize(("seed", "max_error_m"), [(0, 0.0036), (1, 0.0055)])
+def test_path_with_a_wrong_attitude_of_the_cameras_in_body_does_not_bend(
+    seed: int, max_error_m: float, walk: Path
+) -> None:
     exact = open_source(walk)
     assert exact.truth is not None
     truth = load_trajectory(exact.truth)
-    written = draw(exact.rig, CalibrationError.of_level(3, ["cameras-in-body"]), 0).written_rig
+    written = draw(exact.rig, CalibrationError.of_level(3, ["cameras-in-body"]), seed).written_rig
     odometry = Odometry(written)
     estimates = [each for each in map(odometry.process, open_source(walk, written)) if each is not None]
     estimates += odometry.finish()
@@ -122,4 +125,4 @@ def test_path_with_a_wrong_attitude_of_the_cameras_in_body_does_not_bend(walk: P
         for poses in (estimated.nav_T_body, np.array([true[ns] for ns in estimated.stamps_ns.tolist()]))
     )
     np.testing.assert_allclose(steps, true_steps, atol=0.003)  # positions go on
-    assert evaluate(estimated, truth).ate_position_m.rmse < 0.0036
+    assert evaluate(estimated, truth).ate_position_m.rmse < max_error_m

@@ -139,7 +139,7 @@ class OnlineCalibration:
         self._report_findings(stamp_ns)
         self._frontend.recalibrate(estimate.rig, margin_px, self._calibration.extrinsics)
         if has_changed:
-            # The way from an older reference, measured anew, would be a jump that no IMU can follow.
+            # Measured again from an older reference, the way would have a jump that no IMU can follow.
             self._frontend.start_keyframe()
         if self._rig.imu is not None:
             self._synchroniser.imu_correction = ImuCorrection(*estimate.imu_matrices, self._mean_force)

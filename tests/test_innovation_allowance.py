@@ -1,0 +1,93 @@
+"""What innovation tests allow for errors of the calibration: those of the way since vision was last followed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from graphvio.arrays import Float
+from graphvio.backend.smoother_estimator import SmootherEstimator
+from graphvio.backend.states import RigState
+from graphvio.config import Config
+from graphvio.geometry import se3, se3_inverse, so3_exp
+from graphvio.measurements.gate_result import GateResult
+from graphvio.measurements.motion import Quality, RelativeMotion, VisualResult
+from graphvio.odometry.innovation_allowance import InnovationAllowance
+from graphvio.self_calibration.imu_model import PARAMETERS
+from graphvio.self_calibration.innovation import InnovationErrors
+from graphvio.self_calibration.parameters import PAIR
+from graphvio.simulation.default_rig import default_rig
+
+STEP_NS, STEP = 50_000_000, se3(so3_exp(np.array([0.02, -0.03, 0.05])), np.array([0.04, 0.0, 0.01]))
+RATE = np.array([0.4, -0.6, 1.0])
+COVARIANCE = 1e-4 * np.eye(2 * PAIR + PARAMETERS)
+
+
+class MovingEstimator(SmootherEstimator):
+    """A smoother whose states are one step apart: what is tested needs their motions and gate results only."""
+
+    def __init__(self) -> None:
+        super().__init__(default_rig(), Config(), lambda *_: None)
+        self.poses: dict[int, Float] = {}
+
+    def move(self, is_accepted: bool) -> int:
+        """Go one step on, whose vision passes or fails the test."""
+        k = len(self.poses)
+        self.poses[k * STEP_NS] = np.linalg.matrix_power(STEP, k)
+        self.gate_results = {"vision": GateResult(is_accepted, 0.0, 1.0, np.zeros(6), np.eye(6))}
+        return k * STEP_NS
+
+    def state(self) -> RigState:
+        return RigState(self.poses[max(self.poses)], np.array([0.5, 0.1 * len(self.poses), 0.0]), *np.zeros((2, 3)))
+
+    def latest_rate(self) -> Float:
+        return RATE
+
+    def motion_since(self, then_ns: int) -> Float | None:
+        then = self.poses.get(then_ns)
+        return None if then is None else se3_inverse(self.poses[max(self.poses)]) @ then
+
+
+def allowed(allowance: InnovationAllowance, estimator: MovingEstimator, reference_ns: int) -> Float | None:
+    """Return what is added to a motion from a reference to the newest state."""
+    stamp_ns = max(estimator.poses)
+    since = estimator.motion_since(reference_ns)
+    measured = np.eye(4) if since is None else se3_inverse(since)
+    motion = RelativeMotion(reference_ns, stamp_ns, measured, np.eye(6), np.zeros((6, 6)), 100)
+    found = allowance.allow(VisualResult(motion, Quality.GOOD, "", {}), estimator).motion
+    assert found is not None
+    return found.calibration_covariance
+
+
+@pytest.mark.parametrize("refused", [0, 3])
+def test_innovation_allowance_is_for_the_way_since_vision_was_followed(refused: int) -> None:
+    allowance, estimator = InnovationAllowance(2), MovingEstimator()
+    for k in range(10):
+        stamp_ns = estimator.move(is_accepted=k < 10 - refused)
+        allowance.add(stamp_ns, estimator, {0}, COVARIANCE)
+    estimator.move(is_accepted=False)
+    found, errors = allowed(allowance, estimator, 0), InnovationErrors(COVARIANCE, 2)
+    assert found is not None
+    way = np.linalg.matrix_power(STEP, 1 + refused)
+    without_time_offset = errors.covariance(way, None, None)
+    assert np.linalg.eigvalsh(found - without_time_offset)[0] > -1e-15  # the velocity has changed
+    np.testing.assert_allclose(found[:3, :3], without_time_offset[:3, :3], rtol=0.05)
+    assert np.trace(found) < 0.5 * np.trace(errors.covariance(np.linalg.matrix_power(STEP, 10), None, None))
+
+
+def test_innovation_allowance_from_a_newer_reference_is_for_the_way_from_there() -> None:
+    allowance, estimator = InnovationAllowance(2), MovingEstimator()
+    for k in range(6):
+        allowance.add(estimator.move(is_accepted=k < 2), estimator, {0, 4 * STEP_NS}, COVARIANCE)
+    found = allowed(allowance, estimator, 4 * STEP_NS)
+    assert found is not None
+    of_step = InnovationErrors(COVARIANCE, 2).covariance(STEP, None, None)
+    np.testing.assert_allclose(found[:3, :3], of_step[:3, :3], rtol=0.05)
+
+
+def test_innovation_allowance_before_the_first_frameset_and_from_a_forgotten_state_is_none() -> None:
+    allowance, estimator = InnovationAllowance(2), MovingEstimator()
+    estimator.move(is_accepted=True)
+    assert allowed(allowance, estimator, 0) is None
+    allowance.add(0, estimator, {0}, COVARIANCE)
+    assert allowed(allowance, estimator, 7) is None
