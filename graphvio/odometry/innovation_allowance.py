@@ -29,7 +29,9 @@ class InnovationAllowance:
         self._errors: InnovationErrors | None = None
         self._covariance: Float | None = None
         self._followed_ns = -1  # the newest frameset whose motion passed the test
-        self._velocities: dict[int, Float] = {}  # (6,) of body, there and at framesets that motions are measured from
+        self._velocity: Float | None = None  # (6,) of body at the newest frameset
+        self._velocities: dict[int, Float | None] = {}
+        """The same one frameset before that and before those which motions are measured from."""
 
     def add(self, stamp_ns: int, estimator: StateEstimator, references: Set[int], covariance: Float) -> None:
         """Take a frameset.
@@ -47,9 +49,8 @@ class InnovationAllowance:
             self._followed_ns = stamp_ns
         kept = {*references, self._followed_ns}
         self._velocities = {ns: each for ns, each in self._velocities.items() if ns in kept}
-        velocity = _body_velocity(estimator)
-        if velocity is not None:
-            self._velocities[stamp_ns] = velocity
+        self._velocities[stamp_ns] = self._velocity
+        self._velocity = _body_velocity(estimator)
 
     def allow(self, visual: VisualResult, estimator: StateEstimator) -> VisualResult:
         """Return a frameset's result whose motions have the covariance that the calibration's errors add.
@@ -58,7 +59,7 @@ class InnovationAllowance:
             visual: Of the frameset.
             estimator: Has predicted the state there.
         """
-        errors, now = self._errors, _body_velocity(estimator)
+        errors, now = self._errors, self._velocity  # that of the state here would come from the IMU under test
         if visual.motion is None or errors is None:
             return visual
 

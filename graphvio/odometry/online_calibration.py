@@ -10,6 +10,7 @@ from graphvio.arrays import Float
 from graphvio.backend.estimator import StateEstimator
 from graphvio.config import Config
 from graphvio.frontend.visual import VisualFrontend
+from graphvio.geometry import so3_log
 from graphvio.measurements.estimate import Status
 from graphvio.measurements.events import EventKind, Report
 from graphvio.measurements.motion import Quality, VisualResult
@@ -25,6 +26,7 @@ from graphvio.self_calibration.window import View
 
 _MARGIN_SIGMAS = 3.0  # of epipolar lines by the rig file
 _MAX_MARGIN_PX = 5.0  # farther off, patches are not registered
+_MAX_TURN_RAD = np.deg2rad(0.3)  # of the cameras in body, up to which motions are measured from references as before
 _AVERAGED = 100  # samples, whose mean specific force is about that of gravity
 
 
@@ -138,9 +140,6 @@ class OnlineCalibration:
         estimate = self._calibration.estimate
         self._report_findings(stamp_ns)
         self._frontend.recalibrate(estimate.rig, margin_px, self._calibration.extrinsics)
-        if has_changed:
-            # Measured again from an older reference, the way would have a jump that no IMU can follow.
-            self._frontend.start_keyframe()
         if self._rig.imu is not None:
             self._synchroniser.imu_correction = ImuCorrection(*estimate.imu_matrices, self._mean_force)
             if self._corrects_time_offset:
@@ -149,7 +148,11 @@ class OnlineCalibration:
         self._body_R_first_left = estimate.rig.pairs[0].left.body_T_cam[:3, :3]
         if self._restarts or np.array_equal(self._body_R_first_left, old_R_left):
             return None
-        return old_R_left @ self._body_R_first_left.T
+        old_R_new: Float = old_R_left @ self._body_R_first_left.T
+        if self._rig.imu is not None and np.linalg.norm(so3_log(old_R_new)) > _MAX_TURN_RAD:
+            # Measured again from an older reference, the way would have a jump that no IMU can follow.
+            self._frontend.start_keyframe()
+        return old_R_new
 
     def with_allowance(self, visual: VisualResult, estimator: StateEstimator) -> VisualResult:
         """Return a frameset's result with what innovation tests of its motions allow for errors of the calibration."""
