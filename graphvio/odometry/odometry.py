@@ -432,6 +432,7 @@ class Odometry:
             return not self._estimator.has_imu
         return shows_standstill(interval, self.config.initialisation)
 
+    @timed("update")
     def _restart_prediction(self, stamp_ns: int, status: Status) -> None:
         """Predict from the new estimate from now on."""
         if status is Status.LOST or not self._estimator.has_pose:
