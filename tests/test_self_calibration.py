@@ -26,6 +26,7 @@ from graphvio.self_calibration.bundle import Eliminated, Tracks, _observe, _scra
 from graphvio.self_calibration.evidence import EXACT, Evidence, FilePrior, Gaussian
 from graphvio.self_calibration.findings import contradiction, described
 from graphvio.self_calibration.inertial import InertialSamples
+from graphvio.self_calibration.knock import KnockDetector
 from graphvio.self_calibration.online import FullWindow, SelfCalibration
 from graphvio.self_calibration.parameters import (
     BODY,
@@ -426,7 +427,21 @@ def test_self_calibration_after_a_knock_finds_the_turned_camera_and_keeps_the_le
     found = calibration.estimate.rig.pairs[0]
     off = so3_log(np.ascontiguousarray(found.right_T_left[:3, :3] @ knocked.pairs[0].right_T_left[:3, :3].T))
     assert np.rad2deg(np.abs(off)).max() < 0.01
-    assert found.left.intrinsics == pytest.approx(pair.left.intrinsics, abs=0.5)
+    assert found.left.intrinsics == pytest.approx(pair.left.intrinsics, abs=0.02)
+    assert not calibration.estimate.is_file_exact
+    other, in_file = calibration.estimate.rig.pairs[1], rig.pairs[1]  # an exact file stays exact where nothing moved
+    assert np.abs(other.right_T_left - in_file.right_T_left).max() < 1e-5
+    assert np.abs(other.left.body_T_cam - in_file.left.body_T_cam).max() < 1e-5
+
+
+def test_knock_detector_names_the_pair_that_is_off() -> None:
+    rig = default_rig().without_imu()
+    pair = rig.pairs[1]
+    turned = pair.right.body_T_cam @ se3_exp(np.deg2rad([0.06, 0.06, 0.06, 0.0, 0.0, 0.0]))
+    knocked = replace(rig, pairs=(rig.pairs[0], replace(pair, right=replace(pair.right, body_T_cam=turned))))
+    detector, in_force = KnockDetector(), RigCalibration.of(rig)
+    found = [detector.update(views, in_force) for _, _, views in Walk(knocked).framesets(0.5)]
+    assert found[:3] == [[], [], [1]]
 
 
 @pytest.mark.parametrize("level", [0, 2])

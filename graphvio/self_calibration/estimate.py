@@ -27,6 +27,7 @@ class CalibrationEstimate:
             to right, and of the places of pairs and the IMU. `EXACT` where the file is as good as exact.
         log_bayes_factor: twice the logarithm of the odds of these factors against an exact file; above 10 it is very
             strong evidence (R. E. Kass, A. E. Raftery, *Bayes factors*, 1995).
+        is_changed: whether a knock has changed the cameras since the file was made.
     """
 
     file_rig: Rig
@@ -34,11 +35,12 @@ class CalibrationEstimate:
     difference: Float
     file_factors: Float
     log_bayes_factor: float = 0.0
+    is_changed: bool = False
 
     @property
     def is_file_exact(self) -> bool:
         """Whether the measurements say nothing against the rig file, which then stays in force."""
-        return bool((self.file_factors == EXACT).all())
+        return not self.is_changed and bool((self.file_factors == EXACT).all())
 
     @cached_property
     def sigmas(self) -> Float:

@@ -49,10 +49,12 @@ class FilePrior(NamedTuple):
     Attributes:
         covariance: (C, C) of the differences from the file, for factors of 1.
         group: (C,) index of the factor of each parameter, or -1 where none applies: no file has biases.
+        change: (C, C) covariance of what knocks have changed since the file was made, or None. No factor applies to it.
     """
 
     covariance: Float
     group: Int
+    change: Float | None = None
 
     @property
     def n_groups(self) -> int:
@@ -62,7 +64,12 @@ class FilePrior(NamedTuple):
     def with_factors(self, factors: Float) -> Float:
         """Return the covariance (C, C) for the groups' factors (G,)."""
         each = self.of_each(factors)
-        return np.asarray(self.covariance * each * each[:, None])
+        of_file = np.asarray(self.covariance * each * each[:, None])
+        return of_file if self.change is None else of_file + self.change
+
+    def changed(self, change: Float) -> FilePrior:
+        """Return the prior after a change with a covariance (C, C)."""
+        return self._replace(change=change if self.change is None else self.change + change)
 
     def of_each(self, factors: Float) -> Float:
         """Return each parameter's factor (C,), of the groups' factors (G,)."""
@@ -153,7 +160,11 @@ class Evidence(NamedTuple):
             factors: (G,).
         """
         each = prior.of_each(factors)
-        lower = cholesky(self.information + information / (each * each[:, None]))
+        prior_information: Float = information / (each * each[:, None])
+        if prior.change is not None:
+            covariance = prior.with_factors(factors)
+            prior_information, each = np.asarray(np.linalg.inv(covariance), np.float64), np.diag(cholesky(covariance))
+        lower = cholesky(self.information + prior_information)
         fitted = solve_lower(lower, self.vector.reshape(1, -1))[0]
         likelihood = float(fitted @ fitted - 2.0 * np.log(each * np.diag(lower)).sum())
         return likelihood if np.isfinite(likelihood) else -np.inf  # a matrix that rounding made indefinite

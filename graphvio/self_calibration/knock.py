@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -22,20 +22,20 @@ class KnockDetector:
     """Watches how far matches are off their epipolar lines, which nothing in the scene can change."""
 
     def __init__(self) -> None:
-        self._off = 0  # keyframes, one after the other
+        self._off: dict[int, int] = {}  # pair index -> keyframes, one after the other
 
-    def update(self, views: Mapping[int, View], calibration: RigCalibration) -> bool:
+    def update(self, views: Mapping[int, View], calibration: RigCalibration) -> list[int]:
         """Take a keyframe's views.
 
         Returns:
-            Whether cameras of a pair have been off for so long that they are no longer where they were.
+            Indices of the pairs whose cameras have been off for so long that they are no longer where they were.
         """
-        offsets = [epipolar_offset_px(view, calibration, j) for j, view in views.items()]
-        self._off = self._off + 1 if max(offsets, default=0.0) > _MAX_OFFSET_PX else 0
-        if self._off < _CONFIRMED:
-            return False
-        self._off = 0
-        return True
+        off = [j for j, view in views.items() if epipolar_offset_px(view, calibration, j) > _MAX_OFFSET_PX]
+        self._off = {j: self._off.get(j, 0) + 1 for j in off}
+        knocked = [j for j, keyframes in self._off.items() if keyframes >= _CONFIRMED]
+        if knocked:
+            self._off = {}
+        return knocked
 
 
 def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> float:
@@ -57,12 +57,14 @@ def epipolar_offset_px(view: View, calibration: RigCalibration, pair: int) -> fl
     return float(abs(np.median(distances)) * calibration.intrinsics[pair, 1, 0] * scale)
 
 
-def knock_covariance(n_parameters: int, n_pairs: int) -> Float:
-    """Return the covariance (C, C) of what a knock does: it turns and shifts cameras, and leaves lenses and IMU."""
+def knock_covariance(n_parameters: int, pairs: Iterable[int]) -> Float:
+    """Return the covariance (C, C) of what a knock does to some pairs.
+
+    It turns and shifts cameras, and leaves lenses and IMU. A housing bends; its length, and so the baseline, stays.
+    """
     variances = np.zeros(n_parameters)
-    of_pairs = variances[: n_pairs * PAIR].reshape(n_pairs, PAIR)
-    for start in (STEREO, BODY):
-        of_pairs[:, start : start + 3] = _TURNED_RAD**2
-        of_pairs[:, start + 3 : start + 6] = _MOVED_M**2
-    of_pairs[:, STEREO + 3 : BODY] = 0.0  # a housing bends; its length stays
+    for j in pairs:
+        of_pair = variances[j * PAIR : (j + 1) * PAIR]
+        of_pair[STEREO : STEREO + 3] = of_pair[BODY : BODY + 3] = _TURNED_RAD**2
+        of_pair[BODY + 3 : PAIR] = _MOVED_M**2
     return np.diag(variances)

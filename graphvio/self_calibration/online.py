@@ -8,7 +8,7 @@ comes into force a fixed number of framesets after its adjustment began, so that
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import NamedTuple
 
@@ -178,8 +178,8 @@ class SelfCalibration:
         if not self._is_keyframe(stamp_ns, views):
             return
         if self.is_trusted:
-            if self._knocks.update(views, self._in_force):
-                self._forget_places()
+            if knocked := self._knocks.update(views, self._in_force):
+                self._forget_places(knocked)
             elif are_contradicting:
                 return
         self._agreeing += not are_contradicting
@@ -262,14 +262,15 @@ class SelfCalibration:
         """Leave a window out that contradicts those before it; several such windows are a knock."""
         self._refused += is_full
         if self._refused >= _MAX_REFUSED:
-            self._forget_places()
+            self._forget_places(range(len(self._rig.pairs)))
 
-    def _forget_places(self) -> None:
-        """Begin again after a knock, with what was known of lenses and IMU."""
+    def _forget_places(self, pairs: Iterable[int]) -> None:
+        """Begin again after a knock of some pairs, with what was known of the others, of lenses and IMU."""
         if self._pending is not None:
             wait([self._pending])  # it is of a window from before the knock, and reads what changes now
             self._pending = None
-        self._evidence = self._evidence.forgotten(knock_covariance(len(self._walk), len(self._rig.pairs)))
+        change = knock_covariance(len(self._walk), pairs)
+        self._evidence, self._prior = self._evidence.forgotten(change), self._prior.changed(change)
         self._keyframes, self._adjusted_at, self._full_windows = [], 0, 0
         self.has_full_window, self._agreeing, self._refused = False, 0, 0
         self.restarts += 1
@@ -325,11 +326,12 @@ class SelfCalibration:
         factors, log_bayes_factor = evidence.file_factors(self._prior, _MIN_LOG_BAYES_FACTORS)
         posterior = evidence.given(self._prior, _assumed(factors))
         n_cameras, in_force = self._n_cameras, np.zeros_like(difference)
-        if (factors != EXACT).any():
+        is_changed = self._prior.change is not None
+        if is_changed or (factors != EXACT).any():
             in_force = evidence.given(self._prior, factors).mean
         covariance = evidence.mean_square(self._prior, in_force)[:n_cameras, :n_cameras]
         extrinsics = {}
-        estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor)
+        estimate = CalibrationEstimate(self._rig, posterior, in_force, factors, log_bayes_factor, is_changed)
         anywhere = evidence.given(self._prior, np.full_like(factors, MAX_FACTOR))
         if not estimate.is_file_exact:
             extrinsics = extrinsic_covariances(self._rig, anywhere)
