@@ -11,6 +11,7 @@ import os
 import re
 import sys
 import tempfile
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 
@@ -56,6 +57,17 @@ def cache_folders(module: str) -> list[Path]:
 def any_compiled_before(module: str) -> bool:
     """Return whether a cache holds code of a module's kernels, so that a first call need not compile."""
     return any(any(folder.glob("*.nbc")) for folder in cache_folders(module))
+
+
+def compiled_names(modules: Iterable[str]) -> list[str]:
+    """Return the names of the modules' kernels that have code in a cache, that which was compiled last at the end."""
+    times: dict[tuple[str, str], float] = {}
+    for module in modules:
+        for folder in cache_folders(module):
+            for index in folder.glob("*.nbi"):  # such as stereo.epipolar_search-96.py311.nbi
+                name = index.name.split(".")[1].rpartition("-")[0]
+                times[module, name] = index.stat().st_mtime
+    return [name for _, name in sorted(times, key=lambda key: times[key])]
 
 
 @functools.cache

@@ -4,13 +4,14 @@ import atexit
 import logging
 import subprocess
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
 import numba
 import numpy as np
 from numba.core import event as numba_event
 
 from graphvio.compiled_code import KernelCache
+from graphvio.kernel_cache import compiled_names
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -71,23 +72,47 @@ def await_compilers() -> None:
         compiler.wait()
 
 
+class CompilationProgress(NamedTuple):
+    """How many kernels of the modules that are imported are compiled.
+
+    Attributes:
+        compiled: number of kernels whose code is in a cache, by whichever process.
+        total: number of kernels; some of them may not be needed.
+        newest: name of the kernel that was compiled last.
+    """
+
+    compiled: int
+    total: int
+    newest: str
+
+
+def compilation_progress() -> CompilationProgress | None:
+    """Return how many kernels are compiled, or None where this process has compiled none; from any thread."""
+    if not _announcer.has_announced:
+        return None
+    kernels = list(_registered)
+    names = compiled_names({each.__module__ for each in kernels})
+    return CompilationProgress(len(names), len(kernels), names[-1] if names else "")
+
+
 class _Announcer(numba_event.Listener):  # type: ignore[misc]
     """Logs, once in a process, that kernels are being compiled."""
 
     def __init__(self) -> None:
-        self._announced = False
+        self.has_announced = False
 
     def on_start(self, event: Any) -> None:
         """Handle that numba begins to compile a function that no cache holds."""
-        if not self._announced and event.data["dispatcher"] in _registered:
-            self._announced = True
+        if not self.has_announced and event.data["dispatcher"] in _registered:
+            self.has_announced = True
             _log.warning("compiling numerical kernels for this machine, once; it takes about a minute")
 
     def on_end(self, event: Any) -> None:
         """Handle that numba has compiled a function."""
 
 
-numba_event.register("numba:compile", _Announcer())
+_announcer = _Announcer()
+numba_event.register("numba:compile", _announcer)
 
 
 @kernel

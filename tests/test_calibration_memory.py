@@ -27,7 +27,7 @@ KEPT, LEARNT, OTHER = "kept for the next run of simulator-room", "as learnt by t
 def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """The user's cache, empty, while kernels stay where they are."""
     monkeypatch.setattr("graphvio.live.calibration_memory.cache_root", lambda: tmp_path / "cache")
-    monkeypatch.setattr("graphvio.warmup.warm_up", lambda *_: None)
+    monkeypatch.setattr("graphvio.warmup.warm_up", lambda *_, **__: None)
     return tmp_path / "cache/calibrations"
 
 

@@ -55,7 +55,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def cold(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("graphvio.warmup.warm_up", lambda *_: None)
+    monkeypatch.setattr("graphvio.warmup.warm_up", lambda *_, **__: None)
 
 
 def live(*arguments: object) -> Any:
@@ -128,7 +128,7 @@ _LIMITED = """
 import resource, signal, sys
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 import graphvio.warmup
-graphvio.warmup.warm_up = lambda *_: None
+graphvio.warmup.warm_up = lambda *_, **__: None
 from graphvio.sessions import mcap_storage
 mcap_storage._CHUNK_BYTES = 20_000  # so that the size on the disk does not depend on speed
 from graphvio.cli import main

@@ -1,3 +1,4 @@
+import ast
 import importlib
 import os
 import subprocess
@@ -62,6 +63,22 @@ def test_compiled_code_is_written_once_and_found_again(tmp_path: Path) -> None:
     ]
     assert answers == [["False", "0", "1"], ["True", "1", "0"]]
     assert [path for path in tmp_path.iterdir() if path.name.startswith("graphvio.geometry-")]
+
+
+def test_compilation_progress_counts_the_kernels_in_the_cache(tmp_path: Path) -> None:
+    program = (
+        "import numpy as np; from graphvio import geometry, kernels; print(kernels.compilation_progress());"
+        "geometry.skew(np.zeros(3)); geometry.so3_exp(np.zeros(3)); print(tuple(kernels.compilation_progress()))"
+    )
+    environment = {**os.environ, "GRAPHVIO_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+    )
+    before, after = done.stdout.splitlines()
+    compiled, total, newest = ast.literal_eval(after)
+    assert before == "None"
+    assert 2 <= compiled < total
+    assert newest == "so3_exp"
 
 
 def test_loaded_kernels_parse_their_intermediate_code_when_a_caller_is_compiled(tmp_path: Path) -> None:

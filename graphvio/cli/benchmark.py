@@ -60,11 +60,11 @@ def benchmark(
     from graphvio.benchmark.report import write_report
     from graphvio.benchmark.run import run_sequences
     from graphvio.benchmark.table import Benchmark
+    from graphvio.cli.warming import warm_up_visibly
     from graphvio.config import Config
     from graphvio.errors import BenchmarkError
     from graphvio.results import ResultWriter
     from graphvio.simulation import default_rig
-    from graphvio.warmup import warm_up
 
     chosen = dataset_of(dataset)
     settings = Config.load(config)
@@ -78,7 +78,7 @@ def benchmark(
         found = [each for each in found if each.name in wanted]
     results = out if out is not None else ResultWriter.new_folder(Path("results"), f"benchmark-{chosen.key}")
     at_once = min(jobs if jobs is not None else max(1, (os.cpu_count() or 1) // 2), len(found))
-    warm_up(default_rig(), settings)  # once, and not as a part of each sequence's time
+    warm_up_visibly(default_rig(), settings)  # once, and not as a part of each sequence's time
     passed = ["--config", config] + (["--no-imu"] if no_imu else []) + ([] if to_s is None else ["--to", str(to_s)])
     try:
         outcomes = run_sequences(

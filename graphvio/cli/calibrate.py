@@ -74,11 +74,11 @@ def calibrate(
     from graphvio.calibration.report.document import document, write_document
     from graphvio.cli.calibrate_rig import calibrate_rig
     from graphvio.cli.calibration_progress import CalibrationProgress
+    from graphvio.cli.warming import warm_up_visibly
     from graphvio.config import Config
     from graphvio.errors import CalibrationError
     from graphvio.rig_files import save_rig
     from graphvio.runtime import use_one_opencv_thread
-    from graphvio.warmup import warm_up
 
     _check_outputs(out, report, [] if rig is None else [rig])
     is_of_pairs = _is_of_pairs(what, {"--correct-imu": correct_imu, "--guide": guide, "--scale": scale != "auto"})
@@ -92,7 +92,7 @@ def calibrate(
         raise CalibrationError("--correct-imu wants --out FILE to write the rig to, and a recording with an IMU")
     mode = _scale_mode(scale)
     use_one_opencv_thread()
-    warm_up(opened.rig.with_pairs([0]).without_imu(), settings)
+    warm_up_visibly(opened.rig.with_pairs([0]).without_imu(), settings)
     names = [pair.name for pair in opened.rig.pairs]
     with CalibrationProgress(opened.frameset_count, names if guide else None) as progress:
         found = calibrate_pairs(opened, config=settings, seed=seed, scale_mode=mode, on_frameset=progress.on_frameset)

@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 def calibrate_rig(opened: Source, settings: Config, what: str, out: Path | None, report: Path | None) -> None:
     """Calibrate the rig of a recording, print the result, and write what is asked for."""
     from graphvio.calibration.report.rig_page import write_rig_report
+    from graphvio.cli.warming import warm_up_visibly
     from graphvio.odometry.recorded_calibration import calibrate_recording
     from graphvio.rig_files import save_rig
     from graphvio.runtime import interruptible, use_one_opencv_thread
-    from graphvio.warmup import warm_up
 
     use_one_opencv_thread()
-    warm_up(opened.rig, settings)
+    warm_up_visibly(opened.rig, settings)
     try:
         with interruptible(), stage_bars() as bars:
             show = show_stages(bars, {"odometry": opened.frameset_count})

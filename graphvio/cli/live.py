@@ -96,6 +96,7 @@ def run_live(
     from time import monotonic
 
     from graphvio.cli.dashboard import Dashboard, line_of, summary_of
+    from graphvio.cli.warming import warm_up_visibly
     from graphvio.config import Config
     from graphvio.live.health import HealthServer
     from graphvio.live.outputs import ViewOutput
@@ -105,7 +106,6 @@ def run_live(
     from graphvio.live.sources import open_live_source
     from graphvio.rig_files import load_rig
     from graphvio.runtime import StopSignals, share_heap, sigterm_as_interrupt, use_one_opencv_thread
-    from graphvio.warmup import warm_up
 
     if duration_s is not None and not duration_s > 0.0:
         raise typer.BadParameter(f"--for is {duration_s:g}; give seconds")
@@ -131,7 +131,7 @@ def run_live(
             if memory is not None:
                 used = _remembered(memory, used)
             use_one_opencv_thread()
-            warm_up(used, settings)  # measurements that come meanwhile are not used
+            warm_up_visibly(used, settings)  # measurements that come meanwhile are not used
         signals = stack.enter_context(StopSignals())
         recording = stack.enter_context(ExitStack())  # closed after the run, so that it is complete
         viewer = _viewer(stack, used, view, services)

@@ -72,12 +72,12 @@ def optimize(
 
         graphvio optimize monday.mcap tuesday.mcap --out both
     """
+    from graphvio.cli.warming import warm_up_visibly
     from graphvio.config import Config
     from graphvio.optimization.loops.colmap_library import colmap
     from graphvio.optimization.pipeline import optimize_sessions
     from graphvio.results import ResultWriter
     from graphvio.runtime import interruptible, use_one_opencv_thread
-    from graphvio.warmup import warm_up
 
     if not no_loops:
         colmap()  # before hours of work, not after
@@ -93,7 +93,7 @@ def optimize(
         folder = ResultWriter.new_folder(Path("results"), f"{opened[0].name}-optimized")
     use_one_opencv_thread()
     for source in opened:
-        warm_up(source.rig, settings)
+        warm_up_visibly(source.rig, settings)
     try:
         with interruptible(), stage_bars() as bars:
             found = optimize_sessions(

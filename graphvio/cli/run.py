@@ -62,13 +62,13 @@ def run(
     from contextlib import ExitStack
     from dataclasses import asdict
 
+    from graphvio.cli.warming import warm_up_visibly
     from graphvio.config import Config
     from graphvio.pipeline import RunListener
     from graphvio.pipeline import run as run_pipeline
     from graphvio.results import ResultWriter
     from graphvio.runtime import interruptible, use_one_opencv_thread
     from graphvio.viewer import Viewer
-    from graphvio.warmup import warm_up
 
     settings = Config.load(config)
     opened = open_recording(
@@ -85,7 +85,7 @@ def run(
                 RunListener(on_estimate=viewer.show, on_event=viewer.show_event, on_calibration=viewer.show_calibration)
             )
         use_one_opencv_thread()
-        warm_up(opened.rig, settings, wait_for_calibration=False)
+        warm_up_visibly(opened.rig, settings, wait_for_calibration=False)
         listeners.append(RunListener(on_progress=stack.enter_context(_ProgressLine()).show))
         try:
             with interruptible():

@@ -23,15 +23,15 @@ def warmup(config: options.ConfigName = "default", verbose: options.Verbose = Fa
     """
     import numpy as np
 
+    from graphvio.cli.warming import warm_up_visibly
     from graphvio.config import Config
     from graphvio.geometry import rotation_from_quat_wxyz
     from graphvio.kernel_cache import cache_root
     from graphvio.simulation import default_rig
     from graphvio.trajectory import Trajectory
-    from graphvio.warmup import warm_up
 
     begun_s = perf_counter()
-    warm_up(default_rig(), Config.load(config))
+    warm_up_visibly(default_rig(), Config.load(config))
     poses = Trajectory(np.array([0, 2]), np.tile(np.eye(4), (2, 1, 1)))
     poses.at(np.array([1]), max_gap_s=1.0)  # as a true trajectory is compared with
     rotation_from_quat_wxyz(np.array([1.0, 0.0, 0.0, 0.0]))
