@@ -215,8 +215,9 @@ def test_info_describes_a_session(recording: Path, tmp_path: Path) -> None:
     assert found.is_whole
     topics = {topic.name: topic for topic in found.topics}
     images = topics["/pair1/right/image_raw"]
-    assert images.rate_hz == pytest.approx(20.0)
-    assert images.gaps == 0
+    assert images.regularity is not None
+    assert images.regularity.rate_hz == pytest.approx(20.0)
+    assert images.regularity.gaps == 0
     assert images.latency_ms == 0.0
     done = CliRunner().invoke(app, ["info", str(path)])
     assert done.exit_code == 0

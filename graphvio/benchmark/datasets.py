@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from graphvio.errors import BenchmarkError
 from graphvio.sources import is_recording
+from graphvio.sources.surroundings import recordings_below
 
 _MAX_DEPTH = (
     4  # of recordings below the folder: dataset/sequences/00, M_monado_datasets/MI_valve_index/MIO_others/MIO01
@@ -140,7 +140,7 @@ def find_sequences(dataset: Dataset, folder: Path, rig: Path | None = None) -> l
     if not folder.is_dir():
         raise BenchmarkError(f"{folder}: is no folder; give the one that holds the sequences of {dataset.title}")
     found: dict[str, list[Path]] = {}
-    for recording in _recordings(folder.resolve(), _MAX_DEPTH):
+    for recording in recordings_below(folder.resolve(), _MAX_DEPTH, is_recording):
         name = dataset.sequence_of(recording.name)
         if name is not None:
             found.setdefault(name, []).append(recording)
@@ -161,16 +161,6 @@ def find_sequences(dataset: Dataset, folder: Path, rig: Path | None = None) -> l
         for name in sorted(found, key=lambda name: (ranks.get(name, len(ranks)), name))
         for number, recording in enumerate(sorted(found[name]), start=1)
     ]
-
-
-def _recordings(path: Path, depth: int) -> Iterator[Path]:
-    """Yield the recordings at or below a path; what is inside a recording is part of it."""
-    if is_recording(path):
-        yield path
-    elif path.is_dir() and depth:
-        for below in sorted(path.iterdir()):
-            if below.is_dir() or below.suffix in (".bag", ".mcap"):
-                yield from _recordings(below, depth - 1)
 
 
 def _calibration(dataset: Dataset, recording: Path, folder: Path) -> Path | None:

@@ -1,7 +1,8 @@
-"""``graphvio info`` and ``graphvio dump-config``: the contents of a session or bag, and the values of a profile."""
+"""``graphvio info`` and ``graphvio dump-config``: the contents of a recording, and the values of a profile."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,26 +14,47 @@ from graphvio.cli.json_output import publish
 if TYPE_CHECKING:
     from graphvio.sessions.stamps import Clock
     from graphvio.sources.description import Synchronisation, TopicDescription
+    from graphvio.sources.regularity import Regularity
 
 
 def info(
-    session: Annotated[Path, typer.Argument(help="Session (.mcap) or ROS bag (.bag, or a ROS 2 folder).")],
+    source: options.Source,
+    rig: options.RigFile = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Show the contents of a session or bag: duration, size, rig, and topics with their rates, gaps and jitter.
+    """Show what a recording holds: its duration, its rig, and cameras and IMU with their rates, gaps and jitter.
 
-    Also shows how far clocks can be trusted: stamps that go back or jump, the delay from a message's stamp to its
-    recording with its drift, and how well cameras are synchronised.
+    Of a session or bag it shows all topics, and how far clocks can be trusted: stamps that go back or jump, the delay
+    from a message's stamp to its recording with its drift, and how well cameras are synchronised.
+
+    Ends with exit code 0; with 2, and a line that says why, where the path is no recording that can be run.
 
     Examples:
 
+        graphvio info walk
+
         graphvio info mh01.mcap
-
-        graphvio info walk.bag
     """
-    from graphvio.sources.description import describe
+    from graphvio.errors import SourceError
+    from graphvio.sessions.store import is_store
 
-    found = describe(session)
+    try:
+        is_session = is_store(source)
+    except OSError as error:
+        raise SourceError(f"{source}: cannot be read ({error.strerror}); check the path") from None
+    if is_session:
+        _show_session(source, rig)
+    else:
+        _show_folder(source, rig)
+
+
+def _show_session(path: Path, rig: Path | None) -> None:
+    from graphvio.rig_files import load_rig
+    from graphvio.sources.description import describe, rig_line
+
+    found = describe(path)
+    if rig is not None:
+        found = replace(found, rig=rig_line(load_rig(rig)))
     publish(found)
     typer.echo(
         f"{found.path}: {found.duration_s:.1f} s, {found.size_bytes / 1e6:.1f} MB"
@@ -43,9 +65,26 @@ def info(
         typer.echo(f"written by {found.library}")
     typer.echo(f"rig: {found.rig or 'none inside; give one with --rig'}")
     for topic in found.topics:
-        typer.echo(f"{topic.name}  ({topic.type_name}): {topic.messages} messages{_regularity(topic)}")
+        typer.echo(f"{topic.name}  ({topic.type_name}): {topic.messages} messages{_topic_regularity(topic)}")
     for each in found.synchronisation:
         typer.echo(_synchronised(each))
+
+
+def _show_folder(path: Path, rig: Path | None) -> None:
+    from graphvio.sources.contents import describe_folder
+
+    found = describe_folder(path, rig)
+    publish(found)
+    rate = "" if found.rate_hz is None else f" at {found.rate_hz:.2f} Hz"
+    typer.echo(f"{found.path}: {found.layout}, {found.duration_s:.1f} s, {found.framesets} framesets{rate}")
+    typer.echo(f"rig: {found.rig}")
+    for sensor in found.sensors:
+        size = "" if sensor.size_px is None else f" of {sensor.size_px[0]}x{sensor.size_px[1]}"
+        what = f"{sensor.count} {'samples' if sensor.name == 'imu' else 'images'}{size}"
+        typer.echo(f"{sensor.name}: {what}{'' if sensor.regularity is None else _regularity(sensor.regularity)}")
+    typer.echo(f"true trajectory: {found.truth or 'none'}")
+    if found.faults:
+        typer.echo("faults: " + ", ".join(f"{kind} {count}" for kind, count in sorted(found.faults.items())))
 
 
 def dump_config(
@@ -67,12 +106,15 @@ def dump_config(
     typer.echo(settings.to_yaml(), nl=False)
 
 
-def _regularity(topic: TopicDescription) -> str:
-    if topic.rate_hz is None:
+def _topic_regularity(topic: TopicDescription) -> str:
+    if topic.regularity is None:
         return ""
-    text = f", {topic.rate_hz:.2f} Hz, jitter {topic.jitter_ms:.2f} ms, {topic.gaps} gaps, longest interval "
-    text += f"{topic.longest_ms:.1f} ms"
-    return text if topic.clock is None else text + _clock(topic.clock)
+    return _regularity(topic.regularity) + ("" if topic.clock is None else _clock(topic.clock))
+
+
+def _regularity(found: Regularity) -> str:
+    rate = "" if found.rate_hz is None else f", {found.rate_hz:.2f} Hz"
+    return f"{rate}, jitter {found.jitter_ms:.2f} ms, {found.gaps} gaps, longest interval {found.longest_ms:.1f} ms"
 
 
 def _clock(clock: Clock) -> str:

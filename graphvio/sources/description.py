@@ -5,20 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from graphvio.arrays import Int
 from graphvio.errors import RigError, SessionError
+from graphvio.rig import Rig
 from graphvio.sessions.messages import COMPRESSED, IMAGE, STAMPED
 from graphvio.sessions.rig_of_topics import stereo_topics
 from graphvio.sessions.stamps import Clock, Offset, all_header_stamps, compare_clocks, compare_topics
 from graphvio.sessions.store import Store, is_store, open_store
 from graphvio.sessions.topics import Topic
+from graphvio.sources.regularity import Regularity, regularity
 from graphvio.sources.session import rig_in
 
-_GAP_PERIODS = 1.5
-_MIN_MESSAGES = 3
-_NS_PER_MS, _NS_PER_S = 1e6, 1e9
+_NS_PER_S = 1e9
 
 
 @dataclass(frozen=True)
@@ -28,10 +26,7 @@ class TopicDescription:
     name: str  # of the topic
     type_name: str  # of its messages
     messages: int  # how many
-    rate_hz: float | None = None  # by the median interval of the times of recording
-    jitter_ms: float | None = None  # standard deviation of the intervals without gaps
-    gaps: int | None = None  # number of intervals longer than one and a half median ones
-    longest_ms: float | None = None  # longest interval
+    regularity: Regularity | None = None  # of the times of recording
     # stamps of the headers and times of recording compared; None also for messages without header
     clock: Clock | None = None
 
@@ -103,6 +98,13 @@ def describe(path: Path) -> Description:
     )
 
 
+def rig_line(rig: Rig) -> str:
+    """Describe a rig in one line: its name, its pairs and single cameras, and whether it has an IMU."""
+    parts = [f"pairs {', '.join(pair.name for pair in rig.pairs)}"] if rig.pairs else []
+    parts += [f"single camera {single.name}" for single in rig.singles]
+    return ", ".join([rig.name, *parts, "with IMU" if rig.imu else "without IMU"])
+
+
 def _rig(store: Store) -> str:
     try:
         rig = rig_in(store)
@@ -110,29 +112,16 @@ def _rig(store: Store) -> str:
         return f"not usable: {error}"
     if rig is None:
         return ""
-    pairs = ", ".join(pair.name for pair in rig.pairs)
-    singles = "".join(f", single camera {single.name}" for single in rig.singles)
-    return f"{rig.name}, pairs {pairs}{singles}, {'with' if rig.imu else 'without'} IMU"
+    return rig_line(rig)
 
 
 def _topic(topic: Topic, header_ns: Int | None) -> TopicDescription:
     logged_ns = topic.logged_stamps_ns
-    stamps, count = np.sort(logged_ns), len(logged_ns)
-    if count < _MIN_MESSAGES or stamps[0] == stamps[-1]:
-        return TopicDescription(topic.name, topic.type_name, count)
-    steps = np.diff(stamps).astype(np.float64)
-    median = float(np.median(steps))
-    within = steps[steps <= _GAP_PERIODS * median]
-    return TopicDescription(
-        topic.name,
-        topic.type_name,
-        count,
-        _NS_PER_S / median if median else None,
-        float(np.std(within)) / _NS_PER_MS,
-        int(np.sum(steps > _GAP_PERIODS * median)),
-        float(steps.max()) / _NS_PER_MS,
-        None if header_ns is None else compare_clocks(header_ns, logged_ns),
-    )
+    found = regularity(logged_ns)
+    if found is None:
+        return TopicDescription(topic.name, topic.type_name, len(logged_ns))
+    clock = None if header_ns is None else compare_clocks(header_ns, logged_ns)
+    return TopicDescription(topic.name, topic.type_name, len(logged_ns), found, clock)
 
 
 def _synchronisation(stamps: dict[str, Int]) -> tuple[Synchronisation, ...]:

@@ -16,6 +16,7 @@ from graphvio.sources.faults import FaultLog
 from graphvio.sources.index import Index
 from graphvio.sources.plug_ins import Layout, plug_ins
 from graphvio.sources.recording import Recording
+from graphvio.sources.surroundings import meant_instead
 
 _MAX_TOLERANCE_MS = 10.0
 _LAYOUTS: tuple[Layout, ...] = (euroc, kitti_odometry, kitti_raw, uzh_fpv)
@@ -62,14 +63,19 @@ def open_source(
         )
     path = Path(path)
     try:
-        index, rig, faults = _read_index(path, rig, topics or {})
+        index, rig, faults = read_index(path, rig, topics or {})
         tolerance_ns = None if tolerance_ms is None else round(1e6 * tolerance_ms)
         return Recording(index, rig, faults, from_s, to_s, tolerance_ns)
     except OSError as error:
         raise SourceError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
 
 
-def _read_index(path: Path, rig: Rig | None, topics: Mapping[str, str]) -> tuple[Index, Rig, FaultLog]:
+def read_index(path: Path, rig: Rig | None, topics: Mapping[str, str]) -> tuple[Index, Rig, FaultLog]:
+    """Index a recording; arguments and errors are those of `open_source`.
+
+    Returns:
+        The index of all images and samples, the rig, and what was wrong with single files or lines so far.
+    """
     if not path.exists():
         raise SourceError(f"{path}: does not exist; give the folder of a recording")
     resolved = path.resolve()
@@ -79,22 +85,31 @@ def _read_index(path: Path, rig: Rig | None, topics: Mapping[str, str]) -> tuple
         store = open_store(path)
         rig = _required(rig if rig is not None else session.rig_in(store), path)
         return session.read_index(store, rig, faults, topics), rig, faults
-    layout = _layout_of(path)
+    layout = layout_of(path)
     if topics:
         raise SourceError(f"{path}: has no topics to be mapped; that is for sessions and bags")
     rig = _required(rig if rig is not None else find_rig(path), path)
     return layout.read_index(path, rig, faults), rig, faults
 
 
-def _layout_of(path: Path) -> Layout:
+def layout_of(path: Path) -> Layout:
+    """Return the layout of a folder.
+
+    Raises:
+        SourceError: if it is none, or has none that is known; the message says which recording may be meant.
+    """
     if not path.is_dir():
-        raise SourceError(f"{path}: is no recording that graphvio knows; {session.LAYOUT}, or a folder ({_known()})")
+        instead = meant_instead(path, is_recording)
+        raise SourceError(
+            f"{path}: is no recording that graphvio knows; {instead}{session.LAYOUT}, or a folder ({_known()})"
+        )
     if next(path.iterdir(), None) is None:
         raise SourceError(f"{path}: is empty; looked for {_known()}")
     layout = _matching(path)
     if layout is None:
         failures = "".join(f"; {failure}" for failure in plug_ins().failures)
-        raise SourceError(f"{path}: has none of the known layouts; looked for {_known()}{failures}")
+        instead = meant_instead(path, is_recording)
+        raise SourceError(f"{path}: has none of the known layouts; {instead}looked for {_known()}{failures}")
     return layout
 
 

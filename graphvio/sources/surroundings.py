@@ -1,0 +1,65 @@
+"""Where the recordings are that a path which is none may have meant: below it, or around it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+
+_MAX_NAMED = 3
+_LEVELS_BELOW = 2  # such as of GROUP/SEQUENCE in a data set; a home folder has too much below
+_LEVELS_ABOVE = 3  # such as of mav0/cam0/data
+_SUFFIXES = (".bag", ".mcap")
+_CALIBRATIONS = (".yaml", ".yml", ".json")
+_RESULTS = ("summary.json", "report.html", "map.json")  # of run and optimize, calibrate, slam
+
+
+def recordings_below(path: Path, depth: int, is_recording: Callable[[Path], bool]) -> Iterator[Path]:
+    """Yield the recordings at or below a path; what is inside a recording is part of it.
+
+    Args:
+        path: to begin at.
+        depth: levels of folders to go down.
+        is_recording: whether a path has a known layout.
+    """
+    if is_recording(path):
+        yield path
+    elif path.is_dir() and depth:
+        for below in sorted(path.iterdir()):
+            if (below.is_dir() and not below.name.startswith(".")) or below.suffix in _SUFFIXES:
+                yield from recordings_below(below, depth - 1, is_recording)
+
+
+def meant_instead(path: Path, is_recording: Callable[[Path], bool]) -> str:
+    """Say what to give instead of a path that is no recording.
+
+    Args:
+        path: an existing file or folder.
+        is_recording: whether a path has a known layout.
+
+    Returns:
+        A clause of a message that ends with "; ", or an empty text where nothing near it is a recording.
+    """
+    if path.is_file() and path.suffix in _CALIBRATIONS:
+        return f"if it is a calibration, graphvio rig {path} shows it; "
+    if path.is_dir() and any((path / name).is_file() for name in _RESULTS):
+        return "it holds results of graphvio; give the recording that they are of; "
+    around = next(filter(is_recording, list(path.resolve().parents)[:_LEVELS_ABOVE]), None)
+    if around is not None:
+        return f"it is inside the recording {_shown(around.parent if around.name == 'mav0' else around)}; give that; "
+    try:
+        below = list(islice(recordings_below(path, _LEVELS_BELOW, is_recording), _MAX_NAMED + 1))
+    except OSError:  # a folder of somebody else
+        return ""
+    if not below:
+        return ""
+    named = ", ".join(map(str, below[:_MAX_NAMED])) + (", and more" if len(below) > _MAX_NAMED else "")
+    if len(below) == 1:
+        return f"it holds the recording {named}; give that; "
+    return f"it holds {named}; give one of them; "
+
+
+def _shown(path: Path) -> str:
+    """Return a path as short as it can be typed."""
+    here = Path.cwd()
+    return str(path.relative_to(here)) if path != here and path.is_relative_to(here) else str(path)
