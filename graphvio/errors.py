@@ -1,5 +1,7 @@
 """Typed errors: every message says what is wrong, where, and what to do."""
 
+from collections.abc import Sequence
+
 
 class GraphvioError(Exception):
     """Base of every error that a user's input can cause."""
@@ -30,6 +32,14 @@ class MissingExtraError(GraphvioError):
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         super().__init__(f"{purpose} needs {package}: install it with  pip install 'graphvio[{extra}]'")
+
+
+class MissingRequirementError(GraphvioError):
+    """A package is not installed that graphvio cannot do without."""
+
+    def __init__(self, packages: Sequence[str]) -> None:
+        names = ", ".join(packages)
+        super().__init__(f"needs {names}, which this Python lacks: install with  pip install {' '.join(packages)}")
 
 
 class SessionError(GraphvioError):

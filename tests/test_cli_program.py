@@ -1,12 +1,17 @@
 """Options of the program itself."""
 
+import json
 import os
+import re
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 from command_line import graphvio
 
+from graphvio.cli.requirements import REQUIRED
 from graphvio.version import __version__
 
 
@@ -32,3 +37,32 @@ def test_the_shell_completes_commands(typed: str, found: str) -> None:
         check=False,
     )
     assert found in done.stdout.split(), done.stderr
+
+
+def _without_matplotlib(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    code = "import sys; sys.modules['matplotlib'] = None; from graphvio.cli import main; main()"
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=60, check=False)
+
+
+@pytest.mark.parametrize("command", ["optimize", "run"])
+def test_a_missing_package_is_named_before_anything_is_done(command: str, tmp_path: Path) -> None:
+    done = _without_matplotlib(command, "walk", folder=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "graphvio: needs matplotlib, which this Python lacks: install with  pip install matplotlib\n"
+    )
+
+
+def test_doctor_runs_without_a_package_and_shows_it(tmp_path: Path) -> None:
+    done = _without_matplotlib("doctor", "--json", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    versions = json.loads(done.stdout)["versions"]
+    assert versions["matplotlib"] is None
+    assert all(version for name, version in versions.items() if name != "matplotlib")
+
+
+def test_required_packages_are_those_of_the_project() -> None:
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    names = {re.split("[<>=]", each)[0] for each in project["dependencies"]}
+    assert set(REQUIRED.values()) == names - {"typer"}  # without which there is no command line

@@ -17,6 +17,7 @@ from graphvio.cli.json_output import with_json
 from graphvio.cli.live import live
 from graphvio.cli.optimize import optimize
 from graphvio.cli.record import convert, record
+from graphvio.cli.requirements import check_requirements
 from graphvio.cli.rig import rig
 from graphvio.cli.run import run
 from graphvio.cli.serve import serve
@@ -47,11 +48,13 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    pass  # the option acts by its callback
+    if context.invoked_subcommand != "doctor":  # which shows what is missing
+        check_requirements()
 
 
 def _add(command: Callable[..., Any], name: str | None = None) -> None:

@@ -10,8 +10,8 @@ from typing import Any
 
 from graphvio.cli import options
 from graphvio.cli.json_output import publish
+from graphvio.cli.requirements import REQUIRED
 
-_REQUIRED = {"gtsam": "gtsam", "numpy": "numpy", "numba": "numba", "matplotlib": "matplotlib"}
 _OPENCV = ("opencv-python-headless", "opencv-contrib-python-headless", "opencv-python", "opencv-contrib-python")
 _OPTIONAL = {
     "viewer": ("rerun", "rerun-sdk", "live view and recordings"),
@@ -79,7 +79,8 @@ def examine() -> dict[str, Any]:
     folder, shared = cache_root(), shared_root()
     kernels = [file.stat().st_size for file in folder.rglob("*.nbc")]
     versions: dict[str, str | None] = {"graphvio": __version__, "python": platform.python_version()}
-    versions |= {name: _version(package) for name, package in _REQUIRED.items()}
+    versions |= {package: _version(package) if find_spec(module) else None for module, package in REQUIRED.items()}
+    del versions["opencv-python-headless"]  # one of several packages that have its module
     versions["opencv"] = next((version for name in _OPENCV if (version := _version(name))), None)
     return {
         "versions": versions,
