@@ -125,18 +125,40 @@ class Camera:
         return MODEL_NAMES[self.model]
 
     def project(self, points: Float) -> tuple[Float, Bool]:
-        """Project points (N, 3) of the camera frame: pixels (N, 2), and whether each is inside the image (N,)."""
+        """Project points.
+
+        Args:
+            points: (N, 3) in the camera frame, metres.
+
+        Returns:
+            Pixels (N, 2), and whether each is inside the image (N,).
+        """
         points = np.ascontiguousarray(points, dtype=np.float64)
         pixels, valid = project_points(self.model_number, self.intrinsics, self.distortion, points)
         return pixels, valid & self.contains(pixels)
 
     def unproject(self, pixels: Float) -> tuple[Float, Bool]:
-        """Unproject pixels (N, 2): normalised coordinates (N, 2), and whether each pixel has a ray (N,)."""
+        """Unproject pixels.
+
+        Args:
+            pixels: (N, 2), the centre of the first is (0, 0).
+
+        Returns:
+            Normalised coordinates (N, 2) ``[X / Z, Y / Z]``, and whether each pixel has a ray (N,).
+        """
         pixels = np.ascontiguousarray(pixels, dtype=np.float64)
         return unproject_pixels(self.model_number, self.intrinsics, self.distortion, pixels)
 
     def contains(self, pixels: Float, border_px: float = 0.0) -> Bool:
-        """Test whether pixels (N, 2) are inside the image, at least ``border_px`` from its edge (N,)."""
+        """Test whether pixels are inside the image.
+
+        Args:
+            pixels: (N, 2), the centre of the first is (0, 0).
+            border_px: least distance from the edge.
+
+        Returns:
+            Whether each is (N,).
+        """
         width, height = self.size_px
         x, y = pixels[:, 0], pixels[:, 1]
         inside_x = (x >= border_px) & (x <= width - 1 - border_px)
@@ -346,7 +368,15 @@ class Rig:
         return (*self.pairs, *self.singles)
 
     def left2_T_left1(self, first: int = 0, second: int = 1) -> Float:
-        """Transform (4, 4) from one pair's left camera to another's, ``P_12`` of the paper's eq. (1)."""
+        """Transform from one pair's left camera to another's.
+
+        Args:
+            first: index of the one pair.
+            second: index of the other.
+
+        Returns:
+            ``left2_T_left1`` (4, 4), ``P_12`` of the paper's eq. (1).
+        """
         return self.pairs[second].left.cam_T_body @ self.pairs[first].left.body_T_cam
 
     def with_pairs(self, indices: Sequence[int]) -> Rig:
@@ -354,6 +384,9 @@ class Rig:
 
         Args:
             indices: of the pairs, in the order wanted.
+
+        Returns:
+            The rig of these pairs.
 
         Raises:
             RigError: if an index does not exist or is repeated.
@@ -371,6 +404,9 @@ class Rig:
         Args:
             cameras: names; a number N is short for ``camN``.
 
+        Returns:
+            The rig of these cameras.
+
         Raises:
             RigError: if there is no such camera, or neither a pair nor an IMU is left.
         """
@@ -385,6 +421,9 @@ class Rig:
 
     def without_pairs(self) -> Rig:
         """Take each camera for a single one.
+
+        Returns:
+            The rig without pairs.
 
         Raises:
             RigError: if there is no IMU.
@@ -410,13 +449,23 @@ class Rig:
     def without_imu(self) -> Rig:
         """Drop the IMU.
 
+        Returns:
+            The rig without it.
+
         Raises:
             RigError: if no pair is left that shows the scale.
         """
         return replace(self, imu=None)
 
     def with_cameras(self, change: Callable[[Camera], Camera]) -> Rig:
-        """Replace each camera by what a function makes of it."""
+        """Replace each camera by what a function makes of it.
+
+        Args:
+            change: returns the camera to be used instead.
+
+        Returns:
+            The rig with these cameras.
+        """
         pairs = [replace(pair, left=change(pair.left), right=change(pair.right)) for pair in self.pairs]
         singles = [SingleCamera(change(single.left)) for single in self.singles]
         return replace(self, pairs=tuple(pairs), singles=tuple(singles))

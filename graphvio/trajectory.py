@@ -70,17 +70,39 @@ class Trajectory:
         return float(self.stamps_ns[-1] - self.stamps_ns[0]) / _NS_PER_S if len(self) else 0.0
 
     def select(self, which: Bool | Int | slice) -> Trajectory:
-        """Select poses by indices, a slice, or a mask (N,)."""
+        """Select poses.
+
+        Args:
+            which: indices, a slice, or a mask (N,).
+
+        Returns:
+            The trajectory of these poses.
+        """
         return Trajectory(self.stamps_ns[which], self.nav_T_body[which])
 
     def around(self, begin_ns: int, end_ns: int) -> Trajectory:
-        """Select the poses from ``begin_ns`` to ``end_ns``, with one more on either side for interpolation."""
+        """Select the poses of a time, with one more on either side for interpolation.
+
+        Args:
+            begin_ns: where it begins, nanoseconds.
+            end_ns: where it ends.
+
+        Returns:
+            The trajectory of these poses.
+        """
         first = int(np.searchsorted(self.stamps_ns, begin_ns, side="right")) - 1
         last = int(np.searchsorted(self.stamps_ns, end_ns)) + 1
         return self.select(slice(max(first, 0), last))
 
     def transformed(self, other_T_nav: Float) -> Trajectory:
-        """Transform to another world frame by ``other_T_nav`` (4, 4)."""
+        """Transform to another world frame.
+
+        Args:
+            other_T_nav: (4, 4) pose of the present world frame in the other.
+
+        Returns:
+            The trajectory in the other.
+        """
         return Trajectory(self.stamps_ns, np.asarray(other_T_nav) @ self.nav_T_body)
 
     def at(self, stamps_ns: Int, max_gap_s: float) -> tuple[Trajectory, Bool]:

@@ -37,6 +37,9 @@ def load_trajectory(path: str | Path, times: Path | None = None) -> Trajectory:
             or only topic with poses; ``PATH:TOPIC`` names another.
         times: stamps in seconds, one a line, of KITTI poses elsewhere.
 
+    Returns:
+        The poses in the order of their stamps.
+
     Raises:
         TrajectoryError: if the file cannot be read, a line is no pose, or the stamps do not increase; or if a
             session has no truth.
@@ -52,6 +55,10 @@ def load_trajectory(path: str | Path, times: Path | None = None) -> Trajectory:
 
 def save_trajectory(trajectory: Trajectory, path: str | Path) -> None:
     """Write a TUM file: nine decimals on the stamp, ``q_w >= 0``.
+
+    Args:
+        trajectory: of poses ``nav_T_body``.
+        path: of the file, which is replaced.
 
     Raises:
         TrajectoryError: if the file cannot be written.

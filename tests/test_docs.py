@@ -1,8 +1,12 @@
 """What README and docs claim of code is executed or compared here."""
 
+import inspect
+import pkgutil
 import re
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import command_line
 import generate_pages
@@ -99,6 +103,40 @@ def test_every_public_name_is_in_the_reference() -> None:
     public = [name for name in graphvio.__all__ if name != "__version__" and not name.endswith("Error")]
     assert [name for name in public if f"::: graphvio.{name}\n" not in text] == []
     assert "::: graphvio.errors\n" in text
+
+
+def functions_of_the_reference() -> Iterator[tuple[str, Callable[..., Any]]]:
+    """Yield the public functions and methods that the pages of the reference show, with their names."""
+    pages = [page for page in (ROOT / "docs/reference/api").glob("*.md") if page.name != "paper.md"]
+    shown = [name for page in pages for name in re.findall(r"^::: (\S+)$", page.read_text(), re.MULTILINE)]
+    while shown:
+        name = shown.pop()
+        found = pkgutil.resolve_name(name)
+        if inspect.isfunction(found):
+            yield name, found
+        elif inspect.ismodule(found) or inspect.isclass(found):
+            module = found.__name__ if inspect.ismodule(found) else found.__module__
+            for own, member in vars(found).items():
+                member = getattr(member, "__func__", member)  # of static and class methods
+                is_shown = not own.startswith("_") and getattr(member, "__module__", None) == module
+                if is_shown and (inspect.isfunction(member) or inspect.isclass(member)):
+                    shown.append(f"{name}.{own}")
+
+
+def test_public_functions_document_arguments_results_and_errors() -> None:
+    checked = 0
+    for name, function in functions_of_the_reference():
+        text, signature = inspect.getdoc(function) or "", inspect.signature(function)
+        checked += 1
+        if text.startswith("See `"):  # what implements an interface
+            continue
+        if set(signature.parameters) - {"self", "cls"}:
+            assert "\nArgs:\n" in text, name
+        if signature.return_annotation not in ("None", "Iterator[None]"):
+            assert "\nReturns:\n" in text or text.startswith(("Return ", "Yield ")), name
+        if re.search(r"^ +raise \w", inspect.getsource(function), re.MULTILINE):
+            assert "\nRaises:\n" in text, name
+    assert checked > 50
 
 
 def test_every_report_of_a_benchmark_has_its_markers() -> None:

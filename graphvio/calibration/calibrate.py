@@ -51,6 +51,9 @@ def calibrate_pairs(
         scale_mode: whether to estimate ratios of the lengths that pairs measure, see `calibrate_pair`.
         on_frameset: follows the recording, and may end it.
 
+    Returns:
+        The poses of all pairs with their covariance, the comparison with the rig file, and what they are based on.
+
     Raises:
         CalibrationError: if the rig has one pair only, or the recording does not determine the poses of the pairs.
         SourceError: if the recording cannot be read.
@@ -111,6 +114,9 @@ def calibrate_trajectories(
         same_clock: whether all stamps are of one clock; else offsets and drifts are estimated.
         seed: of all random choices.
         scale_mode: whether to estimate ratios of the lengths that odometries measure, see `calibrate_pair`.
+
+    Returns:
+        The poses of all cameras with their covariance, and what they are based on.
 
     Raises:
         CalibrationError: if there are fewer than two, their clocks cannot be related, or the motions do not determine

@@ -130,7 +130,14 @@ class Calibration:
         return not any(len(self._undetermined(j)) for j in range(1, len(self.names)))
 
     def pose_summary(self, j: int) -> PoseSummary:
-        """Summarise the first left camera's pose in the left camera of pair j."""
+        """Summarise the first left camera's pose in the left camera of another pair.
+
+        Args:
+            j: index of the pair, from 1.
+
+        Returns:
+            Its rotation and translation with standard deviations.
+        """
         place = np.ascontiguousarray(self.places.left_T_left1[j])
         covariance = self.places.covariance[6 * j - 6 : 6 * j, 6 * j - 6 : 6 * j]
         turn = so3_log(place[:3, :3])
@@ -142,7 +149,14 @@ class Calibration:
         return PoseSummary(place[:3, 3], sigmas[3:], known[3:], turn, sigmas[:3], known[:3])
 
     def compare_rig(self, j: int = 1) -> RigComparison | None:
-        """Compare the rig's pose of pair j relative to the first with the calibration; None without a rig."""
+        """Compare the rig's pose of a pair relative to the first with the calibration.
+
+        Args:
+            j: index of the pair, from 1.
+
+        Returns:
+            How far both are apart, or None without a rig.
+        """
         if self.rig is None:
             return None
         given = np.ascontiguousarray(self.rig.left2_T_left1(0, j))

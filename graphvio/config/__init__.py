@@ -74,6 +74,12 @@ class Config:
     def load(name_or_path: str | Path) -> Config:
         """Read a profile by its name, or a YAML file.
 
+        Args:
+            name_or_path: name of a profile, or path of a file with the values to change.
+
+        Returns:
+            The configuration; values that are not in it have their default.
+
         Raises:
             ConfigError: if there is no such profile or file, or a key or value in it is not valid.
         """
@@ -99,6 +105,9 @@ class Config:
         Args:
             text: a mapping of stages to mappings of names to values.
             where: where it was read, for messages.
+
+        Returns:
+            The configuration.
 
         Raises:
             ConfigError: if it is no YAML mapping, or a key or value is not valid.

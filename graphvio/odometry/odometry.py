@@ -233,7 +233,11 @@ class Odometry:
         return None if estimate is None else estimate.rig
 
     def on_full_window(self, on_window: Callable[[FullWindow], None]) -> None:
-        """Register a function that gets the measurements of each full window of the self-calibration."""
+        """Register a function that gets the measurements of each full window of the self-calibration.
+
+        Args:
+            on_window: called within `process`.
+        """
         self._calibration.on_full_window(on_window)
 
     def limit_corners(self, share: float) -> None:
@@ -261,7 +265,13 @@ class Odometry:
             self._on_finish.append(on_finish)
 
     def report(self, stamp_ns: int, kind: str, detail: str) -> None:
-        """Add an event to those that `take_events` returns; thread-safe."""
+        """Add an event to those that `take_events` returns; thread-safe.
+
+        Args:
+            stamp_ns: when it happened, nanoseconds.
+            kind: one of `EventKind`, or a name of your own.
+            detail: what happened, in one line.
+        """
         self._events.append(Event(stamp_ns, kind, detail))
 
     # ------------------------------------------------------------------ one frameset

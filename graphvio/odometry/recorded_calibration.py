@@ -171,6 +171,9 @@ def calibrate_recording(
         config: of the odometry.
         on_progress: follows the work.
 
+    Returns:
+        The calibrated rig, and what the recording showed of each parameter.
+
     Raises:
         CalibrationError: if the rig cannot be calibrated so, or hardly moved.
     """

@@ -72,6 +72,9 @@ def optimize_sessions(
             extrinsics of the pairs and the IMU's time offset once more.
         on_progress: called with the progress of each stage.
 
+    Returns:
+        The trajectories with their covariances, and all loop closures; the folder has them as files.
+
     Raises:
         GraphvioError: if a recording cannot be read or holds no pose, or the folder cannot be used.
     """

@@ -23,6 +23,9 @@ def load_rig(path: str | Path) -> Rig:
             ``cameras.txt``, a ``sensor.yaml`` of an EuRoC/ASL folder, KITTI's ``calib.txt`` or
             ``calib_cam_to_cam.txt``; or a folder, in which ``rig.yaml`` takes precedence.
 
+    Returns:
+        The rig.
+
     Raises:
         RigError: if there is no such file, it cannot be read, or it does not describe a usable rig.
     """

@@ -77,6 +77,10 @@ def parse(text: str, path: Path) -> Rig:
 def save_rig(rig: Rig, path: str | Path) -> None:
     """Write a ``rig.yaml`` that reads back to the last digit.
 
+    Args:
+        rig: to be written.
+        path: of the file, which is replaced; masks are named relative to its folder.
+
     Raises:
         RigError: if the file cannot be written.
     """

@@ -177,6 +177,14 @@ class Client:
 
         It is not repeated after a lost connection: whether it arrived is then unknown.
 
+        Args:
+            keyframe_id: of the keyframe.
+            map_T_body: (4, 4) its pose in the map.
+            covariance: (6, 6) of that pose, rotation first, in body.
+
+        Returns:
+            Whether the correction was accepted, and why not.
+
         Raises:
             ServiceError: Also if the correction is malformed, or the server meanwhile serves another run.
         """

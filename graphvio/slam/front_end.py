@@ -51,12 +51,20 @@ class FrontEnd:
     # ------------------------------------------------------------------ keyframes out
 
     def on_keyframe(self, callback: Callable[[Keyframe], None]) -> None:
-        """Hand each keyframe from now on to a callback, within `Odometry.process`: it should return soon."""
+        """Hand each keyframe from now on to a callback.
+
+        Args:
+            callback: called within `Odometry.process`: it should return soon.
+        """
         self._is_wanted = True
         self._callbacks.append(callback)
 
     def keyframes(self, from_id: int = 0) -> Iterator[Keyframe]:
-        """Yield keyframes until the odometry is finished, see `SlamFrontEnd.keyframes`; for a thread of its own."""
+        """Yield keyframes until the odometry is finished, see `SlamFrontEnd.keyframes`; for a thread of its own.
+
+        Args:
+            from_id: the first that is wanted.
+        """
         self._is_wanted = True
         return self.log.follow(from_id)
 
@@ -95,7 +103,14 @@ class FrontEnd:
         return self._map_frame.map_T_odom
 
     def map_T_body(self, stamp_ns: int) -> Float | None:
-        """Predict the pose (4, 4) in the map; None where `Odometry.predict` has none, or the map is not known."""
+        """Predict the pose in the map.
+
+        Args:
+            stamp_ns: when, nanoseconds of the camera clock.
+
+        Returns:
+            ``map_T_body`` (4, 4), or None where `Odometry.predict` has none, or the map is not known.
+        """
         prediction = self._odometry.predict(stamp_ns)
         map_T_odom = None if prediction is None else self._map_frame.of_epoch(prediction.epoch)
         return None if prediction is None or map_T_odom is None else map_T_odom @ prediction.nav_T_body

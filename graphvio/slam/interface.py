@@ -74,14 +74,23 @@ class Served(Protocol):
 
 
 def newest_epoch(served: Served) -> int | None:
-    """Return the epoch of the newest keyframe, or None before the first."""
+    """Return the epoch of the newest keyframe, or None before the first.
+
+    Args:
+        served: the odometry.
+    """
     log = served.keyframe_log
     newest = log.read(max(log.next_id - 1, 0), timeout_s=0.0)
     return None if newest is None else newest.epoch
 
 
 def map_of_epoch(served: Served, epoch: int) -> Float | None:
-    """Return ``map_T_odom`` (4, 4) in force; None if the odometry is in another epoch by now."""
+    """Return ``map_T_odom`` (4, 4) in force; None if the odometry is in another epoch by now.
+
+    Args:
+        served: the odometry.
+        epoch: in which the transform is wanted.
+    """
     before = newest_epoch(served)
     map_T_odom = served.map_T_odom
     return map_T_odom if before == epoch == newest_epoch(served) else None

@@ -25,6 +25,9 @@ class ImageSequence(Protocol):
     def read(self, row: int) -> Image:
         """Return the image of a row, (height, width) uint8; from any thread.
 
+        Args:
+            row: index of its stamp.
+
         Raises:
             ImageError: if it is missing or damaged.
         """
@@ -39,7 +42,14 @@ class ImageFiles:
     names: Sequence[str]  # of the files
 
     def read(self, row: int) -> Image:
-        """Return the image of a row: see `ImageSequence`."""
+        """Return the image of a row, (height, width) uint8; from any thread.
+
+        Args:
+            row: index of its stamp.
+
+        Raises:
+            ImageError: if it is missing or damaged.
+        """
         return read_grey(self.folder / self.names[row])
 
 

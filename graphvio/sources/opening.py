@@ -48,6 +48,9 @@ def open_source(
             median period for left and right, whose stamps may be those of arrival, and 2 ms for pairs.
         topics: name of a camera, or ``imu`` -> topic, for sessions and bags whose topics have other names.
 
+    Returns:
+        The recording, to be iterated as often as wanted; images are decoded while it is.
+
     Raises:
         SourceError: if the folder cannot be read, has no known layout, or holds nothing in the given time.
         RigError: if no rig is given and the recording has none that is usable.
