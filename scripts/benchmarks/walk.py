@@ -36,8 +36,8 @@ _TITLES = {"door": "a door swings open", "people": "a crowd", "blank": "a blank 
 _SIDES = (("front", 0), ("back", 2))
 _COLOURS = (BLUE, RED, "#d98200")  # all pairs together first
 _ROWS = slice(60, 420)
-_STEP_S, _FRAME_MS, _PAUSE_MS = 0.5, 100, 3000
-_QUALITY = 55
+_STEP_S, _FRAME_MS, _PAUSE_MS = 1.0, 200, 3000
+_QUALITY = 40
 
 
 def add_parser(subparsers: Subparsers) -> None:
