@@ -23,7 +23,7 @@ settings.load_profile("graphvio")
 _LONGEST = (
     "corridor", "fleet", "outages", "optimize", "calibrate", "end_to_end", "frontend_covariance", "keyframes",
     "unsynchronised", "cli_slam", "recorded_calibration", "fleet_s3", "convert", "optimization", "examples",
-    "self_calibration", "docs", "tutorials", "odometry", "live", "json_output", "calibration_trajectories",
+    "self_calibration", "page_code", "docs", "tutorials", "odometry", "live", "json_output", "calibration_trajectories",
     "calibration_methods", "calibration_several", "rolling_shutter", "start_in_motion", "mapping", "hard_moments",
     "single_cameras", "calibration_memory", "cli_live", "benchmark", "simulation_scenes", "monocular",
     "self_calibration_inertial", "live_sources", "backend_shared_error", "calibration_pair", "cli_serve", "map_frame",

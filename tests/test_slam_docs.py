@@ -6,24 +6,23 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
 import served
+from pages import ROOT, python_blocks
 
 pytest.importorskip("grpc")
 
 from graphvio.slam.service.options import ServiceOptions
 from graphvio.slam.service.server import GrpcServer
 
-ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/how-to/slam-interface.md").read_text()
 
 
 def example() -> str:
-    (block,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    return str(block)
+    (block,) = (block for block in python_blocks(PAGE) if "def build_map" in block)
+    return block
 
 
 def run(address: str) -> subprocess.CompletedProcess[str]:

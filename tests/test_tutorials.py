@@ -1,7 +1,6 @@
 """The tutorials are followed as they are typed, on short recordings; of all pages the commands' options exist."""
 
 import re
-import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,24 +9,12 @@ import pytest
 import typer
 from calibration_walks import recorded
 from command_line import graphvio, python
+from pages import PAGES, ROOT, python_blocks, typed
 
 from graphvio.cli import app
 
-ROOT = Path(__file__).parents[1]
 TUTORIALS = ROOT / "docs/tutorials"
 PROGRAM = typer.main.get_command(app)
-
-
-def typed(text: str) -> list[list[str]]:
-    """Return the arguments of each command of graphvio in a page's blocks."""
-    lines = re.findall(r"^ {4}(?:\.venv/bin/)?graphvio (.*)$", text, re.MULTILINE)
-    return [shlex.split(line, comments=True) for line in lines]
-
-
-def python_of(text: str) -> str:
-    """Return the only block of Python of a page."""
-    (block,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    return str(block)
 
 
 def follow(name: str, recording: Path, folder: Path) -> str:
@@ -40,7 +27,8 @@ def follow(name: str, recording: Path, folder: Path) -> str:
             assert ran.returncode == 0, f"{arguments}: {ran.stderr}"
     if "```python" not in text:
         return ""
-    (folder / "typed.py").write_text(python_of(text))
+    (block,) = python_blocks(text)
+    (folder / "typed.py").write_text(block)
     done = python(folder / "typed.py", folder=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -82,10 +70,9 @@ def test_session_to_colmap_as_typed(room_walk: Path, tmp_path: Path) -> None:
 
 def documented() -> list[tuple[str, list[str]]]:
     """Return (page, arguments) of each command in the documentation."""
-    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     return [
         (str(page.relative_to(ROOT)), arguments)
-        for page in pages
+        for page in PAGES
         if page.name != "commands.md"
         for arguments in typed(page.read_text())
         if arguments
