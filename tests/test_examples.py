@@ -88,6 +88,35 @@ def test_slam_front_end(room_walk: Path, tmp_path: Path) -> None:
     assert in_map == pytest.approx([10.0 - odom[1], odom[0], odom[2]], abs=0.03)
 
 
+def test_slam_client(room_walk: Path, tmp_path: Path) -> None:
+    """Of a service in another process, which replays the walk at its own pace."""
+    pytest.importorskip("grpc", reason="grpcio is not installed: the extra serve")
+    command = [sys.executable, "-m", "graphvio", "serve", str(room_walk), "--port", "0"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as service:
+        try:
+            assert service.stderr is not None
+            address = next(line for line in service.stderr if line.startswith("gRPC: ")).removeprefix("gRPC: ").strip()
+            said = _run("slam_client.py", address, folder=tmp_path)
+            assert service.wait(60.0) == 0
+        finally:
+            service.kill()
+    assert said.splitlines()[:2] == ["pairs ['front', 'back']", "corrected"]
+    ends = re.findall(r"^keyframe \d+ at (\S+) (\S+) (\S+) m, \d+ landmarks$", said, re.MULTILINE)
+    assert ends[0] == ("10.00", "0.00", "0.00")
+    in_map = load_trajectory(tmp_path / "map.txt")
+    assert len(in_map) == len(ends) >= 5
+    truth, _ = load_trajectory(room_walk / "mav0/state_groundtruth_estimate0/data.csv").at(in_map.stamps_ns, 0.1)
+    moved = np.linalg.inv(in_map.nav_T_body[0]) @ in_map.nav_T_body[-1]
+    np.testing.assert_allclose(moved, np.linalg.inv(truth.nav_T_body[0]) @ truth.nav_T_body[-1], atol=0.02)
+
+
+def test_slam_client_without_a_service_ends_with_one_line(tmp_path: Path) -> None:
+    pytest.importorskip("grpc", reason="grpcio is not installed: the extra serve")
+    done = python(EXAMPLES / "slam_client.py", "127.0.0.1:9", folder=tmp_path)
+    assert done.returncode == 1
+    assert not (tmp_path / "map.txt").exists()
+
+
 def test_every_example_is_run_and_described() -> None:
     scripts = {file.name for file in EXAMPLES.glob("*.py")}
     assert scripts == set(re.findall(r"\]\((\w+\.py)\)", (EXAMPLES / "README.md").read_text()))
