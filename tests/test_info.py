@@ -78,6 +78,9 @@ def test_recordings_near_the_path_are_named(tmp_path: Path) -> None:
 def test_what_is_no_recording_at_all_is_said(tmp_path: Path) -> None:
     assert "does not exist" in refused(tmp_path / "none", tmp_path)
     assert "cannot be read" in refused(tmp_path / ("x" * 300), tmp_path)
+    made_by = "the simulated walk of that name is made by  graphvio simulate room --out room\n"
+    assert made_by in refused(Path("room"), tmp_path)
+    assert made_by in graphvio("run", "room", folder=tmp_path).stderr
     (tmp_path / "other").mkdir()
     assert "is empty; looked for EuRoC/ASL" in refused(tmp_path / "other", tmp_path)
     (tmp_path / "other/rig.yaml").write_text("x: 1\n")

@@ -86,6 +86,11 @@ def test_the_path_of_a_recording_is_a_replay_of_it(tmp_path: Path) -> None:
         ("simulater", "there is no live source 'simulater'.*simulator"),
         ("walk.mcap", "there is no live source 'walk.mcap'.*replay"),
         ("", "there is no live source ''"),
+        (
+            "room",
+            "no recording at that path; the simulated scene of that name is simulator:room, or made by  graphvio sim",
+        ),
+        ("stairs?seed=2", "is simulator:stairs.seed=2, or.*replay:PATH"),
         ("simulator:room?speed", "option 'speed' has no value; write KEY=VALUE"),
         ("simulator:room?=3", "has no value"),
         ("simulator:room?speed=1&speed=2", "option speed is given twice"),

@@ -10,6 +10,7 @@ import typer
 
 from graphvio.cli import options
 from graphvio.cli.json_output import publish
+from graphvio.cli.shared import check_scene
 
 if TYPE_CHECKING:
     from graphvio.sessions.stamps import Clock
@@ -42,6 +43,7 @@ def info(
         is_session = is_store(source)
     except OSError as error:
         raise SourceError(f"{source}: cannot be read ({error.strerror}); check the path") from None
+    check_scene(source)
     if is_session:
         _show_session(source, rig)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -74,6 +75,7 @@ def open_recording(
     from graphvio.rig_files import load_rig
     from graphvio.sources import open_source
 
+    check_scene(source)
     tolerance_ms = settings.timing.simultaneous_ms
     loaded = None if rig is None else load_rig(rig)
     mapped = parsed_topics(topics)
@@ -82,6 +84,22 @@ def open_recording(
     if chosen is opened.rig:
         return opened
     return open_source(source, chosen, from_s=from_s, to_s=to_s, tolerance_ms=tolerance_ms, topics=mapped)
+
+
+def check_scene(source: Path) -> None:
+    """Refuse the name of a simulated scene, of which there is no recording here, with the command that makes it."""
+    from graphvio.errors import SourceError
+
+    with suppress(OSError):  # opening it says what is wrong
+        if source.exists():
+            return
+    from graphvio.simulation import SCENE_NAMES  # takes a moment to import
+
+    if str(source) in SCENE_NAMES:
+        raise SourceError(
+            f"{source}: does not exist; the simulated walk of that name is made by  "
+            f"graphvio simulate {source} --out {source}"
+        )
 
 
 def parsed_topics(text: str | None) -> dict[str, str]:

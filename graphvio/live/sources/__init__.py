@@ -35,10 +35,7 @@ class SourceSpec:
         kind, _, what = head.partition(":")
         if kind not in KINDS:
             if not head or not Path(head).exists():
-                raise SourceError(
-                    f"{text}: there is no live source {kind!r} and no recording at that path{nearest(kind, KINDS)}; "
-                    f"live sources are {', '.join(KINDS)}; a recording is replayed by its path or replay:PATH"
-                )
+                raise _unknown(text, kind)
             kind, what = "replay", head
         options: dict[str, str] = {}
         for each in filter(None, tail.split("&")):
@@ -49,6 +46,22 @@ class SourceSpec:
                 raise SourceError(f"{text}: option {key} is given twice")
             options[key] = value
         return SourceSpec(kind, what, options)
+
+
+def _unknown(text: str, kind: str) -> SourceError:
+    """Return the error of a text that begins with no kind and is no path."""
+    from graphvio.simulation import SCENE_NAMES
+
+    absent = f"{text}: there is no live source {kind!r} and no recording at that path"
+    if kind in SCENE_NAMES:
+        return SourceError(
+            f"{absent}; the simulated scene of that name is simulator:{text}, or made by  graphvio simulate {kind} "
+            f"--out {kind};  a recording elsewhere is replayed by replay:PATH"
+        )
+    return SourceError(
+        f"{absent}{nearest(kind, KINDS)}; live sources are {', '.join(KINDS)}; a recording is replayed by its path or "
+        "replay:PATH"
+    )
 
 
 class SourceKind(Protocol):
