@@ -148,8 +148,8 @@ def find_imu_file(camchain: Path) -> Path:
     defaults = ", ".join(f"{IMU_KEYS[name]}: {getattr(Imu(), name)}" for name in NOISE_KEYS)
     found = f"more than one IMU file ({', '.join(p.name for p in others)})" if others else "no imu.yaml"
     raise RigError(
-        f"{camchain.parent}: {found} next to {camchain.name}, which has T_cam_imu; put the IMU's noise into "
-        f"imu.yaml there (graphvio's defaults:  {defaults}, update_rate: {Imu().rate_hz})"
+        f"{camchain}: {found} next to it, though it has T_cam_imu; put the IMU's noise into imu.yaml there "
+        f"(graphvio's defaults:  {defaults}, update_rate: {Imu().rate_hz})"
     )
 
 

@@ -133,6 +133,7 @@ def _known() -> str:
 def _required(rig: Rig | None, path: Path) -> Rig:
     if rig is None:
         raise RigError(
-            f"{path}: carries no calibration; write a rig.yaml into it, or give a calibration of your own by --rig"
+            f"{path}: carries no calibration; write a rig.yaml into it, which  graphvio rig FILE.. --out "
+            f"{path}/rig.yaml  makes of Kalibr's and other files, or give a calibration of your own by --rig"
         )
     return rig
