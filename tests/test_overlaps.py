@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -34,6 +35,60 @@ def true_pixels(own: Camera, rays: Float, depths: Float, other: Camera) -> Float
     in_own = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None]
     other_T_own = other.cam_T_body @ own.body_T_cam
     return other.project(in_own @ other_T_own[:3, :3].T + other_T_own[:3, 3])[0]
+
+
+class SurroundWalk(NamedTuple):
+    """What cameras did with each other's tracks over a part of a walk in which the rig turns.
+
+    Attributes:
+        distances_px: of tracks that go on in another camera since the one that began the point has ended, from where
+            the renderer has that point.
+        least_distance_px: of a track to another one of its camera, when it was adopted.
+        followed_twice: number of points of which a camera had two tracks.
+    """
+
+    distances_px: Float
+    least_distance_px: float
+    followed_twice: int
+
+
+@pytest.fixture(scope="module")
+def surround_walk() -> SurroundWalk:
+    rig = surrounding()
+    cameras = [single.left for single in rig.singles]
+    simulator = Simulator(build_scene("room", 5.0, 0.0), rig, 1)
+    frontend, poses, stamps = SinglesFrontend(rig, Config()), simulator.world_T_body, list(simulator.stamps_ns)
+    in_world: dict[tuple[int, int], Float] = {}
+    over: set[tuple[int, int]] = set()  # whose distance is noted at their first sight
+    distances_px, apart_px, twice, known = [], [], 0, [np.zeros(0, dtype=np.int64)] * len(cameras)
+    for k in range(60, 100):
+        now_T_world = np.linalg.inv(poses[k])
+        since = {int(then): np.ascontiguousarray(now_T_world @ pose) for then, pose in zip(stamps, poses, strict=True)}
+        visual = frontend.process(simulator.frameset(k), since.__getitem__)
+        frames = frontend.frames_at(stamps[k])
+        for j, sighting in visual.sightings.items():
+            depth, world_T_cam = simulator.view(k, j).depth, poses[k] @ cameras[j].body_T_cam
+            rows, begun_by, begun_as = sighting.adopted
+            columns, lines = np.rint(frames[j].pixels).astype(int).T
+            points = np.column_stack([frames[j].left, np.ones(len(columns))]) * depth[lines, columns][:, None]
+            points = points @ world_T_cam[:3, :3].T + world_T_cam[:3, 3]
+            own = np.setdiff1d(np.arange(len(columns)), rows)
+            in_world |= {(j, int(sighting.ids[i])): points[i] for i in own}
+            origins = list(zip(begun_by.tolist(), begun_as.tolist(), strict=True))
+            twice += len(origins) - len(set(origins))
+            for row, origin in zip(rows, origins, strict=True):
+                if sighting.ids[row] not in known[j]:
+                    others = np.delete(frames[j].pixels, row, axis=0)
+                    apart_px.append(np.linalg.norm(others - frames[j].pixels[row], axis=1).min())
+                track = (j, int(sighting.ids[row]))
+                if origin[1] in visual.sightings[origin[0]].ids or track in over:
+                    continue
+                over.add(track)
+                in_cam = (in_world[origin] - world_T_cam[:3, 3]) @ world_T_cam[:3, :3]
+                distances_px.append(np.linalg.norm(cameras[j].project(in_cam[None])[0][0] - frames[j].pixels[row]))
+            known[j] = np.union1d(known[j], sighting.ids)
+    frontend.close()
+    return SurroundWalk(np.array(distances_px), min(apart_px), twice)
 
 
 @pytest.mark.parametrize(("make_rig", "max_median_px"), [(four_cameras, 0.1), (surrounding, 0.2), (fisheyes, 0.2)])
@@ -80,3 +135,16 @@ def test_rolling_shutters_and_cameras_that_look_apart_share_nothing() -> None:
     frameset = Simulator(build_scene("room", 1.0), apart, 1).frameset(0)
     assert all(each.elsewhere == () for each in frontend.process(frameset, lambda _: None).sightings.values())
     frontend.close()
+
+
+def test_a_point_that_leaves_one_camera_goes_on_in_another_as_the_same(surround_walk: SurroundWalk) -> None:
+    """A track that took over is of the point that the ended track was of, by the renderer's depth."""
+    assert len(surround_walk.distances_px) > 25
+    assert np.median(surround_walk.distances_px) < 0.25
+    assert np.mean(surround_walk.distances_px > 1.0) < 0.15  # corners of edges in depth, and mismatches
+
+
+def test_a_camera_adopts_where_it_has_no_track(surround_walk: SurroundWalk) -> None:
+    """No two tracks of a camera follow one point, and adopted tracks keep their distance to the others."""
+    assert surround_walk.least_distance_px > 0.45 * Config().corners.cell_px(320)
+    assert surround_walk.followed_twice == 0

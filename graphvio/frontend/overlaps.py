@@ -10,6 +10,7 @@ import numpy as np
 
 from graphvio.arrays import Bool, Float
 from graphvio.config import Config
+from graphvio.frontend.handover import FoundThere, Leaving
 from graphvio.frontend.lucas_kanade import Pyramid
 from graphvio.frontend.matching import StereoMatcher, TwoCameras
 from graphvio.frontend.prediction import predict_pixels
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
 
 MIN_OVERLAP = 0.1
 """Smallest share of an image that is searched for in another camera's."""
+
+
+_MAX_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +81,7 @@ class Overlaps:
     """
 
     def __init__(self, rig: Rig, config: Config) -> None:
+        self._sigma_px = config.motion.pixel_sigma_px
         cameras = [single.left for single in rig.singles]
         self._partners = [
             [_partner(own, k, other, config) for k, other in enumerate(cameras) if _is_shared(own, other)]
@@ -84,22 +89,60 @@ class Overlaps:
         ]
 
     def find(
-        self, camera: int, views: Mapping[int, View], cam_T_before: Callable[[int], Float | None], searches: bool
-    ) -> tuple[Elsewhere, ...]:
-        """Find the tracks of one camera in the others.
+        self,
+        camera: int,
+        views: Mapping[int, View],
+        cam_T_before: Callable[[int], Float | None],
+        searches: bool,
+        wanted: Bool | None = None,
+    ) -> None:
+        """Find the tracks of one camera in the others; those that were found at this instant before stay so.
 
         Args:
             camera: index of the camera.
             views: of all cameras that have an image at this instant.
             cam_T_before: returns the camera's predicted motion of points (4, 4) since a stamp, None where unknown.
             searches: whether tracks that were not found before are searched for.
+            wanted: (N,) which tracks to find, None for all.
         """
         own = views[camera]
-        return tuple(
-            self._found(partner, own, views[partner.camera], cam_T_before, searches)
-            for partner in self._partners[camera]
-            if partner.camera in views
-        )
+        for partner in self._partners[camera]:
+            if partner.camera in views:
+                self._find(partner, own, views[partner.camera], cam_T_before, searches, wanted)
+
+    def elsewhere(self, camera: int, frame: PairFrame) -> tuple[Elsewhere, ...]:
+        """Return where other cameras see the tracks of a camera's newest frame."""
+        found = []
+        for partner in self._partners[camera]:
+            if partner.found.stamp_ns == frame.stamp_ns:
+                there = partner.found
+                rows = np.searchsorted(frame.ids, there.ids)
+                found.append(Elsewhere(partner.camera, rows, there.right))
+        return tuple(found)
+
+    def found_in(self, camera: int, stamp_ns: int, leaving: Mapping[int, Leaving]) -> list[FoundThere]:
+        """Return where a camera's image shows tracks that leave the other cameras' views.
+
+        Those that are left out are found at another distance than the motion of their own camera shows.
+
+        Args:
+            camera: index of the camera.
+            stamp_ns: of its image.
+            leaving: camera -> its tracks.
+        """
+        found = []
+        for own, partners in enumerate(self._partners):
+            for partner in partners:
+                there, other = partner.found, partner.cameras.right
+                if partner.camera != camera or own not in leaving or there.stamp_ns != stamp_ns or not len(there.ids):
+                    continue
+                _, inverse_depths, in_front = predict_pixels(
+                    there.left, np.maximum(there.points[:, 2], 0.0), partner.cameras.right_T_left, other.model_number,
+                    other.intrinsics, other.distortion,
+                )  # fmt: skip
+                kept = in_front & _agrees(there, leaving[own], self._sigma_px)
+                found.append(FoundThere(own, there.ids[kept], there.right_pixels[kept], inverse_depths[kept]))
+        return found
 
     def slant(self, camera: int, tracker: PairTracker) -> None:
         """Give a camera's tracker the depth of what was found last in the other cameras, and the slant where known."""
@@ -108,17 +151,21 @@ class Overlaps:
                 if isinstance(partner.matcher, WarpedMatcher) is not is_slope_known:
                     tracker.slant_keyframe_patches(partner.found, partner.cameras, is_slope_known)
 
-    def _found(
+    def _find(
         self,
         partner: _Partner,
         own: View,
         other: View,
         cam_T_before: Callable[[int], Float | None],
         searches: bool,
-    ) -> Elsewhere:
+        wanted: Bool | None,
+    ) -> None:
         frame, before = own.frame, partner.found
         inverse_depths, slopes = _expected(partner, frame, cam_T_before(before.stamp_ns) if len(before.ids) else None)
-        rows = np.arange(len(frame.ids)) if searches else np.flatnonzero(np.isfinite(inverse_depths))
+        chosen = np.ones(len(frame.ids), dtype=bool) if searches else np.isfinite(inverse_depths)
+        if wanted is not None:
+            chosen &= wanted
+        rows = np.flatnonzero(chosen)
         partner.matcher.allow(other.allowed)
         matches = partner.matcher.match(
             own.pyramid, other.pyramid, frame.pixels[rows], frame.left[rows], inverse_depths[rows], slopes[rows],
@@ -126,15 +173,15 @@ class Overlaps:
         )  # fmt: skip
         good = matches.good
         rows = rows[good]
-        chosen = np.zeros(len(frame.ids), dtype=bool)
+        chosen[:] = False
         chosen[rows] = True
         found = frame.keep(chosen)
-        partner.found = PairFrame(
+        new = PairFrame(
             found.stamp_ns, found.ids, found.ages, found.pixels, found.left, matches.right[good],
             matches.right_pixels[good], matches.points[good], matches.covariances[good], matches.slopes[good],
             np.ones(len(rows), dtype=bool), found.flat_for,
         )  # fmt: skip
-        return Elsewhere(partner.camera, rows, matches.right[good])
+        partner.found = before.extended(new) if before.stamp_ns == frame.stamp_ns and len(before.ids) else new
 
 
 def _is_shared(own: Camera, other: Camera) -> bool:
@@ -150,6 +197,16 @@ def _partner(own: Camera, number: int, other: Camera, config: Config) -> _Partne
         return _Partner(number, apart, WarpedMatcher(apart, config))
     pair, (width, height) = StereoPair(f"{own.name} in {other.name}", own, other), other.size_px
     return _Partner(number, pair, StereoMatcher(pair, config, np.ones((height, width), dtype=bool)))
+
+
+def _agrees(there: PairFrame, leaving: Leaving, sigma_px: float) -> Bool:
+    """Select the matches (N,) of leaving tracks whose distance is that of their camera's own motion, within 3 sigma."""
+    if not len(leaving.ids):
+        return np.zeros(len(there.ids), dtype=bool)
+    rows = np.minimum(np.searchsorted(leaving.ids, there.ids), len(leaving.ids) - 1)
+    sigmas = np.hypot(leaving.sigmas[rows], sigma_px * np.sqrt(there.covariances[:, 2, 2]))
+    off = np.abs(there.points[:, 2] - leaving.inverse_depths[rows])
+    return np.asarray((leaving.ids[rows] == there.ids) & (off < _MAX_SIGMAS * sigmas))
 
 
 def _expected(partner: _Partner, frame: PairFrame, motion: Float | None) -> tuple[Float, Float]:

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
+from graphvio.arrays import Bool
 from graphvio.config import Config
+from graphvio.frontend.handover import Handover, Leaving
 from graphvio.frontend.images import ImageMask, checked
 from graphvio.frontend.overlaps import Overlaps
 from graphvio.frontend.rolling_shutter import ReadoutMotion
 from graphvio.frontend.thresholds import THRESHOLDS
 from graphvio.frontend.tracks import PairFrame, common_rows
 from graphvio.frontend.visual import MotionPredictor, VisualFrontend
-from graphvio.measurements.motion import Elsewhere, PairReport, Quality, Sighting, VisualResult
+from graphvio.measurements.motion import PairReport, Quality, Sighting, VisualResult
 from graphvio.measurements.sensors import FrameSet
 from graphvio.rig import Rig
 from graphvio.timing import timed
 
 _MIN_PARALLAX = 0.01  # median displacement of rays since a keyframe: with less, the rig has not moved
 _MAX_PARALLAX = 0.06  # with more, a keyframe is due
+_KEYFRAMES_AHEAD = 2.0  # what leaves a view until then is handed over
 _MIN_INTERVAL_NS = 140_000_000  # between keyframes while there is no motion to predict tracks by
 
 
@@ -27,6 +32,7 @@ class SinglesFrontend(VisualFrontend):
     def __init__(self, rig: Rig, config: Config, image_mask: ImageMask | None = None) -> None:
         super().__init__(rig, config, image_mask)
         self._overlaps = Overlaps(rig, config)
+        self._handover = Handover(len(rig.singles))
 
     def process(
         self, frameset: FrameSet, predict: MotionPredictor, readout: ReadoutMotion | None = None
@@ -57,11 +63,14 @@ class SinglesFrontend(VisualFrontend):
             cur_T_reference = None if reference is None else predict(reference.stamp_ns)
             if reference is not None and cur_T_reference is not None:
                 self._history.advance(reference.stamp_ns, seen.stamp_ns, cur_T_reference, np.zeros((6, 6)))
-            seen = seen._replace(frames=self._refer_to(seen.frames))
-        elsewhere = self._find_elsewhere(seen.frames, predict, is_keyframe)
-        for j in seen.frames if is_keyframe else ():
-            self._overlaps.slant(j, self._trackers[j])
-        sightings = {j: Sighting(frame.ids, frame.left, elsewhere[j]) for j, frame in seen.frames.items()}
+        sightings = self._find_elsewhere(seen.frames, predict, is_keyframe)
+        if is_keyframe:
+            before = seen.frames
+            seen = seen._replace(frames=self._refer_to(self._handed_over(before)))
+            new = {j: ~np.isin(frame.ids, before[j].ids) for j, frame in seen.frames.items()}
+            sightings = self._find_elsewhere(seen.frames, predict, is_keyframe, new)
+            for j in seen.frames:
+                self._overlaps.slant(j, self._trackers[j])
         tracked = sum(int((frame.ages > 0).sum()) for frame in seen.frames.values())
         is_good = tracked >= self._config.motion.min_inliers
         return VisualResult(
@@ -77,15 +86,46 @@ class SinglesFrontend(VisualFrontend):
 
     @timed("elsewhere")
     def _find_elsewhere(
-        self, frames: dict[int, PairFrame], predict: MotionPredictor, searches: bool
-    ) -> dict[int, tuple[Elsewhere, ...]]:
-        """Find each camera's tracks in the other cameras that see the same part of the scene."""
-        views = {j: self._trackers[j].view for j in frames}
+        self, frames: dict[int, PairFrame], predict: MotionPredictor, searches: bool,
+        wanted: Mapping[int, Bool] | None = None,
+    ) -> dict[int, Sighting]:  # fmt: skip
+        """Find each camera's tracks in the other cameras that see the same part of the scene.
 
-        def find(j: int) -> tuple[Elsewhere, ...]:
-            return self._overlaps.find(j, views, lambda then_ns: self._moved(j, predict(then_ns)), searches)
+        Those that another camera's track is a part of are found by that one.
+        """
+        views = {j: self._trackers[j].view for j in frames}
+        of_others = {j: np.zeros(len(frames[j].ids), dtype=bool) for j in frames}
+        if not searches:
+            of_others = {j: self._handover.is_followed(j, frames) for j in frames}
+
+        def find(j: int) -> Sighting:
+            chosen = ~of_others[j] if wanted is None else wanted[j]
+            self._overlaps.find(j, views, lambda then_ns: self._moved(j, predict(then_ns)), searches, chosen)
+            adopted = self._handover.adopted(j, frames[j])
+            return Sighting(frames[j].ids, frames[j].left, self._overlaps.elsewhere(j, frames[j]), adopted)
 
         return self._in_parallel(find, frames)
+
+    @timed("handover")
+    def _handed_over(self, frames: dict[int, PairFrame]) -> dict[int, PairFrame]:
+        """Let cameras follow the points of tracks that are about to leave the others' views."""
+        leaving = {j: self._leaving(j, frame) for j, frame in frames.items()}
+        adopted = dict(frames)
+        for j, frame in sorted(frames.items()):
+            found = self._overlaps.found_in(j, frame.stamp_ns, leaving)
+            adopted[j] = self._handover.adopt(j, self._trackers[j], frames, found)
+        return adopted
+
+    def _leaving(self, camera: int, frame: PairFrame) -> Leaving:
+        """Return the tracks that leave a camera's view soon, if they go on as since the last keyframe."""
+        reference = self._references.of(camera) or PairFrame.empty()
+        then, now = common_rows(reference.ids, frame.ids)
+        ahead = frame.pixels[now] + _KEYFRAMES_AHEAD * (frame.pixels[now] - reference.pixels[then])
+        margin, size = self._config.corners.border_px, np.array(self._rig.groups[camera].left.size_px)
+        leaves = ((ahead < margin) | (ahead > size - 1 - margin)).any(axis=1)
+        then, now = then[leaves], now[leaves]
+        sigmas = self._config.motion.pixel_sigma_px * np.sqrt(reference.covariances[then, 2, 2])
+        return Leaving(frame.ids[now], frame.points[now, 2], sigmas)
 
     def _is_keyframe(
         self, stamp_ns: int, frames: dict[int, PairFrame], predict: MotionPredictor, is_stationary: bool

@@ -129,6 +129,33 @@ class PairTracker:
             self._last = replace(self._last, points=points, covariances=covariances)
         return self._last
 
+    def adopt(self, pixels: Float, inverse_depths: Float) -> tuple[PairFrame, Int]:
+        """Follow points of the newest image from now on, where a single camera has no track near.
+
+        Args:
+            pixels: (N, 2).
+            inverse_depths: (N,) of the points, 1/m.
+
+        Returns:
+            All tracks, and which of the points (M,) the last M of them follow.
+        """
+        frame, cell_px = self._last, self._cell_px
+        inside, usable = usable_at(pixels, self._allowed, self._config.corners.border_px)
+        free = thinned(pixels, inside & usable, cell_px, 1)
+        if len(frame.ids):
+            apart = pixels[:, None] - frame.pixels
+            free &= ((apart**2).sum(axis=2) >= (0.5 * cell_px) ** 2).all(axis=1)
+        both = np.concatenate([frame.pixels, pixels])
+        crowded = ~thinned(both, np.ones(len(both), dtype=bool), cell_px, _MAX_TRACKS_PER_CELL)
+        which = np.flatnonzero(free & ~crowded[len(frame.ids) :])
+        ids, none = self._next_id + np.arange(len(which)), np.zeros(len(which), dtype=np.int64)
+        new = self._matched(
+            frame.stamp_ns, ids, none, pixels[which], inverse_depths[which], np.zeros((len(which), 2)), none, {}
+        )
+        self._next_id += len(which)
+        self._last = frame.extended(replace(new, stage_ms={}))
+        return self._last, which[np.isin(ids, new.ids)]
+
     @property
     def view(self) -> View:
         """The newest left image, and what is tracked in it."""

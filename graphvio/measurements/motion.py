@@ -103,6 +103,23 @@ class Elsewhere(NamedTuple):
     rays: Float
 
 
+class Adopted(NamedTuple):
+    """Tracks of a single camera that follow points which another camera's tracks began.
+
+    Attributes:
+        rows: (M,) of the tracks.
+        cameras: (M,) index of the camera whose track began.
+        ids: (M,) identity of that track.
+    """
+
+    rows: Int
+    cameras: Int
+    ids: Int
+
+
+_NONE_ADOPTED = Adopted(*(np.zeros(0, dtype=np.int64) for _ in range(3)))
+
+
 class Sighting(NamedTuple):
     """What one single camera sees at an instant.
 
@@ -110,11 +127,13 @@ class Sighting(NamedTuple):
         ids: (N,) identities of its tracks, increasing.
         rays: (N, 2) normalised coordinates.
         elsewhere: the same tracks in other cameras whose views overlap.
+        adopted: which of them follow points of other cameras' tracks.
     """
 
     ids: Int
     rays: Float
     elsewhere: tuple[Elsewhere, ...] = ()
+    adopted: Adopted = _NONE_ADOPTED
 
 
 class LocatedPoints(NamedTuple):

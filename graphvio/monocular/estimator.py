@@ -279,16 +279,30 @@ class MonocularEstimator:
         seen = np.isin(ids, newest.landmark)
         fitting = int((seen & ~off).sum())
         is_tracking = fitting >= max(_MIN_LANDMARKS, _MIN_FITTING * int(seen.sum()))
-        outliers = newest.of(ids[off])
+        dropped = window.names.tracks_of(ids[off])
         window.names.end(ids[off])
         window.views = [views.without(ids[off]) for views in window.views]
+        if is_tracking:
+            self._leave_out_mismatches(window, structure, ids, adjusted.equations.errors2)
         self._solved = Solved(adjusted, structure, ids, window.views[-1])
         self._set_covariance(adjusted)
         if is_keyframe:
             self._finish_keyframe(window, adjusted)
         status = self._status(stamp_ns, is_tracking, adjusted)
-        dropped = {int(j): np.unique(outliers.ids[outliers.owner == j]) for j in np.unique(outliers.owner)}
         return StateUpdate(status, outliers=dropped)
+
+    def _leave_out_mismatches(self, window: Window, structure: Structure, ids: Int, errors2: Float) -> None:
+        """Leave out newest views by which another camera has found a landmark at a place where it cannot be.
+
+        A track of another camera that took it over begins a landmark of its own.
+        """
+        rows = np.flatnonzero((structure.state == len(window.views) - 1) & (errors2 > MAX_ERROR2))
+        if not len(rows):
+            return
+        landmarks = ids[np.searchsorted(structure.rows, rows, side="right") - 1]
+        newest = window.views[-1]
+        window.views[-1] = kept = newest.without_foreign(landmarks, structure.camera[rows])
+        window.names.end(np.setdiff1d(newest.landmark, kept.landmark))
 
     def _finish_keyframe(self, window: Window, adjusted: Adjusted) -> None:
         """Let the oldest keyframe leave where the window is full, and follow the noise of the images."""

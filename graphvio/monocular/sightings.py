@@ -16,6 +16,7 @@ from graphvio.arrays import Bool, Float, Int
 from graphvio.measurements.motion import Sighting
 from graphvio.monocular.structure import PRIOR_INVERSE_DEPTH, Cameras, Structure
 
+_NONE: Int = np.zeros(0, dtype=np.int64)
 _MIX = 2654435761  # of Knuth's multiplicative hash: lengths do not depend on the order of tracks
 
 
@@ -28,6 +29,7 @@ class Views(NamedTuple):
         ids: (M,) identities of its tracks.
         landmark: (M,) identities of the landmarks.
         rays: (M, 2) normalised coordinates.
+        is_foreign: (M,) whether the landmark was found in this camera by the track of another one.
     """
 
     camera: Int
@@ -35,21 +37,38 @@ class Views(NamedTuple):
     ids: Int
     landmark: Int
     rays: Float
-
-    def of(self, landmarks: Int) -> Views:
-        """Return the views of some landmarks."""
-        return self._rows(np.isin(self.landmark, landmarks))
+    is_foreign: Bool
 
     def without(self, landmarks: Int) -> Views:
         """Return the views of all but some landmarks."""
         return self._rows(~np.isin(self.landmark, landmarks))
 
+    def without_foreign(self, landmarks: Int, cameras: Int) -> Views:
+        """Return all but the foreign views of some landmarks (K,) in some cameras (K,)."""
+        width = int(max(self.camera.max(initial=0), cameras.max(initial=0))) + 1
+        named = np.isin(self.landmark * width + self.camera, landmarks * width + cameras)
+        return self._rows(~(self.is_foreign & named))
+
+    def once(self, ranks: Int) -> Views:
+        """Return each camera's view of each landmark once: of several tracks', that with the smallest rank (M,)."""
+        order = np.lexsort((self.owner, ranks, self.camera, self.landmark))
+        camera, landmark = self.camera[order], self.landmark[order]
+        again = np.zeros(len(order), dtype=bool)
+        again[order[1:]] = (camera[1:] == camera[:-1]) & (landmark[1:] == landmark[:-1])
+        return self._rows(~again) if again.any() else self
+
     def _rows(self, kept: Bool) -> Views:
-        return Views(self.camera[kept], self.owner[kept], self.ids[kept], self.landmark[kept], self.rays[kept])
+        return Views(
+            self.camera[kept], self.owner[kept], self.ids[kept], self.landmark[kept], self.rays[kept],
+            self.is_foreign[kept],
+        )  # fmt: skip
+
+
+_NO_VIEWS = Views(_NONE, _NONE, _NONE, _NONE, np.zeros((0, 2)), np.zeros(0, dtype=bool))
 
 
 class LandmarkNames:
-    """Joins tracks to landmarks.
+    """Joins tracks to landmarks: tracks of several cameras that follow one point are one landmark.
 
     Args:
         n_cameras: of the rig.
@@ -57,44 +76,91 @@ class LandmarkNames:
     """
 
     def __init__(self, n_cameras: int, max_keyframes: int) -> None:
+        self._n_cameras = n_cameras
         self._max_keyframes = max_keyframes
-        self._ids: list[Int] = [np.zeros(0, dtype=np.int64) for _ in range(n_cameras)]
-        self._landmarks: list[Int] = [np.zeros(0, dtype=np.int64) for _ in range(n_cameras)]
-        self._left: list[Int] = [np.zeros(0, dtype=np.int64) for _ in range(n_cameras)]  # keyframes
+        self._points: Int = _NONE  # increasing, see `_points_of`
+        self._landmarks: Int = _NONE
+        self._left: Int = _NONE  # keyframes
+        self._cameras: Int = _NONE  # that saw each last
+        self._tracks = (_NONE, _NONE, _NONE)  # camera, identity and landmark of the newest tracks
         self._next = 0
 
     def join(self, sightings: Mapping[int, Sighting]) -> Views:
-        """Join the sightings of an instant to landmarks; tracks that have none begin one."""
-        parts = []
-        for j, sighting in sorted(sightings.items()):
-            ids, n = sighting.ids, len(sighting.ids)
-            landmarks, left = np.full(n, -1, dtype=np.int64), np.zeros(n, dtype=np.int64)
-            if len(self._ids[j]):
-                rows = np.minimum(np.searchsorted(self._ids[j], ids), len(self._ids[j]) - 1)
-                known = (self._ids[j][rows] == ids) & (self._left[j][rows] > 0)
-                landmarks[known], left[known] = self._landmarks[j][rows[known]], self._left[j][rows[known]]
-            new = np.flatnonzero(landmarks < 0)
-            landmarks[new] = self._next + np.arange(len(new))
-            self._next += len(new)
-            shortest = (self._max_keyframes + 1) // 2
-            mixed = (ids[new] * _MIX + landmarks[new] * 40503) % 2**32 >> 16
-            left[new] = shortest + mixed % (self._max_keyframes - shortest + 1)
-            self._ids[j], self._landmarks[j], self._left[j] = ids, landmarks, left
-            own = np.full(n, j, dtype=np.int64)
-            parts.append(Views(own, own, ids, landmarks, sighting.rays))
+        """Join the sightings of an instant to landmarks; points that have none begin one."""
+        ordered = sorted(sightings.items())
+        if not ordered:
+            return _NO_VIEWS
+        of_tracks = [self._points_of(j, sighting) for j, sighting in ordered]
+        ids = np.concatenate([sighting.ids for _, sighting in ordered])
+        cameras = np.concatenate([np.full(len(sighting.ids), j, dtype=np.int64) for j, sighting in ordered])
+        landmarks = self._name(np.concatenate(of_tracks), ids, cameras, np.array([j for j, _ in ordered]))
+        self._tracks = cameras, ids, landmarks
+        parts, ranks, begin = [], [], 0
+        for j, sighting in ordered:
+            n = len(sighting.ids)
+            named, own, rank = landmarks[begin : begin + n], np.full(n, j, dtype=np.int64), np.zeros(n, dtype=np.int64)
+            rank[sighting.adopted.rows] = 2
+            begin += n
+            parts.append(Views(own, own, sighting.ids, named, sighting.rays, rank > 0))
+            ranks.append(rank)
             for seen in sighting.elsewhere:
-                other = np.full(len(seen.rows), seen.camera, dtype=np.int64)
-                parts.append(Views(other, own[seen.rows], ids[seen.rows], landmarks[seen.rows], seen.rays))
-        return Views(*(np.concatenate(each) for each in zip(*parts, strict=True))) if parts else _NO_VIEWS
+                rows, other = seen.rows, np.full(len(seen.rows), seen.camera, dtype=np.int64)
+                is_foreign = np.ones(len(rows), dtype=bool)
+                parts.append(Views(other, own[rows], sighting.ids[rows], named[rows], seen.rays, is_foreign))
+                ranks.append(rank[rows] + 1)
+        views = Views(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+        return views.once(np.concatenate(ranks))
 
     def note_keyframe(self) -> None:
         """Take note that the newest sightings are those of a keyframe."""
-        self._left = [left - 1 for left in self._left]
+        self._left = self._left - 1
 
     def end(self, landmarks: Int) -> None:
         """End some landmarks: tracks that go on begin others."""
-        for j, of_camera in enumerate(self._landmarks):
-            self._left[j] = np.where(np.isin(of_camera, landmarks), 0, self._left[j])
+        self._left = np.where(np.isin(self._landmarks, landmarks), 0, self._left)
+
+    def tracks_of(self, landmarks: Int) -> dict[int, Int]:
+        """Return the newest tracks of some landmarks: camera -> identities, increasing."""
+        ended = np.isin(self._tracks[2], landmarks)
+        cameras, ids = self._tracks[0][ended], self._tracks[1][ended]
+        return {int(j): np.unique(ids[cameras == j]) for j in np.unique(cameras)}
+
+    def _points_of(self, camera: int, sighting: Sighting) -> Int:
+        """Return numbers (N,) of the points that a camera's tracks follow: of the camera and track that began each."""
+        points = sighting.ids * self._n_cameras + camera
+        rows, cameras, ids = sighting.adopted
+        points[rows] = ids * self._n_cameras + cameras
+        return points
+
+    def _name(self, of_tracks: Int, ids: Int, cameras: Int, present: Int) -> Int:
+        """Return the landmarks (N,) of tracks, and forget points that the cameras with images no longer see.
+
+        Args:
+            of_tracks: (N,) their points.
+            ids: (N,) their identities.
+            cameras: (N,) whose they are.
+            present: the cameras that have images.
+        """
+        points, firsts, which = np.unique(of_tracks, return_index=True, return_inverse=True)
+        landmarks, left = np.full(len(points), -1, dtype=np.int64), np.zeros(len(points), dtype=np.int64)
+        if len(self._points):
+            rows = np.minimum(np.searchsorted(self._points, points), len(self._points) - 1)
+            known = (self._points[rows] == points) & (self._left[rows] > 0)
+            landmarks[known], left[known] = self._landmarks[rows[known]], self._left[rows[known]]
+        new = np.flatnonzero(landmarks < 0)
+        new = new[np.argsort(firsts[new])]  # in the order of cameras and tracks
+        landmarks[new] = self._next + np.arange(len(new))
+        self._next += len(new)
+        shortest = (self._max_keyframes + 1) // 2
+        mixed = (ids[firsts[new]] * _MIX + landmarks[new] * 40503) % 2**32 >> 16
+        left[new] = shortest + mixed % (self._max_keyframes - shortest + 1)
+        kept = ~np.isin(self._cameras, present) & ~np.isin(self._points, points)
+        columns = (points, landmarks, left, cameras[firsts])
+        before = (self._points, self._landmarks, self._left, self._cameras)
+        both = [np.concatenate([now, then[kept]]) for now, then in zip(columns, before, strict=True)]
+        order = np.argsort(both[0])
+        self._points, self._landmarks, self._left, self._cameras = (column[order] for column in both)
+        return np.asarray(landmarks[which])
 
 
 class Landmarks:
@@ -152,7 +218,3 @@ def far_off(structure: Structure, errors2: Float, max_error2: float, max_share: 
         return np.zeros(0, dtype=bool)
     off = np.add.reduceat(errors2 > max_error2, structure.rows[:-1], dtype=np.int64)
     return np.asarray(off > max_share * np.diff(structure.rows))
-
-
-_NONE = np.zeros(0, dtype=np.int64)
-_NO_VIEWS = Views(_NONE, _NONE, _NONE, _NONE, np.zeros((0, 2)))
