@@ -459,6 +459,31 @@ def test_matches_at_wrong_places_in_other_cameras_do_no_harm() -> None:
     assert abs(scale - 1.0) < 2e-3
 
 
+@pytest.mark.parametrize("turned_deg", [(0.0, 0.2, 0.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)])
+def test_a_camera_that_is_turned_in_the_rig_file_does_not_spoil_the_scale(turned_deg: tuple[float, ...]) -> None:
+    """The second camera is turned along and across the epipolar lines: 0.2 degrees along them are 12 % of the scale."""
+    rig = overlapping_rig()
+    first, second = rig.singles
+    turned_T_cam = np.eye(4)
+    turned_T_cam[:3, :3] = so3_exp(np.deg2rad(np.array(turned_deg)))
+    body_T_cam = second.left.body_T_cam @ turned_T_cam
+    wrong = replace(rig, singles=(first, replace(second, left=replace(second.left, body_T_cam=body_T_cam))))
+    flown = fly(moving(), 5.0, rig=rig, believed=wrong)
+    late = flown.stamps_s > 2.5
+    error_m, scale = aligned(flown._replace(poses=flown.poses[late], truth=flown.truth[late]))
+    assert abs(scale - 1.0) < 0.02
+    assert error_m < 0.02
+    off = [detail for kind, detail in flown.events if kind == EventKind.EXTRINSICS_OFF]
+    assert len(off) == 1
+    assert "check their places in the rig" in off[0]
+
+
+def test_an_exact_rig_is_trusted_and_the_comparison_ends() -> None:
+    flown = fly(moving(), 3.0, rig=overlapping_rig())
+    assert [kind for kind, _ in flown.events] == [EventKind.SCALE_KNOWN]
+    assert flown.estimator.epoch == 0
+
+
 @pytest.mark.parametrize("shares", [False, True])
 def test_points_and_motions_of_keyframes_are_consistent(shares: bool) -> None:
     """Errors of what a SLAM system gets; the noise of tracks is taken for twice as large, as that of images lasts."""

@@ -123,7 +123,9 @@ class Overlaps:
     def found_in(self, camera: int, stamp_ns: int, leaving: Mapping[int, Leaving]) -> list[FoundThere]:
         """Return where a camera's image shows tracks that leave the other cameras' views.
 
-        Those that are left out are found at another distance than the motion of their own camera shows.
+        Left out is what is found at another distance than the motion of its own camera shows, and the tracks of cameras
+        that look the same way: both views lose a point nearly at once, and the error of the match outweighs what a
+        longer track gains.
 
         Args:
             camera: index of the camera.
@@ -134,7 +136,9 @@ class Overlaps:
         for own, partners in enumerate(self._partners):
             for partner in partners:
                 there, other = partner.found, partner.cameras.right
-                if partner.camera != camera or own not in leaving or there.stamp_ns != stamp_ns or not len(there.ids):
+                if partner.camera != camera or not isinstance(partner.matcher, WarpedMatcher) or own not in leaving:
+                    continue
+                if there.stamp_ns != stamp_ns or not len(there.ids):
                     continue
                 _, inverse_depths, in_front = predict_pixels(
                     there.left, np.maximum(there.points[:, 2], 0.0), partner.cameras.right_T_left, other.model_number,

@@ -50,7 +50,8 @@ class EventKind(StrEnum):
     CALIBRATION_CHANGED = "calibration_changed"
     """For some time the images contradict the calibration that was known, as after a knock; it is estimated again."""
     EXTRINSICS_OFF = "extrinsics_off"
-    """The pairs' motions contradict the rig's transform between them; it is corrected for this run."""
+    """The pairs' motions contradict the rig's transform between them; it is corrected for this run. Or the scale of
+    single cameras' overlapping views contradicts the accelerometer's; overlaps are not used from then on."""
 
     # ---------------------------------------------------------------- state estimation
     VISION_GATED = "vision_gated"

@@ -31,7 +31,16 @@ from graphvio.monocular.adjustment import (
     first_prior,
     without_first,
 )
-from graphvio.monocular.initialiser import MAX_ERROR2, MAX_KEYFRAMES, POSE_SIGMAS, Initialiser, Window
+from graphvio.monocular.initialiser import (
+    MAX_DURATION_NS,
+    MAX_ERROR2,
+    MAX_KEYFRAMES,
+    POSE_SIGMAS,
+    Initialiser,
+    Window,
+    shared_points,
+)
+from graphvio.monocular.overlap_trust import OverlapTrust, alone
 from graphvio.monocular.points import Solved, covariance_since, located_points
 from graphvio.monocular.sightings import far_off
 from graphvio.monocular.structure import Cameras, Structure, located
@@ -88,6 +97,8 @@ class MonocularEstimator:
         self._max_gap_ns = round(config.timing.max_imu_gap_ms * 1e6)
         self._sigma_px = _FIRST_SIGMA_PX
         self._initialiser = self._new_initialiser()
+        self._trust = OverlapTrust(self._new_initialiser())
+        self._has_overlaps, self._are_trusted = False, True
         self._window: Window | None = None
         self._latest_ns = 0
         self._since_ns = 0  # of the initialisation
@@ -186,6 +197,7 @@ class MonocularEstimator:
             attitude = initial_attitude(*imu, self._config.initialisation)
             if attitude.is_stationary:
                 self._initialiser.know_gyro_bias(attitude.gyro_bias, attitude.gyro_bias_sigma)
+                self._trust.know_gyro_bias(attitude.gyro_bias, attitude.gyro_bias_sigma)
 
     def predict(self, stamp_ns: int, interval: ImuInterval | None) -> bool:
         """Add a state by the IMU: late samples are awaited for a second, and where some are missing, the epoch ends."""
@@ -225,7 +237,9 @@ class MonocularEstimator:
 
     def apply(self, visual: VisualResult, is_stationary: bool) -> MeasurementUpdate:
         """Take what the cameras see; it is tested when the window is solved."""
-        self._sightings, self._is_stationary = dict(visual.sightings), is_stationary
+        self._has_overlaps |= shared_points(visual.sightings) > 0
+        seen = dict(visual.sightings) if self._are_trusted else alone(visual.sightings)
+        self._sightings, self._is_stationary = seen, is_stationary
         return MeasurementUpdate(None)
 
     def update(self, stamp_ns: int, is_constrained: bool, keep: frozenset[int]) -> StateUpdate:
@@ -236,7 +250,12 @@ class MonocularEstimator:
         if self._window is None:
             return self._initialising(stamp_ns, is_keyframe)
         try:
-            return self._solve(self._window, stamp_ns, is_keyframe)
+            update = self._solve(self._window, stamp_ns, is_keyframe)
+            instead = self._without_overlaps(stamp_ns, self._window) if is_keyframe and self._window else None
+            if instead is None:
+                return update
+            self._lose(stamp_ns, "overlapping views contradict the IMU")
+            return self._begin(instead, stamp_ns, is_keyframe)
         except np.linalg.LinAlgError as error:
             self._lose(stamp_ns, str(error))
             return StateUpdate(Status.LOST)
@@ -245,15 +264,11 @@ class MonocularEstimator:
         """Collect keyframes, and begin the window once the scale is known."""
         if self._has_imu and (is_keyframe or self._is_stationary):
             window = self._initialiser.add(stamp_ns, self._sightings, self._is_stationary)
+            instead = self._without_overlaps(stamp_ns, window)
+            if instead is not None:
+                return self._begin(instead, stamp_ns, is_keyframe)
             if window is not None:
-                self._window, self._is_keyframe, self._before = window, True, None
-                self.initialisations += 1
-                self._report(
-                    stamp_ns,
-                    EventKind.SCALE_KNOWN,
-                    f"the scale is known to 5 % after {(stamp_ns - self._since_ns) * 1e-9:.1f} s",
-                )
-                return self._solve(window, stamp_ns, is_keyframe, is_new=True)
+                return self._begin(window, stamp_ns, is_keyframe)
         if not self._is_reported and stamp_ns - self._since_ns > _REPORT_AFTER_NS:
             self._is_reported = True
             self._report(
@@ -263,6 +278,32 @@ class MonocularEstimator:
                 "on moving: speed up, brake and turn",
             )
         return StateUpdate(Status.INITIALISING)
+
+    def _begin(self, window: Window, stamp_ns: int, is_keyframe: bool) -> StateUpdate:
+        """Begin with a window whose scale is known."""
+        self._window, self._is_keyframe, self._before = window, True, None
+        self.initialisations += 1
+        self._report(
+            stamp_ns,
+            EventKind.SCALE_KNOWN,
+            f"the scale is known to 5 % after {(stamp_ns - self._since_ns) * 1e-9:.1f} s",
+        )
+        return self._solve(window, stamp_ns, is_keyframe, is_new=True)
+
+    def _without_overlaps(self, stamp_ns: int, window: Window | None) -> Window | None:
+        """Return a window without overlaps where these cannot be trusted: they are not used from then on."""
+        if not (self._has_overlaps and self._are_trusted):
+            return None
+        states = None if window is None else window.states
+        found = self._trust.add(stamp_ns, self._sightings, self._is_stationary, states)
+        if found is None:
+            return None
+        instead, why = found
+        self._are_trusted = False
+        self._report(
+            stamp_ns, EventKind.EXTRINSICS_OFF, f"{why}: cameras are used each by itself; check their places in the rig"
+        )
+        return instead
 
     def _solve(self, window: Window, stamp_ns: int, is_keyframe: bool, is_new: bool = False) -> StateUpdate:
         if not is_new:
@@ -292,16 +333,13 @@ class MonocularEstimator:
         return StateUpdate(status, outliers=dropped)
 
     def _leave_out_mismatches(self, window: Window, structure: Structure, ids: Int, errors2: Float) -> None:
-        """Leave out newest views by which another camera has found a landmark at a place where it cannot be.
-
-        A track of another camera that took it over begins a landmark of its own.
-        """
+        """Leave out newest views of adopted tracks that are not at their landmark; they begin one of their own."""
         rows = np.flatnonzero((structure.state == len(window.views) - 1) & (errors2 > MAX_ERROR2))
         if not len(rows):
             return
         landmarks = ids[np.searchsorted(structure.rows, rows, side="right") - 1]
         newest = window.views[-1]
-        window.views[-1] = kept = newest.without_foreign(landmarks, structure.camera[rows])
+        window.views[-1] = kept = newest.without_adopted(landmarks, structure.camera[rows])
         window.names.end(np.setdiff1d(newest.landmark, kept.landmark))
 
     def _finish_keyframe(self, window: Window, adjusted: Adjusted) -> None:
@@ -379,6 +417,7 @@ class MonocularEstimator:
         self._window, self._before, self._contradicted_since_ns = None, None, None
         self._solved = None
         self._initialiser = self._new_initialiser()
+        self._trust = OverlapTrust(self._new_initialiser())
         self.covariance = _NO_COVARIANCE
         self._since_ns, self._is_reported = stamp_ns, False
 
@@ -400,6 +439,8 @@ class MonocularEstimator:
         oldest_ns = self._latest_ns if self._window is None else int(self._window.states.stamps_ns[0])
         if self._window is None and self._initialiser.oldest_ns is not None:
             oldest_ns = self._initialiser.oldest_ns
+        if self._trust.oldest_ns is not None:
+            oldest_ns = min(oldest_ns, max(self._trust.oldest_ns, until_ns - MAX_DURATION_NS))
         first = max(int(np.searchsorted(stamps, oldest_ns - _MARGIN_NS)) - 1, 0)
         end = int(np.searchsorted(stamps, until_ns)) + 1
         self._stamps, self._readings = stamps[end:].tolist(), list(readings[end:])

@@ -29,7 +29,7 @@ MAX_SCALE_SIGMA = 0.05
 MAX_ERROR2 = 16.0  # squared whitened error of a view of what stands still
 _MIN_KEYFRAMES, _MIN_METRIC_KEYFRAMES = 8, 5  # the latter where baselines know the scale
 _MIN_DURATION_S, _MIN_METRIC_DURATION_S = 1.0, 0.5
-_MAX_DURATION_S = 5.0
+MAX_DURATION_NS = 5_000_000_000
 _MIN_LANDMARKS = 20
 _MAX_OFF = 0.3  # share of a landmark's views that may be farther off
 _MIN_FITTING = 0.7  # share of the landmarks
@@ -79,6 +79,7 @@ class Initialiser:
         self._gyro_bias, self._gyro_bias_sigma = np.zeros(3), 0.1
         self._keyframes: list[tuple[int, Mapping[int, Sighting], bool]] = []
         self.reason = "no image has come"
+        self.scale_sigma = np.inf  # of the window that was tested last, as a share
 
     def know_gyro_bias(self, gyro_bias: Float, sigma: float) -> None:
         """Take the gyro's bias (3,) rad/s as a standstill shows it."""
@@ -95,10 +96,10 @@ class Initialiser:
             self._keyframes.pop()  # of a standstill the newest keyframe stays
         self._keyframes.append((stamp_ns, sightings, is_stationary))
         del self._keyframes[:-MAX_KEYFRAMES]
-        while (stamp_ns - self._keyframes[0][0]) * 1e-9 > _MAX_DURATION_S:
+        while stamp_ns - self._keyframes[0][0] > MAX_DURATION_NS:
             del self._keyframes[0]
         duration_s = (stamp_ns - self._keyframes[0][0]) * 1e-9
-        is_metric = _shared(sightings) >= _MIN_LANDMARKS
+        is_metric = shared_points(sightings) >= _MIN_LANDMARKS
         min_keyframes = _MIN_METRIC_KEYFRAMES if is_metric else _MIN_KEYFRAMES
         min_duration_s = _MIN_METRIC_DURATION_S if is_metric else _MIN_DURATION_S
         if is_stationary or len(self._keyframes) < min_keyframes or duration_s < min_duration_s:
@@ -160,7 +161,7 @@ class Initialiser:
             return "images and IMU contradict each other"
         if abs(float(np.linalg.norm(states.gravity)) - GRAVITY_M_S2) > _MAX_GRAVITY_EXCESS:
             return "images and IMU contradict each other about gravity"
-        sigma = scale_sigma(states, at.hessian)
+        self.scale_sigma = sigma = scale_sigma(states, at.hessian)
         if not sigma < MAX_SCALE_SIGMA:
             return f"the scale is known to {100 * sigma:.0f} % only"
         return ""
@@ -184,7 +185,7 @@ class Initialiser:
         return replace(window, states=turned, prior=window.prior._replace(at=at))
 
 
-def _shared(sightings: Mapping[int, Sighting]) -> int:
+def shared_points(sightings: Mapping[int, Sighting]) -> int:
     """Count the points that two cameras see."""
     return sum(len(seen.rows) for sighting in sightings.values() for seen in sighting.elsewhere)
 

@@ -29,7 +29,7 @@ class Views(NamedTuple):
         ids: (M,) identities of its tracks.
         landmark: (M,) identities of the landmarks.
         rays: (M, 2) normalised coordinates.
-        is_foreign: (M,) whether the landmark was found in this camera by the track of another one.
+        is_adopted: (M,) whether the track follows a point that another camera's track began.
     """
 
     camera: Int
@@ -37,17 +37,17 @@ class Views(NamedTuple):
     ids: Int
     landmark: Int
     rays: Float
-    is_foreign: Bool
+    is_adopted: Bool
 
     def without(self, landmarks: Int) -> Views:
         """Return the views of all but some landmarks."""
         return self._rows(~np.isin(self.landmark, landmarks))
 
-    def without_foreign(self, landmarks: Int, cameras: Int) -> Views:
-        """Return all but the foreign views of some landmarks (K,) in some cameras (K,)."""
+    def without_adopted(self, landmarks: Int, cameras: Int) -> Views:
+        """Return all but adopted tracks' views of some landmarks (K,) in some cameras (K,)."""
         width = int(max(self.camera.max(initial=0), cameras.max(initial=0))) + 1
         named = np.isin(self.landmark * width + self.camera, landmarks * width + cameras)
-        return self._rows(~(self.is_foreign & named))
+        return self._rows(~(self.is_adopted & named))
 
     def once(self, ranks: Int) -> Views:
         """Return each camera's view of each landmark once: of several tracks', that with the smallest rank (M,)."""
@@ -60,7 +60,7 @@ class Views(NamedTuple):
     def _rows(self, kept: Bool) -> Views:
         return Views(
             self.camera[kept], self.owner[kept], self.ids[kept], self.landmark[kept], self.rays[kept],
-            self.is_foreign[kept],
+            self.is_adopted[kept],
         )  # fmt: skip
 
 
@@ -105,8 +105,7 @@ class LandmarkNames:
             ranks.append(rank)
             for seen in sighting.elsewhere:
                 rows, other = seen.rows, np.full(len(seen.rows), seen.camera, dtype=np.int64)
-                is_foreign = np.ones(len(rows), dtype=bool)
-                parts.append(Views(other, own[rows], sighting.ids[rows], named[rows], seen.rays, is_foreign))
+                parts.append(Views(other, own[rows], sighting.ids[rows], named[rows], seen.rays, rank[rows] > 0))
                 ranks.append(rank[rows] + 1)
         views = Views(*(np.concatenate(each) for each in zip(*parts, strict=True)))
         return views.once(np.concatenate(ranks))

@@ -1,0 +1,89 @@
+"""Whether cameras whose views overlap can be trusted with the scale: the IMU alone is asked once.
+
+An error of how two cameras are turned to each other looks like another distance of all points, and no residual shows
+it: half a degree may be a third of the scale. Until the scale is known without what cameras see of each other's
+points, too, keyframes are collected for a window without that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from graphvio.measurements.motion import Sighting
+from graphvio.monocular.adjustment import States
+from graphvio.monocular.initialiser import Initialiser, Window
+
+_MAX_SIGMAS = 4.0
+_MIN_OFF = 0.04  # less is no more than what the IMU may be off by
+_MIN_COMMON = 5  # keyframes
+_MIN_SIZE_M = 0.05
+_SUFFICIENT_SIGMA = 0.01  # of the scale by the IMU
+_MAX_COMPARISONS = 8  # each takes as long as an initialisation
+
+
+def alone(sightings: Mapping[int, Sighting]) -> dict[int, Sighting]:
+    """Return what each camera sees by itself."""
+    return {j: Sighting(sighting.ids, sighting.rays) for j, sighting in sightings.items()}
+
+
+class OverlapTrust:
+    """Finds the scale without overlaps beside the estimate that uses them, and compares.
+
+    Args:
+        initialiser: without anything in it.
+    """
+
+    def __init__(self, initialiser: Initialiser) -> None:
+        self._initialiser: Initialiser | None = initialiser
+        self._compared = 0
+
+    @property
+    def oldest_ns(self) -> int | None:
+        """Stamp of the oldest keyframe that is kept, or None."""
+        return None if self._initialiser is None else self._initialiser.oldest_ns
+
+    def know_gyro_bias(self, gyro_bias: np.ndarray, sigma: float) -> None:
+        """Take the gyro's bias (3,) rad/s as a standstill shows it."""
+        if self._initialiser is not None:
+            self._initialiser.know_gyro_bias(gyro_bias, sigma)
+
+    def add(
+        self, stamp_ns: int, sightings: Mapping[int, Sighting], is_stationary: bool, states: States | None
+    ) -> tuple[Window, str] | None:
+        """Take a keyframe.
+
+        Args:
+            stamp_ns: of the keyframe.
+            sightings: of all cameras.
+            is_stationary: whether the rig stands.
+            states: of the window that uses overlaps, or None as long as it does not know the scale.
+
+        Returns:
+            The window without overlaps and what is wrong with these, where they cannot be trusted.
+        """
+        if self._initialiser is None:
+            return None
+        window = self._initialiser.add(stamp_ns, alone(sightings), is_stationary)
+        if window is None:
+            return None
+        if states is None:
+            return window, "what cameras see of each other's points fits no motion"
+        _, mine, theirs = np.intersect1d(window.states.stamps_ns, states.stamps_ns, return_indices=True)
+        size_m = _size_m(window.states, mine)
+        if len(mine) < _MIN_COMMON or size_m < _MIN_SIZE_M:
+            return None
+        off = _size_m(states, theirs) / size_m - 1.0
+        self._compared += 1
+        if abs(off) < max(_MAX_SIGMAS * self._initialiser.scale_sigma, _MIN_OFF):
+            if self._compared == _MAX_COMPARISONS or self._initialiser.scale_sigma < _SUFFICIENT_SIGMA:
+                self._initialiser = None
+            return None
+        return window, f"overlapping views show a scale that is {100 * off:+.0f} % off the accelerometer's"
+
+
+def _size_m(states: States, rows: np.ndarray) -> float:
+    """Return the rms distance of some positions from their mean."""
+    positions = states.poses[rows, :3, 3]
+    return float(np.sqrt(((positions - positions.mean(axis=0)) ** 2).sum(axis=1).mean())) if len(rows) else 0.0
