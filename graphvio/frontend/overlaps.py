@@ -26,6 +26,7 @@ MIN_OVERLAP = 0.1
 """Smallest share of an image that is searched for in another camera's."""
 
 
+_MAX_HANDOVER_OVERLAP = 0.4  # of what a camera shares with any other one
 _MAX_SIGMAS = 3.0
 
 
@@ -87,6 +88,8 @@ class Overlaps:
             [_partner(own, k, other, config) for k, other in enumerate(cameras) if _is_shared(own, other)]
             for own in cameras
         ]
+        shared = [max((overlap(own, other) for other in cameras if other is not own), default=0.0) for own in cameras]
+        self._hands_over = [each < _MAX_HANDOVER_OVERLAP for each in shared]
 
     def find(
         self,
@@ -124,8 +127,8 @@ class Overlaps:
         """Return where a camera's image shows tracks that leave the other cameras' views.
 
         Left out is what is found at another distance than the motion of its own camera shows, and the tracks of cameras
-        that look the same way: both views lose a point nearly at once, and the error of the match outweighs what a
-        longer track gains.
+        that share much of their view with another one, whose own tracks show the same: the error of the match then
+        outweighs what a longer track gains.
 
         Args:
             camera: index of the camera.
@@ -136,7 +139,7 @@ class Overlaps:
         for own, partners in enumerate(self._partners):
             for partner in partners:
                 there, other = partner.found, partner.cameras.right
-                if partner.camera != camera or not isinstance(partner.matcher, WarpedMatcher) or own not in leaving:
+                if partner.camera != camera or not self._hands_over[own] or own not in leaving:
                     continue
                 if there.stamp_ns != stamp_ns or not len(there.ids):
                     continue
