@@ -16,7 +16,7 @@ from graphvio.monocular.adjustment import States
 from graphvio.monocular.initialiser import Initialiser, Window
 
 _MAX_SIGMAS = 4.0
-_MIN_OFF = 0.04  # less is no more than what the IMU may be off by
+_MIN_OFF = 0.025  # seconds after the scale is known, the IMU alone was at most 2.3 % off
 _MIN_COMMON = 5  # keyframes
 _MIN_SIZE_M = 0.05
 _SUFFICIENT_SIGMA = 0.01  # of the scale by the IMU
