@@ -233,6 +233,13 @@ def test_write_plan_shows_trajectory_loops_and_points(one: Optimization, tmp_pat
     assert counts["some"][0] > counts["none"][0] + 500
 
 
+def test_write_plan_of_a_long_corridor_gives_no_warning(
+    one: Optimization, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_plan(one, tmp_path, np.linspace([-300.0, 0.0, 0.0], [300.0, 0.0, 0.0], 500))
+    assert not caplog.messages  # such as matplotlib's of limits that it changes
+
+
 def test_write_report_unjoined_parts_are_listed(truth: Trajectory, tmp_path: Path) -> None:
     found = two_sessions()
     page, summary = report(found, tmp_path, [truth, None])

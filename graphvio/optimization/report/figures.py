@@ -98,9 +98,10 @@ def plot_plan(found: Optimization, numbers: Numbers, frame: int, points: Float |
     _plot_loops(axes, found, lines, 1, 1)
     for line in lines:
         _plot_line(axes, line, 1, 1)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlim(low[0] - margin, high[0] + margin)
-    axes.set_ylim(low[1] - margin, high[1] + margin)
+    centre, half = (low + high) / 2.0, np.array([width, height]) / inch_per_m / 2.0
+    axes.set_aspect("equal", adjustable="box")  # which the axes' place has already
+    axes.set_xlim(centre[0] - half[0], centre[0] + half[0])
+    axes.set_ylim(centre[1] - half[1], centre[1] + half[1])
     axes.set_xlabel("x, m", fontsize=9)
     axes.set_ylabel("y, m", fontsize=9)
     axes.tick_params(labelsize=8.5)
