@@ -26,6 +26,21 @@ def test_no_command_shows_the_help() -> None:
     assert "calibrate-trajectories" in ran.stdout + ran.stderr
 
 
+@pytest.mark.parametrize(
+    ("typed", "hint"),
+    [
+        (["run"], "graphvio run --help"),
+        (["fleet", "optimize", "walk"], "graphvio fleet optimize --help"),
+        (["nothing"], "graphvio --help"),
+    ],
+)
+def test_a_wrong_command_line_names_the_help_of_its_command(typed: list[str], hint: str) -> None:
+    ran = graphvio(*typed)
+    assert ran.returncode == 2
+    assert ran.stderr.count("\n") == 1
+    assert f"({hint}" in ran.stderr
+
+
 @pytest.mark.parametrize(("typed", "found"), [("graphvio cal", "calibrate-trajectories"), ("graphvio ru", "run")])
 def test_the_shell_completes_commands(typed: str, found: str) -> None:
     done = subprocess.run(

@@ -268,6 +268,7 @@ def test_load_rig_pair_without_baseline_or_common_view_raises(tmp_path: Path) ->
         ("rig.yaml", b"", "graphvio_rig is missing"),
         ("rig.yaml", b"\xff\xfe\x00", "no text file"),
         ("rig.bin", b"", "no calibration file"),
+        ("notes.txt", b"lens: dirty\n", "no calibration that graphvio knows"),
     ],
 )
 def test_load_rig_unreadable_file_raises(tmp_path: Path, name: str, content: bytes, message: str) -> None:

@@ -130,6 +130,7 @@ def test_imu_samples_begin_at_most_5_s_before_the_first_frameset(tmp_path: Path)
     ("from_s", "to_s", "message"),
     [
         (5.0, None, r"no frameset lies from 5\.0 s to the end; the recording lasts 0\.450 s"),
+        (0.4, 0.1, r"no frameset lies from 0\.4 s to 0\.1 s; the recording lasts 0\.450 s"),
         (0.3, 0.1, r"from 0\.3 s to 0\.1"),
         (float("nan"), None, "from_s is nan"),
         (None, float("inf"), "to_s is inf"),

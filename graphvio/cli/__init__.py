@@ -104,7 +104,10 @@ def main() -> None:
             typer.echo(usage(), err=True)
             sys.exit(EXIT_BAD_INPUT)
         message = " ".join(usage().split())
-        _refuse(f"{message}  (graphvio --help lists the commands)")
+        hint = "graphvio --help lists the commands"
+        if context is not None and context.parent is not None:
+            hint = f"{context.command_path} --help shows its use"
+        _refuse(f"{message}  ({hint})")
     else:
         sys.exit(code if isinstance(code, int) else 0)
 

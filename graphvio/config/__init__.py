@@ -94,8 +94,12 @@ class Config:
             path = known[str(name_or_path)]
         try:
             text = path.read_text()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: cannot be read ({error}); give a YAML file or a profile's name") from None
+        except OSError as error:
+            raise ConfigError(
+                f"{path}: cannot be read ({error.strerror}); give a YAML file or a profile's name"
+            ) from None
+        except UnicodeDecodeError:
+            raise ConfigError(f"{path}: is not a text file; give a YAML file or a profile's name") from None
         return Config.from_yaml(text, str(path))
 
     @staticmethod

@@ -28,6 +28,11 @@ def load_odometry(file: Path) -> Rig:
     Raises:
         RigError: if a projection or the images are missing, or they do not describe a usable rig.
     """
+    entries = _entries(file)
+    if not any(key.startswith("P") for key in entries):
+        raise RigError(
+            f"{file}: is no calibration that graphvio knows: no YAML or JSON by its name, and none of KITTI's P0 to P3"
+        )
     folder = file.parent
     name, left, right = pair_of([p.name for p in folder.iterdir() if p.is_dir()] if folder.is_dir() else [], "image_{}")
     size = _png_size(folder / f"image_{left}")
@@ -36,7 +41,6 @@ def load_odometry(file: Path) -> Rig:
             f"{file}: has no image size, and {folder / f'image_{left}'} holds no PNG to take it from; put it next "
             "to the image folders, or write a rig.yaml"
         )
-    entries = _entries(file)
     with named(file):
         cameras = [_camera(f"image_{i}", _projection(entries, f"P{i}", file), size) for i in (left, right)]
         return Rig((StereoPair(name, *cameras),), None, folder.resolve().name)

@@ -213,7 +213,7 @@ def _cut(index: FramesetIndex, from_s: float | None, to_s: float | None, name: s
     last = len(stamps) if end is None else int(np.searchsorted(stamps, end, side="right"))
     if first >= last:
         raise SourceError(
-            f"{name}: no frameset lies from {from_s or 0.0} s to {to_s if to_s is not None else 'the end'}; "
+            f"{name}: no frameset lies from {from_s or 0.0} s to {'the end' if to_s is None else f'{to_s} s'}; "
             f"the recording lasts {1e-9 * float(stamps[-1] - stamps[0]):.3f} s"
         )
     return FramesetIndex(stamps[first:last], index.rows[first:last])
