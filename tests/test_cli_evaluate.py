@@ -97,6 +97,19 @@ def test_evaluate_unwritable_json_is_an_error(
     assert "cannot be written" in capsys.readouterr().err
 
 
+def test_a_result_folder_is_taken_for_its_trajectory(
+    files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = tmp_path / "result"
+    result.mkdir()
+    (result / "trajectory.txt").write_bytes(files[0].read_bytes())
+    tables = []
+    for given in (files[0], result):
+        assert run(monkeypatch, "evaluate", given, files[1]) == 0
+        tables.append(capsys.readouterr().out)
+    assert tables[0] == tables[1]
+
+
 def test_a_recording_is_taken_for_its_truth(
     room_walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

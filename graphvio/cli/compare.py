@@ -9,7 +9,7 @@ import typer
 
 from graphvio.cli import options
 from graphvio.cli.json_output import publish
-from graphvio.cli.shared import EXIT_ABOVE_LIMIT, names_of, true_trajectory, warn
+from graphvio.cli.shared import EXIT_ABOVE_LIMIT, names_of, result_trajectory, true_trajectory, warn
 
 if TYPE_CHECKING:
     from graphvio.evaluation import Compared
@@ -57,7 +57,10 @@ def compare(
     from graphvio.evaluation import compare as compare_all
     from graphvio.trajectory_files import load_trajectory
 
-    names, trajectories = names_of(results), [load_trajectory(_file(path, smoothed), times) for path in results]
+    names, trajectories = (
+        names_of(results),
+        [load_trajectory(result_trajectory(path, smoothed), times) for path in results],
+    )
     if truth is None and len(results) < 2:
         raise GraphvioError("one result and no truth: there is nothing to compare; give --truth FILE or more results")
     reference = true_trajectory(truth, times) if truth is not None else trajectories[0]
@@ -90,17 +93,6 @@ def compare(
         warn(f"ATE above {max_ate:g} m: {', '.join(above)}")
     if above or any(each.evaluation is None for each in compared):
         raise typer.Exit(EXIT_ABOVE_LIMIT)
-
-
-def _file(path: Path, smoothed: bool) -> Path:
-    from graphvio.sessions.store import is_store
-
-    if not path.is_dir() or is_store(path):
-        return path
-    optimized = path / "trajectory_optimized.txt"
-    if optimized.is_file():
-        return optimized
-    return path / ("trajectory_smoothed.txt" if smoothed else "trajectory.txt")
 
 
 def _table(compared: list[Compared]) -> object:

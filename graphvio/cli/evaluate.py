@@ -9,7 +9,7 @@ import typer
 
 from graphvio.cli import options
 from graphvio.cli.json_output import publish
-from graphvio.cli.shared import true_trajectory
+from graphvio.cli.shared import result_trajectory, true_trajectory
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    trajectory: Annotated[Path, typer.Argument(help="Estimated trajectory: TUM, EuRoC, KITTI, or BAG:TOPIC.")],
-    truth: Annotated[Path, typer.Argument(help="True trajectory: the same, or a recording that has one.")],
+    trajectory: Annotated[
+        Path, typer.Argument(help="Estimated trajectory: result folder, TUM, EuRoC, KITTI, or BAG:TOPIC.")
+    ],
+    truth: Annotated[Path, typer.Argument(help="True trajectory: such a file, or a recording that has one.")],
     plot: Annotated[
         Path | None, typer.Option(help="Plot both, and the error over time: .png, .pdf or .svg.", metavar="FILE")
     ] = None,
@@ -52,7 +54,9 @@ def evaluate(
     from graphvio.evaluation import evaluate as measure
     from graphvio.trajectory_files import load_trajectory
 
-    figures = measure(load_trajectory(trajectory, times), true_trajectory(truth, times), max_gap_s=max_gap)
+    figures = measure(
+        load_trajectory(result_trajectory(trajectory), times), true_trajectory(truth, times), max_gap_s=max_gap
+    )
     publish(figures.as_dict())
     Console().print(_table(figures))
     if json_file is not None:

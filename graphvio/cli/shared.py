@@ -38,6 +38,18 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 # ---------------------------------------------------------------------- recordings
 
 
+def result_trajectory(path: Path, smoothed: bool = False) -> Path:
+    """Return the trajectory file of a folder of results; another path as it is."""
+    from graphvio.sessions.store import is_store
+
+    if not path.is_dir() or is_store(path):
+        return path
+    optimized = path / "trajectory_optimized.txt"
+    if optimized.is_file():
+        return optimized
+    return path / ("trajectory_smoothed.txt" if smoothed else "trajectory.txt")
+
+
 def true_trajectory(path: Path, times: Path | None = None) -> Trajectory:
     """Read a trajectory file, or the truth of a recording.
 
