@@ -42,6 +42,8 @@ def main(address: str, out: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
     try:
         main(sys.argv[1], Path("map.txt"))
     except ServiceError as error:  # nothing listens there, or the service was stopped

@@ -44,6 +44,8 @@ def _ran(call: Callable[[], object], typed: list[str], folder: Path) -> Ran:
             call()
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else int(end.code is not None)
+            if isinstance(end.code, str):  # the interpreter prints it
+                print(end.code, file=sys.stderr)
         except Exception:  # as the interpreter does
             traceback.print_exc()
             code = 1

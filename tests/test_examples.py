@@ -51,6 +51,14 @@ def test_own_sensors(room_walk: Path, tmp_path: Path) -> None:
     assert max(abs(float(x)) for x, _, _ in tracked) > 0.05
 
 
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.py")), ids=lambda file: file.stem)
+def test_an_example_without_arguments_says_what_it_takes(file: Path, tmp_path: Path) -> None:
+    done = python(file, folder=tmp_path)
+    assert done.returncode == 1
+    assert file.name in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_notebook_runs_from_top_to_bottom(room_walk: Path, tmp_path: Path) -> None:
     """Its cells of code in one process, as a kernel runs them; the recording is there already."""
     notebook = json.loads((EXAMPLES / "first_look.ipynb").read_text())

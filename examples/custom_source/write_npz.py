@@ -29,4 +29,6 @@ def write(source: str, folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     write(sys.argv[1], Path(sys.argv[2]))
