@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ast
 import os
+import runpy
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -45,19 +47,29 @@ def test_package_files_name_what_exists() -> None:
     assert __version__ in named
 
 
-def test_launch_file_runs_the_node_with_known_parameters() -> None:
-    tree = ast.parse((PACKAGE / "launch/graphvio.launch.py").read_text())
-    assert "generate_launch_description" in [each.name for each in tree.body if isinstance(each, ast.FunctionDef)]
-    calls = [each for each in ast.walk(tree) if isinstance(each, ast.Call)]
-    nodes = [
-        {each.arg: each.value for each in call.keywords}
-        for call in calls
-        if isinstance(call.func, ast.Name) and call.func.id == "Node"
-    ]
-    started = next(each for each in nodes if ast.literal_eval(each["package"]) == "graphvio_ros")
-    assert ast.literal_eval(started["executable"]) == "node"
-    parameters = next(each for each in ast.walk(started["parameters"]) if isinstance(each, ast.Dict))
-    assert {ast.literal_eval(key) for key in parameters.keys if key is not None} <= DEFAULTS.keys()
+@pytest.mark.parametrize("given", [{}, {"source": "realsense"}, {"source": "oak", "rig": "rig.yaml"}])
+def test_launch_file_leaves_to_the_parameter_file_what_is_not_given(
+    given: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With stand-ins for the packages of ROS 2, which record how they are called."""
+    nodes: list[dict[str, Any]] = []
+    actions = Mock()
+    actions.OpaqueFunction = lambda function: function(given)
+    configuration = Mock()
+    configuration.LaunchConfiguration = lambda name: Mock(perform=lambda context: context.get(name, ""))
+    ros = Mock()
+    ros.Node = lambda **arguments: nodes.append(arguments)
+    packages = Mock()
+    packages.get_package_share_directory.return_value = str(PACKAGE)
+    modules = {name: Mock() for name in ("launch", "launch.conditions", "launch_ros", "ament_index_python")}
+    modules |= {"launch.actions": actions, "launch.substitutions": configuration, "launch_ros.actions": ros}
+    for name, module in (modules | {"ament_index_python.packages": packages}).items():
+        monkeypatch.setitem(sys.modules, name, module)
+    runpy.run_path(str(PACKAGE / "launch/graphvio.launch.py"))["generate_launch_description"]()
+    started = next(each for each in nodes if each["package"] == "graphvio_ros")
+    assert started["executable"] == "node"
+    assert started["parameters"][1:] == ([given] if given else [])
+    assert given.keys() <= DEFAULTS.keys()
 
 
 def test_parameter_file_has_the_nodes_defaults() -> None:

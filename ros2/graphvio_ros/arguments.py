@@ -59,7 +59,7 @@ def parse(arguments: Sequence[str]) -> NodeArguments:
         elif argument in ("-p", "--param"):
             given.append(value)
         elif argument not in ("--log-level", "--log-config-file", "-e", "--enclave"):
-            raise ConfigError(f"{argument}: is no argument of a ROS 2 node; see docs/sensors/ros2.md")
+            raise ConfigError(f"{argument}: is no argument of a ROS 2 node; see docs/how-to/sensors/ros2.md")
     for path in files:
         parsed.parameters |= _from_file(path, parsed)
     for each in given:
