@@ -8,6 +8,7 @@ Fails where a page is wider than the window, an image is not shown, or a link wi
 
 import functools
 import http.server
+import os
 import subprocess
 import sys
 import tempfile
@@ -40,7 +41,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as temporary:
         site = Path(temporary) / "site"
         command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(site)]
-        subprocess.run(command, cwd=ROOT, check=True)
+        subprocess.run(command, cwd=ROOT, check=True, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"})
         handler = functools.partial(Quiet, directory=str(site))
         with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
             threading.Thread(target=server.serve_forever, daemon=True).start()
