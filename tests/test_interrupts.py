@@ -123,7 +123,7 @@ def test_run_interrupted_says_where_its_results_are(
 
 
 def test_main_interrupted_has_no_traceback(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("graphvio.sources.description.describe", interrupted_kernel)
+    monkeypatch.setattr("graphvio.sources.contents.describe_folder", interrupted_kernel)
     monkeypatch.setattr(sys, "argv", ["graphvio", "info", str(recording)])
     with pytest.raises(SystemExit) as ended:
         main()
@@ -154,7 +154,7 @@ from graphvio.odometry import Odometry
 def process(self, measurement):
     print(measurement.stamp_ns, flush=True)
     time.sleep(0.02)
-graphvio.warmup.warm_up = lambda *_: None
+graphvio.warmup.warm_up = lambda *_, **__: None
 Odometry.process = process
 sys.argv = ["graphvio", "record", {source!r}, "--out", {out!r}]
 main()
