@@ -9,14 +9,17 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 import numba
 import numpy as np
 from numba.core import event as numba_event
+from numba.core.compiler import Compiler
 
 from graphvio.compiled_code import KernelCache
+from graphvio.fast_math import fast_math_compiler
 from graphvio.kernel_cache import compiled_names
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
+_ANY_ORDER = fast_math_compiler(frozenset({"reassoc", "contract", "arcp", "nsz"}))
+_FAST = fast_math_compiler(frozenset({"fast"}))
 _registered: list[Any] = []
 _compilers: list[subprocess.Popen[bytes]] = []
 _log = logging.getLogger(__name__)
@@ -24,7 +27,7 @@ _log = logging.getLogger(__name__)
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function with numba: no GIL, cached on disk, IEEE division (no exception on 1/0)."""
-    return _compile(function, fastmath=False)
+    return _compile(function, Compiler)
 
 
 def vector_kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -32,7 +35,7 @@ def vector_kernel(function: Callable[P, R]) -> Callable[P, R]:
 
     Equal inputs still give equal results on one machine.
     """
-    return _compile(function, fastmath=_ANY_ORDER)
+    return _compile(function, _ANY_ORDER)
 
 
 def fast_kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -40,15 +43,15 @@ def fast_kernel(function: Callable[P, R]) -> Callable[P, R]:
 
     Equal inputs still give equal results on one machine.
     """
-    return _compile(function, fastmath=True)
+    return _compile(function, _FAST)
 
 
-def _compile(function: Callable[P, R], *, fastmath: bool | set[str]) -> Callable[P, R]:
+def _compile(function: Callable[P, R], compiler: type[Compiler]) -> Callable[P, R]:
     # What a kernel calls becomes part of it. Else the linker takes whichever copy of the callee it met first, and these
     # differ by how often they were optimised: the run that compiles would not give what later ones give.
-    compiled = numba.njit(nogil=True, error_model="numpy", fastmath=fastmath, forceinline=True, no_cfunc_wrapper=True)(
-        function
-    )
+    compiled = numba.njit(
+        nogil=True, error_model="numpy", forceinline=True, no_cfunc_wrapper=True, pipeline_class=compiler
+    )(function)
     if compiled is not function:  # as with NUMBA_DISABLE_JIT
         compiled._cache = KernelCache(function)
     _registered.append(compiled)

@@ -103,6 +103,39 @@ def test_loaded_kernels_parse_their_intermediate_code_when_a_caller_is_compiled(
     assert len(compiled) == 19
 
 
+@pytest.mark.parametrize("order", [("plain", "any_order", "fast"), ("fast", "any_order", "plain")])
+def test_fast_arithmetic_stays_within_the_kernels_that_ask_for_it(order: tuple[str, ...], tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    length = (
+        "def {0}(values):\n"
+        "    total = 0.0\n"
+        "    for index in range(values.size):\n"
+        "        total += values[index] ** 2\n"
+        "    return total if np.isfinite(values).all() else np.max(values) ** 3\n"
+    )
+    report = (
+        "for kernel in {0}:\n"
+        "    kernel(np.ones(9))\n"
+        "    code, = kernel.inspect_llvm().values()\n"
+        "    flagged = re.findall(r'= (?:tail )?(f[a-z]+|call) (fast|reassoc|nsz)', code)\n"
+        "    print(kernel.__name__, len(flagged), len(re.findall(r'= (?:tail )?f[a-z]+ ', code)), sep=',')\n"
+    )
+    decorators = {"plain": "@kernel", "any_order": "@vector_kernel", "fast": "@fast_kernel"}
+    program.write_text(
+        "import re, numpy as np; from graphvio.kernels import fast_kernel, kernel, vector_kernel\n"
+        + "".join(f"{decorator}\n{length.format(name)}" for name, decorator in decorators.items())
+        + report.format(", ".join(order))
+    )
+    environment = {**os.environ, "GRAPHVIO_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, program], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+    )
+    counts = {name: (int(flagged), int(of)) for name, flagged, of in (row.split(",") for row in done.stdout.split())}
+    assert counts["plain"][0] == 0
+    assert 0 < counts["any_order"][0] < counts["any_order"][1]
+    assert 0 < counts["fast"][0] < counts["fast"][1]
+
+
 def test_cache_of_all_users_is_read_where_it_cannot_be_written(tmp_path: Path) -> None:
     shared, home = tmp_path / "shared", tmp_path / "home"
     environment = {**os.environ, "GRAPHVIO_CACHE_DIR": str(shared), "XDG_CACHE_HOME": str(home)}
