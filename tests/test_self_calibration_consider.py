@@ -49,7 +49,7 @@ def test_consider_covariance_with_a_better_calibration_is_that_of_the_errors() -
     rng = np.random.default_rng(0)
     start, first, second = keyframe(0, 0), keyframe(1, 1), keyframe(2, 2)
     carried = se3_adjoint(se3_inverse(second.odom_T_body) @ first.odom_T_body)
-    of_first, of_second = rng.standard_normal((2, 6, N))
+    of_first, of_second = 1e-3 * rng.standard_normal((2, 6, N))  # errors so small that they add up
     before, measured = covariance(rng), rng.standard_normal((2, N))
     gain = before @ measured.T @ np.linalg.inv(measured @ before @ measured.T + 0.1 * np.eye(2))
     after = before - gain @ measured @ before
@@ -64,10 +64,26 @@ def test_consider_covariance_with_a_better_calibration_is_that_of_the_errors() -
         consider.extend([first, second], np.array([np.zeros((6, N)), of_second]))
         error = carried @ of_first @ true + of_second @ (true - learnt)
         added = consider.at(second.odom_T_body)
-        nees.append(error @ np.linalg.solve(added + 1e-3 * np.eye(6), error))
+        nees.append(error @ np.linalg.solve(added + 1e-9 * np.eye(6), error))
         squares, reported = squares + np.outer(error, error) / 4000, reported + added / 4000
     assert reported == pytest.approx(squares, abs=0.1 * np.abs(squares).max())
     assert 3.0 < np.mean(nees) < 5.0  # four parameters, and what was learnt of them
+
+
+def test_consider_covariance_of_large_turns_has_their_terms_of_second_order() -> None:
+    rng, nees = np.random.default_rng(3), []
+    for _ in range(200):
+        consider = ConsiderCovariance(N)
+        consider.extend([Keyframe(0, np.eye(4), {}), Keyframe(1, np.eye(4), {})], np.zeros((2, 6, N)))
+        pose = np.eye(4)
+        for change in rng.normal(0.0, [0.03, 0.03, 0.03, 0.1, 0.1, 0.1], (4, 6)):
+            consider.correct(change)
+            pose = pose @ se3_exp(change)
+        error, added = se3_log(pose), consider.at(np.eye(4))
+        assert np.linalg.matrix_rank(added) == 6
+        nees.append(error @ np.linalg.solve(added, error) / 6)
+    assert 0.1 < np.median(nees) < 1.0
+    assert np.quantile(nees, 0.95) < 3.0
 
 
 def test_consider_covariance_at_a_later_pose_grows_with_the_lever_arm() -> None:

@@ -84,7 +84,17 @@ class ConsiderCovariance:
     @property
     def _at_newest(self) -> Float:
         of_now = self._gain @ self._covariance @ self._gain.T
-        return np.asarray(of_now + np.outer(self._left_behind, self._left_behind) + self._before_knock)
+        left_behind = np.outer(self._left_behind, self._left_behind) + _second_order(self._left_behind)
+        return np.asarray(of_now + left_behind + self._before_knock)
+
+
+def _second_order(error: Float) -> Float:
+    """Return the covariance (6, 6) of what derivatives do not say of a pose's error (6,), as its size bounds it.
+
+    They were taken at poses that were turned by that error themselves.
+    """
+    angle, distance = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+    return np.diag(np.repeat([angle * angle, angle * distance], 3) ** 2)
 
 
 def _carried(then: Keyframe, now: Keyframe) -> Float:
