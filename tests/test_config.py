@@ -42,6 +42,11 @@ def test_unknown_key_error_names_the_nearest_one(text: str, named: str) -> None:
         Config.from_yaml(text)
 
 
+def test_unknown_key_error_without_a_near_one_names_the_command_that_shows_all() -> None:
+    with pytest.raises(ConfigError, match=r"motion: unknown key 'colour'; graphvio dump-config shows all$"):
+        Config.from_yaml("motion: {colour: 3}")
+
+
 @pytest.mark.parametrize(
     "value",
     [

@@ -209,6 +209,7 @@ REFUSED = {
         r"rig\.yaml: imu\.gyro_noise: unknown key.*'gyro_noise_density'",
     ),
     "unknown top key": (_set("piars", []), r"piars: unknown key; did you mean 'pairs'"),
+    "unrelated key": (_set("pairs.0.colour", 1), r"colour: unknown key; known here: name, left, right$"),
     "unknown camera key": (_set("pairs.0.left.intrinsic", 1), r"pairs\[0\]\.left\.intrinsic.*'intrinsics'"),
     "version missing": (lambda d: d.pop("graphvio_rig"), r"begin the file with  graphvio_rig: 2"),
     "version unknown": (_set("graphvio_rig", 3), r"reads versions 1 and 2"),

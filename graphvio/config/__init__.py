@@ -24,8 +24,9 @@ from graphvio.config.stages import (
     TimingConfig,
     TrackingConfig,
 )
-from graphvio.config.values import build, nearest
+from graphvio.config.values import build
 from graphvio.errors import ConfigError
+from graphvio.wording import nearest
 
 
 @dataclass(frozen=True)

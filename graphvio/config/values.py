@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any, get_args, get_type_hints
 
 from graphvio.errors import ConfigError
+from graphvio.wording import nearest
 
 _MAX_VALUE = 1e12
 _MAY_BE_ZERO = frozenset(
@@ -53,7 +53,8 @@ def build(kind: type[Any], data: object, where: str) -> Any:
     values = {}
     for key, value in data.items():
         if key not in names:
-            raise ConfigError(f"{where}: unknown key {key!r}{nearest(str(key), names)}")
+            hint = nearest(str(key), names) or "; graphvio dump-config shows all"
+            raise ConfigError(f"{where}: unknown key {key!r}{hint}")
         hint, here = hints[key], f"{where}: {key}"
         if is_dataclass(hint):
             values[key] = build(hint, {} if value is None else value, here)  # type: ignore[arg-type]
@@ -104,12 +105,6 @@ def checked(hint: Any, value: object, where: str) -> object:
     if value != int(value):
         raise ConfigError(f"{where}: is {value!r}; it must be a whole number")
     return int(value)
-
-
-def nearest(key: str, names: Iterable[str]) -> str:
-    """Suggest, for the end of a message, the known name that is most like an unknown one."""
-    close = difflib.get_close_matches(key, list(names), n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def _number_of_text(value: object) -> object:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ import yaml
 from graphvio.arrays import Float
 from graphvio.errors import RigError
 from graphvio.rig import Imu
+from graphvio.wording import nearest
 
 NOISE_KEYS = ("gyro_noise_density", "gyro_random_walk", "accel_noise_density", "accel_random_walk")
 _DEFAULTS = {f.name: f.default for f in fields(Imu)}
@@ -34,14 +34,12 @@ class Section:
         return f"{self.file}: {self.key}.{key}" if self.key else f"{self.file}: {key}"
 
     def only(self, known: Iterable[str]) -> None:
-        """Raise for keys that are not in ``known``; the error names the most similar one that is."""
+        """Raise for keys that are not in ``known``; the error names a similar one that is, or all."""
         known = list(known)
         for key in self.values:
             if key not in known:
-                nearest = difflib.get_close_matches(str(key), known, n=1, cutoff=0.0)[0]
-                raise RigError(
-                    f"{self.where(str(key))}: unknown key; did you mean {nearest!r}? (known here: {', '.join(known)})"
-                )
+                hint = nearest(str(key), known) or f"; known here: {', '.join(known)}"
+                raise RigError(f"{self.where(str(key))}: unknown key{hint}")
 
     def get(self, key: str) -> Any:
         """Get a required value."""

@@ -8,10 +8,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Protocol, cast
 
-from graphvio.config.values import nearest
 from graphvio.errors import SourceError
 from graphvio.live.source import DeviceInfo, LiveSource
 from graphvio.rig import Rig
+from graphvio.wording import nearest
 
 KINDS = ("v4l2", "realsense", "oak", "ros2", "replay", "simulator")
 
