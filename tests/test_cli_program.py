@@ -81,3 +81,34 @@ def test_required_packages_are_those_of_the_project() -> None:
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
     names = {re.split("[<>=]", each)[0] for each in project["dependencies"]}
     assert set(REQUIRED.values()) == names - {"typer"}  # without which there is no command line
+
+
+@pytest.mark.parametrize("value", ["-1", "nan"])
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        ("run", "--from"),
+        ("run", "--to"),
+        ("record --out a.mcap", "--from"),
+        ("convert --out a.mcap", "--to"),
+        ("calibrate", "--from"),
+        ("optimize --out a", "--to"),
+        ("fleet optimize --out a", "--from"),
+        ("benchmark euroc", "--to"),
+        ("live", "--for"),
+        ("serve", "--for"),
+        ("slam", "--for"),
+        ("evaluate truth", "--max-gap"),
+        ("compare", "--max-ate"),
+        ("simulate --out a", "--duration"),
+        ("simulate --out a", "--rate"),
+        ("simulate --out a", "--trigger-offset-ms"),
+    ],
+)
+def test_an_impossible_number_is_refused(command: str, option: str, value: str, tmp_path: Path) -> None:
+    ran = graphvio(*command.split(), "room" if "simulate" in command else "walk", option, value, folder=tmp_path)
+    assert ran.returncode == 2
+    assert ran.stderr.count("\n") == 1
+    assert value in ran.stderr
+    assert option.strip("-").split("-")[0] in ran.stderr
+    assert list(tmp_path.iterdir()) == []

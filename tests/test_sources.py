@@ -134,6 +134,8 @@ def test_imu_samples_begin_at_most_5_s_before_the_first_frameset(tmp_path: Path)
         (0.3, 0.1, r"from 0\.3 s to 0\.1"),
         (float("nan"), None, "from_s is nan"),
         (None, float("inf"), "to_s is inf"),
+        (-1.0, None, "from_s is -1; give seconds after the first frameset, 0 or more"),
+        (None, -0.5, r"to_s is -0\.5"),
     ],
 )
 def test_from_to_without_framesets_is_refused(

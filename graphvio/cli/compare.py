@@ -36,7 +36,10 @@ def compare(
         bool, typer.Option("--smoothed", help="In result folders, use the poses as they left the window.")
     ] = False,
     max_ate: Annotated[
-        float | None, typer.Option("--max-ate", help="Exit with code 4 if an ATE exceeds these metres.", min=0.0)
+        float | None,
+        typer.Option(
+            "--max-ate", help="Exit with code 4 if an ATE exceeds these metres.", callback=options.not_negative
+        ),
     ] = None,
     times: options.Times = None,
     verbose: options.Verbose = False,

@@ -29,7 +29,8 @@ def evaluate(
         Path | None, typer.Option("--save-json", help="Write all figures here.", metavar="FILE")
     ] = None,
     max_gap: Annotated[
-        float, typer.Option(help="Longest gap of the truth that is interpolated, seconds.", min=0.0)
+        float,
+        typer.Option(help="Longest gap of the truth that is interpolated, seconds.", callback=options.not_negative),
     ] = 0.25,
     times: options.Times = None,
     verbose: options.Verbose = False,

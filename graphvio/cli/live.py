@@ -107,8 +107,6 @@ def run_live(
     from graphvio.rig_files import load_rig
     from graphvio.runtime import StopSignals, share_heap, sigterm_as_interrupt, use_one_opencv_thread
 
-    if duration_s is not None and not duration_s > 0.0:
-        raise typer.BadParameter(f"--for is {duration_s:g}; give seconds")
     if png and record is None:
         raise typer.BadParameter("--png is how images are recorded; give --record FILE, too")
     if record is not None:

@@ -1,9 +1,28 @@
 """Arguments and options that several commands have."""
 
+import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+
+def _if(is_possible: Callable[[float], bool], wanted: str) -> Callable[[float | None], float | None]:
+    """Return the check of an option: a value that is not possible is refused, by a message that names the option."""
+
+    def check(value: float | None) -> float | None:
+        if value is not None and not is_possible(value):
+            raise typer.BadParameter(f"{value:g} is not possible; give {wanted}.")
+        return value
+
+    return check
+
+
+# All refuse NaN, which passes typer's own `min`.
+not_negative = _if(lambda value: value >= 0.0, "0 or more")
+seconds = _if(lambda value: 0.0 <= value < math.inf, "seconds, 0 or more")
+duration = _if(lambda value: value > 0.0, "seconds, more than 0")
 
 Source = Annotated[
     Path,
@@ -37,8 +56,8 @@ NoPairs = Annotated[
     bool, typer.Option("--no-pairs", help="Take each camera for a single one; the IMU shows the scale.")
 ]
 NoImu = Annotated[bool, typer.Option("--no-imu", help="Use the cameras alone.")]
-FromS = Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.")]
-ToS = Annotated[float | None, typer.Option("--to", help="End at this second of the recording.")]
+FromS = Annotated[float | None, typer.Option("--from", help="Begin at this second of the recording.", callback=seconds)]
+ToS = Annotated[float | None, typer.Option("--to", help="End at this second of the recording.", callback=seconds)]
 Png = Annotated[bool, typer.Option("--png", help="Pack images as PNG: smaller and slower.")]
 SessionOut = Annotated[Path, typer.Option("--out", help="Session to write; a new file, .mcap.", metavar="FILE")]
 LiveSource = Annotated[
@@ -58,7 +77,9 @@ ForgetCalibration = Annotated[
     bool,
     typer.Option("--forget-calibration", help="Use the rig file, and not what earlier runs learnt."),
 ]
-Duration = Annotated[float | None, typer.Option("--for", help="Stop after so many seconds.", metavar="SECONDS")]
+Duration = Annotated[
+    float | None, typer.Option("--for", help="Stop after so many seconds.", metavar="SECONDS", callback=duration)
+]
 WebPort = Annotated[
     int | None,
     typer.Option("--web", help="Show it in a browser of this machine, on this port and the next.", min=1, max=65534),

@@ -58,8 +58,8 @@ def open_source(
         MissingExtraError: if it is a session or bag, and the extra ``sessions`` is not installed.
     """
     for name, value in (("from_s", from_s), ("to_s", to_s)):
-        if value is not None and not math.isfinite(value):
-            raise SourceError(f"{name} is {value}; give seconds after the first frameset")
+        if value is not None and not 0.0 <= value < math.inf:
+            raise SourceError(f"{name} is {value:g}; give seconds after the first frameset, 0 or more")
     if tolerance_ms is not None and not 0.0 <= tolerance_ms <= _MAX_TOLERANCE_MS:
         raise SourceError(
             f"tolerance_ms is {tolerance_ms}; give 0 to {_MAX_TOLERANCE_MS:g}: images that are triggered together"
