@@ -101,6 +101,7 @@ def test_the_path_of_a_recording_is_a_replay_of_it(tmp_path: Path) -> None:
         ("simulator:room?legs=0", "from 1"),
         ("simulator:room?duration_s=nan", "duration_s is 'nan'"),
         ("simulator:room?speed=1000", "number from 0.01 to 100"),
+        ("replay:walk?speed=fast", "replay: speed is 'fast'; write a number from 0.01 to 100, or max$"),
         ("simulator:room?speed=2&drift_ppm=10", "drift_ppm needs speed=1"),
         ("replay", "names no recording"),
         ("replay:nowhere", "nowhere"),

@@ -23,8 +23,19 @@ def size_of(spec: SourceSpec, key: str) -> tuple[int, int] | None:
     return int(found[1]), int(found[2])
 
 
-def number_of(spec: SourceSpec, key: str, minimum: float, maximum: float) -> float | None:
-    """Return a number in a range, or None where it is not given."""
+def number_of(spec: SourceSpec, key: str, minimum: float, maximum: float, word: str | None = None) -> float | None:
+    """Return a number in a range, or None where it is not given.
+
+    Args:
+        spec: of the source.
+        key: of the option.
+        minimum: smallest value.
+        maximum: largest value.
+        word: that the option takes besides numbers, and that the caller has looked for; only for the message.
+
+    Raises:
+        SourceError: if it is no number, or outside the range.
+    """
     text = spec.options.get(key)
     if text is None:
         return None
@@ -33,7 +44,10 @@ def number_of(spec: SourceSpec, key: str, minimum: float, maximum: float) -> flo
     except ValueError:
         value = math.nan
     if not minimum <= value <= maximum:  # also refuses NaN
-        raise SourceError(f"{spec.kind}: {key} is {text!r}; write a number from {minimum:g} to {maximum:g}")
+        alternative = "" if word is None else f", or {word}"
+        raise SourceError(
+            f"{spec.kind}: {key} is {text!r}; write a number from {minimum:g} to {maximum:g}{alternative}"
+        )
     return value
 
 

@@ -103,7 +103,7 @@ def speed_of(spec: SourceSpec) -> float | None:
     """Return the option ``speed``: a factor such as ``2``, 1 where it is not given, or None for ``max``."""
     if spec.options.get("speed") == "max":
         return None
-    return number_of(spec, "speed", 0.01, 100.0) or 1.0
+    return number_of(spec, "speed", 0.01, 100.0, word="max") or 1.0
 
 
 def paced(measurements: Iterable[Measurement], rig: Rig, pace: Pace) -> Iterator[Reading]:
