@@ -26,6 +26,7 @@ _KITTI_COLUMNS = 12
 _NORM_TOLERANCE = 0.05
 _MAX_STAMP_NS = 2**62
 _SESSION_SUFFIXES = (".mcap", ".bag")
+_ACCEPTED = "give a trajectory file (TUM, EuRoC or KITTI), or BAG:TOPIC"
 
 
 def load_trajectory(path: str | Path, times: Path | None = None) -> Trajectory:
@@ -102,7 +103,7 @@ def stamp_ns_from_seconds(text: str) -> int:
 
 def _load_from_session(path: Path, topic: str | None = None) -> Trajectory:
     if not is_store(path):
-        raise TrajectoryError(f"{path}: is no trajectory file, and no session; give a TUM or EuRoC trajectory file")
+        raise TrajectoryError(f"{path}: is no trajectory file, and no session; {_ACCEPTED}")
     try:
         return Trajectory(*read_poses(path, topic))
     except SessionError as error:
@@ -113,11 +114,9 @@ def _load_text(path: Path, times: Path | None) -> Trajectory:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise TrajectoryError(
-            f"{path}: cannot be read ({error.strerror}); give a TUM or EuRoC trajectory file"
-        ) from None
+        raise TrajectoryError(f"{path}: cannot be read ({error.strerror}); {_ACCEPTED}") from None
     except UnicodeDecodeError:
-        raise TrajectoryError(f"{path}: is not a text file; give a TUM or EuRoC trajectory file") from None
+        raise TrajectoryError(f"{path}: is not a text file; {_ACCEPTED}") from None
     rows = list(_rows(text))
     if rows and not rows[0][2] and len(rows[0][1]) == _KITTI_COLUMNS:
         return _load_kitti(path, rows, times)

@@ -1,5 +1,6 @@
 """``graphvio compare``."""
 
+import re
 from pathlib import Path
 
 import cv2
@@ -85,3 +86,15 @@ def test_compare_unmatched_result_is_reported_and_others_compared(files: dict[st
 
 def test_compare_one_result_is_refused(files: dict[str, Path]) -> None:
     assert "nothing to compare" in str(command(files["good"]).exception)
+
+
+def test_what_is_no_result_is_refused_with_what_is_accepted(files: dict[str, Path], room_walk: Path) -> None:
+    given = r"give a result folder, a trajectory file \(TUM, EuRoC or KITTI\), or BAG:TOPIC$"
+    for wrong, why in (
+        (room_walk, r"is a recording, which can only be the truth \(.*--truth of compare\)"),
+        (files["truth"].parent, r"holds no trajectory\.txt"),
+    ):
+        error = command(files["good"], wrong).exception
+        assert re.fullmatch(f"{wrong}: {why}.*; .*{given}", str(error)), error
+    error = command(files["good"], files["bad"], "--truth", files["folder"]).exception
+    assert "is no recording; as the truth give a recording that has one, a trajectory file" in str(error)

@@ -22,6 +22,7 @@ EXIT_INCOMPLETE = 3  # results are written, but not all that was asked for
 EXIT_ABOVE_LIMIT = 4
 EXIT_INTERRUPTED = 130
 MIN_COMPLETION = 0.9  # share of the framesets that have a pose
+_FILES = "a trajectory file (TUM, EuRoC or KITTI), or BAG:TOPIC"
 
 
 def warn(message: str) -> None:
@@ -39,15 +40,27 @@ def names_of(paths: Sequence[Path]) -> list[str]:
 
 
 def result_trajectory(path: Path, smoothed: bool = False) -> Path:
-    """Return the trajectory file of a folder of results; another path as it is."""
+    """Return the trajectory file of a folder of results; another path as it is.
+
+    Raises:
+        TrajectoryError: if the folder holds no results; the message says what is accepted.
+    """
+    from graphvio.errors import TrajectoryError
     from graphvio.sessions.store import is_store
+    from graphvio.sources import is_recording
 
     if not path.is_dir() or is_store(path):
         return path
-    optimized = path / "trajectory_optimized.txt"
-    if optimized.is_file():
-        return optimized
-    return path / ("trajectory_smoothed.txt" if smoothed else "trajectory.txt")
+    trajectory = "trajectory_smoothed.txt" if smoothed else "trajectory.txt"
+    for name in ("trajectory_optimized.txt", trajectory):
+        if (path / name).is_file():
+            return path / name
+    if is_recording(path):
+        raise TrajectoryError(
+            f"{path}: is a recording, which can only be the truth (the second argument of evaluate, or --truth of "
+            f"compare); as a result give a result folder, {_FILES}"
+        )
+    raise TrajectoryError(f"{path}: holds no {trajectory}; give a result folder, {_FILES}")
 
 
 def true_trajectory(path: Path, times: Path | None = None) -> Trajectory:
@@ -62,10 +75,14 @@ def true_trajectory(path: Path, times: Path | None = None) -> Trajectory:
     from graphvio.sources import is_recording, open_source
     from graphvio.trajectory_files import load_trajectory
 
-    if path.is_dir() and not is_store(path) and is_recording(path):  # a session holds its truth itself
+    if path.is_dir() and not is_store(path):  # a session holds its truth itself
+        if not is_recording(path):
+            raise TrajectoryError(f"{path}: is no recording; as the truth give a recording that has one, {_FILES}")
         truth = open_source(path).truth
         if truth is None:
-            raise TrajectoryError(f"{path}: this recording has no true trajectory; give a file, TUM or EuRoC")
+            raise TrajectoryError(
+                f"{path}: this recording has no true trajectory; as the truth give a recording that has one, {_FILES}"
+            )
         path = truth
     return load_trajectory(path, times)
 
